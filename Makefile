@@ -8,7 +8,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 
 LIBRARY := hbr/kernels/_kernels.so
 
-.PHONY: demo web test test-nightly test-kills test-web fuzz lint docs wheel bench lock clean help
+.PHONY: demo web test test-nightly test-kills test-web kernel-test fuzz lint docs wheel bench lock clean help
 
 help:
 	@echo "make demo   enroll and find objects on the simulated bench, and write rig-demo/report.html"
@@ -17,6 +17,7 @@ help:
 	@echo "make test-nightly  run all tests, with many more cases in each"
 	@echo "make test-kills  kill the program at a hundred points of its work, and check what is left"
 	@echo "make test-web   use the pages in a real browser, and attack the server"
+	@echo "make kernel-test  run the program with Linux's real drivers in a virtual machine"
 	@echo "make fuzz   attack every kind of input for about an hour (a part of test-nightly)"
 	@echo "make lint   formatting, lint, types, import contracts"
 	@echo "make docs   the documentation as a site in site/"
@@ -33,9 +34,9 @@ web: $(READY) $(LIBRARY)
 test: $(READY) $(LIBRARY)
 	@$(BIN)/python -m pytest -n auto --dist worksteal -rs
 
-# The empty -m selects the tests marked nightly, too.
+# This selects the tests marked nightly, too; the kernel tests need the whole computer for themselves.
 test-nightly: $(READY) $(LIBRARY)
-	@$(BIN)/python -m pytest -n auto --dist worksteal -rs -m "" --hypothesis-profile=nightly
+	@$(BIN)/python -m pytest -n auto --dist worksteal -rs -m "not kernel" --hypothesis-profile=nightly
 
 # A hundred kills of the program at different points of eleven kinds of work; a thousand with KILLS=90.
 KILLS ?= 8
@@ -46,6 +47,16 @@ test-kills: $(READY) $(LIBRARY)
 test-web: $(READY) $(LIBRARY)
 	@sh .ci/install .ci/browser.lock
 	@$(BIN)/python -m pytest -rs -m "" --timeout 300 tests/browser
+
+# Installs nothing; docs/how-to/test-with-real-drivers.md says where the kernel comes from (docs/decisions/0043).
+KERNEL_FOLDER := $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/hbr-rig/kernel
+kernel-test: export RIG_TEST_KERNEL ?= $(KERNEL_FOLDER)
+kernel-test: $(READY) $(LIBRARY)
+	@ls $(RIG_TEST_KERNEL) >/dev/null 2>&1 || echo "No kernel in $(RIG_TEST_KERNEL). To get Debian's own, without installing it:\n" \
+	    "   mkdir -p $(KERNEL_FOLDER) && cd $(KERNEL_FOLDER) &&\n" \
+	    "   apt-get download \$$(apt-cache depends linux-image-amd64 | sed -n 's/.*Depends: \(linux-image.*\)/\1/p')\n" \
+	    "The virtual machine needs: sudo apt-get install --no-install-recommends qemu-system-x86 busybox-static kmod udev"
+	@$(BIN)/python -m pytest -rs -m kernel -o faulthandler_timeout=300 tests/kernel
 
 fuzz: $(READY) $(LIBRARY)
 	@$(BIN)/python -m pytest -n auto --dist worksteal -rs -m "" --hypothesis-profile=nightly tests/fuzz

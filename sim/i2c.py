@@ -119,6 +119,27 @@ class SimI2cBus(AbstractContextManager["SimI2cBus"]):
         """Break the next read of more than ``after_bytes`` bytes off after so many."""
         self._cut = after_bytes
 
+    # -- bus side: for an adapter that transfers single messages --------------------------------------------------
+
+    def message(self, address: int, content: bytes | int, *, last: bool) -> bytes:
+        """Transfer one message: write the bytes ``content``, or read so many bytes; a stop follows the ``last``.
+
+        Raises OSError with the kernel's number for what happened on the wire: ETIMEDOUT at once if the bus hangs.
+        """
+        if self.stuck:
+            raise _os_error(ETIMEDOUT)
+        read = b""
+
+        def transfer() -> None:
+            nonlocal read
+            if isinstance(content, int):
+                read = self._read(address, content)
+            else:
+                self._write(address, content)
+
+        self._transaction(transfer, stops=last)
+        return read
+
     # -- bus side: what the kernel does ---------------------------------------------------------------------------
 
     def ioctl(self, fd: int, request: int, argument: Any) -> int:
@@ -146,14 +167,17 @@ class SimI2cBus(AbstractContextManager["SimI2cBus"]):
                 raise _os_error(ENOTTY)
         return 0
 
-    def _transaction(self, messages: Callable[[], None]) -> None:
+    def _transaction(self, messages: Callable[[], None], *, stops: bool = True) -> None:
         if self.stuck:
             self._clock.sleep(TIMEOUT_S)
             raise _os_error(ETIMEDOUT)
         try:
             messages()
+        except OSError:
+            stops = True
+            raise
         finally:
-            for device in list(self._devices.values()):
+            for device in list(self._devices.values()) if stops else ():
                 device.stop()
 
     def _combined(self, messages: list[Any]) -> None:

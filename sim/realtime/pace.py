@@ -4,12 +4,11 @@ import select
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from threading import RLock
-from typing import Final
+from typing import Final, Protocol
 
 from rig.core.clock import SystemClock
 from rig.core.signals import uninterrupted
 from sim.clock import VirtualClock
-from sim.realtime.port import PtyPort
 
 STEP_NS: Final = 20_000_000
 """Longest step of the world. After a pause of this program, requests are answered between the steps that catch up."""
@@ -17,6 +16,16 @@ ACTIVE_NS: Final = 100_000_000
 """How long after the last byte a port is looked at each `ACTIVE_WAIT_S`."""
 ACTIVE_WAIT_S: Final = 0.001
 LONGEST_WAIT_S: Final = 0.1
+
+
+class Port(Protocol):
+    """A port through which other programs use the world: a pseudo-terminal, for example."""
+
+    def fileno(self) -> int:
+        """Return the file descriptor that becomes readable when a program writes; -1 while unplugged."""
+
+    def pump(self) -> bool:
+        """Transfer the waiting bytes in both directions; return whether there were any."""
 
 
 class RealTime:
@@ -37,7 +46,7 @@ class RealTime:
         Whether the world has ended: its time stands still.
     """
 
-    def __init__(self, clock: VirtualClock, ports: Sequence[PtyPort] = ()) -> None:
+    def __init__(self, clock: VirtualClock, ports: Sequence[Port] = ()) -> None:
         self.over = False
         self._clock = clock
         self._ports = ports

@@ -1,0 +1,78 @@
+"""A virtual machine with Linux's real drivers, and the played devices in it."""
+
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import pytest
+
+from tests.kernel.guest_bench import GuestBench
+from tests.kernel.machine import Machine, NotReady, Result, kernel_folder
+from tests.kernel.played_bench import PlayedBench
+
+RULES_FILE = "/etc/udev/rules.d/60-hbr-rig.rules"
+PATIENT = {
+    "servo": ("retries = 10",),
+    "table": ("poll_s = 0.1", "quiet_dps = 2.0"),
+    "imu": ("rate_hz = 50", "bandwidth_hz = 20"),
+}
+"""Settings for an emulated computer, which is slow: a request to a device takes it tens of milliseconds."""
+
+
+@pytest.fixture(scope="session")
+def machine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Machine]:
+    """Boot the virtual machine; skip the test, with the reason, if this computer cannot."""
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        pytest.skip("the kernel tests share one virtual machine: run `make kernel-test`")
+    try:
+        kernel = kernel_folder()
+    except NotReady as missing:
+        pytest.skip(str(missing))
+    with Machine(kernel, tmp_path_factory.mktemp("machine")) as machine:
+        yield machine
+
+
+@pytest.fixture(scope="session")
+def guest(machine: Machine) -> Iterator[GuestBench]:
+    """Plug the devices in."""
+    with PlayedBench() as played:
+        guest = GuestBench(machine, played)
+        guest.plug_in(*played.usb)
+        yield guest
+
+
+@dataclass(frozen=True, slots=True)
+class FirstDay:
+    """What the commands of a first day have printed."""
+
+    find: Result
+    rules: Result
+    latency_before: str
+    latency_after: str
+    link: str
+    setup: Result
+    settings: Result
+    home: Result
+
+
+@pytest.fixture(scope="session")
+def first_day(guest: GuestBench) -> FirstDay:
+    """Set the bench up as a technician does, once for all tests."""
+    latency = "cat /sys/bus/usb-serial/devices/ttyUSB0/latency_timer"
+    find, rules, before = guest.rig("find"), guest.rig("doctor", "--udev"), guest.sh(latency)
+    guest.sh(f"cat > {RULES_FILE} <<'END'\n{rules.output}END")
+    guest.sh("udevadm control --reload && udevadm trigger --action=add && udevadm settle")
+    after, link = guest.sh(latency), guest.sh("readlink -f /dev/rig-servo")
+    setup = guest.rig("setup", "--yes")
+    for section, lines in PATIENT.items():
+        added = "\\n".join((f"[{section}]", *lines))
+        guest.sh(f"sed -i 's/^\\[{section}\\]/{added}/' rig.toml")
+    settings, home = guest.rig("servo", "settings", "--write", "--yes"), guest.rig("home", "--here")
+    return FirstDay(find, rules, before, after, link, setup, settings, home)
+
+
+@pytest.fixture
+def bench(guest: GuestBench, first_day: FirstDay) -> Iterator[GuestBench]:
+    """Return a bench that is ready; at the end, bring what the test has changed into order."""
+    yield guest
+    guest.restore()

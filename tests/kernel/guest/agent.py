@@ -1,0 +1,147 @@
+"""Runs in the virtual machine: does what the tests ask for, over one connection to the computer that runs them.
+
+A request is a line of JSON; so is its answer. Requests run side by side, each in its own thread.
+"""
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from threading import Lock, Thread
+from typing import Any, Final
+
+from tests.programs import Program
+
+HOST: Final = "10.0.2.2"
+"""The computer that runs the tests, as QEMU shows it."""
+VHCI = Path("/sys/devices/platform/vhci_hcd.0")
+AS_USER = """import os
+os.setgroups({groups})
+os.setgid({gid})
+os.setuid({uid})
+"""
+RIG = "from rig.cli.main import main\nmain()\n"
+
+
+class Agent:
+    """Answers requests."""
+
+    def __init__(self, connection: socket.socket) -> None:
+        self._connection = connection
+        self._lock = Lock()
+        self._running: dict[int, Program | subprocess.Popen[str]] = {}
+        self._outputs: dict[int, list[str]] = {}
+        self._readers: dict[int, list[Thread]] = {}
+
+    def run(self) -> None:
+        """Answer until the connection ends."""
+        self._send({"ready": os.uname().release})
+        with self._connection.makefile("r", encoding="utf-8") as lines:
+            for line in lines:
+                Thread(target=self._answer, args=(json.loads(line),), daemon=True).start()
+
+    def _answer(self, request: dict[str, Any]) -> None:
+        number = request.pop("number")
+        try:
+            action: Callable[..., Any] = getattr(self, "do_" + request.pop("do"))
+            self._send({"number": number, "value": action(**request)})
+        except Exception as error:
+            self._send({"number": number, "error": f"{type(error).__name__}: {error}"})
+
+    def _send(self, answer: dict[str, Any]) -> None:
+        with self._lock:
+            self._connection.sendall(json.dumps(answer).encode() + b"\n")
+
+    # -- requests ---------------------------------------------------------------------------------------------------
+
+    def do_attach(self, port: int, hub_port: int, device: int, speed: int) -> None:
+        """Plug the USB device at a TCP port of the other computer into the virtual USB host."""
+        plug = socket.create_connection((HOST, port))
+        plug.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        (VHCI / "attach").write_text(f"{hub_port} {plug.fileno()} {1 << 16 | device} {speed}")
+
+    def do_start(
+        self,
+        words: list[str],
+        folder: str,
+        user: dict[str, Any] | None = None,
+        variables: dict[str, str] | None = None,
+        typed: str = "",
+    ) -> int:
+        """Start `rig ...`; return the number of the process."""
+        program = Program(
+            *words,
+            code=("" if user is None else AS_USER.format(**user)) + RIG,
+            folder=Path(folder),
+            **(variables or {}),
+        )
+        return self._started(program, program.pid, typed)
+
+    def do_shell(self, command: str, folder: str, variables: dict[str, str] | None = None) -> int:
+        """Start a command of the shell; return the number of the process."""
+        pipe = subprocess.PIPE
+        environment = {**os.environ, **(variables or {})}
+        process = subprocess.Popen(
+            ["/bin/bash", "-c", command], cwd=folder, env=environment, stdin=pipe, stdout=pipe, stderr=pipe, text=True
+        )
+        return self._started(process, process.pid, "")
+
+    def do_output(self, pid: int) -> str:
+        """Return what the process has printed so far."""
+        return "".join(self._outputs[pid])
+
+    def do_wait(self, pid: int, timeout: float) -> dict[str, Any] | None:
+        """Return exit code and output of a process when it has ended; None if it has not ended in ``timeout`` s."""
+        process = self._running[pid]
+        try:
+            code = process.wait(timeout)
+        except subprocess.TimeoutExpired:
+            return None
+        for reader in self._readers.pop(pid):
+            reader.join(1.0)  # a guardian may hold the pipe longer
+        del self._running[pid]
+        return {"code": code, "output": "".join(self._outputs.pop(pid))}
+
+    def do_signal(self, pid: int, signal_number: int) -> None:
+        os.kill(pid, signal_number)
+
+    def do_end_all(self) -> int:
+        """Kill all processes that still run; return their number."""
+        for process in self._running.values():
+            process.kill()
+        return len(self._running)
+
+    def _started(self, process: Program | subprocess.Popen[str], pid: int, typed: str) -> int:
+        assert process.stdin is not None
+        with suppress(BrokenPipeError):
+            process.stdin.write(typed)
+            process.stdin.close()
+        self._running[pid] = process
+        output = self._outputs[pid] = []
+        self._readers[pid] = [
+            Thread(target=_read, args=(stream, output), daemon=True) for stream in (process.stdout, process.stderr)
+        ]
+        for reader in self._readers[pid]:
+            reader.start()
+        return pid
+
+
+def _read(stream: Any, output: list[str]) -> None:
+    while text := os.read(stream.fileno(), 65_536):
+        output.append(text.decode(errors="replace"))
+
+
+def main() -> None:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    with socket.create_connection((HOST, int(sys.argv[1]))) as connection:
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        Agent(connection).run()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,29 @@
+#!/bin/bash
+# The first program of the virtual machine: starts what a computer with Linux runs, then the agent.
+# The kernel's command line says where the kernel's modules, Python and the project are, and the agent's TCP port.
+export PATH=/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin HOME=/root LC_ALL=C.UTF-8
+for word in $(cat /proc/cmdline); do
+    case $word in rig.*) declare "${word#rig.}" ;; esac
+done
+release=$(uname -r)
+mount -t tmpfs run /run
+mkdir -p /run/udev /run/lock /dev/pts /dev/shm
+mount -t devpts devpts /dev/pts
+mount -t tmpfs shm /dev/shm
+mkdir -p /lib/modules
+ln -sfn "$modules" "/lib/modules/$release"
+echo "udev $(cut -d" " -f1 /proc/uptime)"; busybox hostname kernel-test
+busybox ifconfig lo 127.0.0.1 up
+if [ -x /lib/systemd/systemd-udevd ]; then /lib/systemd/systemd-udevd --daemon; else udevd --daemon; fi
+udevadm trigger --action=add
+modprobe -a virtio_net vhci-hcd i2c-dev
+udevadm settle --timeout=60; echo "settled $(cut -d" " -f1 /proc/uptime)"
+for _ in {1..100}; do
+    network=$(ls /sys/class/net | grep -v '^lo$' | head -1)
+    [ -n "$network" ] && break
+    sleep 0.1
+done
+busybox ifconfig "$network" 10.0.2.15 netmask 255.255.255.0 up
+busybox route add default gw 10.0.2.2
+cd "$project" || exit 1
+echo "agent $(cut -d" " -f1 /proc/uptime)"; exec "$python" -m tests.kernel.guest.agent "$port"

@@ -1,0 +1,105 @@
+"""The rig in the virtual machine: its folder there, its programs, and the cables of its devices."""
+
+from collections.abc import Callable
+from pathlib import PurePosixPath
+from typing import Any, Final
+
+from rig.core.clock import SystemClock
+from tests.kernel.machine import GuestProcess, Machine, Result
+from tests.kernel.played_bench import PlayedBench
+from tests.kernel.usb.device import UsbDevice
+
+FOLDER: Final = PurePosixPath("/bench")
+VARIABLES: Final = {
+    **{f"XDG_{kind}_HOME": str(FOLDER / kind.lower()) for kind in ("CONFIG", "DATA", "STATE", "CACHE")},
+    "HOME": "/root",
+    "TERM": "dumb",
+    "COLUMNS": "160",
+    "NO_COLOR": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+}
+LATCH: Final = FOLDER / "state/hbr-rig/hardware/latch"
+APPEAR_S: Final = 30.0
+_POLL_S: Final = 0.05
+
+
+class GuestBench:
+    """Runs programs in the machine and moves cables.
+
+    Attributes
+    ----------
+    machine
+        The virtual machine.
+    played
+        The devices' other end.
+    """
+
+    def __init__(self, machine: Machine, played: PlayedBench) -> None:
+        self.machine = machine
+        self.played = played
+        self._nodes = {played.servo: "/dev/ttyUSB0", played.imu: "/dev/i2c-*", played.camera: "/dev/video0"}
+        self.sh(f"mkdir -p {FOLDER}", folder="/")
+
+    # -- programs ---------------------------------------------------------------------------------------------------
+
+    def start(self, *words: object, **options: Any) -> GuestProcess:
+        """Start `rig ...` in the bench's folder."""
+        asked = {"words": [str(word) for word in words], "folder": str(FOLDER), "variables": VARIABLES, **options}
+        return GuestProcess(self.machine, self.machine.ask("start", **asked))
+
+    def rig(self, *words: object, timeout: float = 120.0, **options: Any) -> Result:
+        """Return how `rig ...` has ended."""
+        return self.start(*words, **options).wait(timeout)
+
+    def start_sh(self, command: str, folder: str = str(FOLDER)) -> GuestProcess:
+        """Start a command of the shell."""
+        return GuestProcess(
+            self.machine, self.machine.ask("shell", command=command, folder=folder, variables=VARIABLES)
+        )
+
+    def sh(self, command: str, folder: str = str(FOLDER), timeout: float = 60.0) -> str:
+        """Return the output of a command; raises AssertionError if it fails."""
+        result = self.start_sh(command, folder).wait(timeout)
+        assert result.code == 0, f"{command}: {result}"
+        return result.output.strip()
+
+    def restore(self) -> None:
+        """End all programs, plug every device in, end all faults, and acknowledge what is latched."""
+        self.machine.ask("end_all")
+        self.played.restore()
+        self.plug_in(*(device for device in self.played.usb if device.plug is None))
+        if self.sh(f"tr -d ' \\0' < {LATCH} || true"):
+            assert self.rig("acknowledge").code == 0
+
+    # -- cables -----------------------------------------------------------------------------------------------------
+
+    def plug_in(self, *devices: UsbDevice) -> None:
+        """Plug devices in, and wait until their device files exist."""
+        for device in devices:
+            number = self.played.usb.index(device)
+            self.machine.ask("attach", port=device.port, hub_port=number, device=number + 1, speed=int(device.speed))
+        for device in devices:
+            self.until(lambda device=device: self._exists(device), f"{self._nodes[device]} appears")
+        self.sh("udevadm settle --timeout=30")
+
+    def unplug(self, *devices: UsbDevice) -> None:
+        """Pull the cables of devices, and wait until the kernel has noticed."""
+        for device in devices:
+            device.unplug()
+        for device in devices:
+            self.until(lambda device=device: not self._exists(device), f"{self._nodes[device]} disappears")
+
+    def _exists(self, device: UsbDevice) -> bool:
+        return self.sh(f"ls {self._nodes[device]} 2>/dev/null | head -1", folder="/") != ""
+
+    def until(self, condition: Callable[[], object], what: str, seconds: float = APPEAR_S) -> None:
+        """Wait for a condition; raises AssertionError if it does not come true in ``seconds``."""
+        clock = SystemClock()
+        begun_ns = clock.now_ns()
+        while not condition():
+            assert clock.now_ns() - begun_ns < seconds * 1e9, f"not in {seconds:g} s: {what}"
+            clock.sleep(_POLL_S)
+
+    def pause(self, seconds: float) -> None:
+        """Let time pass."""
+        SystemClock().sleep(seconds)

@@ -1,0 +1,235 @@
+"""A virtual machine with Debian's own kernel, on an overlay of this computer's files."""
+
+import gzip
+import json
+import os
+import platform
+import shutil
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from itertools import count
+from pathlib import Path
+from threading import Condition, Thread
+from typing import Any, Final, Self
+
+from rig.core.clock import SystemClock
+
+KERNEL: Final = "RIG_TEST_KERNEL"
+"""The variable that names the kernel: a package (.deb), or a folder with ``boot`` and ``lib/modules``."""
+ACCELERATOR: Final = "RIG_TEST_ACCELERATOR"
+"""The variable that chooses QEMU's accelerator, for example ``kvm``; default: emulation, which works everywhere."""
+PACKAGES: Final = {"qemu-system-x86_64": "qemu-system-x86", "busybox": "busybox-static", "modprobe": "kmod"}
+"""Programs, and the Debian packages that have them."""
+MODULES: Final = ("virtio_pci", "9pnet_virtio", "9p", "overlay")
+"""What the kernel needs to find its files."""
+BOOT_S: Final = 180.0
+ANSWER_S: Final = 120.0
+PROJECT: Final = Path(__file__).parents[2]
+_INIT = """#!/bin/busybox sh
+busybox=/bin/busybox
+$busybox mkdir -p /proc /sys /dev /newroot /lower /upper
+$busybox mount -t proc proc /proc
+$busybox mount -t sysfs sys /sys
+$busybox mount -t devtmpfs dev /dev
+for module in /modules/*.ko; do $busybox insmod $module || echo "no module $module"; done
+$busybox mount -t 9p -o trans=virtio,version=9p2000.L,msize=512000,cache=loose,ro host /lower
+$busybox mount -t tmpfs -o size=1g,mode=0755 upper /upper
+$busybox mkdir -p /upper/files /upper/work
+$busybox mount -t overlay -o lowerdir=/lower,upperdir=/upper/files,workdir=/upper/work overlay /newroot
+for folder in proc sys dev; do $busybox mount --move /$folder /newroot/$folder; done
+exec $busybox switch_root /newroot /bin/bash {init}
+"""
+
+
+class NotReady(Exception):
+    """This computer cannot run the virtual machine; the text says what is missing and how to get it."""
+
+
+def kernel_folder() -> Path:
+    """Return the folder of the kernel, after unpacking its package beside it.
+
+    Raises
+    ------
+    NotReady
+        Something is missing.
+    """
+    if platform.machine() != "x86_64":
+        raise NotReady(f"the kernel tests need an x86-64 computer, not {platform.machine()}")
+    if missing := [package for program, package in PACKAGES.items() if _found(program) is None]:
+        raise NotReady(f"packages are missing: sudo apt-get install --no-install-recommends {' '.join(missing)} udev")
+    path = Path(os.environ.get(KERNEL, ""))
+    packages = [path] if path.suffix == ".deb" else sorted(path.glob("linux-image-*.deb")) if path.name else []
+    if packages and packages[-1].is_file():
+        path = _unpacked(packages[-1])
+    if not path.name or not list(path.glob("boot/vmlinuz-*")):
+        raise NotReady(f"{KERNEL}={path} names no kernel: `make kernel-test` says how to get one")
+    return path
+
+
+def _found(program: str) -> str | None:
+    return shutil.which(program, path=f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin")
+
+
+def _unpacked(package: Path) -> Path:
+    """Unpack a kernel's package beside it, once."""
+    folder = package.with_suffix("")
+    if not (folder / "complete").exists():
+        shutil.rmtree(folder, ignore_errors=True)
+        subprocess.run(["dpkg-deb", "-x", package, folder], check=True)
+        release = next((folder / "lib/modules").iterdir()).name
+        subprocess.run([_found("depmod") or "depmod", "-b", folder, release], check=True)
+        (folder / "complete").touch()
+    return folder
+
+
+def initial_files(kernel: Path, release: str) -> bytes:
+    """Return the kernel's initial file system: busybox, the modules that find the files, and what starts them."""
+    init = Path(__file__).parent / "guest/init.sh"
+    files: list[tuple[str, int, bytes]] = [(name, 0o40755, b"") for name in ("bin", "modules")]
+    files.append(("init", 0o100755, _INIT.format(init=init).encode()))
+    files.append(("bin/busybox", 0o100755, Path(_found("busybox") or "").read_bytes()))
+    modules: list[str] = []
+    for module in MODULES:
+        command = [_found("modprobe") or "modprobe", "-d", str(kernel), "-S", release, "--show-depends", module]
+        listed = subprocess.run(command, check=True, capture_output=True, text=True).stdout.splitlines()
+        modules += [line.split()[1] for line in listed if line.startswith("insmod")]
+    for number, path in enumerate(dict.fromkeys(modules)):
+        files.append((f"modules/{number:02d}.ko", 0o100644, Path(path).read_bytes()))
+    return gzip.compress(b"".join(_cpio(files)), 1)
+
+
+def _cpio(files: list[tuple[str, int, bytes]]) -> Iterator[bytes]:
+    """Yield an archive in cpio's format "newc" (Documentation/driver-api/early-userspace/buffer-format.rst)."""
+    for number, (name, mode, data) in enumerate([*files, ("TRAILER!!!", 0, b"")], 1):
+        path = name.encode() + b"\0"
+        fields = (number, mode, 0, 0, 1, 0, len(data), 0, 0, 0, 0, len(path), 0)
+        head = b"070701" + b"".join(b"%08X" % field for field in fields) + path
+        yield head + bytes(-len(head) % 4) + data + bytes(-len(data) % 4)
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """How a program in the machine has ended."""
+
+    code: int
+    output: str
+
+
+class Machine:
+    """A running virtual machine, which does what its agent is asked for."""
+
+    def __init__(self, kernel: Path, folder: Path) -> None:
+        release = next((kernel / "lib/modules").iterdir()).name
+        image = folder / "initrd.gz"
+        image.write_bytes(initial_files(kernel, release))
+        self.log = folder / "console.log"
+        self._numbers = count(1)
+        self._answers: dict[int, dict[str, Any]] = {}
+        self._changed = Condition()
+        with socket.create_server(("127.0.0.1", 0)) as listener:
+            words = {
+                "modules": kernel / "lib/modules" / release,
+                "python": sys.executable,
+                "project": PROJECT,
+                "port": listener.getsockname()[1],
+            }
+            line = "console=ttyS0 quiet panic=-1 mitigations=off net.ifnames=0 nokaslr tsc=reliable"
+            line += "".join(f" rig.{name}={value}" for name, value in words.items())
+            self._process = subprocess.Popen(
+                [
+                    *_QEMU,
+                    *("-kernel", kernel / f"boot/vmlinuz-{release}", "-initrd", image, "-append", line),
+                    *("-serial", f"file:{self.log}"),
+                ],
+                stdin=subprocess.DEVNULL,
+                stdout=(folder / "qemu.log").open("wb"),
+                stderr=subprocess.STDOUT,
+            )
+            listener.settimeout(1.0)
+            self._connection = self._agent(listener)
+        self._reader = Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def _agent(self, listener: socket.socket) -> socket.socket:
+        """Wait until the machine has started."""
+        clock = SystemClock()
+        begun_ns = clock.now_ns()
+        while self._process.poll() is None and clock.now_ns() - begun_ns < BOOT_S * 1e9:
+            with suppress(TimeoutError):
+                connection = listener.accept()[0]
+                connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+                connection.settimeout(None)
+                return connection
+        console = self.log.read_text(errors="replace") if self.log.exists() else ""
+        self._process.kill()
+        self._process.wait()
+        raise RuntimeError(f"the virtual machine did not start:\n{console[-4000:]}")
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._process.kill()
+        self._process.wait()
+        with suppress(OSError):
+            self._connection.shutdown(socket.SHUT_RDWR)
+        self._reader.join()
+        self._connection.close()
+
+    def ask(self, what: str, *, answer_s: float = ANSWER_S, **values: Any) -> Any:
+        """Return the agent's answer to a request."""
+        number = next(self._numbers)
+        line = json.dumps({"number": number, "do": what, **values}).encode() + b"\n"
+        self._connection.sendall(line)
+        with self._changed:
+            if not self._changed.wait_for(lambda: number in self._answers, answer_s):
+                raise TimeoutError(f"{what} {values}: no answer in {answer_s:g} s")
+            answer = self._answers.pop(number)
+        if "error" in answer:
+            raise RuntimeError(f"{what} {values}: {answer['error']}")
+        return answer["value"]
+
+    def _read(self) -> None:
+        with suppress(OSError), self._connection.makefile("r", encoding="utf-8") as lines:
+            for line in lines:
+                answer = json.loads(line)
+                with self._changed:
+                    self._answers[answer.get("number", 0)] = answer
+                    self._changed.notify_all()
+
+
+class GuestProcess:
+    """A program that runs in the machine."""
+
+    def __init__(self, machine: Machine, pid: int) -> None:
+        self.pid = pid
+        self._machine = machine
+
+    @property
+    def output(self) -> str:
+        """What it has printed so far."""
+        return str(self._machine.ask("output", pid=self.pid))
+
+    def signal(self, number: int) -> None:
+        self._machine.ask("signal", pid=self.pid, signal_number=number)
+
+    def wait(self, timeout: float = ANSWER_S) -> Result:
+        """Return how it has ended; raises TimeoutError."""
+        ended = self._machine.ask("wait", answer_s=timeout + 10, pid=self.pid, timeout=timeout)
+        if ended is None:
+            raise TimeoutError(f"the program has not ended in {timeout:g} s:\n{self.output}")
+        return Result(**ended)
+
+
+_QEMU: Final[list[str | Path]] = [
+    *("qemu-system-x86_64", "-machine", "q35", "-cpu", "max", "-smp", "2", "-m", "3G"),
+    *("-accel", os.environ.get(ACCELERATOR, "tcg,thread=multi")),
+    *("-nodefaults", "-display", "none", "-no-reboot"),
+    *("-fsdev", "local,id=host,path=/,security_model=none,readonly=on,multidevs=remap"),
+    *("-device", "virtio-9p-pci,fsdev=host,mount_tag=host"),
+    *("-netdev", "user,id=net", "-device", "virtio-net-pci,netdev=net"),
+]

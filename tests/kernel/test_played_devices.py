@@ -1,0 +1,230 @@
+"""The played devices as a USB host sees them, without a virtual machine."""
+
+import struct
+from collections.abc import Iterator
+from contextlib import suppress
+from errno import ENXIO
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sim.camera import SimCapture
+from sim.i2c import SimI2cBus
+from sim.imu.mpu6050 import SimMpu6050
+from sim.realtime.pace import RealTime
+from sim.servo import ServoBus, SimSerial
+from sim.world import World
+from tests.fuzzing import examples
+from tests.kernel.usb import descriptors
+from tests.kernel.usb.device import TO_HOST, UsbDevice
+from tests.kernel.usb.ftdi import FtdiAdapter, baud_rate
+from tests.kernel.usb.i2c_tiny_usb import I2cTinyUsb
+from tests.kernel.usb.usbip import Hang, Stall
+from tests.kernel.usb.webcam import CONTROLS, SIZES, Format, Setting, Webcam, encoded
+
+GET_DESCRIPTOR = 6
+
+
+@pytest.fixture
+def world() -> World:
+    return World(seed=1)
+
+
+@pytest.fixture
+def adapter(world: World) -> Iterator[FtdiAdapter]:
+    adapter = FtdiAdapter(SimSerial(ServoBus(world.clock), timeout=0.0))
+    adapter.time = RealTime(world.clock, [adapter])
+    yield adapter
+    adapter.close()
+
+
+@pytest.fixture
+def bus(world: World) -> Iterator[SimI2cBus]:
+    with SimI2cBus(world.clock) as bus:
+        bus.attach(0x68, SimMpu6050(world))
+        yield bus
+
+
+@pytest.fixture
+def i2c(world: World, bus: SimI2cBus) -> Iterator[I2cTinyUsb]:
+    i2c = I2cTinyUsb(bus, RealTime(world.clock))
+    yield i2c
+    i2c.close()
+
+
+@pytest.fixture
+def webcam(world: World) -> Iterator[Webcam]:
+    webcam = Webcam(SimCapture(world), RealTime(world.clock))
+    yield webcam
+    webcam.close()
+
+
+@pytest.fixture(params=["adapter", "i2c", "webcam"])
+def device(request: pytest.FixtureRequest) -> UsbDevice:
+    return request.getfixturevalue(request.param)
+
+
+def ask(device: UsbDevice, kind: int, number: int, value: int = 0, index: int = 0, length: int = 255) -> bytes:
+    """Return the answer to a request that reads."""
+    return device.control(struct.pack("<BBHHH", kind | TO_HOST, number, value, index, length), b"")
+
+
+def tell(device: UsbDevice, kind: int, number: int, value: int = 0, index: int = 0, data: bytes = b"") -> None:
+    """Send a request that writes."""
+    assert device.control(struct.pack("<BBHHH", kind, number, value, index, len(data)), data) == b""
+
+
+# -- all devices ----------------------------------------------------------------------------------------------------
+
+
+def test_descriptors_have_the_lengths_that_they_state(device: UsbDevice) -> None:
+    first = ask(device, 0, GET_DESCRIPTOR, descriptors.DEVICE << 8)
+    assert len(first) == first[0] == 18
+    whole = ask(device, 0, GET_DESCRIPTOR, descriptors.CONFIGURATION << 8)
+    assert int.from_bytes(whole[2:4], "little") == len(whole)
+    kinds = [part[1] for part in descriptors.parts(whole)]
+    assert kinds.count(descriptors.INTERFACE) == whole[4]
+    ends = sum(part[4] for part in descriptors.parts(whole) if part[1] == descriptors.INTERFACE)
+    assert kinds.count(descriptors.ENDPOINT) == ends
+
+
+def test_strings_are_those_of_the_identity(device: UsbDevice) -> None:
+    first = ask(device, 0, GET_DESCRIPTOR, descriptors.DEVICE << 8)
+    for index, text in zip(first[14:17], device.identity.strings, strict=True):
+        if text:
+            answer = ask(device, 0, GET_DESCRIPTOR, descriptors.STRING << 8 | index)
+            assert (answer[0], answer[2:].decode("utf-16-le")) == (len(answer), text)
+        else:
+            assert index == 0
+    with pytest.raises(Stall):
+        ask(device, 0, GET_DESCRIPTOR, descriptors.STRING << 8 | 9)
+
+
+def test_any_request_is_answered_or_stalled(adapter: FtdiAdapter, i2c: I2cTinyUsb, webcam: Webcam) -> None:
+    @examples(100)
+    @given(setup=st.binary(min_size=8, max_size=8), data=st.binary(max_size=64))
+    def answers(setup: bytes, data: bytes) -> None:
+        for device in (adapter, i2c, webcam):
+            with suppress(Stall):
+                assert isinstance(device.control(setup, data), bytes)
+
+    answers()
+
+
+# -- serial adapter -------------------------------------------------------------------------------------------------
+
+
+def divisor(rate: int) -> tuple[int, int]:
+    """Return value and index of the request for a baud rate, as the kernel's driver calculates them for an FT232H."""
+    codes = (0, 3, 2, 4, 1, 5, 6, 7)
+    eighths = (8 * 120_000_000 + 5 * rate) // (10 * rate)
+    code = eighths >> 3 | codes[eighths & 7] << 14
+    return code & 0xFFFF, code >> 16 << 8 | 0x0200
+
+
+@pytest.mark.parametrize("rate", [9_600, 57_600, 115_200, 1_000_000, 2_000_000, 3_000_000, 4_000_000])
+def test_adapter_understands_the_divisors_of_the_kernel(adapter: FtdiAdapter, rate: int) -> None:
+    value, index = divisor(rate)
+    assert baud_rate(value, index) == rate
+    tell(adapter, 0x40, 3, value, index)
+    assert adapter._connection.baudrate == rate
+
+
+@examples(100)
+@given(st.integers(3_000, 4_400_000))
+def test_a_baud_rate_is_right_within_what_a_servo_tolerates(rate: int) -> None:
+    assert baud_rate(*divisor(rate)) == pytest.approx(rate, rel=0.035)
+
+
+def test_adapter_keeps_its_latency_timer_until_it_is_plugged_in_again(adapter: FtdiAdapter) -> None:
+    assert ask(adapter, 0x40, 10) == b"\x10"
+    tell(adapter, 0x40, 9, 1)
+    assert ask(adapter, 0x40, 10) == b"\x01"
+    adapter.plugged()
+    assert ask(adapter, 0x40, 10) == b"\x10"
+
+
+# -- I2C adapter ----------------------------------------------------------------------------------------------------
+
+FIRST, LAST, IO = 1, 2, 4
+WHO_AM_I = 0x75
+
+
+def read_register(i2c: I2cTinyUsb, address: int) -> bytes:
+    tell(i2c, 0x40, IO | FIRST, 0, address, bytes([WHO_AM_I]))
+    return ask(i2c, 0x40, IO | LAST, 1, address, 1)
+
+
+def test_adapter_reads_a_register_of_a_sensor(i2c: I2cTinyUsb) -> None:
+    assert read_register(i2c, 0x68) == b"\x68"
+    assert ask(i2c, 0x40, 3) == b"\x01"
+
+
+def test_adapter_reports_a_missing_acknowledge(i2c: I2cTinyUsb, bus: SimI2cBus) -> None:
+    read_register(i2c, 0x50)
+    assert ask(i2c, 0x40, 3) == b"\x02"
+    read_register(i2c, 0x68)
+    assert ask(i2c, 0x40, 3) == b"\x01"
+    bus.errors[0x68] = ENXIO
+    read_register(i2c, 0x68)
+    assert ask(i2c, 0x40, 3) == b"\x02"
+
+
+def test_adapter_hangs_while_its_bus_hangs(i2c: I2cTinyUsb, bus: SimI2cBus) -> None:
+    bus.stuck = True
+    with pytest.raises(Hang):
+        read_register(i2c, 0x68)
+    bus.stuck = False
+    assert read_register(i2c, 0x68) == b"\x68"
+
+
+# -- webcam ---------------------------------------------------------------------------------------------------------
+
+
+def test_webcam_has_the_controls_of_its_descriptors(webcam: Webcam) -> None:
+    units = [part for part in descriptors.parts(webcam.configuration) if part[1] == 0x24]
+    camera, processing = (next(part for part in units if part[2] == kind) for kind in (2, 5))
+    bits = int.from_bytes(camera[15:], "little"), int.from_bytes(processing[8:10], "little")
+    # UVC 1.0, tables 3-6 and 3-8: the bit of each selector.
+    camera_bits = {0x02: 1, 0x03: 2, 0x04: 3, 0x06: 5, 0x08: 17}
+    processing_bits = {0x01: 8, 0x04: 9, 0x05: 10, 0x08: 4, 0x0A: 6, 0x0B: 12}
+    assert bits[0] == sum(1 << camera_bits[selector] for unit, selector in CONTROLS if unit == 1)
+    assert bits[1] == sum(1 << processing_bits[selector] for unit, selector in CONTROLS if unit == 2)
+
+
+def control(unit: int, selector: int) -> dict[str, int]:
+    return {"value": selector << 8, "index": unit << 8}
+
+
+EXPOSURE_MODE, EXPOSURE = control(1, 0x02), control(1, 0x04)
+
+
+def test_webcam_keeps_its_settings_in_the_simulated_camera(webcam: Webcam) -> None:
+    with pytest.raises(Stall):  # the automatic exposure sets it
+        tell(webcam, 0x21, Setting.SET, **EXPOSURE, data=struct.pack("<I", 50))
+    tell(webcam, 0x21, Setting.SET, **EXPOSURE_MODE, data=b"\x01")
+    tell(webcam, 0x21, Setting.SET, **EXPOSURE, data=struct.pack("<I", 50))
+    assert ask(webcam, 0x21, Setting.NOW, **EXPOSURE) == struct.pack("<I", 50)
+    assert webcam._camera.get(cv2.CAP_PROP_EXPOSURE) == 50
+
+
+@pytest.mark.parametrize("size", [1, 2])
+@pytest.mark.parametrize("form", list(Format))
+def test_webcam_agrees_on_format_and_size(webcam: Webcam, form: Format, size: int) -> None:
+    wanted = struct.pack("<HBBI", 0, form, size, 333_333) + bytes(18)
+    tell(webcam, 0x21, Setting.SET, 1 << 8, 1, wanted)
+    agreed = ask(webcam, 0x21, Setting.NOW, 1 << 8, 1)
+    width, height = SIZES[size - 1]
+    assert struct.unpack_from("<HBBI", agreed)[1:] == (form, size, 333_333)
+    assert struct.unpack_from("<I", agreed, 18)[0] == 2 * width * height
+
+
+def test_images_are_the_same_after_their_transfer() -> None:
+    image = cv2.GaussianBlur(np.random.default_rng(1).integers(0, 255, (48, 64, 3), np.uint8), (0, 0), 8)
+    yuyv = np.frombuffer(encoded(image, Format.YUYV), np.uint8).reshape(48, 64, 2)
+    assert np.abs(cv2.cvtColor(yuyv, cv2.COLOR_YUV2BGR_YUYV).astype(int) - image).max() <= 8
+    mjpg = cv2.imdecode(np.frombuffer(encoded(image, Format.MJPG), np.uint8), cv2.IMREAD_COLOR)
+    assert np.abs(mjpg.astype(int) - image).max() <= 8
