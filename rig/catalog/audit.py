@@ -13,6 +13,7 @@ from typing import Any
 
 from sqlalchemy import Connection, insert, select
 
+from rig.catalog.database import given_id
 from rig.catalog.records import JsonObject, as_json, this_software
 from rig.catalog.schema import audit
 from rig.catalog.seal import seal_appended
@@ -64,6 +65,7 @@ def append(
     """Add an action to the log, in the transaction of the action itself."""
     connection.execute(
         insert(audit).values(
+            **given_id(connection, audit),
             time_utc=clock.utc(),
             **author(),
             action=action,

@@ -16,6 +16,7 @@ from rig.catalog.catalog import Catalog
 from rig.catalog.columns import FIX
 from rig.catalog.schema import audit, corrections, enrollments, objects, results
 from rig.catalog.seal import appended_digests, damage_of
+from rig.config.catalog_place import CatalogPlace
 from rig.core.clock import Clock, seconds_between
 from rig.core.errors import CatalogDamaged, RigError
 
@@ -27,14 +28,14 @@ _ROWS: Final = 100
 
 
 class BackgroundCheck(AbstractContextManager["BackgroundCheck"]):
-    """Compares the digests of the catalog in the folder ``path`` until all are compared or a ``with`` block ends.
+    """Compares the digests of the catalog at ``place`` until all are compared or a ``with`` block ends.
 
     It has its own thread and its own connection, for reading only. A portion is one transaction: a change of the
     catalog in the meantime is no damage. ``report`` gets the first damage; it is called in the thread.
     """
 
-    def __init__(self, path: Path, clock: Clock, report: Callable[[RigError], None]) -> None:
-        self._path = path
+    def __init__(self, place: CatalogPlace | Path, clock: Clock, report: Callable[[RigError], None]) -> None:
+        self._place = place
         self._clock = clock
         self._report = report
         self._ended = threading.Event()
@@ -53,7 +54,7 @@ class BackgroundCheck(AbstractContextManager["BackgroundCheck"]):
         start_ns = begun_ns = self._clock.now_ns()
         spent_s = 0.0
         try:
-            with Catalog.open(self._path, clock=self._clock, create=False, read_only=True) as catalog:
+            with Catalog.open(self._place, clock=self._clock, create=False, read_only=True) as catalog:
                 for damage in _portions(catalog):
                     if damage is not None:
                         self._report(damage)

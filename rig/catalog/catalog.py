@@ -17,7 +17,7 @@ from rig.catalog.audit import AuditEntry
 from rig.catalog.database import Database, insert_row
 from rig.catalog.describing import known_descriptor
 from rig.catalog.enrollment import Enrollment
-from rig.catalog.places import image_file, make_folder_within
+from rig.catalog.opening import open_database
 from rig.catalog.queries import (
     enrollment_summaries,
     find,
@@ -42,9 +42,9 @@ from rig.catalog.records import (
 from rig.catalog.rows import abandon_unfinished, insert_session, of_status, unfinished_and_complete
 from rig.catalog.schema import enrollments, objects, views
 from rig.catalog.seal import changing_enrollments, changing_object, damage_of, seal_enrollments, seal_objects
+from rig.config.catalog_place import CatalogPlace
 from rig.core.clock import Clock
 from rig.core.errors import CatalogDamaged, CatalogError, ObjectExists, UsageError
-from rig.views import image_files as images
 from rig.views.description import PAPER_DESCRIPTOR
 
 
@@ -56,8 +56,9 @@ class ModelSet(NamedTuple):
 
 
 class Catalog(AbstractContextManager["Catalog"]):
-    """Objects with their enrollments and views in one folder: ``catalog.sqlite`` and ``images/``.
+    """Objects with their enrollments and views.
 
+    They are in one folder (``catalog.sqlite`` and ``images/``), or on a server for several benches (`CatalogPlace`).
     Open it with `Catalog.open`. Several processes may read and write at once. To edit, check, clean up, import and
     export it, use the functions of `rig.catalog.edit`, `.verify`, `.redescribe`, `.upkeep` and `.exchange`.
 
@@ -76,19 +77,19 @@ class Catalog(AbstractContextManager["Catalog"]):
     @classmethod
     def open(
         cls,
-        path: str | PathLike[str],
+        path: str | PathLike[str] | CatalogPlace,
         *,
         clock: Clock,
         create: bool = True,
         read_only: bool = False,
         busy_timeout_s: float = 5.0,
     ) -> Self:
-        """Open the catalog in the folder ``path``.
+        """Open the catalog in the folder, or at the place, ``path``.
 
         Parameters
         ----------
         path
-            Folder of the catalog.
+            Folder of the catalog; or its place, which may name a database server and a store of images.
         clock
             Gives the civil time of what is stored.
         create
@@ -106,9 +107,11 @@ class Catalog(AbstractContextManager["Catalog"]):
             The catalog was written by an earlier version of the program (`rig catalog migrate`).
         CatalogBusy
             Another process locks the catalog for longer than the timeout.
+        CatalogUnavailable
+            The server of the catalog does not answer.
         """
-        root = Path(path).expanduser().absolute()
-        return cls(Database(root, create=create, read_only=read_only, busy_timeout_s=busy_timeout_s), clock)
+        place = CatalogPlace.of(path)
+        return cls(open_database(place, create=create, read_only=read_only, busy_timeout_s=busy_timeout_s), clock)
 
     def __exit__(self, *_: object) -> None:
         self.close()
@@ -118,8 +121,13 @@ class Catalog(AbstractContextManager["Catalog"]):
 
     @property
     def path(self) -> Path:
-        """The catalog's folder."""
+        """The catalog's folder on this computer."""
         return self.database.root
+
+    @property
+    def place(self) -> CatalogPlace:
+        """Where the catalog is."""
+        return self.database.place
 
     def check_enrollable(
         self,
@@ -340,13 +348,16 @@ class Catalog(AbstractContextManager["Catalog"]):
             found = stored_views(connection, views.c.id == int(view_id))
         if not found:
             raise CatalogError(
-                f"there is no view {view_id} in the catalog {self.path}", next_step="load the views again"
+                f"there is no view {view_id} in the catalog {self.place}", next_step="load the views again"
             )
         return found[0]
 
     def image_path(self, view: StoredView) -> Path:
-        """Return the path of the image of a view; a `CatalogDamaged` if it leads out of the catalog."""
-        return image_file(self.path, view.image)
+        """Return a file with the image of a view; a `CatalogDamaged` if its path leads out of the catalog.
+
+        An image of an object store is fetched.
+        """
+        return self.database.images.file(view.image)
 
     def read_image(self, view: StoredView) -> NDArray[np.uint8]:
         """Return the pixels that were stored, uint8 (H, W, 3) BGR.
@@ -357,7 +368,7 @@ class Catalog(AbstractContextManager["Catalog"]):
             The file is missing, is not the stored one, or the system denies access.
         """
         with self.database.catalog_errors():
-            return images.read(self.image_path(view), view.image_sha256)
+            return self.database.images.pixels(view.image, view.image_sha256)
 
     def _start_session(
         self,
@@ -372,7 +383,7 @@ class Catalog(AbstractContextManager["Catalog"]):
         with changing_enrollments(connection, [enrollment_id]):
             session = Session(insert_session(connection, enrollment_id, now, provenance), now, provenance)
         enrollment = Enrollment(self.database, self.clock, enrollment_id, object_id, object_name, session, plan)
-        make_folder_within(self.path, image_file(self.path, enrollment.folder.as_posix()))
+        self.database.images.make_folder(enrollment.folder.as_posix())
         return enrollment
 
 

@@ -83,18 +83,24 @@ class Utc(_Checked):
 
 
 class Words(_Checked):
-    """Text."""
+    """Text. Its order is that of its code points, whatever the language of the server."""
 
     impl = Text
+
+    def load_dialect_impl(self, dialect: Dialect) -> TypeEngine[Any]:
+        return Text(collation="C" if dialect.name == "postgresql" else None)
 
     def check(self, value: Any) -> None:
         _is(value, str)
 
 
 class Name(_Checked):
-    """Text of limited length."""
+    """Text of limited length, ordered as `Words`."""
 
     impl = String
+
+    def load_dialect_impl(self, dialect: Dialect) -> TypeEngine[Any]:
+        return String(self.impl_instance.length, collation="C" if dialect.name == "postgresql" else None)  # type: ignore[attr-defined]
 
     def check(self, value: Any) -> None:
         _is(value, str)
@@ -164,28 +170,30 @@ class Bytes(_Checked):
         _is(value, bytes)
 
 
-class _Json(_Checked):
+class JsonText(_Checked):
+    """JSON, stored as its text."""
+
     impl = JSON
 
     def coerce_compared_value(self, op: Any, value: Any) -> TypeEngine[Any]:
         return self.impl_instance.coerce_compared_value(op, value)
 
 
-class JsonMapping(_Json):
+class JsonMapping(JsonText):
     """A JSON object."""
 
     def check(self, value: Any) -> None:
         _is(value, dict)
 
 
-class SegmentationEvidence(_Json):
+class SegmentationEvidence(JsonText):
     """The evidence of a segmentation as JSON."""
 
     def check(self, value: Any) -> None:
         check_evidence(value)
 
 
-class Azimuths(_Json):
+class Azimuths(JsonText):
     """A list of azimuths as JSON."""
 
     def check(self, value: Any) -> None:

@@ -1,241 +1,98 @@
-"""The SQLite file of a catalog: how it is opened, and its transactions.
+"""What a catalog needs of its database, whichever engine has it: `rig.catalog.sqlite_database`, `rig.catalog.postgres`.
 
-Decision: docs/decisions/0014.
+Decision: docs/decisions/0051.
 """
 
-import os
-import sqlite3
-import sys
-from collections.abc import Iterator
-from contextlib import AbstractContextManager, closing, contextmanager
-from functools import partial
+from abc import ABC, abstractmethod
+from contextlib import AbstractContextManager
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from typing import Any
 
-from sqlalchemy import Connection, NullPool, QueuePool, Table, create_engine, event, insert
+from sqlalchemy import Connection, Table, insert, text
 
-from rig.catalog.columns import FIX, damaged
-from rig.catalog.failures import DATABASE_NAME, absent, catalog_errors
-from rig.catalog.places import check_folder
-from rig.catalog.schema import (
-    APPLICATION_ID,
-    KNOWN_NAMES,
-    METADATA,
-    READABLE_VERSION,
-    RESULTS_VERSION,
-    SCHEMA_VERSION,
-    expected_schema,
-    schema_digest,
-)
-from rig.core.errors import CatalogDamaged, CatalogError, CatalogOutdated
-from rig.core.files import make_folder, sync_folder
+from rig.catalog.image_store import ImageStore
+from rig.catalog.schema import RESULTS_VERSION, SCHEMA_VERSION
+from rig.config.catalog_place import CatalogPlace
+from rig.core.errors import CatalogOutdated
 
 
-class Database:
-    """The database of the catalog in the folder ``root``.
-
-    A commit is durable (WAL, synchronous FULL). A writer takes the write lock at the start of its transaction: it waits
-    there, or the transaction succeeds. Readers never wait.
-
-    Parameters
-    ----------
-    root
-        Folder of the catalog.
-    create
-        Create the catalog if there is none.
-    read_only
-        Write nothing.
-    busy_timeout_s
-        How long a writer waits for another one.
+class Database(ABC):
+    """The database of a catalog, and the store of its images.
 
     Attributes
     ----------
+    place
+        Where the catalog is.
+    images
+        The store of the images.
     version
         Of the tables. A catalog of `READABLE_VERSION` or later can be read without a migration.
-
-    Raises
-    ------
-    CatalogError
-        There is no catalog, it is damaged or of a newer version, or the system denies access.
-    CatalogBusy
-        Another process locks the catalog for longer than the timeout.
     """
 
-    def __init__(self, root: Path, *, create: bool, read_only: bool, busy_timeout_s: float) -> None:
-        self.root = root
-        self._file = root / DATABASE_NAME
-        self._read_only = read_only
-        self._busy_timeout_s = busy_timeout_s
-        self._engine = create_engine("sqlite://", creator=self._connect, poolclass=QueuePool)
-        event.listen(self._engine, "begin", _begin)
-        self._writing = self._engine.execution_options(begin="BEGIN IMMEDIATE")
-        try:
-            with self.catalog_errors():
-                self._open(create=create and not read_only)
-        except BaseException:
-            self.close()
-            raise
+    place: CatalogPlace
+    images: ImageStore
+    version: int
 
-    def close(self) -> None:
-        self._engine.dispose()
-
-    @contextmanager
-    def read(self) -> Iterator[Connection]:
-        """Yield a transaction that sees the catalog as it is at its first query."""
-        with self.catalog_errors(), self._engine.begin() as connection:
-            yield connection
-
-    @contextmanager
-    def write(self) -> Iterator[Connection]:
-        """Yield a transaction that only one process can have at a time. An exception rolls it back."""
-        if self._read_only:
-            raise CatalogError(f"the catalog {self.root} is open for reading only", next_step="open it for writing")
-        with self.catalog_errors(), self._writing.begin() as connection:
-            yield connection
-
-    def catalog_errors(self) -> AbstractContextManager[None]:
-        """Raise errors of SQLite and of the file system as errors of the catalog."""
-        return catalog_errors(self.root, self._busy_timeout_s)
-
-    def _open(self, *, create: bool) -> None:
-        if not database_exists(self.root):
-            if not create:
-                raise absent(self.root)
-            check_folder(self.root)
-            parent = next(parent for parent in self.root.parents if parent.exists())
-            make_folder(self.root, within=parent, mode=0o700)
-            self._create()
-        check_folder(self.root)
-        with self.read() as connection:
-            self.version = version_of(connection, self.root)
-            if self.version < (READABLE_VERSION if self._read_only else SCHEMA_VERSION):
-                raise self.outdated()
-            check_schema(connection, self.root, self.version)
+    @property
+    def root(self) -> Path:
+        """Folder of the catalog on this computer."""
+        return self.place.path
 
     @property
     def has_results(self) -> bool:
         """Whether the catalog has tables for results."""
         return self.version >= RESULTS_VERSION
 
+    @abstractmethod
+    def close(self) -> None:
+        """Close all connections."""
+
+    @abstractmethod
+    def read(self) -> AbstractContextManager[Connection]:
+        """Yield a transaction that sees the catalog as it is at its first query."""
+
+    @abstractmethod
+    def write(self, enrollment_id: int | None = None) -> AbstractContextManager[Connection]:
+        """Yield a transaction that changes the catalog. An exception rolls it back.
+
+        Parameters
+        ----------
+        enrollment_id
+            The only enrollment that it changes; None for any change. Changes of different enrollments may run at once,
+            any other change runs alone.
+        """
+
+    @abstractmethod
+    def catalog_errors(self) -> AbstractContextManager[None]:
+        """Raise errors of the database and of the store of images as errors of the catalog."""
+
+    @abstractmethod
+    def damage(self, connection: Connection) -> list[str]:
+        """Return what the database's own check of its structure finds."""
+
+    @abstractmethod
+    def orphans(self, connection: Connection) -> list[tuple[str, int | None, str]]:
+        """Return table, row and missing table of each row that refers to a missing row."""
+
+    @abstractmethod
+    def last_ids(self, connection: Connection) -> dict[str, int]:
+        """Return the last id that each table has given."""
+
+    @abstractmethod
+    def settings(self, connection: Connection) -> list[tuple[str, Any, Any]]:
+        """Return name, value and right value of each wrong setting of the database."""
+
+    @abstractmethod
+    def size_bytes(self, connection: Connection) -> int:
+        """Return the size of the database."""
+
     def outdated(self) -> CatalogOutdated:
         """Return the error for a catalog that must be migrated first."""
         return CatalogOutdated(
-            f"the catalog {self.root} was written by an earlier program: its schema has version {self.version}, "
+            f"the catalog {self.place} was written by an earlier program: its schema has version {self.version}, "
             f"this program works with {SCHEMA_VERSION}",
             next_step="migrate it (a backup is made): rig catalog migrate",
             evidence={"found": self.version, "known": SCHEMA_VERSION},
-        )
-
-    def _connect(self) -> sqlite3.Connection:
-        mode = "rw"
-        if self._read_only:
-            mode = "ro" if self._is_shareable() else "ro&immutable=1"
-        connection = connect(f"{self._file.as_uri()}?mode={mode}", self._busy_timeout_s)
-        try:
-            connection.execute("PRAGMA foreign_keys = ON")
-        except BaseException:
-            connection.close()
-            raise
-        return connection
-
-    def _is_shareable(self) -> bool:
-        # Readers of a WAL database share an index file beside it. If they may not create it and no writer has created
-        # it, the catalog is an archive or on a read-only disk: SQLite must know that no process will write.
-        return os.access(self.root, os.W_OK) or self._file.with_name(f"{DATABASE_NAME}-wal").exists()
-
-    def _create(self) -> None:
-        """Create the database under another name and rename it when it is complete.
-
-        Changing the journal mode of a file that other processes have open sometimes fails, with any timeout.
-        """
-        with TemporaryDirectory(prefix=".new-", dir=self.root) as folder:
-            made = Path(folder, DATABASE_NAME)
-            made.touch(0o600)  # private; to share a catalog, users change the permissions of its database
-            engine = create_engine("sqlite://", creator=partial(sqlite3.connect, made), poolclass=NullPool)
-            with engine.connect() as connection:
-                connection.exec_driver_sql("PRAGMA journal_mode = WAL")
-                METADATA.create_all(connection)
-                connection.exec_driver_sql(f"PRAGMA application_id = {APPLICATION_ID}")
-                connection.exec_driver_sql(f"PRAGMA user_version = {SCHEMA_VERSION}")
-                connection.commit()
-            try:
-                self._file.hardlink_to(made)
-            except FileExistsError:  # another process was faster, or one was killed after it had created an empty file
-                self._replace_empty(made)
-        sync_folder(self.root)
-
-    def _replace_empty(self, made: Path) -> None:
-        with closing(self._connect()) as lock:
-            lock.execute("BEGIN EXCLUSIVE")  # one of the processes that find the same empty file goes first
-            if not self._file.stat().st_size:
-                made.replace(self._file)
-
-
-def connect(uri: str, busy_timeout_s: float) -> sqlite3.Connection:
-    """Open a database that may come from an untrusted sender.
-
-    Nothing in its schema may call functions with side effects. Where Python can (from 3.12), SQLite's defensive mode
-    also rejects statements that could damage the file.
-    """
-    connection = sqlite3.connect(uri, uri=True, timeout=busy_timeout_s, isolation_level=None, check_same_thread=False)
-    try:
-        if sys.version_info >= (3, 12):
-            connection.setconfig(sqlite3.SQLITE_DBCONFIG_DEFENSIVE, True)
-        for setting in ("trusted_schema = OFF", "cell_size_check = ON", "synchronous = FULL"):
-            connection.execute(f"PRAGMA {setting}")
-    except BaseException:
-        connection.close()
-        raise
-    return connection
-
-
-def database_exists(root: Path) -> bool:
-    """Return whether a folder has a database. A program that was killed may have left an empty file."""
-    if root.exists() and not root.is_dir():
-        raise absent(root)
-    file = root / DATABASE_NAME
-    return file.exists() and file.stat().st_size > 0
-
-
-def version_of(connection: Connection, root: Path) -> int:
-    """Return the version of a catalog's tables, this program's or an earlier one.
-
-    Raises
-    ------
-    CatalogError
-        It is the database of another program or of a newer version.
-    CatalogDamaged
-        No program has written such a version.
-    """
-    application_id = connection.exec_driver_sql("PRAGMA application_id").scalar_one()
-    version: int = connection.exec_driver_sql("PRAGMA user_version").scalar_one()
-    if application_id != APPLICATION_ID:
-        raise CatalogError(
-            f"{root / DATABASE_NAME} is the database of another program", next_step="give the folder of a catalog"
-        )
-    if version > SCHEMA_VERSION:
-        raise CatalogError(
-            f"the catalog {root} was written by a newer program: its schema has version {version}, "
-            f"this program knows {SCHEMA_VERSION}",
-            next_step="update hbr-rig on this computer",
-            evidence={"found": version, "known": SCHEMA_VERSION},
-        )
-    if version < 1:
-        raise damaged("the version of its schema", version)
-    return version
-
-
-def check_schema(connection: Connection, root: Path, version: int) -> None:
-    """Raise `CatalogDamaged` if a database has other tables, indexes, triggers or views than those of its version."""
-    database = connection.connection.driver_connection
-    assert isinstance(database, sqlite3.Connection)
-    if schema_digest(database) != expected_schema(version):
-        names = sorted({str(name) for (name,) in database.execute("SELECT name FROM sqlite_master")} - KNOWN_NAMES)
-        raise CatalogDamaged(
-            f"the database of the catalog {root} has other tables, triggers or views than this program made; "
-            "nothing was changed",
-            next_step=FIX,
-            evidence={"version": version, "unknown": names[:20]},
         )
 
 
@@ -245,5 +102,13 @@ def insert_row(connection: Connection, table: Table, **values: object) -> int:
     return row_id
 
 
-def _begin(connection: Connection) -> None:
-    connection.exec_driver_sql(connection.get_execution_options().get("begin", "BEGIN"))
+def given_id(connection: Connection, table: Table) -> dict[str, int]:
+    """Return the id of the next row of an append-only table as its column; empty if the database gives it.
+
+    The sequences of PostgreSQL leave gaps after a rollback, and a gap in these tables means that rows are missing.
+    """
+    if connection.dialect.name != "postgresql":
+        return {}
+    more = "CAST(CAST(value AS bigint) + 1 AS text)"
+    statement = text(f"UPDATE catalog_properties SET value = {more} WHERE key = :name RETURNING value")
+    return {"id": int(connection.execute(statement, {"name": table.name}).scalar_one())}

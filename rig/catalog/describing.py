@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable, Mapping
 from functools import lru_cache
-from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -10,11 +9,10 @@ from numpy.typing import NDArray
 
 from hbr.descriptors import Descriptor, descriptor, names
 from rig.catalog.columns import damaged
-from rig.catalog.places import image_file
+from rig.catalog.image_store import ImageStore
 from rig.catalog.records import JsonObject, PackedDescriptor, Region, is_region
 from rig.config import ViewConfig
 from rig.core.errors import CatalogError, UsageError
-from rig.views import image_files as images
 from rig.views.description import ViewDescriber
 
 ROUNDED: Final = 0.02
@@ -26,7 +24,7 @@ EmptyTable = tuple[str, str]
 
 @lru_cache(maxsize=4)
 def stored_describer(
-    root: Path, names: tuple[str, ...], region: Region | None, empty_table: EmptyTable | None
+    store: ImageStore, names: tuple[str, ...], region: Region | None, empty_table: EmptyTable | None
 ) -> ViewDescriber:
     """Return a describer that describes stored images as the bench did, with the empty-table image of their session.
 
@@ -38,7 +36,7 @@ def stored_describer(
     # Descriptors of the whole image, such as the paper's, need no segmentation.
     if empty_table is None or all(descriptor(name).whole_image for name in names):
         return ViewDescriber(ViewConfig(roi=region), names)
-    return ViewDescriber(ViewConfig(roi=region), names, images.read(image_file(root, empty_table[0]), empty_table[1]))
+    return ViewDescriber(ViewConfig(roi=region), names, store.pixels(*empty_table))
 
 
 def known_descriptor(name: str) -> Descriptor:

@@ -11,11 +11,9 @@ from rig.calibrations.store import CALIBRATIONS
 from rig.catalog.catalog import Catalog
 from rig.catalog.columns import parse_mapping
 from rig.catalog.describing import EmptyTable, region_of
-from rig.catalog.places import image_file
 from rig.catalog.queries import described_by, in_use, retrieved
 from rig.catalog.records import EnrollmentStatus, Region
 from rig.catalog.schema import descriptors, enrollments, objects, sessions, views
-from rig.views import image_files as images
 from rig.views.description import PAPER_DESCRIPTOR
 
 
@@ -91,9 +89,8 @@ def read_empty_table(catalog: Catalog, empty_table: EmptyTable) -> NDArray[np.ui
     CatalogError
         The file is missing, is not the stored one, or the system denies access.
     """
-    path, sha256 = empty_table
     with catalog.database.catalog_errors():
-        return images.read(image_file(catalog.path, path), sha256)
+        return catalog.database.images.pixels(*empty_table)
 
 
 def described_regions(catalog: Catalog, bench: str) -> set[tuple[Region | None, tuple[str, ...]]]:

@@ -1,6 +1,5 @@
 """An enrollment in progress: add views, then finish or abandon it."""
 
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import timedelta
 from pathlib import Path
@@ -12,14 +11,12 @@ from sqlalchemy import Connection, delete, select, update
 from rig.catalog import audit
 from rig.catalog.database import Database
 from rig.catalog.describing import pack
-from rig.catalog.places import file_mode, image_file
 from rig.catalog.records import EnrollmentStatus, ImageFile, Session, StoredView, ViewRecord
 from rig.catalog.rows import NewView, empty_table_columns, insert_views, measured, supersede, unfinished_and_complete
 from rig.catalog.schema import enrollments, objects, sessions, views
 from rig.catalog.seal import changing_enrollments
 from rig.core.clock import Clock
 from rig.core.errors import CatalogError, UsageError
-from rig.core.files import write
 from rig.views import image_files as images
 from rig.views.description import PAPER_DESCRIPTOR
 
@@ -93,7 +90,7 @@ class Enrollment:
             captured_utc = self._clock.utc() - timedelta(microseconds=age_ns // 1000)
         # The write lock is held while the image is written, so that two processes that continue the same enrollment
         # cannot overwrite each other's images.
-        with self._database.write() as connection:
+        with self._database.write(self.id) as connection:
             self._check_in_progress(connection)
             if index not in self._missing(connection):
                 raise CatalogError(
@@ -122,7 +119,7 @@ class Enrollment:
         Raises UsageError, CatalogError, CatalogBusy as for `add`.
         """
         png = images.encode(image_bgr)
-        with self._database.write() as connection:
+        with self._database.write(self.id) as connection:
             self._check_in_progress(connection)
             image = self._write_image(f"empty-{self.session.id:06d}.png", png)
             with changing_enrollments(connection, [self.id]):
@@ -187,17 +184,14 @@ class Enrollment:
             audit.append(
                 connection, self._clock, audit.Action.ENROLLMENT_DISCARDED, self.object_name, enrollment_id=self.id
             )
-        if self.session.empty_table_image is not None:
-            image_file(self._database.root, self.session.empty_table_image).unlink(missing_ok=True)
-        for folder in (self.folder, self.folder.parent):
-            with suppress(OSError):  # it has images of other enrollments
-                image_file(self._database.root, folder.as_posix()).rmdir()
+        empty_table = self.session.empty_table_image
+        left = (self.folder / "000.png").as_posix()  # there is none, but its folders are empty
+        self._database.images.remove([left] if empty_table is None else [empty_table])
 
     def _write_image(self, name: str, png: bytes) -> ImageFile:
-        path = self.folder / name
-        root = self._database.root
-        write(image_file(root, path.as_posix()), png, mode=file_mode(root))
-        return ImageFile(path.as_posix(), images.digest(png), len(png))
+        path = (self.folder / name).as_posix()
+        self._database.images.write(path, png)
+        return ImageFile(path, images.digest(png), len(png))
 
     def _close(self, connection: Connection, status: EnrollmentStatus) -> None:
         connection.execute(

@@ -7,11 +7,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
-from sqlalchemy.exc import DBAPIError
+from sqlalchemy.exc import DBAPIError, InterfaceError, OperationalError
+from sqlalchemy.exc import TimeoutError as PoolTimeout
 
-from rig.core.errors import CatalogBusy, CatalogDamaged, CatalogError, RigError
-
-DATABASE_NAME: Final = "catalog.sqlite"
+from rig.config.catalog_place import DATABASE_NAME, CatalogPlace
+from rig.core.errors import CatalogBusy, CatalogDamaged, CatalogError, CatalogUnavailable, RigError
 
 
 @contextmanager
@@ -28,6 +28,65 @@ def catalog_errors(root: Path, busy_timeout_s: float) -> Iterator[None]:
         raise _damaged(root, {"sqlite": str(error)}) from error
     except OSError as error:
         raise _of_system(error, root) from error
+
+
+@contextmanager
+def server_errors(place: CatalogPlace, busy_timeout_s: float) -> Iterator[None]:
+    """Raise errors of a database server and of a store of images as errors of the catalog."""
+    try:
+        yield
+    except DBAPIError as error:
+        known = _of_server(error, place, busy_timeout_s)
+        if known is None:
+            raise
+        raise known from error
+    except PoolTimeout as error:
+        raise _unavailable(place, error) from error
+    except OSError as error:
+        raise _of_system(error, Path(place.images or place.path)) from error
+
+
+_GONE: Final = ("08", "57P")
+"""Beginnings of SQLSTATE: connection errors, and a server that stops or starts."""
+
+
+def _of_server(error: DBAPIError, place: CatalogPlace, busy_timeout_s: float) -> RigError | None:
+    state = getattr(error.orig, "sqlstate", None) or ""
+    evidence = {"sqlstate": state, "server": str(error.orig)}
+    if state == "55P03":
+        return CatalogBusy(
+            f"another process has been writing to the catalog {place} for {busy_timeout_s:g} s; nothing was changed",
+            next_step="wait until it has finished, and try again",
+            evidence=evidence,
+        )
+    if state.startswith("53"):
+        return CatalogError(
+            f"the server of the catalog {place} has no space or memory left; this change was not stored, all earlier "
+            "ones are safe",
+            next_step="ask the administrator of the server, then continue",
+            evidence=evidence,
+        )
+    if state.startswith("28") or state in ("42501", "3D000", "25006"):
+        return CatalogError(
+            f"the server denies access to the catalog {place}: {error.orig}",
+            next_step="check catalog.url, ~/.pgpass and the rights of the user on the server",
+            evidence=evidence,
+        )
+    if (
+        state.startswith(_GONE)
+        or state == "25P03"
+        or (not state and isinstance(error, OperationalError | InterfaceError))
+    ):
+        return _unavailable(place, error.orig)
+    return None
+
+
+def _unavailable(place: CatalogPlace, error: object) -> CatalogUnavailable:
+    return CatalogUnavailable(
+        f"the server of the catalog {place} does not answer",
+        next_step="check the network and the server, then try again",
+        evidence={"server": str(error).strip()},
+    )
 
 
 def absent(root: Path) -> CatalogError:

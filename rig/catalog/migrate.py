@@ -12,10 +12,11 @@ from sqlalchemy import Connection, NullPool, create_engine
 
 from rig.catalog import audit, migrations
 from rig.catalog.columns import FIX
-from rig.catalog.database import check_schema, connect, database_exists, version_of
-from rig.catalog.failures import DATABASE_NAME, absent, catalog_errors
+from rig.catalog.failures import absent, catalog_errors
 from rig.catalog.places import check_folder, image_file
 from rig.catalog.schema import SCHEMA_VERSION
+from rig.catalog.sqlite_database import check_schema, connect, database_exists, version_of
+from rig.config.catalog_place import DATABASE_NAME
 from rig.core.clock import Clock
 from rig.core.errors import CatalogDamaged
 from rig.core.files import open_new, sync_file, sync_folder

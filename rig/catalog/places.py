@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Final
 
 from rig.catalog.columns import FIX, image_path
-from rig.catalog.failures import DATABASE_NAME
+from rig.config.catalog_place import DATABASE_NAME
 from rig.core.errors import CatalogDamaged
 from rig.core.files import make_folder
 from rig.views.image_files import IMAGE_FOLDER
@@ -66,8 +66,12 @@ def files_within(folder: Path) -> Iterator[Path]:
 
 
 def file_mode(root: Path) -> int:
-    """Return the permissions of new files: those of the database, so that a shared catalog is shared completely."""
-    return stat.S_IMODE((root / DATABASE_NAME).stat().st_mode) & 0o666
+    """Return the permissions of new files: those of the database, so that a shared catalog is shared completely.
+
+    Without a database in the folder they are those of the folder.
+    """
+    file = root / DATABASE_NAME
+    return stat.S_IMODE((file if file.exists() else root).stat().st_mode) & 0o666
 
 
 def make_folder_within(root: Path, folder: Path) -> None:

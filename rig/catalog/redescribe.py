@@ -4,7 +4,6 @@ from collections.abc import Generator
 from dataclasses import dataclass
 from enum import Enum
 from functools import partial
-from pathlib import Path
 from typing import Any, NamedTuple
 
 from sqlalchemy import and_, bindparam, delete, insert, select, update
@@ -12,14 +11,13 @@ from sqlalchemy import and_, bindparam, delete, insert, select, update
 from rig.catalog.audit import Action
 from rig.catalog.catalog import Catalog
 from rig.catalog.describing import EmptyTable, known_descriptor, pack, region_of, settings_of, stored_describer
+from rig.catalog.image_store import ImageStore
 from rig.catalog.jobs import JobProgress, portions, processes
-from rig.catalog.places import image_file
 from rig.catalog.records import EnrollmentStatus, JsonObject, PackedDescriptor, Region
 from rig.catalog.schema import descriptors, enrollments, objects, sessions, views
 from rig.catalog.seal import changing_enrollments
 from rig.core.errors import CatalogError, UsageError
 from rig.core.processes import map_in_processes
-from rig.views import image_files as images
 from rig.views.description import PAPER_DESCRIPTOR
 
 
@@ -92,7 +90,7 @@ def redescribe(
     failed: list[tuple[str, str]] = []
     done = 0
     yield JobProgress(0, len(items))
-    work = partial(_describe, catalog.path, kind.name)
+    work = partial(_describe, catalog.database.images, kind.name)
     for portion, found in map_in_processes(work, portions(items), processes(jobs, len(items))):
         rows, segmentations = [], []
         for item, one in zip(portion, found, strict=True):
@@ -189,13 +187,13 @@ def _configured_region(conditions: JsonObject) -> Region | None:
     return None if roi is None else region_of({"region": roi})
 
 
-def _describe(root: Path, name: str, portion: tuple[_Item, ...]) -> list[_Described]:
+def _describe(store: ImageStore, name: str, portion: tuple[_Item, ...]) -> list[_Described]:
     kind = known_descriptor(name)
     found = []
     for item in portion:
         try:
-            image = images.read(image_file(root, item.image), item.sha256)
-            described = stored_describer(root, (kind.name,), item.region, item.empty_table)(image)
+            image = store.pixels(item.image, item.sha256)
+            described = stored_describer(store, (kind.name,), item.region, item.empty_table)(image)
             (packed,) = pack(described.levels, item.region)
             found.append(_Described(packed, described.segmentation))
         except (CatalogError, UsageError) as error:

@@ -16,14 +16,12 @@ from sqlalchemy import ColumnElement, Connection, func, insert, or_, select
 
 from rig.catalog import audit
 from rig.catalog.catalog import Catalog
-from rig.catalog.database import insert_row
-from rig.catalog.places import file_mode, image_file, make_folder_within
+from rig.catalog.database import given_id, insert_row
 from rig.catalog.queries import check_complete, find
 from rig.catalog.records import JsonObject, Outcome, Provenance, as_json
 from rig.catalog.schema import corrections, results
 from rig.catalog.seal import seal_appended
 from rig.core.errors import CatalogError, UsageError
-from rig.core.files import write
 from rig.views import image_files as images
 
 MAX_TEXT_LENGTH: Final = 1000
@@ -198,7 +196,8 @@ def record(catalog: Catalog, new: NewResult, image_bgr: NDArray[np.uint8] | None
     operator = author["user"] if new.operator is None else clean_text(new.operator, "operator")
     sample = None if new.answered.sample is None else clean_text(new.answered.sample, "sample")
     with catalog.database.write() as connection:
-        result_id = 1 + (connection.scalar(select(func.max(results.c.id))) or 0)
+        given = given_id(connection, results)
+        result_id = given["id"] if given else 1 + (connection.scalar(select(func.max(results.c.id))) or 0)
         image = None if png is None else _write_image(catalog, result_id, png)
         connection.execute(
             insert(results).values(
@@ -316,6 +315,7 @@ def correct(
         insert_row(
             connection,
             corrections,
+            **given_id(connection, corrections),
             result_id=result_id,
             time_utc=catalog.clock.utc(),
             operator=operator,
@@ -348,9 +348,7 @@ def _note(
 
 def _write_image(catalog: Catalog, result_id: int, png: bytes) -> str:
     path = Path(images.IMAGE_FOLDER, "results", f"{result_id // _FOLDER_SIZE:04d}", f"{result_id:06d}.png").as_posix()
-    file = image_file(catalog.path, path)
-    make_folder_within(catalog.path, file.parent)
-    write(file, png, mode=file_mode(catalog.path))
+    catalog.database.images.write(path, png)
     return path
 
 

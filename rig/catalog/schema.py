@@ -76,7 +76,8 @@ objects = Table(
     sqlite_autoincrement=True,
 )
 
-Index("uq_objects_name", objects.c.name, unique=True, sqlite_where=objects.c.deleted_utc.is_(None))
+_IN_USE = objects.c.deleted_utc.is_(None)
+Index("uq_objects_name", objects.c.name, unique=True, sqlite_where=_IN_USE, postgresql_where=_IN_USE)
 
 _STATUSES = ", ".join(f"'{status}'" for status in EnrollmentStatus)
 
@@ -99,6 +100,7 @@ for _status in (EnrollmentStatus.COMPLETE, EnrollmentStatus.IN_PROGRESS):
         enrollments.c.object_id,
         unique=True,
         sqlite_where=enrollments.c.status == _status.value,
+        postgresql_where=enrollments.c.status == _status.value,
     )
 
 # A resumed enrollment may use another bench, program or calibration, and the bench clock starts again.
@@ -233,9 +235,26 @@ def append_only_triggers(table: str) -> tuple[str, str]:
     )
 
 
+def append_only_rules(table: str) -> tuple[str, ...]:
+    """Return the statements that do the same in PostgreSQL."""
+    what = "audit log" if table == audit.name else f"table of {table}"
+    return (
+        f"CREATE FUNCTION {table}_no_change() RETURNS trigger LANGUAGE plpgsql AS "
+        f"$$ BEGIN RAISE EXCEPTION 'the {what} is only appended to'; END $$",
+        f"CREATE TRIGGER {table}_no_update BEFORE UPDATE ON {table} FOR EACH ROW WHEN (old.digest IS NOT NULL) "
+        f"EXECUTE FUNCTION {table}_no_change()",
+        f"CREATE TRIGGER {table}_no_delete BEFORE DELETE ON {table} FOR EACH ROW EXECUTE FUNCTION {table}_no_change()",
+        f"CREATE TRIGGER {table}_no_truncate BEFORE TRUNCATE ON {table} EXECUTE FUNCTION {table}_no_change()",
+    )
+
+
 for _table in APPEND_ONLY:
-    for _trigger in append_only_triggers(_table.name):
-        event.listen(_table, "after_create", DDL(_trigger))  # type: ignore[no-untyped-call]
+    for _dialect, _statements in (
+        ("sqlite", append_only_triggers(_table.name)),
+        ("postgresql", append_only_rules(_table.name)),
+    ):
+        for _statement in _statements:
+            event.listen(_table, "after_create", DDL(_statement).execute_if(dialect=_dialect))  # type: ignore[no-untyped-call]
 
 KNOWN_NAMES: Final = frozenset(
     {"sqlite_sequence", *(f"{table.name}_no_{change}" for table in APPEND_ONLY for change in ("update", "delete"))}

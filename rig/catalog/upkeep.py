@@ -3,7 +3,6 @@
 Decision: docs/decisions/0016.
 """
 
-import shutil
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -15,8 +14,7 @@ from sqlalchemy import Connection, and_, case, delete, func, or_, select
 from hbr.descriptors import descriptor, names
 from rig.catalog import audit, staging
 from rig.catalog.catalog import Catalog
-from rig.catalog.failures import DATABASE_NAME
-from rig.catalog.places import LOST, files_within, image_file
+from rig.catalog.places import files_within
 from rig.catalog.records import EnrollmentStatus
 from rig.catalog.schema import descriptors, enrollments, objects, results, sessions, views
 from rig.catalog.seal import changing_enrollments
@@ -36,7 +34,10 @@ class DescriptorStatistics:
 
 @dataclass(frozen=True, slots=True)
 class Statistics:
-    """Numbers and sizes in bytes. `collect_garbage` frees `deleted_image_bytes`, and with ``old`` `old_image_bytes`."""
+    """Numbers and sizes in bytes; `free_disk_bytes` is None for an object store.
+
+    `collect_garbage` frees `deleted_image_bytes`, and with ``old`` `old_image_bytes`.
+    """
 
     schema_version: int
     objects: int
@@ -45,7 +46,7 @@ class Statistics:
     views: int
     image_bytes: int
     database_bytes: int
-    free_disk_bytes: int
+    free_disk_bytes: int | None
     labels: dict[str, int]
     benches: dict[str, int]
     descriptors: tuple[DescriptorStatistics, ...]
@@ -107,6 +108,7 @@ def statistics(catalog: Catalog) -> Statistics:
             .order_by(descriptors.c.name, descriptors.c.version)
         ).all()
         entries = len(audit.entries(connection))
+        database_bytes = catalog.database.size_bytes(connection)
         recorded, recorded_bytes = 0, 0
         if catalog.database.has_results:
             stored = select(func.count(), func.sum(results.c.image_bytes)).select_from(results)
@@ -121,8 +123,8 @@ def statistics(catalog: Catalog) -> Statistics:
         enrollments=counts,
         views=sum(view_count for _, view_count, _ in sizes.values()),
         image_bytes=sum(size for _, _, size in sizes.values()),
-        database_bytes=sum(file.stat().st_size for file in catalog.path.glob(f"{DATABASE_NAME}*")),
-        free_disk_bytes=shutil.disk_usage(catalog.path).free,
+        database_bytes=database_bytes,
+        free_disk_bytes=catalog.database.images.free_bytes(),
         labels=dict(labels),
         benches=dict(benches),
         descriptors=tuple(
@@ -164,24 +166,27 @@ def collect_garbage(catalog: Catalog, *, old: bool = False, dry_run: bool = Fals
             .where(or_(objects.c.deleted_utc.is_not(None), enrollments.c.status.in_(_OLD if old else ())))
         ).all()
         ids = [row.id for row in unused]
-        paths = [image_file(catalog.path, name) for name in _files_of(connection, ids)]
+        files = _files_of(connection, ids)
+        for name in files:
+            catalog.database.images.check(name)
         view_count = connection.scalar(select(func.count()).where(views.c.enrollment_id.in_(ids))) or 0
         deleted = tuple(
             connection.scalars(select(objects.c.name).where(objects.c.deleted_utc.is_not(None)).order_by(objects.c.id))
         )
         if not dry_run:
             _delete_rows(connection, ids)
-    for folder in (catalog.path / LOST, *staging.abandoned(catalog.path)):
-        paths += files_within(folder)
-    size = 0
-    for path in paths:
-        with suppress(FileNotFoundError):
-            size += path.lstat().st_size
-    collected = GarbageReport(deleted, len(ids), view_count, len(paths), size)
+    store = catalog.database.images
+    with catalog.database.catalog_errors():
+        files += sorted(store.lost())
+        staged = [path for folder in staging.abandoned(catalog.path) for path in files_within(folder)]
+        size = sum(map(store.size, files)) + sum(path.lstat().st_size for path in staged)
+    count = len(files) + len(staged)
+    collected = GarbageReport(deleted, len(ids), view_count, count, size)
     if not dry_run:
         with catalog.database.catalog_errors():
-            _remove(catalog.path, paths)
-        if ids or deleted or paths:
+            store.remove(files)
+            _remove(catalog.path, staged)
+        if ids or deleted or count:
             catalog.note(
                 audit.Action.GARBAGE_COLLECTED,
                 objects=list(deleted),

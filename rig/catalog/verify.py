@@ -1,14 +1,11 @@
 """Check whether a catalog is as it was stored: rows, images and descriptors. Repair it on request."""
 
 import json
-import os
-import stat
 from collections.abc import Generator, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from functools import partial
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,14 +16,13 @@ from hbr.descriptors import descriptor
 from rig.catalog import audit
 from rig.catalog.catalog import Catalog
 from rig.catalog.describing import EmptyTable, is_current, matches, region_of, stored_describer
+from rig.catalog.image_store import ImageStore
 from rig.catalog.jobs import JobProgress, portions, processes
-from rig.catalog.places import LOST, file_mode, files_within, image_file, lost_file, make_folder_within
 from rig.catalog.queries import packed_descriptors
 from rig.catalog.schema import audit as audit_log
 from rig.catalog.schema import corrections, descriptors, enrollments, objects, results, sessions, views
 from rig.catalog.seal import appended_digests, changing_enrollments, enrollment_digests, object_digests
-from rig.core.errors import CatalogError, UsageError
-from rig.core.files import write
+from rig.core.errors import CatalogDamaged, CatalogError, UsageError
 from rig.core.processes import map_in_processes
 from rig.views import image_files as images
 
@@ -137,8 +133,8 @@ class _State:
     catalog: Catalog
     repair: bool
     findings: list[Finding] = field(default_factory=list)
-    copies: dict[str, Path] = field(default_factory=dict)
-    """A file for each SHA-256."""
+    copies: dict[str, str] = field(default_factory=dict)
+    """The name of a file for each SHA-256."""
     results: int = 0
 
 
@@ -166,16 +162,16 @@ def verify(
     state = _State(catalog, repair)
     # The files are listed before the rows: an image whose row is committed in the meantime is not an orphan.
     with catalog.database.catalog_errors():
-        files = _files(catalog.path)
+        files = catalog.database.images.names()
     items, object_count = _items(catalog)
     for item in items:  # before anything is repaired
-        image_file(catalog.path, item.image)
+        catalog.database.images.check(item.image)
     if _check_rows(state):
         items, object_count = _items(catalog)
 
     yield JobProgress(0, len(items))
     checked: dict[_Item, _Checked] = {}
-    work = partial(_check_portion, catalog.path, quick)
+    work = partial(_check_portion, catalog.database.images, quick)
     for portion, found in map_in_processes(work, portions(items), processes(jobs, len(items))):
         checked.update(zip(portion, found, strict=True))
         yield JobProgress(len(checked), len(items))
@@ -201,24 +197,21 @@ def verify(
     )
 
 
-def _files(root: Path) -> set[str]:
-    folder = root / images.IMAGE_FOLDER
-    return {path.relative_to(root).as_posix() for path in files_within(folder)}
-
-
 def _check_rows(state: _State) -> bool:
     """Check the structure of the database, and return whether rows were removed."""
     removed = False
     with state.catalog.database.read() as connection:
-        messages = connection.exec_driver_sql("PRAGMA integrity_check(20)").scalars().all()
-    if messages != ["ok"]:
-        state.findings += [Finding(Problem.DAMAGED_DATABASE, details={"message": message}) for message in messages]
+        messages = state.catalog.database.damage(connection)
+        orphans = bool(state.catalog.database.orphans(connection))
+    state.findings += [Finding(Problem.DAMAGED_DATABASE, details={"message": message}) for message in messages]
+    if not orphans:
+        return False
     transaction = state.catalog.database.write if state.repair else state.catalog.database.read
     with transaction() as connection:
         connection.exec_driver_sql("PRAGMA defer_foreign_keys = ON")
         # The deletion of an orphan may make others.
-        while broken := connection.exec_driver_sql("PRAGMA foreign_key_check").all():
-            for table, rowid, parent, _ in broken:
+        while broken := state.catalog.database.orphans(connection):
+            for table, rowid, parent in broken:
                 row = _row(connection, table, rowid)
                 finding = Finding(Problem.ORPHANED_ROW, details={"table": table, "parent": parent, "row": row})
                 if state.repair:
@@ -230,7 +223,7 @@ def _check_rows(state: _State) -> bool:
             if not state.repair:
                 return False
             removed = True
-            if any(rowid is None for _, rowid, _, _ in broken):
+            if any(rowid is None for _, rowid, _ in broken):
                 connection.execute(delete(descriptors).where(descriptors.c.view_id.not_in(select(views.c.id))))
     return removed
 
@@ -284,13 +277,13 @@ def _items(catalog: Catalog) -> tuple[list[_Item], int]:
     return items, count
 
 
-def _check_portion(root: Path, quick: bool, portion: tuple[_Item, ...]) -> list[_Checked]:
-    return [_check(root, item, quick) for item in portion]
+def _check_portion(store: ImageStore, quick: bool, portion: tuple[_Item, ...]) -> list[_Checked]:
+    return [_check(store, item, quick) for item in portion]
 
 
-def _check(root: Path, item: _Item, quick: bool) -> _Checked:
+def _check(store: ImageStore, item: _Item, quick: bool) -> _Checked:
     try:
-        content = images.read_file(root / item.image)
+        content = store.read(item.image)
     except OSError as error:
         return _Checked(None, reason=error.strerror or str(error))
     sha256 = images.digest(content)
@@ -311,7 +304,7 @@ def _check(root: Path, item: _Item, quick: bool) -> _Checked:
             different.append((name, version, None))
             continue
         try:
-            describe = stored_describer(root, (name,), region, item.empty_table)
+            describe = stored_describer(store, (name,), region, item.empty_table)
         except CatalogError:
             continue  # the empty-table image is damaged: it is another item
         levels: NDArray[np.uint8] | None = None
@@ -333,24 +326,23 @@ def _referenced(state: _State, connection: Connection) -> set[str]:
 
 def _find_copies(state: _State, checked: Mapping[_Item, _Checked], orphans: Iterable[str]) -> None:
     """Look for the content of missing and changed images under other names."""
-    root = state.catalog.path
+    store = state.catalog.database.images
     if all(found.sha256 == item.sha256 for item, found in checked.items()):
         return
     for item, found in checked.items():
         if found.sha256 is not None:
-            state.copies.setdefault(found.sha256, root / item.image)
-    for path in [*(root / name for name in orphans), *files_within(root / LOST)]:
-        with suppress(OSError):
-            if stat.S_ISREG(path.lstat().st_mode):
-                state.copies.setdefault(images.digest(images.read_file(path)), path)
+            state.copies.setdefault(found.sha256, item.image)
+    for name in [*orphans, *sorted(store.lost())]:
+        with suppress(OSError, CatalogDamaged):  # not a regular file, or a link
+            state.copies.setdefault(images.digest(store.read(name)), name)
 
 
 def _report_images(state: _State, checked: Mapping[_Item, _Checked]) -> None:
-    root = state.catalog.path
+    store = state.catalog.database.images
     wrong = {item: found for item, found in checked.items() if found.sha256 != item.sha256}
     copies = {item: state.copies[item.sha256] for item in wrong if item.sha256 in state.copies}
     # Read all before writing any: two images may have been swapped.
-    contents = {item: images.read_file(path) for item, path in copies.items()} if state.repair else {}
+    contents = {item: store.read(name) for item, name in copies.items()} if state.repair else {}
     for item, found in checked.items():
         if item not in wrong:
             if found.reason:
@@ -358,12 +350,11 @@ def _report_images(state: _State, checked: Mapping[_Item, _Checked]) -> None:
             continue
         repair = None
         if item in contents:
-            make_folder_within(root, (root / item.image).parent)
             if found.sha256 is not None and found.sha256 not in {other.sha256 for other in wrong}:
-                _set_aside(root, item.image)
-            write(image_file(root, item.image), contents[item], mode=file_mode(root))
+                store.set_aside(item.image)
+            store.write(item.image, contents[item])
             repair = Repair.RESTORED
-        copy = copies[item].relative_to(root).as_posix() if item in copies else None
+        copy = copies.get(item)
         if found.sha256 is None:
             finding = item.finding(Problem.MISSING_IMAGE, repair, reason=found.reason, copy=copy)
         else:
@@ -418,10 +409,7 @@ def _report_digests(state: _State) -> None:
             if sealed != found:
                 details = {"enrollment_id": enrollment_id}
                 report(Finding(Problem.ENROLLMENT_CHANGED, owners.get(enrollment_id), details=details))
-        given = {
-            row[0]: row[1]
-            for row in connection.exec_driver_sql("SELECT name, CAST(seq AS INTEGER) FROM sqlite_sequence")
-        }
+        given = state.catalog.database.last_ids(connection)
         state.findings += [
             Finding(Problem.LOG_CHANGED, details={"entry_id": entry_id})
             for entry_id in _changed_rows(connection, audit_log, given)
@@ -436,9 +424,8 @@ def _report_digests(state: _State) -> None:
             last = connection.scalar(select(func.max(table.c.id))) or 0
             if table.kwargs.get("sqlite_autoincrement") and last > given.get(table.name, 0):
                 report(_changed(f"last id of {table.name}", given.get(table.name), last))
-        journal = connection.exec_driver_sql("PRAGMA journal_mode").scalar()
-        if journal not in ("wal", "off"):  # off: opened without permission to write
-            report(_changed("journal", journal, "wal"))
+        for setting, found_value, stored in state.catalog.database.settings(connection):
+            report(_changed(setting, found_value, stored))
 
 
 def _changed_rows(connection: Connection, table: Table, given: Mapping[str, int]) -> list[int]:
@@ -457,24 +444,13 @@ def _changed(setting: str, found: object, stored: object) -> Finding:
 
 
 def _report_orphans(state: _State, orphans: Iterable[str]) -> None:
-    root = state.catalog.path
+    store = state.catalog.database.images
     for name in orphans:
         repair = moved_to = None
         if state.repair:
             with state.catalog.database.write() as connection:
-                if name in _referenced(state, connection) or not os.path.lexists(root / name):
+                if name in _referenced(state, connection) or name not in store.names():
                     continue
-                moved_to = _set_aside(root, name)
+                moved_to = store.set_aside(name)
             repair = Repair.MOVED
         state.findings.append(Finding(Problem.ORPHANED_FILE, path=name, details={"moved_to": moved_to}, repair=repair))
-
-
-def _set_aside(root: Path, name: str) -> str:
-    target = lost_file(root, name)
-    make_folder_within(root, target.parent)
-    number = 1
-    while os.path.lexists(target):
-        target = target.with_name(f"{Path(name).stem}-{number}{Path(name).suffix}")
-        number += 1
-    (root / name).rename(target)
-    return target.relative_to(root).as_posix()

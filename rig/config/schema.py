@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal
 import platformdirs
 from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator, model_validator
 
+from rig.config.catalog_place import CatalogPlace
 from rig.config.imus import imu_kind
 from rig.config.toml_file import NONE
 from rig.config.values import APP, read_values, validate
@@ -318,6 +319,21 @@ class CatalogConfig(Section):
     path: Path | None = Field(
         None, description="folder of the catalog; none: one catalog for each bench in the user's data folder"
     )
+    url: str | None = Field(
+        None,
+        description="PostgreSQL database of a catalog that several benches share: "
+        "postgresql+psycopg://USER@HOST/DATABASE, with the password in ~/.pgpass; none: an SQLite file in the folder",
+    )
+    images: str | None = Field(
+        None, description="folder or object store of the images, such as s3://BUCKET/FOLDER; none: the folder"
+    )
+
+    @field_validator("images")
+    @classmethod
+    def _shared_images(cls, images: str | None, others: ValidationInfo) -> str | None:
+        if images is not None and others.data.get("url") is None:
+            raise ValueError("is for a catalog with a url; an SQLite catalog has its images in its folder")
+        return images
 
 
 class EnrollConfig(Section):
@@ -431,6 +447,10 @@ class RigConfig(Section):
     def catalog_path(self, bench_name: str) -> Path:
         """Return the catalog's folder; by default each bench has its own: simulated and real views do not mix."""
         return self.catalog.path or Path(platformdirs.user_data_dir(APP)) / bench_name
+
+    def catalog_place(self, bench_name: str) -> CatalogPlace:
+        """Return where the catalog of the bench is."""
+        return CatalogPlace(self.catalog_path(bench_name), self.catalog.url, self.catalog.images)
 
     def calibration_path(self, bench_name: str) -> Path:
         """Return the folder of the bench's calibrations."""

@@ -97,6 +97,19 @@ class ConfigError(RigError, code=300, title="configuration"):
     """The configuration has mistakes; the evidence lists all of them."""
 
 
+class ExtraMissing(ConfigError, code=301, title="package missing"):
+    """A function needs optional packages that are not installed."""
+
+    @classmethod
+    def of(cls, extra: str, what: str, error: ImportError) -> "ExtraMissing":
+        """Return the error that ``what`` needs the packages of an extra."""
+        return cls(
+            f"{what} need packages that are not installed",
+            next_step=f"install them: pip install 'hbr-rig[{extra}]'",
+            evidence={"missing": error.name or str(error)},
+        )
+
+
 class DeviceNotFound(RigError, code=400, title="device not found"):
     """No device answers at the place that the configuration names."""
 
@@ -263,6 +276,10 @@ class ExportFailed(CatalogError, code=706, title="export failed"):
 
 class CatalogDamaged(CatalogError, code=707, title="catalog damaged"):
     """A check found that something in the catalog is not as it was stored."""
+
+
+class CatalogUnavailable(CatalogError, code=708, title="catalog not reachable"):
+    """The server of the catalog, or the store of its images, does not answer."""
 
 
 class CatalogBusy(RigError, code=900, title="busy"):

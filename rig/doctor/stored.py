@@ -16,17 +16,18 @@ WANTED = {"imu.scale": "the gyro's scale may be off by a percent"}
 
 def catalog(context: DoctorContext) -> Iterator[Finding]:
     """Check that the catalog can be opened, and that its database and some of its images are undamaged."""
-    path = context.catalog_path
-    if not (path / "catalog.sqlite").exists():
+    place = context.config.catalog_place(context.bench)
+    path = place if place.url is not None else place.path
+    if not place.may_exist():
         yield fine("catalog", FindingCode.NO_CATALOG, path=path)
         return
-    with Catalog.open(path, clock=context.computer.clock, read_only=True) as opened:
+    with Catalog.open(place, clock=context.computer.clock, read_only=True) as opened:
         with opened.database.catalog_errors(), opened.database.read() as connection:
-            checked = connection.exec_driver_sql("PRAGMA quick_check(5)").scalars().all()
-            orphans = len(connection.exec_driver_sql("PRAGMA foreign_key_check").all())
-        if checked != ["ok"] or orphans:
+            checked = opened.database.damage(connection)
+            orphans = len(opened.database.orphans(connection))
+        if checked or orphans:
             fix = context.rig("catalog verify --repair")
-            yield bad("catalog", FindingCode.DATABASE_DAMAGED, fix, 7, path=path, damage=list(checked), orphans=orphans)
+            yield bad("catalog", FindingCode.DATABASE_DAMAGED, fix, 7, path=path, damage=checked, orphans=orphans)
         objects = opened.objects()
         ids = opened.views().view_ids.tolist()
         chosen = ids[:: max(len(ids) // IMAGES, 1)][:IMAGES]
@@ -43,7 +44,7 @@ def catalog(context: DoctorContext) -> Iterator[Finding]:
         if unfinished:
             fix = context.rig(f"enroll {unfinished[0]} --resume")
             yield warning("catalog", FindingCode.UNFINISHED, fix, objects=unfinished)
-        if checked == ["ok"] and not orphans and not broken:
+        if not checked and not orphans and not broken:
             counts = {"objects": len(objects), "views": len(ids), "images": len(chosen)}
             yield fine("catalog", FindingCode.CATALOG, path=path, **counts)
 

@@ -93,4 +93,4 @@ def load_catalog(catalog: Catalog, region: tuple[int, int, int, int] | None) -> 
         )
         if photographs:
             objects.append(PhotographedObject(summary.name, tuple(photographs)))
-    return Dataset(str(catalog.path), tuple(objects), region=region)
+    return Dataset(str(catalog.place), tuple(objects), region=region)

@@ -10,6 +10,7 @@ from rig.bench import Bench
 from rig.catalog import Catalog, Provenance
 from rig.catalog.records import Outcome
 from rig.catalog.results import Answer, NewResult, record
+from rig.config.catalog_place import CatalogPlace
 from rig.core.clock import Clock
 from rig.core.errors import RigError
 from rig.events.events import Accepted, Event, Identified, Note, NoteCode, Recorded, Started, Warned, event_dict
@@ -22,8 +23,8 @@ class ResultRecorder:
 
     Parameters
     ----------
-    folder
-        Folder of the catalog.
+    place
+        Where the catalog is.
     bench
         The bench that takes the views.
     clock
@@ -43,7 +44,7 @@ class ResultRecorder:
 
     def __init__(
         self,
-        folder: Path,
+        place: CatalogPlace | Path,
         bench: Bench,
         *,
         clock: Clock,
@@ -52,7 +53,7 @@ class ResultRecorder:
         with_image: bool = True,
     ) -> None:
         self.sample: str | None = None
-        self._folder = folder
+        self._place = place
         self._bench = bench
         self._clock = clock
         self._catalog_version = catalog_version
@@ -90,7 +91,7 @@ class ResultRecorder:
                 self._catalog_version(),
                 self._operator,
             )
-            with Catalog.open(self._folder, clock=self._clock, create=False) as catalog:
+            with Catalog.open(self._place, clock=self._clock, create=False) as catalog:
                 return Recorded(record(catalog, new, self._image), self.sample)
         except RigError as error:
             return Warned(None, Note(NoteCode.NOT_RECORDED, {"what": error.what, "next_step": error.next_step}))

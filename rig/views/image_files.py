@@ -6,6 +6,7 @@ Decision: docs/decisions/0005.
 import hashlib
 import re
 import unicodedata
+from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
@@ -119,8 +120,8 @@ def _png_size(content: bytes) -> tuple[int, int] | None:
     return int.from_bytes(content[16:20], "big"), int.from_bytes(content[20:24], "big")
 
 
-def read(path: Path, sha256: str) -> NDArray[np.uint8]:
-    """Return the stored pixels, uint8 (H, W, 3) BGR.
+def checked(fetch: Callable[[], bytes], where: str, sha256: str) -> NDArray[np.uint8]:
+    """Return the stored pixels, uint8 (H, W, 3) BGR, of the file at ``where`` that ``fetch`` reads.
 
     Raises
     ------
@@ -129,17 +130,17 @@ def read(path: Path, sha256: str) -> NDArray[np.uint8]:
     """
     fix = "run rig catalog verify --repair to find a copy; otherwise enroll the object again with --replace"
     try:
-        content = read_file(path)
+        content = fetch()
     except FileNotFoundError as error:
-        raise CatalogError(f"the image {path} is missing", next_step=fix) from error
+        raise CatalogError(f"the image {where} is missing", next_step=fix) from error
     except OSError as error:
-        raise CatalogError(f"the image {path} cannot be read: {error.strerror}", next_step=fix) from error
+        raise CatalogError(f"the image {where} cannot be read: {error.strerror}", next_step=fix) from error
     if digest(content) != sha256:
-        raise CatalogError(f"the image {path} is not the one that was stored", next_step=fix)
+        raise CatalogError(f"the image {where} is not the one that was stored", next_step=fix)
     try:
         return decode(content)
     except BadImage as error:
-        raise CatalogError(f"the image {path} is not readable: {error}", next_step=fix) from error
+        raise CatalogError(f"the image {where} is not readable: {error}", next_step=fix) from error
 
 
 def folder(object_id: int, object_name: str, enrollment_id: int) -> Path:

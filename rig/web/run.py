@@ -119,8 +119,8 @@ def run_server(
 
 def checked_catalog(server: Server) -> AbstractContextManager[object]:
     """Return a check of the catalog beside the work of a ``with`` block; damage is on stderr and in the status."""
-    path = server.config.catalog_path(server.bench)
-    if not (path / "catalog.sqlite").exists():
+    place = server.config.catalog_place(server.bench)
+    if not place.may_exist():
         return nullcontext()
 
     def report(damage: RigError) -> None:
@@ -128,7 +128,7 @@ def checked_catalog(server: Server) -> AbstractContextManager[object]:
         with suppress(OSError):
             print(f"Note: {damage.what}. Next step: {damage.next_step}", file=sys.stderr, flush=True)
 
-    return BackgroundCheck(path, server.clock, report)
+    return BackgroundCheck(place, server.clock, report)
 
 
 class _Web(uvicorn.Server):
@@ -170,12 +170,12 @@ def make_server(
         return open_bench(bench, config, seed=seed)
 
     def catalog(clock_: Clock) -> Catalog:
-        return Catalog.open(config.catalog_path(bench), clock=clock_, create=True)
+        return Catalog.open(config.catalog_place(bench), clock=clock_, create=True)
 
     def catalog_for(read_only: bool) -> Catalog:
-        path = config.catalog_path(bench)
-        create = not (path / "catalog.sqlite").exists()
-        return Catalog.open(path, clock=clock, create=create, read_only=read_only and not create)
+        place = config.catalog_place(bench)
+        create = not place.may_exist()
+        return Catalog.open(place, clock=clock, create=create, read_only=read_only and not create)
 
     queue = JobQueue(folder, clock, changed, arguments)
     runs = config.catalog_path(bench) / RUNS

@@ -198,7 +198,7 @@ class Works:
                     events = identify(bench, known, strategy=chosen, seed=self.seed)
                 if bench.config.identify.record != "none":
                     recorder = ResultRecorder(
-                        *(catalog.path, bench),
+                        *(catalog.place, bench),
                         clock=SystemClock(),
                         catalog_version=lambda: model.version,
                         operator=context.job.operator,

@@ -16,7 +16,7 @@ from rig.catalog.exchange.batch import (
     Session,
     View,
 )
-from rig.catalog.places import image_file
+from rig.catalog.image_store import ImageStore
 from rig.catalog.queries import find, packed_descriptors
 from rig.catalog.rows import measured
 from rig.catalog.schema import enrollments, objects, sessions, views
@@ -39,6 +39,7 @@ def read_objects(catalog: Catalog, names: Collection[str] = ()) -> Iterator[Expo
     ObjectNotFound
         There is no object of one of these names.
     """
+    store = catalog.database.images
     with catalog.database.read() as connection:
         wanted = [objects.c.deleted_utc.is_(None)]
         if names:
@@ -54,7 +55,7 @@ def read_objects(catalog: Catalog, names: Collection[str] = ()) -> Iterator[Expo
                 select(enrollments).where(enrollments.c.object_id == row.id).order_by(enrollments.c.id)
             ).all():
                 folder = images.folder(number, row.name, next(enrollment_numbers))
-                by_id = _sessions(connection, enrollment.id, folder, catalog.path, files)
+                by_id = _sessions(connection, enrollment.id, folder, store, files)
                 found.append(
                     Enrollment(
                         status=enrollment.status,
@@ -62,7 +63,7 @@ def read_objects(catalog: Catalog, names: Collection[str] = ()) -> Iterator[Expo
                         finished_utc=enrollment.finished_utc,
                         planned_azimuth_deg=tuple(enrollment.planned_azimuth_deg),
                         sessions=tuple(by_id.values()),
-                        views=tuple(_views(connection, enrollment.id, list(by_id), folder, catalog.path, files)),
+                        views=tuple(_views(connection, enrollment.id, list(by_id), folder, store, files)),
                     )
                 )
             texts = {"name": row.name, "label": row.label, "note": row.note}
@@ -75,11 +76,11 @@ def read_catalog(catalog: Catalog, names: Collection[str] = ()) -> ImportBatch:
     for item, files in read_objects(catalog, names):
         found.append(item)
         sources.update({name: ImageSource(str(path)) for name, path in files.items()})
-    return ImportBatch(str(catalog.path), tuple(found), sources, strict=True)
+    return ImportBatch(str(catalog.place), tuple(found), sources, strict=True)
 
 
 def _sessions(
-    connection: Connection, enrollment_id: int, folder: Path, root: Path, files: dict[str, Path]
+    connection: Connection, enrollment_id: int, folder: Path, store: ImageStore, files: dict[str, Path]
 ) -> dict[int, Session]:
     found = {}
     rows = connection.execute(
@@ -89,7 +90,7 @@ def _sessions(
         exported = None
         if row.empty_table_image is not None:
             exported = (folder / f"empty-{number:03d}{Path(row.empty_table_image).suffix}").as_posix()
-            files[exported] = image_file(root, row.empty_table_image)
+            files[exported] = store.file(row.empty_table_image)
         columns = {name: getattr(row, name) for name in Session.model_fields}
         found[row.id] = Session(**(columns | {"empty_table_image": exported}))
     return found
@@ -100,14 +101,14 @@ def _views(
     enrollment_id: int,
     session_ids: Sequence[int],
     folder: Path,
-    root: Path,
+    store: ImageStore,
     files: dict[str, Path],
 ) -> Iterator[View]:
     of_enrollment = views.c.enrollment_id == enrollment_id
     packed = packed_descriptors(connection, of_enrollment)
     for row in connection.execute(select(views).where(of_enrollment).order_by(views.c.view_index)).all():
         exported = (folder / f"{row.view_index:03d}{Path(row.image).suffix}").as_posix()
-        files[exported] = image_file(root, row.image)
+        files[exported] = store.file(row.image)
         yield View(
             index=row.view_index,
             session=session_ids.index(row.session_id),

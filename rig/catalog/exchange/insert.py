@@ -1,5 +1,6 @@
 """Insert staged objects into a catalog in one transaction."""
 
+import secrets
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -49,6 +50,8 @@ def insert_objects(
         The catalog cannot be written.
     """
     inserter = _Inserter(catalog, staged, folder, label)
+    if not catalog.database.images.moves:
+        inserter.copy_images()
     try:
         with catalog.database.write() as connection:
             # check again: another process may have inserted objects since the plan was made
@@ -81,6 +84,7 @@ class _Inserter:
     folder: Path
     label: str | None
     moved: list[tuple[Path, Path]] = field(default_factory=list)
+    token: str = field(default_factory=lambda: secrets.token_hex(8))
 
     def insert(self, connection: Connection, item: Object) -> None:
         object_id = connection.scalar(select(objects.c.id).where(in_use(item.name)))
@@ -111,7 +115,11 @@ class _Inserter:
         names = [view.image for view in enrollment.views]
         names += [session.empty_table_image for session in enrollment.sessions if session.empty_table_image]
         if names:
-            self._move(self.folder / Path(self.staged[names[0]].file).parent, target)
+            source = Path(self.staged[names[0]].file).parent
+            if self.catalog.database.images.moves:
+                self._move(self.folder / source, target)
+            else:
+                target = self._copied(source)
         session_ids = [
             insert_session(
                 connection,
@@ -135,6 +143,17 @@ class _Inserter:
     def _image_file(self, name: str, target: Path) -> ImageFile:
         one = self.staged[name]
         return ImageFile((target / Path(one.file).name).as_posix(), one.sha256, one.size)
+
+    def copy_images(self) -> None:
+        """Store the images before the transaction: other benches do not wait for a slow store meanwhile.
+
+        If the import fails after that, no row refers to them, and `rig catalog verify` finds them.
+        """
+        for source in sorted(self.folder.iterdir()):
+            self.catalog.database.images.copy_in(source, self._copied(Path(source.name)).as_posix())
+
+    def _copied(self, source: Path) -> Path:
+        return Path(images.IMAGE_FOLDER, f"import-{self.token}", source)
 
     def _move(self, source: Path, target: Path) -> None:
         root = self.catalog.path

@@ -13,7 +13,6 @@ from rig.cli.ui.settings import Settings
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
-    from pathlib import Path
 
     from rig.bench import Bench
     from rig.catalog import Catalog, ObjectDetails, ObjectSummary
@@ -47,7 +46,7 @@ def list_(
 
     with settings.open_catalog(read_only=True) as catalog:
         found = deleted_objects(catalog) if deleted else catalog.objects()
-        path, damage = catalog.path, catalog.damage()
+        path, damage = catalog.place, catalog.damage()
     objects = [
         item
         for item in found
@@ -97,7 +96,7 @@ def show(
 
     with settings.open_catalog(read_only=True) as catalog:
         details = catalog.object(name)
-        folder, damage = catalog.path, catalog.damage(name)
+        folder, damage = catalog.database.images.where(""), catalog.damage(name)
     if settings.json:
         shown = plain(details)
         for view, shown_view in zip(details.views, shown["views"], strict=True):
@@ -111,7 +110,7 @@ def show(
         raise damage
 
 
-def _print_object(details: "ObjectDetails", folder: "Path", *, full: bool) -> None:
+def _print_object(details: "ObjectDetails", folder: str, *, full: bool) -> None:
     from rig.events.wording import counted
     from rig.views.segmentation_evidence import SegmentationSummary
 
@@ -137,7 +136,7 @@ def _print_object(details: "ObjectDetails", folder: "Path", *, full: bool) -> No
         return
     if segmentation := SegmentationSummary.of(view.record.segmentation for view in details.views).text:
         print(segmentation)
-    print(f"images in {(folder / details.views[0].image).parent}")
+    print(f"images in {folder.rstrip('/')}/{details.views[0].image.rpartition('/')[0]}")
     print("view  azimuth  encoder      IMU   sharpness")
     for view in details.views:
         record = view.record
@@ -250,7 +249,7 @@ def stats(settings: Settings) -> None:
 
     with settings.open_catalog(read_only=True) as catalog:
         found = statistics(catalog)
-        path = catalog.path
+        path = catalog.place
     if settings.json:
         settings.print_json({"catalog": str(path), **plain(found)})
         return
@@ -259,7 +258,9 @@ def stats(settings: Settings) -> None:
     print("enrollments  " + (", ".join(f"{count} {status}" for status, count in found.enrollments.items()) or "none"))
     print(f"views        {found.views}")
     print(f"images       {size_words(found.image_bytes)}")
-    print(f"database     {size_words(found.database_bytes)}; {size_words(found.free_disk_bytes)} free on its disk")
+    room = found.free_disk_bytes
+    free = "" if room is None else f"; {size_words(room)} free on the disk of the images"
+    print(f"database     {size_words(found.database_bytes)}{free}")
     if found.labels.keys() - {""}:
         print("labels       " + ", ".join(f"{label or '(none)'} {count}" for label, count in found.labels.items()))
     print(

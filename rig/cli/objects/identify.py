@@ -114,7 +114,7 @@ def identify(
             else:
                 events = identify_one(bench, model(), strategy=chosen, seed=seed, top=top)
             recorder = ResultRecorder(
-                *(catalog.path, bench),
+                *(catalog.place, bench),
                 clock=SystemClock(),
                 catalog_version=lambda: model.version,
                 operator=operator,

@@ -84,10 +84,10 @@ class Settings:
         from rig.catalog import Catalog
         from rig.core.clock import SystemClock
 
-        path = self.load().catalog_path(self.bench_name)
-        if not create and self.load().catalog.path is None and not path.exists():
-            raise self._no_catalog(path)
-        return Catalog.open(path, clock=clock or SystemClock(), create=create, read_only=read_only)
+        place = self.load().catalog_place(self.bench_name)
+        if not create and self.load().catalog.path is None and place.url is None and not place.path.exists():
+            raise self._no_catalog(place.path)
+        return Catalog.open(place, clock=clock or SystemClock(), create=create, read_only=read_only)
 
     def background_check(self) -> "BackgroundCheck":
         """Return a check of the bench's catalog beside the work of a ``with`` block; damage is printed on stderr."""
@@ -98,14 +98,14 @@ class Settings:
             with suppress(OSError):  # stderr is closed
                 print(f"Note: {damage.what}. Next step: {damage.next_step}", file=sys.stderr, flush=True)
 
-        return BackgroundCheck(self.load().catalog_path(self.bench_name), SystemClock(), report)
+        return BackgroundCheck(self.load().catalog_place(self.bench_name), SystemClock(), report)
 
     def _no_catalog(self, path: Path) -> RigError:
         """Return the error that the bench has no catalog; it names the benches that have one."""
         from rig.bench import bench_names
         from rig.core.errors import CatalogError
 
-        others = [name for name in bench_names() if (self.load().catalog_path(name) / "catalog.sqlite").exists()]
+        others = [name for name in bench_names() if self.load().catalog_place(name).database_file.exists()]
         enroll = f"Enroll an object: rig enroll NAME --bench {self.bench_name}"
         return CatalogError(
             f"The bench {self.bench_name} has no catalog yet.",
@@ -115,13 +115,12 @@ class Settings:
 
     def catalog_there(self) -> "Catalog | None":
         """Return the bench's catalog, opened for reading; None if there is none yet."""
-        path = self.load().catalog_path(self.bench_name)
-        return self.open_catalog(read_only=True) if (path / "catalog.sqlite").exists() else None
+        place = self.load().catalog_place(self.bench_name)
+        return self.open_catalog(read_only=True) if place.may_exist() else None
 
     def note(self, action: "Action", **details: Any) -> None:
         """Write an action on the bench into the log of its catalog (`rig log`), if it has one."""
-        path = self.load().catalog_path(self.bench_name)
-        if not (path / "catalog.sqlite").exists():
+        if not self.load().catalog_place(self.bench_name).may_exist():
             return
         try:
             with self.open_catalog() as catalog:

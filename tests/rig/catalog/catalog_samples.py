@@ -26,6 +26,7 @@ from rig.catalog.results import record as record_result
 from rig.core.clock import SystemClock
 from rig.views.description import within
 from tests.programs import Program
+from tests.servers.postgres import use_postgres
 
 _T = TypeVar("_T")
 
@@ -110,6 +111,7 @@ def finished(job: Generator[JobProgress, None, _T]) -> _T:
 
 
 def main() -> None:
+    use_postgres()
     path, name, views, die_before = sys.argv[1], sys.argv[2], int(sys.argv[3]), int(sys.argv[4])
     with Catalog.open(path, clock=SystemClock()) as catalog:
         if not views:

@@ -14,7 +14,8 @@ import pytest
 from sqlalchemy import Engine, event
 
 from rig.catalog import Catalog, Enrollment
-from rig.catalog.database import Database
+from rig.catalog.sqlite_database import SqliteDatabase
+from rig.config.catalog_place import CatalogPlace
 from rig.core.errors import CatalogBusy, CatalogError
 from sim.clock import VirtualClock
 from tests.rig.catalog.catalog_samples import PROVENANCE, fill, image, other_program, plan, record
@@ -94,7 +95,7 @@ def test_image_is_durable_before_its_row(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 def test_database_commits_durably_and_checks_foreign_keys(tmp_path: Path) -> None:
-    database = Database(tmp_path, create=True, read_only=False, busy_timeout_s=1.0)
+    database = SqliteDatabase(CatalogPlace(tmp_path), create=True, read_only=False, busy_timeout_s=1.0)
     with database.write() as connection:
         settings = {
             name: connection.exec_driver_sql(f"PRAGMA {name}").scalar_one()

@@ -39,6 +39,8 @@ from tests.rig.catalog.catalog_samples import (
     without_waiting,
 )
 
+pytestmark = pytest.mark.sqlite
+
 SECRET = b"not a part of the catalog"
 
 

@@ -23,6 +23,8 @@ from rig.core.errors import CatalogBusy, CatalogDamaged, CatalogError, CatalogOu
 from sim.clock import VirtualClock
 from tests.rig.catalog.catalog_samples import PROVENANCE, finished, image, new_result, record, without_waiting
 
+pytestmark = pytest.mark.sqlite
+
 DATA = Path(__file__).parent / "data"
 DUMPS = {1: DATA / "catalog-v1" / "catalog.sql", 2: DATA / "catalog-v2.sql", 3: DATA / "catalog-v3.sql"}
 BUNDLE = DATA / "bundle-v1.rigcat.zip"

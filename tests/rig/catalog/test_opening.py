@@ -14,6 +14,8 @@ from rig.core.errors import CatalogError
 from sim.clock import VirtualClock
 from tests.rig.catalog.catalog_samples import PROVENANCE, fill, plan
 
+pytestmark = pytest.mark.sqlite
+
 needs_permissions = pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
 
 

@@ -22,7 +22,6 @@ from rig.catalog.results import ResultFilter, correct, find_result, find_results
 from rig.catalog.upkeep import collect_garbage
 from rig.catalog.verify import Problem, verify
 from rig.core.errors import CatalogError, ExportFailed, ObjectNotFound, UsageError
-from rig.views.image_files import read
 from sim.clock import VirtualClock
 from tests.rig.catalog.catalog_samples import (
     finished,
@@ -75,7 +74,7 @@ def test_result_has_everything_about_the_answer(catalog: Catalog) -> None:
     assert first.azimuths_deg == (0.0, 60.0)
     assert first.image is not None
     assert first.image_sha256 is not None
-    assert np.array_equal(read(catalog.path / first.image, first.image_sha256), image(1))
+    assert np.array_equal(catalog.database.images.pixels(str(first.image), str(first.image_sha256)), image(1))
     assert third.image is None
 
 

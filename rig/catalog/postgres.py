@@ -1,0 +1,269 @@
+"""A catalog in a PostgreSQL database, for several benches at once.
+
+The tables are those of SQLite. A table ``catalog_properties`` holds what SQLite keeps outside of tables: the kind and
+the version of the database, its id, and the last ids of the append-only tables.
+
+Decision: docs/decisions/0051.
+"""
+
+import uuid
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager
+from typing import Any, Final
+
+from sqlalchemy import Column, Connection, MetaData, QueuePool, Table, Text, create_engine, func, select, text
+from sqlalchemy.exc import ArgumentError, NoSuchModuleError
+
+from rig.catalog.columns import damaged
+from rig.catalog.database import Database
+from rig.catalog.failures import server_errors
+from rig.catalog.image_store import open_store
+from rig.catalog.schema import APPEND_ONLY, METADATA, READABLE_VERSION, SCHEMA_VERSION
+from rig.config.catalog_place import CatalogPlace
+from rig.core.errors import CatalogError, ConfigError, ExtraMissing
+
+CHANNEL: Final = "hbr_rig_catalog"
+"""Channel of the notifications about changes; the payload is the id of the catalog."""
+
+APPLICATION: Final = "hbr-rig catalog"
+
+_PROPERTIES: Final = Table(
+    "catalog_properties", MetaData(), Column("key", Text, primary_key=True), Column("value", Text, nullable=False)
+)
+
+_LOST_BENCH_S: Final = 30
+"""After this time the server ends the transaction of a bench that lost its network or its power."""
+
+_SETTINGS: Final = {
+    "lock_timeout": "{busy_ms}",
+    "idle_in_transaction_session_timeout": str(1000 * _LOST_BENCH_S),
+    "tcp_keepalives_idle": "10",
+    "tcp_keepalives_interval": "5",
+    "tcp_keepalives_count": "3",
+    "synchronous_commit": "on",
+}
+
+_ENROLLMENT_LOCKS: Final = 0x48425200
+
+
+class PostgresDatabase(Database):
+    """The database of a catalog on a PostgreSQL server.
+
+    A commit is durable. Transactions that change one enrollment share a lock of the whole catalog and have a lock of
+    the enrollment; all others have the lock of the catalog alone. Readers have a snapshot and do not wait.
+
+    Parameters
+    ----------
+    place
+        Where the catalog is, with the URL of the database.
+    create
+        Create the tables if there are none.
+    read_only
+        Write nothing.
+    busy_timeout_s
+        How long a writer waits for another one.
+
+    Raises
+    ------
+    CatalogError
+        The database has no catalog, it is of a newer version, or the server denies access.
+    CatalogUnavailable
+        The server does not answer.
+    CatalogBusy
+        Other processes lock the catalog for longer than the timeout.
+    """
+
+    def __init__(self, place: CatalogPlace, *, create: bool, read_only: bool, busy_timeout_s: float) -> None:
+        self.place = place
+        self.images = open_store(place)
+        self._read_only = read_only
+        self._busy_timeout_s = busy_timeout_s
+        engine = _engine(place, busy_timeout_s)
+        self._reading = engine.execution_options(isolation_level="REPEATABLE READ", postgresql_readonly=True)
+        self._writing = engine.execution_options(isolation_level="READ COMMITTED")
+        self._dispose = engine.dispose
+        try:
+            with self.catalog_errors():
+                self._open(create=create and not read_only)
+        except BaseException:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        self._dispose()
+
+    @contextmanager
+    def read(self) -> Iterator[Connection]:
+        with self.catalog_errors(), self._reading.begin() as connection:
+            self._check_version(connection)
+            yield connection
+
+    @contextmanager
+    def write(self, enrollment_id: int | None = None) -> Iterator[Connection]:
+        if self._read_only:
+            raise CatalogError(f"the catalog {self.place} is open for reading only", next_step="open it for writing")
+        with self.catalog_errors(), self._writing.begin() as connection:
+            # The transaction sees what was committed before it got the lock: each query has a snapshot of its own.
+            lock_catalog(connection, enrollment_id)
+            self._check_version(connection)
+            yield connection
+            connection.execute(select(func.pg_notify(CHANNEL, self.id)))
+
+    def catalog_errors(self) -> AbstractContextManager[None]:
+        return server_errors(self.place, self._busy_timeout_s)
+
+    def _open(self, *, create: bool) -> None:
+        with self._writing.begin() as connection:
+            exists = _has_tables(connection)
+        if not exists:
+            if not create:
+                raise CatalogError(
+                    f"the database {self.place} has no catalog",
+                    next_step="check catalog.url, or enroll an object to create the catalog",
+                )
+            self._create()
+        with self._writing.begin() as connection:
+            found = properties(connection)
+        if found.get("application") != APPLICATION:
+            raise CatalogError(f"{self.place} is the database of another program", next_step="check catalog.url")
+        self.id = found["id"]
+        self.version = _version(found, self.place)
+        if self.version < (READABLE_VERSION if self._read_only else SCHEMA_VERSION):
+            raise self.outdated()
+        self._check_mark()
+
+    def _check_mark(self) -> None:
+        """Check that the images are those of this catalog: benches that have each their own folder would lose them."""
+        mark = self.images.mark()
+        if mark == self.id:
+            return
+        where = self.images.where("images")
+        fix = "set catalog.images to the folder or the store that all benches of the catalog use"
+        if mark is not None:
+            raise CatalogError(f"{where} has the images of another catalog than {self.place}", next_step=fix)
+        with self.read() as connection:
+            used = connection.scalar(select(func.count()).select_from(METADATA.tables["enrollments"])) or 0
+        if used:
+            raise CatalogError(f"the images of the catalog {self.place} are not in {where}", next_step=fix)
+        if not self._read_only:
+            self.images.set_mark(self.id)
+
+    def _create(self) -> None:
+        with self._writing.begin() as connection:
+            connection.execute(select(func.pg_advisory_xact_lock(_ENROLLMENT_LOCKS)))
+            if _has_tables(connection):
+                return  # another process was faster
+            _PROPERTIES.metadata.create_all(connection)
+            METADATA.create_all(connection)
+            first = {"application": APPLICATION, "version": str(SCHEMA_VERSION), "id": uuid.uuid4().hex}
+            first |= {table.name: "0" for table in APPEND_ONLY}
+            rows = [{"key": key, "value": value} for key, value in first.items()]
+            connection.execute(_PROPERTIES.insert(), rows)
+
+    def _check_version(self, connection: Connection) -> None:
+        """Check that no other program has migrated the catalog since it was opened."""
+        found = _version(properties(connection), self.place)
+        if found != self.version:
+            raise CatalogError(
+                f"the catalog {self.place} was migrated to version {found} while this program used it",
+                next_step="start the program again; update hbr-rig if it reports a newer version",
+            )
+
+    def damage(self, connection: Connection) -> list[str]:  # noqa: ARG002 - the server checks its own pages
+        return []
+
+    def orphans(self, connection: Connection) -> list[tuple[str, int | None, str]]:  # noqa: ARG002 - always enforced
+        return []
+
+    def last_ids(self, connection: Connection) -> dict[str, int]:
+        found = properties(connection)
+        given = {table.name: int(found.get(table.name, "0")) for table in APPEND_ONLY}
+        for name in ("objects", "enrollments", "sessions", "views"):
+            last = connection.execute(text(f"SELECT last_value, is_called FROM {name}_id_seq")).one()
+            given[name] = last.last_value if last.is_called else 0
+        return given
+
+    def settings(self, connection: Connection) -> list[tuple[str, Any, Any]]:
+        wrong = []
+        for name in ("fsync", "full_page_writes"):
+            found = connection.execute(text(f"SHOW {name}")).scalar()
+            if found != "on":
+                wrong.append((name, found, "on"))
+        return wrong
+
+    def size_bytes(self, connection: Connection) -> int:
+        sizes = [
+            connection.scalar(select(func.pg_total_relation_size(name))) or 0
+            for name in (*METADATA.tables, _PROPERTIES.name)
+        ]
+        return sum(sizes)
+
+
+def lock_catalog(connection: Connection, enrollment_id: int | None = None) -> None:
+    """Wait for the lock of the catalog until the end of the transaction; or, shared, for that of one enrollment."""
+    catalog = "CAST(CAST('catalog_properties' AS regclass) AS oid)"
+    if enrollment_id is None:
+        connection.execute(text(f"SELECT pg_advisory_xact_lock(CAST({catalog} AS bigint))"))
+        return
+    connection.execute(text(f"SELECT pg_advisory_xact_lock_shared(CAST({catalog} AS bigint))"))
+    one = f"SELECT pg_advisory_xact_lock(CAST({catalog} AS integer), CAST(:id AS integer))"
+    connection.execute(text(one), {"id": enrollment_id})
+
+
+def properties(connection: Connection) -> dict[str, str]:
+    """Return the properties of a catalog."""
+    return {row.key: row.value for row in connection.execute(select(_PROPERTIES))}
+
+
+def set_property(connection: Connection, key: str, value: str) -> None:
+    """Change a property of a catalog."""
+    connection.execute(_PROPERTIES.update().where(_PROPERTIES.c.key == key).values(value=value))
+
+
+def _has_tables(connection: Connection) -> bool:
+    return connection.execute(text("SELECT to_regclass('catalog_properties')")).scalar() is not None
+
+
+def _version(found: dict[str, str], place: CatalogPlace) -> int:
+    try:
+        version = int(found["version"])
+    except (KeyError, ValueError) as error:
+        raise damaged("the version of its schema", found.get("version")) from error
+    if version > SCHEMA_VERSION:
+        raise CatalogError(
+            f"the catalog {place} was written by a newer program: its schema has version {version}, "
+            f"this program knows {SCHEMA_VERSION}",
+            next_step="update hbr-rig on this computer",
+            evidence={"found": version, "known": SCHEMA_VERSION},
+        )
+    return version
+
+
+def _engine(place: CatalogPlace, busy_timeout_s: float) -> Any:
+    assert place.url is not None
+    settings = {key: value.format(busy_ms=max(1, round(1000 * busy_timeout_s))) for key, value in _SETTINGS.items()}
+    options = " ".join(f"-c {key}={value}" for key, value in settings.items())
+    try:
+        from sqlalchemy.engine import make_url
+
+        url = make_url(place.url)
+        given = url.query.get("options", "")
+        return create_engine(
+            url.difference_update_query(["options"]),
+            poolclass=QueuePool,
+            pool_pre_ping=True,
+            pool_use_lifo=True,
+            connect_args={
+                "options": f"{options} {given}",
+                "connect_timeout": 5,
+                "application_name": "hbr-rig",
+                "tcp_user_timeout": 15_000,
+            },
+        )
+    except (ArgumentError, NoSuchModuleError) as error:
+        raise ConfigError(
+            f"catalog.url = {str(place)!r} is not the URL of a database",
+            next_step="give postgresql+psycopg://USER@HOST/DATABASE; the password belongs in ~/.pgpass",
+        ) from error
+    except ImportError as error:
+        raise ExtraMissing.of("postgres", "catalogs on PostgreSQL", error) from error

@@ -1,0 +1,48 @@
+"""Where a catalog is: a folder alone, or a folder of this computer with a database server and a store of images."""
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+DATABASE_NAME: Final = "catalog.sqlite"
+
+
+@dataclass(frozen=True, slots=True)
+class CatalogPlace:
+    """Place of a catalog.
+
+    Attributes
+    ----------
+    path
+        Folder on this computer. Without ``url`` it holds the whole catalog, else what this computer needs for itself.
+    url
+        URL of a PostgreSQL database, ``postgresql+psycopg://HOST/DATABASE``; None for an SQLite file in ``path``.
+    images
+        Folder or URL (``s3://BUCKET/FOLDER``) of the images; None for ``path``.
+    """
+
+    path: Path
+    url: str | None = None
+    images: str | None = None
+
+    @classmethod
+    def of(cls, place: "str | os.PathLike[str] | CatalogPlace") -> "CatalogPlace":
+        """Return the place of a catalog in a folder; a place as it is."""
+        found = place if isinstance(place, CatalogPlace) else cls(Path(place))
+        return cls(found.path.expanduser().absolute(), found.url, found.images)
+
+    @property
+    def database_file(self) -> Path:
+        return self.path / DATABASE_NAME
+
+    def may_exist(self) -> bool:
+        """Return whether there is a database file. Whether a server has a catalog is not known before it is asked."""
+        return self.url is not None or self.database_file.exists()
+
+    def __str__(self) -> str:
+        if self.url is None:
+            return str(self.path)
+        before, at, host = self.url.rpartition("@")
+        user = before.rpartition("//")[2].partition(":")[0]
+        return f"{before.partition('//')[0]}//{user}@{host}" if at else self.url

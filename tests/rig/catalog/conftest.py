@@ -1,0 +1,29 @@
+"""The tests of the catalog run on SQLite, and with RIG_TEST_CATALOG=postgres on PostgreSQL (`make test-servers`)."""
+
+import os
+from collections.abc import Iterator
+
+import pytest
+
+from rig.config.catalog_place import CatalogPlace
+from tests.servers.postgres import VARIABLE, server, use_postgres
+
+
+@pytest.fixture(autouse=True, scope="session")
+def _back_end() -> Iterator[None]:
+    if os.environ.get("RIG_TEST_CATALOG") != "postgres":
+        yield
+        return
+    before = CatalogPlace.__dict__["of"]
+    with server() as running, pytest.MonkeyPatch.context() as patch:
+        patch.setenv(VARIABLE, running.url)
+        use_postgres()
+        yield
+        CatalogPlace.of = before  # type: ignore[method-assign]
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    if os.environ.get("RIG_TEST_CATALOG") == "postgres":
+        for item in items:
+            if item.get_closest_marker("sqlite"):
+                item.add_marker(pytest.mark.skip(reason="it is about the SQLite file"))
