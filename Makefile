@@ -8,7 +8,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 
 LIBRARY := hbr/kernels/_kernels.so
 
-.PHONY: demo web test test-nightly test-kills test-web kernel-test fuzz lint docs wheel bench lock clean help
+.PHONY: demo web test test-nightly test-kills test-web kernel-test fuzz lint docs wheel bench lock clean test-servers help
 
 help:
 	@echo "make demo   enroll and find objects on the simulated bench, and write rig-demo/report.html"
@@ -18,6 +18,7 @@ help:
 	@echo "make test-kills  kill the program at a hundred points of its work, and check what is left"
 	@echo "make test-web   use the pages in a real browser, and attack the server"
 	@echo "make kernel-test  run the program with Linux's real drivers in a virtual machine"
+	@echo "make test-servers  test catalogs on PostgreSQL and S3, Dask and bluesky with real servers"
 	@echo "make fuzz   attack every kind of input for about an hour (a part of test-nightly)"
 	@echo "make lint   formatting, lint, types, import contracts"
 	@echo "make docs   the documentation as a site in site/"
@@ -58,6 +59,12 @@ kernel-test: $(READY) $(LIBRARY)
 	    "The virtual machine needs: sudo apt-get install --no-install-recommends qemu-system-x86 busybox-static kmod udev"
 	@$(BIN)/python -m pytest -rs -m kernel -o faulthandler_timeout=300 tests/kernel
 
+# Needs Debian's postgresql. The packages of these tests are large, so only this target installs them.
+test-servers: $(READY) $(LIBRARY)
+	@sh .ci/install .ci/servers.lock
+	@$(BIN)/python -m pytest -rs -m "" --timeout 600 tests/servers
+	@RIG_TEST_CATALOG=postgres $(BIN)/python -m pytest -rs --timeout 300 tests/rig/catalog
+
 fuzz: $(READY) $(LIBRARY)
 	@$(BIN)/python -m pytest -n auto --dist worksteal -rs -m "" --hypothesis-profile=nightly tests/fuzz
 
@@ -82,7 +89,8 @@ bench: $(READY) $(LIBRARY)
 lock:
 	uv pip compile --universal --python-version 3.11 --generate-hashes --extra dev --upgrade \
 	    --no-header --no-emit-index-url pyproject.toml -o requirements.lock
-	for tool in uv:uv cyclonedx-bom:sbom 'playwright schemathesis axe-playwright-python:browser'; do \
+	for tool in uv:uv cyclonedx-bom:sbom 'playwright schemathesis axe-playwright-python:browser' \
+	    'psycopg[binary] s3fs moto[server] distributed bluesky bluesky-tiled-plugins tiled[client,server]:servers'; do \
 	    echo $${tool%:*} | tr ' ' '\n' | uv pip compile - --universal --python-version 3.11 \
 	    --generate-hashes --upgrade --no-header --no-emit-index-url -o .ci/$${tool#*:}.lock; done
 

@@ -40,6 +40,7 @@ class Action(StrEnum):
     REPAIRED = "verified and repaired"
     GARBAGE_COLLECTED = "collected garbage"
     DESCRIBED_AGAIN = "described again"
+    COPIED = "copied"
     MOVED = "moved"
     TABLE_PHOTOGRAPHED = "photographed the empty table"
 

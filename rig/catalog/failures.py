@@ -43,7 +43,7 @@ def server_errors(place: CatalogPlace, busy_timeout_s: float) -> Iterator[None]:
     except PoolTimeout as error:
         raise _unavailable(place, error) from error
     except OSError as error:
-        raise _of_system(error, Path(place.images or place.path)) from error
+        raise _of_system(error, place.images or place.path) from error
 
 
 _GONE: Final = ("08", "57P")
@@ -132,7 +132,7 @@ def _damaged(root: Path, evidence: dict[str, str]) -> CatalogDamaged:
     )
 
 
-def _of_system(error: OSError, root: Path) -> CatalogError:
+def _of_system(error: OSError, root: object) -> CatalogError:
     evidence = {"errno": errno.errorcode.get(error.errno or 0, "unknown"), "system": str(error)}
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         return CatalogError(

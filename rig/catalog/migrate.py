@@ -16,7 +16,7 @@ from rig.catalog.failures import absent, catalog_errors
 from rig.catalog.places import check_folder, image_file
 from rig.catalog.schema import SCHEMA_VERSION
 from rig.catalog.sqlite_database import check_schema, connect, database_exists, version_of
-from rig.config.catalog_place import DATABASE_NAME
+from rig.config.catalog_place import DATABASE_NAME, CatalogPlace
 from rig.core.clock import Clock
 from rig.core.errors import CatalogDamaged
 from rig.core.files import open_new, sync_file, sync_folder
@@ -31,10 +31,11 @@ class Migration:
     backup: Path | None
 
 
-def migrate(path: str | PathLike[str], *, clock: Clock, busy_timeout_s: float = 5.0) -> Migration:
-    """Migrate the catalog in the folder ``path`` to the version of this program, in one transaction.
+def migrate(path: str | PathLike[str] | CatalogPlace, *, clock: Clock, busy_timeout_s: float = 5.0) -> Migration:
+    """Migrate the catalog in the folder, or at the place, ``path`` to the version of this program, in one transaction.
 
     The old database stays beside it, for example as ``catalog-v1-20260131T120000Z.sqlite``. Images are not changed.
+    A database on a server has no copy: it is migrated completely or not at all, while others read the old version.
 
     Raises
     ------
@@ -45,7 +46,12 @@ def migrate(path: str | PathLike[str], *, clock: Clock, busy_timeout_s: float = 
     CatalogBusy
         Another process locks the catalog for longer than the timeout.
     """
-    root = Path(path).expanduser().absolute()
+    place = CatalogPlace.of(path)
+    if place.url is not None:
+        from rig.catalog.postgres import migrate_server
+
+        return Migration(*migrate_server(place, clock, _run_steps, busy_timeout_s), None)
+    root = place.path
     with catalog_errors(root, busy_timeout_s):
         if not database_exists(root):
             raise absent(root)

@@ -7,20 +7,23 @@ Decision: docs/decisions/0051.
 """
 
 import uuid
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from typing import Any, Final
 
 from sqlalchemy import Column, Connection, MetaData, QueuePool, Table, Text, create_engine, func, select, text
 from sqlalchemy.exc import ArgumentError, NoSuchModuleError
 
+from rig.catalog import audit
 from rig.catalog.columns import damaged
 from rig.catalog.database import Database
 from rig.catalog.failures import server_errors
 from rig.catalog.image_store import open_store
 from rig.catalog.schema import APPEND_ONLY, METADATA, READABLE_VERSION, SCHEMA_VERSION
 from rig.config.catalog_place import CatalogPlace
+from rig.core.clock import Clock
 from rig.core.errors import CatalogError, ConfigError, ExtraMissing
+from rig.core.files import make_folder
 
 CHANNEL: Final = "hbr_rig_catalog"
 """Channel of the notifications about changes; the payload is the id of the catalog."""
@@ -76,6 +79,7 @@ class PostgresDatabase(Database):
     def __init__(self, place: CatalogPlace, *, create: bool, read_only: bool, busy_timeout_s: float) -> None:
         self.place = place
         self.images = open_store(place)
+        make_folder(place.path, within=next(one for one in place.path.parents if one.exists()), mode=0o700)
         self._read_only = read_only
         self._busy_timeout_s = busy_timeout_s
         engine = _engine(place, busy_timeout_s)
@@ -117,10 +121,7 @@ class PostgresDatabase(Database):
             exists = _has_tables(connection)
         if not exists:
             if not create:
-                raise CatalogError(
-                    f"the database {self.place} has no catalog",
-                    next_step="check catalog.url, or enroll an object to create the catalog",
-                )
+                raise _absent(self.place)
             self._create()
         with self._writing.begin() as connection:
             found = properties(connection)
@@ -183,13 +184,8 @@ class PostgresDatabase(Database):
             given[name] = last.last_value if last.is_called else 0
         return given
 
-    def settings(self, connection: Connection) -> list[tuple[str, Any, Any]]:
-        wrong = []
-        for name in ("fsync", "full_page_writes"):
-            found = connection.execute(text(f"SHOW {name}")).scalar()
-            if found != "on":
-                wrong.append((name, found, "on"))
-        return wrong
+    def settings(self, connection: Connection) -> list[tuple[str, Any, Any]]:  # noqa: ARG002 - those of the server
+        return []
 
     def size_bytes(self, connection: Connection) -> int:
         sizes = [
@@ -197,6 +193,33 @@ class PostgresDatabase(Database):
             for name in (*METADATA.tables, _PROPERTIES.name)
         ]
         return sum(sizes)
+
+
+def migrate_server(
+    place: CatalogPlace, clock: Clock, run_steps: Callable[[Connection, int], None], busy_timeout_s: float
+) -> tuple[int, int]:
+    """Migrate a catalog to the version of this program in one transaction; return the versions before and after."""
+    engine = _engine(place, busy_timeout_s)
+    try:
+        with server_errors(place, busy_timeout_s), engine.begin() as connection:
+            if not _has_tables(connection):
+                raise _absent(place)
+            lock_catalog(connection)
+            before = _version(properties(connection), place)
+            if before < SCHEMA_VERSION:
+                run_steps(connection, before)
+                set_property(connection, "version", str(SCHEMA_VERSION))
+                audit.append(connection, clock, audit.Action.MIGRATED, before=before, after=SCHEMA_VERSION)
+        return before, SCHEMA_VERSION
+    finally:
+        engine.dispose()
+
+
+def _absent(place: CatalogPlace) -> CatalogError:
+    return CatalogError(
+        f"the database {place} has no catalog",
+        next_step="check catalog.url, or enroll an object to create the catalog",
+    )
 
 
 def lock_catalog(connection: Connection, enrollment_id: int | None = None) -> None:
@@ -221,7 +244,10 @@ def set_property(connection: Connection, key: str, value: str) -> None:
 
 
 def _has_tables(connection: Connection) -> bool:
-    return connection.execute(text("SELECT to_regclass('catalog_properties')")).scalar() is not None
+    # to_regclass may answer from a cache of the session
+    here = "relnamespace = CAST(current_schema() AS regnamespace)"
+    found = f"SELECT count(*) FROM pg_class WHERE relname = :name AND {here}"
+    return bool(connection.execute(text(found), {"name": _PROPERTIES.name}).scalar())
 
 
 def _version(found: dict[str, str], place: CatalogPlace) -> int:

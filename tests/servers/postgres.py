@@ -8,7 +8,7 @@ import signal
 import subprocess
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -38,14 +38,13 @@ def missing() -> str | None:
     if programs() is None:
         return "PostgreSQL is not installed (apt-get install postgresql)"
     if os.geteuid() == 0 and _account() is None:
-        return "PostgreSQL does not run as root, and there is no account 'postgres' or 'nobody'"
+        return "PostgreSQL does not run as root, and there is no account 'postgres'"
     return None
 
 
 def _account() -> pwd.struct_passwd | None:
-    for name in ("postgres", "nobody"):
-        with suppress(KeyError):
-            return pwd.getpwnam(name)
+    with suppress(KeyError):
+        return pwd.getpwnam("postgres")  # Debian's package makes it
     return None
 
 
@@ -148,9 +147,10 @@ def use_postgres() -> None:
 
     copy_folder = shutil.copytree
 
-    def copytree(source: Any, target: Any, **options: Any) -> Any:
-        copied = copy_folder(source, target, **options)
-        _copy_schema(url, Path(source), Path(target))
+    def copytree(source: Any, target: Any, *others: Any, **options: Any) -> Any:  # shutil calls it for each folder
+        copied = copy_folder(source, target, *others, **options)
+        if not isinstance(source, os.DirEntry) and Path(source, "catalog-id").exists():
+            _copy_schema(url, Path(source), Path(target))
         return copied
 
     CatalogPlace.of = classmethod(of)  # type: ignore[method-assign,assignment]
@@ -169,9 +169,8 @@ def _copy_schema(url: str, source: Path, target: Path) -> None:
     schema = str(before.url).rpartition("%3D")[2]
     (target / "catalog-id").unlink(missing_ok=True)
     made = PostgresDatabase(place, create=True, read_only=False, busy_timeout_s=5.0)
-    with made._writing.begin() as connection:
+    with closing(made), made._writing.begin() as connection:
         if connection.execute(text(f"SELECT to_regclass('{schema}.objects')")).scalar() is None:
-            made.close()
             return
         connection.execute(text("DELETE FROM catalog_properties"))
         for table in ("catalog_properties", *(table.name for table in METADATA.sorted_tables)):
@@ -182,4 +181,3 @@ def _copy_schema(url: str, source: Path, target: Path) -> None:
             )
         mark = connection.execute(text("SELECT value FROM catalog_properties WHERE key = 'id'")).scalar_one()
     (target / "catalog-id").write_text(str(mark))
-    made.close()

@@ -153,13 +153,55 @@ def migrate(settings: Settings) -> None:
     from rig.catalog import migrate as job
     from rig.core.clock import SystemClock
 
-    path = settings.load().catalog_path(settings.bench_name)
+    path = settings.load().catalog_place(settings.bench_name)
     done = job(path, clock=SystemClock())
     text = f"{path} is up to date, version {done.after}."
     if done.backup is not None:
         text = f"Migrated {path} from version {done.before} to {done.after}. Backup: {done.backup}"
     backup = None if done.backup is None else str(done.backup)
     settings.say(text, {"catalog": str(path), "before": done.before, "after": done.after, "backup": backup})
+
+
+@app.command("copy")
+@command
+def copy(
+    settings: Settings,
+    source: Annotated[str, typer.Argument(metavar="FROM", help="Folder or database URL of the catalog.")],
+    target: Annotated[str, typer.Argument(metavar="TO", help="Folder or database URL; a new or an empty catalog.")],
+    images: Annotated[
+        str | None,
+        typer.Option(metavar="PLACE", help="Folder or store of the images of a database. Default: catalog.images."),
+    ] = None,
+) -> None:
+    """Copy a whole catalog, for example from this computer to a server, and compare all digests.
+
+    Example: rig catalog copy ~/catalog postgresql+psycopg://rig@server/rig --images s3://rig/catalog
+    """
+    from rig.catalog import Catalog
+    from rig.catalog.copying import copy_catalog
+    from rig.config.catalog_place import CatalogPlace
+    from rig.core.clock import SystemClock
+    from rig.events.wording import counted
+
+    def place(text: str) -> CatalogPlace:
+        if "://" not in text:
+            return CatalogPlace(Path(text))
+        config = settings.load()
+        return CatalogPlace(config.catalog_path(settings.bench_name), text, images or config.catalog.images)
+
+    clock = SystemClock()
+    with (
+        Catalog.open(place(source), clock=clock, create=False, read_only=True) as before,
+        Catalog.open(place(target), clock=clock, create=True) as after,
+    ):
+        interrupted = "Interrupted; the copy is empty. The same command continues with the images."
+        done = run_job("copying", copy_catalog(before, after), interrupted=interrupted)
+        words = (
+            f"Copied {counted(done.objects, 'object')} with {counted(done.views, 'view')}, "
+            f"{counted(done.results, 'result')} and {size_words(done.image_bytes)} of images from {before.place} to "
+            f"{after.place}. All digests are equal."
+        )
+    settings.say(words, done._asdict())
 
 
 @command

@@ -17,6 +17,8 @@ from rig.core.errors import CatalogDamaged, RigError
 from sim.clock import VirtualClock
 from tests.rig.catalog.catalog_samples import PROVENANCE, described, image, plan, true_fill, without_waiting
 
+pytestmark = pytest.mark.sqlite
+
 
 @pytest.fixture(scope="module")
 def sample(tmp_path_factory: pytest.TempPathFactory) -> Path:

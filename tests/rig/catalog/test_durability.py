@@ -94,6 +94,7 @@ def test_image_is_durable_before_its_row(tmp_path: Path, monkeypatch: pytest.Mon
     assert steps == ["sync 000.png.part", "rename 000.png.part 000.png", f"sync {enrollment.folder.name}", "commit"]
 
 
+@pytest.mark.sqlite
 def test_database_commits_durably_and_checks_foreign_keys(tmp_path: Path) -> None:
     database = SqliteDatabase(CatalogPlace(tmp_path), create=True, read_only=False, busy_timeout_s=1.0)
     with database.write() as connection:
@@ -131,6 +132,7 @@ def test_full_disk_loses_only_the_present_view(
         enrollment.finish()
 
 
+@pytest.mark.sqlite
 def test_database_that_cannot_grow_is_reported_as_full_disk(tmp_path: Path) -> None:
     with Catalog.open(tmp_path, clock=VirtualClock()) as catalog:
         enrollment = begin(catalog, "mug", 1)
@@ -150,6 +152,7 @@ def test_begin_fails_if_the_folder_cannot_be_created(tmp_path: Path) -> None:
         assert catalog.objects() == []
 
 
+@pytest.mark.sqlite
 def test_second_writer_gets_busy_error_after_the_timeout(tmp_path: Path) -> None:
     with Catalog.open(tmp_path, clock=VirtualClock(), busy_timeout_s=0.02) as catalog:
         fill(catalog, "tin", 1)

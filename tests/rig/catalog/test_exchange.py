@@ -121,7 +121,7 @@ def run_import(catalog: Catalog, batch: ImportBatch, conflict: Conflict = Confli
 
 def untouched(catalog: Catalog) -> bool:
     """Return whether nothing was imported."""
-    left = [path for path in catalog.path.rglob("*") if path.is_file() and not path.name.startswith("catalog.sqlite")]
+    left = [path for path in catalog.path.rglob("*") if path.is_file() and not path.name.startswith("catalog")]
     return catalog.objects() == [] and left == [] and catalog.log() == []
 
 

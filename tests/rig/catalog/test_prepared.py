@@ -186,6 +186,7 @@ def test_a_file_in_the_place_of_the_folder_is_left_alone(path: Path) -> None:
     assert (path / "prepared").read_text() == "mine"
 
 
+@pytest.mark.sqlite
 def test_damage_of_the_database_is_found_before_its_rows_are_prepared(path: Path) -> None:
     with closing(sqlite3.connect(path / "catalog.sqlite")) as connection, connection:
         connection.execute("UPDATE views SET azimuth_deg = 1.5 WHERE id = 9")
@@ -193,6 +194,7 @@ def test_damage_of_the_database_is_found_before_its_rows_are_prepared(path: Path
         load(catalog)
 
 
+@pytest.mark.sqlite
 def test_a_damaged_name_is_found_at_every_start(path: Path) -> None:
     with opened(path) as catalog:
         load(catalog)

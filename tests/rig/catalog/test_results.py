@@ -164,6 +164,7 @@ def deleted_last(connection: sqlite3.Connection) -> None:
 
 
 @pytest.mark.parametrize(("spoil", "row"), [(changed, 1), (deleted_first, 2), (deleted_last, 1)])
+@pytest.mark.sqlite
 def test_rows_cannot_change_and_verify_finds_a_change_without_triggers(
     catalog: Catalog, spoil: Callable[[sqlite3.Connection], None], row: int
 ) -> None:

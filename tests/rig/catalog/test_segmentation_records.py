@@ -121,6 +121,7 @@ def test_bundle_and_merge_keep_segmentation_and_empty_table(
         assert np.array_equal(before, catalog.views(BENCH_DESCRIPTOR).views.descriptors)
 
 
+@pytest.mark.sqlite
 def test_damaged_empty_table_image_is_found_and_not_used(
     open_catalog: Callable[[str], Catalog],
 ) -> None:

@@ -150,6 +150,7 @@ class TestEdit:
 
 
 class TestLog:
+    @pytest.mark.sqlite
     def test_log_has_action_user_and_time_and_rejects_changes(self, catalog: Catalog, clock: VirtualClock) -> None:
         begun = clock.utc()
         with pytest.raises(ObjectNotFound):
@@ -285,6 +286,7 @@ class TestVerify:
         for quick in (True, False):
             assert problems(finished(verify(catalog, quick=quick))) == [Problem.CHANGED_IMAGE]
 
+    @pytest.mark.sqlite
     def test_wrong_descriptor_is_computed_again(self, catalog: Catalog) -> None:
         sql(catalog, "UPDATE descriptors SET packed = zeroblob(54) WHERE view_id IN (2, 5)")
         found = finished(verify(catalog))
@@ -292,6 +294,7 @@ class TestVerify:
         assert [finding.object_name for finding in found.findings] == ["mug", "tin"] * 2
         assert len(self.repaired(catalog)) == 2
 
+    @pytest.mark.sqlite
     def test_view_without_descriptor_is_described_within_its_region(self, catalog: Catalog) -> None:
         before = catalog.views().views.descriptors
         sql(catalog, "DELETE FROM descriptors WHERE view_id = 4")
@@ -306,6 +309,7 @@ class TestVerify:
             seal_enrollments(connection, None)
         assert np.array_equal(catalog.views().views.descriptors, before)
 
+    @pytest.mark.sqlite
     def test_orphaned_rows_are_recorded_in_the_log(self, catalog: Catalog) -> None:
         sql(catalog, "DELETE FROM enrollments WHERE id = 2")
         assert set(problems(finished(verify(catalog)))) == {Problem.ORPHANED_ROW}
@@ -412,6 +416,7 @@ class TestRedescribe:
             catalog.views("cedd-blurred")
 
 
+@pytest.mark.sqlite
 def test_unknown_settings_are_reported(catalog: Catalog) -> None:
     true_fill(catalog, "mug", 1, 0)
     sql(catalog, """UPDATE descriptors SET settings = '{"lens": "fish"}'""")

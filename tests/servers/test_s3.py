@@ -1,0 +1,170 @@
+"""Images in S3, against a real server process (moto), and copies of catalogs between engines and stores."""
+
+import os
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import suppress
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rig.catalog import Catalog
+from rig.catalog.copying import copy_catalog
+from rig.catalog.edit import delete
+from rig.catalog.exchange import Conflict, import_objects, plan_import
+from rig.catalog.exchange.catalog_reader import read_catalog
+from rig.catalog.results import record as record_result
+from rig.catalog.upkeep import collect_garbage
+from rig.catalog.verify import Problem, Repair, verify
+from rig.config.catalog_place import CatalogPlace
+from rig.core.errors import CatalogError, CatalogUnavailable
+from sim.clock import VirtualClock
+from tests.rig.catalog.catalog_samples import finished, image, new_result, true_fill
+from tests.servers.postgres import PostgresServer, place_in, server
+
+
+@pytest.fixture(scope="module")
+def postgres() -> Iterator[PostgresServer]:
+    with server() as running:
+        yield running
+
+
+class S3Server:
+    """A server of S3 with one bucket."""
+
+    def __init__(self) -> None:
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            self.port = free.getsockname()[1]
+        self.process: subprocess.Popen[bytes] | None = None
+        self.start()
+
+    def start(self) -> None:
+        command = [sys.executable, "-m", "moto.server", "-H", "127.0.0.1", "-p", str(self.port)]
+        self.process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        for _ in range(600):
+            with suppress(OSError), socket.create_connection(("127.0.0.1", self.port), 1):
+                return
+            with suppress(subprocess.TimeoutExpired):
+                self.process.wait(0.1)
+        raise AssertionError("the S3 server did not start")
+
+    def stop(self) -> None:
+        if self.process is not None:
+            self.process.kill()
+            self.process.wait()
+            self.process = None
+
+
+@pytest.fixture(scope="module")
+def s3() -> Iterator[S3Server]:
+    if any(find_spec(name) is None for name in ("moto", "flask", "s3fs")):
+        pytest.skip("moto's server and s3fs are not installed (make test-servers)")
+    running = S3Server()
+    values = {
+        "AWS_ENDPOINT_URL": f"http://127.0.0.1:{running.port}",
+        "AWS_ACCESS_KEY_ID": "test",
+        "AWS_SECRET_ACCESS_KEY": "test",
+        "AWS_DEFAULT_REGION": "us-east-1",
+    }
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in values.items():
+            patch.setenv(name, value)
+        import s3fs
+
+        s3fs.S3FileSystem().mkdir("rig")
+        yield running
+    running.stop()
+
+
+def in_s3(postgres: PostgresServer, folder: Path) -> CatalogPlace:
+    return place_in(postgres.url, folder, f"s3://rig/{folder.parent.name}/{folder.name}")
+
+
+def opened(place: CatalogPlace | Path, **options: bool) -> Catalog:
+    return Catalog.open(place, clock=VirtualClock(), **options)
+
+
+def test_catalog_with_images_in_s3_does_everything(postgres: PostgresServer, s3: S3Server, tmp_path: Path) -> None:
+    place = in_s3(postgres, tmp_path / "shared")
+    with opened(place) as catalog:
+        true_fill(catalog, "mug", 2, 0)
+        true_fill(catalog, "tin", 2, 10)
+        record_result(catalog, new_result(), image(1))
+        (first, second) = catalog.object("mug").views
+        assert np.array_equal(catalog.read_image(second), image(1))
+        assert catalog.image_path(first).is_relative_to(tmp_path)
+        assert finished(verify(catalog)).findings == ()
+        # Damage: one image is lost, one is swapped for another; a copy of the first lies under another name.
+        store = catalog.database.images
+        content = store.read(first.image)
+        store.write("images/left/000.png", content)
+        store.remove([first.image])
+        with pytest.raises(CatalogError, match="missing"):
+            catalog.read_image(first)
+        found = finished(verify(catalog, repair=True)).findings
+        assert [(one.problem, one.repair) for one in found] == [
+            (Problem.MISSING_IMAGE, Repair.RESTORED),
+            (Problem.ORPHANED_FILE, Repair.MOVED),
+        ]
+        assert finished(verify(catalog)).findings == ()
+        delete(catalog, "tin")
+        removed = collect_garbage(catalog)
+        assert (removed.objects, removed.views, removed.files) == (("tin",), 2, 3)
+        assert finished(verify(catalog)).findings == ()
+        assert store.lost() == set()
+    with pytest.raises(CatalogError, match=r"images of the catalog .* are not in"):
+        opened(CatalogPlace(tmp_path / "other", place.url, "s3://rig/elsewhere"))
+
+
+def test_objects_are_imported_into_s3(postgres: PostgresServer, s3: S3Server, tmp_path: Path) -> None:
+    with opened(tmp_path / "local") as local, opened(in_s3(postgres, tmp_path / "shared")) as catalog:
+        true_fill(local, "mug", 2, 0)
+        batch = read_catalog(local)
+        finished(import_objects(catalog, plan_import(catalog, batch, Conflict.REJECT), jobs=1))
+        assert catalog.views().views.object_names == ("mug",)
+        assert finished(verify(catalog, jobs=1)).findings == ()
+
+
+def test_copies_in_both_directions_are_equal(postgres: PostgresServer, s3: S3Server, tmp_path: Path) -> None:
+    with opened(tmp_path / "local") as local, opened(in_s3(postgres, tmp_path / "shared")) as shared:
+        true_fill(local, "mug", 2, 0)
+        true_fill(local, "gone", 1, 5)
+        delete(local, "gone")
+        collect_garbage(local)
+        true_fill(local, "tin", 2, 10)
+        local.begin(
+            "half", planned_azimuth_deg=[0.0], provenance=local.object("mug").enrollments[0].sessions[0].provenance
+        )
+        record_result(local, new_result(), image(1))
+        done = finished(copy_catalog(local, shared))
+        assert (done.objects, done.views, done.results, done.images) == (3, 4, 1, 5)
+        assert shared.version() == local.version()
+        assert finished(verify(shared, jobs=1)).findings == ()
+        with pytest.raises(CatalogError, match="not empty"):
+            finished(copy_catalog(local, shared))
+        with opened(tmp_path / "back") as back:
+            finished(copy_catalog(shared, back))
+            assert back.version() == local.version()
+            assert finished(verify(back, jobs=1)).findings == ()
+            assert [entry.action for entry in back.log()][-2:] == ["copied", "copied"]
+            ids = {name: back.object(name).enrollments[0].id for name in ("mug", "tin")}
+            assert ids == {name: local.object(name).enrollments[0].id for name in ("mug", "tin")}
+            true_fill(back, "new", 1, 20)
+            true_fill(shared, "new", 1, 20)
+            assert back.object("new").enrollments[0].id == shared.object("new").enrollments[0].id == 5
+
+
+def test_store_that_does_not_answer_is_reported(postgres: PostgresServer, s3: S3Server, tmp_path: Path) -> None:
+    with opened(in_s3(postgres, tmp_path / "shared")) as catalog:
+        true_fill(catalog, "mug", 1, 0)
+        endpoint = os.environ["AWS_ENDPOINT_URL"]
+        s3.stop()
+        with pytest.raises(CatalogUnavailable, match="cannot be reached") as error:
+            catalog.read_image(catalog.object("mug").views[0])
+        assert endpoint in str(error.value.evidence)
+        assert catalog.views().views.object_names == ("mug",)
