@@ -39,6 +39,10 @@ _FOCUS_RANGE = (0, 255)
 _SHARP_AT = 120
 _FOCUS_STEP = 15  # by which the autofocus moves the lens between two measurements
 _SHARPNESS_RANGE = (0, 255)
+MODES = tuple(
+    v4l2.VideoMode(fourcc, WIDTH // n, HEIGHT // n, float(FPS)) for fourcc in ("MJPG", "YUYV") for n in (1, 2)
+)
+"""The modes that it offers; MJPG has no errors of compression."""
 _NO_CONTROLS = (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT, cv2.CAP_PROP_FPS, cv2.CAP_PROP_POS_MSEC)
 """What OpenCV answers without asking the camera."""
 _BUFFERS_RANGE = (1, 10)
@@ -103,6 +107,9 @@ class SimCapture:
         The errors of its time.
     stamp_shift_ns
         By how much the time stamps have jumped, of a fault.
+    lamp
+        Frequency in Hz and depth of the light's flicker, which leaves bands because rows are read out one after the
+        other; None for a steady light.
     backdrop
         Wall, table and platter without an object, uint8 (480, 640, 3).
     filters
@@ -116,10 +123,12 @@ class SimCapture:
         self.hangs = False
         self.orbits = False
         self.blur_px = 0.0
+        self.lamp: tuple[float, float] | None = None
         self.filters: list[Callable[[Image, int], Image]] = []
         self._world = world
         self._clock = world.clock
         self._binning = 1
+        self._fourcc = MODES[0].fourcc
         self._noise = world.noise
         self.times = FrameTimes(world)
         self.stamp_shift_ns = 0
@@ -175,6 +184,10 @@ class SimCapture:
         self._change(self._clock.now_ns(), replace(self._controls[-1][1], **values))
 
     # -- interface of cv2.VideoCapture --------------------------------------------------------------------------------
+
+    def modes(self) -> tuple[v4l2.VideoMode, ...]:
+        """Return the modes that the camera offers."""
+        return MODES
 
     def isOpened(self) -> bool:  # noqa: N802
         return self._open
@@ -237,6 +250,7 @@ class SimCapture:
             cv2.CAP_PROP_FRAME_WIDTH: WIDTH // self._binning,
             cv2.CAP_PROP_FRAME_HEIGHT: HEIGHT // self._binning,
             cv2.CAP_PROP_FPS: FPS,
+            cv2.CAP_PROP_FOURCC: v4l2.fourcc_number(self._fourcc),
             cv2.CAP_PROP_POS_MSEC: 0.0 if self._grabbed is None else self._stamp_ns(self._grabbed) * 1e-6,
             cv2.CAP_PROP_BUFFERSIZE: now.buffers,
             cv2.CAP_PROP_AUTO_EXPOSURE: V4L2_EXPOSURE_APERTURE_PRIORITY if now.auto_exposure else V4L2_EXPOSURE_MANUAL,
@@ -260,6 +274,8 @@ class SimCapture:
         self._meter()
         now = self._controls[-1][1]
         match prop:
+            case cv2.CAP_PROP_FOURCC if value in {v4l2.fourcc_number(mode.fourcc) for mode in MODES}:
+                self._fourcc = int(value).to_bytes(4, "little").decode("ascii")
             case cv2.CAP_PROP_FRAME_WIDTH if value in (WIDTH, WIDTH // 2):
                 self._binning = round(WIDTH / value)
             case cv2.CAP_PROP_FRAME_WIDTH | cv2.CAP_PROP_FRAME_HEIGHT | cv2.CAP_PROP_FPS:
@@ -347,6 +363,8 @@ class SimCapture:
         blur = max(abs(controls.focus - _SHARP_AT) * 0.04, self.blur_px)
         if blur > 0.1:
             seen = np.asarray(cv2.GaussianBlur(seen, (0, 0), blur), dtype=np.float32)
+        if self.lamp is not None:
+            seen = np.asarray(seen * _bands(*self.lamp, start, _exposure_ns(controls)), dtype=np.float32)
         return _sensor(self._noise, self._world.seed, self._binning, get_ident()).expose(
             seen,
             light=scene.light,
@@ -454,3 +472,11 @@ def _exposure_ns(controls: Controls) -> int:
 def _within(value: float, limits: tuple[int, int]) -> int:
     """Return ``value`` as V4L2 takes it: a whole number, brought into the range."""
     return int(min(max(int(value), limits[0]), limits[1]))
+
+
+def _bands(hz: float, depth: float, start: int, exposure: int) -> NDArray[np.float32]:
+    """Return the light that each row receives from a flickering lamp during its exposure, (HEIGHT, 1, 1)."""
+    begins_s = start * 1e-9 + np.arange(HEIGHT) / HEIGHT * READOUT_NS * 1e-9
+    middle_s = begins_s + exposure * 0.5e-9
+    light = 1 + depth * np.sinc(hz * exposure * 1e-9) * np.cos(2 * np.pi * hz * middle_s)
+    return light.astype(np.float32)[:, None, None]

@@ -211,7 +211,7 @@ class Computer:
             status = self._at(path).stat()
         except OSError:
             return None
-        return status.st_dev, status.st_ino, status.st_rdev
+        return status.st_dev, status.st_ino, status.st_rdev, status.st_ctime_ns
 
     def same_file(self, one: str, other: str) -> bool:
         """Return whether two paths, which may be links, are the same device."""

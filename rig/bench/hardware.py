@@ -157,7 +157,7 @@ def assemble(
             if config.camera.focus is None:
                 store_focus(state, device, camera.read_locks().focus)
             bench.findings += tuple(
-                f"camera: {n.setting} was set to {n.asked:g}, but the camera reports {n.reported:g}"
+                f"camera: {n.setting} was set to {n.asked_text}, but the camera reports {n.reported_text}"
                 for n in camera.rejected_settings
             )
             return camera

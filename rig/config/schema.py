@@ -241,6 +241,12 @@ class CameraConfig(Section):
     width: int = Field(640, ge=80, le=8000, description="pixels")
     height: int = Field(480, ge=80, le=8000, description="pixels")
     fps: float = Field(30.0, ge=0.1, le=500, description="frames per second")
+    fourcc: str | None = Field(
+        None,
+        pattern="^[A-Z0-9]{4}$",
+        description="pixel format, e.g. YUYV or MJPG; none: an uncompressed one if the camera is fast enough with it, "
+        "else MJPG",
+    )
     exposure_us: float | None = Field(
         10_000.0,
         ge=1,

@@ -23,7 +23,8 @@ from rig.core.clock import Clock, seconds_between
 from rig.core.errors import DeviceFault, DeviceMismatch, DeviceNotFound, DeviceSilent
 from rig.devices import v4l2
 from rig.devices.camera import CameraIdentity, CameraLocks, Frame
-from rig.devices.opencv_capture import Capture
+from rig.devices.opencv_capture import Capture, modes_of
+from rig.devices.v4l2 import choose_mode
 
 V4L2_EXPOSURE_MANUAL = 1
 _V4L2_EXPOSURE_AUTO = (0, 3)  # fully automatic, and aperture priority: the camera sets the time
@@ -52,6 +53,7 @@ class TimeBase(Enum):
 class CameraSettings:
     """Requested settings; None leaves a setting to the camera, but a focus is pinned where the autofocus settles.
 
+    Without ``fourcc``, the pixel format is chosen from what the camera offers (`rig.devices.v4l2.choose_mode`).
     ``gain``, ``focus``, ``sharpness`` and ``backlight_compensation`` are in the camera's own units, as `v4l2-ctl
     --list-ctrls` shows them; ``power_line_frequency`` is the number in its menu.
     """
@@ -67,6 +69,7 @@ class CameraSettings:
     backlight_compensation: float | None = None
     power_line_frequency: float | None = None
     dynamic_frame_rate: bool | None = False
+    fourcc: str | None = None
 
     def __post_init__(self) -> None:
         for name in ("width", "height", "fps", "exposure_us", "white_balance_k"):
@@ -82,6 +85,23 @@ class RejectedSetting:
     setting: str
     asked: float
     reported: float
+
+    @property
+    def asked_text(self) -> str:
+        """The requested value as text."""
+        return _value_text(self.setting, self.asked)
+
+    @property
+    def reported_text(self) -> str:
+        """The reported value as text."""
+        return _value_text(self.setting, self.reported)
+
+
+def _value_text(setting: str, value: float) -> str:
+    if setting != "fourcc":
+        return f"{value:g}"
+    letters = max(round(value), 0).to_bytes(8, "little").rstrip(b"\0").decode("ascii", "replace")
+    return letters if letters.isprintable() and letters else "unknown"
 
 
 class OpenCvCamera:
@@ -108,6 +128,11 @@ class OpenCvCamera:
         Returns what identifies the device file now, None if it is missing. Another value than at the opening means that
         the camera was unplugged: `cv2.VideoCapture.isOpened` stays True on V4L2.
 
+    Attributes
+    ----------
+    modes
+        The modes that the camera offers; empty if they are not known.
+
     Raises
     ------
     DeviceSilent
@@ -133,6 +158,7 @@ class OpenCvCamera:
         self._node_opened = node()
         self._settings = settings or CameraSettings()
         self._missing = capture.get(_UNKNOWN_PROPERTY)
+        self.modes = modes_of(capture)
         self.returns = 0
         self._clock = clock
         self._timeout_s = timeout_s
@@ -222,6 +248,8 @@ class OpenCvCamera:
                 if self._capture.set(prop, value):
                     self._supported.add(prop)
 
+        if (fourcc := self._pixel_format(settings)) is not None:  # before the size: it selects the sizes
+            ask("fourcc", cv2.CAP_PROP_FOURCC, v4l2.fourcc_number(fourcc))
         ask("width", cv2.CAP_PROP_FRAME_WIDTH, settings.width)
         ask("height", cv2.CAP_PROP_FRAME_HEIGHT, settings.height)
         ask("fps", cv2.CAP_PROP_FPS, settings.fps)
@@ -243,8 +271,15 @@ class OpenCvCamera:
         return tuple(
             RejectedSetting(name, value, reported)
             for name, prop, value, reported in read_back
-            if prop not in self._supported or abs(reported - value) > 0.01 * abs(value)
+            if prop not in self._supported or abs(reported - value) > (0.01 * abs(value) if name != "fourcc" else 0)
         )
+
+    def _pixel_format(self, settings: CameraSettings) -> str | None:
+        """Return the pixel format to request; None leaves it to the camera."""
+        if settings.fourcc is not None or settings.width is None or settings.height is None:
+            return settings.fourcc
+        mode = choose_mode(self.modes, settings.width, settings.height, settings.fps or 0.0)
+        return None if mode is None else mode.fourcc
 
     def _known(self, prop: int) -> float | None:
         """Return a property; None if the camera lacks it: -1 on V4L2, where 0 is a true 0; else 0 if it was not set."""

@@ -40,10 +40,20 @@ class V4l2Capture:
         value = v4l2.get_control(self._path, propId)
         return -1.0 if value is None else float(value)
 
+    def modes(self) -> tuple[v4l2.VideoMode, ...]:
+        """Return the modes that the camera offers."""
+        return v4l2.modes(self._path)
+
     def set(self, propId: int, value: float, /) -> bool:
         if propId < v4l2.FIRST_CONTROL:
             return self._capture.set(propId, value)
         return v4l2.set_control(self._path, propId, round(value))
+
+
+def modes_of(capture: Capture) -> tuple[v4l2.VideoMode, ...]:
+    """Return the modes that a source offers; empty for a file or a stream."""
+    modes: tuple[v4l2.VideoMode, ...] = capture.modes() if hasattr(capture, "modes") else ()
+    return modes
 
 
 def open_capture(source: int | str | Path) -> Capture:

@@ -2,6 +2,8 @@
 
 import os
 import struct
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
 from fcntl import ioctl
 from pathlib import Path
 
@@ -16,6 +18,12 @@ FIRST_CONTROL = 0x0098_0000
 """Numbers of controls are above all property numbers of OpenCV."""
 
 _QUERYCAP = 0x8068_5600
+_ENUM_FMT, _ENUM_FRAMESIZES, _ENUM_FRAMEINTERVALS = 0xC040_5602, 0xC02C_564A, 0xC034_564B
+_FORMAT = struct.Struct("III32s4s4I")  # index, type, flags, description, pixel format, mbus code, reserved
+_SIZE = struct.Struct("I4sI6I2I")  # index, pixel format, type, then width and height, or ranges with steps; reserved
+_INTERVAL = struct.Struct("I4sIII6I2I")  # index, pixel format, width, height, type, fractions of a second; reserved
+_VIDEO_CAPTURE, _DISCRETE = 1, 1
+_MOST_ENTRIES = 64
 _G_CTRL, _S_CTRL = 0xC008_561B, 0xC008_561C
 _CONTROL = struct.Struct("Ii")
 _CAPABILITY = struct.Struct("16s32s32s6I")  # driver, card, bus; version, capabilities of the driver and of this node
@@ -33,6 +41,91 @@ def capabilities(path: Path) -> int | None:
 def captures(caps: int) -> bool:
     """Return whether a device with these capabilities delivers images; a converter (memory to memory) does not."""
     return bool(caps & (CAPTURE | CAPTURE_MPLANE)) and not caps & (M2M | M2M_MPLANE)
+
+
+@dataclass(frozen=True, slots=True)
+class VideoMode:
+    """A mode that a camera offers: pixel format (FourCC), size in pixels, and highest frame rate."""
+
+    fourcc: str
+    width: int
+    height: int
+    fps: float
+
+    def __str__(self) -> str:
+        return f"{self.width}x{self.height} at {self.fps:.3g} frames/s ({self.fourcc})"
+
+
+UNCOMPRESSED = ("YUYV", "UYVY", "NV12", "NV21", "YU12", "YV12", "BGR3", "RGB3")
+COMPRESSED = ("MJPG", "JPEG")
+"""Pixel formats that OpenCV converts to colour images; JPEG adds its own errors."""
+
+
+def modes(path: Path) -> tuple[VideoMode, ...]:
+    """Return the modes with pixel formats that OpenCV converts; empty if the device does not list them.
+
+    A size that is a range (stepwise) counts as its largest one.
+    """
+    found = []
+    for fourcc in _entries(path, _ENUM_FMT, lambda i: _FORMAT.pack(i, _VIDEO_CAPTURE, 0, b"", b"", 0, 0, 0, 0)):
+        code = _FORMAT.unpack(fourcc)[4]
+        if code.decode("ascii", "replace") not in UNCOMPRESSED + COMPRESSED:
+            continue
+        for size in _entries(path, _ENUM_FRAMESIZES, lambda i, code=code: _SIZE.pack(i, code, *(0,) * 9)):  # type: ignore[misc]
+            kind, *numbers = _SIZE.unpack(size)[2:]
+            width, height = (numbers[0], numbers[1]) if kind == _DISCRETE else (numbers[1], numbers[4])
+            rates = [
+                _rate(interval)
+                for interval in _entries(
+                    path,
+                    _ENUM_FRAMEINTERVALS,
+                    lambda i, code=code, at=(width, height): _INTERVAL.pack(i, code, *at, *(0,) * 9),  # type: ignore[misc]
+                )
+            ]
+            found.append(VideoMode(code.decode(), width, height, max(rates, default=0.0)))
+    return tuple(found)
+
+
+def choose_mode(
+    offered: Iterable[VideoMode], width: int, height: int, fps: float, fourcc: str | None = None
+) -> VideoMode | None:
+    """Return the best offered mode: first the size that is nearest, then one that is fast enough, then uncompressed.
+
+    Parameters
+    ----------
+    offered
+        The modes of the camera.
+    width, height, fps
+        The wanted mode.
+    fourcc
+        The only pixel format to choose from.
+    """
+
+    def rank(mode: VideoMode) -> tuple[float, bool, bool, float, int]:
+        apart = abs(mode.width - width) + abs(mode.height - height)
+        slow = mode.fps < 0.9 * fps
+        order = (UNCOMPRESSED + COMPRESSED).index(mode.fourcc)
+        return apart, slow, not slow and mode.fourcc in COMPRESSED, -mode.fps if slow else 0.0, order
+
+    known = [mode for mode in offered if mode.fourcc in UNCOMPRESSED + COMPRESSED]
+    return min((mode for mode in known if fourcc in (None, mode.fourcc)), key=rank, default=None)
+
+
+def fourcc_number(fourcc: str) -> int:
+    """Return a pixel format of four letters as a number."""
+    return int.from_bytes(fourcc.encode("ascii"), "little")
+
+
+def _entries(path: Path, request: int, question: Callable[[int], bytes]) -> Iterator[bytes]:
+    for index in range(_MOST_ENTRIES):
+        if (answer := _ask(path, request, question(index))) is None:
+            return
+        yield answer
+
+
+def _rate(interval: bytes) -> float:
+    numerator, denominator = _INTERVAL.unpack(interval)[5:7]  # of a range, the shortest one
+    return float(denominator / numerator) if numerator else 0.0
 
 
 def get_control(path: Path, control: int) -> int | None:

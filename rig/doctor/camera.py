@@ -7,13 +7,16 @@ from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from rig.bench.hardware import camera_settings, store_focus
 from rig.core.clock import seconds_between
 from rig.devices.camera import Camera
 from rig.devices.opencv_camera import OpenCvCamera
+from rig.devices.v4l2 import choose_mode
 from rig.doctor.context import DoctorContext
 from rig.doctor.finding import Finding, FindingCode, bad, fine, warning
+from rig.doctor.flicker import mains_flicker
 from rig.safety.saved_state import FileStore
 from rig.views.capture import ImageQuality, rejection_text
 
@@ -35,6 +38,7 @@ def camera(context: DoctorContext) -> Iterator[Finding]:
         mode = {"name": identity.name, "width": identity.width, "height": identity.height, "fps": identity.fps}
         yield fine("camera", FindingCode.CAMERA, **mode)
         yield fine("camera", FindingCode.TIME_BASE, time_base=source.time_base.value)
+        yield from _mode(context, source)
         yield from _locks(context, source)
         yield from _frames(context, source)
 
@@ -72,11 +76,21 @@ def open_camera(context: DoctorContext, *, refocus: bool = False) -> OpenCvCamer
     return camera
 
 
+def _mode(context: DoctorContext, source: OpenCvCamera) -> Iterator[Finding]:
+    wanted = context.config.camera
+    nearest = choose_mode(source.modes, wanted.width, wanted.height, wanted.fps, wanted.fourcc)
+    if nearest is None:
+        return
+    if (nearest.width, nearest.height) != (wanted.width, wanted.height) or nearest.fps < 0.9 * wanted.fps:
+        size = f"{wanted.width}x{wanted.height} at {wanted.fps:.3g} frames/s"
+        yield warning("camera", FindingCode.MODE_NOT_OFFERED, context.rig("setup"), wanted=size, nearest=nearest)
+
+
 def _locks(context: DoctorContext, source: OpenCvCamera) -> Iterator[Finding]:
     locks = source.read_locks()
     fix = f"v4l2-ctl --list-ctrls-menus -d {context.config.camera.source}"
     for one in source.rejected_settings:
-        found = {"setting": one.setting, "requested": one.asked, "reported": one.reported}
+        found = {"setting": one.setting, "requested": one.asked_text, "reported": one.reported_text}
         yield warning("camera", FindingCode.SETTING_REJECTED, fix, **found)
     wanted = context.config.camera
     not_locked = [
@@ -122,7 +136,8 @@ def _text(value: float | None) -> str | None:
 def _frames(context: DoctorContext, source: Camera) -> Iterator[Finding]:
     clock = context.computer.clock
     again = "Unplug the camera, plug it in again, then: " + context.rig("doctor")
-    frames = []
+    frames: list[NDArray[np.uint8]] = []
+    times_ns = []
     ages = []
     after_ns = start_ns = clock.now_ns()
     rate = 0.0
@@ -130,6 +145,7 @@ def _frames(context: DoctorContext, source: Camera) -> Iterator[Finding]:
         frame = source.capture(after_ns)
         ages.append(seconds_between(frame.exposed_ns, clock.now_ns()))
         frames.append(frame.image_bgr)
+        times_ns.append(frame.exposed_ns)
         if number == QUICK - 1:
             rate = QUICK / max(seconds_between(start_ns, clock.now_ns()), 1e-9)
         after_ns = frame.exposed_ns + (1 if number < QUICK else round(SPACING_S * 1e9))
@@ -150,8 +166,12 @@ def _frames(context: DoctorContext, source: Camera) -> Iterator[Finding]:
         yield warning("camera", FindingCode.FEW_FRAMES, fix, fps=source.identity.fps, **evidence)
     else:
         yield fine("camera", FindingCode.FRAMES, **evidence)
+    rows = np.array([frame.mean(axis=(1, 2)) for frame in frames])
     spread = (max(levels) - min(levels)) / max(levels)
-    if spread > MAX_FLICKER:
+    if (lamp := mains_flicker(rows, np.array(times_ns))) is not None:
+        fix = context.set("camera.exposure_us", f"{lamp.exposure_us(context.config.camera.exposure_us or 1e4):g}")
+        yield warning("camera", FindingCode.MAINS_FLICKER, fix, mains_hz=lamp.mains_hz, depth=lamp.depth)
+    elif spread > MAX_FLICKER:
         fix = "Use a lamp that does not flicker, and keep daylight and shadows away, then: " + context.rig("doctor")
         yield warning("camera", FindingCode.FLICKER, fix, spread=spread, seconds=SPACED * SPACING_S, **evidence)
     quality = asdict(seen[-1])

@@ -10,10 +10,13 @@ import cv2
 import serial
 
 from rig.bench.computer import DeviceFile, SerialPort
+from rig.config import CameraConfig
 from rig.config.toml_file import Key
 from rig.core.errors import DeviceNotFound, RigError
 from rig.devices.head.opening import open_head
 from rig.devices.head.protocol import BAUD
+from rig.devices.opencv_capture import modes_of
+from rig.devices.v4l2 import VideoMode, choose_mode
 from rig.doctor.bus_scan import (
     BAUD_RATES,
     BAUD_RATES_1,
@@ -35,12 +38,13 @@ from rig.doctor.servo import duplicate_id, foreign_bytes
 
 @dataclass(frozen=True, slots=True)
 class FoundCamera:
-    """A camera that opened, and its default mode."""
+    """A camera that opened, its default mode, and the modes that it offers."""
 
     node: DeviceFile
     width: int
     height: int
     fps: float
+    modes: tuple[VideoMode, ...] = ()
 
 
 @dataclass
@@ -196,7 +200,7 @@ class DeviceScan:
                 yield of_error("camera", error)
                 continue
             width, height = (round(capture.get(p)) for p in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
-            found = FoundCamera(node, width, height, capture.get(cv2.CAP_PROP_FPS))
+            found = FoundCamera(node, width, height, capture.get(cv2.CAP_PROP_FPS), modes_of(capture))
             capture.release()
             self.cameras.append(found)
             mode = {"path": node.path, "width": width, "height": height, "fps": found.fps}
@@ -227,6 +231,20 @@ def head_settings(port: SerialPort) -> dict[Key, Any]:
 
 
 def camera_settings(found: FoundCamera) -> dict[Key, Any]:
-    """Return the settings of this camera, by key; its number may change after a restart."""
+    """Return the settings of this camera, by key; its number may change after a restart.
+
+    The mode is the offered one that is nearest to the default. The region of another size is the square in its middle.
+    """
     number = Path(found.node.path).name.removeprefix("video")
-    return {("camera", "source"): found.node.stable or (int(number) if number.isdigit() else found.node.path)}
+    keys: dict[Key, Any] = {
+        ("camera", "source"): found.node.stable or (int(number) if number.isdigit() else found.node.path)
+    }
+    usual = CameraConfig()
+    mode = choose_mode(found.modes, usual.width, usual.height, usual.fps)
+    if mode is not None and (mode.width, mode.height) != (usual.width, usual.height):
+        side = min(mode.width, mode.height)
+        keys |= {("camera", "width"): mode.width, ("camera", "height"): mode.height}
+        keys[("view", "roi")] = [(mode.width - side) // 2, (mode.height - side) // 2, side, side]
+    if mode is not None and 0 < mode.fps < 0.9 * usual.fps:
+        keys[("camera", "fps")] = round(mode.fps, 3)
+    return keys

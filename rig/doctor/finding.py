@@ -106,8 +106,9 @@ class FindingCode(Enum):
     TILTED = "its {axis} axis does not point along the table's axis: {along:+.2f} of gravity is along it"
     # camera
     CAMERA = "{name}: {width}x{height} at {fps:.3g} frames/s"
+    MODE_NOT_OFFERED = "the camera does not offer {wanted}; nearest: {nearest}"
     TIME_BASE = "frames timed by {time_base} exposure"
-    SETTING_REJECTED = "{setting}: requested {requested:g}, the camera reports {reported:g}"
+    SETTING_REJECTED = "{setting}: requested {requested}, the camera reports {reported}"
     NOT_LOCKED = "{settings} not locked: views of one object may differ"
     LOCKED = "locked and read back: {settings}"
     BLACK = "black: mean level {mean_level:.1f} of 255"
@@ -115,6 +116,10 @@ class FindingCode(Enum):
     FRAMES = "frames arrive {frame_age_ms:.0f} ms after exposure, {frames_per_s:.3g} a second"
     LATE_FRAMES = "frames arrive {frame_age_ms:.0f} ms after exposure, {frames_per_s:.3g} a second: too old"
     FEW_FRAMES = "frames arrive {frame_age_ms:.0f} ms after exposure, {frames_per_s:.3g} a second, not {fps:.3g}"
+    MAINS_FLICKER = (
+        "the lamps flicker with the mains ({mains_hz:.0f} Hz): bands of {depth:.0%} in the images; an exposure of "
+        "whole periods of the lamp has none"
+    )
     FLICKER = "the light changes by {spread:.0%} within {seconds:.0f} s"
     VIEW_ACCEPTED = (
         "a view would be accepted now: mean level {mean_level:.0f}, sharpness {sharpness:.0f}, {saturated_share:.1%} "

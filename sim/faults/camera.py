@@ -168,3 +168,14 @@ def _light_flicker(devices: SimDevices, values: Values, _rng: np.random.Generato
         world.change(light=steady)
 
     return restore
+
+
+@simulated_fault(
+    "mains_flicker",
+    "The lamps flicker with the mains. Exposures that are not whole periods of the lamp show bands.",
+    hz=Parameter(50.0, "frequency of the mains, Hz", 1, 400),
+    depth=share(0.3, "the light that flickers"),
+)
+def _mains_flicker(devices: SimDevices, values: Values, _rng: np.random.Generator) -> End:
+    devices.camera.lamp = 2 * values["hz"], values["depth"]
+    return lambda: setattr(devices.camera, "lamp", None)

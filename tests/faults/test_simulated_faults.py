@@ -38,8 +38,8 @@ VOCABULARY = {
         "watchdog_trip",
     ),
     *("duplicate_id", "wrong_model", "backlash", "slip", "friction", "jam", "object_falls", "i2c_nack", "i2c_stuck"),
-    *("imu_saturated", "frozen_frame", "black_frame", "blur", "exposure_jump", "light_flicker", "disk_full"),
-    "clock_jump",
+    *("imu_saturated", "frozen_frame", "black_frame", "blur", "exposure_jump", "light_flicker"),
+    *("mains_flicker", "disk_full", "clock_jump"),
     *("lost_frames", "doubled_frame", "stamp_jump", "stamps_backwards", "stamp_jitter"),
 }
 

@@ -339,6 +339,17 @@ def test_all_controls_that_the_camera_has_are_locked(world: World) -> None:
     assert camera.rejected_settings == ()
 
 
+def test_pixel_format_is_chosen_or_configured(world: World) -> None:
+    for settings, fourcc in ((CameraSettings(), "YUYV"), (CameraSettings(fourcc="MJPG"), "MJPG")):
+        capture = SimCapture(world)
+        camera = OpenCvCamera(capture, clock=world.clock, settings=settings)
+        assert capture.get(cv2.CAP_PROP_FOURCC) == cv2.VideoWriter.fourcc(*fourcc)
+        assert camera.rejected_settings == ()
+    camera = OpenCvCamera(SimCapture(world), clock=world.clock, settings=CameraSettings(fourcc="H264"))
+    (rejected,) = camera.rejected_settings
+    assert (rejected.setting, rejected.asked_text, rejected.reported_text) == ("fourcc", "H264", "MJPG")
+
+
 def test_autofocus_is_pinned_where_it_settles(world: World) -> None:
     """A camera wakes with its autofocus on; switched off at once, the lens stays where it happens to be."""
     capture = SimCapture(world)

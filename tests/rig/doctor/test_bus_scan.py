@@ -8,13 +8,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rig.bench.computer import DeviceFile
 from rig.config.imus import imu_kinds
 from rig.core.errors import DeviceNotFound
 from rig.devices.dynamixel.registers import model_numbers
 from rig.devices.open_imu import open_imu
-from rig.devices.v4l2 import CAPTURE, M2M, M2M_MPLANE, capabilities
+from rig.devices.v4l2 import CAPTURE, M2M, M2M_MPLANE, VideoMode, capabilities
 from rig.doctor.bus_scan import BAUD_RATES, BaudScan, scan_imus, scan_servos, without_echoes
-from rig.doctor.device_scan import DeviceScan
+from rig.doctor.device_scan import DeviceScan, FoundCamera, camera_settings
 from rig.doctor.examination import run_checks
 from rig.doctor.finding import FindingCode, Severity
 from sim.faults import Faults
@@ -259,3 +260,25 @@ def test_file_that_is_no_video_device_has_no_capabilities(tmp_path):
     (tmp_path / "video0").write_text("")
     assert capabilities(tmp_path / "video0") is None
     assert capabilities(tmp_path / "video1") is None
+
+
+def test_mode_of_a_camera_is_chosen_from_what_it_offers():
+    node = DeviceFile("/dev/video2", "Cam", None, "video", True, ())
+    at = {"node": node, "width": 1280, "height": 720, "fps": 10.0}
+    hd = (VideoMode("YUYV", 1280, 720, 10.0), VideoMode("MJPG", 1280, 720, 20.0), VideoMode("MJPG", 1920, 1080, 30.0))
+    assert camera_settings(FoundCamera(**at, modes=hd)) == {
+        ("camera", "source"): 2,
+        ("camera", "width"): 1280,
+        ("camera", "height"): 720,
+        ("camera", "fps"): 20.0,
+        ("view", "roi"): [280, 0, 720, 720],
+    }
+    usual = VideoMode("YUYV", 640, 480, 30.0)
+    assert camera_settings(FoundCamera(**at, modes=(*hd, usual))) == {("camera", "source"): 2}
+    assert camera_settings(FoundCamera(**at)) == {("camera", "source"): 2}
+
+
+def test_doctor_names_the_nearest_mode():
+    with unopened("camera.width=1280", "camera.height=720", "view.roi=none") as bench:
+        problems = bench.problems("camera")
+        assert problems[FindingCode.MODE_NOT_OFFERED] == "rig setup --bench sim"

@@ -1,0 +1,95 @@
+"""Modes of a camera, as its driver lists them, and the choice among them."""
+
+import errno
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rig.devices import v4l2
+from rig.devices.v4l2 import COMPRESSED, UNCOMPRESSED, VideoMode, choose_mode
+from tests.fuzzing import examples
+
+C920 = {
+    b"YUYV": {(640, 480): [(1, 30), (1, 15)], (1920, 1080): [(1, 5)]},
+    b"H264": {(1920, 1080): [(1, 30)]},
+    b"MJPG": {(640, 480): [(1, 30)], (1920, 1080): [(1, 30), (1, 24)]},
+}
+
+
+def driver(formats, *, stepwise=False):
+    """Return the ``ioctl`` of a camera driver, after linux/videodev2.h."""
+
+    def answer(_file, request, argument):
+        index = int.from_bytes(argument[:4], "little")
+        number = lambda at: int.from_bytes(argument[at : at + 4], "little")  # noqa: E731
+        words = lambda *values: b"".join(value.to_bytes(4, "little") for value in values)  # noqa: E731
+        try:
+            match request:
+                case 0xC0405602 if number(4) == 1:
+                    return argument[:44] + list(formats)[index] + argument[48:]
+                case 0xC02C564A:
+                    width, height = list(formats[argument[4:8]])[index]
+                    if stepwise:
+                        return argument[:8] + words(2, 16, width, 16, 16, height, 16, 0, 0)
+                    return argument[:8] + words(1, width, height, *(0,) * 6)
+                case 0xC034564B:
+                    numerator, denominator = formats[argument[4:8]][number(8), number(12)][index]
+                    return argument[:16] + words(1, numerator, denominator, *(0,) * 6)
+        except (IndexError, KeyError):
+            pass
+        raise OSError(errno.EINVAL, "no more")
+
+    return answer
+
+
+@pytest.mark.parametrize("stepwise", [False, True])
+def test_modes_are_those_that_opencv_converts(monkeypatch, tmp_path, stepwise):
+    node = tmp_path / "video0"
+    node.touch()
+    monkeypatch.setattr(v4l2, "ioctl", driver(C920, stepwise=stepwise))
+    assert v4l2.modes(node) == (
+        VideoMode("YUYV", 640, 480, 30.0),
+        VideoMode("YUYV", 1920, 1080, 5.0),
+        VideoMode("MJPG", 640, 480, 30.0),
+        VideoMode("MJPG", 1920, 1080, 30.0),
+    )
+    assert v4l2.modes(Path("/nowhere")) == ()
+
+
+def test_uncompressed_is_chosen_where_it_is_fast_enough(monkeypatch, tmp_path):
+    node = tmp_path / "video0"
+    node.touch()
+    monkeypatch.setattr(v4l2, "ioctl", driver(C920))
+    offered = v4l2.modes(node)
+    assert choose_mode(offered, 640, 480, 30).fourcc == "YUYV"
+    assert choose_mode(offered, 1920, 1080, 30).fourcc == "MJPG"
+    assert choose_mode(offered, 1920, 1080, 5).fourcc == "YUYV"
+    assert str(choose_mode(offered, 800, 600, 30, "MJPG")) == "640x480 at 30 frames/s (MJPG)"
+    assert choose_mode((), 640, 480, 30) is None
+    assert choose_mode([VideoMode("H264", 640, 480, 30)], 640, 480, 30) is None
+
+
+modes = st.builds(
+    VideoMode,
+    st.sampled_from((*UNCOMPRESSED, *COMPRESSED, "H264")),
+    st.sampled_from((320, 640, 1280)),
+    st.sampled_from((240, 480, 720)),
+    st.sampled_from((0.0, 5.0, 15.0, 30.0, 60.0)),
+)
+
+
+@examples(30)
+@given(st.lists(modes, max_size=8), st.sampled_from((320, 640, 1000)), st.sampled_from((5.0, 30.0)))
+def test_no_offered_mode_is_better_than_the_chosen_one(offered, width, fps):
+    chosen = choose_mode(offered, width, 480, fps)
+    for mode in offered:
+        if mode.fourcc == "H264":
+            continue
+        assert chosen in offered
+        away, best = (abs(m.width - width) + abs(m.height - 480) for m in (mode, chosen))
+        assert best <= away
+        if best == away and mode.fps >= fps:
+            assert chosen.fps >= 0.9 * fps
+            assert chosen.fourcc in UNCOMPRESSED or mode.fourcc in COMPRESSED

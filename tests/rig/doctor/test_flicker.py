@@ -1,0 +1,54 @@
+"""Lamps that flicker with the mains are named, and the exposure without bands."""
+
+import numpy as np
+import pytest
+
+from rig.doctor.finding import FindingCode
+from rig.doctor.flicker import mains_flicker
+from sim.faults import Faults
+from sim.faults.schedule import read_faults
+from tests.rig.doctor.doctor_parts import unopened
+
+
+def images(lamp_hz, depth, *, fps=25.0, readout_s=0.02, drift=0.0, count=11):
+    """Return the row levels and times of images of a scene under a lamp."""
+    rng = np.random.default_rng(1)
+    times_s = np.cumsum([0, 1, 1, 1, 1, 4, 5, 5, 4, 5, 5][:count]) / fps
+    rows = np.linspace(0, 1, 480)
+    scene = 60 + 30 * np.sin(7 * rows)
+    lamp = 1 + depth * np.cos(2 * np.pi * lamp_hz * (times_s[:, None] + readout_s * rows))
+    level = 1 + drift * np.sin(2 * np.pi * 1.3 * times_s)[:, None]
+    return scene * lamp * level * rng.normal(1, 0.004, (count, 1)) + rng.normal(0, 0.1, (count, 480)), (
+        times_s * 1e9
+    ).astype(np.int64)
+
+
+@pytest.mark.parametrize(("lamp_hz", "fps"), [(100, 30), (120, 25), (100, 24), (120, 28)])
+@pytest.mark.parametrize("readout_s", [0.0, 0.008, 0.033])
+def test_mains_is_named_with_its_depth(lamp_hz, fps, readout_s):
+    found = mains_flicker(*images(lamp_hz, 0.05, fps=fps, readout_s=readout_s))
+    assert found.mains_hz == lamp_hz / 2
+    assert found.depth == pytest.approx(0.05, rel=0.2)
+
+
+@pytest.mark.parametrize(
+    "scene", [{"depth": 0.0}, {"depth": 0.0, "drift": 0.2}, {"depth": 0.004}, {"depth": 0.0, "count": 3}]
+)
+def test_steady_light_and_slow_changes_are_no_mains_flicker(scene):
+    assert mains_flicker(*images(100, **scene)) is None
+
+
+def test_exposure_is_a_whole_number_of_periods():
+    at_50, at_60 = mains_flicker(*images(100, 0.1, fps=30)), mains_flicker(*images(120, 0.1))
+    assert [at_50.exposure_us(wanted) for wanted in (3000, 12_000, 18_000)] == [10_000, 10_000, 20_000]
+    assert [at_60.exposure_us(wanted) for wanted in (3000, 10_000, 18_000)] == [8333, 8333, 16_667]
+
+
+def test_doctor_names_the_mains_and_the_exposure_that_hides_it():
+    with unopened("camera.exposure_us=5000") as bench:
+        Faults(bench.devices).schedule(*read_faults(["mains_flicker"]))
+        found = bench.problems("camera")
+        assert found == {FindingCode.MAINS_FLICKER: "rig config set camera.exposure_us 10000"}
+    with unopened() as bench:  # the default of 10 ms
+        Faults(bench.devices).schedule(*read_faults(["mains_flicker"]))
+        assert bench.problems("camera") == {}
