@@ -31,6 +31,10 @@ _COMPUTERS_OWN = re.compile(r"smbus|i915|nvidia|amdgpu|radeon|gmbus|aux|ddc|hdmi
 """I2C buses of memory, monitors and clock chips, which must not be scanned."""
 _CONVERTERS = re.compile(r"bcm2835-(isp|codec)|pispbe|hevc", re.IGNORECASE)
 """Video devices of a Raspberry Pi that convert images; some claim to capture."""
+_RAW_RECEIVERS = re.compile(r"unicam|rp1-cfe", re.IGNORECASE)
+"""Receivers of ribbon cables: they deliver raw values of the sensor, which OpenCV cannot develop."""
+_SENSORS = re.compile(r"((?:imx|ov|gc|s5k|hm|arducam)[\w-]*) \d+-[0-9a-f]{4}")
+"""Names of the sensors' own nodes (v4l-subdev), with their I2C bus and address."""
 _NETWORK_FILE_SYSTEMS = frozenset({"nfs", "nfs4", "cifs", "smb3", "smbfs", "sshfs", "fuse.sshfs", "9p", "afs"})
 
 
@@ -170,6 +174,13 @@ class Computer:
         nodes = self._nodes(_CAMERAS, "dev/v4l/by-id")
         return [n for n in nodes if self._is_camera(n)]
 
+    def ribbon_cameras(self) -> list[str]:
+        """Return the sensors on ribbon cables of a Raspberry Pi, for example imx708; libcamera develops their images."""
+        receivers = any(_RAW_RECEIVERS.search(node.name) for node in self._nodes(_CAMERAS, ""))
+        names = (self._text(f"{_CAMERAS}/{entry.name}/name") for entry in self._entries(_CAMERAS))
+        sensors = [found[1] for name in names if (found := _SENSORS.fullmatch(name))]
+        return sensors or (["unknown sensor"] if receivers else [])
+
     def video_capabilities(self, path: str) -> int | None:
         """Return the capabilities of a video device; None if it does not report them."""
         from rig.devices.v4l2 import capabilities
@@ -179,7 +190,7 @@ class Computer:
     def _is_camera(self, node: DeviceFile) -> bool:
         from rig.devices.v4l2 import captures
 
-        if _CONVERTERS.search(node.name):
+        if not node.path.startswith("/dev/video") or _CONVERTERS.search(node.name) or _RAW_RECEIVERS.search(node.name):
             return False
         if (caps := self.video_capabilities(node.path)) is not None and not captures(caps):
             return False
@@ -191,6 +202,11 @@ class Computer:
         The number of a camera and its path can mean another camera after replugging. None for a file or a stream, and
         if the system does not show more than the path.
         """
+        if str(source).startswith("picamera2"):
+            from rig.devices.picamera2_capture import camera_id, camera_number
+
+            number = camera_number(source)
+            return None if number is None else camera_id(number)
         path = f"/dev/video{source}" if str(source).isdigit() else str(source)
         if not path.startswith("/dev/"):
             return None

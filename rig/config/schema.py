@@ -237,7 +237,11 @@ class HeadConfig(Section):
 class CameraConfig(Section):
     """The camera and its locked settings."""
 
-    source: int | str = Field(0, description="index or path of the camera, for OpenCV")
+    source: int | str = Field(
+        0,
+        description="index or path of the camera, for OpenCV; picamera2 or picamera2:1: a camera on the ribbon cable "
+        "of a Raspberry Pi",
+    )
     width: int = Field(640, ge=80, le=8000, description="pixels")
     height: int = Field(480, ge=80, le=8000, description="pixels")
     fps: float = Field(30.0, ge=0.1, le=500, description="frames per second")

@@ -8,6 +8,7 @@ import cv2
 
 from rig.core.errors import DeviceNotFound
 from rig.devices import v4l2
+from rig.devices.picamera2_capture import Picamera2Capture, camera_number
 
 
 class Capture(Protocol):
@@ -59,11 +60,15 @@ def modes_of(capture: Capture) -> tuple[v4l2.VideoMode, ...]:
 def open_capture(source: int | str | Path) -> Capture:
     """Open a camera by number or device path, or a video file, an image sequence (``img_%03d.png``) or a stream's URL.
 
+    ``picamera2`` or ``picamera2:1`` is a camera on the ribbon cable of a Raspberry Pi.
+
     Raises
     ------
     DeviceNotFound
         The source does not exist, the user may not open it, or another program uses it; the next step says which.
     """
+    if (number := camera_number(source)) is not None:
+        return Picamera2Capture(number)
     if isinstance(source, int) or str(source).isdigit():
         source = f"/dev/video{source}"
     path = str(source)

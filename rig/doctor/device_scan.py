@@ -3,6 +3,7 @@
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from rig.core.errors import DeviceNotFound, RigError
 from rig.devices.head.opening import open_head
 from rig.devices.head.protocol import BAUD
 from rig.devices.opencv_capture import modes_of
+from rig.devices.picamera2_capture import INSTALL
 from rig.devices.v4l2 import VideoMode, choose_mode
 from rig.doctor.bus_scan import (
     BAUD_RATES,
@@ -63,6 +65,8 @@ class DeviceScan:
     servos: list[tuple[SerialPort, FoundServo]] = field(default_factory=list)
     imus: list[FoundImu] = field(default_factory=list)
     cameras: list[FoundCamera] = field(default_factory=list)
+    ribbons: list[int] = field(default_factory=list)
+    """Numbers of the cameras on ribbon cables."""
     heads: list[SerialPort] = field(default_factory=list)
     duplicate_ids: bool = False
     """Two servos with the same id were found."""
@@ -187,7 +191,11 @@ class DeviceScan:
 
     def find_cameras(self, context: DoctorContext) -> Iterator[Finding | str]:
         nodes = context.computer.cameras()
-        if not nodes:
+        ribbons = context.computer.ribbon_cameras()
+        for number, name in enumerate(ribbons):
+            self.ribbons.append(number)
+            yield ribbon_camera(name, number)
+        if not nodes and not ribbons:
             yield warning("camera", FindingCode.NO_CAMERA, "Connect the camera, then: " + context.rig("find"))
         for node in nodes:
             if problems := [finding for finding in access(context, "camera", node, "video") if finding.fix]:
@@ -205,6 +213,14 @@ class DeviceScan:
             self.cameras.append(found)
             mode = {"path": node.path, "width": width, "height": height, "fps": found.fps}
             yield fine("camera", FindingCode.CAMERA, name=f"{node.path}: {node.name}", **mode)
+
+
+def ribbon_camera(name: str, number: int) -> Finding:
+    """Return how a camera on the ribbon cable of a Raspberry Pi is reached."""
+    place = {"name": name, "number": number}
+    if find_spec("picamera2") is None:
+        return warning("camera", FindingCode.RIBBON_CAMERA_UNREACHABLE, INSTALL, **place)
+    return fine("camera", FindingCode.RIBBON_CAMERA, **place)
 
 
 def servo_settings(port: SerialPort, servo: FoundServo) -> dict[Key, Any]:

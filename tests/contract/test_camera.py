@@ -1,5 +1,6 @@
 """What every `rig.devices.camera.Camera` keeps to, whatever is behind it."""
 
+import sys
 from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
@@ -12,6 +13,7 @@ from rig.core.clock import Clock
 from rig.devices.camera import Camera, CameraIdentity, CameraLocks, Frame
 from rig.devices.opencv_camera import OpenCvCamera
 from rig.devices.opencv_capture import open_capture
+from sim import picamera2
 from sim.camera import SimCapture
 from sim.objects.shelf import shelf
 from sim.world import World
@@ -48,7 +50,15 @@ def video_file(folder: Path) -> Opened:
     return OpenCvCamera(open_capture(path), clock=world.clock), world.clock
 
 
-@pytest.fixture(params=[simulated, image_sequence, video_file], ids=lambda kind: kind.__name__)
+def raspberry_pi(_: Path) -> Opened:
+    world = World(seed=1)
+    world.put(shelf()["toy-house"])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(sys.modules, "picamera2", picamera2.module(SimCapture(world), world.clock))
+        return OpenCvCamera(open_capture("picamera2:0"), clock=world.clock), world.clock
+
+
+@pytest.fixture(params=[simulated, raspberry_pi, image_sequence, video_file], ids=lambda kind: kind.__name__)
 def opened(request: pytest.FixtureRequest, tmp_path: Path) -> Opened:
     kind: Callable[[Path], Opened] = request.param
     return kind(tmp_path)

@@ -28,7 +28,7 @@ def images(lamp_hz, depth, *, fps=25.0, readout_s=0.02, drift=0.0, count=11):
 def test_mains_is_named_with_its_depth(lamp_hz, fps, readout_s):
     found = mains_flicker(*images(lamp_hz, 0.05, fps=fps, readout_s=readout_s))
     assert found.mains_hz == lamp_hz / 2
-    assert found.depth == pytest.approx(0.05, rel=0.2)
+    assert found.depth == pytest.approx(0.05, rel=0.4)
 
 
 @pytest.mark.parametrize(

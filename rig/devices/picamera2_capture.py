@@ -1,0 +1,265 @@
+"""A camera on the ribbon cable of a Raspberry Pi, through picamera2: `camera.source = "picamera2"`.
+
+libcamera, which develops the images of these sensors, cannot be reached through OpenCV. `Picamera2Capture` has the
+interface of `cv2.VideoCapture`, so that `rig.devices.opencv_camera.OpenCvCamera` locks and reads back its settings as
+those of any camera. picamera2 is imported only when such a camera is opened.
+"""
+
+import importlib
+import re
+from collections.abc import Mapping
+from math import log10
+from typing import Any, Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.core.errors import DeviceNotFound
+from rig.devices import v4l2
+
+INSTALL: Final = (
+    "Install it: `sudo apt install -y python3-picamera2`, and make the Python environment with access to it: "
+    "`python3 -m venv --system-site-packages ~/rig-env`."
+)
+_SOURCE: Final = re.compile(r"picamera2(?::(\d+))?")
+_FRAME_WAIT_S: Final = 3.0
+_SETTLE_FRAMES: Final = 12
+"""Frames after which changed settings are certainly in force: sensor and image processor delay them by several."""
+_NOMINAL_FPS: Final = 30.0
+_MANUAL_FOCUS, _CONTINUOUS_FOCUS = 0, 2  # libcamera's AfMode
+
+
+def camera_number(source: object) -> int | None:
+    """Return the number of the camera that ``picamera2`` or ``picamera2:1`` names; None for another source."""
+    found = _SOURCE.fullmatch(str(source))
+    return int(found[1] or 0) if found else None
+
+
+def camera_id(number: int) -> str | None:
+    """Return what identifies a camera: its sensor and its connector; None if there is none, or no picamera2."""
+    try:
+        cameras = _library().Picamera2.global_camera_info()
+    except DeviceNotFound:
+        return None
+    return next((f"{one['Model']} at {one['Id']}" for one in cameras if one.get("Num") == number), None)
+
+
+def _library() -> Any:
+    """Return the module picamera2. Raises `DeviceNotFound` if it is not installed."""
+    try:
+        return importlib.import_module("picamera2")
+    except ImportError as error:
+        raise DeviceNotFound(
+            "The camera of the Raspberry Pi needs picamera2, which this Python does not have.",
+            next_step=INSTALL,
+            evidence={"reason": str(error)},
+        ) from error
+
+
+class Picamera2Capture:
+    """An open camera of a Raspberry Pi, as a `rig.devices.opencv_capture.Capture`.
+
+    Units are those of OpenCV's V4L2 backend where there are any: exposure in 100 µs, white balance in kelvin. Gain is
+    in decibels (20 log10 of libcamera's AnalogueGain), focus in dioptres (LensPosition), sharpness as libcamera's.
+    `get` returns what the metadata of a frame report, -1 for what the camera lacks.
+
+    Parameters
+    ----------
+    number
+        The number of the camera (`rpicam-hello --list-cameras`).
+
+    Raises
+    ------
+    DeviceNotFound
+        picamera2 is not installed, there is no such camera, or another program uses it.
+    """
+
+    def __init__(self, number: int) -> None:
+        library = _library()
+        cameras = library.Picamera2.global_camera_info()
+        if not any(one.get("Num") == number for one in cameras):
+            raise DeviceNotFound(
+                f"libcamera finds no camera {number}.",
+                next_step="Switch the computer off and check the ribbon cable; `rpicam-hello --list-cameras` lists the "
+                "cameras that are found.",
+                evidence={"found": [str(one.get("Model")) for one in cameras]},
+            )
+        try:
+            self._camera = library.Picamera2(number)
+        except (RuntimeError, IndexError) as error:
+            raise DeviceNotFound(
+                f"The camera {number} of the Raspberry Pi cannot be opened.",
+                next_step="Close the program that uses it, for example rpicam-hello.",
+                evidence={"reason": str(error)},
+            ) from error
+        self._size = (640, 480)
+        self._fps = _NOMINAL_FPS
+        self._fixed_rate = False
+        self._asked: dict[str, Any] = {}
+        if "AfMode" in self._controls:  # the lens wakes at a fixed distance; `OpenCvCamera` pins what is found
+            self._asked["AfMode"] = _CONTINUOUS_FOCUS
+        self._request: Any = None
+        self._metadata: Mapping[str, Any] = {}
+        self._open, self._running, self._settling = True, False, False
+
+    # -- interface of cv2.VideoCapture --------------------------------------------------------------------------------
+
+    def isOpened(self) -> bool:  # noqa: N802
+        return self._open
+
+    def grab(self) -> bool:
+        """Take the next frame; False if none arrives in time."""
+        if not self._open:
+            return False
+        self._start()
+        self._release_request()
+        try:
+            self._request = self._camera.capture_request(wait=_FRAME_WAIT_S)
+        except (TimeoutError, RuntimeError):  # the sensor hangs, or the camera stopped
+            return False
+        self._metadata = self._request.get_metadata()
+        return True
+
+    def retrieve(self) -> tuple[bool, NDArray[np.uint8] | None]:
+        """Return the frame that was grabbed last, uint8 (H, W, 3) BGR."""
+        if self._request is None:
+            return False, None
+        return True, np.array(self._request.make_array("main"), dtype=np.uint8)
+
+    def release(self) -> None:
+        """Stop the camera and close it; a second call does nothing."""
+        if self._open:
+            self._open = False
+            self._release_request()
+            if self._running:
+                self._camera.stop()
+            self._camera.close()
+
+    def get(self, propId: int, /) -> float:
+        match propId:
+            case cv2.CAP_PROP_FRAME_WIDTH:
+                return float(self._size[0])
+            case cv2.CAP_PROP_FRAME_HEIGHT:
+                return float(self._size[1])
+            case cv2.CAP_PROP_FPS:
+                return self._fps
+            case cv2.CAP_PROP_POS_MSEC:
+                return self._exposed_ms()
+            case v4l2.EXPOSURE_DYNAMIC_FRAMERATE:
+                return float(not self._fixed_rate)
+            case cv2.CAP_PROP_AUTO_EXPOSURE:
+                return 3.0 if self._asked.get("AeEnable", True) else 1.0
+            case cv2.CAP_PROP_AUTO_WB:
+                return float(self._asked.get("AwbEnable", True))
+            case cv2.CAP_PROP_AUTOFOCUS if "AfMode" in self._controls:
+                return float(self._asked.get("AfMode", _MANUAL_FOCUS) != _MANUAL_FOCUS)
+            case cv2.CAP_PROP_SHARPNESS if "Sharpness" in self._controls:
+                return round(float(self._asked.get("Sharpness", self._controls["Sharpness"][2])), 2)
+            case cv2.CAP_PROP_EXPOSURE:
+                return self._reported("ExposureTime", lambda value: max(float(round(value / 100)), 1.0))
+            case cv2.CAP_PROP_GAIN:
+                return self._reported("AnalogueGain", lambda value: max(round(20 * log10(value), 1), 0.0))
+            case cv2.CAP_PROP_WB_TEMPERATURE if "ColourTemperature" in self._controls:
+                return self._reported("ColourTemperature", lambda value: float(round(value, -1)))
+            case cv2.CAP_PROP_FOCUS if "LensPosition" in self._controls:
+                return self._reported("LensPosition", lambda value: round(value, 2))
+        return -1.0
+
+    def set(self, propId: int, value: float, /) -> bool:
+        match propId:
+            case cv2.CAP_PROP_FRAME_WIDTH:
+                return self._resize(round(value), self._size[1])
+            case cv2.CAP_PROP_FRAME_HEIGHT:
+                return self._resize(self._size[0], round(value))
+            case cv2.CAP_PROP_FPS:
+                self._fps = value
+                return self._control("FrameDurationLimits", (round(1e6 / value),) * 2) if self._fixed_rate else True
+            case v4l2.EXPOSURE_DYNAMIC_FRAMERATE if not value:
+                self._fixed_rate = self._control("FrameDurationLimits", (round(1e6 / self._fps),) * 2)
+                return self._fixed_rate
+            case cv2.CAP_PROP_AUTO_EXPOSURE:
+                return self._control("AeEnable", value != 1)
+            case cv2.CAP_PROP_AUTO_WB:
+                return self._control("AwbEnable", bool(value))
+            case cv2.CAP_PROP_AUTOFOCUS:
+                return self._control("AfMode", _CONTINUOUS_FOCUS if value else _MANUAL_FOCUS)
+            case cv2.CAP_PROP_EXPOSURE:
+                return self._control("ExposureTime", round(value * 100))
+            case cv2.CAP_PROP_GAIN:
+                return self._control("AnalogueGain", 10 ** (value / 20))
+            case cv2.CAP_PROP_WB_TEMPERATURE:
+                return self._control("ColourTemperature", round(value))
+            case cv2.CAP_PROP_FOCUS:
+                return self._control("LensPosition", value)
+            case cv2.CAP_PROP_SHARPNESS:
+                return self._control("Sharpness", value)
+        return False
+
+    # -- libcamera ----------------------------------------------------------------------------------------------------
+
+    @property
+    def _controls(self) -> Mapping[str, tuple[Any, Any, Any]]:
+        """The controls of the camera: lowest, highest and default value."""
+        controls: Mapping[str, tuple[Any, Any, Any]] = self._camera.camera_controls
+        return controls
+
+    def _control(self, name: str, value: Any) -> bool:
+        """Request a setting, within its range; return whether the camera has it."""
+        if name not in self._controls:
+            return False
+        low, high, _ = self._controls[name]
+        if isinstance(value, int | float) and not isinstance(value, bool):
+            value = type(value)(min(max(value, low), high))
+        self._asked[name] = value
+        if self._running:
+            self._camera.set_controls({name: value})
+            self._settling = True
+        return True
+
+    def _reported(self, name: str, converted: Any) -> float:
+        """Return a setting from the metadata of a frame that was exposed with the present settings."""
+        if self._open and (self._settling or not self._metadata):
+            for _ in range(_SETTLE_FRAMES):
+                if not self.grab():
+                    break
+            self._settling = False
+        value = self._metadata.get(name)
+        return -1.0 if value is None else float(converted(value))
+
+    def _resize(self, width: int, height: int) -> bool:
+        if (width, height) != self._size:
+            self._size = (width, height)
+            if self._running:
+                self._release_request()
+                self._camera.stop()
+                self._running = False
+        return True
+
+    def _start(self) -> None:
+        """Start the camera with all requested settings. "RGB888" is libcamera's name for the order B, G, R."""
+        if self._running:
+            return
+        config = self._camera.create_video_configuration(
+            main={"size": self._size, "format": "RGB888"}, controls=dict(self._asked), buffer_count=4
+        )
+        self._camera.configure(config)
+        self._size = tuple(self._camera.camera_configuration()["main"]["size"])  # libcamera may align it
+        self._camera.start()
+        self._running = self._settling = True
+
+    def _release_request(self) -> None:
+        """Give the buffer of the last frame back; without free buffers the camera stops."""
+        if self._request is not None:
+            self._request.release()
+            self._request = None
+
+    def _exposed_ms(self) -> float:
+        """Return the start of the exposure on the monotonic clock.
+
+        The driver dates the start of the readout of the first row (SensorTimestamp), which is the end of its exposure.
+        """
+        stamp_ns = self._metadata.get("SensorTimestamp")
+        if stamp_ns is None:
+            return 0.0
+        return float(stamp_ns) * 1e-6 - float(self._metadata.get("ExposureTime", 0)) * 1e-3

@@ -1,0 +1,182 @@
+"""A fake of the Python package picamera2 in front of the simulated camera: a Raspberry Pi with a Camera Module 3.
+
+It has the part of picamera2's interface that `rig.devices.picamera2_capture` uses, with the behaviour that a driver can
+get wrong: settings take effect some frames later, only the metadata of a frame tell which were in force, a name that
+the camera lacks is an error, there are only as many frames as released buffers, and the time stamp is that of the
+readout.
+"""
+
+from collections import deque
+from math import log10
+from types import ModuleType
+from typing import Any, Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.core.clock import Clock
+from sim.camera import SimCapture
+
+DELAY_FRAMES: Final = 4
+"""Frames until a setting is in force."""
+_LONGEST_US: Final = 33_000
+_CONTROLS: Final[dict[str, tuple[Any, Any, Any]]] = {
+    "AeEnable": (False, True, True),
+    "AfMode": (0, 2, 0),
+    "AnalogueGain": (1.0, 16.0, 1.0),
+    "AwbEnable": (False, True, True),
+    "ColourTemperature": (2800, 6500, 5000),
+    "ExposureTime": (100, _LONGEST_US, 20_000),
+    "FrameDurationLimits": (33_333, 120_000, 33_333),
+    "LensPosition": (0.0, 15.0, 1.0),
+    "Sharpness": (0.0, 16.0, 1.0),
+}
+_FOCUS_PER_DIOPTRE: Final = 17.0  # the simulated lens has 0 to 255
+
+
+class Picamera2:
+    """A camera that is not started; ``sensor`` sees the simulated world. See picamera2's manual for the methods."""
+
+    sensor: SimCapture
+    clock: Clock
+    in_use = False
+
+    def __init__(self, camera_num: int = 0) -> None:
+        if camera_num != 0:
+            raise IndexError("list index out of range")
+        if type(self).in_use:
+            raise RuntimeError("Failed to acquire camera: Device or resource busy")
+        type(self).in_use = True
+        self._config: dict[str, Any] | None = None
+        self._started = self._closed = False
+        self._pending: deque[tuple[int, dict[str, Any]]] = deque()
+        self._frames = 0
+        self.held = 0
+        self.sensor.reopen()
+
+    @staticmethod
+    def global_camera_info() -> list[dict[str, Any]]:
+        return [{"Model": "imx708", "Location": 2, "Rotation": 180, "Id": "/base/axi/pcie/i2c/imx708@1a", "Num": 0}]
+
+    @property
+    def camera_controls(self) -> dict[str, tuple[Any, Any, Any]]:
+        return dict(_CONTROLS)
+
+    def create_video_configuration(
+        self, main: dict[str, Any] | None = None, controls: dict[str, Any] | None = None, buffer_count: int = 6
+    ) -> dict[str, Any]:
+        return {"main": {"format": "XBGR8888", "size": (1280, 720)} | (main or {})} | {
+            "controls": controls or {},
+            "buffer_count": buffer_count,
+        }
+
+    def configure(self, config: dict[str, Any]) -> None:
+        if self._started:
+            raise RuntimeError("Camera must be stopped before configuring")
+        if config["main"]["format"] != "RGB888":
+            raise RuntimeError("the fake has one pixel format")
+        width = config["main"]["size"][0]
+        self._check(config["controls"])
+        self.sensor.set(cv2.CAP_PROP_FRAME_WIDTH, 640 if width > 480 else 320)
+        size = tuple(int(self.sensor.get(p)) for p in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
+        self._config = config | {"main": config["main"] | {"size": size}}
+
+    def camera_configuration(self) -> dict[str, Any]:
+        assert self._config is not None
+        return self._config
+
+    def start(self) -> None:
+        if self._config is None:
+            raise RuntimeError("Camera has not been configured")
+        self._started = True
+        self._pending.clear()
+        self._apply(self._config["controls"])
+
+    def stop(self) -> None:
+        self._started = False
+
+    def close(self) -> None:
+        if not self._closed:
+            self._closed = True
+            type(self).in_use = False
+
+    def set_controls(self, controls: dict[str, Any]) -> None:
+        self._check(controls)
+        self._pending.append((self._frames + DELAY_FRAMES, dict(controls)))
+
+    def capture_request(self, wait: bool | float | None = None) -> "CompletedRequest":
+        if not self._started:
+            raise RuntimeError("Camera is not started")
+        assert self._config is not None
+        timeout_s = float(wait or 0)
+        if self.held >= self._config["buffer_count"]:  # no buffer is free: the camera waits
+            self.clock.sleep(timeout_s)
+            raise TimeoutError
+        while self._pending and self._pending[0][0] <= self._frames:
+            self._apply(self._pending.popleft()[1])
+        if self.sensor.hangs or not self.sensor.grab():
+            self.clock.sleep(timeout_s)
+            raise TimeoutError
+        self._frames += 1
+        return CompletedRequest(self)
+
+    def _check(self, controls: dict[str, Any]) -> None:
+        for name in controls:
+            if name not in _CONTROLS:
+                raise RuntimeError(f"Control {name} is not advertised by libcamera")
+
+    def _apply(self, controls: dict[str, Any]) -> None:
+        """Set the sensor; a value is in force only while its automatic is off."""
+        sensor = self.sensor
+        automatics = {"AeEnable": cv2.CAP_PROP_AUTO_EXPOSURE, "AwbEnable": cv2.CAP_PROP_AUTO_WB}
+        for name, prop in automatics.items():
+            if name in controls:
+                sensor.set(prop, (3 if controls[name] else 1) if name == "AeEnable" else int(controls[name]))
+        if "AfMode" in controls:
+            sensor.set(cv2.CAP_PROP_AUTOFOCUS, int(controls["AfMode"] != 0))
+        if "ExposureTime" in controls:
+            sensor.set(cv2.CAP_PROP_EXPOSURE, controls["ExposureTime"] / 100)
+        if "AnalogueGain" in controls:
+            sensor.set(cv2.CAP_PROP_GAIN, round(20 * log10(controls["AnalogueGain"])))
+        if "ColourTemperature" in controls:
+            sensor.set(cv2.CAP_PROP_WB_TEMPERATURE, controls["ColourTemperature"])
+        if "LensPosition" in controls and not sensor.get(cv2.CAP_PROP_AUTOFOCUS):
+            sensor.set(cv2.CAP_PROP_FOCUS, round(controls["LensPosition"] * _FOCUS_PER_DIOPTRE))
+
+
+class CompletedRequest:
+    """A frame in its buffer, until it is released."""
+
+    def __init__(self, camera: Picamera2) -> None:
+        sensor = camera.sensor
+        self._camera = camera
+        camera.held += 1
+        exposure_us = int(sensor.get(cv2.CAP_PROP_EXPOSURE) * 100) - 8  # whole lines of the sensor
+        begun_ns = round(sensor.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
+        self._metadata = {
+            "SensorTimestamp": begun_ns + exposure_us * 1000,
+            "ExposureTime": exposure_us,
+            "AnalogueGain": 10 ** (sensor.get(cv2.CAP_PROP_GAIN) / 20),
+            "ColourTemperature": int(sensor.get(cv2.CAP_PROP_WB_TEMPERATURE)),
+            "LensPosition": sensor.get(cv2.CAP_PROP_FOCUS) / _FOCUS_PER_DIOPTRE,
+        }
+
+    def get_metadata(self) -> dict[str, Any]:
+        return dict(self._metadata)
+
+    def make_array(self, name: str) -> NDArray[np.uint8]:
+        assert name == "main"
+        _, image = self._camera.sensor.retrieve()
+        assert image is not None
+        return image
+
+    def release(self) -> None:
+        self._camera.held -= 1
+
+
+def module(sensor: SimCapture, clock: Clock) -> ModuleType:
+    """Return a module ``picamera2`` whose camera is ``sensor``; a test puts it into `sys.modules`."""
+    fake: Any = ModuleType("picamera2")
+    fake.Picamera2 = type("Picamera2", (Picamera2,), {"sensor": sensor, "clock": clock, "in_use": False})
+    return fake  # type: ignore[no-any-return]

@@ -1,0 +1,151 @@
+"""A camera on the ribbon cable of a Raspberry Pi: the same locks, true time stamps, and what is missing."""
+
+import sys
+from importlib.machinery import ModuleSpec
+
+import cv2
+import numpy as np
+import pytest
+
+from rig.bench.computer import Computer
+from rig.bench.hardware import camera_settings
+from rig.config import load_config
+from rig.core.errors import DeviceNotFound, DeviceSilent
+from rig.devices.opencv_camera import CameraSettings, OpenCvCamera, TimeBase
+from rig.devices.opencv_capture import open_capture
+from rig.devices.picamera2_capture import Picamera2Capture, camera_number
+from rig.doctor.device_scan import DeviceScan
+from rig.doctor.finding import FindingCode
+from rig.safety.saved_state import MemoryStore
+from sim import picamera2
+from sim.camera import SimCapture
+from sim.objects.shelf import shelf
+from sim.world import World
+from tests.rig.doctor.doctor_parts import unopened
+
+
+@pytest.fixture
+def world():
+    world = World(seed=1)
+    world.put(shelf()["toy-house"])
+    return world
+
+
+@pytest.fixture
+def sensor(world, monkeypatch):
+    sensor = SimCapture(world)
+    monkeypatch.setitem(sys.modules, "picamera2", picamera2.module(sensor, world.clock))
+    return sensor
+
+
+def test_settings_are_locked_and_read_back_from_the_frames(world, sensor):
+    camera = OpenCvCamera(open_capture("picamera2"), clock=world.clock)
+    locks = camera.read_locks()
+    assert camera.rejected_settings == ()
+    assert (locks.exposure_us, locks.gain, locks.white_balance_k) == (10_000, 0, 5000)
+    assert (locks.auto_exposure, locks.auto_white_balance, locks.dynamic_frame_rate) == (False, False, False)
+    assert (locks.focus, locks.autofocus) == (pytest.approx(120 / 17, abs=0.01), False)  # where the autofocus settled
+    assert camera.time_base is TimeBase.STAMPED
+    sensor.drift(gain_db=3.0, kelvin=4000)  # a fault of the sensor shows in the metadata of the next frame
+    camera.capture(world.clock.now_ns())
+    assert (camera.read_locks().gain, camera.read_locks().white_balance_k) == (3.0, 4000)
+
+
+def test_configured_settings_are_in_force_before_they_are_read(world, sensor):
+    """libcamera applies a setting some frames after it was requested."""
+    settings = CameraSettings(320, 240, exposure_us=5000, gain=6, white_balance_k=3000, focus=2, sharpness=4)
+    camera = OpenCvCamera(open_capture("picamera2:0"), clock=world.clock, settings=settings)
+    locks = camera.read_locks()
+    assert camera.rejected_settings == ()
+    assert (locks.exposure_us, locks.gain, locks.white_balance_k, locks.focus, locks.sharpness) == (
+        5000,
+        6,
+        3000,
+        2,
+        4,
+    )
+    assert camera.capture(world.clock.now_ns()).image_bgr.shape == (240, 320, 3)
+
+
+def test_value_beyond_the_range_is_reported(world, sensor):
+    camera = OpenCvCamera(open_capture("picamera2"), clock=world.clock, settings=CameraSettings(exposure_us=90_000))
+    (rejected,) = camera.rejected_settings
+    assert (rejected.setting, rejected.asked, rejected.reported) == ("exposure_100us", 900, 330)
+
+
+def test_time_stamp_is_the_start_of_the_exposure(world, sensor):
+    capture = open_capture("picamera2")
+    capture.grab()
+    assert capture.get(cv2.CAP_PROP_POS_MSEC) == pytest.approx(sensor.get(cv2.CAP_PROP_POS_MSEC), abs=0.01)
+
+
+def test_frames_are_copies_in_the_order_of_opencv_and_buffers_are_given_back(world, sensor):
+    capture = open_capture("picamera2")
+    for _ in range(12):
+        assert capture.grab()
+        image = capture.retrieve()[1]
+    np.testing.assert_array_equal(image, sensor.retrieve()[1])
+    assert capture._camera.held == 1
+    capture.release()
+    capture.release()
+    assert not capture.isOpened()
+    assert not capture.grab()
+    open_capture("picamera2").release()  # it can be opened again
+
+
+def test_hanging_sensor_is_silent_in_bounded_time(world, sensor):
+    camera = OpenCvCamera(open_capture("picamera2"), clock=world.clock)
+    sensor.hangs = True
+    begun_ns = world.clock.now_ns()
+    with pytest.raises(DeviceSilent, match="delivers no frames"):
+        camera.capture(begun_ns)
+    assert world.clock.now_ns() - begun_ns < 8e9
+
+
+def test_missing_camera_other_user_and_missing_package_say_what_to_do(sensor, monkeypatch):
+    with pytest.raises(DeviceNotFound, match="no camera 1") as missing:
+        open_capture("picamera2:1")
+    assert missing.value.evidence == {"found": ["imx708"]}
+    first = open_capture("picamera2")
+    with pytest.raises(DeviceNotFound, match="cannot be opened"):
+        open_capture("picamera2")
+    first.release()
+    assert Computer().camera_device("picamera2:0") == "imx708 at /base/axi/pcie/i2c/imx708@1a"
+    assert Computer().camera_device("picamera2:1") is None
+    monkeypatch.setitem(sys.modules, "picamera2", None)
+    with pytest.raises(DeviceNotFound, match="needs picamera2") as missing:
+        Picamera2Capture(0)
+    assert "apt install -y python3-picamera2" in missing.value.next_step
+    assert Computer().camera_device("picamera2:0") is None
+
+
+def test_source_names_the_camera_by_its_number():
+    assert [camera_number(source) for source in ("picamera2", "picamera2:1", "picamera2:x", "0", 0, "/dev/video0")] == [
+        *(0, 1),
+        *(None,) * 4,
+    ]
+    config = load_config(None, ["camera.source=picamera2:1"])
+    assert config.camera.source == "picamera2:1"
+    assert camera_settings(config, MemoryStore(), None).width == 640
+
+
+@pytest.mark.parametrize("receiver", ["unicam-image", "rp1-cfe-csi2_ch0"])
+def test_sensor_on_the_ribbon_cable_is_recognised_and_not_opened(receiver, monkeypatch):
+    with unopened(plugged=False) as bench:
+        files = bench.computer
+        files.serial_port()
+        files.i2c_bus()
+        files.camera(0, receiver)
+        files.camera(10, "bcm2835-codec-decode")
+        files.write("sys/class/video4linux/v4l-subdev0/name", "imx708 10-001a\n")
+        files.write("sys/class/video4linux/v4l-subdev1/name", "dw9807 10-000c\n")
+        assert bench.context.computer.cameras() == []
+        assert bench.context.computer.ribbon_cameras() == ["imx708"]
+        monkeypatch.setattr("rig.doctor.device_scan.find_spec", lambda _: None)
+        scan = DeviceScan()
+        (found,) = scan.find_cameras(bench.context)
+        assert (found.code, found.parameters["name"]) == (FindingCode.RIBBON_CAMERA_UNREACHABLE, "imx708")
+        assert "python3-picamera2" in found.fix
+        monkeypatch.setattr("rig.doctor.device_scan.find_spec", lambda name: ModuleSpec(name, None))
+        (found,) = scan.find_cameras(bench.context)
+        assert (found.code, found.parameters["number"]) == (FindingCode.RIBBON_CAMERA, 0)
