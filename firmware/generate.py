@@ -87,6 +87,10 @@ def header(table: Table) -> str:
         "static inline uint16_t get_u16(const uint8_t *from) {",
         "    return (uint16_t)(from[0] | (uint16_t)from[1] << 8);",
         "}",
+        "",
+        "static inline uint32_t get_u32(const uint8_t *from) {",
+        "    return get_u16(from) | (uint32_t)get_u16(from + 2) << 16;",
+        "}",
     ]
     for message in table["message"]:
         if message["from"] != "head":

@@ -222,13 +222,22 @@ static uint8_t trigger(struct head *head, uint16_t width_us, uint8_t *body) {
     return rejection;
 }
 
+/* Only at rest: storing takes some milliseconds, in which no sample is sent. */
+static uint8_t set_serial(struct head *head, uint32_t serial) {
+    if (head->state == HEAD_STATE_ACTIVE) {
+        return REJECTION_BUSY;
+    }
+    hal_store_serial(serial);
+    return REJECTION_NONE;
+}
+
 /* Length of each request's body by its id; 0xFF if the request does not exist. */
 static uint8_t length_of(uint8_t id) {
     static const uint8_t sizes[] = {
         [MESSAGE_HELLO] = SIZE_HELLO, [MESSAGE_HEARTBEAT] = SIZE_HEARTBEAT,   [MESSAGE_SHUTDOWN] = SIZE_SHUTDOWN,
         [MESSAGE_LIGHT] = SIZE_LIGHT, [MESSAGE_RELAY] = SIZE_RELAY, [MESSAGE_TRIGGER] = SIZE_TRIGGER,
         [MESSAGE_IMU] = SIZE_IMU,     [MESSAGE_READ_COUNTERS] = SIZE_READ_COUNTERS, [MESSAGE_ACKNOWLEDGE] = SIZE_ACKNOWLEDGE,
-        [MESSAGE_STREAM] = SIZE_STREAM,
+        [MESSAGE_STREAM] = SIZE_STREAM, [MESSAGE_SET_SERIAL] = SIZE_SET_SERIAL,
     };
     return id >= MESSAGE_HELLO && id < sizeof sizes ? sizes[id] : UINT8_MAX;
 }
@@ -277,6 +286,9 @@ static uint8_t execute(struct head *head, uint8_t id, const uint8_t *body, uint8
         case MESSAGE_STREAM:
             rejection = body[STREAM_ON] > 1 ? REJECTION_OUT_OF_RANGE : REJECTION_NONE;
             head->streaming = body[STREAM_ON] == 1;
+            break;
+        case MESSAGE_SET_SERIAL:
+            rejection = set_serial(head, get_u32(body + SET_SERIAL_SERIAL));
             break;
         case MESSAGE_READ_COUNTERS:
             *reply = MESSAGE_COUNTERS;

@@ -8,7 +8,7 @@
 #define PROTOCOL_VERSION 1
 #endif
 #define FIRMWARE_MAJOR 1
-#define FIRMWARE_MINOR 0
+#define FIRMWARE_MINOR 1
 #define FIRMWARE_PATCH 0
 #define MAX_BODY 24
 
@@ -104,6 +104,8 @@
 #define SIZE_STREAM 1
 #define MESSAGE_READ_COUNTERS 0x0A
 #define SIZE_READ_COUNTERS 0
+#define MESSAGE_SET_SERIAL 0x0B
+#define SIZE_SET_SERIAL 4
 #define MESSAGE_DONE 0x80
 #define SIZE_DONE 2
 #define MESSAGE_IDENTITY 0x81
@@ -138,6 +140,10 @@ static inline uint8_t *put_u32(uint8_t *out, uint32_t value) {
 
 static inline uint16_t get_u16(const uint8_t *from) {
     return (uint16_t)(from[0] | (uint16_t)from[1] << 8);
+}
+
+static inline uint32_t get_u32(const uint8_t *from) {
+    return get_u16(from) | (uint32_t)get_u16(from + 2) << 16;
 }
 
 struct done {
@@ -303,5 +309,6 @@ static inline uint8_t put_status_changed(uint8_t *out, const struct status_chang
 #define IMU_FILTER 3
 #define IMU_RANGE 4
 #define STREAM_ON 0
+#define SET_SERIAL_SERIAL 0
 
 #endif

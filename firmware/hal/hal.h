@@ -1,4 +1,4 @@
-/* Interface between core and board. All functions are short and never wait. */
+/* Interface between core and board. All functions but hal_store_serial are short and never wait. */
 #ifndef HEAD_HAL_H
 #define HEAD_HAL_H
 
@@ -66,5 +66,8 @@ bool hal_estop_open(void);
 uint8_t hal_board(void);
 uint8_t hal_reset_cause(void);
 uint32_t hal_serial(void);
+
+/* Store the serial number for good; the only function that may take some milliseconds. */
+void hal_store_serial(uint32_t serial);
 
 #endif

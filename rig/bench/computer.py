@@ -175,7 +175,7 @@ class Computer:
         return [n for n in nodes if self._is_camera(n)]
 
     def ribbon_cameras(self) -> list[str]:
-        """Return the sensors on ribbon cables of a Raspberry Pi, for example imx708; libcamera develops their images."""
+        """Return the sensors on ribbon cables of a Raspberry Pi, for example imx708; libcamera develops the images."""
         receivers = any(_RAW_RECEIVERS.search(node.name) for node in self._nodes(_CAMERAS, ""))
         names = (self._text(f"{_CAMERAS}/{entry.name}/name") for entry in self._entries(_CAMERAS))
         sensors = [found[1] for name in names if (found := _SENSORS.fullmatch(name))]

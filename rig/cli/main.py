@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from rig.cli.bench import config, doctor, find, jog, safety, serve, servo, setup, snapshot, table
+from rig.cli.bench import config, doctor, find, head, jog, safety, serve, servo, setup, snapshot, table
 from rig.cli.catalog import calibrate as rules
 from rig.cli.catalog import catalog, exchange, results, upkeep
 from rig.cli.objects import empty_table, enroll, evaluate, identify, runs
@@ -144,6 +144,7 @@ catalog.app.command("calibrate")(rules.calibrate)
 app.add_typer(results.app, name="results", rich_help_panel=OBJECTS)
 app.add_typer(catalog.app, name="catalog", rich_help_panel=OBJECTS)
 app.add_typer(config.app, name="config", rich_help_panel=BENCH)
+app.add_typer(head.app, name="head", rich_help_panel=BENCH)
 app.add_typer(servo.app, name="servo", rich_help_panel=BENCH)
 app.command("eval", rich_help_panel=MORE)(evaluate.evaluate)
 for _point in sorted(entry_points(group=GROUP), key=lambda point: point.name):

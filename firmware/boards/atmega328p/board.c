@@ -360,6 +360,10 @@ uint32_t hal_serial(void) {
     return eeprom_read_dword((const uint32_t *)0);
 }
 
+void hal_store_serial(uint32_t serial) {
+    eeprom_update_dword((uint32_t *)0, serial);
+}
+
 int main(void) {
     PORTD = _BV(ESTOP); /* pull-up: an open loop reads high */
     DDRD = _BV(LIGHT) | _BV(RELAY);

@@ -225,6 +225,10 @@ uint32_t hal_serial(void) {
     return here->serial;
 }
 
+void hal_store_serial(uint32_t serial) {
+    here->serial = serial;
+}
+
 /* -- board.h ----------------------------------------------------------------------------------------------------- */
 
 static void start(struct board *b, uint8_t cause) {

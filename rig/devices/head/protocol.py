@@ -6,7 +6,7 @@ from struct import Struct
 from typing import ClassVar, get_args
 
 PROTOCOL_VERSION = 1
-FIRMWARE = (1, 0, 0)
+FIRMWARE = (1, 1, 0)
 """Firmware version of this protocol table."""
 MAX_BODY = 24
 BAUD = 250_000
@@ -206,6 +206,15 @@ class ReadCounters:
 
 
 @dataclass(frozen=True, slots=True)
+class SetSerial:
+    """Store the serial number for good, but not while the head is active. Since firmware 1.1."""
+
+    ID: ClassVar[int] = 0x0B
+    LAYOUT: ClassVar[Struct] = Struct("<I")
+    serial: int  # Serial number; serial_unset removes it.
+
+
+@dataclass(frozen=True, slots=True)
 class Done:
     """The request was carried out or rejected; also the reply to unknown requests."""
 
@@ -228,7 +237,7 @@ class Identity:
     board: int  # Board.
     capabilities: int  # Capability bits.
     reset_cause: int  # Reset.
-    serial: int  # Serial number, set when the board was flashed.
+    serial: int  # Serial number, see set_serial.
     uptime_us: int  # Time since the start; wraps with the clock.
 
 
@@ -310,7 +319,7 @@ class StatusChanged:
     reset_cause: int  # Reset.
 
 
-Request = Hello | Heartbeat | Shutdown | Acknowledge | Light | Relay | Trigger | Imu | Stream | ReadCounters
+Request = Hello | Heartbeat | Shutdown | Acknowledge | Light | Relay | Trigger | Imu | Stream | ReadCounters | SetSerial
 
 Answer = Done | Identity | HeartbeatReply | Triggered | Counters | Sample | StatusChanged
 

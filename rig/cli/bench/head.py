@@ -1,0 +1,61 @@
+"""`rig head`: the rig head's identity and serial number."""
+
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from rig.cli.bench.findings import doctor_context
+from rig.cli.ui.command import command
+from rig.cli.ui.settings import Settings
+
+if TYPE_CHECKING:
+    from rig.devices.head.protocol import Identity
+
+app = typer.Typer(help="Show the rig head, or store its serial number.", no_args_is_help=True)
+
+
+@app.command("info")
+@command
+def info(settings: Settings) -> None:
+    """Show board, firmware and serial number of the rig head. Switches nothing.
+
+    Example: rig head info --bench sim --set imu.connection=head
+    """
+    _show(settings, None)
+
+
+@app.command("set-serial")
+@command
+def set_serial(
+    settings: Settings,
+    serial: Annotated[int, typer.Argument(metavar="N", min=0, max=2**32 - 2, help="Serial number of this head.")],
+) -> None:
+    """Store the serial number that distinguishes this head from others. No program may use the head.
+
+    Example: rig head set-serial 17 --bench sim --set imu.connection=head
+    """
+    _show(settings, serial)
+
+
+def _show(settings: Settings, serial: int | None) -> None:
+    """Store the serial number unless it is None, and print the head's identity."""
+    from contextlib import closing
+
+    from rig.devices.head.connection import version
+    from rig.devices.head.protocol import BAUD, SERIAL_UNSET, Board
+    from rig.devices.head.serial_number import read_identity, store_serial
+
+    with doctor_context(settings) as context:
+        context.require_free()
+        port, clock = context.config.head.port, context.computer.clock
+        with closing(context.computer.open_serial(port, BAUD, "head")) as connection:
+            found: Identity
+            if serial is None:
+                found = read_identity(connection, clock, name=port)
+            else:
+                found = store_serial(connection, clock, serial, name=port)
+    stored = None if found.serial == SERIAL_UNSET else found.serial
+    board = Board(found.board).name.lower()
+    report = {"port": port, "board": board, "firmware": version(found), "serial": stored}
+    shown = "no serial number" if stored is None else f"serial number {stored}"
+    settings.say(f"{port}: rig head on {board}, firmware {version(found)}, {shown}", report)
