@@ -78,12 +78,20 @@ class ComputerFiles:
         self.link(by_id, self.root / "dev" / name)
 
     def i2c_bus(
-        self, number: int = 1, name: str = "bcm2835 (i2c@7e804000)", *, mode: int = 0o660, compatible: str = ""
+        self,
+        number: int = 1,
+        name: str = "bcm2835 (i2c@7e804000)",
+        *,
+        mode: int = 0o660,
+        compatible: str = "",
+        hertz: int = 0,
     ) -> None:
-        """Add an I2C bus; ``compatible`` is its kind in the device tree."""
+        """Add an I2C bus; ``compatible`` is its kind in the device tree, ``hertz`` its frequency there."""
         self.write(f"sys/class/i2c-dev/i2c-{number}/name", f"{name}\n")
         if compatible:
-            self.write(f"sys/class/i2c-dev/i2c-{number}/device/of_node/compatible", f"{compatible}\0")
+            node = self.write(f"sys/class/i2c-dev/i2c-{number}/device/of_node/compatible", f"{compatible}\0").parent
+            if hertz:
+                (node / "clock-frequency").write_bytes(hertz.to_bytes(4, "big"))
         self.write(f"dev/i2c-{number}").chmod(mode)
 
     def i2c_driver(self, driver: str, number: int = 1, address: int = 0x68) -> None:

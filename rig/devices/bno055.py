@@ -38,6 +38,14 @@ _CARRIED_DEG = 0.01
 """Difference between orientation and rate that the next reading corrects: the orientation's resolution."""
 _ORIENTATION_AGE_S = 0.015  # largest age of an orientation: a period of the fusion, plus the reading
 _G = 9.80665
+_ATTEMPTS = 4  # readings until one is valid
+_IDENTITY_READS = 8
+SLOW_BUS = (
+    "A Raspberry Pi up to the 4 does not wait for the BNO055, which stretches the clock. Use a slow bus (add "
+    "dtparam=i2c_arm_baudrate=10000 to /boot/firmware/config.txt) or a software bus (dtoverlay=i2c-gpio,bus=3, and "
+    "imu.bus = 3), then restart."
+)
+"""What to do about a controller that corrupts the answers of a sensor that stretches the clock."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,6 +178,14 @@ class Bno055:
                 if self._clock.now_ns() > deadline_ns:
                     raise self._registers.not_found(silent, "ADR pin (low 0x28, high 0x29)") from silent
                 self._clock.sleep(_POLL_S)
+        if got not in KIND.identities:
+            again = {self._registers.read(KIND.register, 1)[0] for _ in range(_IDENTITY_READS)}
+            if again & {*KIND.identities, *(_late_by_one_bit(one) for one in KIND.identities)} or len(again) > 1:
+                raise DeviceFault(
+                    f"The bus {self._registers.name} corrupts the answers of the BNO055.",
+                    next_step=SLOW_BUS,
+                    evidence={"identity": sorted(again | {got}), "expected": list(KIND.identities)},
+                )
         return identified(KIND, got, self._registers.address, self._registers.name, NOISE_DPS_RTHZ)
 
     def _set_up(self) -> None:
@@ -203,9 +219,9 @@ class Bno055:
     def _read(self) -> _Reading:
         """Read the data and the status that shows whether they are valid, in one transfer.
 
-        I2C has no checksum. An orientation whose norm is not 1 was corrupted by the bus, and is read once more.
+        I2C has no checksum. An orientation whose norm is not 1 was corrupted by the bus, and is read again.
         """
-        for _ in range(2):
+        for _ in range(_ATTEMPTS):
             block = self._registers.read(_FIRST, _LAST + 1 - _FIRST)
             orientation = np.frombuffer(block[0x0C:0x14], "<i2") / LSB_PER_QUATERNION
             status = block[0x25:]  # SYS_STATUS, SYS_ERR, UNIT_SEL, -, OPR_MODE, PWR_MODE
@@ -215,6 +231,7 @@ class Bno055:
                 stat = block[0x21]
                 calibration = Bno055Calibration(stat >> 6, stat >> 4 & 3, stat >> 2 & 3, stat & 3)
                 return _Reading(np.frombuffer(block[:6], "<i2") / LSB_PER_DPS, orientation, calibration)
+            self.statistics.corrupt += 1
         reset = mode == _CONFIG_MODE
         raise DeviceFault(
             "The BNO055 was reset: its supply was interrupted."
@@ -222,8 +239,7 @@ class Bno055:
             else "The BNO055's fusion does not run with its settings, or the bus corrupts bytes.",
             next_step="Check its supply and cable, then open the bench again."
             if reset
-            else "Open the bench again. On a Raspberry Pi the BNO055 needs a slow bus because it stretches the clock: "
-            "dtparam=i2c_arm_baudrate=10000, or a software bus (i2c-gpio).",
+            else f"Open the bench again. {SLOW_BUS}",
             evidence={
                 "system_status": {"got": status[0], "expected": _FUSION_RUNNING},
                 "system_error": status[1],
@@ -233,6 +249,11 @@ class Bno055:
                 "orientation_norm": round(float(np.linalg.norm(orientation)), 4),
             },
         )
+
+
+def _late_by_one_bit(value: int) -> int:
+    """Return what a controller reads that takes the first bit too early, while SDA is still high."""
+    return 0x80 | value >> 1
 
 
 def _rotation_deg(before: Floats, after: Floats) -> Floats:

@@ -29,11 +29,12 @@ _T = TypeVar("_T")
 
 @dataclass(slots=True)
 class I2cStatistics:
-    """Statistics since the bus was opened; ``overflows`` counts how often samples were lost."""
+    """Statistics since the bus was opened; ``overflows`` counts lost samples, ``corrupt`` impossible readings."""
 
     transfers: int = 0
     retries: int = 0
     overflows: int = 0
+    corrupt: int = 0
 
 
 class I2cRegisters:

@@ -58,7 +58,10 @@ def ports(context: DoctorContext) -> Iterator[Finding]:
         if port is None:
             yield _missing(context, key, wanted, context.computer.serial_ports())
             continue
-        yield from access(context, "port", port, "dialout")
+        findings = list(access(context, "port", port, "dialout"))
+        yield from findings
+        if not any(one.fix for one in findings) and context.computer.is_left_to_modem_manager(port):
+            yield warning("port", FindingCode.MODEM_MANAGER, udev_command(context), path=port.path)
         if port.latency_ms is not None:
             yield _latency(context, port)
     if not head:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from rig.config import ImuConfig
+from rig.devices.bno055 import SLOW_BUS
 from rig.devices.head.opening import open_head
 from rig.devices.head.protocol import BAUD
 from rig.devices.imu import Imu, ImuSamples
@@ -20,6 +21,9 @@ SECONDS, DRAIN_S = 1.5, 0.25
 NOISY = 4.0  # multiple of the datasheet's noise that a quiet table does not exceed
 NO_REST_DPS = 20.0
 MAX_BIAS_DPS = 20.0  # zero-rate output of the MPU-6050's datasheet; more is a rotation, or a broken sensor
+STRETCH_KHZ = 20.0
+"""Highest frequency at which a controller that does not wait for a stretched clock reads a BNO055 correctly."""
+_SLOWER = "echo dtparam=i2c_arm_baudrate=10000 | sudo tee -a /boot/firmware/config.txt && sudo reboot"
 UPRIGHT = 0.94  # share of gravity along the table's axis when the sensor lies within 20° of it
 
 
@@ -39,6 +43,10 @@ def imu(context: DoctorContext) -> Iterator[Finding]:
                 yield of_error("imu", fault, context.rig("acknowledge"))
             yield from _at_rest(context, head)
         return
+    khz = context.computer.cannot_stretch_khz(config.imu.bus)
+    if config.imu.model == "bno055" and khz is not None and khz > STRETCH_KHZ:
+        bus = context.computer.i2c_name(config.imu.bus)
+        yield warning("imu", FindingCode.CLOCK_STRETCHING, _SLOWER, bus=bus, khz=khz)
     try:
         there = scan_imus(context.computer, config.imu.bus)
     except OSError as error:
@@ -55,6 +63,10 @@ def imu(context: DoctorContext) -> Iterator[Finding]:
         if here.note:
             yield fine("imu", FindingCode.IMU_NOTE, note=here.note)
         yield from _at_rest(context, sensor)
+        corrupt = getattr(getattr(sensor, "statistics", None), "corrupt", 0)
+        if corrupt:
+            fix = SLOW_BUS if config.imu.model == "bno055" else "Shorten the I2C cable, then: " + context.rig("doctor")
+            yield warning("imu", FindingCode.CORRUPT_READINGS, fix, corrupt=corrupt)
 
 
 def _at_rest(context: DoctorContext, sensor: Imu) -> Iterator[Finding]:

@@ -106,6 +106,9 @@ class SimBno055:
         """Whether it acknowledges its address; it does not during start-up."""
         return self._clock.now_ns() >= self._silent_until_ns
 
+    stretches = True
+    """It holds SCL low while it prepares an answer (BST-BNO055-DS000, 4.6)."""
+
     def start(self, reading: bool) -> None:
         self._pointed = reading
 

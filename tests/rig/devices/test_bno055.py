@@ -188,3 +188,40 @@ def test_bench_with_bno055_moves_settles_and_agrees(simulated) -> None:
             assert move.agreement is not None, move.gyro.reason
             assert move.agreement.agrees
             assert move.gyro.angle_deg == pytest.approx(move.rotation_encoder_deg, abs=1.5)
+
+
+# -- clock stretching on a Raspberry Pi 4 -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("share", [1.0, 0.6])
+def test_bus_that_corrupts_the_identity_is_named_with_its_remedy(bench: Bench, share: float) -> None:
+    bench.bus.stretch_errors = share
+    with pytest.raises(DeviceFault) as corrupt:
+        for _ in range(8):  # one reading in a row may be right
+            bench.open().close()
+    assert "i2c_arm_baudrate=10000" in corrupt.value.next_step
+    assert "i2c-gpio" in corrupt.value.next_step
+
+
+def test_rare_corrupt_readings_are_repeated_and_counted(bench: Bench, imu: Bno055) -> None:
+    bench.bus.stretch_errors = 0.2
+    bench.rotate(30.0)
+    begun_ns = bench.clock.now_ns()
+    turned = 0.0
+    for _ in range(50):
+        bench.clock.sleep(0.04)
+        turned += float(imu.read_samples().gyro_dps[:, 2].sum()) / imu.rate_hz
+    assert turned == pytest.approx(30.0 * (bench.clock.now_ns() - begun_ns) * 1e-9, abs=2.0)
+    assert imu.statistics.corrupt > 3
+
+
+def test_bench_works_with_a_bus_at_10_khz(simulated) -> None:
+    s = simulated("imu.model=bno055")
+    bus = s.operator.devices.i2c
+    bus.bit_ns, bus.stretch_errors = 100_000, 1.0  # as slow as that, a stretch ends within its bit
+    with Turntable(s.bench) as table:
+        for angle_deg in (90.0, 45.0):
+            move = table.goto(angle_deg)
+            assert move.agrees
+            assert move.gyro.valid
+    assert s.bench.imu.statistics.corrupt == 0

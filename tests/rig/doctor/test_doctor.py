@@ -125,6 +125,18 @@ def test_missing_port_is_explained_by_brltty():
         assert (problem.code, problem.fix) == (FindingCode.BRLTTY_TAKES_PORT, "sudo apt remove brltty")
 
 
+def test_port_that_modem_manager_will_open_is_reported(bench):
+    """It runs as root, so a user does not see that it has the port open."""
+    assert bench.problems("port") == {}
+    bench.computer.process(78, "/usr/sbin/ModemManager")
+    problem = bench.problem("port")
+    assert problem.code is FindingCode.MODEM_MANAGER
+    assert "udevadm trigger" in problem.fix
+    node = (bench.computer.root / "dev/ttyUSB0").stat().st_rdev
+    bench.computer.write(f"run/udev/data/c{os.major(node)}:{os.minor(node)}", "S:rig-servo\nE:ID_MM_PORT_IGNORE=1\n")
+    assert bench.problems("port") == {}
+
+
 def test_bench_is_not_opened_while_another_program_has_the_port_open(bench):
     """The simulated computer opens the port: the other program has not locked it."""
 
