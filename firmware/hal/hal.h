@@ -67,7 +67,7 @@ uint8_t hal_board(void);
 uint8_t hal_reset_cause(void);
 uint32_t hal_serial(void);
 
-/* Store the serial number for good; the only function that may take some milliseconds. */
+/* Store the serial number in permanent memory; the only function that may take some milliseconds. */
 void hal_store_serial(uint32_t serial);
 
 #endif

@@ -207,7 +207,7 @@ class ReadCounters:
 
 @dataclass(frozen=True, slots=True)
 class SetSerial:
-    """Store the serial number for good, but not while the head is active. Since firmware 1.1."""
+    """Store the serial number in permanent memory, but not while the head is active. Since firmware 1.1."""
 
     ID: ClassVar[int] = 0x0B
     LAYOUT: ClassVar[Struct] = Struct("<I")

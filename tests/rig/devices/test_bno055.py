@@ -194,7 +194,7 @@ def test_bench_with_bno055_moves_settles_and_agrees(simulated) -> None:
 
 
 @pytest.mark.parametrize("share", [1.0, 0.6])
-def test_bus_that_corrupts_the_identity_is_named_with_its_remedy(bench: Bench, share: float) -> None:
+def test_bus_that_corrupts_the_identity_is_named_with_its_fix(bench: Bench, share: float) -> None:
     bench.bus.stretch_errors = share
     with pytest.raises(DeviceFault) as corrupt:
         for _ in range(8):  # one reading in a row may be right
@@ -207,11 +207,11 @@ def test_rare_corrupt_readings_are_repeated_and_counted(bench: Bench, imu: Bno05
     bench.bus.stretch_errors = 0.2
     bench.rotate(30.0)
     begun_ns = bench.clock.now_ns()
-    turned = 0.0
+    rotated = 0.0
     for _ in range(50):
         bench.clock.sleep(0.04)
-        turned += float(imu.read_samples().gyro_dps[:, 2].sum()) / imu.rate_hz
-    assert turned == pytest.approx(30.0 * (bench.clock.now_ns() - begun_ns) * 1e-9, abs=2.0)
+        rotated += float(imu.read_samples().gyro_dps[:, 2].sum()) / imu.rate_hz
+    assert rotated == pytest.approx(30.0 * (bench.clock.now_ns() - begun_ns) * 1e-9, abs=2.0)
     assert imu.statistics.corrupt > 3
 
 
