@@ -364,7 +364,9 @@ class SimCapture:
         if blur > 0.1:
             seen = np.asarray(cv2.GaussianBlur(seen, (0, 0), blur), dtype=np.float32)
         if self.lamp is not None:
-            seen = np.asarray(seen * _bands(*self.lamp, start, _exposure_ns(controls)), dtype=np.float32)
+            seen = np.asarray(
+                seen * _bands(*self.lamp, start, _exposure_ns(controls), self.times.readout_ns), dtype=np.float32
+            )
         return _sensor(self._noise, self._world.seed, self._binning, get_ident()).expose(
             seen,
             light=scene.light,
@@ -474,9 +476,9 @@ def _within(value: float, limits: tuple[int, int]) -> int:
     return int(min(max(int(value), limits[0]), limits[1]))
 
 
-def _bands(hz: float, depth: float, start: int, exposure: int) -> NDArray[np.float32]:
+def _bands(hz: float, depth: float, start: int, exposure: int, readout: int) -> NDArray[np.float32]:
     """Return the light that each row receives from a flickering lamp during its exposure, (HEIGHT, 1, 1)."""
-    begins_s = start * 1e-9 + np.arange(HEIGHT) / HEIGHT * READOUT_NS * 1e-9
+    begins_s = start * 1e-9 + np.arange(HEIGHT) / HEIGHT * readout * 1e-9
     middle_s = begins_s + exposure * 0.5e-9
     light = 1 + depth * np.sinc(hz * exposure * 1e-9) * np.cos(2 * np.pi * hz * middle_s)
     return light.astype(np.float32)[:, None, None]
