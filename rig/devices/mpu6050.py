@@ -17,6 +17,7 @@ from rig.devices.i2c import I2cRegisters, I2cStatistics
 from rig.devices.imu import FifoTimes, ImuIdentity, ImuSamples, identified
 
 SMPLRT_DIV, _FIFO_EN, _ACCEL_XOUT_H, _TEMP_OUT_H = 0x19, 0x23, 0x3B, 0x41
+_GYRO_CONFIG, _GYRO_SELF_TEST = 0x1B, 0xE0  # all three axes, at 250 °/s
 _USER_CTRL, _PWR_MGMT_1, _FIFO_COUNTH, _FIFO_R_W = 0x6A, 0x6B, 0x72, 0x74
 
 _DEVICE_RESET, _ASLEEP, _CLOCK_PLL_GYRO_X = 0x80, 0x40, 0x01
@@ -34,6 +35,9 @@ _FILTERS = {188: 1, 98: 2, 42: 3, 20: 4, 10: 5, 5: 6}
 
 _TESTED_SAMPLES, _TESTED_S = 50, 2.0
 """How many samples of a clone are tested, and how long at most: 50 samples fit into any of the FIFOs."""
+_SELF_TEST_DPS = (5.0, 220.0)
+"""Smallest and largest response to the self-test; that of an MPU-6050 is 25 to 101 °/s by its factory trim (RM 4.1)."""
+_SELF_TEST_SAMPLES = 4, 20  # at least, and within a second
 _WILD_DPS = 20.0  # standard deviation that no table at rest shows
 
 
@@ -246,7 +250,8 @@ class Mpu6050Clone(Mpu6050):
     Raises
     ------
     DeviceMismatch
-        Its samples come at another rate, are all equal or wild, or gravity is not 1 g.
+        Its samples come at another rate, are all equal or wild, gravity is not 1 g, or its gyro does not respond to its
+        self-test.
     """
 
     KIND = imu_kind("mpu6050_clone")
@@ -269,6 +274,11 @@ class Mpu6050Clone(Mpu6050):
             problems.append(f"its rates scatter by {noise_dps:.0f} °/s")
         if not 0.8 < gravity_g < 1.2:
             problems.append(f"gravity is {gravity_g:.2f} g")
+        response_dps = np.zeros(3) if problems else self._self_test(rates.mean(axis=0))
+        low_dps, high_dps = _SELF_TEST_DPS
+        if not problems and not all(low_dps <= abs(one) <= high_dps for one in response_dps):
+            shown = ", ".join(f"{one:.0f}" for one in response_dps)
+            problems.append(f"its gyro responds with {shown} °/s to its self-test")
         if problems:
             raise DeviceMismatch(
                 f"The clone at I2C address {self._address:#04x} of {self._registers.name} does not behave as an "
@@ -276,6 +286,19 @@ class Mpu6050Clone(Mpu6050):
                 next_step="Keep the table still and open the bench again. If it fails again, use another sensor.",
                 evidence={"samples": got, "expected": due, "noise_dps": noise_dps, "gravity_g": gravity_g},
             )
+
+    def _self_test(self, at_rest_dps: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return what each axis of the gyro reads more while its self-test moves it, in °/s."""
+        self._registers.write(_GYRO_CONFIG, _GYRO_SELF_TEST)
+        self._empty_fifo()
+        least, most = _SELF_TEST_SAMPLES
+        count = max(least, min(most, round(self.rate_hz)))
+        self._clock.sleep(count / self.rate_hz)
+        words = self._pop(self._fifo_count() // _FRAME * _FRAME) or b""
+        self._registers.write(SMPLRT_DIV, *self._settings[SMPLRT_DIV])
+        self._empty_fifo()
+        late = np.frombuffer(words, ">i2").reshape(-1, 3)[count // 2 :]  # after the low-pass has settled
+        return late.mean(axis=0) / LSB_PER_DPS[250] - at_rest_dps if len(late) else np.zeros(3)
 
 
 def settings(range_dps: int, rate_hz: float, bandwidth_hz: int) -> dict[int, bytes]:

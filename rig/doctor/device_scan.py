@@ -246,6 +246,11 @@ def head_settings(port: SerialPort) -> dict[Key, Any]:
     return {("imu", "connection"): "head", ("head", "port"): port.stable or port.path}
 
 
+def ribbon_settings(number: int) -> dict[Key, Any]:
+    """Return the settings of a camera on a ribbon cable, by key."""
+    return {("camera", "source"): f"picamera2:{number}"}
+
+
 def camera_settings(found: FoundCamera) -> dict[Key, Any]:
     """Return the settings of this camera, by key; its number may change after a restart.
 

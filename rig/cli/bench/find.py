@@ -58,7 +58,7 @@ def find(
 
 def proposed_settings(scan: "DeviceScan") -> "dict[Key, Any]":
     """Return the settings of the unambiguous devices: those of which exactly one was found."""
-    from rig.doctor.device_scan import camera_settings, head_settings, imu_settings, servo_settings
+    from rig.doctor.device_scan import camera_settings, head_settings, imu_settings, ribbon_settings, servo_settings
 
     wanted: dict[Key, Any] = {}
     if len(scan.servos) == 1 and not scan.duplicate_ids:
@@ -69,4 +69,6 @@ def proposed_settings(scan: "DeviceScan") -> "dict[Key, Any]":
         wanted |= imu_settings(scan.imus[0])
     if len(scan.cameras) == 1:
         wanted |= camera_settings(scan.cameras[0])
+    elif len(scan.ribbons) == 1 and not scan.cameras:
+        wanted |= ribbon_settings(scan.ribbons[0])
     return wanted

@@ -95,7 +95,14 @@ class Dialogue:
 
     def run(self) -> "dict[Key, Any]":
         """Return the settings that were found or entered, by key."""
-        from rig.doctor.device_scan import DeviceScan, camera_settings, head_settings, imu_settings, servo_settings
+        from rig.doctor.device_scan import (
+            DeviceScan,
+            camera_settings,
+            head_settings,
+            imu_settings,
+            ribbon_settings,
+            servo_settings,
+        )
 
         scan = DeviceScan()
         self._scan(scan)
@@ -119,9 +126,14 @@ class Dialogue:
             if self.context.config.imu.connection == "head" and ("imu", "connection") not in imu[1]:
                 self.wanted[("imu", "connection")] = "i2c"
         shown = [f"{c.node.path}: {c.node.name}, {c.width}x{c.height}" for c in scan.cameras]
-        camera = self._pick("camera", scan.cameras, shown, lambda found: found.node)
-        if camera is not None:
-            self.wanted |= camera_settings(camera)
+        if not scan.ribbons:
+            camera = self._pick("camera", scan.cameras, shown, lambda found: found.node)
+            self.wanted |= {} if camera is None else camera_settings(camera)
+        else:
+            cameras = [camera_settings(found) for found in scan.cameras]
+            ribbons = [ribbon_settings(number) for number in scan.ribbons]
+            names = [f"on ribbon cable {number}" for number in scan.ribbons]
+            self.wanted |= self._pick("camera", [*cameras, *ribbons], [*shown, *names]) or {}
         self._cable_budget()
         return self.wanted
 

@@ -166,6 +166,10 @@ def test_clone_that_behaves_is_accepted(who_am_i: int, rate_hz: float, device: t
     with Bench(NoiseModel(), who_am_i=who_am_i, device=device) as bench:
         imu = bench.open(Mpu6050Clone, rate_hz=rate_hz)
         assert (imu.identity.model, imu.identity.who_am_i) == ("MPU-6050 clone", who_am_i)
+        bench.clock.sleep(max(0.03, 4 / rate_hz))
+        samples = imu.read_samples()  # the self-test is over
+        assert len(samples.time_ns) >= 3
+        assert np.abs(samples.gyro_dps).max() < 25
 
 
 @pytest.mark.parametrize(
@@ -178,8 +182,9 @@ def test_clone_that_behaves_is_accepted(who_am_i: int, rate_hz: float, device: t
         ),
         (lambda sensor: setattr(sensor.inertial, "accel_bias_g", sensor.inertial.up), "gravity is 2.0"),
         (lambda sensor: sensor.distortions.append(lambda words: words[::-1] * np.int16(300)), "scatter"),
+        (lambda sensor: setattr(sensor, "self_test_dps", np.array([58.0, 0.0, 58.0])), "to its self-test"),
     ],
-    ids=["rate", "frozen", "gravity", "noise"],
+    ids=["rate", "frozen", "gravity", "noise", "self-test"],
 )
 def test_clone_that_misbehaves_is_rejected(spoil: Any, problem: str) -> None:
     with Bench(NoiseModel(), device=SimMpu6050Clone) as bench:

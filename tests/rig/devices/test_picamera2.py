@@ -9,6 +9,7 @@ import pytest
 
 from rig.bench.computer import Computer
 from rig.bench.hardware import camera_settings
+from rig.cli.bench.find import proposed_settings
 from rig.config import load_config
 from rig.core.errors import DeviceNotFound, DeviceSilent
 from rig.devices.opencv_camera import CameraSettings, OpenCvCamera, TimeBase
@@ -149,3 +150,4 @@ def test_sensor_on_the_ribbon_cable_is_recognised_and_not_opened(receiver, monke
         monkeypatch.setattr("rig.doctor.device_scan.find_spec", lambda name: ModuleSpec(name, None))
         (found,) = scan.find_cameras(bench.context)
         assert (found.code, found.parameters["number"]) == (FindingCode.RIBBON_CAMERA, 0)
+        assert proposed_settings(DeviceScan(ribbons=[0])) == {("camera", "source"): "picamera2:0"}
