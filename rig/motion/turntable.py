@@ -385,7 +385,7 @@ class Turntable(AbstractContextManager["Turntable"]):
     ) -> float:
         """Poll until the profile has ended near the goal and all is quiet for ``quiet_s``; return the goal.
 
-        The polling also feeds the servo's watchdog.
+        The polling also feeds the servo's watchdog. Decision: docs/decisions/0044.
         """
         config, to_table = self._config, self._safety.angle_reference.to_table
         start_ns = self._clock.now_ns()
