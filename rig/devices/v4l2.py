@@ -45,7 +45,7 @@ def captures(caps: int) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class VideoMode:
-    """A mode that a camera offers: pixel format (FourCC), size in pixels, and highest frame rate."""
+    """A mode that a camera offers: pixel format (FourCC), size in pixels, and highest frame rate (0: not known)."""
 
     fourcc: str
     width: int
@@ -103,7 +103,7 @@ def choose_mode(
 
     def rank(mode: VideoMode) -> tuple[float, bool, bool, float, int]:
         apart = abs(mode.width - width) + abs(mode.height - height)
-        slow = mode.fps < 0.9 * fps
+        slow = 0 < mode.fps < 0.9 * fps
         order = (UNCOMPRESSED + COMPRESSED).index(mode.fourcc)
         return apart, slow, not slow and mode.fourcc in COMPRESSED, -mode.fps if slow else 0.0, order
 

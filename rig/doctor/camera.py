@@ -81,7 +81,7 @@ def _mode(context: DoctorContext, source: OpenCvCamera) -> Iterator[Finding]:
     nearest = choose_mode(source.modes, wanted.width, wanted.height, wanted.fps, wanted.fourcc)
     if nearest is None:
         return
-    if (nearest.width, nearest.height) != (wanted.width, wanted.height) or nearest.fps < 0.9 * wanted.fps:
+    if (nearest.width, nearest.height) != (wanted.width, wanted.height) or 0 < nearest.fps < 0.9 * wanted.fps:
         size = f"{wanted.width}x{wanted.height} at {wanted.fps:.3g} frames/s"
         yield warning("camera", FindingCode.MODE_NOT_OFFERED, context.rig("setup"), wanted=size, nearest=nearest)
 
