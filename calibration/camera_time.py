@@ -16,6 +16,7 @@ grows from the top to the bottom. The scatter of fast frames beyond that of slow
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from math import sqrt
 
 import cv2
@@ -305,7 +306,7 @@ def _bands(passes: Sequence[Pass]) -> list[tuple[slice, float]]:
     height = longest.images.shape[1]
     return [
         (slice(int(a), int(b)), float((energy[a:b] * (np.arange(a, b) + 0.5)).sum() / energy[a:b].sum() / height))
-        for a, b in zip(edges[:-1], edges[1:], strict=True)
+        for a, b in pairwise(edges)
         if energy[a:b].sum() > 0
     ]
 
