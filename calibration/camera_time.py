@@ -91,6 +91,8 @@ class CameraTime(Procedure):
     names, title, devices, plots = (NAME,), "time of the frames", ("servo", "camera", "exposure"), (plot,)
     valid_days = 90
     """Time stamps depend on camera, driver and USB port; three months find a changed kernel."""
+    thing: str | None = None
+    """The object that the operator puts on the table; None: it is there."""
     rounds: int = 1
 
     def measure(self, bench: Bench, *_: CalibrationResult) -> Measured:
@@ -99,6 +101,8 @@ class CameraTime(Procedure):
         if config.camera.exposure_us is None:
             yield found.reject(RejectionCode.EXPOSURE_NOT_LOCKED)
             return
+        if self.thing is not None:
+            bench.operator.place(self.thing)
         speeds = [speed for speed in SPEEDS if speed < config.table.velocity_dps] + [config.table.velocity_dps]
         passes: list[Pass] = []
         lost = frames = 0

@@ -135,6 +135,28 @@ def table(
     run(settings, TableAxis(board, ObjectSpace(radius_mm, height_mm, middle_mm, lens_mm)))
 
 
+@app.command("camera-time")
+@command
+def camera_time(
+    settings: Settings,
+    thing: Annotated[
+        str | None,
+        typer.Option(
+            "--object", metavar="NAME", help="Object with texture that the simulated bench puts on the table."
+        ),
+    ] = None,
+) -> None:
+    """Calibrate when frames are exposed, so that views can be taken while the table rotates.
+
+    Put an object with texture, or the board, on the table. Exit code 6 if the frames' times jitter too much.
+
+    Example: rig calibrate camera-time --bench sim --object mug-star
+    """
+    from calibration.procedures import CameraTime
+
+    run(settings, CameraTime(thing))
+
+
 @app.command("noise")
 @command
 def noise(

@@ -11,6 +11,7 @@ from calibration.procedures import (
     CameraCard,
     CameraModel,
     CameraNoise,
+    CameraTime,
     Encoder,
     GyroNoise,
     GyroRotation,
@@ -72,3 +73,4 @@ imu = CalibrationJob("IMU (half an hour)", lambda _: [GyroScale(), ImuMounting()
 camera = CalibrationJob("Camera (card and board)", lambda _: [CameraNoise(), CameraCard(), CameraModel(BOARD)])
 table = CalibrationJob("Table axis (board)", lambda _: [TableAxis(BOARD, ObjectSpace(80.0, 150.0, 75.0, None))])
 noise = CalibrationJob("Repeated views (an object)", _repeatability)
+camera_time = CalibrationJob("Time of the frames (an object with texture)", lambda _: [CameraTime()])

@@ -5,6 +5,7 @@ from calibration.cable import Cable as Cable
 from calibration.camera_light import CameraCard as CameraCard
 from calibration.camera_light import CameraNoise as CameraNoise
 from calibration.camera_model import CameraModel as CameraModel
+from calibration.camera_time import CameraTime as CameraTime
 from calibration.encoder import Encoder as Encoder
 from calibration.gyro_noise import GyroNoise as GyroNoise
 from calibration.gyro_rotation import GyroRotation as GyroRotation
@@ -28,5 +29,6 @@ PROCEDURES: tuple[type[Procedure], ...] = (
     CameraCard,
     CameraModel,
     TableAxis,
+    CameraTime,
     Repeatability,
 )

@@ -16,6 +16,10 @@ CALIBRATIONS = "calibrations"
 """The key in a bench's conditions that names the results in force."""
 
 
+_COMMANDS = {"camera.time": "camera-time"}
+"""Commands that are not named after the first part of their results."""
+
+
 class CalibrationStatus(StrEnum):
     """Whether a bench can use one kind of calibration."""
 
@@ -54,7 +58,7 @@ class CalibrationStanding:
     @property
     def command(self) -> str:
         """The command that calibrates again."""
-        return f"rig calibrate {self.result.name.partition('.')[0]}"
+        return f"rig calibrate {_COMMANDS.get(self.result.name, self.result.name.partition('.')[0])}"
 
 
 class CalibrationStore:

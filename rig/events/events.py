@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hbr import Outcome, StopDecision, StopReason
+from rig.motion.scan_speed import SpeedLimit
 from rig.views.capture import ViewEvidence
 
 SCHEMA = 2
@@ -102,6 +103,22 @@ class Moved:
     bound_deg: float | None
     agrees: bool
     seconds: float
+
+
+@dataclass(frozen=True, slots=True)
+class ScanStarted:
+    """The table begins a turn in which the views are taken while it rotates.
+
+    Angles of the table in degrees, unwrapped. ``limit`` says what limits the speed, and ``value`` is the number that
+    belongs to it: the exposure in ms, the frames per second, the table's or the gyro's speed in °/s, or the uncertainty
+    of a frame's time in ms.
+    """
+
+    speed_dps: float
+    limit: SpeedLimit
+    value: float
+    from_deg: float
+    to_deg: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -368,6 +385,7 @@ class Recorded:
 Event = (
     Started
     | Moved
+    | ScanStarted
     | Unwinding
     | Rejected
     | Accepted

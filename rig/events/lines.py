@@ -14,6 +14,7 @@ from rig.events.events import (
     Ranked,
     Recorded,
     Rejected,
+    ScanStarted,
     SimilarObjects,
     SkipReason,
     Started,
@@ -31,6 +32,7 @@ from rig.events.wording import (
     move_words,
     next_step_words,
     note_words,
+    scan_words,
     share_words,
     signed,
     similar_objects_words,
@@ -51,6 +53,8 @@ def line(event: Event) -> str:
         case Moved():
             encoder, asked = (angle_words(angle, 2) for angle in (event.encoder_deg, event.commanded_deg))
             return f"  table at {encoder} (asked {asked}): {move_words(event)}"
+        case ScanStarted():
+            return f"  {scan_words(event)}"
         case Unwinding():
             return f"  {unwinding_words(event)}"
         case Rejected():

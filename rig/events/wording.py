@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from math import ceil, isfinite, nan
-from typing import Any
+from typing import Any, Final
 
 from hbr import Outcome, StopDecision, StopReason
 from hbr.dense.stopping import Limitation, LimitationCode
@@ -14,11 +14,13 @@ from rig.events.events import (
     Note,
     NoteCode,
     RotationReason,
+    ScanStarted,
     SimilarObject,
     SimilarObjects,
     Unwinding,
     WaitReason,
 )
+from rig.motion.scan_speed import SpeedLimit
 from rig.views.table_problems import problem_text
 
 NAMED = 5
@@ -250,6 +252,21 @@ def move_words(moved: Moved) -> str:
         return words
     bound = "" if moved.bound_deg is None else f" by more than {moved.bound_deg:.2f}°"
     return f"{words}; they differ{bound}, so the gyro value counts"
+
+
+_SPEED_LIMITS: Final = {
+    SpeedLimit.SMEAR: "{value:g} ms exposure allows {speed:.0f} °/s",
+    SpeedLimit.FRAME_RATE: "{value:g} frames/s allow {speed:.0f} °/s",
+    SpeedLimit.TABLE: "table.velocity_dps allows {speed:.0f} °/s",
+    SpeedLimit.GYRO: "the gyro's range of {value:g} °/s allows {speed:.0f} °/s",
+    SpeedLimit.TIME: "frame times that are uncertain by {value:.1f} ms allow {speed:.0f} °/s",
+}
+
+
+def scan_words(scan: ScanStarted) -> str:
+    """Return that a scan begins, its speed, and what limits it."""
+    limit = _SPEED_LIMITS[scan.limit].format(value=scan.value, speed=scan.speed_dps)
+    return f"one turn from {angle_words(scan.from_deg)} to {angle_words(scan.to_deg)}: {limit}"
 
 
 def unwinding_words(unwinding: Unwinding) -> str:

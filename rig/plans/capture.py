@@ -102,6 +102,7 @@ def capture(index: int, viewer: Viewer, table: Turntable, settled_ns: int) -> Ge
             return attempt
         yield Rejected(index, attempt.number, attempt.reasons, attempt.evidence)
     evidence = attempt.evidence
+    assert evidence.stillness is not None
     texts = "; ".join(rejection_text(reason, evidence) for reason in attempt.reasons)
     next_step = "Check the light, the focus and the scene. The limits and view.retakes are in [view]."
     if RejectReason.LOCKS_CHANGED in attempt.reasons:

@@ -19,9 +19,11 @@ from rig.core.clock import seconds_between
 from rig.core.errors import ObjectMoved, RigError, RotationDisagreement
 from rig.events.events import Accepted, Enrolled, Event, Started, plain
 from rig.motion.move import Move
+from rig.motion.scan_speed import require_camera_time
 from rig.motion.turntable import Turntable
 from rig.plans.capture import announced, capture, check_camera, moved, warn_of_table
 from rig.plans.estimate import even_azimuths, table_angles
+from rig.plans.fly import fly_views, park
 from rig.views.capture import Viewer, image_similarity
 from rig.views.description import DESCRIPTORS, ViewDescriber
 from rig.views.empty_table import empty_table_status
@@ -40,6 +42,7 @@ def enroll(
     note: str | None = None,
     resume: bool = False,
     replace: bool = False,
+    fly: bool | None = None,
 ) -> Generator[Event, None, Enrolled]:
     """Enroll the object ``name`` with views at even steps; yields events and returns the last of them.
 
@@ -48,6 +51,9 @@ def enroll(
     back; a table that covers less than a revolution takes the views within its limits. An interrupted enrollment keeps
     its views: ``resume`` takes the missing ones, provided that the object was not moved. Closing the generator switches
     the torque off.
+
+    With ``fly`` the views are taken in one turn without a stop (`rig.plans.fly`). Those that fail or are missing are
+    then taken at rest. The default is ``enroll.mode``; "auto" means at rest.
 
     Every view is described by `rig.views.description.DESCRIPTORS`. Segmentation uses the bench's empty-table image, if
     there is one (`rig.plans.photograph_table`); the enrollment stores it.
@@ -67,6 +73,9 @@ def enroll(
         See `rig.views.capture` and `rig.motion.turntable`; the views stored so far stay.
     """
     limits_deg, sign = bench.config.table.limits_deg, bench.config.table.orientation_sign
+    fly = bench.config.enroll.mode == "fly" if fly is None else fly
+    if fly:
+        require_camera_time(bench.config)
     status = empty_table_status(bench)
     provenance = Provenance(
         bench=bench.name,
@@ -105,9 +114,11 @@ def enroll(
             empty_table = None if status.table is None else status.table.image_bgr
             if empty_table is not None:
                 enrollment.store_empty_table(empty_table)
-            retakes = yield from _take_views(
-                bench, enrollment, to_go, ViewDescriber(bench.config.view, DESCRIPTORS, empty_table)
-            )
+            describe = ViewDescriber(bench.config.view, DESCRIPTORS, empty_table)
+            if fly:
+                retakes = yield from _fly_and_complete(bench, enrollment, to_go, describe)
+            else:
+                retakes = yield from _take_views(bench, enrollment, to_go, describe)
         except BaseException:
             if not resume:
                 with suppress(RigError):  # it has views to resume
@@ -124,40 +135,8 @@ def _take_views(
 ) -> Generator[Event, None, int]:
     """Take and store the views at these table angles, return to 0, and return the number of repeated images."""
     viewer = Viewer(bench.camera, bench.config.view)
-    sign = bench.config.table.orientation_sign
-    retakes = 0
-    imu = _ImuAngle()
-    first: tuple[int, float, NDArray[np.uint8]] | None = None
     with Turntable(bench) as table:
-        for index, angle_deg in angles_deg.items():
-            move = yield from announced(index, table, angle_deg)
-            yield moved(index, move)
-            if move.agreement is None or not move.agreement.agrees:
-                disagreement = _disagreement(move)
-                if move.agreement is not None:
-                    bench.safety.latch(disagreement)  # a platter that has slipped once will slip again
-                raise disagreement
-            imu.add(move)
-            attempt = yield from capture(index, viewer, table, move.settled_ns)
-            retakes += attempt.number - 1
-            described = describe(attempt.image_bgr)
-            record = ViewRecord(
-                index=index,
-                commanded_deg=move.commanded_deg,
-                encoder_deg=move.encoder_deg,
-                azimuth_deg=float(wrap360(sign * (imu.angle_deg if move.by_gyro else move.encoder_deg))),
-                descriptors=described.levels,
-                captured_ns=attempt.evidence.exposed_ns,
-                imu_deg=imu.angle_deg,
-                imu_sigma_deg=imu.sigma_deg,
-                evidence=plain(attempt.evidence),
-                region=bench.config.view.roi,
-                segmentation=described.segmentation,
-            )
-            enrollment.add(record, attempt.image_bgr)
-            yield Accepted(index, record.azimuth_deg, attempt.evidence, attempt.image_bgr, described.segmentation)
-            yield from warn_of_table(bench, index, described)
-            first = first or (index, angle_deg, attempt.image_bgr)
+        retakes, first, index = yield from _step_views(bench, enrollment, table, viewer, angles_deg, describe)
         # Return to the first view to check that the object was not moved, then to 0 to free the cable: without its
         # supply the servo forgets whole revolutions, and a cable that stays wound up is wound further the next time.
         if first and first[0] != index:
@@ -165,6 +144,74 @@ def _take_views(
         if first is None or first[0] == index or first[1] != 0.0:
             yield from announced(index, table, 0.0)
     return retakes
+
+
+def _fly_and_complete(
+    bench: Bench, enrollment: Enrollment, angles_deg: Mapping[int, float], describe: ViewDescriber
+) -> Generator[Event, None, int]:
+    """Take and store the views in one turn, the others at rest, return to 0; return the number of repeated images."""
+    viewer = Viewer(bench.camera, bench.config.view)
+    retakes = 0
+    with Turntable(bench) as table:
+        stored, start_deg, before, after = yield from fly_views(bench, enrollment, table, viewer, angles_deg, describe)
+        require_not_moved(bench, enrollment, 0, start_deg, before, after)
+        left = {index: angle for index, angle in angles_deg.items() if index not in stored}
+        if left:
+            retakes, _, index = yield from _step_views(bench, enrollment, table, viewer, left, describe)
+            yield from _check_not_moved(bench, enrollment, table, viewer, 0, start_deg, before)
+            if start_deg != 0.0:
+                yield from announced(index, table, 0.0)
+        else:
+            park(table, bench)
+    return len(left) + retakes
+
+
+def _step_views(
+    bench: Bench,
+    enrollment: Enrollment,
+    table: Turntable,
+    viewer: Viewer,
+    angles_deg: Mapping[int, float],
+    describe: ViewDescriber,
+) -> Generator[Event, None, tuple[int, tuple[int, float, NDArray[np.uint8]] | None, int]]:
+    """Take and store the views at these table angles at rest.
+
+    Returns the number of repeated images, index, angle and image of the first view, and the index of the last one.
+    """
+    sign = bench.config.table.orientation_sign
+    retakes = 0
+    imu = _ImuAngle()
+    first: tuple[int, float, NDArray[np.uint8]] | None = None
+    for index, angle_deg in angles_deg.items():
+        move = yield from announced(index, table, angle_deg)
+        yield moved(index, move)
+        if move.agreement is None or not move.agreement.agrees:
+            disagreement = _disagreement(move)
+            if move.agreement is not None:
+                bench.safety.latch(disagreement)  # a platter that has slipped once will slip again
+            raise disagreement
+        imu.add(move)
+        attempt = yield from capture(index, viewer, table, move.settled_ns)
+        retakes += attempt.number - 1
+        described = describe(attempt.image_bgr)
+        record = ViewRecord(
+            index=index,
+            commanded_deg=move.commanded_deg,
+            encoder_deg=move.encoder_deg,
+            azimuth_deg=float(wrap360(sign * (imu.angle_deg if move.by_gyro else move.encoder_deg))),
+            descriptors=described.levels,
+            captured_ns=attempt.evidence.exposed_ns,
+            imu_deg=imu.angle_deg,
+            imu_sigma_deg=imu.sigma_deg,
+            evidence=plain(attempt.evidence),
+            region=bench.config.view.roi,
+            segmentation=described.segmentation,
+        )
+        enrollment.add(record, attempt.image_bgr)
+        yield Accepted(index, record.azimuth_deg, attempt.evidence, attempt.image_bgr, described.segmentation)
+        yield from warn_of_table(bench, index, described)
+        first = first or (index, angle_deg, attempt.image_bgr)
+    return retakes, first, index
 
 
 def _check_not_moved(
@@ -185,7 +232,19 @@ def _check_not_moved(
     """
     move = yield from announced(index, table, angle_deg)
     again = yield from capture(index, viewer, table, move.settled_ns)
-    alike = image_similarity(image_bgr, again.image_bgr, bench.config.view)
+    require_not_moved(bench, enrollment, index, angle_deg, image_bgr, again.image_bgr)
+
+
+def require_not_moved(
+    bench: Bench,
+    enrollment: Enrollment,
+    index: int,
+    angle_deg: float,
+    image_bgr: NDArray[np.uint8],
+    again_bgr: NDArray[np.uint8],
+) -> None:
+    """Compare two frames of view ``index``; abandon the enrollment and raise `ObjectMoved` if the object moved."""
+    alike = image_similarity(image_bgr, again_bgr, bench.config.view)
     if alike < SAME_SIMILARITY:
         enrollment.abandon()
         raise ObjectMoved(

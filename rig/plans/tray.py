@@ -14,6 +14,7 @@ from rig.catalog import Catalog, ObjectSummary, clean_name
 from rig.core.errors import ObjectNotFound, RigError, RotationDisagreement, UsageError, ViewRejected
 from rig.core.files import read
 from rig.events.events import Event, Item, SkipReason
+from rig.motion.scan_speed import can_fly
 from rig.plans.enroll import enroll
 
 COLUMNS: Final = ("name", "label", "note", "views")
@@ -140,6 +141,7 @@ def enroll_tray(
     *,
     views: int | None = None,
     operator: TrayOperator | None = None,
+    fly: bool | None = None,
 ) -> Generator[Event, None, None]:
     """Enroll the objects of a tray one after the other; yields an `Item` before the events of each.
 
@@ -156,6 +158,9 @@ def enroll_tray(
         Number of views for objects without their own; by default ``enroll.views``.
     operator
         Puts the objects on the table; by default an `AutomaticOperator`.
+    fly
+        Whether the views are taken in motion. The default is ``enroll.mode``; "auto" means in motion if the camera's
+        time is calibrated and the cable budget allows a revolution.
 
     Raises
     ------
@@ -189,6 +194,7 @@ def enroll_tray(
                     note=item.note,
                     resume=resume,
                     replace=interrupted is not None and not resume,
+                    fly=_flies(bench) if fly is None else fly,
                 )
             except OBJECT_ERRORS as error:
                 decision = operator.decide_after_error(item, error)
@@ -199,6 +205,13 @@ def enroll_tray(
                     break
             else:
                 break
+
+
+def _flies(bench: Bench) -> bool:
+    mode = bench.config.enroll.mode
+    low_deg, high_deg = bench.config.table.limits_deg
+    room = low_deg <= 0.0 and high_deg >= 360.0
+    return mode == "fly" or (mode == "auto" and room and can_fly(bench.config))
 
 
 def _rows(text: str) -> Generator[tuple[int, list[str]], None, None]:

@@ -36,6 +36,26 @@ class RejectReason(StrEnum):
     OVEREXPOSED = "overexposed"
     BLURRED = "blurred"
     NOISE = "noise"
+    SMEARED = "smeared"
+    ANGLE_UNCERTAIN = "angle-uncertain"
+    TIME_UNCERTAIN = "time-uncertain"
+
+
+@dataclass(frozen=True, slots=True)
+class MotionEvidence:
+    """How the table moved while a view was exposed.
+
+    ``middle_ns`` is the middle of the exposure on the bench's clock, ``angle_deg`` the table's angle then with its
+    standard uncertainty, ``speed_dps`` its speed, and ``smear_px`` the motion during the exposure at the edge of the
+    region. ``residual_deg`` is the largest difference between encoder and gyro during the motion.
+    """
+
+    middle_ns: int
+    angle_deg: float
+    angle_sigma_deg: float
+    speed_dps: float
+    smear_px: float
+    residual_deg: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +63,9 @@ class ViewEvidence:
     """The measurements that decide whether a frame is accepted.
 
     ``settled_ns`` and ``exposed_ns`` are times on the bench's clock. ``sharpness`` is the variance of the Laplacian of
-    the grey region, in squared levels. The shares are shares of the region's pixels.
+    the grey region, in squared levels. The shares are shares of the region's pixels. For a view that was taken in
+    motion, ``settled_ns`` is the time at which the motion began, ``motion`` says how the table moved, and ``stillness``
+    is None.
     """
 
     settled_ns: int
@@ -55,7 +77,8 @@ class ViewEvidence:
     repeated: bool
     locks: CameraLocks
     locks_hold: bool
-    stillness: Stillness
+    stillness: Stillness | None
+    motion: MotionEvidence | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -206,6 +229,9 @@ _TEXTS: Mapping[str, str] = {
     RejectReason.OVEREXPOSED: "overexposed ({0.saturated_share:.0%} saturated)",
     RejectReason.BLURRED: "blurred (sharpness {0.sharpness:.1f})",
     RejectReason.NOISE: "noise instead of an image",
+    RejectReason.SMEARED: "smeared by {0.motion.smear_px:.1f} px at {0.motion.speed_dps:.0f} °/s",
+    RejectReason.ANGLE_UNCERTAIN: "the angle is uncertain by {0.motion.angle_sigma_deg:.2f}°",
+    RejectReason.TIME_UNCERTAIN: "the time stamp does not fit the camera's rhythm",
 }
 
 

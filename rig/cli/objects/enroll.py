@@ -52,6 +52,12 @@ def enroll(
     replace: Annotated[
         bool, typer.Option("--replace", help="Enroll again. The old views stay in use until the new ones are complete.")
     ] = False,
+    fly: Annotated[
+        bool | None,
+        typer.Option(
+            "--fly/--at-rest", help="Take the views in one turn without a stop, or at rest (default: enroll.mode)."
+        ),
+    ] = None,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Only show the plan: views, duration, table angles. Nothing moves.")
     ] = False,
@@ -70,12 +76,17 @@ def enroll(
 
     Example: rig enroll mug-white --bench sim --views 36 --report mug.html
 
+    With --fly the table does not stop: a turn takes some seconds. Run rig calibrate camera-time before.
+
     Example: rig enroll --list tray.csv --bench sim
+
+    Example: rig enroll mug-white --bench sim --fly
     """
     from rig.plans.tray import read_tray
 
     # Reject wrong options before a device is opened.
     given = {"--views": views, "--step": step, "--label": label, "--note": note, "--report": report, "--yes": yes}
+    given |= {"--fly": fly is True, "--at-rest": fly is False}
     views = _views(views, step)
     _check(name, tray, label=label, note=note, resume=resume, replace=replace)
     if report is not None:
@@ -107,14 +118,14 @@ def enroll(
         job = _Job(settings, bench, catalog)
         if name is not None:
             events = enroll_one(
-                bench, catalog, name, views=views, label=labels, note=note, resume=resume, replace=replace
+                bench, catalog, name, views=views, label=labels, note=note, resume=resume, replace=replace, fly=fly
             )
             job.run(events, ["To continue:", _command(settings, given, name, "--resume")], report)
         else:
             asks = isinstance(bench.operator, ObjectAlreadyPlaced)
             operator = OperatorPrompts(job.close_view) if asks else AutomaticOperator()
             job.run(
-                enroll_tray(bench, catalog, items, views=views, operator=operator),
+                enroll_tray(bench, catalog, items, views=views, operator=operator, fly=fly),
                 ["To continue with the other objects:", _command(settings, given, "--list", str(tray))],
                 report,
             )

@@ -19,6 +19,7 @@ from rig.events.events import (
     Failed,
     Note,
     NoteCode,
+    ScanStarted,
     SimilarObject,
     Unwinding,
     Waiting,
@@ -28,6 +29,7 @@ from rig.events.events import (
     event_dict,
     event_kind,
 )
+from rig.motion.scan_speed import SpeedLimit
 from rig.plans.enroll import enroll
 from rig.plans.identify import identify
 from rig.plans.photograph_table import photograph_table
@@ -36,7 +38,7 @@ from rig.plans.similar_objects import similar_objects
 from rig.plans.tray import TrayItem, enroll_tray
 from rig.safety.gyro_rotation import Stillness
 from rig.search.model import load_model
-from rig.views.capture import ViewEvidence
+from rig.views.capture import MotionEvidence, ViewEvidence
 
 TEXT = (Path(__file__).parents[3] / "docs" / "events.md").read_text(encoding="utf-8")
 PLAIN = {"string": str, "integer": int, "number": (int, float), "boolean": bool, "object": dict}
@@ -49,6 +51,7 @@ PARTS = {
     "evidence": ViewEvidence,
     "locks": CameraLocks,
     "stillness": Stillness,
+    "motion": MotionEvidence,
 }
 
 
@@ -135,6 +138,7 @@ def test_every_event_that_the_plans_emit_is_as_documented(simulated, tmp_path):
     error = caught.value.as_dict()
     seen |= {check_event(Failed(**error)), check_event(Waiting(WaitReason.NEXT_OBJECT))}
     seen.add(check_event(Warned(3, Note(NoteCode.EMPTY_TABLE_CHANGED, {"problem": {"code": "missing"}}))))
+    seen.add(check_event(ScanStarted(90.0, SpeedLimit.SMEAR, 10.0, 0.0, 360.0)))
     seen.add(check_event(Unwinding(0, 330.0, 0.0, 1, (-400.0, 400.0))))
     assert seen == {event_kind(kind) for kind in get_args(Event)}
 

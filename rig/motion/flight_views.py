@@ -1,0 +1,85 @@
+"""Judges frames that were taken while the table rotated, as `rig.views.capture` does for frames at rest."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.config import RigConfig
+from rig.devices.camera import CameraLocks
+from rig.motion.scan_speed import smear_px, time_sigma_ms
+from rig.motion.trajectory import Trajectory
+from rig.views.capture import Attempt, ImageQuality, MotionEvidence, RejectReason, ViewEvidence
+from rig.views.stream import StreamFrame, irregular_stamps, middle_ns
+
+
+@dataclass(frozen=True, slots=True)
+class FlightJudge:
+    """Judges the frames of one motion.
+
+    Attributes
+    ----------
+    locks
+        The camera's settings at the beginning; they must not have changed (``locks_hold``).
+    begun_ns
+        When the motion began.
+    period_s
+        Time between two frames.
+    """
+
+    config: RigConfig
+    locks: CameraLocks
+    locks_hold: bool
+    begun_ns: int
+    period_s: float
+
+    def irregular(self, stamps_ns: Sequence[int]) -> NDArray[np.bool_]:
+        """Return which time stamps of consecutive frames cannot be trusted, bool (n,)."""
+        return irregular_stamps(stamps_ns, self.period_s, self.config.camera_time.jitter_ms)
+
+    def judge(self, frame: StreamFrame, trajectory: Trajectory, *, irregular: bool, number: int = 1) -> Attempt:
+        """Return a frame as an attempt at a view: its evidence, and the reasons to reject it."""
+        quality = ImageQuality.of(frame.image_bgr, self.config.view)
+        middle = middle_ns(frame.stamp_ns, self.config.camera_time)
+        motion = trajectory.at([middle])
+        speed_dps = abs(float(motion.rate_dps[0]))
+        time_deg = speed_dps * time_sigma_ms(self.config) * 1e-3
+        evidence = MotionEvidence(
+            middle,
+            float(motion.angle_deg[0]),
+            float(np.hypot(motion.sigma_deg[0], time_deg)),
+            speed_dps,
+            smear_px(self.config, speed_dps),
+            trajectory.residual_deg,
+        )
+        reasons = []
+        if irregular or not frame.stamped:
+            reasons.append(RejectReason.TIME_UNCERTAIN)
+        if evidence.angle_sigma_deg > self.config.view.max_angle_sigma_deg or not trajectory.consistent:
+            reasons.append(RejectReason.ANGLE_UNCERTAIN)
+        if evidence.smear_px > 1.1 * self.config.view.max_smear_px:  # the speed ripples about the chosen one
+            reasons.append(RejectReason.SMEARED)
+        if frame.repeated:
+            reasons.append(RejectReason.REPEATED_FRAME)
+        if not self.locks_hold:
+            reasons.append(RejectReason.LOCKS_CHANGED)
+        reasons += quality.reasons(self.config.view)
+        return Attempt(
+            number,
+            frame.image_bgr,
+            ViewEvidence(
+                settled_ns=self.begun_ns,
+                exposed_ns=frame.stamp_ns,
+                sharpness=quality.sharpness,
+                mean_level=quality.mean_level,
+                dark_share=quality.dark_share,
+                saturated_share=quality.saturated_share,
+                repeated=frame.repeated,
+                locks=self.locks,
+                locks_hold=self.locks_hold,
+                stillness=None,
+                motion=evidence,
+            ),
+            tuple(reasons),
+        )

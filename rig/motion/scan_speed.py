@@ -1,0 +1,91 @@
+"""The speed of a scan: the fastest at which its views are good enough, and what limits it."""
+
+from dataclasses import dataclass
+from enum import StrEnum
+from math import hypot, radians
+from typing import Final
+
+from rig.config import RigConfig
+from rig.core.errors import UsageError
+
+GYRO_SHARE: Final = 0.9
+"""Share of the gyro's range that a scan uses: the table rings, and the scale may be off."""
+FRAME_SHARE: Final = 0.9
+"""A frame for each planned angle arrives with a margin, because the frame rate is nominal."""
+FIT_SIGMA_DEG: Final = 0.05
+"""Standard uncertainty of the angle that is left to the trajectory."""
+
+
+class SpeedLimit(StrEnum):
+    """What limits the speed of a scan."""
+
+    SMEAR = "smear"
+    FRAME_RATE = "frame-rate"
+    TABLE = "table"
+    GYRO = "gyro"
+    TIME = "time"
+
+
+@dataclass(frozen=True, slots=True)
+class ScanSpeed:
+    """A speed in °/s, what limits it, and the number of the limit as in `rig.events.events.ScanStarted`."""
+
+    dps: float
+    limit: SpeedLimit
+    value: float
+
+
+def edge_px(config: RigConfig) -> float:
+    """Return the distance of the region's edge from its middle, where the axis is, in pixels."""
+    return (config.camera.width if config.view.roi is None else config.view.roi[2]) / 2
+
+
+def smear_px(config: RigConfig, speed_dps: float) -> float:
+    """Return the motion at the edge of the region during an exposure, in pixels."""
+    return abs(radians(speed_dps)) * edge_px(config) * exposure_s(config)
+
+
+def exposure_s(config: RigConfig) -> float:
+    """Return the locked exposure time; raise `UsageError` if it is not locked."""
+    if config.camera.exposure_us is None:
+        raise UsageError(
+            "The exposure time of the camera is not locked, so that the smear of views in motion is not known.",
+            next_step="Set camera.exposure_us to a number and run rig calibrate camera-time, or take views at rest.",
+        )
+    return config.camera.exposure_us * 1e-6
+
+
+def time_sigma_ms(config: RigConfig) -> float:
+    """Return the standard uncertainty of the middle of a frame's exposure."""
+    return hypot(config.camera_time.jitter_ms, config.camera_time.uncertainty_ms)
+
+
+def can_fly(config: RigConfig) -> bool:
+    """Return whether views can be taken in motion: the camera's time is calibrated, and its exposure is locked."""
+    return config.camera_time.offset_ms is not None and config.camera.exposure_us is not None
+
+
+def require_camera_time(config: RigConfig) -> None:
+    """Raise `UsageError` unless views can be taken in motion."""
+    exposure_s(config)
+    if config.camera_time.offset_ms is None:
+        raise UsageError(
+            "The time of the camera's frames is not calibrated, so that their angles in motion are not known.",
+            next_step="Run rig calibrate camera-time, or take the views at rest.",
+        )
+
+
+def scan_speed(config: RigConfig, *, fps: float, gyro_range_dps: float, spacing_deg: float | None) -> ScanSpeed:
+    """Return the fastest speed for views every ``spacing_deg``; None: no view is planned at a certain angle."""
+    milliseconds = exposure_s(config) * 1e3
+    left_deg = max(config.view.max_angle_sigma_deg**2 - FIT_SIGMA_DEG**2, 1e-6) ** 0.5
+    sigma_ms = max(time_sigma_ms(config), 1e-3)
+    speeds = [
+        ScanSpeed(config.table.velocity_dps, SpeedLimit.TABLE, config.table.velocity_dps),
+        ScanSpeed(config.view.max_smear_px / smear_px(config, 1.0), SpeedLimit.SMEAR, milliseconds),
+        ScanSpeed(GYRO_SHARE * gyro_range_dps, SpeedLimit.GYRO, gyro_range_dps),
+        ScanSpeed(left_deg / (sigma_ms * 1e-3), SpeedLimit.TIME, sigma_ms),
+    ]
+    if spacing_deg is not None:
+        speeds.append(ScanSpeed(FRAME_SHARE * spacing_deg * fps, SpeedLimit.FRAME_RATE, fps))
+    return min(speeds, key=lambda one: one.dps)

@@ -1,0 +1,214 @@
+"""The part of an enrollment in which the views are taken while the table rotates: a fly scan.
+
+The table turns from rest to rest by one revolution. For each planned angle the frame nearest to it is kept. When the
+turn is over, the trajectory of the platter gives each frame its angle, and each is judged as a view at rest is. Nothing
+is stored before: an interrupted turn leaves no view.
+
+Decision: docs/decisions/0047.
+"""
+
+from collections.abc import Generator, Mapping
+from dataclasses import dataclass, field
+from math import inf
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hbr.core.angles import wrap360
+from rig.bench import Bench
+from rig.catalog import Enrollment, ViewRecord
+from rig.core.errors import LimitExceeded, RotationDisagreement
+from rig.events.events import Accepted, Event, Rejected, ScanStarted, plain
+from rig.motion.flight_views import FlightJudge
+from rig.motion.move import Move
+from rig.motion.scan_speed import require_camera_time, scan_speed
+from rig.motion.turntable import Flight, Turntable
+from rig.plans.capture import announced, capture, moved, warn_of_table
+from rig.views.capture import Attempt, Viewer
+from rig.views.description import ViewDescriber
+from rig.views.stream import FrameStream, StreamFrame, middle_ns
+
+NEAR_SHARE = 0.6
+"""A frame stands for a planned angle if it is within this share of the step from it."""
+
+
+@dataclass
+class Scan:
+    """Frames of a turn: the nearest one to each planned angle, and the stamps of all."""
+
+    bench: Bench
+    table: Turntable
+    stream: FrameStream
+    angles_deg: Mapping[int, float]
+    nearest: dict[int, tuple[float, StreamFrame]] = field(default_factory=dict)
+    stamps_ns: list[int] = field(default_factory=list)
+    _readings: list[tuple[int, float]] = field(default_factory=list)
+
+    def each(self) -> None:
+        """Wait for the next frame, and keep it if it is the nearest so far to a planned angle."""
+        frame = self.stream.next(self.table.collect_gyro)
+        self.stamps_ns.append(frame.stamp_ns)
+        about_deg = self._about_deg(middle_ns(frame.stamp_ns, self.bench.config.camera_time))
+        for index, angle_deg in self.angles_deg.items():
+            away_deg = abs(angle_deg - about_deg)
+            if away_deg < self.nearest.get(index, (15.0, None))[0]:
+                self.nearest[index] = away_deg, frame
+
+    def observe(self, time_ns: int, angle_deg: float) -> None:
+        """Take a reading of the encoder."""
+        self._readings = [*self._readings[-7:], (time_ns, angle_deg)]
+
+    def _about_deg(self, time_ns: int) -> float:
+        """Return the angle at a time, roughly: from the last readings of the encoder."""
+        if len(self._readings) < 2:
+            return self._readings[-1][1] if self._readings else self.table.rest_deg
+        times = np.array([(t - time_ns) * 1e-9 for t, _ in self._readings])
+        angles = np.array([angle for _, angle in self._readings])
+        if times[-1] >= 0:
+            return float(np.interp(0.0, times, angles))
+        rate = (angles[-1] - angles[-2]) / max(times[-1] - times[-2], 1e-3)
+        return float(angles[-1] - rate * times[-1])
+
+
+def start_of_turn(bench: Bench, angles_deg: Mapping[int, float]) -> float | None:
+    """Return where a revolution upwards that passes all angles begins; None if the cable budget does not allow one."""
+    low_deg, high_deg = bench.config.table.limits_deg
+    start_deg = min(min(angles_deg.values()), high_deg - 360.0)
+    return start_deg if start_deg >= low_deg and max(angles_deg.values()) <= start_deg + 360.0 else None
+
+
+def fly_views(
+    bench: Bench,
+    enrollment: Enrollment,
+    table: Turntable,
+    viewer: Viewer,
+    angles_deg: Mapping[int, float],
+    describe: ViewDescriber,
+) -> Generator[Event, None, tuple[set[int], float, NDArray[np.uint8], NDArray[np.uint8]]]:
+    """Take the views at these table angles in one turn, and store those that pass their checks.
+
+    Returns the indices of the stored views, the start angle, and the frames at rest before and after the turn, which
+    show the same side of the object.
+
+    Raises
+    ------
+    UsageError
+        The camera's time is not calibrated.
+    LimitExceeded
+        The cable budget does not allow a revolution.
+    RotationDisagreement
+        Encoder and gyro disagree: no view of the turn is stored.
+    """
+    config = bench.config
+    require_camera_time(config)
+    start_deg = start_of_turn(bench, angles_deg)
+    if start_deg is None:
+        raise LimitExceeded(
+            "A scan needs a revolution upwards. The cable budget does not allow that.",
+            next_step="Increase table.limits_deg if the cable is long enough, or take the views at rest.",
+            evidence={"limits_deg": list(config.table.limits_deg)},
+        )
+    end_deg = start_deg + 360.0
+    ordered = sorted(angles_deg.values())
+    spacing_deg = min(np.diff(ordered).tolist(), default=360.0)
+    speed = scan_speed(
+        config, fps=bench.camera.identity.fps, gyro_range_dps=bench.imu.range_dps, spacing_deg=spacing_deg
+    )
+    if abs(table.rest_deg - start_deg) > config.table.tolerance_deg:
+        yield moved(0, (yield from announced(0, table, start_deg)))
+    before = yield from capture(0, viewer, table, bench.clock.now_ns())
+    yield ScanStarted(speed.dps, speed.limit, speed.value, start_deg, end_deg)
+    recorder = table.recorder()
+    scan = Scan(bench, table, FrameStream(bench.camera, bench.clock), angles_deg)
+    add_reading = recorder.add_reading
+
+    def observed(time_ns: int, angle_deg: float) -> None:
+        add_reading(time_ns, angle_deg)
+        scan.observe(time_ns, angle_deg)
+
+    recorder.add_reading = observed  # type: ignore[method-assign]
+    begun_ns = bench.clock.now_ns()
+    move = table.fly(end_deg, Flight(scan.each, (start_deg, end_deg), recorder, speed.dps))
+    yield moved(len(angles_deg), move)
+    trajectory = recorder.fit()
+    if trajectory is None or move.agreement is None or not (move.agreement.agrees and trajectory.consistent):
+        raise _disagreement(bench, move, None if trajectory is None else trajectory.residual_deg)
+    after = yield from capture(0, viewer, table, move.settled_ns)
+    judge = FlightJudge(
+        config,
+        before.evidence.locks,
+        before.evidence.locks_hold and after.evidence.locks_hold,
+        begun_ns,
+        scan.stream.period_s,
+    )
+    off = dict(zip(scan.stamps_ns, judge.irregular(scan.stamps_ns).tolist(), strict=True))
+    stored: set[int] = set()
+    for index, angle_deg in angles_deg.items():
+        _, frame = scan.nearest.pop(index, (inf, None))
+        if frame is None:
+            continue
+        attempt = judge.judge(frame, trajectory, irregular=off[frame.stamp_ns])
+        assert attempt.evidence.motion is not None
+        if abs(attempt.evidence.motion.angle_deg - angle_deg) > NEAR_SHARE * spacing_deg:
+            continue  # the frames near this angle were lost
+        if not attempt.accepted:
+            yield Rejected(index, attempt.number, attempt.reasons, attempt.evidence)
+            continue
+        yield from _store(bench, enrollment, index, angle_deg, attempt, describe)
+        stored.add(index)
+    return stored, start_deg, before.image_bgr, after.image_bgr
+
+
+def _store(
+    bench: Bench, enrollment: Enrollment, index: int, angle_deg: float, attempt: Attempt, describe: ViewDescriber
+) -> Generator[Event, None, None]:
+    motion = attempt.evidence.motion
+    assert motion is not None
+    described = describe(attempt.image_bgr)
+    record = ViewRecord(
+        index=index,
+        commanded_deg=angle_deg,
+        encoder_deg=motion.angle_deg,
+        azimuth_deg=float(wrap360(bench.config.table.orientation_sign * motion.angle_deg)),
+        descriptors=described.levels,
+        captured_ns=attempt.evidence.exposed_ns,
+        evidence=plain(attempt.evidence),
+        region=bench.config.view.roi,
+        segmentation=described.segmentation,
+    )
+    enrollment.add(record, attempt.image_bgr)
+    yield Accepted(index, record.azimuth_deg, attempt.evidence, attempt.image_bgr, described.segmentation)
+    yield from warn_of_table(bench, index, described)
+
+
+def park(table: Turntable, bench: Bench) -> Move:
+    """Return to 0 to free the cable; the table need not be quiet there, because no view follows."""
+    low_deg, high_deg = sorted((0.0, table.rest_deg))
+    poll_s = bench.config.table.poll_s
+    flight = Flight(
+        lambda: bench.clock.sleep(poll_s),
+        (low_deg, high_deg),
+        table.recorder(),
+        bench.config.table.velocity_dps,
+        quiet=False,
+    )
+    return table.fly(0.0, flight)
+
+
+def _disagreement(bench: Bench, move: Move, residual_deg: float | None) -> RotationDisagreement:
+    what = f"The servo rotated {move.rotation_encoder_deg:.2f}°, the platter {move.gyro.angle_deg:.2f}°"
+    if residual_deg is not None:
+        what += f", and on the way they differed by up to {residual_deg:.2f}°"
+    error = RotationDisagreement(
+        f"{what}. No view of this turn is stored.",
+        next_step="Tighten the platter, and enroll the object again with --replace. If the gyro lost samples, check "
+        "the IMU's cable and continue with --resume.",
+        evidence={
+            "table_deg": round(move.encoder_deg, 2),
+            "residual_deg": None if residual_deg is None else round(residual_deg, 3),
+            "gyro": move.gyro.reason or "valid",
+        },
+    )
+    if move.gyro.valid:
+        bench.safety.latch(error)
+    return error

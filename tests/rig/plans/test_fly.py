@@ -1,0 +1,183 @@
+"""Enrollment in motion: true angles, complete enrollments, and no view where something is wrong."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rig import Catalog, enroll
+from rig.bench import Bench
+from rig.core.errors import DeviceSilent, LimitExceeded, ObjectMoved, RigError, RotationDisagreement, UsageError
+from rig.events.events import Accepted, Enrolled, Event, ScanStarted
+from rig.events.lines import line
+from rig.motion.scan_speed import SpeedLimit
+from rig.plans.tray import TrayItem, enroll_tray
+from sim.bench import ShelfOperator, open_sim_bench
+from sim.faults import Fault
+from sim.noise import NoiseModel
+from sim.objects.shelf import shelf
+from sim.world import World
+from tests.rig.motion.times import camera_time
+
+SMALL = ("camera.width=320", "camera.height=240", "view.roi=[40, 0, 240, 240]", "view.max_smear_px=2")
+
+
+@contextmanager
+def flying(
+    folder: Path, *settings: str, seed: int = 4, faults: tuple[str, ...] = (), **noise: float
+) -> Iterator[tuple[Bench, Catalog, World]]:
+    world = World(seed=seed, noise=NoiseModel(**noise))
+    config = camera_time(world, *SMALL, *settings)
+    operator = ShelfOperator(world, shelf())
+    with (
+        open_sim_bench(config, operator, faults=[Fault.parse(one) for one in faults]) as bench,
+        Catalog.open(folder / "catalog", clock=bench.clock) as catalog,
+    ):
+        yield bench, catalog, world
+
+
+def true_errors(events: list[Event], bench: Bench, world: World) -> np.ndarray[Any, Any]:
+    """Return the errors of the angles of views in motion that the world still remembers."""
+    times, found = bench.operator.devices.camera.times, []  # type: ignore[attr-defined]
+    for event in events:
+        if isinstance(event, Accepted) and (motion := event.evidence.motion) is not None:
+            middle_ns = event.evidence.exposed_ns - times.offset_ns + times.readout_ns // 2 + 5_000_000
+            found.append(motion.angle_deg - world.table_deg(middle_ns) - world.noise.backlash_deg / 2)
+    return np.array(found)
+
+
+def test_one_turn_enrolls_all_views_at_their_true_angles(tmp_path: Path) -> None:
+    with flying(tmp_path, lost_frames=0.02, usb_latency_ms=1.0) as (bench, catalog, world):
+        events: list[Event] = []
+        errors = None
+        for event in enroll(bench, catalog, "mug-star", views=24, fly=True):
+            events.append(event)
+            if isinstance(event, Accepted) and event.evidence.motion is not None:
+                more = true_errors([event], bench, world)
+                errors = more if errors is None else np.append(errors, more)
+        assert errors is not None
+        assert np.abs(errors).max() < 0.2
+        done = events[-1]
+        assert isinstance(done, Enrolled)
+        assert done.seconds < 14
+        stored = catalog.object("mug-star").views
+        planned = -15.0 * np.arange(24) % 360
+        azimuths = np.array([view.record.azimuth_deg for view in stored])
+        assert np.abs((azimuths - planned + 180) % 360 - 180).max() < 4.0
+        moving = [view.record.evidence for view in stored if view.record.evidence["motion"]]
+        assert len(moving) >= 22
+        for evidence in moving:
+            assert set(evidence["motion"]) >= {"middle_ns", "angle_deg", "angle_sigma_deg", "speed_dps", "smear_px"}
+        started = next(event for event in events if isinstance(event, ScanStarted))
+        assert "allows" in line(started)
+        assert abs(bench.servo.read_state().velocity_dps) < 1
+        assert not bench.servo.read_condition().torque
+
+
+@pytest.mark.parametrize(
+    ("settings", "limit", "words"),
+    [
+        (("view.max_smear_px=0.8",), SpeedLimit.SMEAR, "10 ms exposure allows 38 °/s"),
+        ((), SpeedLimit.TABLE, "table.velocity_dps allows 90 °/s"),
+        (("table.velocity_dps=200", "view.max_smear_px=9"), SpeedLimit.FRAME_RATE, "30 frames/s allow 135 °/s"),
+        (("camera_time.jitter_ms=5",), SpeedLimit.TIME, "uncertain by 5.0 ms"),
+    ],
+)
+def test_speed_is_the_fastest_that_the_limits_allow(
+    tmp_path: Path, settings: tuple[str, ...], limit: SpeedLimit, words: str
+) -> None:
+    with flying(tmp_path, *settings) as (bench, catalog, _):
+        events = enroll(bench, catalog, "dice", views=72, fly=True)
+        started = next(event for event in events if isinstance(event, ScanStarted))
+        events.close()
+    assert started.limit is limit
+    assert words in line(started)
+
+
+def outcome(tmp_path: Path, fault: str) -> tuple[RigError | None, list[Event], float]:
+    """Return the error of an enrollment under a fault, its events, and the largest error of a stored angle."""
+    events: list[Event] = []
+    error, worst = None, 0.0
+    with suppress(DeviceSilent), flying(tmp_path, faults=(fault,)) as (bench, catalog, world):
+        try:
+            for event in enroll(bench, catalog, "toy-car", views=12, fly=True):
+                events.append(event)
+                worst = max([worst, *np.abs(true_errors([event], bench, world))])
+        except RigError as failure:
+            error = failure
+        if "unplug" not in fault:
+            assert not bench.servo.read_condition().torque
+    return error, events, worst
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [
+        "lost_frames:rate=0.4@move0",
+        "doubled_frame@move0",
+        "camera.slow:fps=10@move0",
+        "camera.delayed@move0",
+        "stamp_jump:ms=15@move0+2s",
+        "stamps_backwards@move0+2s",
+        "stamp_jitter@move0",
+        "camera.intermittent@move0",
+        "frozen_frame@move0+0.5s",
+    ],
+)
+def test_faulty_frames_leave_only_true_views(tmp_path: Path, fault: str) -> None:
+    error, events, worst = outcome(tmp_path, f"{fault.split('@')[0]}@1.5s+2s")
+    assert error is None
+    assert isinstance(events[-1], Enrolled)  # complete: what is missing was taken at rest
+    assert worst < 0.4
+
+
+@pytest.mark.parametrize(
+    ("fault", "kind"),
+    [("slip:angle=3@2s", RotationDisagreement), ("jam@2s", RigError), ("unplug@2s", RigError)],
+)
+def test_failed_turn_stores_no_view(tmp_path: Path, fault: str, kind: type[RigError]) -> None:
+    error, events, _ = outcome(tmp_path, fault)
+    assert isinstance(error, kind)
+    assert not any(isinstance(event, Accepted) for event in events)
+
+
+def test_interrupted_turn_resumes(tmp_path: Path) -> None:
+    with flying(tmp_path) as (bench, catalog, _):
+        events = enroll(bench, catalog, "lamp", views=8, fly=True)
+        for event in events:
+            if isinstance(event, Accepted):
+                break
+        events.close()
+        assert not bench.servo.read_condition().torque
+        *_, done = enroll(bench, catalog, "lamp", resume=True, fly=True)
+        assert isinstance(done, Enrolled)
+        assert len(catalog.object("lamp").views) == 8
+
+
+def test_moved_object_abandons_the_turn(tmp_path: Path) -> None:
+    with flying(tmp_path, faults=("object_falls@3s",)) as (bench, catalog, _), pytest.raises(ObjectMoved):
+        list(enroll(bench, catalog, "toy-car", views=8, fly=True))
+
+
+def test_scan_needs_camera_time_and_a_revolution_of_cable(tmp_path: Path) -> None:
+    with flying(tmp_path, "table.mode=pan", "table.limits_deg=[-100, 100]") as (bench, catalog, _):
+        with pytest.raises(LimitExceeded):
+            list(enroll(bench, catalog, "dice", views=8, fly=True))
+        bench.config = bench.config.model_copy(
+            update={"camera_time": bench.config.camera_time.model_copy(update={"offset_ms": None})}
+        )
+        with pytest.raises(UsageError, match="not calibrated") as caught:
+            list(enroll(bench, catalog, "dice", views=8, fly=True))
+        assert "rig calibrate camera-time" in caught.value.next_step
+        assert not catalog.objects()
+
+
+def test_trays_fly_if_the_camera_time_is_calibrated(tmp_path: Path) -> None:
+    with flying(tmp_path) as (bench, catalog, _):
+        tray = list(enroll_tray(bench, catalog, [TrayItem(2, "dice")], views=8))
+        assert any(isinstance(event, ScanStarted) for event in tray)
+        single = list(enroll(bench, catalog, "lamp", views=4))
+        assert not any(isinstance(event, ScanStarted) for event in single)
