@@ -416,6 +416,10 @@ class IdentifyConfig(Section):
             raise ValueError(f"must not be above max_views, which is {max_views}")
         return min_views
 
+    def limited_to(self, max_views: int) -> "IdentifyConfig":
+        """Return these settings with another largest number of views, which the smallest one does not exceed."""
+        return self.model_copy(update={"max_views": max_views, "min_views": min(self.min_views, max_views)})
+
 
 class RigConfig(Section):
     """Everything in `rig.toml`."""

@@ -178,7 +178,7 @@ class Works:
     def _identify(self, context: Context, request: IdentifyRequest) -> None:
         bench, before = context.bench, context.bench.config
         if request.max_views is not None:
-            update = {"identify": before.identify.model_copy(update={"max_views": request.max_views})}
+            update = {"identify": before.identify.limited_to(request.max_views)}
             bench.config = before.model_copy(update=update)
         name = request.strategy or bench.config.identify.strategy
         chosen = None if name is None else strategy_named(name)

@@ -85,7 +85,9 @@ def identify(
     from rig.views.object_presence import TableWatcher
 
     if max_views is not None:
-        settings = settings.merged(None, None, [f"identify.max_views={max_views}"], None, False)
+        limited = settings.load().identify.limited_to(max_views)
+        changes = [f"identify.{key}={getattr(limited, key)}" for key in ("max_views", "min_views")]
+        settings = settings.merged(None, None, changes, None, False)
     config = settings.load().identify
     sample = _checked_sample(sample, scan=scan, watch=watch, records=config.record != "none")
     name = strategy or config.strategy
