@@ -182,8 +182,8 @@ def pose_rmse_by_object(runs: Runs, method: int, *, alike: bool) -> FloatArray:
 
 
 def step_median_ms(runs: Runs, method: int) -> list[float]:
-    """Return the median time of a step after 1, 2, ... queries, in milliseconds."""
-    return [float(np.median(runs.step_ns[method, ..., n])) * 1e-6 for n in _steps(runs, method)]
+    """Return the median time of a step after 1, 2, ... queries in the first trial of each object, in milliseconds."""
+    return [float(np.median(runs.step_ns[method, :, 0, n])) * 1e-6 for n in _steps(runs, method)]
 
 
 def _steps(runs: Runs, method: int) -> NDArray[np.intp]:

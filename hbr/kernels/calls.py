@@ -275,3 +275,57 @@ def support(
         slope, part_deg, whole, address(scratch), room, address(added),
     )  # fmt: skip
     return added
+
+
+def rotated(
+    anchors: IndexArray,
+    rotation_deg: FloatArray,
+    object_index: IndexArray,
+    by_object: tuple[IndexArray, IndexArray],
+    azimuth_deg: FloatArray,
+) -> IndexArray | None:
+    """Return for each view the view of its object whose azimuth is closest to rotation_deg further on."""
+    found = library()
+    if found is None:
+        return None
+    given = _whole(anchors), np.ascontiguousarray(rotation_deg), _whole(object_index), *map(_whole, by_object)
+    azimuths = np.ascontiguousarray(azimuth_deg)
+    views = np.empty(len(anchors), np.int64)
+    asked, rotation, *others = map(address, given)
+    found.hbr_rotated(asked, rotation, len(anchors), *others, address(azimuths), address(views))
+    return views
+
+
+def paths(
+    columns: list[IndexArray],
+    queries: LevelArray,
+    orientation_deg: FloatArray,
+    descriptors: LevelArray,
+    object_index: IndexArray,
+    azimuth_deg: FloatArray,
+    omega: float,
+) -> tuple[FloatArray, IndexArray] | None:
+    """Return score (C,) and path (C, N) of every object, by rising object; see `hbr.paper.hough`."""
+    found = library()
+    if found is None or queries.shape[1] > ByteRows.LONGEST:
+        return None
+    queries, orientation_deg = np.ascontiguousarray(queries), np.ascontiguousarray(orientation_deg)
+    object_index, azimuth_deg = _whole(object_index), np.ascontiguousarray(azimuth_deg)
+    if descriptors.strides[1:] != (1,):
+        descriptors = np.ascontiguousarray(descriptors)
+    rows = np.concatenate(columns).astype(np.int64, copy=False)
+    begin = np.zeros(len(columns) + 1, np.int64)
+    np.cumsum([len(column) for column in columns], out=begin[1:])
+    most = len(columns[-1])
+    value, predecessor = np.empty(len(rows)), np.empty(len(rows), np.int64)
+    scores, taken, count = np.empty(most), np.empty((most, len(columns)), np.int64), np.empty(1, np.int64)
+    found.hbr_paths(
+        address(queries), queries.strides[0], *queries.shape, address(descriptors), descriptors.strides[0],
+        address(object_index), address(azimuth_deg), address(orientation_deg), omega,
+        *map(address, (begin, rows, value, predecessor, scores, taken, count)),
+    )  # fmt: skip
+    return scores[: count[0]], taken[: count[0]]
+
+
+def _whole(array: IndexArray) -> NDArray[np.int64]:
+    return np.ascontiguousarray(array, np.int64)

@@ -31,6 +31,10 @@ _SIGNATURES: Final[dict[str, tuple[Any, ...]]] = {
     "hbr_support": (
         *[_POINTER] * 3, _INTEGER, _POINTER, _POINTER, _REAL, _REAL, _INTEGER, _POINTER, _INTEGER, _POINTER,
     ),
+    "hbr_rotated": (_POINTER, _POINTER, _INTEGER, *[_POINTER] * 5),
+    "hbr_paths": (
+        _POINTER, _INTEGER, _INTEGER, _INTEGER, _POINTER, _INTEGER, *[_POINTER] * 3, _REAL, *[_POINTER] * 7,
+    ),
 }  # fmt: skip
 
 _forced_off = False

@@ -119,7 +119,7 @@ class Views:
     def select(self, rows: IndexArray | NDArray[np.bool_]) -> "Views":
         """Return the views of these indices, or of a mask. Every object keeps its index and name."""
         chosen = copy(self)  # which has been checked
-        chosen.__dict__.pop("_by_object", None)
+        chosen.__dict__.pop("by_object", None)
         for name in ("descriptors", "azimuth_deg", "object_index"):
             object.__setattr__(chosen, name, _read_only(getattr(self, name)[rows]))
         return chosen
@@ -130,12 +130,13 @@ class Views:
 
     def of_each(self, object_index: IndexArray) -> tuple[IndexArray, IndexArray]:
         """Return the indices of the views of these objects, one object after the other, and where each begins."""
-        order, start = self._by_object
+        order, start = self.by_object
         positions, begin = ranges(start[object_index], start[object_index + 1] - start[object_index])
         return order[positions], begin
 
     @cached_property
-    def _by_object(self) -> tuple[IndexArray, IndexArray]:
+    def by_object(self) -> tuple[IndexArray, IndexArray]:
+        """The indices of all views, one object after the other, and where each object begins, (objects + 1,)."""
         order = np.argsort(self.object_index, kind="stable")
         start = np.searchsorted(self.object_index[order], np.arange(len(self.object_names) + 1))
         return order, start

@@ -14,6 +14,7 @@ from hbr.core.angles import revolutions_between
 from hbr.core.arrays import FloatArray, IndexArray, LevelArray
 from hbr.core.segments import first_maximum, lengths, ranges
 from hbr.descriptors.tanimoto import tanimoto
+from hbr.kernels import calls
 from hbr.model.views import Views
 from hbr.paper.index import ViewIndex, check_queries
 
@@ -122,8 +123,7 @@ def retrieve(
             extended = _extend_orient(lists, orientations, views)
         case "orient_all":
             extended = _extend_orient_all(lists, orientations, views)
-    columns = [_by_object(rows, views) for rows in extended]
-    scores, paths = _best_paths(columns, queries, orientations, views, omega)
+    scores, paths = _best_paths(extended, queries, orientations, views, omega)
 
     order = np.argsort(-scores, kind="stable")
     paths = paths[order]
@@ -200,6 +200,9 @@ def _rotated(anchors: IndexArray, rotation_deg: FloatArray, views: Views) -> Ind
     """Return for each view the view of its object whose azimuth is closest to rotation_deg further on (ρ)."""
     if not len(anchors):
         return anchors
+    compiled = calls.rotated(anchors, rotation_deg, views.object_index, views.by_object, views.azimuth_deg)
+    if compiled is not None:
+        return compiled
     rows, begin = views.of_each(views.object_index[anchors])
     count = lengths(begin, len(rows))
     rotated_deg = views.azimuth_deg[rows] - np.repeat(views.azimuth_deg[anchors], count)
@@ -213,10 +216,14 @@ def _by_object(rows: IndexArray, views: Views) -> IndexArray:
 
 
 def _best_paths(
-    columns: _Columns, queries: LevelArray, orientations: FloatArray, views: Views, omega: float
+    extended: _Columns, queries: LevelArray, orientations: FloatArray, views: Views, omega: float
 ) -> tuple[FloatArray, IndexArray]:
-    """Return score (C,) and path (C, N) of every object, by rising object. Every object is in every column."""
+    """Return score (C,) and path (C, N) of every object, by rising object. Every object is in every list."""
     azimuth_deg = views.azimuth_deg
+    compiled = calls.paths(extended, queries, orientations, views.descriptors, views.object_index, azimuth_deg, omega)
+    if compiled is not None:
+        return compiled
+    columns = [_by_object(rows, views) for rows in extended]
     # forward: the best value of a path that ends at each view, and its predecessor on that path
     value = tanimoto(queries[0], views.descriptors[columns[0]])[0]
     predecessors = []

@@ -1,6 +1,7 @@
 """Exact search for the views most similar to a query."""
 
 from copy import copy
+from functools import cached_property
 from typing import Final, Literal, Protocol, Self, TypeVar, get_args
 
 import numpy as np
@@ -53,11 +54,14 @@ class ViewIndex:
             )
         self.views = views
         self._method = method
-        self._searcher: _Searcher = _searcher(views.descriptors, method)
         self._remembered: dict[tuple[bytes, int], tuple[IndexArray, FloatArray]] = {}
 
     def __len__(self) -> int:
         return len(self.views)
+
+    @cached_property
+    def _searcher(self) -> "_Searcher":
+        return _searcher(self.views.descriptors, self._method)
 
     def extended(self, more: Views) -> "ViewIndex":
         """Return an index of these views followed by more; this index does not change.
@@ -113,6 +117,18 @@ class ViewIndex:
                 self._remembered.clear()
             self._remembered[key] = found
         return found[0].copy(), found[1].copy()
+
+    def remember(self, query: LevelArray, view_indices: IndexArray, similarities: FloatArray) -> None:
+        """Use a result that is known for `search`, for example from an index that has more views.
+
+        Parameters
+        ----------
+        query : uint8 array (144,)
+            The query.
+        view_indices, similarities : arrays (k,)
+            What `search` returns for this query and k.
+        """
+        self._remembered[np.asarray(query).tobytes(), len(view_indices)] = view_indices, similarities
 
 
 def check_queries(queries: LevelArray) -> None:

@@ -1,4 +1,4 @@
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -159,8 +159,19 @@ def test_symmetric_object_has_a_pose_error_but_no_error_of_appearance() -> None:
 def test_time_of_a_step_comes_from_the_timer() -> None:
     ticks = iter(range(0, 10**9, 7))
     runs = run_object(0, QUERIES[:24], VIEWS, ALL[:2], PROTOCOL, now_ns=lambda: next(ticks))
-    assert (runs.step_ns[1] == 7).all()
+    assert (runs.step_ns[1, :, 0] == 7).all()
+    assert (runs.step_ns[1, :, 1:] == 0).all()
     assert (run(0, ALL[:1]).step_ns == 0).all()
+
+
+def test_shared_retrieval_lists_change_no_result(monkeypatch: pytest.MonkeyPatch) -> None:
+    for protocol in (PROTOCOL, replace(PROTOCOL, removal="queries"), replace(PROTOCOL, enrolled=12)):
+        shared = run_object(0, QUERIES[:24], VIEWS, ALL, protocol)
+        with monkeypatch.context() as patch:
+            patch.setattr(_Trials, "_share_lists", lambda *_: None)
+            searched = run_object(0, QUERIES[:24], VIEWS, ALL, protocol)
+        for item in fields(Runs):
+            np.testing.assert_array_equal(getattr(shared, item.name), getattr(searched, item.name), item.name)
 
 
 def test_runs_of_objects_are_joined_in_their_order() -> None:

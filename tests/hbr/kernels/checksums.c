@@ -15,6 +15,11 @@ void hbr_similarity(const struct measure *, const uint8_t *, int64_t, int64_t, c
                     const int64_t *, int64_t, double *);
 void hbr_support(const int64_t *, const int64_t *, const int64_t *, int64_t, const double *, const float *, double,
                  double, int64_t, double *, int64_t, float *);
+void hbr_rotated(const int64_t *, const double *, int64_t, const int64_t *, const int64_t *, const int64_t *,
+                 const double *, int64_t *);
+void hbr_paths(const uint8_t *, int64_t, int64_t, int64_t, const uint8_t *, int64_t, const int64_t *, const double *,
+               const double *, double, const int64_t *, int64_t *, double *, int64_t *, double *, int64_t *,
+               int64_t *);
 void hbr_cedd(const uint8_t *, int64_t, int64_t, int64_t, int64_t, int64_t, const void *, double *, uint8_t *);
 
 static uint64_t state = 88172645463325252ULL, sum = 1469598103934665603ULL;
@@ -59,6 +64,31 @@ static void support(void) {
     add(found, sizeof found);
 }
 
+static void paths(void) {
+    static uint8_t levels[300 * 144];
+    static int64_t object[300], order[300], start[11], anchors[300], rows[5 * 300], begin[6], before[5 * 300];
+    static int64_t rotated[300], taken[10 * 5], objects;
+    static double azimuth_deg[300], rotation_deg[300], value[5 * 300], scores[10];
+    static const double orientation_deg[5] = {0, 90.3, -170, 1000, 7.125};
+    for (size_t i = 0; i < sizeof levels; i++) levels[i] = random_bits() % 3 ? 0 : random_bits() % 8;
+    for (int i = 0; i < 300; i++) {
+        order[i] = i;
+        object[i] = i / 30;
+        anchors[i] = random_bits() % 300;
+        azimuth_deg[i] = (double)(random_bits() % 36000) * .01;
+        rotation_deg[i] = (double)(random_bits() % 72000) * .01 - 360;
+    }
+    for (int j = 0; j <= 10; j++) start[j] = 30 * j;
+    for (int q = 0; q <= 5; q++) begin[q] = 300 * q;
+    for (int i = 0; i < 5 * 300; i++) rows[i] = 299 - i % 300;
+    hbr_rotated(anchors, rotation_deg, 300, object, order, start, azimuth_deg, rotated);
+    hbr_paths(levels, 144, 5, 144, levels, 144, object, azimuth_deg, orientation_deg, .5, begin, rows, value, before,
+              scores, taken, &objects);
+    add(rotated, sizeof rotated);
+    add(scores, sizeof scores);
+    add(taken, sizeof taken);
+}
+
 static void cedd(void) {
     static double hues[720], saturation[256 * 12], value[256 * 12], representatives[144 * 8], scratch[20000];
     static int64_t bins[720];
@@ -92,5 +122,7 @@ int main(void) {
     printf("support %016llx\n", (unsigned long long)sum);
     cedd();
     printf("cedd %016llx\n", (unsigned long long)sum);
+    paths();
+    printf("paths %016llx\n", (unsigned long long)sum);
     return 0;
 }

@@ -16,6 +16,7 @@ from hbr.dense.filter import DenseIndex
 from hbr.kernels import compile as compiling
 from hbr.kernels import library, without_library
 from hbr.kernels.library import load
+from hbr.paper.hough import Extension
 
 compiled = pytest.mark.skipif(library() is None, reason="the kernels are not compiled: there is no C compiler")
 seeds = st.integers(0, 2**32 - 1)
@@ -206,6 +207,7 @@ def test_every_processor_computes_the_same_bits(
             *("similarity", "542eb7f2cb30d834"),
             *("support", "ed89ce9843a4048f"),
             *("cedd", "dbb7e2153b86eaf9"),
+            *("paths", "b66e286db50ed0e7"),
         ]
 
 
@@ -234,3 +236,44 @@ def test_missing_compiler_keeps_the_earlier_library(tmp_path: Path, monkeypatch:
     monkeypatch.setenv("CC", "false")  # a compiler that fails
     assert compiling.compile_kernels(tmp_path / "library.so") is None
     assert list(tmp_path.iterdir()) == []
+
+
+@compiled
+@settings(max_examples=60)
+@given(
+    counts=st.lists(st.integers(1, 40), min_size=1, max_size=6),
+    step_deg=st.sampled_from([0.0, 2.5, 5.0, 90.0]),
+    queries=st.integers(1, 8),
+    list_length=st.sampled_from([1, 3, 10, 300]),
+    omega=st.sampled_from([0.0, 0.5, 2.0]),
+    extension=st.sampled_from(["visual", "orient", "orient_all"]),
+    seed=seeds,
+)
+def test_paths_are_those_of_the_reference(
+    counts: list[int],
+    step_deg: float,
+    queries: int,
+    list_length: int,
+    omega: float,
+    extension: Extension,
+    seed: int,
+) -> None:
+    rng = np.random.default_rng(seed)
+    objects = rng.permutation(np.repeat(np.arange(len(counts)), counts))
+    levels = (rng.integers(0, 8, (len(objects), 144)) * (rng.random((len(objects), 144)) < 0.2)).astype(np.uint8)
+    levels[rng.integers(0, len(levels), len(levels) // 3)] = levels[0]  # equal scores
+    azimuth_deg, orientation_deg = rng.uniform(0, 360, len(levels)), rng.uniform(-400, 400, queries)
+    if step_deg:  # equally close views
+        azimuth_deg, orientation_deg = (part // step_deg * step_deg for part in (azimuth_deg, orientation_deg))
+    views = hbr.Views(np.repeat(levels, 2, axis=0)[::2], azimuth_deg, objects, tuple(map(str, range(len(counts)))))
+    asked = levels[rng.integers(0, len(levels), queries)]
+
+    def ranking() -> hbr.Ranking:
+        index = hbr.ViewIndex(views)
+        return hbr.retrieve(asked, orientation_deg, index, omega=omega, list_length=list_length, extension=extension)
+
+    with without_library():
+        reference = ranking()
+    found = ranking()
+    for name in ("object_index", "scores", "pose_deg", "paths"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(reference, name), name)

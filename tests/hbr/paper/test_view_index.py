@@ -78,6 +78,7 @@ def test_extended_index_equals_a_new_one(seed: int, sizes: list[int], method: Me
 def test_extension_projects_only_the_new_views(monkeypatch: pytest.MonkeyPatch) -> None:
     rows = adversarial(np.random.default_rng(0), 3000)
     index = ViewIndex(views_of(rows[:2000]), "bound")
+    index.search(rows[0], 1)  # prepares it
     projected = []
     project = _Bound._project
 
