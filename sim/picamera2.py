@@ -53,6 +53,7 @@ class Picamera2:
         self._pending: deque[tuple[int, dict[str, Any]]] = deque()
         self._frames = 0
         self.held = 0
+        self._waiting = 0
         self.sensor.reopen()
 
     @staticmethod
@@ -117,9 +118,15 @@ class Picamera2:
             self._apply(self._pending.popleft()[1])
         if self.sensor.hangs or not self.sensor.grab():
             self.clock.sleep(timeout_s)
+            self._waiting += 1  # the job is not cancelled by its timeout
             raise TimeoutError
+        self.held, self._waiting = self.held + self._waiting, 0  # the jobs before it take their frames
         self._frames += 1
         return CompletedRequest(self)
+
+    def cancel_all_and_flush(self) -> None:
+        """Cancel the jobs that wait for a frame."""
+        self._waiting = 0
 
     def _check(self, controls: dict[str, Any]) -> None:
         for name in controls:

@@ -119,6 +119,7 @@ class Picamera2Capture:
         try:
             self._request = self._camera.capture_request(wait=_FRAME_WAIT_S)
         except (TimeoutError, RuntimeError):  # the sensor hangs, or the camera stopped
+            self._camera.cancel_all_and_flush()  # or the request would later take a buffer that is never given back
             return False
         self._metadata = self._request.get_metadata()
         return True

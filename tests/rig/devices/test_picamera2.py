@@ -101,6 +101,11 @@ def test_hanging_sensor_is_silent_in_bounded_time(world, sensor):
     with pytest.raises(DeviceSilent, match="delivers no frames"):
         camera.capture(begun_ns)
     assert world.clock.now_ns() - begun_ns < 8e9
+    for _ in range(5):
+        with pytest.raises(DeviceSilent):
+            camera.capture(world.clock.now_ns())
+    sensor.hangs = False
+    assert camera.capture(world.clock.now_ns()).exposed_ns > begun_ns
 
 
 def test_missing_camera_other_user_and_missing_package_say_what_to_do(sensor, monkeypatch):
