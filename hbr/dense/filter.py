@@ -13,10 +13,9 @@ Decision: docs/decisions/0025.
 """
 
 from collections.abc import Sequence
-from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -84,9 +83,25 @@ class DenseIndex:
     def __len__(self) -> int:
         return len(self.object_index)
 
+    def _copied(self) -> "DenseIndex":
+        copied = object.__new__(DenseIndex)
+        copied.__dict__.update(self.__dict__)
+        return copied
+
+    def __getstate__(self) -> dict[str, object]:
+        """Return what another process needs; it prepares the views for comparison itself."""
+        own = {name: self.__dict__[name] for name in ("views", "omega", "power", "object_index")}
+        return own | {"segments": (self._segments.order, self._segments.begin, self._segments.lengths)}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        segments = state.pop("segments")
+        self.__dict__.update(state)
+        self.compared = self.views.prepared()
+        self._set_segments(*segments)
+
     def without(self, views: IndexArray) -> "DenseIndex":
         """Return an index that leaves out some views; each object must keep at least one."""
-        fewer = copy(self)
+        fewer = self._copied()
         kept = ~np.isin(self._segments.order, views)
         count = np.add.reduceat(kept, self._segments.begin)
         if not count.all():
@@ -96,7 +111,7 @@ class DenseIndex:
 
     def only(self, places: IndexArray) -> "DenseIndex":
         """Return an index of some objects alone, whose later steps do not look at the others."""
-        fewer = copy(self)
+        fewer = self._copied()
         own, begin = ranges(self._segments.begin[places], self._segments.lengths[places])
         order = self._segments.order[own]
         rows = order if (np.diff(order) > 0).all() else np.sort(order)

@@ -1,8 +1,9 @@
 """Searches for every enrolled object with its own views: the sample from which a stopping rule is fitted."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Final
+from functools import partial
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,6 +63,19 @@ class Leaders:
         )
 
 
+Task = tuple[int, float]
+"""The place of a searched object in the index, and how far aside the search before it was."""
+
+
+class Found(NamedTuple):
+    """The searches for one object; each list has the views of the first search, then those of the second, ..."""
+
+    known: list[tuple[int, float, float]]
+    unknown: list[tuple[int, float, float]]
+    confidence: list[float]
+    correct: list[bool]
+
+
 @dataclass(frozen=True, eq=False)
 class LeaveOneOut:
     """Searches for every object with its own enrolled views; arrays of (searches, views).
@@ -101,6 +115,7 @@ def leave_one_out(
     seen: LevelArray | None = None,
     searches: int = 4,
     progress: Callable[[int, int], object] | None = None,
+    tasks: Callable[[Callable[[Task], "Found"], Sequence[Task]], Iterable[tuple[Task, "Found"]]] | None = None,
 ) -> LeaveOneOut:
     """Search for every object with its own enrolled views, 90° apart, as if the camera had stood beside them.
 
@@ -123,6 +138,8 @@ def leave_one_out(
         Searches for each object; their first views are spread around it.
     progress : callable, optional
         Called before each object with the number of objects done, and of all.
+    tasks : callable, optional
+        Yields each of some tasks with the result of a function of it, in any order, for example from other processes.
 
     Raises
     ------
@@ -134,38 +151,28 @@ def leave_one_out(
     shape = len(index.views), index.length
     if seen is not None and seen.shape != shape:
         raise ValueError(f"seen has shape {seen.shape}; the catalog's views have {shape}")
-    searched, known, unknown, confidence, correct = [], [], [], [], []
-    aside = 0.0
+    todo, aside = [], 0.0
     for place, object_index in enumerate(index.object_index.tolist()):
-        if progress is not None:
-            progress(place, len(index))
-        rows = index.views.of(object_index)
-        if len(rows) < max(views, 2):
+        count = len(index.views.of(object_index))
+        if count < max(views, 2):
             continue
-        rows = rows[np.argsort(index.views.azimuth_deg[rows], kind="stable")]
-        azimuth_deg = index.views.azimuth_deg[rows]
-        starts = np.unique(np.arange(searches) * len(rows) // searches).tolist()
-        spread = [_spread(azimuth_deg, start, views) for start in starts]
-        used = np.unique(spread)
-        levels = index.views.levels(rows[used]) if seen is None else seen[rows[used]]
-        similar = dict(zip(used.tolist(), index.compared.similarity(levels), strict=True))
-        others = np.delete(index.object_index, place)
-        for start, chosen in zip(starts, spread, strict=True):
-            searched.append(object_index)
-            support = np.zeros((len(index), BINS), np.float32)
-            for n, i in enumerate(chosen):
-                # The query lies beside its enrolled view, towards alternating neighbours.
-                aside = (aside + _GOLDEN) % 1
-                neighbour = rows[(i + (1 if n % 2 else -1)) % len(rows)]
-                moved = similar[i].copy()
-                moved[rows[i]] -= aside * (moved[rows[i]] - moved[neighbour])
-                support += index.support(moved, float(azimuth_deg[i] - azimuth_deg[start]))
-                belief = Belief(index, support, azimuth_deg[chosen[: n + 1]])
-                scores, probability = belief.scores(), belief.posterior(beta).sum(axis=1)
-                known.append(leader(index.object_index, scores))
-                unknown.append(leader(others, np.delete(scores, place)))
-                confidence.append(probability.max())
-                correct.append(probability.argmax() == place)
+        todo.append((place, aside))
+        for _ in range(views * len(np.unique(np.arange(searches) * count // searches))):
+            aside = (aside + _GOLDEN) % 1
+    work = partial(_searches_for, index, beta, views, seen, searches)
+    by_place: dict[int, Found] = {}
+    for (place, _), found in ((one, work(one)) for one in todo) if tasks is None else tasks(work, todo):
+        if progress is not None:
+            progress(len(by_place), len(todo))
+        by_place[place] = found
+    searched, known, unknown, confidence, correct = [], [], [], [], []
+    for place, _ in todo:
+        one = by_place[place]
+        searched += [int(index.object_index[place])] * (len(one.known) // views)
+        known += one.known
+        unknown += one.unknown
+        confidence += one.confidence
+        correct += one.correct
     if not known:
         raise ValueError(f"no object has {max(views, 2)} views; enroll more of each, or search with fewer views")
     each = -1, views
@@ -178,6 +185,39 @@ def leave_one_out(
         np.reshape(correct, each),
         beta,
     )
+
+
+def _searches_for(
+    index: DenseIndex, beta: float, views: int, seen: LevelArray | None, searches: int, task: Task
+) -> Found:
+    """Search for the object at one place of the index."""
+    place, aside = task
+    rows = index.views.of(int(index.object_index[place]))
+    rows = rows[np.argsort(index.views.azimuth_deg[rows], kind="stable")]
+    azimuth_deg = index.views.azimuth_deg[rows]
+    starts = np.unique(np.arange(searches) * len(rows) // searches).tolist()
+    spread = [_spread(azimuth_deg, start, views) for start in starts]
+    used = np.unique(spread)
+    levels = index.views.levels(rows[used]) if seen is None else seen[rows[used]]
+    similar = dict(zip(used.tolist(), index.compared.similarity(levels), strict=True))
+    others = np.delete(index.object_index, place)
+    found = Found([], [], [], [])
+    for start, chosen in zip(starts, spread, strict=True):
+        support = np.zeros((len(index), BINS), np.float32)
+        for n, i in enumerate(chosen):
+            # The query lies beside its enrolled view, towards alternating neighbours.
+            aside = (aside + _GOLDEN) % 1
+            neighbour = rows[(i + (1 if n % 2 else -1)) % len(rows)]
+            moved = similar[i].copy()
+            moved[rows[i]] -= aside * (moved[rows[i]] - moved[neighbour])
+            support += index.support(moved, float(azimuth_deg[i] - azimuth_deg[start]))
+            belief = Belief(index, support, azimuth_deg[chosen[: n + 1]])
+            scores, probability = belief.scores(), belief.posterior(beta).sum(axis=1)
+            found.known.append(leader(index.object_index, scores))
+            found.unknown.append(leader(others, np.delete(scores, place)))
+            found.confidence.append(float(probability.max()))
+            found.correct.append(bool(probability.argmax() == place))
+    return found
 
 
 def leader(object_index: IndexArray, scores: FloatArray) -> tuple[int, float, float]:

@@ -6,7 +6,7 @@
 Decision: docs/decisions/0026.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from math import ceil, floor, inf, nan
@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hbr.core.arrays import FloatArray
 from hbr.dense.filter import BETA, Belief, DenseIndex, update_belief
-from hbr.dense.leave_one_out import Leaders, LeaveOneOut, leader, leave_one_out, usual_scores
+from hbr.dense.leave_one_out import Found, Leaders, LeaveOneOut, Task, leader, leave_one_out, usual_scores
 
 #: No search ends at a smaller confidence, however well the leave-one-out searches went: real views may be less clear.
 SMALLEST_MIN_CONFIDENCE: Final = 0.9
@@ -309,6 +309,7 @@ def calibrate_stopping_rule(
     most_searches: int = MOST_SEARCHES,
     sample: int | None = None,
     progress: Callable[[int, int], object] | None = None,
+    tasks: Callable[[Callable[[Task], Found], Sequence[Task]], Iterable[tuple[Task, Found]]] | None = None,
 ) -> CalibratedRule:
     """Search for the enrolled objects among each other, and return the rule that follows.
 
@@ -322,10 +323,10 @@ def calibrate_stopping_rule(
         Searches in all, from different first views; each object is searched for at least once.
     sample
         Search only for so many objects, among each other.
-    progress
+    progress, tasks
         As for `leave_one_out`.
     """
-    searches = calibration_searches(index, most_searches=most_searches, sample=sample, progress=progress)
+    searches = calibration_searches(index, most_searches=most_searches, sample=sample, progress=progress, tasks=tasks)
     if searches is None:
         return CalibratedRule(_rule_without_candidates(index, error_rate, false_reject))
     objects = len(index) if sample is None else min(len(index), max(2, sample))
@@ -354,6 +355,7 @@ def calibration_searches(
     most_searches: int = MOST_SEARCHES,
     sample: int | None = None,
     progress: Callable[[int, int], object] | None = None,
+    tasks: Callable[[Callable[[Task], Found], Sequence[Task]], Iterable[tuple[Task, Found]]] | None = None,
 ) -> LeaveOneOut | None:
     """Return the leave-one-out searches of a calibration; None if objects cannot be compared with each other."""
     usual_views = int(np.median((~index.left_out).sum(axis=1)))
@@ -367,6 +369,7 @@ def calibration_searches(
         views=min(CALIBRATED_VIEWS, usual_views),
         searches=max(1, min(most_searches // len(index), int(index.rows.shape[1]))),
         progress=progress,
+        tasks=tasks,
     )
 
 

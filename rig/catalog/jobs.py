@@ -5,6 +5,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final, TypeVar
 
+from rig.core.cluster import Cluster
+from rig.core.processes import Jobs
+
 _T = TypeVar("_T")
 
 PORTION: Final = 32
@@ -25,6 +28,8 @@ def portions(items: Sequence[_T]) -> Iterator[tuple[_T, ...]]:
         yield tuple(items[start : start + PORTION])
 
 
-def processes(wanted: int | None, items: int) -> int:
-    """Return how many processes are worth starting for a number of images."""
+def processes(wanted: Jobs | None, items: int) -> Jobs:
+    """Return how many processes are worth starting for a number of images; a cluster as it is."""
+    if isinstance(wanted, Cluster):
+        return wanted
     return min(wanted or os.cpu_count() or 1, max(1, items // (4 * PORTION)))

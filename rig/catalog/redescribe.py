@@ -17,7 +17,7 @@ from rig.catalog.records import EnrollmentStatus, JsonObject, PackedDescriptor, 
 from rig.catalog.schema import descriptors, enrollments, objects, sessions, views
 from rig.catalog.seal import changing_enrollments
 from rig.core.errors import CatalogError, UsageError
-from rig.core.processes import map_in_processes
+from rig.core.processes import Jobs, map_in_processes
 from rig.views.description import PAPER_DESCRIPTOR
 
 
@@ -60,7 +60,7 @@ def redescribe(
     *,
     region: Region | Stored | None = Stored.REGION,
     again: bool = False,
-    jobs: int | None = None,
+    jobs: Jobs | None = None,
 ) -> Generator[JobProgress, None, Redescribed]:
     """Describe the views of all objects in use that are not described by the present version of a descriptor.
 
@@ -76,7 +76,7 @@ def redescribe(
     again
         Also describe views that are described already.
     jobs
-        Number of processes; None for one per core.
+        Number of processes, or a cluster; None for one process per core.
 
     Raises
     ------

@@ -23,7 +23,7 @@ from rig.catalog.schema import audit as audit_log
 from rig.catalog.schema import corrections, descriptors, enrollments, objects, results, sessions, views
 from rig.catalog.seal import appended_digests, changing_enrollments, enrollment_digests, object_digests
 from rig.core.errors import CatalogDamaged, CatalogError, UsageError
-from rig.core.processes import map_in_processes
+from rig.core.processes import Jobs, map_in_processes
 from rig.views import image_files as images
 
 
@@ -139,7 +139,7 @@ class _State:
 
 
 def verify(
-    catalog: Catalog, *, repair: bool = False, quick: bool = False, jobs: int | None = None
+    catalog: Catalog, *, repair: bool = False, quick: bool = False, jobs: Jobs | None = None
 ) -> Generator[JobProgress, None, Verification]:
     """Check every row, image and descriptor.
 
@@ -152,7 +152,7 @@ def verify(
     quick
         Compare the hashes of the files only; do not describe the images again.
     jobs
-        Number of processes; None for one per core.
+        Number of processes, or a cluster; None for one process per core.
 
     Raises
     ------

@@ -12,14 +12,14 @@ from hbr.dense.filter import DenseIndex
 from hbr.evaluation.matrix import Cell, cells, enrolled_few, hits
 from hbr.evaluation.statistics import wilson
 from hbr.model.views import Views
-from rig.core.processes import map_in_processes
+from rig.core.processes import Jobs, map_in_processes
 from rig.evaluation.plan import Plan
 from rig.evaluation.report import Rows
 
 _Enrolled = dict[bool, Views]
 
 
-def run_matrix(plan: Plan, jobs: int, advance: Callable[[str], None]) -> dict[str, Any]:
+def run_matrix(plan: Plan, jobs: Jobs, advance: Callable[[str], None]) -> dict[str, Any]:
     """Return the hit-rate of every cell after each number of views, as JSON values; equal plans give equal values.
 
     `advance` is called with the name of each object after its enrollment and after its searches.

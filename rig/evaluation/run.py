@@ -9,12 +9,12 @@ from hbr.evaluation.descriptors import enrolled_levels, query_levels
 from hbr.evaluation.protocol import Runs, rule_of_trial, run_object
 from hbr.model.views import Views
 from rig.core.clock import SystemClock
-from rig.core.processes import map_in_processes
+from rig.core.processes import Jobs, map_in_processes
 from rig.evaluation.plan import Plan
 from rig.evaluation.store import Store
 
 
-def enrolled_views(plan: Plan, jobs: int, advance: Callable[[str], None]) -> Views:
+def enrolled_views(plan: Plan, jobs: Jobs, advance: Callable[[str], None]) -> Views:
     """Return the descriptors of all photographs as enrolled views; `advance` is called with each object's name.
 
     Raises
@@ -35,7 +35,7 @@ def enrolled_views(plan: Plan, jobs: int, advance: Callable[[str], None]) -> Vie
     )
 
 
-def run_plan(plan: Plan, views: Views, store: Store, jobs: int, advance: Callable[[str], None]) -> Runs:
+def run_plan(plan: Plan, views: Views, store: Store, jobs: Jobs, advance: Callable[[str], None]) -> Runs:
     """Search for every object that has no stored runs, and return the runs of all objects.
 
     The results do not depend on `jobs`. `advance` is called with the name of each object. If the call is interrupted,

@@ -16,7 +16,7 @@ from hbr.evaluation.protocol import Protocol, Runs, run_object, views_of_trial
 from hbr.evaluation.statistics import wilson
 from hbr.evaluation.unknown_objects import left_out, unknown_objects
 from hbr.model.views import Views
-from rig.core.processes import map_in_processes
+from rig.core.processes import Jobs, map_in_processes
 from rig.evaluation.plan import Plan
 from rig.evaluation.report import Rows
 
@@ -25,7 +25,7 @@ NOMINAL: Final = (0.005, 0.01, 0.02, 0.05)
 
 
 def run_unknown_objects(
-    plan: Plan, views: Views, count: int, draws: int, jobs: int, advance: Callable[[str], None]
+    plan: Plan, views: Views, count: int, draws: int, jobs: Jobs, advance: Callable[[str], None]
 ) -> dict[str, Any]:
     """Return false accepts and rejects after each number of views, as JSON values; equal plans give equal values.
 

@@ -18,7 +18,7 @@ from rig.catalog.jobs import JobProgress, portions, processes
 from rig.catalog.staging import staging
 from rig.core.errors import ImportRejected
 from rig.core.files import sync_tree
-from rig.core.processes import map_in_processes
+from rig.core.processes import Jobs, map_in_processes
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +41,7 @@ def import_objects(
     label: str | None = None,
     descriptors: Sequence[str] = (),
     strict: bool = False,
-    jobs: int | None = None,
+    jobs: Jobs | None = None,
 ) -> Generator[JobProgress, None, Imported]:
     """Import the objects of a plan, all or nothing.
 
@@ -57,7 +57,7 @@ def import_objects(
     strict
         Import nothing if one image is rejected. This is always so for a bundle.
     jobs
-        Number of processes; None for one per core.
+        Number of processes, or a cluster; None for one process per core.
 
     Raises
     ------
@@ -86,7 +86,7 @@ def import_objects(
 
 
 def preview_import(
-    plan: Plan, *, strict: bool = False, jobs: int | None = None
+    plan: Plan, *, strict: bool = False, jobs: Jobs | None = None
 ) -> Generator[JobProgress, None, Imported]:
     """Check every image of a plan, and return what `import_objects` would return. Nothing is written.
 
@@ -103,7 +103,7 @@ def preview_import(
 
 
 def _stage_all(
-    plan: Plan, folder: Path | None, descriptors: tuple[str, ...], strict: bool, jobs: int | None
+    plan: Plan, folder: Path | None, descriptors: tuple[str, ...], strict: bool, jobs: Jobs | None
 ) -> Generator[JobProgress, None, dict[str, StagedImage]]:
     """Stage the images of a plan and return them by name; ``strict`` ends at the first portion with a rejected one."""
     items = list(items_of(plan, descriptors))

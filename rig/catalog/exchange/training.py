@@ -25,7 +25,7 @@ from rig.catalog.jobs import JobProgress, portions, processes
 from rig.catalog.records import EnrollmentStatus, Region, this_software
 from rig.config import ViewConfig
 from rig.core.errors import ExportFailed, UsageError
-from rig.core.processes import map_in_processes
+from rig.core.processes import Jobs, map_in_processes
 from rig.views import image_files as images
 from rig.views.description import BENCH_DESCRIPTOR, ViewDescriber, within
 
@@ -88,7 +88,7 @@ def write_training(
     fractions: Sequence[float] = (0.8, 0.1, 0.1),
     seed: int = 0,
     intrinsics: Intrinsics = lambda _: None,
-    jobs: int | None = None,
+    jobs: Jobs | None = None,
 ) -> Generator[JobProgress, None, TrainingExport]:
     """Write the views that searches use as a training set into a new folder, all or nothing.
 

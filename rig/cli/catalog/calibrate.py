@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from rig.cli.ui.cluster import ClusterOption, jobs_of
 from rig.cli.ui.command import command
 from rig.cli.ui.settings import Settings
 
@@ -21,6 +22,7 @@ def calibrate(
     false_reject: Annotated[
         float, typer.Option(min=0.0001, max=0.5, help="Largest share of enrolled objects called unknown.")
     ] = 0.02,
+    cluster: ClusterOption = None,
 ) -> None:
     """Calibrate the stopping rule, which decides when rig identify ends a search.
 
@@ -36,6 +38,7 @@ def calibrate(
     from rig.cli.ui.jobs import progress_bar
     from rig.core.clock import SystemClock, seconds_between
     from rig.core.errors import CatalogError
+    from rig.core.processes import map_in_processes
     from rig.events.events import plain
     from rig.search.stopping_rules import FILE, stopping_rule_values, write_stopping_rule
     from rig.views.description import BENCH_DESCRIPTOR
@@ -55,7 +58,14 @@ def calibrate(
         def show(done: int, total: int) -> None:
             progress(JobProgress(done, total))
 
-        found = calibrate_stopping_rule(index, error_rate=error_rate, false_reject=false_reject, progress=show)
+        where = jobs_of(None, cluster)
+        found = calibrate_stopping_rule(
+            index,
+            error_rate=error_rate,
+            false_reject=false_reject,
+            progress=show,
+            tasks=None if where is None else lambda work, tasks: map_in_processes(work, tasks, where),
+        )
     made_utc = f"{clock.utc():%Y-%m-%dT%H:%M:%SZ}"
     write_stopping_rule(path, found.rule, index, made_utc=made_utc)
     if settings.json:

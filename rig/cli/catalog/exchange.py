@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from rig.cli.ui.cluster import ClusterOption, jobs_of
 from rig.cli.ui.command import command
 from rig.cli.ui.complete import object_names
 from rig.cli.ui.jobs import run_job, size_words
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from rig.catalog.exchange import ImportBatch, Imported
     from rig.catalog.exchange.batch import ExportedObject, Session
     from rig.catalog.exchange.training import Intrinsics
+    from rig.core.processes import Jobs
 
 SHOWN = 20
 """Number of rejected files and of gaps that are listed. With --json all of them are."""
@@ -72,6 +74,7 @@ def import_(
     ] = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Only report what would be imported.")] = False,
     jobs: Annotated[int | None, typer.Option(min=1, help="Number of processes. Default: one per core.")] = None,
+    cluster: ClusterOption = None,
 ) -> None:
     """Import photographs with known angles, or objects of another bench; all or nothing.
 
@@ -85,7 +88,7 @@ def import_(
         descriptors=[descriptor_name(one) for one in descriptor or ()],
         strict=strict,
         dry_run=dry_run,
-        jobs=jobs,
+        jobs=jobs_of(jobs, cluster),
     )
 
 
@@ -98,7 +101,7 @@ def run_import(
     descriptors: "Sequence[str]" = (),
     strict: bool,
     dry_run: bool,
-    jobs: int | None,
+    jobs: "Jobs | None",
 ) -> None:
     """Import a batch, or check it, and report."""
     from contextlib import nullcontext

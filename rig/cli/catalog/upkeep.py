@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from rig.cli.catalog.catalog import YesOption, app
+from rig.cli.ui.cluster import ClusterOption, jobs_of
 from rig.cli.ui.command import command
 from rig.cli.ui.complete import object_names
 from rig.cli.ui.jobs import confirm, print_table, run_job, size_words
@@ -25,6 +26,7 @@ def verify(
     repair: Annotated[bool, typer.Option("--repair", help="Repair what can be repaired. Nothing is deleted.")] = False,
     quick: Annotated[bool, typer.Option("--quick", help="Only compare the hashes of the files.")] = False,
     jobs: JobsOption = None,
+    cluster: ClusterOption = None,
 ) -> None:
     """Check whether everything is as it was stored. The exit code is 7 if a problem is left.
 
@@ -38,7 +40,7 @@ def verify(
     with settings.open_catalog(read_only=not repair) as catalog:
         found = run_job(
             "verifying",
-            job(catalog, repair=repair, quick=quick, jobs=jobs),
+            job(catalog, repair=repair, quick=quick, jobs=jobs_of(jobs, cluster)),
             interrupted="Interrupted; nothing was changed.",
         )
     if settings.json:
@@ -74,6 +76,7 @@ def redescribe(
     ] = "stored",
     again: Annotated[bool, typer.Option("--again", help="Also describe views that are described already.")] = False,
     jobs: JobsOption = None,
+    cluster: ClusterOption = None,
 ) -> None:
     """Describe the stored images again, after a descriptor or its settings have changed.
 
@@ -91,7 +94,7 @@ def redescribe(
     with settings.open_catalog() as catalog:
         done = run_job(
             "describing",
-            job(catalog, descriptor_name(descriptor), region=part, again=again, jobs=jobs),
+            job(catalog, descriptor_name(descriptor), region=part, again=again, jobs=jobs_of(jobs, cluster)),
             interrupted="Interrupted; the results so far are stored. The same command continues.",
         )
     if settings.json:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from rig.cli.ui.cluster import ClusterOption, jobs_of
 from rig.cli.ui.command import command
 from rig.cli.ui.exit_codes import EXIT_INTERRUPTED
 from rig.cli.ui.models import descriptor_name
@@ -15,6 +16,7 @@ from rig.cli.ui.settings import Settings
 
 if TYPE_CHECKING:
     from hbr.evaluation.datasets import Dataset
+    from rig.core.processes import Jobs
     from rig.evaluation.plan import Plan
 
 #: Draws of left-out objects.
@@ -118,6 +120,7 @@ def evaluate(
         typer.Option(min=0, help="Margin per view that ends a search of the paper; default: identify.margin."),
     ] = None,
     jobs: Annotated[int | None, typer.Option(min=1, help="Number of processes; default: one for each core.")] = None,
+    cluster: ClusterOption = None,
     out: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder for the results.")] = Path("rig-eval"),
     resume: Annotated[bool, typer.Option("--resume", help="Continue with the results in the folder.")] = False,
 ) -> None:
@@ -139,7 +142,7 @@ def evaluate(
     from rig.evaluation.store import Store
     from rig.evaluation.write import write_results
 
-    jobs = jobs or os.cpu_count() or 1
+    workers = jobs_of(jobs, cluster) or os.cpu_count() or 1
     descriptor = descriptor_name(descriptor)
     try:
         plan = Plan.of(
@@ -174,10 +177,10 @@ def evaluate(
         note = f"{dataset.name}: {len(dataset.objects)} objects, {dataset.views} views, {dataset.missing} missing"
         print(f"{note}, {dataset.ignored} other images" if dataset.ignored else note, file=sys.stderr)
         if leave_out is not None:
-            _unknown_objects(settings, plan, leave_out, jobs, out)
+            _unknown_objects(settings, plan, leave_out, workers, out)
             return
         if matrix:
-            _matrix(settings, plan, jobs, out)
+            _matrix(settings, plan, workers, out)
             return
         store = Store(out / "runs", plan.settings(), resume=resume)
 
@@ -192,9 +195,9 @@ def evaluate(
             return advance
 
         with Progress("describing") as progress:
-            model = enrolled_views(plan, jobs, tell(progress, "described"))
+            model = enrolled_views(plan, workers, tell(progress, "described"))
         with Progress("searching") as progress:
-            runs = run_plan(plan, model, store, jobs, tell(progress, "searched"))
+            runs = run_plan(plan, model, store, workers, tell(progress, "searched"))
     except ValueError as error:
         raise UsageError(
             str(error), next_step="Correct the options or the data set, then continue with --resume."
@@ -223,7 +226,7 @@ def evaluate(
     print(f"Written: {out / 'report.html'}, results.json, results.csv and the figures beside it.", file=sys.stderr)
 
 
-def _matrix(settings: Settings, plan: "Plan", jobs: int, out: Path) -> None:
+def _matrix(settings: Settings, plan: "Plan", jobs: "Jobs", out: Path) -> None:
     from rig.cli.ui.present import Progress, console
     from rig.evaluation.matrix import matrix_rows, run_matrix
     from rig.evaluation.write import write_json
@@ -245,7 +248,7 @@ def _matrix(settings: Settings, plan: "Plan", jobs: int, out: Path) -> None:
     print(f"Written: {out / 'matrix.json'}, with Wilson's intervals.", file=sys.stderr)
 
 
-def _unknown_objects(settings: Settings, plan: "Plan", count: int, jobs: int, out: Path) -> None:
+def _unknown_objects(settings: Settings, plan: "Plan", count: int, jobs: "Jobs", out: Path) -> None:
     from rig.cli.ui.present import Progress, console
     from rig.evaluation.run import enrolled_views
     from rig.evaluation.unknown_objects import run_unknown_objects, unknown_object_rows

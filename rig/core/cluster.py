@@ -1,0 +1,144 @@
+"""Applies a function to many items on a Dask cluster."""
+
+import pickle
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from functools import lru_cache
+from hashlib import sha256
+from pathlib import Path
+from typing import Any, Final, TypeVar
+
+from rig.core.errors import ClusterFailed, ExtraMissing, UsageError
+
+_Item = TypeVar("_Item")
+_T = TypeVar("_T")
+
+LOCAL: Final = "local"
+START_S: Final = 30
+
+
+@dataclass(frozen=True)
+class Cluster:
+    """A Dask cluster.
+
+    Attributes
+    ----------
+    address
+        Of its scheduler, ``tcp://HOST:8786``; or ``local`` or ``local:WORKERS`` to start one on this computer.
+    """
+
+    address: str
+
+    def workers(self) -> int | None:
+        """Return how many workers to start on this computer; None for a cluster that runs already.
+
+        Raises
+        ------
+        UsageError
+            The number is not valid.
+        """
+        name, _, count = self.address.partition(":")
+        if name != LOCAL:
+            return None
+        if count and not (count.isdecimal() and int(count) > 0):
+            raise UsageError(f"--cluster {self.address!r}: {count!r} is not a number", next_step="give local:2")
+        return int(count or 0)
+
+
+def map_on_cluster(work: Callable[[_Item], _T], items: Iterable[_Item], cluster: Cluster) -> Iterator[tuple[_Item, _T]]:
+    """Yield each item with its result, in the order of completion; closing the generator ends the tasks.
+
+    The workers need this program in the same version, and the same files under the same names. A worker that dies costs
+    the items that it worked on: others do them again.
+
+    Parameters
+    ----------
+    work
+        A function that can be pickled. Each worker gets it once.
+    items
+        Items that can be pickled.
+
+    Raises
+    ------
+    ClusterFailed
+        The cluster does not answer, or an item ended several workers.
+    """
+    todo = list(items)
+    if not todo:
+        return
+    try:
+        from distributed import Client, KilledWorker, LocalCluster, as_completed
+    except ImportError as error:
+        raise ExtraMissing.of("cluster", "jobs on a cluster", error) from error
+    from hbr.descriptors import loaded_models
+
+    with ExitStack() as ends:
+        try:
+            count = cluster.workers()
+            where: Any = cluster.address
+            if count is not None:
+                started = LocalCluster(
+                    n_workers=count or None, threads_per_worker=1, dashboard_address=None, silence_logs=50
+                )
+                where = ends.enter_context(started)
+            client = ends.enter_context(Client(where, timeout=START_S))
+        except (OSError, TimeoutError, ValueError) as error:
+            raise ClusterFailed(
+                f"the cluster {cluster.address} does not answer",
+                next_step="start its scheduler and workers (dask scheduler, dask worker), or use --cluster local",
+                evidence={"error": str(error)},
+            ) from error
+        models = tuple(str(model.path) for model in loaded_models())
+        content = pickle.dumps(work)
+        digest = sha256(content).hexdigest()
+        # A task, and no data that is sent to workers: the scheduler repeats it if the worker that has it dies.
+        shared = client.submit(bytes, content, key=f"rig-work-{digest}", pure=True)
+        futures = {
+            client.submit(_call, shared, digest, models, item, pure=False, key=f"rig-{digest[:12]}-{number}"): item
+            for number, item in enumerate(todo)
+        }
+        try:
+            for future in as_completed(futures):
+                item = futures.pop(future)
+                yield item, future.result()
+                future.release()
+        except KilledWorker as error:
+            raise ClusterFailed(
+                "An item ended several workers of the cluster.",
+                next_step="Check whether the workers ran out of memory, and try again.",
+                evidence={"error": str(error)},
+            ) from error
+        finally:
+            for future in futures:
+                future.cancel()
+
+
+def _call(content: bytes, digest: str, models: Sequence[str], item: Any) -> Any:
+    return _loaded(_Content(content, digest), tuple(models))(item)
+
+
+@dataclass(frozen=True)
+class _Content:
+    content: bytes
+    digest: str
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Content) and other.digest == self.digest
+
+    def __hash__(self) -> int:
+        return hash(self.digest)
+
+
+@lru_cache(maxsize=2)
+def _loaded(content: _Content, models: tuple[str, ...]) -> Callable[[Any], Any]:
+    """Return the function in this worker."""
+    import cv2
+
+    from hbr.descriptors import load_model
+
+    for path in models:
+        load_model(Path(path))
+    cv2.setNumThreads(1)
+    found: Callable[[Any], Any] = pickle.loads(content.content)
+    return found

@@ -1,0 +1,115 @@
+"""Jobs on a Dask cluster: the same results as without, and a dead worker costs its item alone."""
+
+import os
+import signal
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import Result
+
+import hbr
+from hbr import DenseIndex, calibrate_stopping_rule
+from rig.catalog import Catalog
+from rig.catalog.redescribe import redescribe
+from rig.catalog.verify import verify
+from rig.core.cluster import Cluster, map_on_cluster
+from rig.core.errors import ClusterFailed, UsageError
+from rig.core.processes import map_in_processes
+from sim.clock import VirtualClock
+from tests.rig.catalog.catalog_samples import finished, true_fill
+
+distributed = pytest.importorskip("distributed", reason="Dask is not installed (make test-servers)")
+
+pytestmark = pytest.mark.filterwarnings("ignore")  # of the packages of Dask, about their own threads
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[Cluster]:
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50
+    ) as running:
+        yield Cluster(running.scheduler_address)
+
+
+def half(number: int) -> float:
+    return number / 2
+
+
+def die_once(folder: Path, number: int) -> int:
+    mark = folder / str(number)
+    with mark.open("a") as file:
+        file.write("x")
+    if number == 3 and mark.read_text() == "x":
+        os.kill(os.getpid(), signal.SIGKILL)
+    return number * number
+
+
+def test_items_come_with_their_results(cluster: Cluster) -> None:
+    assert dict(map_on_cluster(half, range(10), cluster)) == {n: n / 2 for n in range(10)}
+    assert dict(map_in_processes(half, [], cluster)) == {}
+
+
+def test_error_of_an_item_is_raised(cluster: Cluster) -> None:
+    with pytest.raises(TypeError):
+        list(map_on_cluster(half, [1, "x"], cluster))
+
+
+def test_dead_worker_costs_its_item_alone(tmp_path: Path) -> None:
+    found = dict(map_on_cluster(partial(die_once, tmp_path), range(12), Cluster("local:2")))
+    assert found == {n: n * n for n in range(12)}
+    done = {number: len((tmp_path / str(number)).read_text()) for number in range(12)}
+    assert done[3] == 2
+    assert sum(done.values()) <= 12 + 3  # with what lay finished on the dead worker
+
+
+def test_wrong_addresses_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rig.core.cluster.START_S", 1)
+    with pytest.raises(ClusterFailed, match="does not answer"):
+        list(map_on_cluster(half, [1], Cluster("tcp://127.0.0.1:9")))
+    with pytest.raises(UsageError, match="not a number"):
+        list(map_on_cluster(half, [1], Cluster("local:two")))
+
+
+def test_catalog_jobs_give_the_same(cluster: Cluster, tmp_path: Path) -> None:
+    with Catalog.open(tmp_path, clock=VirtualClock()) as catalog:
+        for number in range(4):
+            true_fill(catalog, f"object {number}", 4, 10 * number)
+        before = catalog.version()
+        done = finished(redescribe(catalog, again=True, jobs=cluster))
+        assert (done.described, done.failed) == (16, ())
+        assert catalog.version() == before
+        store = catalog.database.images
+        view = catalog.object("object 2").views[1]
+        store.remove([view.image])
+        assert finished(verify(catalog, jobs=cluster)) == finished(verify(catalog, jobs=1))
+
+
+def test_calibration_gives_the_same_bits(cluster: Cluster) -> None:
+    rng = np.random.default_rng(0)
+    views = hbr.Views.concatenate(
+        [
+            hbr.Views.of_object(f"o{j}", rng.integers(0, 4, (8, 544), np.uint8), np.arange(8) * 45.0, "edges+colours")
+            for j in range(5)
+        ]
+    )
+    index = DenseIndex(views)
+    alone = calibrate_stopping_rule(index)
+    spread = calibrate_stopping_rule(index, tasks=lambda work, tasks: map_in_processes(work, tasks, cluster))
+    assert repr(spread) == repr(alone)
+    assert spread.rule.min_confidence == alone.rule.min_confidence
+
+
+def test_commands_take_a_cluster(cluster: Cluster, rig: Callable[..., Result]) -> None:
+    with Catalog.open("catalog", clock=VirtualClock()) as catalog:
+        for number in range(3):
+            true_fill(catalog, f"object {number}", 8, 10 * number)
+    words = ("catalog", "verify", "--cluster", cluster.address, "--json")
+    done = rig(*words)
+    assert done.exit_code == 0, done.output
+    assert '"findings": []' in done.stdout
+    both = rig("catalog", "verify", "--cluster", cluster.address, "--jobs", "2")
+    assert both.exit_code == 2
+    assert "both given" in both.output
