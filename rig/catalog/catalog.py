@@ -70,6 +70,9 @@ class Catalog(AbstractContextManager["Catalog"]):
         Gives the civil time of what is stored.
     """
 
+    copied_utc: datetime | None = None
+    """When this local copy of a catalog on a server was made; None for the catalog itself."""
+
     def __init__(self, database: Database, clock: Clock) -> None:
         self.database = database
         self.clock = clock

@@ -138,9 +138,12 @@ class ImagePath(_Checked):
 
 
 class Number(_Checked):
-    """A finite number."""
+    """A finite number. SQLite stores −0.0 as 0.0, so every engine does: equal rows have equal digests."""
 
     impl = Float
+
+    def process_bind_param(self, value: float | None, dialect: Dialect) -> float | None:  # noqa: ARG002
+        return value if value is None else value + 0.0
 
     def check(self, value: Any) -> None:
         _is_number(value)

@@ -86,6 +86,10 @@ class Database(ABC):
     def size_bytes(self, connection: Connection) -> int:
         """Return the size of the database."""
 
+    def may_have_changed(self) -> bool:
+        """Return whether another query can find something new since the last call."""
+        return True
+
     def outdated(self) -> CatalogOutdated:
         """Return the error for a catalog that must be migrated first."""
         return CatalogOutdated(

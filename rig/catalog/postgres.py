@@ -12,6 +12,7 @@ from contextlib import AbstractContextManager, contextmanager
 from typing import Any, Final
 
 from sqlalchemy import Column, Connection, MetaData, QueuePool, Table, Text, create_engine, func, select, text
+from sqlalchemy.engine import make_url
 from sqlalchemy.exc import ArgumentError, NoSuchModuleError
 
 from rig.catalog import audit
@@ -86,6 +87,7 @@ class PostgresDatabase(Database):
         self._reading = engine.execution_options(isolation_level="REPEATABLE READ", postgresql_readonly=True)
         self._writing = engine.execution_options(isolation_level="READ COMMITTED")
         self._dispose = engine.dispose
+        self._listener: Any = None
         try:
             with self.catalog_errors():
                 self._open(create=create and not read_only)
@@ -95,6 +97,8 @@ class PostgresDatabase(Database):
 
     def close(self) -> None:
         self._dispose()
+        if self._listener is not None:
+            self._listener.close()
 
     @contextmanager
     def read(self) -> Iterator[Connection]:
@@ -169,6 +173,25 @@ class PostgresDatabase(Database):
                 f"the catalog {self.place} was migrated to version {found} while this program used it",
                 next_step="start the program again; update hbr-rig if it reports a newer version",
             )
+
+    def may_have_changed(self) -> bool:
+        """Ask the server's notifications; without a connection the answer is yes, so that the next query reports it."""
+        try:
+            if self._listener is None or self._listener.closed:
+                import psycopg
+
+                url = make_url(str(self.place.url)).set(drivername="postgresql").render_as_string(hide_password=False)
+                self._listener = psycopg.connect(url, autocommit=True, connect_timeout=5)
+                self._listener.execute(f"LISTEN {CHANNEL}")
+                return True  # what happened before is not known
+            found = False
+            for one in self._listener.notifies(timeout=0):
+                found = found or one.payload == self.id
+            self._listener.execute("SELECT 1")
+            return found
+        except Exception:  # of any kind: the connection is lost
+            self._listener = None
+            return True
 
     def damage(self, connection: Connection) -> list[str]:  # noqa: ARG002 - the server checks its own pages
         return []
@@ -270,8 +293,6 @@ def _engine(place: CatalogPlace, busy_timeout_s: float) -> Any:
     settings = {key: value.format(busy_ms=max(1, round(1000 * busy_timeout_s))) for key, value in _SETTINGS.items()}
     options = " ".join(f"-c {key}={value}" for key, value in settings.items())
     try:
-        from sqlalchemy.engine import make_url
-
         url = make_url(place.url)
         given = url.query.get("options", "")
         return create_engine(

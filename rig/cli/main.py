@@ -14,7 +14,7 @@ from typer.core import TyperGroup
 
 from rig.cli.bench import config, doctor, find, head, jog, safety, serve, servo, setup, snapshot, table
 from rig.cli.catalog import calibrate as rules
-from rig.cli.catalog import catalog, exchange, results, upkeep
+from rig.cli.catalog import catalog, deliver, exchange, results, upkeep
 from rig.cli.objects import empty_table, enroll, evaluate, identify, runs
 from rig.cli.ui.command import (
     BenchOption,
@@ -140,6 +140,7 @@ app.command("setup", rich_help_panel=BENCH)(setup.setup)
 app.command("import", rich_help_panel=OBJECTS)(exchange.import_)
 app.command("export", rich_help_panel=OBJECTS)(exchange.export)
 app.command("log", rich_help_panel=OBJECTS)(upkeep.log)
+catalog.app.command("deliver")(deliver.deliver)
 catalog.app.command("calibrate")(rules.calibrate)
 app.add_typer(results.app, name="results", rich_help_panel=OBJECTS)
 app.add_typer(catalog.app, name="catalog", rich_help_panel=OBJECTS)

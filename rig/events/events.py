@@ -34,6 +34,7 @@ class NoteCode(StrEnum):
     STOPPING_RULE_OUTDATED = "stopping-rule-outdated"
     RATES_NOT_GUARANTEED = "rates-not-guaranteed"
     NOT_RECORDED = "not-recorded"
+    LOCAL_COPY = "local-copy"
     EARLIER_VERSION = "earlier-version"
 
 

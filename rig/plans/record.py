@@ -8,11 +8,12 @@ from numpy.typing import NDArray
 
 from rig.bench import Bench
 from rig.catalog import Catalog, Provenance
+from rig.catalog.journal import Journal
 from rig.catalog.records import Outcome
 from rig.catalog.results import Answer, NewResult, record
 from rig.config.catalog_place import CatalogPlace
 from rig.core.clock import Clock
-from rig.core.errors import RigError
+from rig.core.errors import CatalogUnavailable, RigError
 from rig.events.events import Accepted, Event, Identified, Note, NoteCode, Recorded, Started, Warned, event_dict
 
 
@@ -91,7 +92,11 @@ class ResultRecorder:
                 self._catalog_version(),
                 self._operator,
             )
-            with Catalog.open(self._place, clock=self._clock, create=False) as catalog:
-                return Recorded(record(catalog, new, self._image), self.sample)
+            try:
+                with Catalog.open(self._place, clock=self._clock, create=False) as catalog:
+                    return Recorded(record(catalog, new, self._image), self.sample)
+            except CatalogUnavailable:
+                with Journal.of(CatalogPlace.of(self._place), self._clock) as journal:
+                    return Recorded(record(journal, new, self._image), self.sample)
         except RigError as error:
             return Warned(None, Note(NoteCode.NOT_RECORDED, {"what": error.what, "next_step": error.next_step}))

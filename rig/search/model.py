@@ -5,7 +5,7 @@ Decision: docs/decisions/0030.
 
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -97,6 +97,14 @@ def load_model(
     CatalogError, CatalogBusy
         The catalog cannot be read.
     """
+    model = _load(catalog, descriptor, progress)
+    if catalog.copied_utc is None:
+        return model
+    note = Note(NoteCode.LOCAL_COPY, {"copied_utc": f"{catalog.copied_utc:%Y-%m-%d %H:%M:%S} UTC"})
+    return replace(model, notes=(note, *model.notes))
+
+
+def _load(catalog: Catalog, descriptor: str | None, progress: Callable[[JobProgress], None] | None) -> Model:
     notes: tuple[Note, ...] = ()
     if descriptor == BENCH_DESCRIPTOR:
         return _dense(catalog, progress)

@@ -16,6 +16,7 @@ from rig.cli.ui.settings import Settings
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from hbr import Views
     from rig.bench import Bench
     from rig.catalog import Catalog
     from rig.events.events import Event
@@ -99,7 +100,7 @@ def enroll(
 
     with (
         settings.open_bench() as bench,
-        settings.open_catalog(clock=bench.clock, create=True) as catalog,
+        settings.open_for_enrollment(bench.clock) as catalog,
         settings.background_check(),
     ):
         from rig.bench import ObjectAlreadyPlaced
@@ -130,6 +131,7 @@ def enroll(
                 report,
             )
             job.print_total(len(items))
+    settings.deliver()
 
 
 def _command(settings: Settings, given: "Mapping[str, Any]", *arguments: str) -> str:
@@ -181,7 +183,7 @@ class _Job:
                     self._heading = f"{event.number} of {event.of} "
                 if isinstance(event, Enrolled):  # it is in the catalog now; Enrolled stays its last event
                     with progress_bar("Preparing objects for searches") as progress:
-                        views = prepared_views(self._catalog, progress=progress)
+                        views = self._others(prepared_views(self._catalog, progress=progress), event.name)
                     self._show(similar_objects(views, event.name))
                 self._show(event)
                 if isinstance(event, Enrolled):
@@ -222,6 +224,27 @@ class _Job:
         # in a pipe, the text on stderr would only repeat the JSON
         if not self._settings.json or self._screen.is_terminal:
             self._view.add(event)
+
+    def _others(self, views: "Views", name: str) -> "Views":
+        """Return the views of the journal's object with those of the server or of its local copy, if it is in one."""
+        import numpy as np
+
+        import hbr
+        from rig.catalog.journal import Journal
+        from rig.catalog.prepared import prepared_views
+        from rig.core.errors import RigError
+
+        if not isinstance(self._catalog, Journal):
+            return views
+        own = views.select(views.object_index == views.object_names.index(name))
+        own = hbr.Views.of_object(name, own.descriptors, own.azimuth_deg, own.descriptor)
+        try:
+            with self._settings.open_shared() as shared:
+                others = prepared_views(shared)
+        except RigError:  # no server, and no copy yet
+            return views
+        kept = others.select(np.array([one != name for one in others.object_names])[others.object_index])
+        return hbr.Views.concatenate([own, kept])
 
     def _complete(self) -> None:
         """Add the views of earlier sessions to the record of a resumed enrollment."""

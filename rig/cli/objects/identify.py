@@ -95,7 +95,7 @@ def identify(
     screen = console(stderr=settings.json)
     answer = None
     events: Generator[Event, None, object]
-    with settings.open_catalog(read_only=True) as catalog:
+    with settings.open_for_search() as catalog:
         model = CurrentModel(catalog, None if chosen is None else descriptor_for(chosen))
         known = model()  # report a catalog that cannot be searched before the bench is opened
         if scan and not watch:
@@ -116,7 +116,7 @@ def identify(
             else:
                 events = identify_one(bench, model(), strategy=chosen, seed=seed, top=top)
             recorder = ResultRecorder(
-                *(catalog.place, bench),
+                *(settings.load().catalog_place(settings.bench_name), bench),
                 clock=SystemClock(),
                 catalog_version=lambda: model.version,
                 operator=operator,

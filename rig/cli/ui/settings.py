@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from rig.bench import Bench
     from rig.catalog import Action, Catalog
     from rig.catalog.background import BackgroundCheck
+    from rig.catalog.journal import Delivery
     from rig.config import RigConfig
     from rig.core.clock import Clock
 
@@ -88,6 +89,59 @@ class Settings:
         if not create and self.load().catalog.path is None and place.url is None and not place.path.exists():
             raise self._no_catalog(place.path)
         return Catalog.open(place, clock=clock or SystemClock(), create=create, read_only=read_only)
+
+    def open_for_search(self) -> "Catalog":
+        """Open the bench's catalog for reading; if its server does not answer, the local copy.
+
+        The journal is delivered before, if there is something in it.
+        """
+        from rig.catalog.journal import waiting
+        from rig.core.clock import SystemClock
+
+        if waiting(self.load().catalog_place(self.bench_name), SystemClock()):
+            self.deliver()
+        return self.open_shared()
+
+    def open_shared(self) -> "Catalog":
+        """Open the bench's catalog for reading; if its server does not answer, the local copy."""
+        from rig.catalog.local_copy import open_copy
+        from rig.core.clock import SystemClock
+        from rig.core.errors import CatalogUnavailable
+
+        try:
+            return self.open_catalog(read_only=True)
+        except CatalogUnavailable:
+            return open_copy(self.load().catalog_place(self.bench_name), SystemClock())
+
+    def open_for_enrollment(self, clock: "Clock") -> "Catalog":
+        """Open the catalog for new views: the journal of this computer if the catalog is on a server."""
+        from rig.catalog.journal import Journal
+
+        place = self.load().catalog_place(self.bench_name)
+        return self.open_catalog(clock=clock, create=True) if place.url is None else Journal.of(place, clock)
+
+    def deliver(self, *, replacing: "Collection[str]" = ()) -> "list[Delivery]":
+        """Deliver the journal to the server of the catalog; print what was delivered, and why something was not."""
+        from rig.catalog.journal import Journal
+        from rig.catalog.journal import deliver as job
+        from rig.core.clock import SystemClock
+        from rig.core.errors import CatalogUnavailable
+
+        place = self.load().catalog_place(self.bench_name)
+        if place.url is None:
+            return []
+        try:
+            with Journal.of(place, SystemClock()) as journal, self.open_catalog(create=True) as server:
+                done = job(journal, server, replacing=replacing)
+        except CatalogUnavailable as error:
+            print(f"Note: {error.what}. The journal of this computer keeps it for later.", file=sys.stderr)
+            return []
+        for one in done:
+            if one.conflict is not None:
+                print(f"Note: {one.conflict.what}. Next step: {one.conflict.next_step}", file=sys.stderr)
+            else:
+                print(f"Delivered {one.name} with {one.views} views to {place}.", file=sys.stderr)
+        return done
 
     def background_check(self) -> "BackgroundCheck":
         """Return a check of the bench's catalog beside the work of a ``with`` block; damage is printed on stderr."""

@@ -1,0 +1,57 @@
+"""`rig catalog deliver`: bring the journal of this computer to the server."""
+
+from typing import Annotated
+
+import typer
+
+from rig.cli.ui.command import command
+from rig.cli.ui.settings import Settings
+
+EXIT_CATALOG = 7
+
+
+@command
+def deliver(
+    settings: Settings,
+    rename: Annotated[
+        tuple[str, str] | None,
+        typer.Option("--rename", metavar="NAME NEW", help="Deliver an object of the journal under another name."),
+    ] = None,
+    replace: Annotated[
+        list[str] | None,
+        typer.Option("--replace", metavar="NAME", help="Replace the object of the server by that of the journal."),
+    ] = None,
+    discard: Annotated[
+        str | None, typer.Option("--discard", metavar="NAME", help="Remove an object from the journal.")
+    ] = None,
+) -> None:
+    """Deliver what this computer enrolled and answered while the server of the catalog did not answer.
+
+    rig enroll and rig identify do it, too. The options are for conflicts of names, which a person decides.
+
+    Example: rig catalog deliver --rename mug-white mug-white-2
+    """
+    from rig.catalog import edit
+    from rig.catalog.journal import Journal
+    from rig.catalog.journal import discard as remove
+    from rig.core.clock import SystemClock
+    from rig.core.errors import UsageError
+
+    place = settings.load().catalog_place(settings.bench_name)
+    if place.url is None:
+        raise UsageError("the catalog is in a folder of this computer", next_step="nothing has to be delivered")
+    if rename is not None or discard is not None:
+        with Journal.of(place, SystemClock()) as journal:
+            if rename is not None:
+                edit.rename(journal, *rename)
+            if discard is not None:
+                remove(journal, discard)
+    done = settings.deliver(replacing=replace or ())
+    conflicts = [one for one in done if one.conflict is not None]
+    if settings.json:
+        rows = [{"name": one.name, "views": one.views, "conflict": one.conflict and one.conflict.what} for one in done]
+        settings.print_json({"delivered": len(done) - len(conflicts), "objects": rows})
+    elif not done:
+        print("No object was delivered.")
+    if conflicts:
+        raise typer.Exit(EXIT_CATALOG)
