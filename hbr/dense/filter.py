@@ -258,15 +258,23 @@ class Belief:
         A, the sum of what each query adds, at most their number; for azimuths 0, 5, ... at the first query.
     orientation_deg : float64 array (n,)
         Orientations of the camera around the object at the queries, from any zero.
+    weights : float64 array (n,), or None
+        How much each query counts, 0..1; None: all count fully.
     """
 
     index: DenseIndex
     support: Floats
     orientation_deg: FloatArray
+    weights: FloatArray | None = None
 
     @property
     def queries(self) -> int:
         return len(self.orientation_deg)
+
+    @property
+    def amount(self) -> float:
+        """The sum of the queries' weights; their number if all count fully."""
+        return float(self.queries if self.weights is None else self.weights.sum())
 
     @property
     def rotated_deg(self) -> float:
@@ -275,7 +283,7 @@ class Belief:
 
     def scores(self) -> FloatArray:
         """Score of every object considered: the power mean of the similarities at the best azimuth, 0..1."""
-        mean = self.support.max(axis=1).astype(np.float64) / self.queries
+        mean = self.support.max(axis=1).astype(np.float64) / self.amount
         scores: FloatArray = np.maximum(mean, 0) ** (1 / self.index.power)
         return scores
 
@@ -311,9 +319,11 @@ class Belief:
     def posterior(self, beta: float = BETA) -> FloatArray:
         """Return the probability of every hypothesis, (k, 72): proportional to exp(β A / √n).
 
-        The root reduces it: views of one object are not independent, and each adds less than the one before.
+        The root reduces it: views of one object are not independent, and each adds less than the one before. Weights
+        say that already, so that with them there is no root.
         """
-        exponent = self.support.astype(np.float64) * (beta / np.sqrt(self.queries))
+        root = np.sqrt(self.queries) if self.weights is None else 1.0
+        exponent = self.support.astype(np.float64) * (beta / root)
         weights = np.exp(exponent - exponent.max())
         probability: FloatArray = weights / weights.sum()
         return probability
@@ -339,7 +349,12 @@ class DenseRanking:
 
 
 def update_belief(
-    query: LevelArray, orientation_deg: float, so_far: DenseIndex | Belief, *, kept: int = KEPT
+    query: LevelArray,
+    orientation_deg: float,
+    so_far: DenseIndex | Belief,
+    *,
+    kept: int = KEPT,
+    weight: float | None = None,
 ) -> Belief:
     """Add a query to the belief.
 
@@ -353,6 +368,8 @@ def update_belief(
         The enrolled views for the first query, the belief so far for any other.
     kept : int
         Objects that are considered further after the first query: those with the most similar views.
+    weight : float, optional
+        How much the query counts, 0..1, if it is nearly the same evidence as an earlier one (`hbr.dense.arc`).
 
     Raises
     ------
@@ -373,8 +390,14 @@ def update_belief(
     if isinstance(so_far, Belief):
         similar = index.compared.similarity(query[None])[0]
         rotated_deg = float(wrap180(orientation_deg - so_far.orientation_deg[0]))
-        support = so_far.support + index.support(similar, rotated_deg)
-        return Belief(index, support, np.append(so_far.orientation_deg, orientation_deg))
+        added = index.support(similar, rotated_deg)
+        weights = so_far.weights
+        if weight is not None or weights is not None:
+            weight = 1.0 if weight is None else weight
+            added = added * np.float32(weight)
+            weights = np.append(np.ones(so_far.queries) if weights is None else weights, weight)
+        support = so_far.support + added
+        return Belief(index, support, np.append(so_far.orientation_deg, orientation_deg), weights)
     if len(index) > kept:
         index = index.only(index.nearest(query, kept))
     similar = index.compared.similarity(query[None])[0]
@@ -405,8 +428,9 @@ def completed(belief: Belief, index: DenseIndex, queries: Sequence[LevelArray]) 
     if len(places) == len(kept):
         return belief
     more: DenseIndex | Belief = index.only(places)
-    for query, orientation_deg in zip(queries, belief.orientation_deg.tolist(), strict=True):
-        more = update_belief(query, orientation_deg, more, kept=len(places))
+    weights = [None] * len(queries) if belief.weights is None else belief.weights.tolist()
+    for query, orientation_deg, weight in zip(queries, belief.orientation_deg.tolist(), weights, strict=True):
+        more = update_belief(query, orientation_deg, more, kept=len(places), weight=weight)
     assert isinstance(more, Belief)
     return more
 

@@ -114,6 +114,8 @@ def leave_one_out(
     views: int = 4,
     seen: LevelArray | None = None,
     searches: int = 4,
+    step_deg: float = _STEP_DEG,
+    weight: float | None = None,
     progress: Callable[[int, int], object] | None = None,
     tasks: Callable[[Callable[[Task], "Found"], Sequence[Task]], Iterable[tuple[Task, "Found"]]] | None = None,
 ) -> LeaveOneOut:
@@ -136,6 +138,11 @@ def leave_one_out(
         and blur. The enrolled views themselves by default.
     searches : int
         Searches for each object; their first views are spread around it.
+    step_deg : float
+        Distance between the views of a search.
+    weight : float, optional
+        How much each view after the first counts, if they are nearly the same evidence. All views of a search then lie
+        beside their enrolled views by the same share, because what differs between two sessions differs in all of them.
     progress : callable, optional
         Called before each object with the number of objects done, and of all.
     tasks : callable, optional
@@ -154,12 +161,13 @@ def leave_one_out(
     todo, aside = [], 0.0
     for place, object_index in enumerate(index.object_index.tolist()):
         count = len(index.views.of(object_index))
-        if count < max(views, 2):
+        if count < (max(views, 2) if weight is None else 2):
             continue
         todo.append((place, aside))
-        for _ in range(views * len(np.unique(np.arange(searches) * count // searches))):
+        drawn = views if weight is None else 1  # shares of a step that each search draws
+        for _ in range(drawn * len(np.unique(np.arange(searches) * count // searches))):
             aside = (aside + _GOLDEN) % 1
-    work = partial(_searches_for, index, beta, views, seen, searches)
+    work = partial(_searches_for, index, beta, views, seen, searches, step_deg, weight)
     by_place: dict[int, Found] = {}
     for (place, _), found in ((one, work(one)) for one in todo) if tasks is None else tasks(work, todo):
         if progress is not None:
@@ -188,7 +196,14 @@ def leave_one_out(
 
 
 def _searches_for(
-    index: DenseIndex, beta: float, views: int, seen: LevelArray | None, searches: int, task: Task
+    index: DenseIndex,
+    beta: float,
+    views: int,
+    seen: LevelArray | None,
+    searches: int,
+    step_deg: float,
+    weight: float | None,
+    task: Task,
 ) -> Found:
     """Search for the object at one place of the index."""
     place, aside = task
@@ -196,7 +211,7 @@ def _searches_for(
     rows = rows[np.argsort(index.views.azimuth_deg[rows], kind="stable")]
     azimuth_deg = index.views.azimuth_deg[rows]
     starts = np.unique(np.arange(searches) * len(rows) // searches).tolist()
-    spread = [_spread(azimuth_deg, start, views) for start in starts]
+    spread = [_spread(azimuth_deg, start, views, step_deg, again=weight is not None) for start in starts]
     used = np.unique(spread)
     levels = index.views.levels(rows[used]) if seen is None else seen[rows[used]]
     similar = dict(zip(used.tolist(), index.compared.similarity(levels), strict=True))
@@ -204,14 +219,17 @@ def _searches_for(
     found = Found([], [], [], [])
     for start, chosen in zip(starts, spread, strict=True):
         support = np.zeros((len(index), BINS), np.float32)
+        aside = aside if weight is None else (aside + _GOLDEN) % 1
         for n, i in enumerate(chosen):
             # The query lies beside its enrolled view, towards alternating neighbours.
-            aside = (aside + _GOLDEN) % 1
+            aside = (aside + _GOLDEN) % 1 if weight is None else aside
             neighbour = rows[(i + (1 if n % 2 else -1)) % len(rows)]
             moved = similar[i].copy()
             moved[rows[i]] -= aside * (moved[rows[i]] - moved[neighbour])
-            support += index.support(moved, float(azimuth_deg[i] - azimuth_deg[start]))
-            belief = Belief(index, support, azimuth_deg[chosen[: n + 1]])
+            added = index.support(moved, float(azimuth_deg[i] - azimuth_deg[start]))
+            support += added if weight is None or n == 0 else added * np.float32(weight)
+            weights = None if weight is None else np.concatenate([[1.0], np.full(n, weight)])
+            belief = Belief(index, support, azimuth_deg[chosen[: n + 1]], weights)
             scores, probability = belief.scores(), belief.posterior(beta).sum(axis=1)
             found.known.append(leader(index.object_index, scores))
             found.unknown.append(leader(others, np.delete(scores, place)))
@@ -238,11 +256,14 @@ def usual_scores(leaders: Leaders, correct: NDArray[np.bool_], objects: int) -> 
     return usual
 
 
-def _spread(azimuth_deg: FloatArray, start: int, count: int) -> list[int]:
-    """Return the indices of ``count`` different views, a step apart, the first one at ``start``."""
+def _spread(
+    azimuth_deg: FloatArray, start: int, count: int, step_deg: float = _STEP_DEG, *, again: bool = False
+) -> list[int]:
+    """Return the indices of ``count`` views, a step apart, the first one at ``start``; different ones but ``again``."""
     chosen = [start]
     for n in range(1, count):
-        away = np.abs((azimuth_deg - azimuth_deg[start] - n * _STEP_DEG + 180) % 360 - 180)
-        away[chosen] = np.inf
+        away = np.abs((azimuth_deg - azimuth_deg[start] - n * step_deg + 180) % 360 - 180)
+        if not again:
+            away[chosen] = np.inf
         chosen.append(int(away.argmin()))
     return chosen

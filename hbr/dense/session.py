@@ -46,9 +46,11 @@ class DenseSession:
 
     def add(self, levels: LevelArray, orientation_deg: float) -> StopDecision:
         """Add the next view, as for `update_belief`, and return the rule's decision."""
-        self._so_far = self.belief = update_belief(levels, orientation_deg, self._so_far, kept=self._kept)
+        self._so_far = self.belief = update_belief(
+            levels, orientation_deg, self._so_far, kept=self._kept, weight=self._weight(orientation_deg)
+        )
         self._queries.append(levels)
-        self.decision = self.rule.decide(self.belief, max_views=self.max_views)
+        self.decision = self._decide(self.belief)
         if self.decision.outcome is not Outcome.CONTINUE:
             self._complete()
         return self.decision
@@ -61,8 +63,15 @@ class DenseSession:
         """Return the decision with which the search ends here, even if the rule would continue."""
         if self.decision.outcome is Outcome.CONTINUE:
             self._complete()
-            return self.rule.decide(self.belief, max_views=self.belief.queries)
+            return self._decide(self.belief, last=True)
         return self.decision
+
+    def _weight(self, orientation_deg: float) -> float | None:  # noqa: ARG002
+        """Return how much the next view counts; None: fully."""
+        return None
+
+    def _decide(self, belief: Belief, *, last: bool = False) -> StopDecision:
+        return self.rule.decide(belief, max_views=belief.queries if last else self.max_views)
 
     def _complete(self) -> None:
         """Before an end: decide again if an object that was left out after the first view can be first or second."""
@@ -71,4 +80,4 @@ class DenseSession:
         found = completed(self.belief, self._index, self._queries)
         if found is not self.belief:
             self._so_far = self.belief = found
-            self.decision = self.rule.decide(found, max_views=self.max_views)
+            self.decision = self._decide(found)

@@ -372,7 +372,10 @@ class Turntable(AbstractContextManager["Turntable"]):
     def _steer(self, state: ServoState, goal_deg: float) -> MotionMonitor:
         """Give the moving servo another goal; return the monitor of the motion from here on."""
         self._safety.set_goal(self._safety.angle_reference.to_servo(goal_deg))
-        return self._monitor(self.stopping_deg(state), goal_deg)
+        here_deg = self._safety.angle_reference.to_table(state.position_deg)
+        # If the goal lies behind, the table overshoots before it comes back.
+        start_deg = max(here_deg, self.stopping_deg(state), key=lambda angle: abs(angle - goal_deg))
+        return self._monitor(start_deg, goal_deg)
 
     def _wait_for_rest(
         self,

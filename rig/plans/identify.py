@@ -11,14 +11,18 @@ from numpy.typing import NDArray
 import hbr
 from hbr.core.angles import wrap360
 from rig.bench import Bench
+from rig.config import RigConfig
 from rig.core.clock import seconds_between
 from rig.core.errors import RigError
-from rig.events.events import Accepted, Decided, Event, Identified, Started
+from rig.events.events import Accepted, Event, Identified, Started
+from rig.motion.scan_speed import can_fly, require_camera_time
 from rig.motion.turntable import Turntable
 from rig.plans.capture import announced, capture, check_camera, moved, unwind, warn_of_table
+from rig.plans.identify_moving import decided as decided_event
+from rig.plans.identify_moving import search_in_motion
 from rig.search.model import Model, empty_table_for
-from rig.search.session import SHOWN, begin_search
-from rig.search.strategies import AnyStrategy, Finish, Rotate
+from rig.search.session import SHOWN, ArcSearch, begin_search
+from rig.search.strategies import AnyStrategy, Finish
 from rig.views.capture import Viewer
 from rig.views.description import ViewDescriber
 
@@ -69,7 +73,11 @@ def identify(
         See `rig.views.capture` and `rig.motion.turntable`.
     """
     config = bench.config.identify
+    if strategy is None and flies(bench.config, model):
+        strategy = "arc"
     search, chosen = begin_search(model, bench.config, strategy, seed=seed, top=top)
+    if isinstance(search, ArcSearch):
+        require_camera_time(bench.config)
     viewer = Viewer(bench.camera, bench.config.view)
     notes = model.notes if isinstance(model, Model) else ()
     if isinstance(model, Model):
@@ -90,6 +98,13 @@ def identify(
     )
     bench.operator.place(None)
     started_ns = bench.clock.now_ns()
+    if isinstance(search, ArcSearch):
+        found = yield from search_in_motion(bench, search, viewer, describe, top=top, started_ns=started_ns)
+        answer = search.answer(found.ranked, found.end, travelled_deg=found.travelled_deg, seconds=found.seconds)
+        yield answer
+        if found.failed:
+            raise found.failed
+        return answer
     travelled_deg = 0.0
     sign = bench.config.table.orientation_sign  # the camera goes around the object against the table
     number = 0
@@ -112,7 +127,7 @@ def identify(
                 break
             # Rotate: within the cable budget, and count what the table really did.
             asked_deg = table.rest_deg + sign * step.rotation_deg
-            decided = _decided(number, step, table.within_reach(asked_deg), top)
+            decided = decided_event(number, step, table.within_reach(asked_deg), top)
             yield decided
             move = yield from announced(number, table, decided.target_deg, asked_deg=asked_deg)
             travelled_deg += abs(move.rotation_deg)
@@ -130,16 +145,8 @@ def identify(
     return answer
 
 
-def _decided(number: int, step: Rotate, target_deg: float, top: int) -> Decided:
-    return Decided(
-        index=number,
-        side="left" if step.rotation_deg >= 0 else "right",
-        rotation_deg=step.rotation_deg,
-        target_deg=target_deg,
-        s_left=step.s_left,
-        s_right=step.s_right,
-        candidates=step.candidates[:top],
-        reason=step.reason,
-        note=step.note,
-        weighed=step.weighed,
-    )
+def flies(config: RigConfig, model: Model | hbr.ViewIndex) -> bool:
+    """Return whether a search without a named strategy takes frames in motion, by ``identify.mode``."""
+    is_dense = isinstance(model, Model) and isinstance(model.index, hbr.DenseIndex)
+    mode = config.identify.mode
+    return is_dense and config.identify.strategy is None and (mode == "fly" or (mode == "auto" and can_fly(config)))

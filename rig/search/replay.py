@@ -88,6 +88,8 @@ def check(run: SavedRun, *, by: AnyStrategy | None = None) -> Check:
                         run.model, run.config, by or started.strategy, seed=started.seed or 0, top=top
                     )
                 levels = view.levels[search.descriptor]
+                if event.evidence.motion is not None:
+                    table_deg = event.evidence.motion.angle_deg
                 ranked, step = search.add(levels, event.azimuth_deg, table_deg=table_deg)
                 found.views += 1
                 if event.segmentation is not None:

@@ -2,6 +2,7 @@
 
 from abc import ABC, abstractmethod
 from dataclasses import replace
+from functools import lru_cache
 from math import isfinite
 from typing import Final, cast
 
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 import hbr
 from hbr.core.angles import wrap360
+from hbr.dense.arc import ArcSession, calibrate_arc_rule
 from hbr.dense.pose import pose
 from hbr.model.symmetry import symmetry
 from rig.config import RigConfig
@@ -17,6 +19,7 @@ from rig.core.errors import CatalogError, UsageError
 from rig.events.events import Candidate, Identified, Ranked
 from rig.search.model import Model
 from rig.search.strategies import (
+    Arc,
     DenseSearchState,
     DenseStrategy,
     Finish,
@@ -25,6 +28,7 @@ from rig.search.strategies import (
     Strategy,
     descriptor_for,
     is_dense,
+    reachable_arcs,
     reachable_rotations,
     strategy_for,
 )
@@ -248,6 +252,54 @@ class DenseSearch(Search):
         return tuple(names[j] for j in belief.index.object_index[order[:count]].tolist())
 
 
+class ArcSearch(DenseSearch):
+    """The bench's own search in motion (`hbr.dense.arc`): each frame counts as far as it is new evidence.
+
+    `looked` says whether the last frame led to a decision; between decisions the last one stays.
+    """
+
+    def __init__(
+        self,
+        index: hbr.DenseIndex,
+        rule: hbr.StoppingRule,
+        config: RigConfig,
+        strategy: DenseStrategy,
+        *,
+        seed: int,
+        top: int,
+    ) -> None:
+        super().__init__(index, rule, config, strategy, seed=seed, top=top)
+        self._arc = self._session = ArcSession(index, _arc_rule(index, rule.error_rate, rule.false_reject))
+        self._step: Rotate | Finish | None = None
+
+    @property
+    def looked(self) -> bool:
+        return self._arc.looked
+
+    def _decide(self, ranked: Ranked, table_deg: float) -> Rotate | Finish:  # noqa: ARG002
+        if self._step is None or self.looked:
+            way = float(np.sign(self._step.rotation_deg)) if isinstance(self._step, Rotate) else 0.0
+            rotations_deg, seconds = reachable_arcs(self._config, table_deg, way)
+            self._step = self._strategy.next(
+                DenseSearchState(
+                    session=self._arc,
+                    decision=self._arc.decision,
+                    rotations_deg=rotations_deg,
+                    seconds=seconds,
+                    table_deg=table_deg,
+                    config=self._config.identify,
+                    rng=self._rng,
+                )
+            )
+        return self._step
+
+
+@lru_cache(maxsize=4)
+def _arc_rule(index: hbr.DenseIndex, error_rate: float, false_reject: float) -> hbr.StoppingRule:
+    """Return the rule of searches in motion; it is fitted once for each model."""
+    return calibrate_arc_rule(index, error_rate=error_rate, false_reject=false_reject)
+
+
 def begin_search(
     model: Model | hbr.ViewIndex,
     config: RigConfig,
@@ -288,6 +340,8 @@ def begin_search(
     wanted = descriptor_for(chosen)
     if isinstance(model.index, hbr.DenseIndex) and is_dense(chosen) and model.rule is not None:
         if wanted == model.descriptor:
+            if isinstance(chosen, Arc):
+                return ArcSearch(model.index, model.rule, config, chosen, seed=seed, top=top), chosen
             return DenseSearch(model.index, model.rule, config, chosen, seed=seed, top=top), chosen
     elif isinstance(model.index, hbr.ViewIndex) and not is_dense(chosen):
         return HoughSearch(model.index, config, cast(Strategy, chosen), seed=seed, top=top), chosen

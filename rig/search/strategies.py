@@ -20,11 +20,13 @@ from numpy.typing import NDArray
 import hbr
 from hbr import Outcome, StopReason
 from hbr.core.angles import wrap180
+from hbr.dense.arc import ARC_DEG, LOOK_DEG, next_arc
 from rig.config import IdentifyConfig, RigConfig
 from rig.core.errors import UsageError
 from rig.events.events import RotationReason, Weighed
 from rig.motion.motion_model import MotionModel
 from rig.motion.move import equivalent_within
+from rig.motion.scan_speed import scan_speed
 from rig.views.description import BENCH_DESCRIPTOR, PAPER_DESCRIPTOR
 
 GROUP: Final = "rig.strategies"
@@ -202,6 +204,26 @@ def reachable_rotations(config: RigConfig, table_deg: float) -> tuple[NDArray[np
     return np.array(rotations_deg), np.array(seconds)
 
 
+def reachable_arcs(config: RigConfig, table_deg: float, way: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the ends of the arcs that the cable allows, as rotations of the camera, and the time to each.
+
+    ``way`` is the sign of the present rotation of the camera, 0 at rest: the other way takes the time for a reversal.
+    """
+    speed = scan_speed(config, fps=config.camera.fps, gyro_range_dps=config.imu.range_dps, spacing_deg=None).dps
+    low_deg, high_deg = config.table.limits_deg
+    arcs_deg = np.arange(LOOK_DEG, 180.0 + LOOK_DEG, LOOK_DEG)
+    arcs_deg = np.concatenate([-arcs_deg[::-1], arcs_deg])
+    ends_deg = table_deg + config.table.orientation_sign * arcs_deg
+    arcs_deg = arcs_deg[(ends_deg >= low_deg) & (ends_deg <= high_deg)]
+    seconds = np.abs(arcs_deg) / speed
+    if not way:  # where the cable ends before the whole arc, the table would have to come back
+        for side in (-1.0, 1.0):
+            room_deg = high_deg - table_deg if side * config.table.orientation_sign > 0 else table_deg - low_deg
+            seconds[np.sign(arcs_deg) == side] += max(ARC_DEG - room_deg, 0.0) / speed / 2
+    seconds[np.sign(arcs_deg) == -way] += 2 * speed / config.table.acceleration_dps2
+    return arcs_deg, seconds
+
+
 def end_by_margin(state: SearchState) -> Finish | None:
     """Return the end that most strategies of the paper's search share, or None.
 
@@ -294,8 +316,32 @@ class Dense:
         )
 
 
+class Arc:
+    """The bench's own in motion: rotate along the arc that tells most, and decide again while the table rotates."""
+
+    name = "arc"
+    descriptor = BENCH_DESCRIPTOR
+
+    def next(self, state: DenseSearchState) -> Rotate | Finish:
+        if state.decision.outcome is not Outcome.CONTINUE:
+            return Finish(state.decision.reason)
+        if not len(state.rotations_deg):
+            return Finish(StopReason.NO_ROTATION_LEFT)
+        belief, beta = state.session.belief, state.session.rule.beta
+        best = next_arc(belief, beta=beta, rotations_deg=state.rotations_deg, seconds=state.seconds)
+        names = belief.index.views.object_names
+        return Rotate(
+            best.rotation_deg,
+            RotationReason.NEW_SIDE if best.pair is None else RotationReason.SEPARATES_CANDIDATES,
+            candidates=() if best.pair is None else tuple(names[i] for i in best.pair),
+            weighed=Weighed(
+                tuple(best.rotations_deg.tolist()), tuple(best.confusion.tolist()), tuple(best.cost.tolist())
+            ),
+        )
+
+
 BUILT_IN: Final[dict[str, Callable[[], AnyStrategy]]] = {
-    strategy.name: strategy for strategy in (Dense, Active, Passive, Sweep, Random)
+    strategy.name: strategy for strategy in (Dense, Arc, Active, Passive, Sweep, Random)
 }
 
 

@@ -32,7 +32,8 @@ def identify(
         str | None,
         typer.Option(
             metavar="NAME",
-            help="Search strategy: dense, ahbr, hbr, sweep, random or that of a plug-in (default: identify.strategy).",
+            help="Search strategy: dense, arc (dense in motion), ahbr, hbr, sweep, random or that of a plug-in "
+            "(default: identify.strategy).",
             autocompletion=strategy_names,
         ),
     ] = None,

@@ -123,7 +123,7 @@ def test_strategies_plug_in_by_an_entry_point(monkeypatch):
     broken = EntryPoint("broken", "no.such.module:Thing", strategies.GROUP)
     mine = EntryPoint("once", f"{__name__}:Once", strategies.GROUP)
     monkeypatch.setattr(strategies, "entry_points", lambda **_: [broken, mine])
-    assert strategies.names() == ["dense", "ahbr", "hbr", "sweep", "random", "broken", "once"]
+    assert strategies.names() == ["dense", "arc", "ahbr", "hbr", "sweep", "random", "broken", "once"]
     rotations, end, _ = run("once")
     assert rotations == []
     assert end.note.startswith("one view of")

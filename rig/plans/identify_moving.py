@@ -1,0 +1,188 @@
+"""The part of an identification in which the table rotates: frames that pass on the way are evidence.
+
+The first view is taken at rest. Then the table rotates along an arc; each frame is judged, described and added to the
+belief. Each time the frames have covered another step of the circle the search decides: it ends in mid-turn, goes on,
+or gives the table another goal without a stop. If the table arrives first, the next view is taken at rest.
+
+Decision: docs/decisions/0047.
+"""
+
+from collections.abc import Generator
+from dataclasses import dataclass, field
+from typing import Final
+
+from hbr import StopReason
+from hbr.core.angles import wrap360
+from rig.bench import Bench
+from rig.core.clock import seconds_between
+from rig.core.errors import RigError
+from rig.events.events import Accepted, Decided, Event, Ranked, Rejected
+from rig.motion.flight_views import FlightJudge
+from rig.motion.scan_speed import scan_speed
+from rig.motion.trajectory import TrajectoryRecorder
+from rig.motion.turntable import Flight, Turntable
+from rig.plans.capture import capture, moved, unwind, warn_of_table
+from rig.search.session import ArcSearch
+from rig.search.strategies import Finish, Rotate
+from rig.views.capture import Viewer
+from rig.views.description import ViewDescriber
+from rig.views.stream import FrameStream
+
+FIRST_REST_S: Final = 0.15
+"""How long the gyro is averaged before the first view: the fit of the trajectory corrects the bias later."""
+STAMPS: Final = 30
+"""Time stamps that are compared with each other: a second of frames."""
+MOST_FLIGHTS: Final = 8
+NEW_GOAL_DEG: Final = 10.0
+
+
+@dataclass
+class Found:
+    """How a search in motion ended."""
+
+    ranked: Ranked
+    end: Finish
+    travelled_deg: float
+    seconds: float
+    failed: RigError | None
+
+
+@dataclass
+class _Passing:
+    """The frames that pass: what `Flight.each` does in a search."""
+
+    bench: Bench
+    table: Turntable
+    search: ArcSearch
+    stream: FrameStream
+    recorder: TrajectoryRecorder
+    judge: FlightJudge
+    describe: ViewDescriber
+    top: int
+    number: int
+    ranked: Ranked
+    step: Rotate | Finish
+    goal_deg: float
+    ended_ns: int | None = None
+    events: list[Event] = field(default_factory=list)
+    stamps_ns: list[int] = field(default_factory=list)
+
+    def each(self) -> float | None:
+        """Take the next frame as evidence; return a new goal, or where the table stops if the search has ended."""
+        frame = self.stream.next(self.table.collect_gyro, newest=True)
+        self.stamps_ns = [*self.stamps_ns[1 - STAMPS :], frame.stamp_ns]
+        if self.ended_ns is not None:
+            return self.goal_deg
+        trajectory = self.recorder.fit()
+        if trajectory is None:
+            return None
+        irregular = bool(self.judge.irregular(self.stamps_ns)[-1])
+        attempt = self.judge.judge(frame, trajectory, irregular=irregular)
+        motion = attempt.evidence.motion
+        assert motion is not None
+        if not attempt.accepted:
+            self.events.append(Rejected(self.number + 1, 1, attempt.reasons, attempt.evidence))
+            return None
+        self.number += 1
+        sign = self.bench.config.table.orientation_sign
+        azimuth_deg = float(wrap360(sign * motion.angle_deg))
+        described = self.describe(attempt.image_bgr)
+        self.events.append(
+            Accepted(self.number, azimuth_deg, attempt.evidence, attempt.image_bgr, described.segmentation)
+        )
+        levels = described.levels[self.search.descriptor]
+        self.ranked, self.step = self.search.add(levels, azimuth_deg, table_deg=motion.angle_deg)
+        if not self.search.looked:
+            return None
+        self.events.append(self.ranked)
+        if isinstance(self.step, Finish):
+            self.ended_ns = self.bench.clock.now_ns()
+            self.goal_deg = self.table.stopping_deg(self.bench.servo.read_state())
+            return self.goal_deg
+        goal_deg = motion.angle_deg + sign * self.step.rotation_deg
+        if abs(goal_deg - self.goal_deg) <= NEW_GOAL_DEG:
+            return None
+        self.goal_deg = goal_deg
+        self.events.append(decided(self.number, self.step, goal_deg, self.top))
+        return goal_deg
+
+
+def search_in_motion(
+    bench: Bench, search: ArcSearch, viewer: Viewer, describe: ViewDescriber, *, top: int, started_ns: int
+) -> Generator[Event, None, Found]:
+    """Search along arcs until the stopping rule ends the search; the frames of an arc become events at its end.
+
+    Raises what `rig.plans.identify.identify` raises.
+    """
+    config = bench.config
+    sign = config.table.orientation_sign
+    speed = scan_speed(config, fps=config.camera.fps, gyro_range_dps=bench.imu.range_dps, spacing_deg=None)
+    travelled_deg = 0.0
+    number = 0
+    failed: RigError | None = None
+    with Turntable(bench, first_rest_s=FIRST_REST_S) as table:
+        low_deg, high_deg = table.limits_deg
+        stream: FrameStream | None = None
+        recorder: TrajectoryRecorder | None = None
+        settled_ns = bench.clock.now_ns()
+        for _ in range(MOST_FLIGHTS):
+            # A view at rest: the first one, and where an arc has ended without an answer.
+            captured = yield from capture(number, viewer, table, settled_ns)
+            azimuth_deg = float(wrap360(sign * table.rest_deg))
+            described = describe(captured.image_bgr)
+            yield Accepted(number, azimuth_deg, captured.evidence, captured.image_bgr, described.segmentation)
+            yield from warn_of_table(bench, number, described)
+            ranked, step = search.add(described.levels[search.descriptor], azimuth_deg, table_deg=table.rest_deg)
+            ended_ns = bench.clock.now_ns()
+            if search.looked:
+                yield ranked
+            if isinstance(step, Finish):
+                break
+            # An arc: frames are evidence while the table rotates.
+            goal_deg = min(max(table.rest_deg + sign * step.rotation_deg, low_deg), high_deg)
+            if search.looked:
+                yield decided(number, step, goal_deg, top)
+            recorder = recorder or table.recorder()
+            stream = stream or FrameStream(bench.camera, bench.clock)
+            judge = FlightJudge(config, captured.evidence.locks, True, bench.clock.now_ns(), stream.period_s)
+            passing = _Passing(
+                bench, table, search, stream, recorder, judge, describe, top, number, ranked, step, goal_deg
+            )
+            reach_deg = max(low_deg, table.rest_deg - 360.0), min(high_deg, table.rest_deg + 360.0)
+            try:
+                move = table.fly(goal_deg, Flight(passing.each, reach_deg, recorder, speed.dps, quiet=False))
+            finally:
+                yield from passing.events
+            number, ranked, step = passing.number, passing.ranked, passing.step
+            travelled_deg += abs(move.rotation_deg)
+            yield moved(number, move)
+            if passing.ended_ns is not None:
+                ended_ns = passing.ended_ns
+                break
+            number += 1
+            still = table.hold()
+            settled_ns = still.settled_ns
+            yield moved(number, still)
+        seconds = seconds_between(started_ns, ended_ns)
+        try:
+            yield from unwind(number, table)
+        except RigError as error:
+            failed = error  # report the answer first
+    end = step if isinstance(step, Finish) else Finish(StopReason.MAX_VIEWS)
+    return Found(ranked, end, travelled_deg, seconds, failed)
+
+
+def decided(number: int, step: Rotate, target_deg: float, top: int) -> Decided:
+    """Return the event of a decision to rotate."""
+    return Decided(
+        index=number,
+        side="left" if step.rotation_deg >= 0 else "right",
+        rotation_deg=step.rotation_deg,
+        target_deg=target_deg,
+        s_left=step.s_left,
+        s_right=step.s_right,
+        candidates=step.candidates[:top],
+        reason=step.reason,
+        note=step.note,
+        weighed=step.weighed,
+    )

@@ -1,0 +1,124 @@
+"""Searches in motion: they end in mid-turn, can be replayed, and take no false frame for evidence."""
+
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import hbr
+from hbr.dense.arc import LOOK_DEG, LOOKS, ArcSession, calibrate_arc_rule, frame_weight
+from rig import Catalog, enroll, identify, load_model
+from rig.bench import Bench
+from rig.core.errors import RigError, UsageError
+from rig.events.events import Accepted, Decided, Identified, Moved, Ranked
+from rig.search.model import Model
+from rig.search.replay import check
+from rig.search.saved_run import RunWriter, load_run
+from sim.bench import ShelfOperator, open_sim_bench
+from sim.faults import Fault
+from sim.objects.shelf import shelf
+from sim.world import World
+from tests.rig.motion.times import camera_time
+
+NAMES = ("mug-white", "mug-star", "dice", "lamp")
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Model]:
+    """Return a model of four objects, two of them twins."""
+    world = World(seed=5)
+    with (
+        open_sim_bench(camera_time(world), ShelfOperator(world, shelf())) as bench,
+        Catalog.open(tmp_path_factory.mktemp("model"), clock=bench.clock) as catalog,
+    ):
+        for name in NAMES:
+            list(enroll(bench, catalog, name, views=18))
+        yield load_model(catalog)
+
+
+def moving(world: World, *settings: str, faults: tuple[str, ...] = ()) -> Bench:
+    operator = ShelfOperator(world, shelf(), next_object="mug-star", yaw_deg=200.0)
+    return open_sim_bench(camera_time(world, *settings), operator, faults=[Fault.parse(one) for one in faults])
+
+
+def test_search_ends_in_mid_turn_and_can_be_replayed(model: Model, tmp_path: Path) -> None:
+    with moving(World(seed=2)) as bench, RunWriter(tmp_path / "run", bench, model) as writer:
+        events = []
+        for event in identify(bench, model):
+            writer.add(event)
+            events.append(event)
+        answer = events[-1]
+        assert isinstance(answer, Identified)
+        assert answer.name == "mug-star"
+        in_motion = [e for e in events if isinstance(e, Accepted) and e.evidence.motion is not None]
+        assert len(in_motion) >= 3
+        goal_deg = [e.target_deg for e in events if isinstance(e, Decided)][-1]
+        stop_deg = next(e.encoder_deg for e in events if isinstance(e, Moved))
+        assert abs(goal_deg - stop_deg) > 5  # the table did not go to the end of the arc
+        assert answer.seconds < 3.5
+        assert not bench.servo.read_condition().torque
+    found = check(load_run(tmp_path / "run"))
+    assert found.is_complete
+    assert found.differences == []
+    assert found.views == 1 + len(in_motion)
+    looks = [e.candidates[0].probability for e in events if isinstance(e, Ranked)]
+    assert len(looks) < 1 + len(in_motion)
+
+
+def test_unknown_object_is_told_within_the_arc(model: Model) -> None:
+    with moving(World(seed=3)) as bench:
+        bench.operator.next_object = "book-night"  # type: ignore[attr-defined]
+        *_, answer = identify(bench, model)
+    assert isinstance(answer, Identified)
+    assert answer.outcome is hbr.Outcome.UNKNOWN
+    assert answer.seconds < 4.0
+
+
+def test_search_at_rest_stays_without_calibration_and_motion_asks_for_it(model: Model) -> None:
+    with moving(World(seed=2), "identify.mode=step") as bench:
+        events = list(identify(bench, model))
+        assert all(e.evidence.motion is None for e in events if isinstance(e, Accepted))
+        plain = bench.config.camera_time.model_copy(update={"offset_ms": None})
+        bench.config = bench.config.model_copy(update={"camera_time": plain})
+        with pytest.raises(UsageError, match="not calibrated"):
+            list(identify(bench, model, strategy="arc"))
+
+
+@pytest.mark.parametrize(
+    "fault", ["frozen_frame@0.5s", "stamps_backwards@0.6s", "stamp_jump:ms=20@0.6s+0.1s", "lost_frames:rate=0.6@0.3s"]
+)
+def test_faulty_frames_are_no_evidence(model: Model, fault: str) -> None:
+    world = World(seed=2)
+    with moving(world, faults=(fault,)) as bench:
+        times = bench.operator.devices.camera.times  # type: ignore[attr-defined]
+        with suppress(RigError):
+            for event in identify(bench, model):
+                if isinstance(event, Accepted) and (motion := event.evidence.motion) is not None:
+                    middle_ns = event.evidence.exposed_ns - times.offset_ns + times.readout_ns // 2 + 5_000_000
+                    assert abs(motion.angle_deg - world.table_deg(middle_ns) - 0.125) < 0.6
+        assert not bench.servo.read_condition().torque
+
+
+def test_evidence_of_an_arc_does_not_depend_on_the_number_of_its_frames() -> None:
+    sums = [sum(frame_weight(step) for _ in np.arange(0, 90, step)) for step in (1.0, 2.0, 3.0)]
+    assert max(sums) / min(sums) < 1.05
+    assert frame_weight(0.0) == 0.0
+
+
+def test_rule_decides_at_looks_only(model: Model) -> None:
+    index = model.index
+    assert isinstance(index, hbr.DenseIndex)
+    rule = calibrate_arc_rule(index)
+    assert len(rule.open_set_thresholds) == LOOKS
+    session = ArcSession(index, rule)
+    levels = index.views.levels(np.array([0]))[0]
+    looked = []
+    for angle in np.arange(0.0, 61.0, 3.0).tolist():
+        session.add(levels, angle)
+        looked.append(session.looked)
+    assert np.flatnonzero(looked).tolist() == [0, *range(5, 21, round(LOOK_DEG / 3))]
+    session.add(levels, 30.0)  # seen before
+    assert not session.looked
+    assert session.belief.amount < session.belief.queries
