@@ -132,7 +132,7 @@ class OpenCvCamera:
     def capture(self, after_ns: int, meanwhile: Callable[[], object] | None = None) -> Frame:
         """Return the first frame whose exposure began at or after ``after_ns``; older frames are dropped.
 
-        ``meanwhile`` is called several times per second while the method waits for a slow camera.
+        ``meanwhile`` is called several times per second while the method waits for a slow or an unplugged camera.
 
         Raises
         ------
@@ -148,7 +148,7 @@ class OpenCvCamera:
                 self._clock.sleep(seconds_between(self._clock.now_ns(), after_ns))
             elif meanwhile is not None:
                 self._await(meanwhile)
-            exposed_ns = self._grab()
+            exposed_ns = self._grab(meanwhile)
             if exposed_ns is not None and exposed_ns >= after_ns:
                 return Frame(self._retrieve(), exposed_ns, self.time_base is TimeBase.STAMPED)
             dropped += 1
@@ -284,7 +284,7 @@ class OpenCvCamera:
             self._clock.sleep(min(left_s, _SLICE_S))
             meanwhile()
 
-    def _grab(self) -> int | None:
+    def _grab(self, meanwhile: Callable[[], object] | None = None) -> int | None:
         """Grab the next frame; return the start of its exposure on the bench's clock, or None if it may be old."""
         try:
             return self._grab_now()
@@ -292,12 +292,13 @@ class OpenCvCamera:
             unplugged = not self._capture.isOpened() or self._node() != self._node_opened
             if self._reopen is None or self.time_base is TimeBase.RECORDED or not unplugged:
                 raise
-            self._reconnect(self._reopen)
+            self._reconnect(self._reopen, meanwhile or (lambda: None))
             return self._grab_now()
 
-    def _reconnect(self, reopen: Callable[[], Capture]) -> None:
+    def _reconnect(self, reopen: Callable[[], Capture], meanwhile: Callable[[], object]) -> None:
         """Wait until the camera is connected again, and set it up as before."""
         self._capture.release()
+        meanwhile()
         end_ns = self._clock.now_ns() + round(self._timeout_s * 1e9)
         while True:
             try:
@@ -312,12 +313,15 @@ class OpenCvCamera:
                         evidence=missing.evidence,
                     ) from missing
                 self._clock.sleep(_REPLUG_PAUSE_S)
+                meanwhile()
+        meanwhile()
         self._last_stamp_ns = -1
         rejected_settings, mode = self._configure(self._settings), (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)
         got, expected = (
             tuple(round(self._capture.get(prop)) for prop in mode),
             (self.identity.width, self.identity.height),
         )
+        meanwhile()
         if got != expected or rejected_settings != self.rejected_settings:
             raise DeviceMismatch(
                 f"{self.identity.name} is another camera after it was unplugged, or has other settings.",

@@ -427,6 +427,13 @@ def test_replugged_camera_continues_with_its_settings(world: World, away_s: floa
     assert camera.returns == 1
 
 
+def test_meanwhile_is_called_while_the_camera_is_unplugged(world: World) -> None:
+    camera = returning(world, SimCapture(world), 2.0)
+    done_ns = [world.clock.now_ns()]
+    camera.capture(world.clock.now_ns(), lambda: done_ns.append(world.clock.now_ns()))
+    assert np.diff([*done_ns, world.clock.now_ns()]).max() < 0.8e9  # the gyro's FIFO lasts for 0.85 s
+
+
 def test_missing_camera_raises_device_silent_in_bounded_time(world: World) -> None:
     capture = SimCapture(world)
     camera = returning(world, capture, 3600.0)
