@@ -1,7 +1,8 @@
 """What every `rig.devices.camera.Camera` keeps to, whatever is behind it."""
 
+import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from itertools import pairwise
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from rig.core.clock import Clock
+from rig.core.clock import Clock, SystemClock
 from rig.devices.camera import Camera, CameraIdentity, CameraLocks, Frame
 from rig.devices.opencv_camera import OpenCvCamera
 from rig.devices.opencv_capture import open_capture
@@ -58,10 +59,29 @@ def raspberry_pi(_: Path) -> Opened:
         return OpenCvCamera(open_capture("picamera2:0"), clock=world.clock), world.clock
 
 
-@pytest.fixture(params=[simulated, raspberry_pi, image_sequence, video_file], ids=lambda kind: kind.__name__)
-def opened(request: pytest.FixtureRequest, tmp_path: Path) -> Opened:
+def device_file(_: Path, form: str = "YUYV") -> Opened:
+    path = os.environ.get("RIG_TEST_CAMERA", "")
+    if not path:
+        pytest.skip("`make kernel-test` gives it a device file")
+    capture, clock = open_capture(path), SystemClock()
+    capture.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*form))
+    return OpenCvCamera(capture, clock=clock), clock
+
+
+def device_file_mjpg(folder: Path) -> Opened:
+    return device_file(folder, "MJPG")
+
+
+IN_MEMORY = (simulated, raspberry_pi, image_sequence, video_file)
+DEVICE_FILES = tuple(pytest.param(kind, marks=pytest.mark.kernel) for kind in (device_file, device_file_mjpg))
+
+
+@pytest.fixture(params=[*IN_MEMORY, *DEVICE_FILES], ids=lambda kind: kind.__name__)
+def opened(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Opened]:
     kind: Callable[[Path], Opened] = request.param
-    return kind(tmp_path)
+    camera, clock = kind(tmp_path)
+    yield camera, clock
+    camera.close()
 
 
 def test_frame_has_the_size_of_the_identity_eight_bits_and_its_time(opened: Opened) -> None:

@@ -1,5 +1,6 @@
 """What every `rig.devices.imu.Imu` must keep; a new driver joins by an entry in `SENSORS`."""
 
+import os
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, closing, contextmanager
 from dataclasses import dataclass
@@ -7,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from rig.core.clock import Clock
+from rig.core.clock import Clock, SystemClock
 from rig.core.errors import DeviceSilent
 from rig.devices.bno055 import Bno055
 from rig.devices.head.sensors import HeadSensor
@@ -86,11 +87,30 @@ def pseudo_terminal(noise: NoiseModel) -> Iterator[Sensor]:
         yield Sensor(h.imu, h.world, h.unplug, 0.007, 0.3, LATE_S)
 
 
+class FileSensor(Sensor):
+    """An IMU at a device file; its world is in another program."""
+
+    @property
+    def clock(self) -> Clock:
+        return SystemClock()
+
+
+@contextmanager
+def device_file(noise: NoiseModel) -> Iterator[Sensor]:
+    """Open an MPU-6050 with few samples, for an emulated computer."""
+    path = os.environ.get("RIG_TEST_I2C", "")
+    if not path:
+        pytest.skip("`make kernel-test` gives it a device file")
+    with closing(Mpu6050(path, clock=SystemClock(), rate_hz=10.0, bandwidth_hz=5)) as imu:
+        yield FileSensor(imu, World(), lambda: None, 0.1, 1.0)
+
+
 SENSORS: dict[str, Callable[[NoiseModel], Opened]] = {
     "mpu6050": on_i2c(Mpu6050, SimMpu6050, 0x68, 0.005, 0.3),
     "mpu6500": on_i2c(Mpu6500, SimMpu6500, 0x68, 0.005, 0.3),
     "mpu9250": on_i2c(Mpu9250, SimMpu9250, 0x68, 0.005, 0.3),
     "bno055": on_i2c(Bno055, SimBno055, 0x28, 0.02, 0.01),
+    "device-file": device_file,
     "head": on_head("memory", heads.mpu6050, 0.007),
     "head-bno055": on_head("memory", heads.bno055, 0.02, resolution_dps=1 / 16),
     "head-avr": on_head("avr", heads.mpu6050, 0.007),
@@ -98,7 +118,7 @@ SENSORS: dict[str, Callable[[NoiseModel], Opened]] = {
 }
 
 
-@pytest.fixture(params=SENSORS)
+@pytest.fixture(params=[pytest.param(name, marks=[pytest.mark.kernel] * (name == "device-file")) for name in SENSORS])
 def open_sensor(request: pytest.FixtureRequest) -> Callable[[NoiseModel], Opened]:
     return SENSORS[request.param]
 

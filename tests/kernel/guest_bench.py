@@ -37,7 +37,11 @@ class GuestBench:
     def __init__(self, machine: Machine, played: PlayedBench) -> None:
         self.machine = machine
         self.played = played
-        self._nodes = {played.servo: "/dev/ttyUSB0", played.imu: "/dev/i2c-*", played.camera: "/dev/video0"}
+        self._shown = {
+            played.servo: "ls /dev/serial/by-id/*",
+            played.imu: "grep -l i2c-tiny-usb /sys/class/i2c-dev/*/name",
+            played.camera: "ls /dev/v4l/by-id/*-index0",
+        }
         self.sh(f"mkdir -p {FOLDER}", folder="/")
 
     # -- programs ---------------------------------------------------------------------------------------------------
@@ -79,7 +83,7 @@ class GuestBench:
             number = self.played.usb.index(device)
             self.machine.ask("attach", port=device.port, hub_port=number, device=number + 1, speed=int(device.speed))
         for device in devices:
-            self.until(lambda device=device: self._exists(device), f"{self._nodes[device]} appears")
+            self.until(lambda device=device: self._exists(device), f"{type(device).__name__} appears")
         self.sh("udevadm settle --timeout=30")
 
     def unplug(self, *devices: UsbDevice) -> None:
@@ -87,10 +91,10 @@ class GuestBench:
         for device in devices:
             device.unplug()
         for device in devices:
-            self.until(lambda device=device: not self._exists(device), f"{self._nodes[device]} disappears")
+            self.until(lambda device=device: not self._exists(device), f"{type(device).__name__} disappears")
 
     def _exists(self, device: UsbDevice) -> bool:
-        return self.sh(f"ls {self._nodes[device]} 2>/dev/null | head -1", folder="/") != ""
+        return self.sh(f"{self._shown[device]} 2>/dev/null || true", folder="/") != ""
 
     def until(self, condition: Callable[[], object], what: str, seconds: float = APPEAR_S) -> None:
         """Wait for a condition; raises AssertionError if it does not come true in ``seconds``."""
@@ -99,6 +103,13 @@ class GuestBench:
         while not condition():
             assert clock.now_ns() - begun_ns < seconds * 1e9, f"not in {seconds:g} s: {what}"
             clock.sleep(_POLL_S)
+
+    def until_printed(self, process: GuestProcess, text: str, seconds: float = 120.0) -> None:
+        """Wait until a program has printed a text; raises AssertionError with its output if it does not."""
+        try:
+            self.until(lambda: text in process.output, text, seconds)
+        except AssertionError:
+            raise AssertionError(f"it has not printed {text!r} in {seconds:g} s:\n{process.output}") from None
 
     def pause(self, seconds: float) -> None:
         """Let time pass."""

@@ -113,10 +113,11 @@ def _cpio(files: list[tuple[str, int, bytes]]) -> Iterator[bytes]:
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """How a program in the machine has ended."""
+    """How a program in the machine has ended: its exit code, all that it printed, and its standard output."""
 
     code: int
     output: str
+    result: str
 
 
 class Machine:
@@ -139,16 +140,13 @@ class Machine:
             }
             line = "console=ttyS0 quiet panic=-1 mitigations=off net.ifnames=0 nokaslr tsc=reliable"
             line += "".join(f" rig.{name}={value}" for name, value in words.items())
-            self._process = subprocess.Popen(
-                [
-                    *_QEMU,
-                    *("-kernel", kernel / f"boot/vmlinuz-{release}", "-initrd", image, "-append", line),
-                    *("-serial", f"file:{self.log}"),
-                ],
-                stdin=subprocess.DEVNULL,
-                stdout=(folder / "qemu.log").open("wb"),
-                stderr=subprocess.STDOUT,
-            )
+            command = [
+                *_QEMU,
+                *("-kernel", kernel / f"boot/vmlinuz-{release}", "-initrd", image, "-append", line),
+                *("-serial", f"file:{self.log}"),
+            ]
+            with (folder / "qemu.log").open("wb") as output:
+                self._process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=output, stderr=output)
             listener.settimeout(1.0)
             self._connection = self._agent(listener)
         self._reader = Thread(target=self._read, daemon=True)

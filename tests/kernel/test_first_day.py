@@ -52,8 +52,8 @@ def test_goto_rotates_the_table_and_status_shows_it(bench: GuestBench) -> None:
     assert bench.played.table()[0] == pytest.approx(90, abs=0.7)
     status = bench.rig("status", "--json")
     assert status.code == 0
-    known = json.loads(status.output)
-    assert known["table"]["angle_deg"] == pytest.approx(90, abs=0.7)
+    known = json.loads(status.result)
+    assert known["table_deg"] == pytest.approx(90, abs=0.7)
 
 
 def test_an_object_is_enrolled_and_identified(bench: GuestBench) -> None:

@@ -16,7 +16,7 @@ def test_without_the_servo_the_table_does_not_move_and_status_shows_the_others(b
     assert goto.code == 4, goto.output
     assert "Check the USB cable" in goto.output
     status = bench.rig("status", "--json")
-    known = json.loads(status.output[: status.output.rindex("}") + 1])
+    known = json.loads(status.result)
     assert known["imu"]["model"] == "MPU-6050"
     bench.plug_in(bench.played.servo)
     assert bench.sh("cat /sys/bus/usb-serial/devices/ttyUSB0/latency_timer; readlink -f /dev/rig-servo") == (
@@ -51,7 +51,7 @@ def test_table_stops_when_the_imu_is_unplugged_while_it_rotates(bench: GuestBenc
 @pytest.mark.parametrize("pause_s", [0.0, 1.0])
 def test_an_enrollment_continues_when_the_camera_was_unplugged(bench: GuestBench, pause_s: float) -> None:
     enroll = bench.start("enroll", f"mug-{pause_s:.0f}", "--views", 4)
-    bench.until(lambda: "view 1 of 4" in enroll.output, "the first view", 60)
+    bench.until_printed(enroll, "view 1 of 4")
     bench.played.camera.unplug()
     bench.until(lambda: bench.played.camera.plug is None, "the camera is unplugged")
     bench.pause(pause_s)

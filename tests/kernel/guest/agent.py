@@ -35,7 +35,7 @@ class Agent:
         self._connection = connection
         self._lock = Lock()
         self._running: dict[int, Program | subprocess.Popen[str]] = {}
-        self._outputs: dict[int, list[str]] = {}
+        self._outputs: dict[int, list[tuple[bool, str]]] = {}
         self._readers: dict[int, list[Thread]] = {}
 
     def run(self) -> None:
@@ -93,10 +93,10 @@ class Agent:
 
     def do_output(self, pid: int) -> str:
         """Return what the process has printed so far."""
-        return "".join(self._outputs[pid])
+        return "".join(text for _, text in self._outputs[pid])
 
     def do_wait(self, pid: int, timeout: float) -> dict[str, Any] | None:
-        """Return exit code and output of a process when it has ended; None if it has not ended in ``timeout`` s."""
+        """Return exit code, all output and standard output of a process; None if it has not ended in ``timeout`` s."""
         process = self._running[pid]
         try:
             code = process.wait(timeout)
@@ -105,7 +105,9 @@ class Agent:
         for reader in self._readers.pop(pid):
             reader.join(1.0)  # a guardian may hold the pipe longer
         del self._running[pid]
-        return {"code": code, "output": "".join(self._outputs.pop(pid))}
+        parts = self._outputs.pop(pid)
+        result = "".join(text for is_result, text in parts if is_result)
+        return {"code": code, "output": "".join(text for _, text in parts), "result": result}
 
     def do_signal(self, pid: int, signal_number: int) -> None:
         os.kill(pid, signal_number)
@@ -124,16 +126,17 @@ class Agent:
         self._running[pid] = process
         output = self._outputs[pid] = []
         self._readers[pid] = [
-            Thread(target=_read, args=(stream, output), daemon=True) for stream in (process.stdout, process.stderr)
+            Thread(target=_read, args=(stream, stream is process.stdout, output), daemon=True)
+            for stream in (process.stdout, process.stderr)
         ]
         for reader in self._readers[pid]:
             reader.start()
         return pid
 
 
-def _read(stream: Any, output: list[str]) -> None:
+def _read(stream: Any, is_result: bool, output: list[tuple[bool, str]]) -> None:
     while text := os.read(stream.fileno(), 65_536):
-        output.append(text.decode(errors="replace"))
+        output.append((is_result, text.decode(errors="replace")))
 
 
 def main() -> None:

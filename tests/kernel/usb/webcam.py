@@ -8,7 +8,7 @@ import struct
 from dataclasses import dataclass
 from enum import IntEnum
 from threading import Event, Thread
-from typing import Any, Final
+from typing import Final
 
 import cv2
 import numpy as np
@@ -68,6 +68,8 @@ class Control:
     factory: int
     property: int
     step: int = 1
+    changes: bool = False
+    """The camera may change it by itself, and says that (bit 3 of the abilities): the driver does not remember it."""
 
     def now(self, camera: SimCapture) -> int:
         return round(camera.get(self.property))
@@ -93,14 +95,14 @@ class ExposureMode(Control):
 CONTROLS: Final[dict[tuple[int, int], Control]] = {
     (_CAMERA_UNIT, 0x02): ExposureMode(1, 0, 0, 8, cv2.CAP_PROP_AUTO_EXPOSURE, step=0b1001),
     (_CAMERA_UNIT, 0x03): Control(1, 0, 1, 1, v4l2.EXPOSURE_DYNAMIC_FRAMERATE),
-    (_CAMERA_UNIT, 0x04): Control(4, 1, 333, 100, cv2.CAP_PROP_EXPOSURE),
-    (_CAMERA_UNIT, 0x06): Control(2, 0, 255, 0, cv2.CAP_PROP_FOCUS),
+    (_CAMERA_UNIT, 0x04): Control(4, 1, 333, 100, cv2.CAP_PROP_EXPOSURE, changes=True),
+    (_CAMERA_UNIT, 0x06): Control(2, 0, 255, 0, cv2.CAP_PROP_FOCUS, changes=True),
     (_CAMERA_UNIT, 0x08): Control(1, 0, 1, 1, cv2.CAP_PROP_AUTOFOCUS),
     (_PROCESSING_UNIT, 0x01): Control(2, 0, 1, 0, cv2.CAP_PROP_BACKLIGHT),
     (_PROCESSING_UNIT, 0x04): Control(2, 0, 24, 0, cv2.CAP_PROP_GAIN),
     (_PROCESSING_UNIT, 0x05): Control(1, 0, 2, 2, v4l2.POWER_LINE_FREQUENCY),
     (_PROCESSING_UNIT, 0x08): Control(2, 0, 255, 3, cv2.CAP_PROP_SHARPNESS),
-    (_PROCESSING_UNIT, 0x0A): Control(2, 2800, 6500, 4600, cv2.CAP_PROP_WB_TEMPERATURE),
+    (_PROCESSING_UNIT, 0x0A): Control(2, 2800, 6500, 4600, cv2.CAP_PROP_WB_TEMPERATURE, changes=True),
     (_PROCESSING_UNIT, 0x0B): Control(1, 0, 1, 1, cv2.CAP_PROP_AUTO_WB),
 }
 """The controls by unit and selector; the units' descriptors list them as bits."""
@@ -235,7 +237,7 @@ class Webcam(UsbDevice):
             case Setting.SIZE:
                 return struct.pack("<H", size)
             case Setting.ABILITIES:
-                return b"\x03"
+                return b"\x0b" if control.changes else b"\x03"
         values = {
             Setting.LEAST: control.least,
             Setting.MOST: control.most,
@@ -311,9 +313,5 @@ def encoded(image: NDArray[np.uint8], form: Format) -> bytes:
     """Return an image, uint8 (height, width, 3), in the format of the stream."""
     if form is Format.MJPG:
         return bytes(cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1])
-    yuv: Any = cv2.cvtColor(image, cv2.COLOR_BGR2YUV)
-    packed = np.empty((*image.shape[:2], 2), np.uint8)
-    packed[..., 0] = yuv[..., 0]
-    for place, channel in ((0, 1), (1, 2)):  # two pixels share their colour
-        packed[:, place::2, 1] = (yuv[:, ::2, channel].astype(np.uint16) + yuv[:, 1::2, channel] + 1) >> 1
-    return packed.tobytes()
+    # In YUYV levels reach from 16 to 235 (ITU-R BT.601), in JPEG from 0 to 255.
+    return bytes(np.ascontiguousarray(cv2.cvtColor(image, cv2.COLOR_BGR2YUV_YUYV)))

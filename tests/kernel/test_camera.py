@@ -1,0 +1,101 @@
+"""Cameras behind Linux's drivers: faults, changed settings, formats, and a second driver."""
+
+import json
+import sys
+from pathlib import PurePosixPath
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.kernel.guest_bench import GuestBench
+from tests.kernel.machine import PROJECT
+
+pytestmark = [pytest.mark.kernel, pytest.mark.timeout(600)]
+
+
+def camera_findings(bench: GuestBench) -> dict[str, Any]:
+    doctor = bench.rig("doctor", "--json")
+    return {one["code"]: one for one in json.loads(doctor.result)["findings"] if one["topic"] == "camera"}
+
+
+def test_doctor_finds_a_camera_that_repeats_one_image(bench: GuestBench) -> None:
+    still: list[np.ndarray] = []
+    with bench.played.time.present():
+        bench.played.devices.camera.filters.append(lambda image, _: (still.append(image), still[0])[1])
+    assert "camera_frozen" in camera_findings(bench)
+
+
+def test_a_camera_that_hangs_is_reported(bench: GuestBench) -> None:
+    bench.played.camera.stopped = True
+    snapshot = bench.rig("snapshot", "hangs.png")
+    assert snapshot.code == 4, snapshot.output
+    assert "hangs: no frame in" in snapshot.output
+    bench.played.camera.stopped = False
+    again = bench.rig("snapshot", "again.png")
+    assert again.code == 0, again.output
+
+
+@pytest.mark.parametrize(
+    ("drift", "reason"),
+    [
+        ({"focus": 60.0}, "a setting of the camera has changed"),
+        ({"kelvin": 3200.0}, "a setting of the camera has changed"),
+        ({"gain_db": 12.0}, "overexposed"),  # the driver remembers a gain, and does not ask the camera again
+    ],
+    ids=lambda value: "" if isinstance(value, str) else next(iter(value)),
+)
+def test_a_view_is_rejected_after_a_setting_has_drifted(
+    bench: GuestBench, drift: dict[str, float], reason: str
+) -> None:
+    enroll = bench.start("enroll", f"drift-{next(iter(drift))[:4]}", "--views", 4)
+    bench.until_printed(enroll, "view 1 of 4")
+    with bench.played.time.present():
+        bench.played.devices.camera.drift(**drift)
+    ended = enroll.wait(300)
+    assert ended.code == 6, ended.output
+    assert reason in ended.output, ended.output
+
+
+def test_the_same_scene_is_seen_in_both_formats(bench: GuestBench) -> None:
+    levels = {}
+    for name in ("YUYV", "MJPG"):
+        script = "; ".join(
+            (
+                "import cv2; from rig.devices.opencv_capture import open_capture",
+                "camera = open_capture('/dev/video0')",
+                f"camera.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*'{name}'))",
+                "camera.grab(); camera.grab(); ok, image = camera.retrieve()",
+                "form = int(camera.get(cv2.CAP_PROP_FOURCC)).to_bytes(4, 'little').decode()",
+                "print(form, *image.shape, image.mean())",
+            )
+        )
+        got, *shape, level = bench.sh(f'{sys.executable} -c "{script}"', folder=str(PROJECT)).split()
+        assert (got, shape) == (name, ["480", "640", "3"])
+        levels[name] = float(level)
+    assert levels["YUYV"] == pytest.approx(levels["MJPG"], rel=0.03)
+
+
+def test_another_driver_delivers_frames_with_plausible_times(bench: GuestBench) -> None:
+    bench.sh("modprobe vivid n_devs=1 node_types=0x1 && udevadm settle")
+    try:
+        node = PurePosixPath(bench.sh("dirname $(grep -l vivid /sys/class/video4linux/*/name | head -1)")).name
+        source = ("--set", f"camera.source=/dev/{node}")
+        snapshot = bench.rig("snapshot", "vivid.png", *source)
+        assert snapshot.code == 0, snapshot.output
+        assert "640x480 pixels" in snapshot.output
+    finally:
+        bench.sh("modprobe -r vivid")
+
+
+def test_image_of_the_real_driver_is_that_of_the_simulated_camera(bench: GuestBench) -> None:
+    assert bench.rig("snapshot", "view.png").code == 0
+    encoded = bytes.fromhex(bench.sh("od -An -v -tx1 view.png | tr -d ' \\n'"))
+    seen = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_COLOR)
+    with bench.played.time.present():
+        camera = bench.played.devices.camera
+        for _ in range(6):  # the first ones have waited in the buffers
+            camera.grab()
+        drawn = camera.retrieve()[1]
+    assert np.abs(seen.astype(int) - drawn).mean() < 6
