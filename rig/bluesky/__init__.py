@@ -1,0 +1,9 @@
+"""The bench for bluesky (extra ``bluesky``): devices for a RunEngine, and enroll and identify as plans.
+
+Decision: docs/decisions/0053.
+"""
+
+from rig.bluesky.devices import BenchDevices, CameraDevice, FlyScan, ImuDevice, TableDevice
+from rig.bluesky.plans import enroll, identify
+
+__all__ = ["BenchDevices", "CameraDevice", "FlyScan", "ImuDevice", "TableDevice", "enroll", "identify"]

@@ -1,0 +1,298 @@
+"""Table, camera, IMU and fly scan with the protocols of bluesky (`bluesky.protocols`).
+
+A bench belongs to one thread. All devices of a bench share a thread of their own; a status is done when its work is.
+"""
+
+from collections.abc import Callable, Generator, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import AbstractContextManager, ExitStack
+from typing import Any, Self
+
+import numpy as np
+
+from rig.bench import Bench
+from rig.catalog import Catalog
+from rig.events.events import Accepted, Event
+from rig.motion.turntable import Turntable
+from rig.plans.enroll import enroll as enroll_steps
+from rig.views.capture import Viewer
+
+
+class WorkStatus:
+    """The status of work in the thread of the bench (`bluesky.protocols.Status`)."""
+
+    def __init__(self, future: "Future[Any]") -> None:
+        self._future = future
+
+    def add_callback(self, callback: Callable[[Any], None]) -> None:
+        self._future.add_done_callback(lambda _: callback(self))
+
+    def exception(self, timeout: float | None = 0.0) -> BaseException | None:
+        return self._future.exception(timeout)
+
+    @property
+    def done(self) -> bool:
+        return self._future.done()
+
+    @property
+    def success(self) -> bool:
+        return self.done and self._future.exception() is None
+
+
+class BenchDevices(AbstractContextManager["BenchDevices"]):
+    """An open bench with its devices for a RunEngine; the torque is on in the ``with`` block if ``hold`` is set.
+
+    Parameters
+    ----------
+    bench
+        An open bench. No other thread may use it.
+    hold
+        Whether to prepare the table at the start. `table` needs it; `enroll` and `identify` prepare it themselves.
+
+    Attributes
+    ----------
+    table, camera, imu
+        The devices.
+    """
+
+    def __init__(self, bench: Bench, *, hold: bool = True) -> None:
+        self.bench = bench
+        self._hold = hold
+        self._worker = ThreadPoolExecutor(1, "bench")
+        self._held = ExitStack()
+        self.turntable: Turntable | None = None
+        self.table = TableDevice(self)
+        self.camera = CameraDevice(self)
+        self.imu = ImuDevice(self)
+
+    def __enter__(self) -> Self:
+        if self._hold:
+            self.turntable = self.run(lambda: self._held.enter_context(Turntable(self.bench)))
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        try:
+            self.run(self._held.close)
+        finally:
+            self._worker.shutdown()
+
+    def run(self, work: Callable[[], Any]) -> Any:
+        """Return the result of work in the thread of the bench."""
+        return self._worker.submit(work).result()
+
+    def start(self, work: Callable[[], Any]) -> WorkStatus:
+        """Start work in the thread of the bench."""
+        return WorkStatus(self._worker.submit(work))
+
+    def now_s(self) -> float:
+        """Return the civil time in seconds since 1970, for documents."""
+        return self.bench.clock.utc().timestamp()
+
+    def provenance(self) -> dict[str, Any]:
+        """Return bench, devices and conditions as metadata of a run."""
+        plain: dict[str, Any] = self.run(
+            lambda: {
+                "bench": self.bench.name,
+                "devices": self.bench.devices(),
+                "conditions": dict(self.bench.conditions),
+            }
+        )
+        return plain
+
+
+class Device:
+    """A device of a bench: its name, and readings of one moment."""
+
+    parent = None
+
+    def __init__(self, devices: BenchDevices, name: str) -> None:
+        self.name = name
+        self._devices = devices
+        self._reading: dict[str, Any] = {}
+
+    def _read(self, values: dict[str, Any]) -> None:
+        now = self._devices.now_s()
+        self._reading = {f"{self.name}_{key}": {"value": value, "timestamp": now} for key, value in values.items()}
+
+    def read(self) -> dict[str, Any]:
+        return self._reading
+
+    def describe(self) -> dict[str, Any]:
+        return {key: data_key(self.name, one["value"]) for key, one in self._reading.items()}
+
+
+def data_key(source: str, value: Any) -> dict[str, Any]:
+    """Return the description of a value for documents."""
+    kinds = {bool: "boolean", str: "string", int: "integer", float: "number"}
+    kind = next((words for type_, words in kinds.items() if isinstance(value, type_)), "array")
+    key = {"source": f"rig:{source}", "dtype": kind, "shape": list(np.shape(value)) if kind == "array" else []}
+    if isinstance(value, np.ndarray):
+        key["dtype_numpy"] = value.dtype.str
+    return key
+
+
+class TableDevice(Device):
+    """The table: Movable to an angle in degrees, Stoppable, Readable."""
+
+    def __init__(self, devices: BenchDevices) -> None:
+        super().__init__(devices, "table")
+        self.hints = {"fields": ["table_encoder_deg"]}
+
+    def set(self, value: float) -> WorkStatus:
+        """Rotate the table to an angle; the status has the error of a motion that fails."""
+        return self._devices.start(lambda: self._goto(float(value)))
+
+    def _goto(self, angle_deg: float) -> None:
+        table = self._devices.turntable
+        if table is None:
+            raise RuntimeError("the table is not held: open BenchDevices with hold=True")
+        move = table.goto(angle_deg)
+        gyro = move.gyro
+        values = {"commanded_deg": float(move.commanded_deg), "encoder_deg": float(move.encoder_deg)}
+        values |= {"imu_rotation_deg": float(gyro.angle_deg) if gyro.valid else float("nan")}
+        self._read(values)
+
+    def stop(self, *, success: bool = True) -> None:  # noqa: ARG002 - a stop is a stop
+        """Stop the table along its ramp; the torque stays off until the next start."""
+        self._devices.bench.state.request_stop()
+
+    def read(self) -> dict[str, Any]:
+        if not self._reading:
+            table = self._devices.turntable
+            angle_deg = float("nan") if table is None else float(self._devices.run(table.angle_deg))
+            self._read({"commanded_deg": angle_deg, "encoder_deg": angle_deg, "imu_rotation_deg": float("nan")})
+        return self._reading
+
+    def describe(self) -> dict[str, Any]:
+        return {key: {**data_key(self.name, one["value"]), "units": "deg"} for key, one in self.read().items()}
+
+
+class CameraDevice(Device):
+    """The camera: `trigger` takes and judges a frame; it is Readable, with the image as an array."""
+
+    def __init__(self, devices: BenchDevices) -> None:
+        super().__init__(devices, "camera")
+
+    def trigger(self) -> WorkStatus:
+        return self._devices.start(self._capture)
+
+    def _capture(self) -> None:
+        bench, table = self._devices.bench, self._devices.turntable
+        if table is None:
+            raise RuntimeError("the table is not held: open BenchDevices with hold=True")
+        viewer = Viewer(bench.camera, bench.config.view)
+        attempts = viewer.attempts(bench.clock.now_ns(), table.check_still, table.collect_gyro)
+        attempt = next(one for one in attempts if one.accepted or one.number > bench.config.view.retakes)
+        evidence = attempt.evidence
+        values = {"image": attempt.image_bgr, "accepted": attempt.accepted, "sharpness": float(evidence.sharpness)}
+        self._read(values)
+
+
+class ImuDevice(Device):
+    """The IMU: `trigger` averages its samples since the last one; it is Readable."""
+
+    def __init__(self, devices: BenchDevices) -> None:
+        super().__init__(devices, "imu")
+
+    def trigger(self) -> WorkStatus:
+        return self._devices.start(self._sample)
+
+    def _sample(self) -> None:
+        bench = self._devices.bench
+        bench.imu.read_samples()
+        bench.clock.sleep(0.1)
+        samples = bench.imu.read_samples()
+        rate = samples.gyro_dps.mean(axis=0)
+        self._read({"rate_dps": rate, "samples": len(samples.time_ns), "lost": int(samples.lost)})
+
+
+class Steps(Device):
+    """A plan of the rig as a device: each `trigger` takes the next view; `finished` is set after the last."""
+
+    def __init__(self, devices: BenchDevices, name: str, events: Generator[Event, None, Any]) -> None:
+        super().__init__(devices, name)
+        self._events = events
+        self.finished = False
+        self.last: Event | None = None
+
+    def trigger(self) -> WorkStatus:
+        return self._devices.start(self._next)
+
+    def _next(self) -> None:
+        for event in self._events:
+            self.last = event
+            if isinstance(event, Accepted):
+                self._read(view_values(event))
+                return
+        self.finished = True
+
+    def close(self) -> None:
+        """End the plan where it is; the table stops and its torque goes off."""
+        self._devices.run(self._events.close)
+
+
+def view_values(event: Accepted) -> dict[str, Any]:
+    """Return the values of an accepted view for documents."""
+    return {
+        "index": int(event.index),
+        "azimuth_deg": float(event.azimuth_deg),
+        "sharpness": float(event.evidence.sharpness),
+    }
+
+
+class FlyScan:
+    """The fly scan as a Flyer: it enrolls an object in one turn without a stop (`rig.plans.fly`).
+
+    Parameters
+    ----------
+    devices
+        Of the bench, with ``hold=False``: the scan prepares the table itself.
+    catalog
+        Gets the views.
+    object_name
+        The object.
+    views
+        Number of views; None for `enroll.views`.
+    """
+
+    parent = None
+
+    def __init__(self, devices: BenchDevices, catalog: Catalog, object_name: str, *, views: int | None = None) -> None:
+        self.name = "fly"
+        self._devices = devices
+        self._events = enroll_steps(devices.bench, catalog, object_name, views=views, fly=True)
+        self._views: list[dict[str, Any]] = []
+        self._status: WorkStatus | None = None
+
+    def kickoff(self) -> WorkStatus:
+        self._status = self._devices.start(self._scan)
+        return self._devices.start(lambda: None) if self._status.done else _Started()
+
+    def _scan(self) -> None:
+        for event in self._events:
+            if isinstance(event, Accepted):
+                data = {f"fly_{key}": value for key, value in view_values(event).items()}
+                now = self._devices.now_s()
+                self._views.append({"data": data, "timestamps": dict.fromkeys(data, now), "time": now})
+
+    def complete(self) -> WorkStatus:
+        """Return the status of the scan: done when all views are in the catalog."""
+        assert self._status is not None, "kickoff first"
+        return self._status
+
+    def describe_collect(self) -> dict[str, Any]:
+        example = {"fly_index": 0, "fly_azimuth_deg": 0.0, "fly_sharpness": 0.0}
+        return {"views": {key: data_key("fly", value) for key, value in example.items()}}
+
+    def collect(self) -> Iterator[dict[str, Any]]:
+        views, self._views = self._views, []
+        yield from views
+
+
+class _Started(WorkStatus):
+    """The status of something that has started."""
+
+    def __init__(self) -> None:
+        future: Future[None] = Future()
+        future.set_result(None)
+        super().__init__(future)

@@ -1,0 +1,147 @@
+"""The bench in a real RunEngine: valid documents with provenance, stored and read back with Tiled."""
+
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("bluesky", reason="bluesky is not installed (make test-servers)")
+pytestmark = pytest.mark.filterwarnings("ignore")  # of the packages of bluesky
+
+import event_model  # noqa: E402
+from bluesky import RunEngine, plan_stubs, plans, protocols  # noqa: E402
+
+from rig.bench import open_bench  # noqa: E402
+from rig.bluesky import BenchDevices, FlyScan, enroll, identify  # noqa: E402
+from rig.catalog import Catalog  # noqa: E402
+from rig.config import load_config  # noqa: E402
+from rig.search.model import load_model  # noqa: E402
+from tests.rig.plans.test_fly import flying  # noqa: E402
+
+Documents = list[tuple[str, dict[str, Any]]]
+
+
+@pytest.fixture
+def devices(tmp_path: Path) -> Iterator[BenchDevices]:
+    config = load_config(None, [f'state_dir="{tmp_path / "state"}"'], search=False)
+    with open_bench("sim", config, seed=3) as bench:
+        yield BenchDevices(bench, hold=False)
+
+
+def validated(documents: Documents) -> dict[str, int]:
+    counts: dict[str, int] = {}
+    for name, document in documents:
+        event_model.schema_validators[event_model.DocumentNames[name]].validate(document)
+        counts[name] = counts.get(name, 0) + 1
+    return counts
+
+
+@contextmanager
+def tiled_server(folder: Path) -> Iterator[str]:
+    """Yield the address of a Tiled server with an SQLite catalog of its own."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    command = [sys.executable, "-m", "tiled", "serve", "catalog", "--temp", "--api-key", "secret", "--port", str(port)]
+    with (folder / "tiled.log").open("w") as log:
+        process = subprocess.Popen(command, stdout=log, stderr=log, cwd=folder)
+    try:
+        for _ in range(600):
+            with suppress(OSError), socket.create_connection(("127.0.0.1", port), 1):
+                break
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(0.1)
+                raise AssertionError((folder / "tiled.log").read_text())
+        yield f"http://127.0.0.1:{port}/api/v1"
+    finally:
+        process.kill()
+        process.wait()
+
+
+def test_devices_have_the_protocols_and_scan(devices: BenchDevices) -> None:
+    devices._hold = True
+    assert isinstance(devices.table, protocols.Movable)
+    assert isinstance(devices.table, protocols.Stoppable)
+    assert isinstance(devices.camera, protocols.Readable)
+    assert isinstance(devices.camera, protocols.Triggerable)
+    assert isinstance(devices.imu, protocols.Triggerable)
+    documents: Documents = []
+    with devices:
+        devices.bench.operator.place("toy-house")
+        engine = RunEngine({}, context_managers=[])
+        engine.subscribe(lambda name, document: documents.append((name, document)))
+        engine(plans.scan([devices.camera, devices.imu], devices.table, 0, 90, 3, md=devices.provenance()))
+    counts = validated([one for one in documents if one[0] != "event"])
+    assert counts == {"start": 1, "descriptor": 1, "stop": 1}
+    events = [document for name, document in documents if name == "event"]
+    assert [round(event["data"]["table_encoder_deg"]) for event in events] == [0, 45, 90]
+    assert all(event["data"]["camera_accepted"] for event in events)
+    assert documents[0][1]["bench"] == "sim"
+
+
+def test_plans_enroll_and_identify_and_tiled_reads_them_back(devices: BenchDevices, tmp_path: Path) -> None:
+    from bluesky_tiled_plugins import TiledWriter
+    from tiled.client import from_uri
+
+    documents: Documents = []
+    with (
+        tiled_server(tmp_path) as uri,
+        devices,
+        Catalog.open(tmp_path / "catalog", clock=devices.bench.clock) as c,
+    ):
+        client = from_uri(uri, api_key="secret")
+        engine = RunEngine({}, context_managers=[])
+        engine.subscribe(lambda name, document: documents.append((name, document)))
+        engine.subscribe(TiledWriter(client))
+        engine(enroll(devices, c, "toy-house", views=8))
+        engine(enroll(devices, c, "toy-car", views=8))
+        assert {one.name: one.views for one in c.objects()} == {"toy-house": 8, "toy-car": 8}
+        (uid,) = engine(identify(devices, load_model(c)))
+        counts = validated(documents)
+        assert counts["start"] == counts["stop"] == 3
+        answer = next(d for n, d in documents if n == "event" and "answer_object" in d["data"])
+        assert answer["data"]["answer_outcome"] in ("found", "ambiguous", "unknown")
+        run = client[uid]
+        assert run.metadata["start"]["bench"] == "sim"
+        assert run.metadata["start"]["plan_name"] == "rig_identify"
+        assert run.metadata["stop"]["exit_status"] == "success"
+        client.context.http_client.close()
+
+
+def test_flyer_enrolls_in_one_turn(tmp_path: Path) -> None:
+    documents: Documents = []
+    with flying(tmp_path) as (bench, catalog, _), BenchDevices(bench, hold=False) as devices:
+        flyer = FlyScan(devices, catalog, "toy-house", views=12)
+        assert isinstance(flyer, protocols.Flyable)
+        engine = RunEngine({}, context_managers=[])
+        engine.subscribe(lambda name, document: documents.append((name, document)))
+        engine(plans.fly([flyer], md=devices.provenance()))
+        assert catalog.object("toy-house").summary.views == 12
+    validated(documents)
+    assert sum(len(d["seq_num"]) if n == "event_page" else n == "event" for n, d in documents) == 12
+    assert documents[-1][1]["exit_status"] == "success"
+
+
+def test_abort_ends_the_plan_and_switches_the_torque_off(devices: BenchDevices, tmp_path: Path) -> None:
+    with devices, Catalog.open(tmp_path / "catalog", clock=devices.bench.clock) as catalog:
+        engine = RunEngine({}, context_managers=[])
+
+        def broken() -> Any:
+            plan = enroll(devices, catalog, "toy-house", views=8)
+            for number, message in enumerate(plan):
+                if number == 8:
+                    plan.close()
+                    break
+                yield message
+            yield from plan_stubs.null()
+
+        engine(broken())
+        (left,) = catalog.objects()
+        assert left.unfinished_views  # they stay, and the bench is free for the next plan
+        engine(enroll(devices, catalog, "toy-house", resume=True))
+        assert catalog.object("toy-house").summary.views == 8
