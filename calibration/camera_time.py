@@ -47,7 +47,7 @@ FEWEST_FRAMES = 40
 BANDS = 4
 TEXTURE_SHARE = 0.1
 """Rows with less than this share of the texture of the best row are left out."""
-MAX_UNCERTAINTY_MS = 0.5
+MAX_UNCERTAINTY_MS = 1.0
 MAX_LOST = 0.2
 MAX_ANGLE_DEG = 0.15
 """Largest scatter of the angle that a frame of a slow pass shows."""
@@ -285,8 +285,8 @@ def evaluate(passes: Sequence[Pass], *, exposure_ms: float, fastest_dps: float, 
 
 READOUT_S = 0.03
 """Standard uncertainty of the read-out time before it is measured."""
-COMMON_S = 0.0002
-"""What the time stamps of the encoder contribute to the uncertainty, in all passes alike."""
+COMMON_S = 0.0005
+"""What all passes have in common: the times of encoder readings, and rows that show another part of the object."""
 
 
 def _bands(passes: Sequence[Pass]) -> list[tuple[slice, float]]:

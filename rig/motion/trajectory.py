@@ -11,6 +11,8 @@ shaft has run through. The parameters follow by weighted least squares over all 
 enters as further readings: the bias that was measured at rest, and the uncertainty of the scale. The platter's angle is
 the same sum without o. Angles are those that the encoder shows when the platter is driven upwards, as in the views of
 a table that stops from below.
+
+Decision: docs/decisions/0046.
 """
 
 from dataclasses import dataclass, field

@@ -13,7 +13,8 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from markupsafe import Markup
 
 from hbr import Outcome
-from hbr.core.angles import wrap360
+from hbr.core.angles import wrap180, wrap360
+from rig.charts.arc_chart import arc_chart
 from rig.charts.azimuth_ring import RingView, azimuth_ring
 from rig.charts.decision_chart import decision_chart
 from rig.charts.polar_path import polar_path
@@ -170,6 +171,7 @@ class _Retrieval(NamedTuple):
     path: Markup
     compared: bool
     scores: Markup
+    arc: Markup
     notes: list[str]
     decisions: list[Markup]
     frames: list[_Frame]
@@ -223,11 +225,31 @@ def _retrieval(number: int, record: IdentificationRecord, *, unfold: bool) -> _R
         path=path,
         compared=any(event.s_left is not None for event in record.decided),
         scores=scores,
+        arc=_arc(record),
         notes=[sentence(note_words(note)) for note in record.notes],
         decisions=_decisions(record),
         frames=_frames(record),
         unfold=unfold or record.correct is False,
     )
+
+
+def _arc(record: IdentificationRecord) -> Markup:
+    """Return the chart of the probability along the arc; empty for a search at rest."""
+    turned_deg, last_deg, rotated = 0.0, None, {}
+    for view in record.views:
+        if last_deg is not None:
+            turned_deg += abs(wrap180(view.azimuth_deg - last_deg))
+        last_deg = view.azimuth_deg
+        rotated[view.index] = turned_deg
+    looks = [
+        (rotated[ranked.index], {c.name: c.probability or 0.0 for c in ranked.candidates})
+        for ranked in record.ranked
+        if ranked.index in rotated
+    ]
+    confidence = next((ranked.decision.min_confidence for ranked in record.ranked if ranked.decision), None)
+    if confidence is None or len(looks) < 2 or all(view.evidence.motion is None for view in record.views):
+        return Markup()
+    return Markup(arc_chart(looks, min_confidence=confidence).svg(themed=True))
 
 
 def _truth(record: IdentificationRecord) -> str:

@@ -13,6 +13,7 @@ from rig import Catalog, enroll, identify, load_model
 from rig.bench import Bench
 from rig.core.errors import RigError, UsageError
 from rig.events.events import Accepted, Decided, Identified, Moved, Ranked
+from rig.report.run_report import run_report
 from rig.search.model import Model
 from rig.search.replay import check
 from rig.search.saved_run import RunWriter, load_run
@@ -63,6 +64,7 @@ def test_search_ends_in_mid_turn_and_can_be_replayed(model: Model, tmp_path: Pat
     assert found.is_complete
     assert found.differences == []
     assert found.views == 1 + len(in_motion)
+    assert "Probability along the arc" in run_report(load_run(tmp_path / "run"))
     looks = [e.candidates[0].probability for e in events if isinstance(e, Ranked)]
     assert len(looks) < 1 + len(in_motion)
 
