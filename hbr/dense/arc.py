@@ -4,8 +4,8 @@ Frames a few degrees apart show nearly the same. If the correlation of what they
 their distance d, a frame adds the share 1 - exp(-2 d / L) of a new one (the part of a Markov process that the frame
 before does not determine). With this weight, the evidence of an arc does not depend on the number of its frames.
 
-The stopping rule decides at looks, each time the frames have covered another step of the circle. Its limits come from
-leave-one-out searches along such arcs, with as many looks and the same weights: `calibrate_arc_rule`.
+The stopping rule decides each time the frames have covered another step of the circle. Its limits come from
+leave-one-out searches along such arcs, with as many decisions and the same weights: `calibrate_arc_rule`.
 
 Decision: docs/decisions/0047.
 """
@@ -30,11 +30,11 @@ from hbr.dense.stopping import (
     fit_stopping_rule,
 )
 
-LOOK_DEG: Final = 15.0
+STEP_DEG: Final = 15.0
 """The rule decides whenever the frames have covered so much more of the circle."""
 ARC_DEG: Final = 210.0
 """An object that is not found on so long an arc is unknown."""
-LOOKS: Final = round(ARC_DEG / LOOK_DEG) + 1
+DECISIONS: Final = round(ARC_DEG / STEP_DEG) + 1
 CORRELATION_DEG: Final = 90.0
 """L: views of a search at rest are so far apart."""
 FRAME_DEG: Final = 3.0
@@ -50,8 +50,8 @@ def frame_weight(apart_deg: float) -> float:
     return 1.0 - exp(-2.0 * max(apart_deg, 0.0) / CORRELATION_DEG)
 
 
-LOOK_WEIGHT: Final = LOOK_DEG / FRAME_DEG * frame_weight(FRAME_DEG)
-"""What the frames between two looks count together."""
+STEP_WEIGHT: Final = STEP_DEG / FRAME_DEG * frame_weight(FRAME_DEG)
+"""What the frames between two decisions count together."""
 
 
 def calibrate_arc_rule(
@@ -65,10 +65,10 @@ def calibrate_arc_rule(
         return calibrate_stopping_rule(index, error_rate=error_rate, false_reject=false_reject).rule
     searches = leave_one_out(
         index,
-        views=LOOKS,
+        views=DECISIONS,
         searches=max(1, min(most_searches // len(index), int(index.rows.shape[1]))),
-        step_deg=LOOK_DEG,
-        weight=LOOK_WEIGHT,
+        step_deg=STEP_DEG,
+        weight=STEP_WEIGHT,
     )
     objects = len(index) if len(index) >= FEWEST_OBJECTS else None
     return fit_stopping_rule(searches, error_rate=error_rate, false_reject=false_reject, objects=objects)
@@ -79,28 +79,28 @@ class ArcSession(DenseSession):
 
     Attributes
     ----------
-    looks
-        Decisions so far; the first view is the first look.
-    looked
+    decisions
+        Decisions so far; the first view is the first one.
+    is_new_decision
         Whether the last view led to a decision.
     """
 
     def __init__(self, index: DenseIndex, rule: StoppingRule) -> None:
-        super().__init__(index, rule, max_views=LOOKS)
-        self.looks = 0
-        self.looked = False
+        super().__init__(index, rule, max_views=DECISIONS)
+        self.decisions = 0
+        self.is_new_decision = False
         self._covered_deg = 0.0
 
     def add(self, levels: np.ndarray, orientation_deg: float) -> StopDecision:
-        """Add the next frame and return the rule's last decision; `looked` says whether it is a new one."""
+        """Add the next frame and return the rule's last decision; `is_new_decision` says whether it is a new one."""
         if self._queries:
-            self._covered_deg += min(self._apart_deg(orientation_deg), LOOK_DEG)
-        looks = 1 + int(self._covered_deg / LOOK_DEG + 1e-9)
-        self.looked = looks > self.looks
-        self.looks = looks
-        before = self.decision if self.looks > 1 or self._queries else None
+            self._covered_deg += min(self._apart_deg(orientation_deg), STEP_DEG)
+        decisions = 1 + int(self._covered_deg / STEP_DEG + 1e-9)
+        self.is_new_decision = decisions > self.decisions
+        self.decisions = decisions
+        before = self.decision if self.decisions > 1 or self._queries else None
         decision = super().add(levels, orientation_deg)
-        if not self.looked and before is not None:
+        if not self.is_new_decision and before is not None:
             self.decision = before
         return self.decision if before is not None else decision
 
@@ -111,7 +111,9 @@ class ArcSession(DenseSession):
         return frame_weight(self._apart_deg(orientation_deg)) if self._queries else None
 
     def _decide(self, belief: Belief, *, last: bool = False) -> StopDecision:
-        return self.rule.decide(belief, max_views=min(self.looks, LOOKS) if last else LOOKS, looks=self.looks)
+        return self.rule.decide(
+            belief, max_views=min(self.decisions, DECISIONS) if last else DECISIONS, decisions=self.decisions
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,17 +138,17 @@ def next_arc(
     Parameters
     ----------
     rotations_deg
-        Ends of the possible arcs, multiples of `LOOK_DEG` to both sides, float64 (a,); the nearest ones included.
+        Ends of the possible arcs, multiples of `STEP_DEG` to both sides, float64 (a,); the nearest ones included.
     seconds
         Time to each.
     """
     here_deg = float(belief.orientation_deg[-1])
     apart_deg = size_deg(here_deg + rotations_deg[:, None] - belief.orientation_deg).min(axis=1)
-    new = np.minimum(apart_deg / LOOK_DEG, 1.0) * LOOK_WEIGHT
+    new = np.minimum(apart_deg / STEP_DEG, 1.0) * STEP_WEIGHT
     probability, place, bin_of = _strongest(belief.posterior(beta))
     cost = second_costs * seconds
     pairs = probability[:, None] * probability * (place[:, None] != place)
-    told = np.zeros(len(rotations_deg))
+    confusion = np.zeros(len(rotations_deg))
     pair = None
     if pairs.any():
         similar, known = _expected(belief, place, bin_of, rotations_deg)
@@ -158,13 +160,13 @@ def next_arc(
             continue
         if pairs.any():
             remaining = pairs * np.exp(-_SHARPNESS * np.cumsum(exponent[way], axis=0))
-            told[way] = np.log(np.maximum(remaining.sum(axis=(1, 2)), 1e-300))
+            confusion[way] = np.log(np.maximum(remaining.sum(axis=(1, 2)), 1e-300))
         else:  # one object alone: a new side helps to find its azimuth
-            told[way] = -_SHARPNESS * np.cumsum(new[way])
-    sums = np.where(np.abs(rotations_deg) >= LEAST_ARC_DEG, told + cost, np.inf)
-    chosen = int((sums if np.isfinite(sums).any() else told + cost).argmin())
+            confusion[way] = -_SHARPNESS * np.cumsum(new[way])
+    sums = np.where(np.abs(rotations_deg) >= LEAST_ARC_DEG, confusion + cost, np.inf)
+    chosen = int((sums if np.isfinite(sums).any() else confusion + cost).argmin())
     if pairs.any():
         first, second = np.unravel_index(int(pairs.argmax()), pairs.shape)
         objects = belief.index.object_index
         pair = int(objects[place[first]]), int(objects[place[second]])
-    return NextArc(float(rotations_deg[chosen]), pair, rotations_deg, told, cost)
+    return NextArc(float(rotations_deg[chosen]), pair, rotations_deg, confusion, cost)

@@ -144,8 +144,8 @@ class StoppingRule:
     searches: int
     limitations: tuple[Limitation, ...] = ()
 
-    def decide(self, belief: Belief, *, max_views: int = 8, looks: int | None = None) -> StopDecision:
-        """Decide whether a search ends after these views; ``looks`` counts instead of them in a search in motion.
+    def decide(self, belief: Belief, *, max_views: int = 8, decisions: int | None = None) -> StopDecision:
+        """Decide whether a search ends after these views; ``decisions`` counts instead of them in a search in motion.
 
         An object is found if it is confident and reaches the open-set threshold. Before the last calibrated view the
         highest of all thresholds counts: an unknown object that passes the first threshold gets another view, which
@@ -156,11 +156,11 @@ class StoppingRule:
         probability = belief.posterior(self.beta).sum(axis=1)
         best = int(probability.argmax())
         calibrated = len(self.open_set_thresholds)
-        looks = belief.queries if looks is None else looks
-        n = min(looks, calibrated) - 1
+        decisions = belief.queries if decisions is None else decisions
+        n = min(decisions, calibrated) - 1
         leaders = Leaders.of([leader(belief.index.object_index, belief.scores())], (1, 1))
         score = float(leaders.open_set_score(self.usual_scores[:, n : n + 1])[0, 0])
-        early = looks < min(calibrated, max_views)
+        early = decisions < min(calibrated, max_views)
         threshold = max(self.open_set_thresholds) if early else self.open_set_thresholds[n]
         confidence = float(probability[best])
         if score < threshold:
@@ -168,7 +168,7 @@ class StoppingRule:
             reason = StopReason.BELOW_OPEN_SET_THRESHOLD
         elif confidence >= self.min_confidence:
             outcome, reason = Outcome.FOUND, StopReason.CONFIDENT
-        elif looks < max_views:
+        elif decisions < max_views:
             outcome, reason = Outcome.CONTINUE, StopReason.NOT_CONFIDENT
         else:
             outcome, reason = Outcome.AMBIGUOUS, StopReason.MAX_VIEWS

@@ -70,7 +70,7 @@ class Scan:
         return float(angles[-1] - rate * times[-1])
 
 
-def start_of_turn(bench: Bench, angles_deg: Mapping[int, float]) -> float | None:
+def start_of_revolution(bench: Bench, angles_deg: Mapping[int, float]) -> float | None:
     """Return where a revolution upwards that passes all angles begins; None if the cable budget does not allow one."""
     low_deg, high_deg = bench.config.table.limits_deg
     start_deg = min(min(angles_deg.values()), high_deg - 360.0)
@@ -101,7 +101,7 @@ def fly_views(
     """
     config = bench.config
     require_camera_time(config)
-    start_deg = start_of_turn(bench, angles_deg)
+    start_deg = start_of_revolution(bench, angles_deg)
     if start_deg is None:
         raise LimitExceeded(
             "A scan needs a revolution upwards. The cable budget does not allow that.",

@@ -1,7 +1,7 @@
 """The part of an identification in which the table rotates: frames that pass on the way are evidence.
 
 The first view is taken at rest. Then the table rotates along an arc; each frame is judged, described and added to the
-belief. Each time the frames have covered another step of the circle the search decides: it ends in mid-turn, goes on,
+belief. Each time the frames have covered another step of the circle the search decides: it ends in mid-turn, continues,
 or gives the table another goal without a stop. If the table arrives first, the next view is taken at rest.
 
 Decision: docs/decisions/0047.
@@ -92,7 +92,7 @@ class _Passing:
         )
         levels = described.levels[self.search.descriptor]
         self.ranked, self.step = self.search.add(levels, azimuth_deg, table_deg=motion.angle_deg)
-        if not self.search.looked:
+        if not self.search.is_new_decision:
             return None
         self.events.append(self.ranked)
         if isinstance(self.step, Finish):
@@ -134,13 +134,13 @@ def search_in_motion(
             yield from warn_of_table(bench, number, described)
             ranked, step = search.add(described.levels[search.descriptor], azimuth_deg, table_deg=table.rest_deg)
             ended_ns = bench.clock.now_ns()
-            if search.looked:
+            if search.is_new_decision:
                 yield ranked
             if isinstance(step, Finish):
                 break
             # An arc: frames are evidence while the table rotates.
             goal_deg = min(max(table.rest_deg + sign * step.rotation_deg, low_deg), high_deg)
-            if search.looked:
+            if search.is_new_decision:
                 yield decided(number, step, goal_deg, top)
             recorder = recorder or table.recorder()
             stream = stream or FrameStream(bench.camera, bench.clock)

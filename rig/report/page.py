@@ -235,21 +235,21 @@ def _retrieval(number: int, record: IdentificationRecord, *, unfold: bool) -> _R
 
 def _arc(record: IdentificationRecord) -> Markup:
     """Return the chart of the probability along the arc; empty for a search at rest."""
-    turned_deg, last_deg, rotated = 0.0, None, {}
+    rotated_deg, last_deg, rotated = 0.0, None, {}
     for view in record.views:
         if last_deg is not None:
-            turned_deg += abs(wrap180(view.azimuth_deg - last_deg))
+            rotated_deg += abs(wrap180(view.azimuth_deg - last_deg))
         last_deg = view.azimuth_deg
-        rotated[view.index] = turned_deg
-    looks = [
+        rotated[view.index] = rotated_deg
+    decisions = [
         (rotated[ranked.index], {c.name: c.probability or 0.0 for c in ranked.candidates})
         for ranked in record.ranked
         if ranked.index in rotated
     ]
     confidence = next((ranked.decision.min_confidence for ranked in record.ranked if ranked.decision), None)
-    if confidence is None or len(looks) < 2 or all(view.evidence.motion is None for view in record.views):
+    if confidence is None or len(decisions) < 2 or all(view.evidence.motion is None for view in record.views):
         return Markup()
-    return Markup(arc_chart(looks, min_confidence=confidence).svg(themed=True))
+    return Markup(arc_chart(decisions, min_confidence=confidence).svg(themed=True))
 
 
 def _truth(record: IdentificationRecord) -> str:

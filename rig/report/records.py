@@ -225,7 +225,7 @@ class IdentificationRecord:
             rotation_deg = wrap180(after.azimuth_deg - before.azimuth_deg)
             if after.move is not None:
                 rotation_deg += 360.0 * round((-after.move.rotation_encoder_deg - rotation_deg) / 360.0)
-            # At rest every view but the last is followed by a decision; in motion one decision counts for several frames.
+            # In motion one decision counts for several frames.
             decided = next(d for d in reversed(self.decided) if d.index <= before.index)
             steps.append(PathStep(rotation_deg, decided.s_left, decided.s_right, decided.candidates[:2]))
         return steps

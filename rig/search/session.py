@@ -255,7 +255,7 @@ class DenseSearch(Search):
 class ArcSearch(DenseSearch):
     """The bench's own search in motion (`hbr.dense.arc`): each frame counts as far as it is new evidence.
 
-    `looked` says whether the last frame led to a decision; between decisions the last one stays.
+    `is_new_decision` says whether the last frame led to a decision; between decisions the last one stays.
     """
 
     def __init__(
@@ -273,11 +273,11 @@ class ArcSearch(DenseSearch):
         self._step: Rotate | Finish | None = None
 
     @property
-    def looked(self) -> bool:
-        return self._arc.looked
+    def is_new_decision(self) -> bool:
+        return self._arc.is_new_decision
 
     def _decide(self, ranked: Ranked, table_deg: float) -> Rotate | Finish:  # noqa: ARG002
-        if self._step is None or self.looked:
+        if self._step is None or self.is_new_decision:
             way = float(np.sign(self._step.rotation_deg)) if isinstance(self._step, Rotate) else 0.0
             rotations_deg, seconds = reachable_arcs(self._config, table_deg, way)
             self._step = self._strategy.next(

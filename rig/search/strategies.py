@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 import hbr
 from hbr import Outcome, StopReason
 from hbr.core.angles import wrap180
-from hbr.dense.arc import ARC_DEG, LOOK_DEG, next_arc
+from hbr.dense.arc import ARC_DEG, STEP_DEG, next_arc
 from rig.config import IdentifyConfig, RigConfig
 from rig.core.errors import UsageError
 from rig.events.events import RotationReason, Weighed
@@ -211,7 +211,7 @@ def reachable_arcs(config: RigConfig, table_deg: float, way: float) -> tuple[NDA
     """
     speed = scan_speed(config, fps=config.camera.fps, gyro_range_dps=config.imu.range_dps, spacing_deg=None).dps
     low_deg, high_deg = config.table.limits_deg
-    arcs_deg = np.arange(LOOK_DEG, 180.0 + LOOK_DEG, LOOK_DEG)
+    arcs_deg = np.arange(STEP_DEG, 180.0 + STEP_DEG, STEP_DEG)
     arcs_deg = np.concatenate([-arcs_deg[::-1], arcs_deg])
     ends_deg = table_deg + config.table.orientation_sign * arcs_deg
     arcs_deg = arcs_deg[(ends_deg >= low_deg) & (ends_deg <= high_deg)]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import hbr
-from hbr.dense.arc import LOOK_DEG, LOOKS, ArcSession, calibrate_arc_rule, frame_weight
+from hbr.dense.arc import DECISIONS, STEP_DEG, ArcSession, calibrate_arc_rule, frame_weight
 from rig import Catalog, enroll, identify, load_model
 from rig.bench import Bench
 from rig.core.errors import RigError, UsageError
@@ -65,11 +65,11 @@ def test_search_ends_in_mid_turn_and_can_be_replayed(model: Model, tmp_path: Pat
     assert found.differences == []
     assert found.views == 1 + len(in_motion)
     assert "Probability along the arc" in run_report(load_run(tmp_path / "run"))
-    looks = [e.candidates[0].probability for e in events if isinstance(e, Ranked)]
-    assert len(looks) < 1 + len(in_motion)
+    decisions = [e.candidates[0].probability for e in events if isinstance(e, Ranked)]
+    assert len(decisions) < 1 + len(in_motion)
 
 
-def test_unknown_object_is_told_within_the_arc(model: Model) -> None:
+def test_unknown_object_is_recognised_within_the_arc(model: Model) -> None:
     with moving(World(seed=3)) as bench:
         bench.operator.next_object = "book-night"  # type: ignore[attr-defined]
         *_, answer = identify(bench, model)
@@ -113,14 +113,14 @@ def test_rule_decides_at_looks_only(model: Model) -> None:
     index = model.index
     assert isinstance(index, hbr.DenseIndex)
     rule = calibrate_arc_rule(index)
-    assert len(rule.open_set_thresholds) == LOOKS
+    assert len(rule.open_set_thresholds) == DECISIONS
     session = ArcSession(index, rule)
     levels = index.views.levels(np.array([0]))[0]
-    looked = []
+    is_new_decision = []
     for angle in np.arange(0.0, 61.0, 3.0).tolist():
         session.add(levels, angle)
-        looked.append(session.looked)
-    assert np.flatnonzero(looked).tolist() == [0, *range(5, 21, round(LOOK_DEG / 3))]
+        is_new_decision.append(session.is_new_decision)
+    assert np.flatnonzero(is_new_decision).tolist() == [0, *range(5, 21, round(STEP_DEG / 3))]
     session.add(levels, 30.0)  # seen before
-    assert not session.looked
+    assert not session.is_new_decision
     assert session.belief.amount < session.belief.queries
