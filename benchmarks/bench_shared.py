@@ -1,0 +1,90 @@
+"""A catalog on PostgreSQL against one in a folder, and an evaluation on a local Dask cluster against two processes.
+
+Needs the packages of `.ci/servers.lock` and a PostgreSQL server program; without them it says so and ends.
+
+    python -m benchmarks.bench_shared [--objects 1000] [--photographs FOLDER]
+"""
+
+import argparse
+import subprocess
+import sys
+import tempfile
+from contextlib import closing
+from pathlib import Path
+from timeit import default_timer
+
+from benchmarks.large_catalog import build
+from benchmarks.record import record
+from rig.catalog import Catalog
+from rig.catalog.copying import copy_catalog
+from rig.config.catalog_place import CatalogPlace
+from rig.core.clock import SystemClock
+from rig.search.model import load_model
+from tests.servers.postgres import PostgresServer, missing, place_in
+
+RIG = [sys.executable, "-c", "from rig.cli.main import main; main()"]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--objects", type=int, default=1_000, help="objects of 72 views")
+    parser.add_argument("--photographs", type=Path, help="folder in the layout of COIL-100, for the evaluation")
+    options = parser.parse_args()
+    if reason := missing():
+        print(f"Not measured: {reason}")
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        compare_engines(Path(folder), options.objects)
+        if options.photographs:
+            compare_evaluations(Path(folder), options.photographs)
+
+
+def compare_engines(folder: Path, objects: int) -> None:
+    """Time what a program does before its first ranking."""
+    build(folder / "sqlite", objects)
+    with closing(PostgresServer()) as server:
+        place = place_in(server.url, folder / "postgres")
+        with (
+            Catalog.open(folder / "sqlite", clock=SystemClock()) as source,
+            Catalog.open(place, clock=SystemClock()) as target,
+        ):
+            for _ in copy_catalog(source, target):
+                pass
+        for first in (True, False):  # the second time the prepared file of the index is there
+            embedded, shared = steps(folder / "sqlite"), steps(place)
+            for name, took_ms in shared.items():
+                label = f"{objects:,} objects on PostgreSQL: {name}{', nothing prepared' if first else ''}"
+                record(label, took_ms, "SQLite", embedded[name])
+
+
+def steps(place: Path | CatalogPlace) -> dict[str, float]:
+    """Return the milliseconds of opening a catalog, of listing its objects and of loading its model."""
+    times = [default_timer()]
+    with Catalog.open(place, clock=SystemClock(), read_only=True) as catalog:
+        times.append(default_timer())
+        catalog.objects()
+        times.append(default_timer())
+        load_model(catalog)
+        times.append(default_timer())
+    names = ("open", "list", "model for the first ranking")
+    return {name: (b - a) * 1e3 for name, a, b in zip(names, times, times[1:], strict=False)}
+
+
+def compare_evaluations(folder: Path, photographs: Path) -> None:
+    """Time the same evaluation by two processes and by two workers of a local cluster, and compare the results."""
+    found, took_ms = {}, {}
+    for name, words in {"two processes": ["--jobs", "2"], "two workers": ["--cluster", "local:2"]}.items():
+        out = folder / name.replace(" ", "-")
+        command = [*RIG, "eval", str(photographs), "--noise", "mb", "--trials", "2", "--out", str(out), *words]
+        start = default_timer()
+        subprocess.run(command, check=True, capture_output=True)
+        took_ms[name] = (default_timer() - start) * 1e3
+        found[name] = (out / "results.csv").read_bytes()
+    record(
+        "rig eval on a local Dask cluster of two workers", took_ms["two workers"], "--jobs 2", took_ms["two processes"]
+    )
+    print(f"The results are {'equal' if found['two processes'] == found['two workers'] else 'DIFFERENT'}.")
+
+
+if __name__ == "__main__":
+    main()
