@@ -1,6 +1,6 @@
 """A catalog on PostgreSQL against one in a folder, and an evaluation on a local Dask cluster against two processes.
 
-Needs the packages of `.ci/servers.lock` and a PostgreSQL server program; without them it says so and ends.
+Needs the packages of `.ci/servers.lock` and a PostgreSQL server program; without them it prints why and ends.
 
     python -m benchmarks.bench_shared [--objects 1000] [--photographs FOLDER]
 """

@@ -183,7 +183,9 @@ def test_racing_ends_and_cancellations_never_give_both():
         host.answers(1)
         deliverer = Thread(target=lambda: [host.plug.deliver(1, lambda _: b"") for _ in numbers])
         deliverer.start()
-        host.ask(*(Unlink(number + 1, number) for number in reversed(numbers)))
+        # a thread of its own: the answers fill the connection unless they are read meanwhile
+        asker = Thread(target=host.ask, args=[Unlink(number + 1, number) for number in reversed(numbers)])
+        asker.start()
         ended, cancelled = set(), set()
         while len(ended) + len(cancelled) < len(numbers):
             kind, number, status, _ = host.answers(1)[0]
@@ -192,6 +194,7 @@ def test_racing_ends_and_cancellations_never_give_both():
             elif status:
                 cancelled.add(number - 1)
         deliverer.join()
+        asker.join()
         assert ended | cancelled == set(numbers)
 
 

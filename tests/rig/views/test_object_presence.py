@@ -86,7 +86,7 @@ def test_unplugged_camera_ends_the_waiting(simulated):
 
 
 def test_watch_identifies_objects_and_continues_after_a_failure(simulated, tmp_path):
-    s = simulated(*SMALL, "identify.max_views=4", seed=4)
+    s = simulated(*SMALL, "identify.max_views=4", seed=7)
     with Catalog.open(tmp_path, clock=s.bench.clock) as catalog:
         for name in ("toy-car", "book-night"):
             list(enroll(s.bench, catalog, name, views=12))

@@ -126,7 +126,7 @@ def test_dry_run_and_doctor_move_nothing(serve):
 def test_calibrations_are_offered_and_others_rejected(serve):
     served = serve()
     offered = served.client.get("/api/v1/calibrations").json()["available"]
-    assert set(offered) == {"servo", "imu", "camera", "table", "noise"}
+    assert set(offered) == {"servo", "imu", "camera", "camera-time", "table", "noise"}
     assert served.run(kind="calibrate", name="nothing")["error"]["code"] == 200
     assert served.run(kind="calibrate", name="noise")["error"]["code"] == 200
 
