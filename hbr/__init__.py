@@ -21,13 +21,14 @@ from hbr.descriptors.cedd import cedd
 from hbr.descriptors.cedd_packing import pack, unpack, unpack_rows
 from hbr.descriptors.describe import describe
 from hbr.descriptors.tanimoto import tanimoto
+from hbr.descriptors.together import ViewsTogether
 from hbr.model.views import PackedViews, Views
 from hbr.paper.hough import Extension, Ranking, retrieve
 from hbr.paper.index import ViewIndex
 from hbr.paper.margin import score_margin
 from hbr.paper.next_view import Decision, Side, next_view
 from hbr.paper.open_set import open_set_threshold
-from hbr.segmentation import Background, Segmentation, segment
+from hbr.segmentation import Background, Segmentation, hypotheses, segment
 
 __all__ = [
     "Background",
@@ -50,11 +51,13 @@ __all__ = [
     "StoppingRule",
     "ViewIndex",
     "Views",
+    "ViewsTogether",
     "calibrate_stopping_rule",
     "cedd",
     "describe",
     "descriptor",
     "fit_stopping_rule",
+    "hypotheses",
     "leave_one_out",
     "next_best_view",
     "next_view",

@@ -10,6 +10,7 @@ leave-one-out searches along such arcs, with as many decisions and the same weig
 Decision: docs/decisions/0047.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import exp
 from typing import Final
@@ -17,7 +18,7 @@ from typing import Final
 import numpy as np
 
 from hbr.core.angles import size_deg
-from hbr.core.arrays import FloatArray
+from hbr.core.arrays import FloatArray, LevelArray
 from hbr.dense.filter import Belief, DenseIndex
 from hbr.dense.leave_one_out import leave_one_out
 from hbr.dense.next_view import _expected, _strongest
@@ -91,7 +92,9 @@ class ArcSession(DenseSession):
         self.is_new_decision = False
         self._covered_deg = 0.0
 
-    def add(self, levels: np.ndarray, orientation_deg: float) -> StopDecision:
+    def add(
+        self, levels: LevelArray, orientation_deg: float, *, earlier: Sequence[LevelArray] | None = None
+    ) -> StopDecision:
         """Add the next frame and return the rule's last decision; `is_new_decision` says whether it is a new one."""
         if self._queries:
             self._covered_deg += min(self._apart_deg(orientation_deg), STEP_DEG)
@@ -99,7 +102,7 @@ class ArcSession(DenseSession):
         self.is_new_decision = decisions > self.decisions
         self.decisions = decisions
         before = self.decision if self.decisions > 1 or self._queries else None
-        decision = super().add(levels, orientation_deg)
+        decision = super().add(levels, orientation_deg, earlier=earlier)
         if not self.is_new_decision and before is not None:
             self.decision = before
         return self.decision if before is not None else decision

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from hbr.core.angles import wrap180, wrap360
 from hbr.core.arrays import FloatArray, IndexArray, LevelArray
 from hbr.core.segments import lengths, ranges
+from hbr.dense.whitening import Whitening
 from hbr.descriptors import Packed, descriptor
 from hbr.kernels import calls
 from hbr.model.views import Views
@@ -72,6 +73,7 @@ class DenseIndex:
         self.power = power
         self.object_index: IndexArray = np.flatnonzero(np.bincount(views.object_index))
         self.compared = views.prepared()
+        self.whitening = Whitening(views)
         order, begin = views.of_each(self.object_index)
         count = lengths(begin, len(order))
         rising = np.diff(views.azimuth_deg[order], prepend=0) >= 0
@@ -163,23 +165,44 @@ class DenseIndex:
         """Number of levels of a view."""
         return descriptor(self.views.descriptor).length
 
+    def similarity(self, query: LevelArray) -> FloatArray:
+        """Return the similarity of every view to a query, (n,): of several segmentations, (h, length), the largest."""
+        similar = self.compared.similarity(np.atleast_2d(query))
+        most: FloatArray = similar[0] if len(similar) == 1 else similar.max(axis=0)
+        return most
+
     def best(self, query: LevelArray) -> FloatArray:
         """Return the largest similarity of each object's views to a query, (k,)."""
-        similar = self.compared.similarity(query[None])[0]
+        similar = self.similarity(query)
         best: FloatArray = np.maximum.reduceat(similar[self._segments.order], self._segments.begin)
         return best
 
     def bounds(self, query: LevelArray) -> FloatArray:
         """Return a bound of the support that a query adds to each object at any azimuth, (k,)."""
         compared = self.compared
-        most = compared.bounds(query, self._segments) if isinstance(compared, Packed) else self.best(query)
+        if isinstance(compared, Packed):
+            most = np.max([compared.bounds(row, self._segments) for row in np.atleast_2d(query)], axis=0)
+        else:
+            most = self.best(query)
         return self._raised(most).astype(np.float64)
 
     def nearest(self, query: LevelArray, kept: int) -> IndexArray:
         """Return the objects with the most similar views, ascending places (kept,); of equal ones, the first."""
-        if isinstance(self.compared, Packed):
+        if isinstance(self.compared, Packed) and query.ndim == 1:
             return self.compared.nearest(query, self._segments, kept)
         return np.sort(np.argsort(-self.best(query), kind="stable")[:kept])
+
+    @property
+    def view_counts(self) -> IndexArray:
+        """Number of views of each object."""
+        return self._segments.lengths
+
+    def nearest_views(self, place: int, at_deg: float, count: int) -> IndexArray:
+        """Return the rows of an object's views that are nearest to an azimuth, (count,); of fewer views, some twice."""
+        begin = self._segments.begin[place]
+        rows = self._segments.order[begin : begin + self._segments.lengths[place]]
+        away = np.abs((self.views.azimuth_deg[rows] - at_deg + 180) % 360 - 180)
+        return np.resize(rows[np.argsort(away, kind="stable")[:count]], count)
 
     @cached_property
     def _ring(self) -> tuple[IndexArray, FloatArray, Floats]:
@@ -260,12 +283,15 @@ class Belief:
         Orientations of the camera around the object at the queries, from any zero.
     weights : float64 array (n,), or None
         How much each query counts, 0..1; None: all count fully.
+    levels : tuple of uint8 arrays (length,) or (h, length)
+        The queries.
     """
 
     index: DenseIndex
     support: Floats
     orientation_deg: FloatArray
     weights: FloatArray | None = None
+    levels: tuple[LevelArray, ...] = ()
 
     @property
     def queries(self) -> int:
@@ -360,8 +386,9 @@ def update_belief(
 
     Parameters
     ----------
-    query : uint8 array (length,)
-        The view, described as the enrolled ones are.
+    query : uint8 array (length,) or (h, length)
+        The view, described as the enrolled ones are; a row for each of several segmentations, of which the most similar
+        one counts.
     orientation_deg : float
         Orientation of the camera around the object, counter-clockwise, from any zero that all queries share.
     so_far : DenseIndex or Belief
@@ -379,7 +406,7 @@ def update_belief(
     index = so_far.index if isinstance(so_far, Belief) else so_far
     query = np.asarray(query)
     length = index.length
-    if query.dtype != np.uint8 or query.shape != (length,):
+    if query.dtype != np.uint8 or query.ndim not in (1, 2) or query.shape[-1] != length or not query.size:
         raise ValueError(
             f"the query is {query.dtype} of shape {query.shape}; {index.views.descriptor} has uint8 of ({length},)"
         )
@@ -388,7 +415,7 @@ def update_belief(
     if kept < 1:
         raise ValueError(f"kept is {kept}; at least 1 object is needed")
     if isinstance(so_far, Belief):
-        similar = index.compared.similarity(query[None])[0]
+        similar = index.similarity(query)
         rotated_deg = float(wrap180(orientation_deg - so_far.orientation_deg[0]))
         added = index.support(similar, rotated_deg)
         weights = so_far.weights
@@ -397,11 +424,13 @@ def update_belief(
             added = added * np.float32(weight)
             weights = np.append(np.ones(so_far.queries) if weights is None else weights, weight)
         support = so_far.support + added
-        return Belief(index, support, np.append(so_far.orientation_deg, orientation_deg), weights)
+        return Belief(
+            index, support, np.append(so_far.orientation_deg, orientation_deg), weights, (*so_far.levels, query)
+        )
     if len(index) > kept:
         index = index.only(index.nearest(query, kept))
-    similar = index.compared.similarity(query[None])[0]
-    return Belief(index, index.support(similar, 0.0), np.array([orientation_deg], np.float64))
+    similar = index.similarity(query)
+    return Belief(index, index.support(similar, 0.0), np.array([orientation_deg], np.float64), levels=(query,))
 
 
 def completed(belief: Belief, index: DenseIndex, queries: Sequence[LevelArray]) -> Belief:
@@ -416,7 +445,7 @@ def completed(belief: Belief, index: DenseIndex, queries: Sequence[LevelArray]) 
         Of some objects of the index.
     index : DenseIndex
         With all objects.
-    queries : sequence of uint8 arrays (length,)
+    queries : sequence of uint8 arrays (length,) or (h, length)
         The queries of the belief.
     """
     kept = np.searchsorted(index.object_index, belief.index.object_index)

@@ -211,13 +211,13 @@ def _searches_for(
     rows = rows[np.argsort(index.views.azimuth_deg[rows], kind="stable")]
     azimuth_deg = index.views.azimuth_deg[rows]
     starts = np.unique(np.arange(searches) * len(rows) // searches).tolist()
-    spread = [_spread(azimuth_deg, start, views, step_deg, again=weight is not None) for start in starts]
-    used = np.unique(spread)
+    spreads = [spread(azimuth_deg, start, views, step_deg, again=weight is not None) for start in starts]
+    used = np.unique(spreads)
     levels = index.views.levels(rows[used]) if seen is None else seen[rows[used]]
     similar = dict(zip(used.tolist(), index.compared.similarity(levels), strict=True))
     others = np.delete(index.object_index, place)
     found = Found([], [], [], [])
-    for start, chosen in zip(starts, spread, strict=True):
+    for start, chosen in zip(starts, spreads, strict=True):
         support = np.zeros((len(index), BINS), np.float32)
         aside = aside if weight is None else (aside + _GOLDEN) % 1
         for n, i in enumerate(chosen):
@@ -256,7 +256,7 @@ def usual_scores(leaders: Leaders, correct: NDArray[np.bool_], objects: int) -> 
     return usual
 
 
-def _spread(
+def spread(
     azimuth_deg: FloatArray, start: int, count: int, step_deg: float = _STEP_DEG, *, again: bool = False
 ) -> list[int]:
     """Return the indices of ``count`` views, a step apart, the first one at ``start``; different ones but ``again``."""

@@ -1,7 +1,9 @@
 """One search by the dense filter: views in; belief, decision and next best view out."""
 
+from collections.abc import Sequence
 from typing import Final
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from hbr.core.arrays import LevelArray
@@ -44,8 +46,22 @@ class DenseSession:
         self._so_far: DenseIndex | Belief = index
         self._queries: list[LevelArray] = []
 
-    def add(self, levels: LevelArray, orientation_deg: float) -> StopDecision:
-        """Add the next view, as for `update_belief`, and return the rule's decision."""
+    def add(
+        self, levels: LevelArray, orientation_deg: float, *, earlier: Sequence[LevelArray] | None = None
+    ) -> StopDecision:
+        """Add the next view, as for `update_belief`, and return the rule's decision.
+
+        Parameters
+        ----------
+        levels : uint8 array (length,) or (h, length)
+            The view; a row for each of several segmentations.
+        orientation_deg : float
+            Orientation of the camera around the object, from any zero that all views share.
+        earlier : sequence of uint8 arrays, optional
+            The earlier views, described again: they were segmented better since.
+        """
+        if earlier is not None:
+            self._replace(earlier)
         self._so_far = self.belief = update_belief(
             levels, orientation_deg, self._so_far, kept=self._kept, weight=self._weight(orientation_deg)
         )
@@ -54,6 +70,18 @@ class DenseSession:
         if self.decision.outcome is not Outcome.CONTINUE:
             self._complete()
         return self.decision
+
+    def _replace(self, queries: Sequence[LevelArray]) -> None:
+        """Compute the belief again from other descriptions of the same views."""
+        if len(queries) != len(self._queries):
+            raise ValueError(f"{len(queries)} earlier views; the search has {len(self._queries)}")
+        same = all(np.array_equal(a, b) for a, b in zip(queries, self._queries, strict=True))
+        if same or not queries:
+            return
+        orientations_deg = self.belief.orientation_deg.tolist()
+        self._so_far, self._queries = self._index, list(queries)
+        for query, orientation_deg in zip(queries, orientations_deg, strict=True):
+            self._so_far = self.belief = update_belief(query, orientation_deg, self._so_far, kept=self._kept)
 
     def next_best_view(self, rotations_deg: ArrayLike | None = None, seconds: ArrayLike | None = None) -> NextBestView:
         """Return the rotation to the next best view, as `hbr.next_best_view` does."""

@@ -7,7 +7,7 @@ Decision: docs/decisions/0026.
 """
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from math import ceil, floor, inf, nan
 from typing import Any, Final
@@ -18,6 +18,8 @@ from numpy.typing import ArrayLike, NDArray
 from hbr.core.arrays import FloatArray
 from hbr.dense.filter import BETA, Belief, DenseIndex, update_belief
 from hbr.dense.leave_one_out import Found, Leaders, LeaveOneOut, Task, leader, leave_one_out, usual_scores
+from hbr.dense.open_set import OpenSetModel, evidence
+from hbr.dense.shifted_searches import STRENGTHS, ShiftedSearches, can_shift, shifted_searches
 
 #: No search ends at a smaller confidence, however well the leave-one-out searches went: real views may be less clear.
 SMALLEST_MIN_CONFIDENCE: Final = 0.9
@@ -25,6 +27,12 @@ SMALLEST_MIN_CONFIDENCE: Final = 0.9
 UNCALIBRATED_MIN_CONFIDENCE: Final = 0.98
 #: With fewer objects, leaving one out leaves no second candidate.
 FEWEST_OBJECTS: Final = 3
+#: With fewer objects, the open-set score is not fitted to changes of the bench.
+FEWEST_OBJECTS_SHIFTED: Final = 10
+#: Largest share of objects that are not enrolled, and are accepted under changes of the bench.
+FALSE_ACCEPT: Final = 0.02
+#: Changes of the bench up to this strength are mild: enrolled objects must be accepted at the rate that was asked for.
+_MILD: Final = 0.5
 #: Views of a leave-one-out search, if most objects have enough; searches in a calibration.
 CALIBRATED_VIEWS: Final = 4
 MOST_SEARCHES: Final = 400
@@ -109,6 +117,29 @@ class Limitation:
     values: dict[str, Any] = field(default_factory=dict)
 
 
+@dataclass(frozen=True, slots=True)
+class ShiftRates:
+    """Rates in leave-one-out searches under a change of the bench.
+
+    Attributes
+    ----------
+    strength : float
+        Of the change; 1 is a hard one.
+    searches : int
+        Searches for enrolled objects, and as many for the same objects as if they were not enrolled.
+    accepted, rejected : int
+        Enrolled objects that were accepted after at most all views, and that were called unknown.
+    false_accepts : int
+        Objects that were not enrolled, and were accepted.
+    """
+
+    strength: float
+    searches: int
+    accepted: int
+    rejected: int
+    false_accepts: int
+
+
 @dataclass(frozen=True, eq=False)
 class StoppingRule:
     """When a search ends, and which objects are unknown.
@@ -132,6 +163,13 @@ class StoppingRule:
         Leave-one-out searches that the rule comes from.
     limitations : tuple of Limitation
         What the rule does not guarantee; empty if it guarantees both rates.
+    open_set : OpenSetModel, optional
+        The weights of the open-set score. Without them the score is that of `Leaders.open_set_score`.
+    unknown_thresholds : tuple of float
+        With weights: open-set scores after 1, 2, ... views below which an object is unknown. Between them and
+        ``open_set_thresholds`` it is ambiguous. Without weights both thresholds are one.
+    rates : tuple of ShiftRates
+        Measured rates under changes of the bench.
     """
 
     beta: float
@@ -143,6 +181,9 @@ class StoppingRule:
     false_accept: float
     searches: int
     limitations: tuple[Limitation, ...] = ()
+    open_set: OpenSetModel | None = None
+    unknown_thresholds: tuple[float, ...] = ()
+    rates: tuple[ShiftRates, ...] = ()
 
     def decide(self, belief: Belief, *, max_views: int = 8, decisions: int | None = None) -> StopDecision:
         """Decide whether a search ends after these views; ``decisions`` counts instead of them in a search in motion.
@@ -158,14 +199,16 @@ class StoppingRule:
         calibrated = len(self.open_set_thresholds)
         decisions = belief.queries if decisions is None else decisions
         n = min(decisions, calibrated) - 1
-        leaders = Leaders.of([leader(belief.index.object_index, belief.scores())], (1, 1))
-        score = float(leaders.open_set_score(self.usual_scores[:, n : n + 1])[0, 0])
+        score = self._open_set_score(belief, n)
         early = decisions < min(calibrated, max_views)
         threshold = max(self.open_set_thresholds) if early else self.open_set_thresholds[n]
         confidence = float(probability[best])
+        unknown_below = self.unknown_thresholds[n] if self.unknown_thresholds else threshold
         if score < threshold:
             outcome = Outcome.CONTINUE if early else Outcome.UNKNOWN
             reason = StopReason.BELOW_OPEN_SET_THRESHOLD
+            if not early and score >= unknown_below:
+                outcome = Outcome.CONTINUE if decisions < max_views else Outcome.AMBIGUOUS
         elif confidence >= self.min_confidence:
             outcome, reason = Outcome.FOUND, StopReason.CONFIDENT
         elif decisions < max_views:
@@ -174,6 +217,13 @@ class StoppingRule:
             outcome, reason = Outcome.AMBIGUOUS, StopReason.MAX_VIEWS
         object_index = int(belief.index.object_index[best])
         return StopDecision(outcome, reason, object_index, confidence, self.min_confidence, score, threshold)
+
+    def _open_set_score(self, belief: Belief, n: int) -> float:
+        if self.open_set is not None:
+            _, numbers = evidence(belief.index, belief.support, belief.orientation_deg, belief.levels)
+            return self.open_set.score(numbers, belief.queries)
+        leaders = Leaders.of([leader(belief.index.object_index, belief.scores())], (1, 1))
+        return float(leaders.open_set_score(self.usual_scores[:, n : n + 1])[0, 0])
 
 
 def conformal_threshold(scores: ArrayLike, false_reject: float) -> float:
@@ -270,6 +320,46 @@ def fit_stopping_rule(
     )
 
 
+def fit_open_set(rule: StoppingRule, searches: ShiftedSearches) -> StoppingRule:
+    """Return the rule with an open-set score that is fitted to changes of the bench.
+
+    An object is accepted from the first score on that at most 2 % of the objects that are not enrolled reach after any
+    number of views: such scores do not rise when the bench changes, while those of enrolled objects fall. If enrolled
+    objects are so similar to each other that more than ``false_reject`` of them would not reach it after a mild change,
+    the threshold is lower. Objects are unknown if their score is below that of nearly all searches for enrolled
+    objects; between the thresholds they are ambiguous.
+    """
+    model = OpenSetModel.fitted(searches.known, searches.correct, searches.unknown)
+    known, unknown = model.scores(searches.known), model.scores(searches.unknown)
+    known_best = np.where(searches.correct, known, -np.inf).max(axis=1)
+    accepted_from = -conformal_threshold(-unknown.max(axis=1), max(FALSE_ACCEPT, 1.001 / (len(unknown) + 1)))
+    mild = np.maximum(known_best[searches.strength <= _MILD], known.min())
+    accepted_from = min(accepted_from, float(np.quantile(mild, rule.false_reject)))
+    share = max(rule.false_reject, 1.001 / (len(known) + 1))
+    views = known.shape[1]
+    unknown_below = tuple(min(accepted_from, conformal_threshold(known[:, n], share)) for n in range(views))
+    rates = []
+    for strength in STRENGTHS:
+        own = searches.strength == strength
+        rates.append(
+            ShiftRates(
+                strength,
+                int(own.sum()),
+                int((known_best[own] >= accepted_from).sum()),
+                int(((known[own] < accepted_from).all(axis=1) & (known[own, -1] < unknown_below[-1])).sum()),
+                int((unknown[own] >= accepted_from).any(axis=1).sum()),
+            )
+        )
+    return replace(
+        rule,
+        open_set=model,
+        open_set_thresholds=(accepted_from,) * views,
+        unknown_thresholds=unknown_below,
+        false_accept=float((unknown >= accepted_from).any(axis=1).mean()),
+        rates=tuple(rates),
+    )
+
+
 @dataclass(frozen=True, eq=False)
 class CalibratedRule:
     """A stopping rule, and what it does in the leave-one-out searches that it comes from.
@@ -308,6 +398,7 @@ def calibrate_stopping_rule(
     error_rate: float = 0.01,
     false_reject: float = 0.02,
     most_searches: int = MOST_SEARCHES,
+    most_shifted_searches: int = MOST_SEARCHES,
     sample: int | None = None,
     progress: Callable[[int, int], object] | None = None,
     tasks: Callable[[Callable[[Task], Found], Sequence[Task]], Iterable[tuple[Task, Found]]] | None = None,
@@ -322,6 +413,8 @@ def calibrate_stopping_rule(
         As for `fit_stopping_rule`.
     most_searches
         Searches in all, from different first views; each object is searched for at least once.
+    most_shifted_searches
+        Searches under changes of the bench, from which the open-set score is fitted (`fit_open_set`).
     sample
         Search only for so many objects, among each other.
     progress, tasks
@@ -332,6 +425,10 @@ def calibrate_stopping_rule(
         return CalibratedRule(_rule_without_candidates(index, error_rate, false_reject))
     objects = len(index) if sample is None else min(len(index), max(2, sample))
     rule = fit_stopping_rule(searches, error_rate=error_rate, false_reject=false_reject, objects=objects)
+    if sample is None and len(index) >= FEWEST_OBJECTS_SHIFTED and can_shift(index):
+        views = searches.confidence.shape[1]
+        rule = fit_open_set(rule, shifted_searches(index, views=views, searches=most_shifted_searches))
+        return _calibrated(rule, searches)
     known, unknown = (part.open_set_score(rule.usual_scores)[:, -1] for part in (searches.known, searches.unknown))
     ended, wrong = _ended(searches, rule.min_confidence)
     accepted = unknown >= rule.open_set_thresholds[-1]
@@ -347,6 +444,20 @@ def calibrate_stopping_rule(
         rejected=int((known < rule.open_set_thresholds[-1]).sum()),
         accepted=int(accepted.sum()) if objects >= FEWEST_OBJECTS else None,
         confused=tuple((names[a], names[b]) for a, b in confused[np.lexsort((first, -times))].tolist()),
+    )
+
+
+def _calibrated(rule: StoppingRule, searches: LeaveOneOut) -> CalibratedRule:
+    """Return what a rule with weights does: the numbers of searches under changes of the bench."""
+    ended, wrong = _ended(searches, rule.min_confidence)
+    return CalibratedRule(
+        rule,
+        views=searches.confidence.shape[1],
+        ended=len(ended),
+        wrong=wrong,
+        mean_views=float(ended.mean() + 1) if len(ended) else nan,
+        rejected=sum(one.rejected for one in rule.rates),
+        accepted=sum(one.false_accepts for one in rule.rates),
     )
 
 

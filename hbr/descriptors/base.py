@@ -6,6 +6,7 @@ from typing import Protocol
 import numpy as np
 
 from hbr.core.arrays import FloatArray, ImageArray, IndexArray, LevelArray
+from hbr.descriptors.shift import Shift
 from hbr.kernels import library
 from hbr.kernels.calls import Measure, PackedRows, Segments
 from hbr.segmentation import Segmentation
@@ -76,6 +77,14 @@ class Descriptor(Protocol):
         TypeError, ValueError
             The array is no such image.
         """
+
+    def entries(self, rows: LevelArray) -> FloatArray:
+        """Return what levels, uint8 (n, length), mean as numbers whose differences count alike, float64 (n, d)."""
+        return rows.astype(np.float64)
+
+    def shifted(self, levels: LevelArray, shift: Shift) -> LevelArray:  # noqa: ARG002
+        """Return the levels of a view, uint8 (length,), as after a change of the bench; as they are if unknown."""
+        return levels
 
     def prepared(self, rows: LevelArray, /) -> Comparison:
         """Prepare rows, uint8 (m, length), for comparison with many queries.

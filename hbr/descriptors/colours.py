@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from hbr.core.arrays import FloatArray, ImageArray, IndexArray, LevelArray
 from hbr.descriptors.base import CompiledDescriptor
+from hbr.descriptors.shift import Shift
 from hbr.kernels.calls import Measure
 from hbr.segmentation import CROP_PX, Segmentation, segment
 
@@ -38,6 +39,8 @@ _NEAR_ENTRIES: Final = 4096
 _LARGEST: Final = int(_WEIGHTS.sum()) * 255**2
 _FAR: Final = np.array([exp(-i * _NEAR_ENTRIES / (20_000 * _WIDTH**2)) for i in range(_LARGEST // _NEAR_ENTRIES + 1)])
 _NEAR: Final = np.array([exp(-i / (20_000 * _WIDTH**2)) for i in range(_NEAR_ENTRIES)])
+#: Factor that brings coefficients to the size of a unit vector's entries.
+_ENTRY: Final = 0.12
 #: Cells of which the object covers less are left out.
 _MIN_COVERED: Final = 0.1
 
@@ -73,6 +76,28 @@ class Colours(CompiledDescriptor):
         steps = np.rint(_coefficients(found.crop, found.mask) / _STEP)
         levels: FloatArray = np.clip(steps + 128, 0, 255)
         return levels.astype(np.uint8)
+
+    def entries(self, rows: LevelArray) -> FloatArray:
+        values: FloatArray = (rows.astype(np.float64) - 128) * (_ENTRY * _STEP)
+        return values
+
+    def shifted(self, levels: LevelArray, shift: Shift) -> LevelArray:
+        rng = np.random.default_rng(shift.seed)
+        coefficients = np.split((levels.astype(np.float64) - 128) * _STEP, np.cumsum(_KEPT)[:-1])
+        planes = np.zeros((len(_KEPT), _CELLS, _CELLS), np.float32)
+        for plane, part, kept in zip(planes, coefficients, _ZIGZAG, strict=True):
+            plane[kept] = part
+        planes = shift.moved(np.stack([cv2.idct(plane) for plane in planes]))
+        planes[0] *= shift.contrast
+        planes[1:] += (1 - _SUBTRACTED[1:, None, None]) * shift.light[:, None, None]
+        stains = rng.normal(0, shift.stain, (len(_KEPT), 4, 4)).astype(np.float32)
+        planes += np.stack([cv2.resize(stain, (_CELLS, _CELLS), interpolation=cv2.INTER_LINEAR) for stain in stains])
+        planes *= shift.visible
+        found = np.concatenate(
+            [cv2.dct(np.ascontiguousarray(p))[kept] for p, kept in zip(planes, _ZIGZAG, strict=True)]
+        )
+        changed: FloatArray = np.clip(np.rint(found / _STEP) + 128, 0, 255)
+        return changed.astype(np.uint8)
 
     def compared(self, rows: LevelArray, /) -> "_Kernel":
         return _Kernel(rows.astype(np.float64))

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from hbr.core.arrays import FloatArray, ImageArray, LevelArray
 from hbr.descriptors.base import CompiledDescriptor
 from hbr.descriptors.cosine import WholeCosine
+from hbr.descriptors.shift import Shift
 from hbr.kernels.calls import Measure
 from hbr.segmentation import CROP_PX, Segmentation, segment
 
@@ -71,6 +72,26 @@ class Edges(CompiledDescriptor):
         packed = parts[:, :, 0] << 6 | parts[:, :, 1] << 4 | parts[:, :, 2] << 2 | parts[:, :, 3]
         return packed.astype(np.uint8, copy=False)
 
+    def entries(self, rows: LevelArray) -> FloatArray:
+        values = _REPRESENTATIVES[rows]
+        length = np.sqrt(np.einsum("ij,ij->i", values, values))[:, None]
+        unit: FloatArray = values / length
+        return unit
+
+    def shifted(self, levels: LevelArray, shift: Shift) -> LevelArray:
+        rng = np.random.default_rng(shift.seed)
+        roots = _REPRESENTATIVES[levels].astype(np.float32)
+        cells = shift.moved((roots * roots).reshape(_DIRECTIONS, _CELLS, _CELLS)) * shift.visible
+        hidden = 1 - shift.visible
+        mean = float(cells.mean())
+        upright = np.zeros((_DIRECTIONS, 1, 1), np.float32)
+        upright[[0, -1]] = 0.5  # gradients of a bar that stands are horizontal
+        cells += 3 * mean * hidden * (upright + 0.1)
+        false = rng.exponential(1.0, cells.shape) * (rng.random((1, _CELLS, _CELLS)) < 0.3)
+        cells = np.maximum(cells, 0) ** shift.exponent
+        cells += (2 * shift.false * float(cells.mean()) * false).astype(np.float32)
+        return np.searchsorted(_BORDERS, _normalised(cells)).astype(np.uint8)
+
     def unpack_rows(self, packed: bytes) -> LevelArray:
         rows = self.packed_rows(packed)
         return np.stack([rows >> 6, rows >> 4 & 3, rows >> 2 & 3, rows & 3], axis=2).reshape(-1, self.length)
@@ -91,7 +112,10 @@ def _histogram(image: ImageArray) -> NDArray[np.float32]:
     votes = votes[:_DIRECTIONS] + votes[_DIRECTIONS : 2 * _DIRECTIONS]
     votes[0] += np.maximum(place - (2 * _DIRECTIONS - 1), 0)
     votes *= magnitude
-    cells = _SHARES @ votes @ _SHARES.T
+    return _normalised(_SHARES @ votes @ _SHARES.T)
+
+
+def _normalised(cells: NDArray[np.float32]) -> NDArray[np.float32]:
     length = float(np.sqrt((cells * cells).sum()))
     if length == 0:
         return np.zeros(cells.size, np.float32)

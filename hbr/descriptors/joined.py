@@ -7,6 +7,7 @@ import numpy as np
 
 from hbr.core.arrays import FloatArray, ImageArray, IndexArray, LevelArray
 from hbr.descriptors.base import Comparison, CompiledDescriptor, Descriptor
+from hbr.descriptors.shift import Shift
 from hbr.kernels.calls import Measure
 from hbr.segmentation import Segmentation, segment
 
@@ -51,6 +52,15 @@ class Joined(CompiledDescriptor):
             edges_share=edges_share,
             colours_share=colours_share,
         )
+
+    def entries(self, rows: LevelArray) -> FloatArray:
+        return np.concatenate(
+            [part.entries(rows[:, own]) for part, own in zip(self.parts, self._columns(), strict=True)], axis=1
+        )
+
+    def shifted(self, levels: LevelArray, shift: Shift) -> LevelArray:
+        parts = zip(self.parts, self._columns(), strict=True)
+        return np.concatenate([part.shifted(levels[own], shift) for part, own in parts])
 
     def pack_rows(self, rows: LevelArray) -> LevelArray:
         columns = zip(self.parts, self._columns(), strict=True)

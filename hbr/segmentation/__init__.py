@@ -2,6 +2,17 @@
 
 from hbr.segmentation.background import MIN_AGREEMENT, Background
 from hbr.segmentation.evidence import Issue, IssueCode, Method
-from hbr.segmentation.segment import CROP_PX, Box, Segmentation, segment
+from hbr.segmentation.segment import CROP_PX, Box, Segmentation, hypotheses, segment
 
-__all__ = ["CROP_PX", "MIN_AGREEMENT", "Background", "Box", "Issue", "IssueCode", "Method", "Segmentation", "segment"]
+__all__ = [
+    "CROP_PX",
+    "MIN_AGREEMENT",
+    "Background",
+    "Box",
+    "Issue",
+    "IssueCode",
+    "Method",
+    "Segmentation",
+    "hypotheses",
+    "segment",
+]

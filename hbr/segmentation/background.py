@@ -88,12 +88,18 @@ class Difference:
         Pixels that are darker by the same share in all colours: a shadow, or a grey object.
     correction : Illumination
         Brings the frame's illumination to that of the empty-table image.
+    evenly : float32 array (h, w)
+        Mean over the channels of what remains of the difference, in logarithms.
+    coloured : float32 array (h, w)
+        Largest distance of a channel from that mean.
     """
 
     agreement: float
     certain: Mask
     possible: Mask
     correction: Illumination
+    evenly: Floats
+    coloured: Floats
 
     @property
     def reliable(self) -> bool:
@@ -125,9 +131,28 @@ class Background:
     def __init__(self, empty_table_bgr: ImageArray) -> None:
         check_frame(empty_table_bgr)
         self.shape = empty_table_bgr.shape[:2]
-        self._grey_levels = shrunk(empty_table_bgr)
-        self._log = _logarithm(self._grey_levels)
-        self._useful = _useful(self._grey_levels)
+        self._set(shrunk(empty_table_bgr))
+
+    @classmethod
+    def learned(cls, small: ImageArray, shape: tuple[int, int]) -> "Background":
+        """Return a background that was learned from frames of this height and width.
+
+        Parameters
+        ----------
+        small : uint8 array (h, w, 3)
+            The background, of the size that `shrunk` returns for a frame.
+        shape : (int, int)
+            Height and width of the frames.
+        """
+        background = cls.__new__(cls)
+        background.shape = shape
+        background._set(small)
+        return background
+
+    def _set(self, small: ImageArray) -> None:
+        self._grey_levels = small
+        self._log = _logarithm(small)
+        self._useful = _useful(small)
         self.correction, self.issue = self._backdrop_correction()
 
     def difference(self, small: ImageArray) -> Difference:
@@ -146,7 +171,15 @@ class Background:
         certain |= possible & (cv2.blur(grain, (5, 5)) > 0.15)
         agrees = _largest([np.abs(part) for part in residual]) < _AGREES
         shares = np.array([cell.mean() for cell in border_cells(agrees)])
-        return Difference(float((shares > _CELL_SHARE).mean()), certain, possible & ~certain, Illumination(-slopes))
+        agreement = float((shares > _CELL_SHARE).mean())
+        return Difference(
+            agreement,
+            certain,
+            possible & ~certain,
+            Illumination(-slopes),
+            evenly,
+            np.asarray(coloured, np.float32),
+        )
 
     def _backdrop_correction(self) -> tuple[Illumination | None, IssueCode | None]:
         """Return the correction that makes a plain, nearly grey backdrop grey, and what prevents it or a part of it."""

@@ -1,6 +1,6 @@
 """Segmentation of a frame: the object's box, mask and illumination, and a crop of fixed size."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Final
 
@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from hbr.core.arrays import ImageArray
 from hbr.core.deprecation import renamed_keyword
 from hbr.core.validation import check_frame
-from hbr.segmentation.background import Background, Illumination, shrunk
+from hbr.segmentation.background import Background, Illumination, Mask, shrunk
 from hbr.segmentation.evidence import Issue, IssueCode, Method
 from hbr.segmentation.guess import guess_object
+from hbr.segmentation.network import shares
 from hbr.segmentation.plain import plain_difference
 from hbr.segmentation.silhouette import silhouette
 
@@ -25,6 +26,12 @@ _MARGIN: Final = 1.1
 _PATCH_SPREAD: Final = 12.0
 #: Brightness of the grey that replaces the background, as a share of the object's brightness.
 _SURROUND: Final = 0.5
+
+#: Probabilities above which a pixel belongs to the object: of the first segmentation, and of further ones.
+_LEVELS: Final = (0.5, 0.2, 0.8)
+#: Boxes that overlap by more are one.
+_SAME_BOX: Final = 0.85
+MOST_HYPOTHESES: Final = 4
 
 Box = tuple[int, int, int, int]
 
@@ -49,6 +56,8 @@ class Segmentation:
         How the box was found.
     issues : tuple of Issue
         What could not be done, and why.
+    correction : Illumination or None
+        The illumination correction.
     """
 
     crop: ImageArray
@@ -58,6 +67,7 @@ class Segmentation:
     agreement: float | None
     method: Method
     issues: tuple[Issue, ...] = ()
+    correction: Illumination | None = field(default=None, repr=False)
 
     def evidence(self) -> dict[str, Any]:
         """Return method, box, gains, agreement and issues as JSON values, to be stored with the view."""
@@ -189,6 +199,95 @@ def segment(
     return _cut_out(image_bgr, found, box, correction, agreement, method, tuple(issues))
 
 
+def hypotheses(
+    image_bgr: ImageArray,
+    *,
+    empty_table: Background | ImageArray | None = None,
+    learned: Background | None = None,
+    most: int = MOST_HYPOTHESES,
+) -> tuple[Segmentation, ...]:
+    """Return several segmentations of a frame, the likeliest first, whose boxes differ.
+
+    A search compares the enrolled views with all of them, and the most similar one counts
+    (`hbr.DenseSession.add` takes the levels of several segmentations as rows). Before a plain background there is one.
+
+    Parameters
+    ----------
+    image_bgr, empty_table
+        As for `segment`.
+    learned : Background, optional
+        The background that the other views of the search show (`hbr.segmentation.learned.LearnedBackground.of`). The
+        object is not guessed then.
+    most : int
+        Largest number of segmentations.
+
+    Raises
+    ------
+    TypeError, ValueError
+        As for `segment`.
+    """
+    check_frame(image_bgr)
+    small = shrunk(image_bgr)
+    background = Background(empty_table) if isinstance(empty_table, np.ndarray) else empty_table
+    difference = None
+    if background is not None and background.shape == image_bgr.shape[:2]:
+        difference = background.difference(small)
+    by_picture = difference is not None and difference.reliable
+    if learned is None or by_picture or plain_difference(small) is not None:
+        first = segment(image_bgr, empty_table=background)
+        if first.method is Method.PLAIN_BACKGROUND or (most == 1 and not by_picture):
+            return (first,)
+        share = shares(small, difference if by_picture else None).object
+        if by_picture:
+            found = [first, *_by_network(image_bgr, share, Method.EMPTY_TABLE, first)]
+            if most == 1:  # an enrollment: the network's box is right more often
+                found.reverse()
+        else:
+            found = [first, *_by_network(image_bgr, share, Method.NETWORK, first)]
+    else:
+        issues = [Issue(IssueCode.BACKGROUND_NOT_PLAIN)]
+        if difference is not None:
+            issues.insert(0, Issue(IssueCode.TABLE_DIFFERS, {"agreement": round(difference.agreement, 3)}))
+        agreement = None if difference is None else difference.agreement
+        nothing = _cut_out(image_bgr, None, None, None, agreement, Method.NONE, (*issues, Issue(IssueCode.NO_OBJECT)))
+        like = replace(nothing, issues=tuple(issues))
+        share = shares(small, learned.difference(small), learned=True).object
+        found = _by_network(image_bgr, share, Method.ROTATION, like, levels=_LEVELS[: max(1, most - 1)])
+        if most > 1:
+            found += _by_network(image_bgr, shares(small).object, Method.NETWORK, like)
+        found = found or [nothing]
+    several: list[Segmentation] = []
+    for one in found:
+        if all(one.box is None or known.box is None or _overlap(known.box, one.box) < _SAME_BOX for known in several):
+            several.append(one)
+    return tuple(several[:most])
+
+
+def _by_network(
+    image: ImageArray,
+    share: NDArray[np.float32],
+    method: Method,
+    like: Segmentation,
+    levels: tuple[float, ...] = _LEVELS[:1],
+) -> list[Segmentation]:
+    """Return the segmentations at these probabilities, with the illumination and the evidence of another one."""
+    masks = [mask for level in levels if (mask := _object_in(share, level)) is not None]
+    return [_cut_out(image, mask, None, like.correction, like.agreement, method, like.issues) for mask in masks]
+
+
+def _object_in(share: NDArray[np.float32], level: float) -> Mask | None:
+    """Return the object's silhouette where its probability is above a level."""
+    return silhouette(share > level, framed=False)
+
+
+def _overlap(a: Box, b: Box) -> float:
+    """Return the intersection of two boxes over their union."""
+    across = min(a[0] + a[2], b[0] + b[2]) - max(a[0], b[0])
+    down = min(a[1] + a[3], b[1] + b[3]) - max(a[1], b[1])
+    both = max(0, across) * max(0, down)
+    return both / (a[2] * a[3] + b[2] * b[3] - both)
+
+
 def _cut_out(
     image: ImageArray,
     found: NDArray[np.bool_] | None,
@@ -217,7 +316,7 @@ def _cut_out(
     else:
         mask = np.full((CROP_PX, CROP_PX), 255, np.uint8)
     gains = None if correction is None else correction.gains
-    return Segmentation(crop, mask, box, gains, agreement, method, issues)
+    return Segmentation(crop, mask, box, gains, agreement, method, issues, correction)
 
 
 def _square_around(box: Box) -> tuple[float, float, float]:

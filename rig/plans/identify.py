@@ -24,7 +24,7 @@ from rig.search.model import Model, empty_table_for
 from rig.search.session import SHOWN, ArcSearch, begin_search
 from rig.search.strategies import AnyStrategy, Finish
 from rig.views.capture import Viewer
-from rig.views.description import ViewDescriber
+from rig.views.description import SearchDescriber
 
 
 def identify(
@@ -85,7 +85,7 @@ def identify(
     if empty_table is None and isinstance(model, Model):
         empty_table, more = empty_table_for(bench, model)
         notes += more
-    describe = ViewDescriber(bench.config.view, (search.descriptor,), empty_table)
+    describe = SearchDescriber(bench.config.view, search.descriptor, empty_table)
     yield Started(
         "identify",
         None,
@@ -121,7 +121,8 @@ def identify(
             yield Accepted(number, azimuth_deg, captured.evidence, captured.image_bgr, described.segmentation)
             yield from warn_of_table(bench, number, described)
             # Decide: rank the candidates, then rotate or finish.
-            ranked, step = search.add(described.levels[search.descriptor], azimuth_deg, table_deg=table.rest_deg)
+            levels = described.levels[search.descriptor]
+            ranked, step = search.add(levels, azimuth_deg, table_deg=table.rest_deg, earlier=described.earlier)
             yield ranked
             if isinstance(step, Finish):
                 break

@@ -7,9 +7,9 @@ from typing import Any, Final
 
 from rig.events.events import Accepted, Decided, Identified, Moved, Ranked, RotationReason, plain
 from rig.search.saved_run import SavedRun
-from rig.search.session import Search, begin_search
+from rig.search.session import ArcSearch, Search, begin_search
 from rig.search.strategies import AnyStrategy, Finish, Rotate
-from rig.views.description import ViewDescriber
+from rig.views.description import SearchDescriber, ViewDescriber
 
 TOLERANCE: Final = 1e-9
 """Numbers that differ less are equal: another machine may sum in another order."""
@@ -71,7 +71,9 @@ def check(run: SavedRun, *, by: AnyStrategy | None = None) -> Check:
     tolerance = EARLIER_TOLERANCE if run.format_version < 4 else TOLERANCE
     found = Check(is_complete=run.error is not None and not run.is_cut)
     search: Search | None = None
-    describe = ViewDescriber(run.config.view, (run.views.descriptor,), run.empty_table)
+    single = ViewDescriber(run.config.view, (run.views.descriptor,), run.empty_table)
+    # runs of earlier formats, and searches in motion, have one segmentation of each view
+    several = SearchDescriber(run.config.view, run.views.descriptor, run.empty_table)
     ranked: Ranked | None = None
     step: Rotate | Finish | None = None
     table_deg = 0.0
@@ -81,16 +83,17 @@ def check(run: SavedRun, *, by: AnyStrategy | None = None) -> Check:
             case Moved():
                 table_deg = event.encoder_deg
             case Accepted():
-                view = describe(event.image_bgr)
                 if search is None:
                     top = len(run.views.object_names)
                     search, _ = begin_search(
                         run.model, run.config, by or started.strategy, seed=started.seed or 0, top=top
                     )
+                whole = run.format_version < 5 or isinstance(search, ArcSearch)
+                view = (single if whole else several)(event.image_bgr)
                 levels = view.levels[search.descriptor]
                 if event.evidence.motion is not None:
                     table_deg = event.evidence.motion.angle_deg
-                ranked, step = search.add(levels, event.azimuth_deg, table_deg=table_deg)
+                ranked, step = search.add(levels, event.azimuth_deg, table_deg=table_deg, earlier=view.earlier)
                 found.views += 1
                 if event.segmentation is not None:
                     saved, again = event.segmentation, plain(view.segmentation)

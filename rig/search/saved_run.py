@@ -38,7 +38,7 @@ from rig.search.stopping_rules import read_stopping_rule, write_stopping_rule
 from rig.views import image_files as images
 
 FORMAT: Final = "hbr-rig run"
-VERSION: Final = 4
+VERSION: Final = 5
 """Version 2 brought the dense search; version 3 stores codes instead of sentences, and terms of the glossary.
 Since version 4 similarities are the same on every computer."""
 EMPTY_TABLE: Final = "empty_table.png"

@@ -1,6 +1,7 @@
 """A search without its hardware: views in, ranking and decision out. The bench runs it, and a replay runs it again."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 from math import isfinite
@@ -53,20 +54,31 @@ class Search(ABC):
         self._top = top
         self._rng = np.random.default_rng(seed)
         self._orientations: list[float] = []
+        self._earlier: Sequence[NDArray[np.uint8]] | None = None
 
-    def add(self, levels: NDArray[np.uint8], azimuth_deg: float, *, table_deg: float) -> tuple[Ranked, Rotate | Finish]:
+    def add(
+        self,
+        levels: NDArray[np.uint8],
+        azimuth_deg: float,
+        *,
+        table_deg: float,
+        earlier: Sequence[NDArray[np.uint8]] | None = None,
+    ) -> tuple[Ranked, Rotate | Finish]:
         """Add the next view; return the candidates, and the strategy's decision.
 
         Parameters
         ----------
-        levels : uint8 array (length,)
-            The view by the search's descriptor.
+        levels : uint8 array (length,) or (k, length)
+            The view by the search's descriptor; for the dense search also several segmentations of it.
         azimuth_deg
             Orientation of the camera around the object, from any zero that all views share, in [0, 360).
         table_deg
             The table angle, unwrapped.
+        earlier : sequence of uint8 arrays, optional
+            The levels of the earlier views, which were segmented again.
         """
         self._orientations.append(azimuth_deg)
+        self._earlier = earlier
         ranked = self._rank(levels)
         return ranked, self._decide(ranked, table_deg)
 
@@ -188,7 +200,8 @@ class DenseSearch(Search):
         self._session = hbr.DenseSession(index, rule, max_views=config.identify.max_views)
 
     def _rank(self, levels: NDArray[np.uint8]) -> Ranked:
-        decision = self._session.add(levels, self._orientations[-1])
+        revised = {} if self._earlier is None else {"earlier": self._earlier}
+        decision = self._session.add(levels, self._orientations[-1], **revised)
         belief = self._session.belief
         probability = belief.posterior(self._session.rule.beta).sum(axis=1)
         scores = belief.scores()

@@ -4,7 +4,7 @@ See docs/decisions/0031-store-the-stopping-rule-beside-the-catalog.md.
 """
 
 import json
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from hashlib import sha256
 from importlib.metadata import version
 from math import inf, nan
@@ -15,7 +15,8 @@ import numpy as np
 
 import hbr
 from hbr.dense.filter import BETA
-from hbr.dense.stopping import Limitation, LimitationCode
+from hbr.dense.open_set import NUMBERS, OpenSetModel
+from hbr.dense.stopping import Limitation, LimitationCode, ShiftRates
 from hbr.descriptors import descriptor
 from rig.core.errors import CatalogError
 from rig.core.files import json_values, read, write
@@ -25,8 +26,9 @@ FILE: Final = "search_rules.json"
 """Beside ``catalog.sqlite``."""
 FORMAT: Final = "hbr-rig search rules"
 MAX_FILE_BYTES: Final = 16_000_000
-VERSION: Final = 3
-"""Version 1 stored limitations as sentences, and used other names; version 3 has the digest of packed views."""
+VERSION: Final = 4
+"""Version 1 stored limitations as sentences, and used other names; version 3 has the digest of packed views, version 4
+the weights of the open-set score."""
 ERROR_RATE: Final = 0.01
 FALSE_REJECT: Final = 0.02
 
@@ -39,6 +41,8 @@ _LOADED_S: Final = 5e-6
 """Time for a calibration while the operator waits, its minimum, and what each loaded view takes off it."""
 _SEARCH_S, _VIEW_S = 1.4e-3, 1.3e-6
 """Time of a leave-one-out search, and its increase with each enrolled view."""
+_QUICK_SHIFTED: Final = 80
+"""Searches under changes of the bench while the operator waits; each takes about 10 ms."""
 
 
 def quick_stopping_rule(
@@ -57,6 +61,7 @@ def quick_stopping_rule(
         error_rate=error_rate,
         false_reject=false_reject,
         most_searches=searches if sample is None else len(index),
+        most_shifted_searches=_QUICK_SHIFTED,
         sample=sample,
     ).rule
 
@@ -168,7 +173,10 @@ def stopping_rule_values(rule: hbr.StoppingRule, index: hbr.DenseIndex, *, made_
             "views": len(views),
             "sha256": digest(index),
         },
-        **plain(replace(rule, usual_scores=usual)),  # type: ignore[arg-type]
+        **plain(replace(rule, usual_scores=usual, open_set=None)),  # type: ignore[arg-type]
+        "open_set": None
+        if rule.open_set is None
+        else {f.name: getattr(rule.open_set, f.name).tolist() for f in fields(rule.open_set)},
     }
 
 
@@ -220,7 +228,12 @@ def read_stopping_rule(folder: Path) -> StoredRule | None:
             limitations=tuple(
                 Limitation(LimitationCode(one["code"]), dict(one["values"])) for one in values["limitations"]
             ),
+            open_set=_open_set(values.get("open_set")),
+            unknown_thresholds=tuple(_or(threshold, -inf) for threshold in values.get("unknown_thresholds", ())),
+            rates=tuple(ShiftRates(**one) for one in values.get("rates", ())),
         )
+        if len(rule.unknown_thresholds) not in (0, len(rule.open_set_thresholds)):
+            raise ValueError("it does not have one threshold for each number of views")
         scores = rule.usual_scores
         if scores.ndim != 2 or scores.shape[1] != len(rule.open_set_thresholds) or not np.isfinite(scores).all():
             raise ValueError("it does not have one usual score for each object and number of views")
@@ -235,6 +248,20 @@ def read_stopping_rule(folder: Path) -> StoredRule | None:
             next_step="to renew it: rig catalog calibrate",
             evidence={"reason": str(error)},
         ) from error
+
+
+def _open_set(values: dict[str, Any] | None) -> OpenSetModel | None:
+    """Return the weights of the open-set score; None if the rule has none."""
+    if values is None:
+        return None
+    arrays = {name: np.array(values[name], np.float64) for name in ("middle", "spread", "weights", "offset")}
+    views = len(arrays["offset"])
+    for name, array in arrays.items():
+        if array.shape != ((views,) if name == "offset" else (views, len(NUMBERS))) or not np.isfinite(array).all():
+            raise ValueError(f"the {name} of its open-set score is not {views} times {len(NUMBERS)} numbers")
+    if not views or not (arrays["spread"] > 0).all():
+        raise ValueError("its open-set score cannot be computed")
+    return OpenSetModel(**arrays)
 
 
 def _from_version_1(values: dict[str, Any]) -> dict[str, Any]:

@@ -38,11 +38,14 @@ class DescribedView:
         `hbr.Segmentation.evidence` as JSON values; None if no segmentation was made.
     table_problem
         Set for the view after which it is clear that the bench no longer looks like its empty-table image.
+    earlier : tuple of uint8 arrays (k, length), optional
+        In a search: the levels of all earlier views, which were segmented again; a row for each segmentation.
     """
 
     levels: Mapping[str, NDArray[np.uint8]]
     segmentation: dict[str, Any] | None
     table_problem: TableProblem | None = None
+    earlier: tuple[NDArray[np.uint8], ...] | None = None
 
 
 def within(image_bgr: NDArray[np.uint8], region: tuple[int, int, int, int] | None) -> NDArray[np.uint8]:
@@ -137,3 +140,45 @@ class ViewDescriber:
         if self._background is None:
             self._background = hbr.Background(within(self._table, self.region))
         return hbr.segment(part, empty_table=self._background)
+
+
+class SearchDescriber(ViewDescriber):
+    """Describes the views of one search by one descriptor, with several segmentations of each view.
+
+    The background is learned from all views of the search, so that each view also improves the earlier ones
+    (`hbr.ViewsTogether`). The levels have a row for each segmentation.
+
+    Parameters
+    ----------
+    config, empty_table
+        As for `ViewDescriber`.
+    name
+        The descriptor.
+
+    Raises
+    ------
+    ValueError
+        The descriptor is unknown.
+    """
+
+    def __init__(self, config: ViewConfig, name: str, empty_table: NDArray[np.uint8] | None = None) -> None:
+        super().__init__(config, (name,), empty_table)
+        self._name = name
+        self._views: hbr.ViewsTogether | None = None
+
+    def __call__(self, image_bgr: NDArray[np.uint8]) -> DescribedView:
+        """Describe the next frame of the search; errors as for `ViewDescriber`."""
+        if not self._segments:
+            return super().__call__(image_bgr)
+        part = within(image_bgr, self.region)
+        fits = self._table is None or self._table.shape == image_bgr.shape
+        if self._views is None:
+            table = within(self._table, self.region) if self._table is not None and fits else None
+            self._views = hbr.ViewsTogether(self._name, empty_table=table)
+        found = self._views.add(part)[0]
+        if self._table is not None and not fits:
+            sizes = {"table_px": list(self._table.shape[1::-1]), "frame_px": list(image_bgr.shape[1::-1])}
+            found = replace(found, issues=(Issue(IssueCode.TABLE_SIZE, sizes), *found.issues))
+        *earlier, levels = self._views.levels
+        problem = self._table_problem(found.agreement)
+        return DescribedView({self._name: levels}, found.evidence(), problem, tuple(earlier))

@@ -1,0 +1,93 @@
+"""Description of views that belong together: those of one search, or of one enrollment.
+
+They share a background, which is learned while the table turns (`hbr.segmentation.learned`). So every new view also
+improves the segmentation of the earlier ones.
+"""
+
+from typing import Final
+
+import numpy as np
+
+from hbr.core.arrays import ImageArray, LevelArray
+from hbr.descriptors.base import Descriptor
+from hbr.descriptors.registry import descriptor as descriptor_of
+from hbr.segmentation import Background, Method, Segmentation, hypotheses
+from hbr.segmentation.learned import LearnedBackground
+from hbr.segmentation.segment import MOST_HYPOTHESES
+
+#: Segmentations that other views do not improve.
+_FINAL: Final = (Method.PLAIN_BACKGROUND, Method.EMPTY_TABLE)
+
+
+class ViewsTogether:
+    """The views of one search or enrollment, each described by several segmentations.
+
+    ::
+
+        views = hbr.ViewsTogether("edges+colours", empty_table=table)  # or without an empty-table image
+        for frame, orientation_deg in frames:
+            views.add(frame)
+            decision = session.add(views.levels[-1], orientation_deg, earlier=views.levels[:-1])
+
+    Parameters
+    ----------
+    descriptor : str or Descriptor
+        A descriptor of the object.
+    empty_table : Background, or uint8 array (H, W, 3), optional
+        As for `hbr.segment`.
+    several : bool
+        Whether each view has several segmentations, for a search; an enrollment has one.
+
+    Attributes
+    ----------
+    segmentations : list of tuple of Segmentation
+        Of each view, the likeliest first.
+    levels : list of uint8 array (k, length)
+        Levels of each view, a row for each segmentation.
+    """
+
+    def __init__(
+        self,
+        descriptor: str | Descriptor,
+        *,
+        empty_table: Background | ImageArray | None = None,
+        several: bool = True,
+    ) -> None:
+        self._descriptor = descriptor_of(descriptor) if isinstance(descriptor, str) else descriptor
+        self._table = Background(empty_table) if isinstance(empty_table, np.ndarray) else empty_table
+        self._several = several
+        self._images: list[ImageArray] = []
+        self._learned = LearnedBackground()
+        self.segmentations: list[tuple[Segmentation, ...]] = []
+        self.levels: list[LevelArray] = []
+
+    def add(self, image_bgr: ImageArray, *, revise: bool = True) -> tuple[Segmentation, ...]:
+        """Add a view, and segment the earlier ones again if asked for; return the segmentations of the new view.
+
+        Raises
+        ------
+        TypeError, ValueError
+            As for `hbr.segment`, or the view has another size than the others.
+        """
+        self._learned.add(image_bgr)
+        self._images.append(image_bgr)
+        self.segmentations.append(())
+        self.levels.append(np.empty((0, self._descriptor.length), np.uint8))
+        if revise:
+            self.revise()
+        else:
+            self._describe(len(self._images) - 1)
+        return self.segmentations[-1]
+
+    def revise(self) -> None:
+        """Segment all views again that other views can improve."""
+        for view, found in enumerate(self.segmentations):
+            if not found or found[0].method not in _FINAL:
+                self._describe(view)
+
+    def _describe(self, view: int) -> None:
+        learned = self._learned.of(view)
+        most = MOST_HYPOTHESES if self._several else 1
+        found = hypotheses(self._images[view], empty_table=self._table, learned=learned, most=most)
+        self.segmentations[view] = found
+        self.levels[view] = np.stack([self._descriptor.describe(one) for one in found])

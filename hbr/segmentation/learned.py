@@ -1,0 +1,55 @@
+"""Segmentation by rotation: the background is learned from the views of one search or enrollment.
+
+While the table rotates, the background stands still, and the object and the platter's marks move. So a view is compared
+with the median of the other views: behind the object most of them show the background. The network knows that such a
+median can show the object, too, and weighs it with what it sees.
+"""
+
+from typing import Final
+
+import numpy as np
+
+from hbr.core.arrays import ImageArray
+from hbr.segmentation.background import Background, shrunk
+
+#: Largest number of views that the background is learned from.
+_MOST: Final = 9
+
+
+class LearnedBackground:
+    """The views of one search or enrollment, from one camera before one background in one light."""
+
+    def __init__(self) -> None:
+        self._shape: tuple[int, int] | None = None
+        self._small: list[ImageArray] = []
+
+    def __len__(self) -> int:
+        return len(self._small)
+
+    def add(self, image_bgr: ImageArray) -> None:
+        """Add a view, uint8 (H, W, 3).
+
+        Raises
+        ------
+        ValueError
+            The view has another size than the others.
+        """
+        height, width = image_bgr.shape[:2]
+        if self._shape is not None and self._shape != (height, width):
+            raise ValueError(
+                f"the view has {width} x {height} pixels, the others {self._shape[1]} x {self._shape[0]}; "
+                "views of one search need one size"
+            )
+        self._shape = height, width
+        self._small.append(shrunk(image_bgr))
+
+    def of(self, view: int) -> Background | None:
+        """Return the background of a view, learned from the others; None with a single view."""
+        others = [n for n in range(len(self)) if n != view]
+        if not others or self._shape is None:
+            return None
+        if len(others) > _MOST:  # spread over all of them
+            others = [others[n * len(others) // _MOST] for n in range(_MOST)]
+        return Background.learned(
+            np.median(np.stack([self._small[n] for n in others]), axis=0).astype(np.uint8), self._shape
+        )

@@ -1,0 +1,93 @@
+"""Segmentation of the views of one search together, and the open-set score under changes of the bench."""
+
+import numpy as np
+import pytest
+
+import hbr
+from hbr.dense.shifted_searches import can_shift
+from hbr.descriptors.shift import Shift
+from hbr.evaluation.changed_bench import HARD, Bench, Visit
+from hbr.segmentation import Method
+
+
+def frames(count: int) -> tuple[list[np.ndarray], np.ndarray, list[tuple[int, int, int, int]]]:
+    """Return frames of a striped box on a textured bench, its empty table, and the true boxes."""
+    visit = Visit(Bench.drawn(np.random.default_rng(1003)), HARD, np.random.default_rng(5))
+    found, boxes = [], []
+    for n in range(count):
+        photograph = np.zeros((128, 128, 3), np.uint8)
+        half = (26, 40, 30, 44)[n % 4]
+        photograph[20:110, 64 - half : 64 + half] = (40, 60, 210)
+        photograph[30 : 50 + 10 * n, 64 - half : 64 + half - 8] = (230, 220, 60)
+        frame = visit.photograph(photograph, photograph.any(axis=2), 90.0 * n)
+        rows, columns = np.nonzero(frame.mask)
+        found.append(frame.image)
+        boxes.append((columns.min(), rows.min(), np.ptp(columns) + 1, np.ptp(rows) + 1))
+    return found, visit.empty(), boxes
+
+
+def overlap(a: tuple[int, ...], b: tuple[int, ...]) -> float:
+    across = min(a[0] + a[2], b[0] + b[2]) - max(a[0], b[0])
+    down = min(a[1] + a[3], b[1] + b[3]) - max(a[1], b[1])
+    both = max(0, across) * max(0, down)
+    return both / (a[2] * a[3] + b[2] * b[3] - both)
+
+
+def test_further_views_revise_the_segmentation_of_earlier_ones() -> None:
+    images, _, boxes = frames(3)
+    views = hbr.ViewsTogether("edges+colours")
+    views.add(images[0])
+    assert views.segmentations[0][0].method is Method.GUESS
+    for image in images[1:]:
+        views.add(image)
+    assert [found[0].method for found in views.segmentations] == [Method.ROTATION] * 3
+    assert min(overlap(found[0].box, box) for found, box in zip(views.segmentations, boxes, strict=True)) > 0.55
+    assert [len(levels) for levels in views.levels] == [len(found) for found in views.segmentations]
+
+
+def test_the_network_uses_the_empty_table_image() -> None:
+    images, empty, boxes = frames(1)
+    found = hbr.hypotheses(images[0], empty_table=empty, most=1)
+    assert found[0].method is Method.EMPTY_TABLE
+    assert overlap(found[0].box, boxes[0]) > 0.8
+    again = hbr.hypotheses(images[0], empty_table=empty, most=1)
+    np.testing.assert_array_equal(found[0].mask, again[0].mask)
+
+
+def test_views_of_another_size_are_rejected() -> None:
+    images, _, _ = frames(1)
+    views = hbr.ViewsTogether("edges+colours")
+    views.add(images[0])
+    with pytest.raises(ValueError, match="one size"):
+        views.add(images[0][:200])
+
+
+def test_the_most_similar_segmentation_counts() -> None:
+    rng = np.random.default_rng(0)
+    levels = rng.integers(0, 4, (6, 512), dtype=np.uint8)
+    index = hbr.DenseIndex(hbr.Views(levels, np.arange(6) * 120.0 % 360, np.repeat([0, 1], 3), ("a", "b"), "edges"))
+    other = rng.integers(0, 4, 512, dtype=np.uint8)
+    several = hbr.update_belief(np.stack([other, levels[4]]), 0.0, index)
+    alone = hbr.update_belief(levels[4], 0.0, index)
+    assert several.ranking().object_index[0] == 1
+    assert several.scores()[1] == alone.scores()[1]
+
+
+def test_a_shift_of_strength_0_changes_nothing_and_a_hard_one_does() -> None:
+    images, empty, _ = frames(1)
+    kind = hbr.descriptor("edges+colours")
+    levels = kind.describe(hbr.segment(images[0], empty_table=empty))
+    rng = np.random.default_rng(0)
+    same = kind.shifted(levels, Shift.drawn(rng, 0.0))
+    assert kind.similarity(same[None], levels[None])[0, 0] > 0.995
+    hard = [kind.shifted(levels, Shift.drawn(rng, 1.0)) for _ in range(20)]
+    similar = kind.similarity(np.stack(hard), levels[None])[:, 0]
+    assert 0.7 < np.median(similar) < 0.97
+
+
+def test_a_descriptor_without_shifts_keeps_the_earlier_score() -> None:
+    rng = np.random.default_rng(0)
+    views = hbr.Views(
+        rng.integers(0, 8, (8, 144), dtype=np.uint8), np.arange(8) * 90.0 % 360, np.repeat([0, 1], 4), ("a", "b")
+    )
+    assert not can_shift(hbr.DenseIndex(views))
