@@ -105,6 +105,14 @@ def evaluate(
             help="Leave this number of objects out, five times, and search for them, too: false accepts and rejects.",
         ),
     ] = None,
+    bench_change: Annotated[
+        str | None,
+        typer.Option(
+            metavar="mild|hard",
+            help="Search by edges+colours after a change of a whole drawn bench; every ninth object is not enrolled. "
+            "Uses --enrolled (36), --objects, --reference none.",
+        ),
+    ] = None,
     objects: Annotated[
         str | None, typer.Option(metavar="FIRST-LAST", help="Evaluate only these objects, counted from 1; e.g. 51-100.")
     ] = None,
@@ -145,6 +153,10 @@ def evaluate(
     workers = jobs_of(jobs, cluster) or os.cpu_count() or 1
     descriptor = descriptor_name(descriptor)
     try:
+        if bench_change is not None:
+            dataset = _dataset(settings, folder, objects)
+            _bench_change(settings, dataset, bench_change, reference != "none", enrolled or 36, workers, out)
+            return
         plan = Plan.of(
             _dataset(settings, folder, objects),
             Condition(
@@ -224,6 +236,32 @@ def evaluate(
     for sentence in contest_sentences(results):
         screen.print(sentence, markup=False, highlight=False, soft_wrap=not screen.is_terminal)
     print(f"Written: {out / 'report.html'}, results.json, results.csv and the figures beside it.", file=sys.stderr)
+
+
+def _bench_change(
+    settings: Settings, dataset: "Dataset", kind: str, picture: bool, enrolled: int, jobs: "Jobs", out: Path
+) -> None:
+    from hbr.evaluation.changes import Changes
+    from rig.cli.ui.present import Progress, console
+    from rig.evaluation.changes import change_rows, run_changes
+    from rig.evaluation.write import write_json
+
+    if kind not in ("mild", "hard"):
+        raise ValueError(f"bench change {kind!r} is unknown; use mild or hard")
+    changes = Changes(kind, picture, enrolled, seed=settings.seed or 0)  # type: ignore[arg-type]
+    with Progress("enrolling, searching") as progress:
+        progress.start(2 * len(dataset.objects))
+
+        def advance(_name: str) -> None:
+            progress.advance()
+
+        results = run_changes(dataset, changes, jobs, advance)
+    write_json(results, out / "bench_change.json")
+    if settings.json:
+        settings.print_json({"event": "finished", **results})
+        return
+    console().print(change_rows(results).terminal())
+    print(f"Written: {out / 'bench_change.json'}.", file=sys.stderr)
 
 
 def _matrix(settings: Settings, plan: "Plan", jobs: "Jobs", out: Path) -> None:

@@ -1,0 +1,185 @@
+"""Searches by image after a change of the bench: how many decisions are right, and how many unknown objects accepted.
+
+Objects are enrolled on one drawn bench. Each search is a visit to the same bench (mild change), or to one of twelve
+other benches (hard change), with four views, 90° apart. Some objects are never enrolled.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Final, Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from hbr.core.angles import wrap180
+from hbr.core.arrays import ImageArray, LevelArray
+from hbr.dense.filter import DenseIndex
+from hbr.dense.session import DenseSession
+from hbr.dense.stopping import Outcome, StoppingRule
+from hbr.descriptors.together import ViewsTogether
+from hbr.evaluation.changed_bench import ENROLLMENT, HARD, MILD, Bench, Visit
+from hbr.evaluation.condition import object_mask
+from hbr.evaluation.datasets import Dataset, PhotographedObject, read_photograph
+from hbr.evaluation.draws import generator
+
+Kind = Literal["mild", "hard"]
+#: Views of a search, and the step between them.
+VIEWS: Final = 4
+_STEP_DEG: Final = 90.0
+#: Views after which a search would end in any case.
+_MAX_VIEWS: Final = 8
+_BENCHES: Final = 12
+DESCRIPTOR: Final = "edges+colours"
+
+
+@dataclass(frozen=True)
+class Changes:
+    """The settings of such searches.
+
+    Attributes
+    ----------
+    kind : {"mild", "hard"}
+        The change of the bench.
+    picture : bool
+        Whether enrollment and searches use a picture of their empty table.
+    enrolled : int
+        Enrolled views of each object.
+    trials : int
+        Searches for each object.
+    every : int
+        Every so many-th object is never enrolled.
+    seed : int
+        Of all random values.
+    """
+
+    kind: Kind = "hard"
+    picture: bool = True
+    enrolled: int = 36
+    trials: int = 4
+    every: int = 9
+    seed: int = 0
+
+    def is_enrolled(self, place: int) -> bool:
+        """Return whether the object at this place of the data set is enrolled."""
+        return (place + 1) % self.every != 0
+
+
+@dataclass(frozen=True)
+class SearchResult:
+    """A search, with the leading object after each view.
+
+    Attributes
+    ----------
+    leaders : tuple of str
+        After 1, 2, 3 and 4 views.
+    outcome : Outcome
+        With which the stopping rule ended the search; `Outcome.CONTINUE` if it did not within four views.
+    decided : str
+        The leading object then.
+    views : int
+        Views until then.
+    """
+
+    leaders: tuple[str, ...]
+    outcome: Outcome
+    decided: str
+    views: int
+
+
+def enroll_changed(item: PhotographedObject, changes: Changes) -> tuple[LevelArray, NDArray[np.float64]]:
+    """Return the levels of an object's enrolled views, and their azimuths.
+
+    Raises
+    ------
+    DatasetError
+        A photograph cannot be used.
+    """
+    visit = Visit(_enrollment_bench(), ENROLLMENT, np.random.default_rng(1))
+    places = _places(item, np.arange(changes.enrolled) * 360 / changes.enrolled)
+    views = ViewsTogether(DESCRIPTOR, empty_table=visit.empty() if changes.picture else None, several=False)
+    for place in places:
+        azimuth_deg = item.photographs[place].azimuth_deg
+        views.add(visit.photograph(*_cut_out(item, place), azimuth_deg).image, revise=False)
+    views.revise()
+    return np.stack([levels[0] for levels in views.levels]), item.azimuth_deg[places]
+
+
+def search_changed(
+    item: PhotographedObject, changes: Changes, index: DenseIndex, rule: StoppingRule
+) -> list[SearchResult]:
+    """Search for an object, once for each trial.
+
+    Raises
+    ------
+    DatasetError
+        A photograph cannot be used.
+    """
+    results = []
+    for trial in range(changes.trials):
+        rng = generator(changes.seed, item.name, "trial", trial)
+        hard = changes.kind == "hard"
+        bench = _benches()[int(rng.integers(_BENCHES))] if hard else _enrollment_bench()
+        visit = Visit(bench, HARD if hard else MILD, rng)
+        first_deg = rng.uniform(0, 360)
+        views = ViewsTogether(DESCRIPTOR, empty_table=visit.empty() if changes.picture else None)
+        session = DenseSession(index, rule, max_views=_MAX_VIEWS)
+        leaders: list[str] = []
+        ended: SearchResult | None = None
+        for n, place in enumerate(_places(item, first_deg + _STEP_DEG * np.arange(VIEWS, dtype=np.float64))):
+            azimuth_deg = item.photographs[place].azimuth_deg
+            views.add(visit.photograph(*_cut_out(item, place), azimuth_deg).image)
+            *earlier, levels = views.levels
+            decision = session.add(levels, azimuth_deg, earlier=earlier)
+            names = index.views.object_names
+            leaders.append(names[int(session.belief.ranking().object_index[0])])
+            if ended is None and decision.outcome is not Outcome.CONTINUE:
+                ended = SearchResult((), decision.outcome, names[decision.object_index], n + 1)
+        ended = ended or SearchResult((), Outcome.CONTINUE, leaders[-1], VIEWS)
+        results.append(SearchResult(tuple(leaders), ended.outcome, ended.decided, ended.views))
+    return results
+
+
+def summary(known: dict[str, list[SearchResult]], unknown: dict[str, list[SearchResult]]) -> dict[str, float | int]:
+    """Return the shares that the searches of enrolled objects, and of others, ended with; by names with units."""
+    searches = [(name, one) for name, results in known.items() for one in results]
+    others = [one for results in unknown.values() for one in results]
+    count, unknown_count = max(1, len(searches)), max(1, len(others))
+    found = [(name, one) for name, one in searches if one.outcome is Outcome.FOUND]
+    return {
+        "searches": len(searches),
+        **{f"hit_rate_{n}": sum(one.leaders[n - 1] == name for name, one in searches) / count for n in (1, 2, VIEWS)},
+        "decided_right": sum(one.decided == name for name, one in found) / count,
+        "decided_wrong": sum(one.decided != name for name, one in found) / count,
+        "called_unknown": sum(one.outcome is Outcome.UNKNOWN for _, one in searches) / count,
+        "mean_views": sum(one.views for _, one in found) / max(1, len(found)),
+        "unknown_searches": len(others),
+        "unknown_accepted": sum(one.outcome is Outcome.FOUND for one in others) / unknown_count,
+        "unknown_called_unknown": sum(one.outcome is Outcome.UNKNOWN for one in others) / unknown_count,
+    }
+
+
+def enrolled_names(dataset: Dataset, changes: Changes) -> list[str]:
+    """Return the names of the objects that are enrolled."""
+    return [item.name for place, item in enumerate(dataset.objects) if changes.is_enrolled(place)]
+
+
+def _cut_out(item: PhotographedObject, place: int) -> tuple[ImageArray, NDArray[np.bool_]]:
+    image = read_photograph(item.photographs[place].path)
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(object_mask(image).astype(np.uint8))
+    area = stats[1:, cv2.CC_STAT_AREA]
+    return image, np.isin(labels, 1 + np.flatnonzero(area >= 0.05 * area.max(initial=0)))
+
+
+def _places(item: PhotographedObject, azimuth_deg: NDArray[np.float64]) -> list[int]:
+    return [int(np.abs(wrap180(item.azimuth_deg - one)).argmin()) for one in azimuth_deg.tolist()]
+
+
+@cache
+def _enrollment_bench() -> Bench:
+    return Bench.drawn(np.random.default_rng(7), textured=0.35, clutter=3)
+
+
+@cache
+def _benches() -> tuple[Bench, ...]:
+    return tuple(Bench.drawn(np.random.default_rng(1000 + k)) for k in range(_BENCHES))
