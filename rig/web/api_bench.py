@@ -27,9 +27,7 @@ def add_bench(api: APIRouter, server: Server) -> None:
     @api.post("/stop", tags=["bench"])
     def stop(_person: Watcher) -> dict[str, Any]:
         """Stop the table, and cancel all jobs. Needs no lease. The answer says whether the running job has ended."""
-        ended = server.worker.stop()
-        server.hub.publish("stop", {"ended": ended})
-        return {"ended": ended, "status": server.worker.status}
+        return {"ended": server.worker.stop(), "status": server.worker.status}
 
     @api.get("/events", tags=["bench"], response_class=StreamingResponse)
     async def events(

@@ -63,7 +63,7 @@ class Hub:
     def close(self) -> None:
         """End all streams."""
         self._closed = True
-        self.publish("stop", {"ended": True})
+        self.publish("close", {})  # wakes them
 
     @property
     def last_id(self) -> str:

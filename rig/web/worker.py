@@ -130,10 +130,12 @@ class BenchWorker:
     def stop(self, wait_s: float = 2.0) -> bool:
         """Stop the table at once and cancel all jobs; return whether no job runs any more.
 
-        May be called from any thread. The control loop of the motion notices the request in its next round.
+        May be called from any thread. The control loop of the motion notices the request in its next round. The
+        listeners get an event at the request, and one when the running job has ended.
         """
         self.stops += 1
         self._queue.cancel_all()
+        self._hub.publish("stop", {"ended": False})
         self._stop_asked.set()
         bench = self._held.bench
         if self._job is not None and bench is not None:
@@ -141,7 +143,10 @@ class BenchWorker:
         start_ns = self._clock.now_ns()
         while self._job is not None and seconds_between(start_ns, self._clock.now_ns()) < wait_s:
             self._clock.sleep(0.01)
-        return self._job is None
+        ended = self._job is None
+        if ended:
+            self._report_stop()
+        return ended
 
     def run(self) -> None:
         """Run jobs until `end` is called; then close the bench."""
@@ -159,7 +164,6 @@ class BenchWorker:
 
     def _run(self, job: Job) -> None:
         self._job = job
-        self._stop_asked.clear()
         self._views[job.id] = []
         self._left = self._outline = None
         for old in list(self._views)[:-JOBS_WITH_PICTURES]:
@@ -188,7 +192,14 @@ class BenchWorker:
             self._held.bench.state.clear_stop()
         self._queue.end(job, state, error)
         self.jobs_ended[state.value] = self.jobs_ended.get(state.value, 0) + 1
+        self._report_stop()
         self._read_status()
+
+    def _report_stop(self) -> None:
+        """Tell the listeners once that no job runs any more after a stop."""
+        if self._stop_asked.is_set():
+            self._stop_asked.clear()
+            self._hub.publish("stop", {"ended": True})
 
     def _context(self, job: Job) -> Context:
         return Context(

@@ -165,12 +165,20 @@ setInterval(() => {
   if ($("lease-button")?.dataset.mine) request("POST", "/lease", {}).catch(() => {});
 }, 15000);
 
+const STOPPED = "Stopped. All jobs are cancelled.";
+const NOT_STOPPED = "The stop is requested, but the job has not ended. If the table still moves, switch off its supply.";
+const say = (words) => $("messages").replaceChildren(h("p", {}, words));
+
+// The job may end before or after the answer to the request: the event tells.
+let stopped = true;
+on("stop", ({ ended }) => {
+  stopped = ended;
+  say(ended ? STOPPED : "Stopping …");
+});
 $("stop")?.addEventListener("click", async () => {
+  stopped = false;
   const answer = await act(() => request("POST", "/stop"));
-  if (answer) {
-    const words = answer.ended ? "Stopped. All jobs are cancelled." : "The stop is requested, but the job has not ended. If the table still moves, switch off its supply.";
-    $("messages").replaceChildren(h("p", {}, words));
-  }
+  if (answer) say(answer.ended || stopped ? STOPPED : NOT_STOPPED);
 });
 
 // -- a job ---------------------------------------------------------------------------------------------------------------

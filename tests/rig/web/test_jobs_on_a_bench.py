@@ -88,6 +88,20 @@ def test_stop_in_a_motion_stops_the_table_and_cancels_all_jobs(serve):
     assert served.run(kind="home")["state"] == "done"
 
 
+def test_listeners_learn_when_a_job_ends_after_the_answer_to_a_stop(serve):
+    served = serve("bench.sim.speed=2")
+    job = served.client.post("/api/v1/jobs", json={"kind": "goto", "angle_deg": 350}).json()
+    while served.client.get("/api/v1/status").json().get("table_deg", 0.0) < 20.0:
+        pass
+    worker, hub = served.server.worker, served.server.hub
+    assert not worker.stop(wait_s=0.0)
+    assert served.wait(job["id"])["state"] == "cancelled"
+    stops = [message.data for message in hub.since(0)[0] if message.kind == "stop"]
+    while len(stops) < 2:
+        stops = [message.data for message in hub.since(0)[0] if message.kind == "stop"]
+    assert stops == ['{"ended": false}', '{"ended": true}']
+
+
 def test_fault_is_latched_shown_and_acknowledged(serve):
     served = serve("bench.sim.faults=['jam@move0+9s']")
     job = served.run(kind="goto", angle_deg=180)
