@@ -21,7 +21,7 @@ from hbr.core.angles import size_deg
 from hbr.core.arrays import FloatArray, LevelArray
 from hbr.dense.filter import Belief, DenseIndex
 from hbr.dense.leave_one_out import leave_one_out
-from hbr.dense.next_view import _expected, _strongest
+from hbr.dense.next_view import expected_similarity, strongest
 from hbr.dense.session import DenseSession
 from hbr.dense.stopping import (
     FEWEST_OBJECTS,
@@ -148,13 +148,13 @@ def next_arc(
     here_deg = float(belief.orientation_deg[-1])
     apart_deg = size_deg(here_deg + rotations_deg[:, None] - belief.orientation_deg).min(axis=1)
     new = np.minimum(apart_deg / STEP_DEG, 1.0) * STEP_WEIGHT
-    probability, place, bin_of = _strongest(belief.posterior(beta))
+    probability, place, bin_of = strongest(belief.posterior(beta))
     cost = second_costs * seconds
     pairs = probability[:, None] * probability * (place[:, None] != place)
     confusion = np.zeros(len(rotations_deg))
     pair = None
     if pairs.any():
-        similar, known = _expected(belief, place, bin_of, rotations_deg)
+        similar, known = expected_similarity(belief, place, bin_of, rotations_deg)
         exponent = new[:, None, None] * np.sqrt(known[:, :, None] * known[:, None, :]) * (1 - similar)
     for side in (1.0, -1.0):
         way = np.flatnonzero(np.sign(rotations_deg) == side)

@@ -20,7 +20,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from hbr.core.angles import wrap180, wrap360
+from hbr.core.angles import size_deg, wrap180, wrap360
 from hbr.core.arrays import FloatArray, IndexArray, LevelArray
 from hbr.core.segments import lengths, ranges
 from hbr.dense.whitening import Whitening
@@ -99,6 +99,7 @@ class DenseIndex:
         segments = state.pop("segments")
         self.__dict__.update(state)
         self.compared = self.views.prepared()
+        self.whitening = Whitening(self.views)
         self._set_segments(*segments)
 
     def without(self, views: IndexArray) -> "DenseIndex":
@@ -188,9 +189,14 @@ class DenseIndex:
 
     def nearest(self, query: LevelArray, kept: int) -> IndexArray:
         """Return the objects with the most similar views, ascending places (kept,); of equal ones, the first."""
-        if isinstance(self.compared, Packed) and query.ndim == 1:
-            return self.compared.nearest(query, self._segments, kept)
-        return np.sort(np.argsort(-self.best(query), kind="stable")[:kept])
+        if not isinstance(self.compared, Packed):
+            return np.sort(np.argsort(-self.best(query), kind="stable")[:kept])
+        nearest = [self.compared.nearest(row, self._segments, kept) for row in np.atleast_2d(query)]
+        if len(nearest) == 1:
+            return nearest[0]
+        # an object that is among the best by its largest similarity is so by the row that has it
+        places = np.unique(np.concatenate(nearest))
+        return places[np.sort(np.argsort(-self.only(places).best(query), kind="stable")[:kept])]
 
     @property
     def view_counts(self) -> IndexArray:
@@ -201,8 +207,8 @@ class DenseIndex:
         """Return the rows of an object's views that are nearest to an azimuth, (count,); of fewer views, some twice."""
         begin = self._segments.begin[place]
         rows = self._segments.order[begin : begin + self._segments.lengths[place]]
-        away = np.abs((self.views.azimuth_deg[rows] - at_deg + 180) % 360 - 180)
-        return np.resize(rows[np.argsort(away, kind="stable")[:count]], count)
+        away_deg = size_deg(self.views.azimuth_deg[rows] - at_deg)
+        return np.resize(rows[np.argsort(away_deg, kind="stable")[:count]], count)
 
     @cached_property
     def _ring(self) -> tuple[IndexArray, FloatArray, Floats]:

@@ -101,11 +101,11 @@ def next_best_view(
     landing_deg = here_deg + angles_deg
     apart_deg = size_deg(landing_deg[:, None] - belief.orientation_deg).min(axis=1)
     novelty = 1 - np.exp(-0.5 * (apart_deg / _NEAR_DEG) ** 2)
-    probability, place, bin_of = _strongest(belief.posterior(beta))
+    probability, place, bin_of = strongest(belief.posterior(beta))
     cost = second_costs * times_s
     pairs = probability[:, None] * probability * (place[:, None] != place)
     if pairs.any():
-        similar, known = _expected(belief, place, bin_of, angles_deg)
+        similar, known = expected_similarity(belief, place, bin_of, angles_deg)
         tells = novelty[:, None, None] * np.sqrt(known[:, :, None] * known[:, None, :])
         remaining = pairs * np.exp(-sharpness * tells * (1 - similar))
         confusion = np.log(np.maximum(remaining.sum(axis=(1, 2)), 1e-300))
@@ -137,8 +137,8 @@ def most_informative_rotation(belief: Belief, *, beta: float = BETA, rotations_d
         As for `next_best_view`.
     """
     angles_deg = _all_rotations() if rotations_deg is None else np.asarray(rotations_deg, np.float64)
-    probability, place, bin_of = _strongest(belief.posterior(beta))
-    similar, _ = _expected(belief, place, bin_of, angles_deg)
+    probability, place, bin_of = strongest(belief.posterior(beta))
+    similar, _ = expected_similarity(belief, place, bin_of, angles_deg)
     weights = probability * np.exp(
         beta / np.sqrt(belief.queries + 1) * (np.maximum(similar, 0) ** belief.index.power - 1)
     )
@@ -154,7 +154,7 @@ def _all_rotations() -> FloatArray:
     return steps * (360 / BINS)
 
 
-def _strongest(posterior: FloatArray) -> tuple[FloatArray, IndexArray, IndexArray]:
+def strongest(posterior: FloatArray) -> tuple[FloatArray, IndexArray, IndexArray]:
     """Probability, object (its place) and bin of the strongest hypotheses, one peak of an object after the other."""
     peaks = posterior * (posterior >= np.roll(posterior, 1, axis=1)) * (posterior >= np.roll(posterior, -1, axis=1))
     # a peak stands for the slopes beside it
@@ -171,7 +171,7 @@ def _strongest(posterior: FloatArray) -> tuple[FloatArray, IndexArray, IndexArra
     return weight[best], place, bin_of
 
 
-def _expected(
+def expected_similarity(
     belief: Belief, place: IndexArray, bin_of: IndexArray, angles_deg: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Similarity of what the hypotheses would show after each turn, (a, m, m), and how well that is known, (a, m)."""

@@ -62,14 +62,18 @@ class DenseSession:
         """
         if earlier is not None:
             self._replace(earlier)
-        self._so_far = self.belief = update_belief(
-            levels, orientation_deg, self._so_far, kept=self._kept, weight=self._weight(orientation_deg)
-        )
-        self._queries.append(levels)
+        self._extend(levels, orientation_deg)
         self.decision = self._decide(self.belief)
         if self.decision.outcome is not Outcome.CONTINUE:
             self._complete()
         return self.decision
+
+    def _extend(self, levels: LevelArray, orientation_deg: float) -> None:
+        """Add a view to the belief."""
+        self._so_far = self.belief = update_belief(
+            levels, orientation_deg, self._so_far, kept=self._kept, weight=self._weight(orientation_deg)
+        )
+        self._queries.append(levels)
 
     def _replace(self, queries: Sequence[LevelArray]) -> None:
         """Compute the belief again from other descriptions of the same views."""
@@ -79,9 +83,9 @@ class DenseSession:
         if same or not queries:
             return
         orientations_deg = self.belief.orientation_deg.tolist()
-        self._so_far, self._queries = self._index, list(queries)
+        self._so_far, self._queries = self._index, []
         for query, orientation_deg in zip(queries, orientations_deg, strict=True):
-            self._so_far = self.belief = update_belief(query, orientation_deg, self._so_far, kept=self._kept)
+            self._extend(query, orientation_deg)
 
     def next_best_view(self, rotations_deg: ArrayLike | None = None, seconds: ArrayLike | None = None) -> NextBestView:
         """Return the rotation to the next best view, as `hbr.next_best_view` does."""

@@ -1,5 +1,7 @@
 """The dense Hough filter against its formula written out."""
 
+import pickle
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -142,3 +144,11 @@ def test_invalid_query_is_rejected() -> None:
         DenseIndex(Views.empty())
     with pytest.raises(ValueError, match=r"power is 0\.5"):
         DenseIndex(catalog(1), power=0.5)
+
+
+def test_index_of_another_process_whitens_in_the_same_way() -> None:
+    index = DenseIndex(catalog(3))
+    copied = pickle.loads(pickle.dumps(index))
+    np.testing.assert_array_equal(
+        copied.whitening.unit(index.views.descriptors[:5]), index.whitening.unit(index.views.descriptors[:5])
+    )

@@ -78,12 +78,12 @@ def test_visited_view_has_no_expected_gain() -> None:
 @given(st.integers(0, 23), st.floats(5, 100))
 def test_expected_confusion_equals_the_formula(start: int, sharpness: float) -> None:
     """Once more from the posterior of single hypotheses that the decision keeps, written out."""
-    from hbr.dense.next_view import _strongest
+    from hbr.dense.next_view import strongest
 
     belief = update_belief(viewed(start * STEP), 20.0, INDEX)
     revolutions = np.array([-120.0, 33.0, 90.0])
     see = next_best_view(belief, beta=40.0, sharpness=sharpness, rotations_deg=revolutions)
-    probability, place, bins = _strongest(belief.posterior(40.0))
+    probability, place, bins = strongest(belief.posterior(40.0))
     for rotation, confusion in zip(revolutions, see.confusion, strict=True):
         novelty = 1 - np.exp(-0.5 * (min(abs(rotation), 360 - abs(rotation)) / 15) ** 2)
         away = [

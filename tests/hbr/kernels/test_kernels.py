@@ -180,6 +180,10 @@ def test_the_nearest_objects_are_those_of_the_reference(counts: list[int], kept:
     some = index.only(np.sort(shuffled))
     np.testing.assert_array_equal(some.best(query), best[np.sort(shuffled)])
     np.testing.assert_array_equal(some.nearest(query, 1), [best[np.sort(shuffled)].argmax()])
+    several = np.concatenate([query[None], rows_of("edges+colours", 2, rng), levels[:1]])
+    with without_library():
+        nearest = reference.nearest(several, min(kept, len(counts)))
+    np.testing.assert_array_equal(index.nearest(several, min(kept, len(counts))), nearest)
 
 
 @pytest.mark.parametrize(
