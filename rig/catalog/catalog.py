@@ -260,6 +260,10 @@ class Catalog(AbstractContextManager["Catalog"]):
         with self.database.read() as connection:
             return object_summaries(connection, objects.c.deleted_utc.is_(None))
 
+    def known_objects(self) -> list[ObjectSummary]:
+        """Return the objects that need not be enrolled: those in use. A journal adds those of its server."""
+        return self.objects()
+
     def first_views(self) -> dict[str, int]:
         """Return the id of one view of each object in use, to show the object by."""
         with self.database.read() as connection:

@@ -47,8 +47,10 @@ class _Checked(TypeDecorator[Any]):
         cls.cache_ok = True  # SQLAlchemy does not inherit it
 
     def check(self, value: Any) -> None:
-        """Raise ValueError or TypeError for a value that this program would not have stored."""
-        raise NotImplementedError
+        """Raise ValueError or TypeError for a value that this program would not have stored.
+
+        Without one of its own, the conversion of a column checks its values.
+        """
 
     def result_processor(self, dialect: Dialect, coltype: object) -> Callable[[Any], Any]:
         convert = super().result_processor(dialect, coltype)
@@ -77,9 +79,6 @@ class Utc(_Checked):
 
     def process_result_value(self, value: datetime | None, dialect: Dialect) -> datetime | None:  # noqa: ARG002
         return value if value is None else value.replace(tzinfo=UTC)
-
-    def check(self, value: Any) -> None:
-        pass  # the conversion has checked it
 
 
 class Words(_Checked):

@@ -6,13 +6,14 @@ Every row keeps its id and its digest. The rows are copied in one transaction, a
 from collections.abc import Generator
 from typing import Any, NamedTuple
 
-from sqlalchemy import Connection, Table, func, insert, select, text
+from sqlalchemy import Connection, Table, func, select, text
 
 from rig.catalog import audit
 from rig.catalog.catalog import Catalog
 from rig.catalog.jobs import JobProgress
 from rig.catalog.postgres import set_property
-from rig.catalog.schema import APPEND_ONLY, METADATA, objects, results, sessions, views
+from rig.catalog.rows import copied_columns, insert_copies
+from rig.catalog.schema import APPEND_ONLY, METADATA, SCHEMA_VERSION, objects, results, sessions, views
 from rig.catalog.seal import appended_digests, damage_of, enrollment_digests, object_digests
 from rig.core.errors import CatalogDamaged, CatalogError
 from rig.views import image_files as images
@@ -40,11 +41,15 @@ def copy_catalog(source: Catalog, target: Catalog) -> Generator[JobProgress, Non
 
     Raises
     ------
+    CatalogOutdated
+        The source must be migrated first.
     CatalogError, CatalogBusy
         The target is not empty, or one of them cannot be used.
     CatalogDamaged
         Something in the source is not as it was stored.
     """
+    if source.database.version < SCHEMA_VERSION:
+        raise source.database.outdated()
     with source.database.read() as reading:
         damage = damage_of(reading, None, None)
         if damage is not None:
@@ -125,9 +130,11 @@ def _copy_image(source: Catalog, target: Catalog, name: str, sha256: str) -> int
 
 
 def _copy_rows(reading: Connection, writing: Connection, table: Table) -> None:
-    rows = reading.execution_options(yield_per=_AT_ONCE).execute(select(table).order_by(*table.primary_key))
+    rows = reading.execution_options(yield_per=_AT_ONCE).execute(
+        select(*copied_columns(reading, table)).order_by(*table.primary_key)
+    )
     for part in rows.partitions(_AT_ONCE):
-        writing.execute(insert(table), [dict(row._mapping) for row in part])
+        insert_copies(writing, table, part)
 
 
 def _give_ids(connection: Connection, given: dict[str, int]) -> None:

@@ -13,7 +13,7 @@ from sqlalchemy import Connection, Table, insert, text
 from rig.catalog.image_store import ImageStore
 from rig.catalog.schema import RESULTS_VERSION, SCHEMA_VERSION
 from rig.config.catalog_place import CatalogPlace
-from rig.core.errors import CatalogOutdated
+from rig.core.errors import CatalogError, CatalogOutdated
 
 
 class Database(ABC):
@@ -90,6 +90,10 @@ class Database(ABC):
         """Return whether another query can find something new since the last call."""
         return True
 
+    def read_only_error(self) -> CatalogError:
+        """Return the error for a change of a catalog that is open for reading."""
+        return CatalogError(f"the catalog {self.place} is open for reading only", next_step="open it for writing")
+
     def outdated(self) -> CatalogOutdated:
         """Return the error for a catalog that must be migrated first."""
         return CatalogOutdated(
@@ -98,6 +102,16 @@ class Database(ABC):
             next_step="migrate it (a backup is made): rig catalog migrate",
             evidence={"found": self.version, "known": SCHEMA_VERSION},
         )
+
+
+def newer(place: CatalogPlace, version: int) -> CatalogError:
+    """Return the error for a catalog of a version that this program does not know."""
+    return CatalogError(
+        f"the catalog {place} was written by a newer program: its schema has version {version}, "
+        f"this program knows {SCHEMA_VERSION}",
+        next_step="update hbr-rig on this computer",
+        evidence={"found": version, "known": SCHEMA_VERSION},
+    )
 
 
 def insert_row(connection: Connection, table: Table, **values: object) -> int:

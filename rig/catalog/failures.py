@@ -55,7 +55,7 @@ def _of_server(error: DBAPIError, place: CatalogPlace, busy_timeout_s: float) ->
     evidence = {"sqlstate": state, "server": str(error.orig)}
     if state == "55P03":
         return CatalogBusy(
-            f"another process has been writing to the catalog {place} for {busy_timeout_s:g} s; nothing was changed",
+            f"another process has been using the catalog {place} for {busy_timeout_s:g} s; nothing was changed",
             next_step="wait until it has finished, and try again",
             evidence=evidence,
         )

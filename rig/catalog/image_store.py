@@ -95,6 +95,10 @@ class ImageStore(ABC):
     def mark(self) -> str | None:
         """Return the id of the catalog that the images belong to."""
 
+    def is_empty(self) -> bool:
+        """Return whether there is nothing at all, as in a network share that is not mounted."""
+        return False
+
     @abstractmethod
     def set_mark(self, catalog_id: str) -> None:
         """Store the id of the catalog that the images belong to."""
@@ -188,6 +192,9 @@ class FolderImages(ImageStore):
             return read_local(self.root / MARK, max_bytes=100).decode()
         return None
 
+    def is_empty(self) -> bool:
+        return not self.root.is_dir() or not any(self.root.iterdir())
+
     def set_mark(self, catalog_id: str) -> None:
         self.root.mkdir(parents=True, exist_ok=True)
         write_local(self.root / MARK, catalog_id.encode(), mode=file_mode(self.root))
@@ -211,10 +218,9 @@ class FsspecImages(ImageStore):
         image_file(self._cache, name)
 
     def read(self, name: str) -> bytes:
+        if self._size(name) > images.MAX_FILE_BYTES:
+            raise OSError(None, f"it is larger than {images.MAX_FILE_BYTES} bytes", name)
         with self._store() as (files, root):
-            size = files.info(f"{root}/{name}")["size"]
-            if size > images.MAX_FILE_BYTES:
-                raise OSError(None, f"it is larger than {images.MAX_FILE_BYTES} bytes", name)
             return bytes(files.cat_file(f"{root}/{name}"))
 
     def file(self, name: str) -> Path:
@@ -243,9 +249,13 @@ class FsspecImages(ImageStore):
         return {str(path)[len(root) :].lstrip("/") for path in found}
 
     def size(self, name: str) -> int:
-        with suppress(FileNotFoundError), self._store() as (files, root):
-            return int(files.info(f"{root}/{name}")["size"])
+        with suppress(FileNotFoundError):
+            return self._size(name)
         return 0
+
+    def _size(self, name: str) -> int:
+        with self._store() as (files, root):
+            return int(files.info(f"{root}/{name}")["size"])
 
     def remove(self, names: Iterable[str]) -> None:
         with self._store() as (files, root):

@@ -10,34 +10,28 @@ import json
 import shutil
 from contextlib import suppress
 from datetime import datetime
-from pathlib import Path
 from typing import Any, Final
 
-from sqlalchemy import Connection, Table, delete, insert, select
+from sqlalchemy import Connection, Table, delete, select
 
 from rig.catalog.catalog import Catalog
 from rig.catalog.queries import retrieved
+from rig.catalog.rows import copied_columns, insert_copies
 from rig.catalog.schema import descriptors, enrollments, objects, sessions, views
 from rig.config.catalog_place import CatalogPlace
 from rig.core.clock import Clock
-from rig.core.errors import CatalogError
+from rig.core.errors import CatalogUnavailable
 from rig.core.files import json_values, read, write
 
-FOLDER: Final = "local-copy"
 STATE: Final = "state.json"
 RULES: Final = "search_rules.json"
 _AT_ONCE: Final = 100
 """Enrollments that are read from the server at once."""
 
 
-def copy_folder(place: CatalogPlace) -> Path:
-    """Return the folder of the local copy of a catalog on a server."""
-    return place.path / FOLDER
-
-
 def update_copy(catalog: Catalog) -> bool:
     """Bring the local copy up to date; return whether anything had changed. Only changed objects are read."""
-    folder = copy_folder(catalog.place)
+    folder = catalog.place.copy_folder
     with Catalog.open(folder, clock=catalog.clock) as copy:
         with catalog.database.read() as reading, copy.database.write() as writing:
             now, before = _used(reading), _used(writing)
@@ -67,23 +61,44 @@ def open_copy(place: CatalogPlace, clock: Clock) -> Catalog:
 
     Raises
     ------
-    CatalogError
+    CatalogUnavailable
         There is no copy of this catalog.
     """
-    folder = copy_folder(place)
+    folder = place.copy_folder
     try:
         state = json_values(read(folder / STATE, max_bytes=10_000))
         if state["catalog"] != str(place):
             raise ValueError("a copy of another catalog")
         copied_utc = datetime.fromisoformat(state["copied_utc"])
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise CatalogError(
-            f"the server of the catalog {place} does not answer, and this computer has no copy of it",
-            next_step="check the network and the server; a copy is made when a search uses the server",
+        raise CatalogUnavailable(
+            f"this computer has no copy of the catalog {place}",
+            next_step="a copy is made when a search uses the server",
         ) from error
     copy = Catalog.open(folder, clock=clock, create=False, read_only=True)
     copy.copied_utc = copied_utc
     return copy
+
+
+def open_or_copy(place: CatalogPlace, clock: Clock) -> Catalog:
+    """Return a catalog, open for reading; its local copy while its server or its store does not answer.
+
+    Raises
+    ------
+    CatalogUnavailable
+        There is no copy either.
+    """
+    try:
+        return Catalog.open(place, clock=clock, create=False, read_only=True)
+    except CatalogUnavailable as error:
+        try:
+            return open_copy(place, clock)
+        except CatalogUnavailable as missing:
+            raise CatalogUnavailable(
+                f"{error.what}, and {missing.what}",
+                next_step=f"{error.next_step}; {missing.next_step}",
+                evidence=error.evidence,
+            ) from error
 
 
 def _used(connection: Connection) -> set[tuple[Any, ...]]:
@@ -106,9 +121,8 @@ def _remove(connection: Connection, enrollment_ids: set[int], object_ids: set[in
 
 def _copy(reading: Connection, writing: Connection, table: Table, key: Any, ids: list[int]) -> None:
     for start in range(0, len(ids), 500):
-        rows = reading.execute(select(table).where(key.in_(ids[start : start + 500]))).mappings().all()
-        if rows:
-            writing.execute(insert(table), [dict(row) for row in rows])
+        wanted = select(*copied_columns(reading, table)).where(key.in_(ids[start : start + 500]))
+        insert_copies(writing, table, reading.execute(wanted))
 
 
 def _newest_empty_table(connection: Connection) -> str | None:

@@ -17,17 +17,20 @@ from sqlalchemy.exc import ArgumentError, NoSuchModuleError
 
 from rig.catalog import audit
 from rig.catalog.columns import damaged
-from rig.catalog.database import Database
+from rig.catalog.database import Database, newer
 from rig.catalog.failures import server_errors
 from rig.catalog.image_store import open_store
 from rig.catalog.schema import APPEND_ONLY, METADATA, READABLE_VERSION, SCHEMA_VERSION
 from rig.config.catalog_place import CatalogPlace
 from rig.core.clock import Clock
-from rig.core.errors import CatalogError, ConfigError, ExtraMissing
+from rig.core.errors import CatalogError, CatalogUnavailable, ConfigError, ExtraMissing
 from rig.core.files import make_folder
 
 CHANNEL: Final = "hbr_rig_catalog"
 """Channel of the notifications about changes; the payload is the id of the catalog."""
+
+FIRST_VERSION: Final = 4
+"""The first version of the schema that a server could have. The steps before it are for SQLite."""
 
 APPLICATION: Final = "hbr-rig catalog"
 
@@ -109,7 +112,7 @@ class PostgresDatabase(Database):
     @contextmanager
     def write(self, enrollment_id: int | None = None) -> Iterator[Connection]:
         if self._read_only:
-            raise CatalogError(f"the catalog {self.place} is open for reading only", next_step="open it for writing")
+            raise self.read_only_error()
         with self.catalog_errors(), self._writing.begin() as connection:
             # The transaction sees what was committed before it got the lock: each query has a snapshot of its own.
             lock_catalog(connection, enrollment_id)
@@ -148,6 +151,11 @@ class PostgresDatabase(Database):
             raise CatalogError(f"{where} has the images of another catalog than {self.place}", next_step=fix)
         with self.read() as connection:
             used = connection.scalar(select(func.count()).select_from(METADATA.tables["enrollments"])) or 0
+        if used and self.images.is_empty():
+            raise CatalogUnavailable(
+                f"the images of the catalog {self.place} are not in {where}, which is empty",
+                next_step=f"mount the network share if it is not mounted; or {fix}",
+            )
         if used:
             raise CatalogError(f"the images of the catalog {self.place} are not in {where}", next_step=fix)
         if not self._read_only:
@@ -176,10 +184,10 @@ class PostgresDatabase(Database):
 
     def may_have_changed(self) -> bool:
         """Ask the server's notifications; without a connection the answer is yes, so that the next query reports it."""
+        import psycopg
+
         try:
             if self._listener is None or self._listener.closed:
-                import psycopg
-
                 url = make_url(str(self.place.url)).set(drivername="postgresql").render_as_string(hide_password=False)
                 self._listener = psycopg.connect(url, autocommit=True, connect_timeout=5)
                 self._listener.execute(f"LISTEN {CHANNEL}")
@@ -189,7 +197,7 @@ class PostgresDatabase(Database):
                 found = found or one.payload == self.id
             self._listener.execute("SELECT 1")
             return found
-        except Exception:  # of any kind: the connection is lost
+        except (psycopg.Error, OSError):  # the connection is lost
             self._listener = None
             return True
 
@@ -278,13 +286,10 @@ def _version(found: dict[str, str], place: CatalogPlace) -> int:
         version = int(found["version"])
     except (KeyError, ValueError) as error:
         raise damaged("the version of its schema", found.get("version")) from error
+    if version < FIRST_VERSION:
+        raise damaged("the version of its schema", version)
     if version > SCHEMA_VERSION:
-        raise CatalogError(
-            f"the catalog {place} was written by a newer program: its schema has version {version}, "
-            f"this program knows {SCHEMA_VERSION}",
-            next_step="update hbr-rig on this computer",
-            evidence={"found": version, "known": SCHEMA_VERSION},
-        )
+        raise newer(place, version)
     return version
 
 

@@ -1,12 +1,27 @@
 """Insert sessions and views into the tables. Enrolled and imported views take the same path."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import datetime
 from typing import Any, Final
 
-from sqlalchemy import ColumnElement, Connection, and_, insert, select, update
+from sqlalchemy import (
+    JSON,
+    ColumnElement,
+    Connection,
+    Row,
+    Table,
+    Text,
+    and_,
+    bindparam,
+    cast,
+    insert,
+    select,
+    type_coerce,
+    update,
+)
 
+from rig.catalog.columns import JsonText
 from rig.catalog.database import insert_row
 from rig.catalog.records import EnrollmentStatus, ImageFile, PackedDescriptor, Provenance
 from rig.catalog.schema import descriptors, enrollments, sessions, views
@@ -85,6 +100,26 @@ def insert_views(connection: Connection, enrollment_id: int, new: Sequence[NewVi
         ],
     )
     return ids
+
+
+def copied_columns(connection: Connection, table: Table) -> list[ColumnElement[Any]]:
+    """Return the columns of a table for `insert_copies`: JSON as the stored text, because digests are over the text."""
+    as_text = cast if connection.dialect.name == "postgresql" else type_coerce
+    return [
+        as_text(column, Text).label(column.name) if isinstance(column.type, JsonText) else column
+        for column in table.columns
+    ]
+
+
+def insert_copies(connection: Connection, table: Table, rows: Iterable[Row[Any]]) -> None:
+    """Insert rows that were read by `copied_columns`, from either engine."""
+    values: dict[str, Any] = {}
+    for column in table.columns:
+        values[column.name] = bindparam(column.name, type_=Text if isinstance(column.type, JsonText) else column.type)
+        if isinstance(column.type, JsonText) and connection.dialect.name == "postgresql":
+            values[column.name] = cast(values[column.name], JSON)
+    if copies := [dict(row._mapping) for row in rows]:
+        connection.execute(insert(table).values(values), copies)
 
 
 def of_status(object_id: int, status: EnrollmentStatus) -> ColumnElement[bool]:

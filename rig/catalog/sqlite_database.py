@@ -16,7 +16,7 @@ from typing import Any
 from sqlalchemy import Connection, NullPool, QueuePool, create_engine, event
 
 from rig.catalog.columns import FIX, damaged
-from rig.catalog.database import Database
+from rig.catalog.database import Database, newer
 from rig.catalog.failures import absent, catalog_errors
 from rig.catalog.image_store import open_store
 from rig.catalog.places import check_folder
@@ -86,7 +86,7 @@ class SqliteDatabase(Database):
     @contextmanager
     def write(self, enrollment_id: int | None = None) -> Iterator[Connection]:  # noqa: ARG002 - one writer at a time
         if self._read_only:
-            raise CatalogError(f"the catalog {self.root} is open for reading only", next_step="open it for writing")
+            raise self.read_only_error()
         with self.catalog_errors(), self._writing.begin() as connection:
             yield connection
 
@@ -216,12 +216,7 @@ def version_of(connection: Connection, root: Path) -> int:
             f"{root / DATABASE_NAME} is the database of another program", next_step="give the folder of a catalog"
         )
     if version > SCHEMA_VERSION:
-        raise CatalogError(
-            f"the catalog {root} was written by a newer program: its schema has version {version}, "
-            f"this program knows {SCHEMA_VERSION}",
-            next_step="update hbr-rig on this computer",
-            evidence={"found": version, "known": SCHEMA_VERSION},
-        )
+        raise newer(CatalogPlace(root), version)
     if version < 1:
         raise damaged("the version of its schema", version)
     return version

@@ -36,6 +36,11 @@ class CatalogPlace:
     def database_file(self) -> Path:
         return self.path / DATABASE_NAME
 
+    @property
+    def copy_folder(self) -> Path:
+        """Folder of the local copy of a catalog on a server (`rig.catalog.local_copy`)."""
+        return self.path / "local-copy"
+
     def may_exist(self) -> bool:
         """Return whether there is a database file. Whether a server has a catalog is not known before it is asked."""
         return self.url is not None or self.database_file.exists()

@@ -130,7 +130,7 @@ def read_tray(path: Path) -> tuple[TrayItem, ...]:
 
 def left_to_enroll(catalog: Catalog, items: Sequence[TrayItem]) -> list[TrayItem]:
     """Return the objects of a tray that are not enrolled, or whose enrollment was interrupted."""
-    enrolled = {known.name for known in catalog.objects() if known.views and known.unfinished_views is None}
+    enrolled = {known.name for known in catalog.known_objects() if known.views and known.unfinished_views is None}
     return [item for item in items if item.name not in enrolled]
 
 
@@ -170,7 +170,7 @@ def enroll_tray(
     operator = operator or AutomaticOperator()
     for number, item in enumerate(items, 1):
         while True:
-            known = {summary.name: summary for summary in catalog.objects()}.get(item.name)
+            known = {summary.name: summary for summary in catalog.known_objects()}.get(item.name)
             interrupted = known if known is not None and known.unfinished_views is not None else None
             if known is not None and interrupted is None and known.views:
                 yield Item(number, len(items), item.name, "skip", SkipReason.ALREADY_ENROLLED)

@@ -218,7 +218,12 @@ class DenseSearch(Search):
         return Ranked(belief.queries - 1, candidates, candidates[0].score - others, decision)
 
     def _decide(self, ranked: Ranked, table_deg: float) -> Rotate | Finish:  # noqa: ARG002
-        rotations_deg, seconds = reachable_rotations(self._config, table_deg)
+        return self._next(table_deg, *reachable_rotations(self._config, table_deg))
+
+    def _next(
+        self, table_deg: float, rotations_deg: NDArray[np.float64], seconds: NDArray[np.float64]
+    ) -> Rotate | Finish:
+        """Ask the strategy, which chooses among these rotations of the camera."""
         state = DenseSearchState(
             session=self._session,
             decision=self._session.decision,
@@ -292,18 +297,7 @@ class ArcSearch(DenseSearch):
     def _decide(self, ranked: Ranked, table_deg: float) -> Rotate | Finish:  # noqa: ARG002
         if self._step is None or self.is_new_decision:
             way = float(np.sign(self._step.rotation_deg)) if isinstance(self._step, Rotate) else 0.0
-            rotations_deg, seconds = reachable_arcs(self._config, table_deg, way)
-            self._step = self._strategy.next(
-                DenseSearchState(
-                    session=self._arc,
-                    decision=self._arc.decision,
-                    rotations_deg=rotations_deg,
-                    seconds=seconds,
-                    table_deg=table_deg,
-                    config=self._config.identify,
-                    rng=self._rng,
-                )
-            )
+            self._step = self._next(table_deg, *reachable_arcs(self._config, table_deg, way))
         return self._step
 
 

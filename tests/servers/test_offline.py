@@ -6,23 +6,37 @@ import sys
 import uuid
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
+from click import Command, Context
 from typer.testing import Result
 
 from rig.catalog import Catalog, edit
-from rig.catalog.journal import Journal, deliver, journal_folder, waiting
-from rig.catalog.local_copy import open_copy, update_copy
+from rig.catalog.delivery import deliver
+from rig.catalog.journal import Journal, journal_folder, waiting
+from rig.catalog.local_copy import open_copy, open_or_copy, update_copy
 from rig.catalog.results import find_results
 from rig.catalog.results import record as record_result
 from rig.catalog.verify import Problem, verify
+from rig.cli.ui.complete import object_names
 from rig.config.catalog_place import CatalogPlace
 from rig.core.clock import SystemClock
-from rig.core.errors import CatalogError, CatalogUnavailable, ObjectExists
+from rig.core.errors import CatalogDamaged, CatalogError, CatalogUnavailable, ObjectExists
 from rig.events.events import NoteCode
+from rig.plans.tray import TrayItem, left_to_enroll
 from rig.search.current_model import CurrentModel
 from tests.programs import Program
-from tests.rig.catalog.catalog_samples import die_at, finished, image, new_result, true_fill
+from tests.rig.catalog.catalog_samples import (
+    PROVENANCE,
+    described,
+    die_at,
+    finished,
+    image,
+    new_result,
+    record,
+    true_fill,
+)
 from tests.servers.postgres import PostgresServer, place_in, server
 
 CLOCK = SystemClock()
@@ -48,6 +62,11 @@ def place(postgres: PostgresServer, tmp_path: Path) -> CatalogPlace:
 def names(place: CatalogPlace) -> dict[str, int]:
     with Catalog.open(place, clock=CLOCK, read_only=True) as catalog:
         return {one.name: one.views for one in catalog.objects() if one.enrolled_utc is not None}
+
+
+def settings_of(place: CatalogPlace) -> list[str]:
+    values = {"path": str(place.path), "url": place.url, "images": place.images}
+    return [f"catalog.{key}={json.dumps(value)}" for key, value in values.items()]
 
 
 def test_copy_has_what_searches_compare_and_follows(place: CatalogPlace) -> None:
@@ -132,9 +151,7 @@ def test_conflict_is_kept_and_resolved_by_a_person(
     with Catalog.open(place, clock=CLOCK) as shared:
         for number, name in enumerate(("star", "cube", "cone")):
             true_fill(shared, name, 3, 40 + 3 * number)
-    settings = [f"catalog.path={json.dumps(str(place.path))}", f"catalog.url={json.dumps(place.url)}"]
-    settings.append(f"catalog.images={json.dumps(place.images)}")
-    words = [word for one in settings for word in ("--set", one)]
+    words = [word for one in settings_of(place) for word in ("--set", one)]
     reported = rig("catalog", "deliver", *words)
     assert reported.exit_code == 7, reported.output
     assert "another object of that name; nothing is lost" in reported.stderr
@@ -146,6 +163,162 @@ def test_conflict_is_kept_and_resolved_by_a_person(
     assert names(place) == {"mug": 2, "tin": 2, "star": 3, "cube": 2, "cone": 3, "star-2": 2}
     with Catalog.open(place, clock=CLOCK) as shared:
         assert finished(verify(shared, jobs=1)).findings == ()
+
+
+def test_names_of_the_server_are_known_before_the_table_is_cleared(
+    postgres: PostgresServer, place: CatalogPlace
+) -> None:
+    with Journal.of(place, CLOCK) as journal:
+        true_fill(journal, "star", 2, 30)
+        unfinished = journal.begin("cube", planned_azimuth_deg=[0.0], provenance=PROVENANCE)
+        unfinished.add(record(0), image(1))
+        with pytest.raises(ObjectExists, match="'mug' is enrolled already"):
+            journal.check_enrollable("mug")
+        journal.check_enrollable("mug", replace=True)
+        journal.check_enrollable("cone")
+        items = [TrayItem(1, name) for name in ("mug", "star", "cube", "cone", "tin")]
+        assert [one.name for one in left_to_enroll(journal, items)] == ["cube", "cone"]
+        postgres.stop()
+        try:  # by the local copy
+            assert [one.name for one in left_to_enroll(journal, items)] == ["cube", "cone"]
+            journal.check_enrollable("mug")  # its name is compared when the server is back
+        finally:
+            postgres.start()
+
+
+def test_completion_offers_the_names_of_the_local_copy(place: CatalogPlace, monkeypatch: pytest.MonkeyPatch) -> None:
+    given = {"overrides": settings_of(place)}
+    monkeypatch.setattr(Catalog, "open", None)  # the server is not asked
+    context = Context(Command("enroll"))
+    context.params = given
+    assert object_names(context, "m") == ["mug"]
+
+
+def test_name_reserved_by_a_program_that_was_killed_is_free_for_its_bench(place: CatalogPlace) -> None:
+    with Journal.of(place, CLOCK) as journal, Catalog.open(place, clock=CLOCK) as shared:
+        with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt):
+            patch.setattr(journal.database, "write", _interrupt)
+            journal.begin("star", planned_azimuth_deg=[0.0], provenance=PROVENANCE)
+        assert shared.summary("star").unfinished_views == 0
+        journal.check_enrollable("star")
+        true_fill(journal, "star", 1, 30)
+        assert [one.conflict for one in deliver(journal, shared)] == [None]
+
+
+def _interrupt(*_: object, **__: object) -> Any:
+    raise KeyboardInterrupt
+
+
+def test_damage_in_the_journal_stays_there_and_is_reported(place: CatalogPlace) -> None:
+    with Journal.of(place, CLOCK) as journal, Catalog.open(place, clock=CLOCK) as shared:
+        for number, name in enumerate(("star", "cube", "cone")):
+            true_fill(journal, name, 2, 30 + 3 * number)
+        record_result(journal, new_result("found", "star"), image(1))
+        (recorded,) = find_results(journal)
+        store = journal.database.images
+        assert recorded.image is not None
+        store.remove([recorded.image, journal.object("cube").views[1].image])
+        store.write(journal.object("star").views[0].image, store.read(journal.object("star").views[1].image))
+        done = deliver(journal, shared)
+        assert [(one.name, type(one.conflict)) for one in done] == [
+            ("star", CatalogDamaged),
+            ("cube", CatalogDamaged),
+            ("cone", type(None)),
+        ]
+        assert set(names(place)) == {"mug", "tin", "cone"}
+        assert [one.name for one in journal.objects()] == ["star", "cube"]
+        (finding,) = finished(verify(shared, jobs=1)).findings
+        assert finding.problem is Problem.MISSING_IMAGE  # of the answer, which is there all the same
+
+
+def test_bench_works_while_its_share_is_not_mounted(place: CatalogPlace, tmp_path: Path) -> None:
+    share = tmp_path / "shared"
+    share.rename(tmp_path / "not mounted")
+    for mount_point in (False, True):
+        if mount_point:
+            share.mkdir()
+        with open_or_copy(place, CLOCK) as copy:
+            assert copy.copied_utc is not None
+        with Journal.of(place, CLOCK) as journal:
+            true_fill(journal, f"star {mount_point}", 2, 30)
+            assert journal.unreachable is not None
+            assert "mount the network share" in journal.unreachable.next_step
+    share.rmdir()
+    (tmp_path / "not mounted").rename(share)
+    with Journal.of(place, CLOCK) as journal, Catalog.open(place, clock=CLOCK) as shared:
+        assert [one.conflict for one in deliver(journal, shared)] == [None, None]
+        assert finished(verify(shared, jobs=1)).findings == ()
+
+
+def test_each_object_of_a_tray_is_delivered_and_none_is_asked_for_again(
+    place: CatalogPlace, rig: Callable[..., Result], tmp_path: Path
+) -> None:
+    words = [word for one in settings_of(place) for word in ("--set", one)]
+    words += [
+        "--views",
+        "4",
+        "--set",
+        "camera.width=320",
+        "--set",
+        "camera.height=240",
+        "--set",
+        "view.roi=[40,0,240,240]",
+    ]
+    seen = []
+    for listed in (["toy-house"], ["toy-house", "toy-car", "mug"]):
+        (tmp_path / "tray.csv").write_text("name\n" + "\n".join(listed))
+        done = rig("enroll", "--list", "tray.csv", "--json", *words)
+        assert done.exit_code == 0, done.output
+        events = [json.loads(line) for line in done.stdout.splitlines()]
+        seen.append([(one["name"], one["action"]) for one in events if one["event"] == "item"])
+        assert f"Delivered {listed[min(1, len(listed) - 1)]} with 4 views" in done.stderr
+    assert seen == [
+        [("toy-house", "enroll")],
+        [("toy-house", "skip"), ("toy-car", "enroll"), ("mug", "skip")],
+    ]
+    assert names(place) == {"mug": 2, "tin": 2, "toy-house": 4, "toy-car": 4}
+
+
+def killed_enrollment() -> None:
+    """Enroll an object through the journal, and die before a durable step."""
+    folder, url, shared_images, step = sys.argv[1:5]
+    here = CatalogPlace(Path(folder), url, shared_images)
+    with Journal.of(here, CLOCK) as journal:
+        die_at(int(step))
+        true_fill(journal, f"object {step}", 2, int(step))
+    print("enrolled", flush=True)
+    os._exit(0)
+
+
+@pytest.mark.parametrize("every", [7, pytest.param(1, marks=pytest.mark.nightly)])
+def test_enrollment_is_continued_after_a_kill_at_any_point(place: CatalogPlace, every: int) -> None:
+    code = "from tests.servers.test_offline import killed_enrollment; killed_enrollment()"
+    expected = names(place)
+    for step in range(1, 200, every):
+        name = f"object {step}"
+        expected[name] = 2
+        program = Program(str(place.path), str(place.url), str(place.images), str(step), code=code)
+        out, errors = program.communicate(60)
+        with Journal.of(place, CLOCK) as journal, Catalog.open(place, clock=CLOCK) as shared:
+            known = {one.name: one for one in journal.known_objects()}.get(name)
+            if known is None:
+                true_fill(journal, name, 2, step)
+            elif known.unfinished_views is not None:
+                enrollment = journal.resume(name, provenance=PROVENANCE)
+                for index in enrollment.missing():
+                    enrollment.add(described(index, step + index), image(step + index))
+                enrollment.finish()
+            assert [one.conflict for one in deliver(journal, shared)] == [None]
+        assert names(place) == expected, step
+        if "enrolled" in out:
+            break
+        assert program.returncode == -9, errors
+    else:
+        raise AssertionError("the enrollment has more steps")
+    assert step > 10
+    with Catalog.open(place, clock=CLOCK) as shared:
+        assert finished(verify(shared, jobs=1)).findings == ()
+        assert {one.unfinished_views for one in shared.objects()} == {None}
 
 
 def killed_delivery() -> None:

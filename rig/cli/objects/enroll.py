@@ -98,6 +98,7 @@ def enroll(
         _dry_run(settings, names, views, resume=resume, replace=replace)
         return
 
+    settings.deliver_waiting()
     with (
         settings.open_bench() as bench,
         settings.open_for_enrollment(bench.clock) as catalog,
@@ -131,7 +132,6 @@ def enroll(
                 report,
             )
             job.print_total(len(items))
-    settings.deliver()
 
 
 def _command(settings: Settings, given: "Mapping[str, Any]", *arguments: str) -> str:
@@ -190,6 +190,7 @@ class _Job:
                     self._enrolled += 1
                     self._complete()
                     self._stored_views = 0
+                    self._deliver()
         except BaseException:
             self.close_view()
             if self._stored_views or self._enrolled:
@@ -200,6 +201,14 @@ class _Job:
             self.close_view()
             if report is not None and self._records:
                 self._write(report)
+
+    def _deliver(self) -> None:
+        """Deliver the object, so that the other benches have it before this one has enrolled the next."""
+        from rig.catalog.journal import Journal
+
+        if isinstance(self._catalog, Journal):
+            self.close_view()
+            self._settings.deliver()
 
     def print_total(self, items: int) -> None:
         if not self._settings.json:
@@ -214,6 +223,7 @@ class _Job:
             self._settings.print_json(event_dict(event))
         if isinstance(event, Started):
             self.close_view()
+            self._report_journal()
             self._records.append(EnrollmentRecord(region=self._bench.config.view.roi))
         if self._view is None:
             self._view = EnrollView(self._screen, self._bench.config, self._heading)
@@ -224,6 +234,15 @@ class _Job:
         # in a pipe, the text on stderr would only repeat the JSON
         if not self._settings.json or self._screen.is_terminal:
             self._view.add(event)
+
+    def _report_journal(self) -> None:
+        """Say that the server of the catalog does not answer, and that the views are stored all the same."""
+        from rig.catalog.journal import Journal
+
+        if isinstance(self._catalog, Journal) and self._catalog.unreachable is not None:
+            error = self._catalog.unreachable
+            text = f"Note: {error.what}. The views go into the journal of this computer. Next step: {error.next_step}"
+            print(text, file=sys.stderr)
 
     def _others(self, views: "Views", name: str) -> "Views":
         """Return the views of the journal's object with those of the server or of its local copy, if it is in one."""

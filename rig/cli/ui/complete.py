@@ -11,12 +11,15 @@ def object_names(ctx: typer.Context, incomplete: str) -> list[str]:
     import sqlite3
 
     from rig.cli.ui.settings import Settings
+    from rig.config.catalog_place import DATABASE_NAME
 
     # An unfinished command line can hold anything, such as an unknown bench or a file that is not a configuration.
     with suppress(Exception):
         given = {**(ctx.parent.params if ctx.parent else {}), **ctx.params}
         settings = Settings().merged(given.get("bench"), given.get("config"), given.get("overrides"), None, False)
-        path = settings.load().catalog_path(settings.bench_name) / "catalog.sqlite"
+        place = settings.load().catalog_place(settings.bench_name)
+        # A server may take long to answer, so its names are those of the last search on this computer.
+        path = place.database_file if place.url is None else place.copy_folder / DATABASE_NAME
         # sqlite3 directly: importing SQLAlchemy takes too long for completion.
         with closing(sqlite3.connect(f"{path.as_uri()}?mode=ro", uri=True, timeout=0.2)) as database:
             rows = database.execute(

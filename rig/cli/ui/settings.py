@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from rig.bench import Bench
     from rig.catalog import Action, Catalog
     from rig.catalog.background import BackgroundCheck
-    from rig.catalog.journal import Delivery
+    from rig.catalog.delivery import Delivery
     from rig.config import RigConfig
     from rig.core.clock import Clock
 
@@ -95,23 +95,16 @@ class Settings:
 
         The journal is delivered before, if there is something in it.
         """
-        from rig.catalog.journal import waiting
-        from rig.core.clock import SystemClock
-
-        if waiting(self.load().catalog_place(self.bench_name), SystemClock()):
-            self.deliver()
+        self.deliver_waiting()
         return self.open_shared()
 
     def open_shared(self) -> "Catalog":
         """Open the bench's catalog for reading; if its server does not answer, the local copy."""
-        from rig.catalog.local_copy import open_copy
+        from rig.catalog.local_copy import open_or_copy
         from rig.core.clock import SystemClock
-        from rig.core.errors import CatalogUnavailable
 
-        try:
-            return self.open_catalog(read_only=True)
-        except CatalogUnavailable:
-            return open_copy(self.load().catalog_place(self.bench_name), SystemClock())
+        place = self.load().catalog_place(self.bench_name)
+        return self.open_catalog(read_only=True) if place.url is None else open_or_copy(place, SystemClock())
 
     def open_for_enrollment(self, clock: "Clock") -> "Catalog":
         """Open the catalog for new views: the journal of this computer if the catalog is on a server."""
@@ -120,10 +113,18 @@ class Settings:
         place = self.load().catalog_place(self.bench_name)
         return self.open_catalog(clock=clock, create=True) if place.url is None else Journal.of(place, clock)
 
+    def deliver_waiting(self) -> None:
+        """Deliver the journal if something is in it."""
+        from rig.catalog.journal import waiting
+        from rig.core.clock import SystemClock
+
+        if waiting(self.load().catalog_place(self.bench_name), SystemClock()):
+            self.deliver()
+
     def deliver(self, *, replacing: "Collection[str]" = ()) -> "list[Delivery]":
         """Deliver the journal to the server of the catalog; print what was delivered, and why something was not."""
+        from rig.catalog.delivery import deliver as job
         from rig.catalog.journal import Journal
-        from rig.catalog.journal import deliver as job
         from rig.core.clock import SystemClock
         from rig.core.errors import CatalogUnavailable
 
