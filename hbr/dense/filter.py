@@ -18,7 +18,7 @@ from functools import cached_property
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from hbr.core.angles import size_deg, wrap180, wrap360
 from hbr.core.arrays import FloatArray, IndexArray, LevelArray
@@ -203,12 +203,35 @@ class DenseIndex:
         """Number of views of each object."""
         return self._segments.lengths
 
-    def nearest_views(self, place: int, at_deg: float, count: int) -> IndexArray:
-        """Return the rows of an object's views that are nearest to an azimuth, (count,); of fewer views, some twice."""
+    def nearest_views(self, place: int, at_deg: ArrayLike, count: int) -> IndexArray:
+        """Return the rows of an object's views that are nearest to azimuths, (..., count); of fewer, some twice."""
         begin = self._segments.begin[place]
         rows = self._segments.order[begin : begin + self._segments.lengths[place]]
-        away_deg = size_deg(self.views.azimuth_deg[rows] - at_deg)
-        return np.resize(rows[np.argsort(away_deg, kind="stable")[:count]], count)
+        away_deg = size_deg(self.views.azimuth_deg[rows] - np.asarray(at_deg)[..., None])
+        nearest = np.argsort(away_deg, axis=-1, kind="stable")[..., np.arange(count) % len(rows)]
+        return rows[nearest]
+
+    def nearest_view(self, place: IndexArray, at_deg: FloatArray) -> tuple[IndexArray, FloatArray]:
+        """Return the view of each object, (m,), that is nearest to an azimuth, (a, m), and how far away it is.
+
+        Of equally near views, the one with the smaller azimuth.
+        """
+        count, columns = self._segments.lengths[place], np.arange(len(place))
+        own_deg = np.where(self.left_out[place], 900.0, self.azimuth_deg[place])
+        keys = (
+            own_deg + 1000.0 * columns[:, None]
+        )  # one rising row of all: column i lies between 1000 i and 1000 (i + 1)
+        behind = np.searchsorted(keys.ravel(), wrap360(at_deg) + 1000.0 * columns) - own_deg.shape[1] * columns
+        before, behind = (behind - 1) % count, behind % count
+        is_new = np.diff(own_deg, axis=1, prepend=-1.0) != 0
+        first = np.maximum.accumulate(np.where(is_new, np.arange(own_deg.shape[1]), 0), axis=1)
+        before = first[columns, before]
+        before_deg, behind_deg = (size_deg(own_deg[columns, at] - at_deg) for at in (before, behind))
+        is_before = (before_deg < behind_deg) | ((before_deg == behind_deg) & (before < behind))
+        return (
+            self.rows[place, np.where(is_before, before, behind)],
+            np.where(is_before, before_deg, behind_deg),
+        )
 
     @cached_property
     def _ring(self) -> tuple[IndexArray, FloatArray, Floats]:

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from hbr.core.angles import size_deg, wrap360
 from hbr.core.arrays import FloatArray, IndexArray
 from hbr.dense.filter import BETA, BINS, Belief
+from hbr.descriptors import Packed
 
 #: Largest number of compared hypotheses, and the share of the belief that is not compared.
 _STRONGEST: Final = 16
@@ -103,24 +104,25 @@ def next_best_view(
     novelty = 1 - np.exp(-0.5 * (apart_deg / _NEAR_DEG) ** 2)
     probability, place, bin_of = strongest(belief.posterior(beta))
     cost = second_costs * times_s
-    pairs = probability[:, None] * probability * (place[:, None] != place)
-    if pairs.any():
+    first, second = np.nonzero(np.triu(place[:, None] != place))  # pairs of different objects
+    if len(first):
         similar, known = expected_similarity(belief, place, bin_of, angles_deg)
-        tells = novelty[:, None, None] * np.sqrt(known[:, :, None] * known[:, None, :])
+        similar = similar[:, first, second]
+        tells = novelty[:, None] * np.sqrt(known[:, first] * known[:, second])
+        pairs = probability[first] * probability[second]
         remaining = pairs * np.exp(-sharpness * tells * (1 - similar))
-        confusion = np.log(np.maximum(remaining.sum(axis=(1, 2)), 1e-300))
+        confusion = np.log(np.maximum(2 * remaining.sum(axis=1), 1e-300))
     else:  # one object alone: a new side helps to find its azimuth
         confusion = -sharpness * novelty
     chosen = int((confusion + cost).argmin())
     pair: tuple[int, int] | None = None
     similarity: FloatArray | None = None
-    if pairs.any():
-        gained = pairs - remaining[chosen]
-        first, second = np.unravel_index(int(gained.argmax()), gained.shape)
+    if len(first):
+        most = int((pairs - remaining[chosen]).argmax())
         objects = belief.index.object_index
-        ordered = sorted((first, second), key=lambda i: -probability[i])
+        ordered = sorted((first[most], second[most]), key=lambda i: -probability[i])
         pair = int(objects[place[ordered[0]]]), int(objects[place[ordered[1]]])
-        similarity = similar[:, first, second]
+        similarity = similar[:, most]
     rotation_deg = float(angles_deg[chosen])
     return NextBestView(rotation_deg, wrap360(here_deg + rotation_deg), pair, angles_deg, confusion, cost, similarity)
 
@@ -138,7 +140,7 @@ def most_informative_rotation(belief: Belief, *, beta: float = BETA, rotations_d
     """
     angles_deg = _all_rotations() if rotations_deg is None else np.asarray(rotations_deg, np.float64)
     probability, place, bin_of = strongest(belief.posterior(beta))
-    similar, _ = expected_similarity(belief, place, bin_of, angles_deg)
+    similar, _ = expected_similarity(belief, place, bin_of, angles_deg, of_one_object=True)
     weights = probability * np.exp(
         beta / np.sqrt(belief.queries + 1) * (np.maximum(similar, 0) ** belief.index.power - 1)
     )
@@ -156,30 +158,40 @@ def _all_rotations() -> FloatArray:
 
 def strongest(posterior: FloatArray) -> tuple[FloatArray, IndexArray, IndexArray]:
     """Probability, object (its place) and bin of the strongest hypotheses, one peak of an object after the other."""
-    peaks = posterior * (posterior >= np.roll(posterior, 1, axis=1)) * (posterior >= np.roll(posterior, -1, axis=1))
+    around = np.concatenate([posterior[:, -1:], posterior, posterior[:, :1]], axis=1)
+    is_peak = (posterior >= around[:, :-2]) & (posterior >= around[:, 2:])
     # a peak stands for the slopes beside it
-    mass = posterior.sum(axis=1, keepdims=True)
-    total = peaks.sum(axis=1, keepdims=True)
-    weight = (peaks * np.divide(mass, total, out=np.zeros_like(mass), where=total > 0)).ravel()
-    count = min(_STRONGEST, len(weight))
+    mass = posterior.sum(axis=1)
+    total = (posterior * is_peak).sum(axis=1)
+    share = np.divide(mass, total, out=np.zeros_like(mass), where=total > 0)
+    peaks = np.flatnonzero(is_peak)
+    weight = posterior.ravel()[peaks] * share[peaks // posterior.shape[1]]
+    count = min(_STRONGEST, len(peaks))
     best = np.argpartition(-weight, count - 1)[:count]
     best = best[np.argsort(-weight[best], kind="stable")]
+    weight, best = weight[best], peaks[best]
     place, bin_of = np.divmod(best, posterior.shape[1])
     second = int((place != place[0]).argmax())  # a decision is between two objects, however unlikely the second
-    enough = max(1 + int(np.searchsorted(np.cumsum(weight[best]), 1 - _NEGLIGIBLE)), second + 1)
-    best, place, bin_of = best[:enough], place[:enough], bin_of[:enough]
-    return weight[best], place, bin_of
+    enough = max(1 + int(np.searchsorted(np.cumsum(weight), 1 - _NEGLIGIBLE)), second + 1)
+    return weight[:enough], place[:enough], bin_of[:enough]
 
 
 def expected_similarity(
-    belief: Belief, place: IndexArray, bin_of: IndexArray, angles_deg: FloatArray
+    belief: Belief, place: IndexArray, bin_of: IndexArray, angles_deg: FloatArray, *, of_one_object: bool = False
 ) -> tuple[FloatArray, FloatArray]:
-    """Similarity of what the hypotheses would show after each turn, (a, m, m), and how well that is known, (a, m)."""
+    """Return what the hypotheses would show after each rotation.
+
+    Returns
+    -------
+    similar : float64 array (a, m, m)
+        Similarity of each two; of one object, only if that is asked for.
+    known : float64 array (a, m)
+        How well that is known.
+    """
     index = belief.index
     seen_deg = bin_of * (360.0 / BINS) + belief.rotated_deg + angles_deg[:, None]
-    own_deg = index.azimuth_deg[place]
-    away_deg = size_deg(own_deg[None] - seen_deg[:, :, None])
-    away_deg[:, index.left_out[place]] = np.inf
-    nearest = away_deg.argmin(axis=2)
-    known = np.exp(-0.5 * (np.take_along_axis(away_deg, nearest[:, :, None], axis=2)[:, :, 0] / _NEAR_DEG) ** 2)
-    return index.compared.among(index.rows[place[None], nearest]), known
+    rows, away_deg = index.nearest_view(place, seen_deg)
+    known = np.exp(-0.5 * (away_deg / _NEAR_DEG) ** 2)
+    if isinstance(index.compared, Packed) and not of_one_object:
+        return index.compared.among(rows, place), known
+    return index.compared.among(rows), known

@@ -80,12 +80,14 @@ def evidence(
     if units is None:
         units = [index.whitening.unit(np.atleast_2d(query)) for query in queries]
     pose_deg = support[order].argmax(axis=1) * _BIN_DEG
+    rotated_deg = orientation_deg - orientation_deg[0]
+    places = zip(order.tolist(), pose_deg.tolist(), strict=True)
+    rows = np.stack([index.nearest_views(place, at_deg + rotated_deg, _NEXT) for place, at_deg in places])
+    near = index.whitening.unit(index.views.levels(rows.ravel())) if enrolled is None else enrolled[rows.ravel()]
+    near = near.reshape(*rows.shape, -1)
     white = np.zeros(len(order))
-    for unit, rotated_deg in zip(units, (orientation_deg - orientation_deg[0]).tolist(), strict=True):
-        places = zip(order.tolist(), (pose_deg + rotated_deg).tolist(), strict=True)
-        rows = np.stack([index.nearest_views(place, at_deg, _NEXT) for place, at_deg in places])
-        near = index.whitening.unit(index.views.levels(rows.ravel())) if enrolled is None else enrolled[rows.ravel()]
-        white += (unit @ near.T).max(axis=0).reshape(rows.shape).max(axis=1) / count
+    for n, unit in enumerate(units):
+        white += (near[:, n] @ unit.T).max(axis=(1, 2)) / count
     if len(order) == 1:
         alone[3:6] = white[0]
         return best, alone

@@ -254,5 +254,6 @@ class Packed:
     def only(self, rows: IndexArray, /) -> "Packed":
         return Packed(self._kind, self._rows.only(rows))
 
-    def among(self, rows: IndexArray, /) -> FloatArray:
-        return self._rows.among(rows)
+    def among(self, rows: IndexArray, kinds: IndexArray | None = None, /) -> FloatArray:
+        """Return the similarity of rows to each other within groups; of rows of one kind, (k,), 1."""
+        return self._rows.among(rows, kinds)

@@ -161,13 +161,18 @@ class PackedRows:
         )  # fmt: skip
         return similar
 
-    def among(self, rows: IndexArray) -> FloatArray:
-        """Return the similarity of rows to each other within groups: indices (g, k) in, (g, k, k) out."""
-        places = np.ascontiguousarray(rows if self._places is None else self._places[rows], np.int64)
+    def among(self, rows: IndexArray, kinds: IndexArray | None = None) -> FloatArray:
+        """Return the similarity of rows to each other within groups: indices (g, k) in, (g, k, k) out.
+
+        Rows of one kind, (k,), are not compared: 1.
+        """
+        places = _whole(rows if self._places is None else self._places[rows])
+        kinds = None if kinds is None else _whole(kinds)
         similar = np.empty((*places.shape, places.shape[1]))
         self._library.hbr_among(
-            self._by_address, *self._at, address(self.squares), address(places), *places.shape, address(similar)
-        )
+            self._by_address, *self._at, address(self.squares), address(places), *places.shape,
+            0 if kinds is None else address(kinds), address(similar),
+        )  # fmt: skip
         return similar
 
     def bounds(self, query: LevelArray, segments: Segments) -> FloatArray:

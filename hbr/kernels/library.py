@@ -22,7 +22,7 @@ _SIGNATURES: Final[dict[str, tuple[Any, ...]]] = {
     "hbr_similarity": (
         *[_POINTER] * 2, _INTEGER, _INTEGER, _POINTER, _INTEGER, _POINTER, _POINTER, _INTEGER, _POINTER,
     ),
-    "hbr_among": (_POINTER, _POINTER, _INTEGER, _POINTER, _POINTER, _INTEGER, _INTEGER, _POINTER),
+    "hbr_among": (_POINTER, _POINTER, _INTEGER, _POINTER, _POINTER, _INTEGER, _INTEGER, _POINTER, _POINTER),
     "hbr_bounds": (*[_POINTER] * 3, _INTEGER, *[_POINTER] * 3),
     "hbr_nearest": (*[_POINTER] * 3, _INTEGER, *[_POINTER] * 4, _INTEGER, _POINTER, _POINTER),
     "hbr_byte_squares": (_POINTER, *[_INTEGER] * 3, _POINTER),

@@ -300,25 +300,38 @@ EXPORT void hbr_similarity(const struct measure *m, const uint8_t *queries, int6
     }
 }
 
-/* Store the similarity of rows to each other within groups: places (groups, size) -> (groups, size, size). */
+/* Store the similarity of rows to each other within groups: places (groups, size) -> (groups, size, size). Rows of one
+   kind are not compared, 1 is stored; kinds (size) may be null, for as many kinds as rows. */
 EXPORT void hbr_among(const struct measure *m, const uint8_t *rows, int64_t stride, const double *squares,
-                      const int64_t *places, int64_t groups, int64_t size, double *similar) {
+                      const int64_t *places, int64_t groups, int64_t size, const int64_t *kinds, double *similar) {
     const struct loops *loops = fastest();
     struct query q;
     const uint8_t *chosen[CHUNK];
-    double lengths[CHUNK];
+    double lengths[CHUNK], found[CHUNK];
+    int64_t others[CHUNK];
     for (int64_t g = 0; g < groups; g++, places += size, similar += size * size)
         for (int64_t a = 0; a < size; a++) {
-            begin_query(&q, m, rows + places[a] * stride, loops);
-            q.square = squares[places[a]];
-            for (int64_t first = a; first < size; first += CHUNK) {
-                const int64_t some = size - first < CHUNK ? size - first : CHUNK;
-                for (int64_t i = 0; i < some; i++) {
-                    chosen[i] = rows + places[first + i] * stride;
-                    lengths[i] = squares[places[first + i]];
+            int prepared = 0;
+            for (int64_t next = a; next < size;) {
+                int64_t some = 0;
+                for (; next < size && some < CHUNK; next++) {
+                    if (kinds && kinds[next] == kinds[a]) {
+                        similar[a * size + next] = similar[next * size + a] = 1.0;
+                        continue;
+                    }
+                    others[some] = next;
+                    chosen[some] = rows + places[next] * stride;
+                    lengths[some++] = squares[places[next]];
                 }
-                compare(&q, loops, 0, chosen, lengths, some, similar + a * size + first);
-                for (int64_t b = first; b < first + some; b++) similar[b * size + a] = similar[a * size + b];
+                if (!some) break;
+                if (!prepared) {
+                    begin_query(&q, m, rows + places[a] * stride, loops);
+                    q.square = squares[places[a]];
+                    prepared = 1;
+                }
+                compare(&q, loops, 0, chosen, lengths, some, found);
+                for (int64_t i = 0; i < some; i++)
+                    similar[a * size + others[i]] = similar[others[i] * size + a] = found[i];
             }
         }
 }

@@ -1,6 +1,7 @@
 """The dense Hough filter against its formula written out."""
 
 import pickle
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hbr import DenseIndex, Views, tanimoto, update_belief
+from hbr.core.angles import size_deg
 from hbr.dense.filter import BINS, Belief, completed
 from tests.fuzzing import examples
 from tests.hbr.dense.searches import belief_after
@@ -152,3 +154,20 @@ def test_index_of_another_process_whitens_in_the_same_way() -> None:
     np.testing.assert_array_equal(
         copied.whitening.unit(index.views.descriptors[:5]), index.whitening.unit(index.views.descriptors[:5])
     )
+
+
+@examples(30)
+@given(st.integers(0, 10**6), st.sampled_from([0.0, 5.0, 40.0]))
+def test_nearest_view_is_that_of_a_search_among_all_views(seed: int, step_deg: float) -> None:
+    views = catalog(seed)
+    if step_deg:  # several views at one azimuth, and azimuths half-way between two
+        views = replace(views, azimuth_deg=views.azimuth_deg // step_deg * step_deg)
+    index, rng = DenseIndex(views), np.random.default_rng(seed)
+    place = rng.integers(0, len(index), 5)
+    at_deg = rng.uniform(-720, 720, (9, 5))
+    at_deg[::2] = at_deg[::2] // 2.5 * 2.5
+    rows, away_deg = index.nearest_view(place, at_deg)
+    far_deg = size_deg(index.azimuth_deg[place] - at_deg[:, :, None])
+    far_deg[:, index.left_out[place]] = np.inf
+    np.testing.assert_array_equal(rows, index.rows[place, far_deg.argmin(axis=2)])
+    np.testing.assert_array_equal(away_deg, far_deg.min(axis=2))

@@ -91,6 +91,9 @@ def test_similarity_has_the_bits_of_the_reference(kind: str, queries: int, count
         np.testing.assert_array_equal(found.only(some).similarity(asked), expected[1])
         np.testing.assert_array_equal(found.only(some).only(np.arange(len(some))).similarity(asked), expected[1])
         np.testing.assert_array_equal(found.among(groups), expected[2])
+        kinds = rng.integers(0, 3, 4)
+        apart = np.where(kinds[:, None] == kinds, 1.0, expected[2])
+        np.testing.assert_array_equal(found.among(groups, kinds), apart)
 
 
 @compiled
