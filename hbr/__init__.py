@@ -3,7 +3,8 @@
 from typing import Any
 from warnings import warn
 
-from hbr.dense.filter import Belief, DenseIndex, update_belief
+from hbr.dense.filter import Belief, update_belief
+from hbr.dense.index import DenseIndex
 from hbr.dense.leave_one_out import LeaveOneOut, leave_one_out
 from hbr.dense.next_view import NextBestView, next_best_view
 from hbr.dense.session import DenseSession

@@ -19,7 +19,8 @@ import numpy as np
 
 from hbr.core.angles import size_deg
 from hbr.core.arrays import FloatArray, LevelArray
-from hbr.dense.filter import Belief, DenseIndex
+from hbr.dense.filter import Belief
+from hbr.dense.index import DenseIndex
 from hbr.dense.leave_one_out import leave_one_out
 from hbr.dense.next_view import expected_similarity, strongest
 from hbr.dense.session import DenseSession

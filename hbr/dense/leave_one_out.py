@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hbr.core.arrays import FloatArray, IndexArray, LevelArray
-from hbr.dense.filter import BETA, BINS, Belief, DenseIndex
+from hbr.dense.filter import BETA, Belief
+from hbr.dense.index import BINS, DenseIndex
 
 #: Weight of the margin in the open-set score, and of the leader's usual score.
 _MARGIN_WEIGHT: Final = 0.5

@@ -11,7 +11,8 @@ from numpy.typing import ArrayLike
 
 from hbr.core.angles import size_deg, wrap360
 from hbr.core.arrays import FloatArray, IndexArray
-from hbr.dense.filter import BETA, BINS, Belief
+from hbr.dense.filter import BETA, Belief
+from hbr.dense.index import BINS
 from hbr.descriptors import Packed
 
 #: Largest number of compared hypotheses, and the share of the belief that is not compared.

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hbr.core.arrays import FloatArray, LevelArray
-from hbr.dense.filter import DenseIndex
+from hbr.dense.index import DenseIndex
 
 #: Candidates that the leader is compared with.
 COHORT: Final = 10

@@ -15,7 +15,8 @@ import numpy as np
 
 from hbr.core.angles import wrap360
 from hbr.core.arrays import FloatArray
-from hbr.dense.filter import BINS, Belief
+from hbr.dense.filter import Belief
+from hbr.dense.index import BINS
 
 #: κ, and the share of the posterior's half-width that is the uncertainty: azimuths are estimated finer than its bins.
 SHARPNESS: Final = 120.0

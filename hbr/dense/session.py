@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from hbr.core.arrays import LevelArray
-from hbr.dense.filter import KEPT, Belief, DenseIndex, completed, update_belief
+from hbr.dense.filter import KEPT, Belief, completed, update_belief
+from hbr.dense.index import DenseIndex
 from hbr.dense.next_view import NextBestView, next_best_view
 from hbr.dense.stopping import Outcome, StopDecision, StoppingRule
 

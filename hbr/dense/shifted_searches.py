@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hbr.core.arrays import FloatArray, LevelArray
-from hbr.dense.filter import BINS, DenseIndex
+from hbr.dense.index import BINS, DenseIndex
 from hbr.dense.leave_one_out import spread
 from hbr.dense.open_set import NUMBERS, evidence
 from hbr.descriptors import descriptor

@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hbr.core.arrays import FloatArray
-from hbr.dense.filter import BETA, Belief, DenseIndex, update_belief
+from hbr.dense.filter import BETA, Belief, update_belief
+from hbr.dense.index import DenseIndex
 from hbr.dense.leave_one_out import Found, Leaders, LeaveOneOut, Task, leader, leave_one_out, usual_scores
 from hbr.dense.open_set import OpenSetModel, evidence
 from hbr.dense.shifted_searches import STRENGTHS, ShiftedSearches, can_shift, shifted_searches

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from hbr.core.angles import wrap180
 from hbr.core.arrays import ImageArray, LevelArray
-from hbr.dense.filter import DenseIndex
+from hbr.dense.index import DenseIndex
 from hbr.dense.session import DenseSession
 from hbr.dense.stopping import Outcome, StoppingRule
 from hbr.descriptors.together import ViewsTogether

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from hbr.core.angles import wrap180
 from hbr.core.arrays import LevelArray
-from hbr.dense.filter import Belief, DenseIndex, update_belief
+from hbr.dense.filter import Belief, update_belief
+from hbr.dense.index import DenseIndex
 from hbr.descriptors.describe import describe
 from hbr.evaluation.condition import Condition
 from hbr.evaluation.datasets import Dataset, read_photograph

@@ -268,7 +268,7 @@ def support(
     part_deg: float,
     whole: int,
 ) -> NDArray[np.float32] | None:
-    """Return what one query adds to every azimuth of each object, (objects, 72); see `hbr.dense.filter`."""
+    """Return what one query adds to every azimuth of each object, (objects, 72); see `hbr.dense.index`."""
     found = library()
     if found is None:
         return None

@@ -1,4 +1,4 @@
-/* The support of the dense filter, with the same bits as hbr/dense/filter.py, which explains it. */
+/* The support of the dense filter, with the same bits as hbr/dense/index.py, which explains it. */
 #include "kernels.h"
 
 #define BINS 72

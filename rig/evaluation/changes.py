@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hbr.core.arrays import LevelArray
-from hbr.dense.filter import DenseIndex
+from hbr.dense.index import DenseIndex
 from hbr.dense.stopping import StoppingRule, calibrate_stopping_rule
 from hbr.evaluation.changes import (
     DESCRIPTOR,

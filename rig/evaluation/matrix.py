@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hbr.dense.filter import DenseIndex
+from hbr.dense.index import DenseIndex
 from hbr.evaluation.matrix import Cell, cells, enrolled_few, hits
 from hbr.evaluation.statistics import wilson
 from hbr.model.views import Views

@@ -7,7 +7,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from hbr.dense.filter import DenseIndex
+from hbr.dense.index import DenseIndex
 from hbr.dense.leave_one_out import LeaveOneOut
 from hbr.dense.stopping import StoppingRule, calibration_searches, fit_stopping_rule
 from hbr.evaluation.descriptors import query_levels

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 
 from hbr import DenseIndex, Views, tanimoto, update_belief
 from hbr.core.angles import size_deg
-from hbr.dense.filter import BINS, Belief, completed
+from hbr.dense.filter import Belief, completed
+from hbr.dense.index import BINS
 from tests.fuzzing import examples
 from tests.hbr.dense.searches import belief_after
 

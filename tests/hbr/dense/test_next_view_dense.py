@@ -6,7 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hbr import DenseIndex, Views, next_best_view
-from hbr.dense.filter import BINS, update_belief
+from hbr.dense.filter import update_belief
+from hbr.dense.index import BINS
 from hbr.dense.next_view import most_informative_rotation
 from tests.fuzzing import examples
 

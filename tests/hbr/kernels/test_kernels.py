@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import hbr
-from hbr.dense.filter import DenseIndex
+from hbr.dense.index import DenseIndex
 from hbr.kernels import compile as compiling
 from hbr.kernels import library, without_library
 from hbr.kernels.library import load

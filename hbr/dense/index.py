@@ -1,0 +1,284 @@
+"""Enrolled views, prepared for the dense Hough filter: what one query adds to every hypothesis.
+
+A query i, rotated by r_i since the first, adds to the hypothesis (j, φ), object j with azimuth φ at the first query,
+
+    s_i(j, φ + r_i) = max_k [T(q_i, c_jk)^p - ω · away(φ + r_i, k) / 360]
+
+where k runs over all views of the object and away is how far the azimuth lies outside the arc of view k, which reaches
+half-way to its neighbours: an azimuth between two views is as good as one on a view, also if a view is missing.
+The power p gives a query near an enrolled view more weight than one between two views.
+
+Decision: docs/decisions/0025.
+"""
+
+from functools import cached_property
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hbr.core.angles import size_deg, wrap360
+from hbr.core.arrays import FloatArray, IndexArray, LevelArray
+from hbr.core.segments import lengths, ranges
+from hbr.dense.whitening import Whitening
+from hbr.descriptors import Packed, descriptor
+from hbr.kernels import calls
+from hbr.model.views import Views
+
+#: Number of azimuths at the first query.
+BINS: Final = 72
+BIN_DEG: Final = 360 / BINS
+#: Degrees that no azimuth reaches.
+_FAR_DEG: Final = 2000.0
+
+Floats = NDArray[np.float32]
+
+
+class DenseIndex:
+    """Enrolled views, prepared for the dense filter.
+
+    Parameters
+    ----------
+    views : Views
+        Of any descriptor. Objects without views are left out.
+    omega : float
+        Weight ω of the orientation, per revolution.
+    power : float
+        p, of the similarities; 1 for the plain sum.
+    """
+
+    def __init__(self, views: Views, *, omega: float = 2.0, power: float = 4.0) -> None:
+        if not (np.isfinite(omega) and omega >= 0):
+            raise ValueError(f"omega is {omega}; a finite weight of at least 0 is needed, 2 by default")
+        if not (np.isfinite(power) and power >= 1):
+            raise ValueError(f"power is {power}; a finite one of at least 1 is needed, 4 by default")
+        if not len(views):
+            raise ValueError("there are no views; enroll at least one object first")
+        self.views = views
+        self.omega = omega
+        self.power = power
+        self.object_index: IndexArray = np.flatnonzero(np.bincount(views.object_index))
+        self.compared = views.prepared()
+        self.whitening = Whitening(views)
+        order, begin = views.of_each(self.object_index)
+        count = lengths(begin, len(order))
+        rising = np.diff(views.azimuth_deg[order], prepend=0) >= 0
+        rising[begin] = True
+        if not rising.all():
+            order = order[np.lexsort((views.azimuth_deg[order], np.repeat(np.arange(len(count)), count)))]
+        self._set_segments(order, begin, count)
+
+    def __len__(self) -> int:
+        return len(self.object_index)
+
+    def _copied(self) -> "DenseIndex":
+        copied = object.__new__(DenseIndex)
+        copied.__dict__.update(self.__dict__)
+        return copied
+
+    def __getstate__(self) -> dict[str, object]:
+        """Return what another process needs; it prepares the views for comparison itself."""
+        own = {name: self.__dict__[name] for name in ("views", "omega", "power", "object_index")}
+        return own | {"segments": (self._segments.order, self._segments.begin, self._segments.lengths)}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        segments = state.pop("segments")
+        self.__dict__.update(state)
+        self.compared = self.views.prepared()
+        self.whitening = Whitening(self.views)
+        self._set_segments(*segments)
+
+    def without(self, views: IndexArray) -> "DenseIndex":
+        """Return an index that leaves out some views; each object must keep at least one."""
+        fewer = self._copied()
+        kept = ~np.isin(self._segments.order, views)
+        count = np.add.reduceat(kept, self._segments.begin)
+        if not count.all():
+            raise ValueError("an object would be left without any view; leave out fewer")
+        fewer._set_segments(self._segments.order[kept], np.cumsum(count) - count, count)
+        return fewer
+
+    def only(self, places: IndexArray) -> "DenseIndex":
+        """Return an index of some objects alone, whose later steps do not look at the others."""
+        fewer = self._copied()
+        own, begin = ranges(self._segments.begin[places], self._segments.lengths[places])
+        order = self._segments.order[own]
+        rows = order if (np.diff(order) > 0).all() else np.sort(order)
+        fewer.views = self.views.select(rows)
+        fewer.compared = self.compared.only(rows)
+        fewer.object_index = self.object_index[places]
+        order = np.arange(len(rows)) if rows is order else np.searchsorted(rows, order)
+        fewer._set_segments(order, begin, self._segments.lengths[places])
+        return fewer
+
+    def _set_segments(self, order: IndexArray, begin: IndexArray, count: IndexArray) -> None:
+        """Set the views of each object: ``count`` of the rows ``order`` from ``begin`` on, by rising azimuth."""
+        self._segments = calls.Segments(order, begin, count, bool((np.diff(order, prepend=-1) == 1).all()))
+        for name in ("rows", "left_out", "azimuth_deg", "spacing_deg", "_ring"):
+            self.__dict__.pop(name, None)  # those of the index that this one was copied from
+
+    @cached_property
+    def rows(self) -> IndexArray:
+        """Rows of each object's views by rising azimuth, padded by the first of them."""
+        columns = np.arange(self._segments.lengths.max())
+        rows: IndexArray = self._segments.order[
+            self._segments.begin[:, None] + np.where(columns < self._segments.lengths[:, None], columns, 0)
+        ]
+        return rows
+
+    @cached_property
+    def left_out(self) -> NDArray[np.bool_]:
+        """Where `rows` is padding."""
+        padding: NDArray[np.bool_] = np.arange(self._segments.lengths.max()) >= self._segments.lengths[:, None]
+        return padding
+
+    @cached_property
+    def azimuth_deg(self) -> FloatArray:
+        """Azimuths of `rows`."""
+        return self.views.azimuth_deg[self.rows]
+
+    @cached_property
+    def spacing_deg(self) -> FloatArray:
+        """The usual step between neighbouring views of each object; 360 of a single one."""
+        spacing_deg = np.empty(len(self))
+        for count in np.unique(self._segments.lengths).tolist():  # of objects with as many views
+            ring_deg = self.azimuth_deg[self._segments.lengths == count, :count]
+            steps_deg = np.diff(ring_deg, axis=1, append=ring_deg[:, :1] + 360)
+            spacing_deg[self._segments.lengths == count] = np.median(steps_deg, axis=1)
+        return spacing_deg
+
+    @cached_property
+    def length(self) -> int:
+        """Number of levels of a view."""
+        return descriptor(self.views.descriptor).length
+
+    def similarity(self, query: LevelArray) -> FloatArray:
+        """Return the similarity of every view to a query, (n,): of several segmentations, (h, length), the largest."""
+        similar = self.compared.similarity(np.atleast_2d(query))
+        most: FloatArray = similar[0] if len(similar) == 1 else similar.max(axis=0)
+        return most
+
+    def best(self, query: LevelArray) -> FloatArray:
+        """Return the largest similarity of each object's views to a query, (k,)."""
+        similar = self.similarity(query)
+        best: FloatArray = np.maximum.reduceat(similar[self._segments.order], self._segments.begin)
+        return best
+
+    def bounds(self, query: LevelArray) -> FloatArray:
+        """Return a bound of the support that a query adds to each object at any azimuth, (k,)."""
+        compared = self.compared
+        if isinstance(compared, Packed):
+            most = np.max([compared.bounds(row, self._segments) for row in np.atleast_2d(query)], axis=0)
+        else:
+            most = self.best(query)
+        return self._raised(most).astype(np.float64)
+
+    def nearest(self, query: LevelArray, kept: int) -> IndexArray:
+        """Return the objects with the most similar views, ascending places (kept,); of equal ones, the first."""
+        if not isinstance(self.compared, Packed):
+            return np.sort(np.argsort(-self.best(query), kind="stable")[:kept])
+        nearest = [self.compared.nearest(row, self._segments, kept) for row in np.atleast_2d(query)]
+        if len(nearest) == 1:
+            return nearest[0]
+        # an object that is among the best by its largest similarity is so by the row that has it
+        places = np.unique(np.concatenate(nearest))
+        return places[np.sort(np.argsort(-self.only(places).best(query), kind="stable")[:kept])]
+
+    @property
+    def view_counts(self) -> IndexArray:
+        """Number of views of each object."""
+        return self._segments.lengths
+
+    def nearest_views(self, place: int, at_deg: ArrayLike, count: int) -> IndexArray:
+        """Return the rows of an object's views that are nearest to azimuths, (..., count); of fewer, some twice."""
+        begin = self._segments.begin[place]
+        rows = self._segments.order[begin : begin + self._segments.lengths[place]]
+        away_deg = size_deg(self.views.azimuth_deg[rows] - np.asarray(at_deg)[..., None])
+        nearest = np.argsort(away_deg, axis=-1, kind="stable")[..., np.arange(count) % len(rows)]
+        return rows[nearest]
+
+    def nearest_view(self, place: IndexArray, at_deg: FloatArray) -> tuple[IndexArray, FloatArray]:
+        """Return the view of each object, (m,), that is nearest to an azimuth, (a, m), and how far away it is.
+
+        Of equally near views, the one with the smaller azimuth.
+        """
+        count, columns = self._segments.lengths[place], np.arange(len(place))
+        own_deg = np.where(self.left_out[place], 900.0, self.azimuth_deg[place])
+        keys = (
+            own_deg + 1000.0 * columns[:, None]
+        )  # one rising row of all: column i lies between 1000 i and 1000 (i + 1)
+        behind = np.searchsorted(keys.ravel(), wrap360(at_deg) + 1000.0 * columns) - own_deg.shape[1] * columns
+        before, behind = (behind - 1) % count, behind % count
+        is_new = np.diff(own_deg, axis=1, prepend=-1.0) != 0
+        first = np.maximum.accumulate(np.where(is_new, np.arange(own_deg.shape[1]), 0), axis=1)
+        before = first[columns, before]
+        before_deg, behind_deg = (size_deg(own_deg[columns, at] - at_deg) for at in (before, behind))
+        is_before = (before_deg < behind_deg) | ((before_deg == behind_deg) & (before < behind))
+        return (
+            self.rows[place, np.where(is_before, before, behind)],
+            np.where(is_before, before_deg, behind_deg),
+        )
+
+    @cached_property
+    def _ring(self) -> tuple[IndexArray, FloatArray, Floats]:
+        """Two turns of every object's views in rows, where their arcs end, and the penalty there.
+
+        From 180° before 0 on: a copy of each view is within 180° of any azimuth.
+        """
+        first_deg = np.where(self.azimuth_deg < 180, self.azimuth_deg, self.azimuth_deg - 360)
+        first_deg = np.where(self.left_out, np.inf, first_deg)
+        unrolled_deg = np.concatenate([first_deg, first_deg + 360], axis=1)
+        places = np.argsort(unrolled_deg, axis=1, kind="stable")
+        ring_deg = np.take_along_axis(unrolled_deg, places, axis=1)
+        with np.errstate(invalid="ignore"):  # padding stands at infinity, behind all views
+            middle_deg = (ring_deg[:, 1:] + ring_deg[:, :-1]) / 2
+        own = np.arange(places.shape[1]) < 2 * self._segments.lengths[:, None]
+        # the view at each place of the two turns; behind them one beyond all
+        ring = np.where(own, np.take_along_axis(self.rows, places % self.rows.shape[1], axis=1), len(self.views))
+        # where the arc of each view ends and the next one's begins; far away behind the last
+        ends_deg = np.where(own[:, 1:], middle_deg, _FAR_DEG)
+        keys = (ends_deg + 2 * _FAR_DEG * np.arange(len(self))[:, None]).ravel()
+        return ring, keys, (ends_deg * (self.omega / 360)).astype(np.float32)
+
+    def support(self, similar: FloatArray, rotated_deg: float) -> Floats:
+        """Return what one query adds to every hypothesis.
+
+        Parameters
+        ----------
+        similar : float array (n,)
+            Similarity of the query to every view.
+        rotated_deg : float
+            Orientation since the first query, counter-clockwise.
+
+        Returns
+        -------
+        float32 array (k, 72)
+            For azimuths 0, 5, 10, ... at the first query.
+        """
+        whole, part_deg = divmod(rotated_deg % 360.0, BIN_DEG)
+        levels = self._raised(similar)
+        slope = self.omega / 360
+        azimuth_deg = self.views.azimuth_deg
+        compiled = calls.support(self._segments, azimuth_deg, levels, slope, part_deg, int(whole))
+        if compiled is not None:
+            return compiled
+        ring, keys, penalty = self._ring
+        seen_deg = part_deg + np.arange(BINS) * BIN_DEG  # in this order the search below is quicker
+        slope_at = (seen_deg * slope).astype(np.float32)
+        own = np.append(levels, np.float32(-np.inf))[ring]
+        place = np.arange(len(self))[:, None]
+        # the view on whose arc the azimuth lies, among all objects' rows
+        nearest = np.searchsorted(keys, seen_deg + 2 * _FAR_DEG * place) + place
+        # of the views before and behind a running maximum knows the best: the penalty is a straight line from its arc
+        before, behind = np.full((2, *own.shape), -np.inf, np.float32)
+        np.maximum.accumulate(own[:, :-1] + penalty, axis=1, out=before[:, 1:])
+        np.maximum.accumulate((own[:, 1:] - penalty)[:, ::-1], axis=1, out=behind[:, -2::-1])
+        best: Floats = np.maximum(before.ravel()[nearest] - slope_at, behind.ravel()[nearest] + slope_at)
+        np.maximum(best, own.ravel()[nearest], out=best)
+        return np.roll(best, -int(whole), axis=1)
+
+    def _raised(self, similar: FloatArray) -> Floats:
+        """Return the similarities to the power p; for 4 by products, which are the same on every computer."""
+        similar = np.maximum(similar, 0)
+        raised: FloatArray = np.square(np.square(similar)) if self.power == 4 else similar**self.power
+        return raised.astype(np.float32)
