@@ -8,6 +8,7 @@ Decision: docs/decisions/0024.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Final
 
 import cv2
@@ -70,8 +71,9 @@ class Illumination:
         x = ((np.arange(width) + 0.5) / width - 0.5)[None, :, None]
         y = ((np.arange(height) + 0.5) / height - 0.5)[:, None, None]
         along, down = (self.slopes[0] + x * self.slopes[1]).astype(np.float32), (y * self.slopes[2]).astype(np.float32)
-        planes: Floats = along + down
-        return planes
+        # in long rows: NumPy adds up short ones slowly
+        planes: Floats = along.reshape(1, -1) + np.tile(down.reshape(height, 3), (1, width))
+        return planes.reshape(height, width, 3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,8 +219,13 @@ def shrunk(image_bgr: ImageArray) -> ImageArray:
 
 def border_cells(image: NDArray[np.generic]) -> list[NDArray[np.generic]]:
     """Return the 12 cells of a 4 x 4 grid that lie at the border."""
-    rows, columns = (np.linspace(0, side, 5).astype(int) for side in image.shape[:2])
+    rows, columns = map(_quarters, image.shape[:2])
     return [image[rows[y] : rows[y + 1], columns[x] : columns[x + 1]] for y, x in _BORDER]
+
+
+@lru_cache
+def _quarters(side: int) -> tuple[int, ...]:
+    return tuple(np.linspace(0, side, 5).astype(int).tolist())
 
 
 def _logarithm(image: ImageArray) -> Floats:

@@ -43,7 +43,9 @@ def silhouette(certain: Mask, possible: Mask | None = None, *, framed: bool) -> 
             kept = _without_stump(cv2.dilate(kept, _disc(1)).astype(np.uint8) & everything)
         if possible is not None:
             hull = np.zeros_like(kept)
-            cv2.fillConvexPoly(hull, cv2.convexHull(cv2.findNonZero(kept)), (1,))
+            # the hull of the outlines is that of all pixels, in a tenth of the time
+            outlines, _ = cv2.findContours(kept, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+            cv2.fillConvexPoly(hull, cv2.convexHull(np.concatenate(outlines)), (1,))
             kept |= hull & possible
         return _filled(kept)
     return None
