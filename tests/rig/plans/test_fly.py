@@ -103,7 +103,7 @@ def outcome(tmp_path: Path, fault: str) -> tuple[RigError | None, list[Event], f
     error, worst = None, 0.0
     with suppress(DeviceSilent), flying(tmp_path, faults=(fault,)) as (bench, catalog, world):
         try:
-            for event in enroll(bench, catalog, "toy-car", views=12, fly=True):
+            for event in enroll(bench, catalog, "dice", views=12, fly=True):
                 events.append(event)
                 worst = max([worst, *np.abs(true_errors([event], bench, world))])
         except RigError as failure:
@@ -159,7 +159,7 @@ def test_interrupted_turn_resumes(tmp_path: Path) -> None:
 
 def test_moved_object_abandons_the_turn(tmp_path: Path) -> None:
     with flying(tmp_path, faults=("object_falls@3s",)) as (bench, catalog, _), pytest.raises(ObjectMoved):
-        list(enroll(bench, catalog, "toy-car", views=8, fly=True))
+        list(enroll(bench, catalog, "dice", views=8, fly=True))
 
 
 def test_scan_needs_camera_time_and_a_revolution_of_cable(tmp_path: Path) -> None:
