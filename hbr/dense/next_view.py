@@ -165,12 +165,11 @@ def strongest(posterior: FloatArray) -> tuple[FloatArray, IndexArray, IndexArray
     mass = posterior.sum(axis=1)
     total = (posterior * is_peak).sum(axis=1)
     share = np.divide(mass, total, out=np.zeros_like(mass), where=total > 0)
-    peaks = np.flatnonzero(is_peak)
-    weight = posterior.ravel()[peaks] * share[peaks // posterior.shape[1]]
-    count = min(_STRONGEST, len(peaks))
-    best = np.argpartition(-weight, count - 1)[:count]
+    weight = (posterior * is_peak * share[:, None]).ravel()
+    count = min(_STRONGEST, len(weight))
+    best = np.argpartition(-weight, count - 1)[:count]  # of all: of equal weights, earlier runs chose the same ones
     best = best[np.argsort(-weight[best], kind="stable")]
-    weight, best = weight[best], peaks[best]
+    weight = weight[best]
     place, bin_of = np.divmod(best, posterior.shape[1])
     second = int((place != place[0]).argmax())  # a decision is between two objects, however unlikely the second
     enough = max(1 + int(np.searchsorted(np.cumsum(weight), 1 - _NEGLIGIBLE)), second + 1)
