@@ -1,8 +1,9 @@
 """Segmentation: finds the object in a frame, corrects its illumination, and brings it to a fixed size."""
 
 from hbr.segmentation.background import MIN_AGREEMENT, Background
+from hbr.segmentation.cut_out import CROP_PX, Box, Segmentation
 from hbr.segmentation.evidence import Issue, IssueCode, Method
-from hbr.segmentation.segment import CROP_PX, Box, Segmentation, hypotheses, segment
+from hbr.segmentation.segment import hypotheses, segment
 
 __all__ = [
     "CROP_PX",

@@ -183,6 +183,12 @@ class Background:
             np.asarray(coloured, np.float32),
         )
 
+    def whole_correction(self, difference: Difference) -> Illumination:
+        """Return the correction of a frame to the light of this image, and to a plain grey backdrop if it shows one."""
+        if self.correction is None:
+            return difference.correction
+        return Illumination(difference.correction.slopes + self.correction.slopes)
+
     def _backdrop_correction(self) -> tuple[Illumination | None, IssueCode | None]:
         """Return the correction that makes a plain, nearly grey backdrop grey, and what prevents it or a part of it."""
         cells = [

@@ -14,6 +14,7 @@ from rig.catalog.describing import EmptyTable, region_of
 from rig.catalog.queries import described_by, in_use, retrieved
 from rig.catalog.records import EnrollmentStatus, Region
 from rig.catalog.schema import descriptors, enrollments, objects, sessions, views
+from rig.catalog.together import needs_segmentation
 from rig.views.description import PAPER_DESCRIPTOR
 
 
@@ -79,6 +80,20 @@ def _camera_settings(catalog: Catalog, condition: ColumnElement[bool]) -> list[d
             if isinstance(locks, dict) and locks not in settings:
                 settings.append(locks)
     return settings
+
+
+def guessed_objects(catalog: Catalog) -> tuple[str, ...]:
+    """Return the names of the objects in use whose first view was segmented by a guess from this view alone."""
+    with catalog.database.read() as connection:
+        rows = connection.execute(
+            select(objects.c.name, views.c.segmentation)
+            .select_from(objects)
+            .join(enrollments)
+            .join(views, views.c.enrollment_id == enrollments.c.id)
+            .where(retrieved(), views.c.view_index == 0, views.c.segmentation.is_not(None))
+            .order_by(objects.c.name)
+        )
+        return tuple(name for name, segmentation in rows if needs_segmentation(segmentation))
 
 
 def read_empty_table(catalog: Catalog, empty_table: EmptyTable) -> NDArray[np.uint8]:

@@ -15,6 +15,7 @@ from rig.catalog.records import EnrollmentStatus, ImageFile, Session, StoredView
 from rig.catalog.rows import NewView, empty_table_columns, insert_views, measured, supersede, unfinished_and_complete
 from rig.catalog.schema import enrollments, objects, sessions, views
 from rig.catalog.seal import changing_enrollments
+from rig.catalog.together import describe_together, object_descriptors, stored_images, write_described
 from rig.core.clock import Clock
 from rig.core.errors import CatalogError, UsageError
 from rig.views import image_files as images
@@ -127,6 +128,36 @@ class Enrollment:
                     update(sessions).where(sessions.c.id == self.session.id).values(empty_table_columns(image))
                 )
         self.session = replace(self.session, empty_table_image=image.path)
+
+    def revise(self) -> int:
+        """Segment all stored views together, as a search does, and describe them again; return their number.
+
+        Descriptors of the whole image stay, and so do views that were described by those alone. All or none of the
+        views change; after an interruption call it again.
+
+        Raises
+        ------
+        CatalogError
+            An image cannot be read, or the enrollment is no longer in progress.
+        CatalogBusy
+            Another process is writing for longer than the timeout.
+        """
+        with self._database.read() as connection:
+            names = object_descriptors(connection, self.id)
+            images = stored_images(connection, self.id)
+        if not names:
+            return 0
+        found = describe_together(self._database.images, names, images)
+        for one in found:
+            if one.reason:
+                raise CatalogError(
+                    f"a view of {self.object_name!r} cannot be segmented: {one.reason}",
+                    next_step="check the disk, then continue the enrollment with --resume",
+                )
+        with self._database.write(self.id) as connection:
+            self._check_in_progress(connection)
+            with changing_enrollments(connection, [self.id]):
+                return write_described(connection, found)
 
     def finish(self) -> None:
         """Make this the enrollment that searches use. The previous one is superseded.

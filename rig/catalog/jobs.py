@@ -1,8 +1,9 @@
 """Parts that the long jobs of a catalog share: progress, and portions of images for processes."""
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from typing import Final, TypeVar
 
 from rig.core.cluster import Cluster
@@ -26,6 +27,18 @@ def portions(items: Sequence[_T]) -> Iterator[tuple[_T, ...]]:
     """Yield the items in portions."""
     for start in range(0, len(items), PORTION):
         yield tuple(items[start : start + PORTION])
+
+
+def portions_of_groups(items: Sequence[_T], group: Callable[[_T], object]) -> Iterator[tuple[_T, ...]]:
+    """Yield the items in portions that divide no group; the items of a group follow each other."""
+    portion: list[_T] = []
+    for _, own in groupby(items, group):
+        portion += own
+        if len(portion) >= PORTION:
+            yield tuple(portion)
+            portion = []
+    if portion:
+        yield tuple(portion)
 
 
 def processes(wanted: Jobs | None, items: int) -> Jobs:

@@ -1,21 +1,27 @@
 """Describe the stored images again after a descriptor, its version or its settings have changed."""
 
+import json
+from collections import defaultdict
 from collections.abc import Generator
 from dataclasses import dataclass
 from enum import Enum
 from functools import partial
+from itertools import groupby
 from typing import Any, NamedTuple
 
-from sqlalchemy import and_, bindparam, delete, insert, select, update
+from sqlalchemy import select
 
+from hbr.descriptors import Descriptor
+from hbr.descriptors import descriptor as descriptor_named
 from rig.catalog.audit import Action
 from rig.catalog.catalog import Catalog
-from rig.catalog.describing import EmptyTable, known_descriptor, pack, region_of, settings_of, stored_describer
+from rig.catalog.describing import is_current, known_descriptor, pack, region_of, settings_of, stored_describer
 from rig.catalog.image_store import ImageStore
-from rig.catalog.jobs import JobProgress, portions, processes
-from rig.catalog.records import EnrollmentStatus, JsonObject, PackedDescriptor, Region
+from rig.catalog.jobs import JobProgress, portions_of_groups, processes
+from rig.catalog.records import EnrollmentStatus, JsonObject, Region
 from rig.catalog.schema import descriptors, enrollments, objects, sessions, views
 from rig.catalog.seal import changing_enrollments
+from rig.catalog.together import Described, StoredImage, describe_together, needs_segmentation, write_described
 from rig.core.errors import CatalogError, UsageError
 from rig.core.processes import Jobs, map_in_processes
 from rig.views.description import PAPER_DESCRIPTOR
@@ -39,19 +45,16 @@ class Redescribed:
 
 
 class _Item(NamedTuple):
-    view_id: int
-    image: str
-    sha256: str
-    region: Region | None
-    empty_table: EmptyTable | None
+    """A view to be described; ``evidence`` is that of its segmentation, as JSON text.
 
+    ``together`` says that the views of its enrollment are segmented again, and ``names`` which descriptors follow.
+    """
 
-class _Described(NamedTuple):
-    """The packed levels of a view, or the reason why it cannot be described."""
-
-    packed: PackedDescriptor | None
-    segmentation: dict[str, Any] | None = None
-    reason: str = ""
+    view: StoredImage
+    enrollment_id: int
+    evidence: str
+    together: bool
+    names: tuple[str, ...]
 
 
 def redescribe(
@@ -64,8 +67,10 @@ def redescribe(
 ) -> Generator[JobProgress, None, Redescribed]:
     """Describe the views of all objects in use that are not described by the present version of a descriptor.
 
-    Results are committed in portions: after an interruption the next call continues there. A descriptor of the object
-    alone uses the empty-table image of the session, if there is one, and its segmentation is stored with the view.
+    Results are committed in portions: after an interruption the next call continues there. For a descriptor of the
+    object alone, views that were segmented by a guess, or not at all, are segmented together with the other views of
+    their enrollment, as at its end (`rig.catalog.together`), and all descriptors of the object follow. Other views keep
+    their segmentation.
 
     Parameters
     ----------
@@ -74,7 +79,7 @@ def redescribe(
     region
         Part of the images to describe; None for the whole image. Imported images keep their regions.
     again
-        Also describe views that are described already.
+        Also describe views that are described already, and segment them again.
     jobs
         Number of processes, or a cluster; None for one process per core.
 
@@ -86,41 +91,18 @@ def redescribe(
         The catalog cannot be written.
     """
     kind = known_descriptor(descriptor)
-    items, unchanged = _items(catalog, kind.name, kind.version, region, again)
+    items, unchanged = _items(catalog, kind, region, again)
     failed: list[tuple[str, str]] = []
     done = 0
     yield JobProgress(0, len(items))
-    work = partial(_describe, catalog.database.images, kind.name)
-    for portion, found in map_in_processes(work, portions(items), processes(jobs, len(items))):
-        rows, segmentations = [], []
-        for item, one in zip(portion, found, strict=True):
-            if one.packed is None:
-                failed.append((item.image, one.reason))
-                continue
-            rows.append({"view_id": item.view_id, **one.packed._asdict()})
-            if one.segmentation is not None:
-                segmentations.append({"of_view": item.view_id, "new": one.segmentation})
+    work = partial(_describe, catalog.database.images)
+    for portion, found in map_in_processes(work, portions_of_groups(items, _group), processes(jobs, len(items))):
+        failed += [(item.view.image, one.reason) for item, one in zip(portion, found, strict=True) if one.reason]
         with catalog.database.write() as connection:
-            ids = [row["view_id"] for row in rows]
-            alive = set(connection.scalars(select(views.c.id).where(views.c.id.in_(ids))))
+            ids = [item.view.view_id for item in portion]
             owners = connection.scalars(select(views.c.enrollment_id).where(views.c.id.in_(ids)).distinct())
             with changing_enrollments(connection, owners):
-                connection.execute(
-                    delete(descriptors).where(
-                        and_(
-                            descriptors.c.view_id.in_(ids),
-                            descriptors.c.name == kind.name,
-                            descriptors.c.version == kind.version,
-                        )
-                    )
-                )
-                if alive:
-                    connection.execute(insert(descriptors), [row for row in rows if row["view_id"] in alive])
-                if segmentations:
-                    connection.execute(
-                        update(views).where(views.c.id == bindparam("of_view")).values(segmentation=bindparam("new")),
-                        segmentations,
-                    )
+                write_described(connection, found)
         done += len(portion)
         yield JobProgress(done, len(items))
     if items:
@@ -131,9 +113,7 @@ def redescribe(
     return Redescribed(kind.name, kind.version, done - len(failed), unchanged, tuple(failed))
 
 
-def _items(
-    catalog: Catalog, name: str, version: int, region: Region | Stored | None, again: bool
-) -> tuple[list[_Item], int]:
+def _items(catalog: Catalog, kind: Descriptor, region: Region | Stored | None, again: bool) -> tuple[list[_Item], int]:
     with catalog.database.read() as connection:
         wanted = connection.execute(
             select(
@@ -141,6 +121,9 @@ def _items(
                 views.c.image,
                 views.c.image_sha256,
                 views.c.encoder_deg,
+                views.c.segmentation,
+                views.c.enrollment_id,
+                views.c.session_id,
                 sessions.c.conditions,
                 sessions.c.empty_table_image,
                 sessions.c.empty_table_image_sha256,
@@ -152,32 +135,44 @@ def _items(
                 objects.c.deleted_utc.is_(None),
                 enrollments.c.status.in_([EnrollmentStatus.COMPLETE, EnrollmentStatus.IN_PROGRESS]),
             )
-            .order_by(views.c.id)
+            .order_by(views.c.enrollment_id, views.c.id)
         ).all()
         known: dict[int, dict[str, Any]] = {}
         present: dict[int, dict[str, Any]] = {}
+        others: dict[int, set[str]] = defaultdict(set)
         for view_id, other, its_version, settings in connection.execute(
             select(descriptors.c.view_id, descriptors.c.name, descriptors.c.version, descriptors.c.settings)
         ):
             # of several regions, that of the descriptor itself or of the paper's counts
-            if view_id not in known or other in (PAPER_DESCRIPTOR, name):
+            if view_id not in known or other in (PAPER_DESCRIPTOR, kind.name):
                 known[view_id] = settings
-            if (other, its_version) == (name, version):
+            if (other, its_version) == (kind.name, kind.version):
                 present[view_id] = settings
+            if is_current(other, its_version) and not descriptor_named(other).whole_image:
+                others[view_id].add(other)
     items, unchanged = [], 0
-    for row in wanted:
-        if isinstance(region, Stored) or row.encoder_deg is None:
-            settings = known.get(row.id)
-            part = region_of(settings) if settings is not None else _configured_region(row.conditions)
-        else:
-            part = region
-        if not again and present.get(row.id) == settings_of(part):
-            unchanged += 1
-        else:
+    for enrollment_id, group in groupby(wanted, lambda row: row.enrollment_id):
+        own = list(group)
+        regions = {row.id: _region(row, known.get(row.id), region) for row in own}
+        described = {row.id for row in own if not again and present.get(row.id) == settings_of(regions[row.id])}
+        together = not kind.whole_image and (again or any(needs_segmentation(row.segmentation) for row in own))
+        names = {kind.name}.union(*(others[row.id] for row in own)) if together else {kind.name}
+        for row in own:
+            if row.id in described and not together:
+                unchanged += 1
+                continue
             table = row.empty_table_image
             empty_table = None if table is None else (table, row.empty_table_image_sha256)
-            items.append(_Item(row.id, row.image, row.image_sha256, part, empty_table))
+            image = StoredImage(row.id, row.image, row.image_sha256, row.session_id, regions[row.id], empty_table)
+            items.append(_Item(image, enrollment_id, json.dumps(row.segmentation), together, tuple(sorted(names))))
     return items, unchanged
+
+
+def _region(row: Any, settings: JsonObject | None, region: Region | Stored | None) -> Region | None:
+    """The region to describe of a view; imported images, which have no angle of an encoder, keep theirs."""
+    if not isinstance(region, Stored) and row.encoder_deg is not None:
+        return region
+    return region_of(settings) if settings is not None else _configured_region(row.conditions)
 
 
 def _configured_region(conditions: JsonObject) -> Region | None:
@@ -187,17 +182,31 @@ def _configured_region(conditions: JsonObject) -> Region | None:
     return None if roi is None else region_of({"region": roi})
 
 
-def _describe(store: ImageStore, name: str, portion: tuple[_Item, ...]) -> list[_Described]:
-    kind = known_descriptor(name)
-    found = []
-    for item in portion:
-        try:
-            image = store.pixels(item.image, item.sha256)
-            described = stored_describer(store, (kind.name,), item.region, item.empty_table)(image)
-            (packed,) = pack(described.levels, item.region)
-            found.append(_Described(packed, described.segmentation))
-        except (CatalogError, UsageError) as error:
-            found.append(_Described(None, reason=error.what))
-        except (OSError, ValueError) as error:  # ValueError: the descriptor cannot describe this image
-            found.append(_Described(None, reason=str(error)))
+def _group(item: _Item) -> tuple[bool, int]:
+    """Return what is segmented together: an enrollment, or a view alone."""
+    return item.together, item.enrollment_id if item.together else item.view.view_id
+
+
+def _describe(store: ImageStore, portion: tuple[_Item, ...]) -> list[Described]:
+    found: list[Described] = []
+    for (together, _), group in groupby(portion, _group):
+        own = list(group)
+        if together:
+            found += describe_together(store, own[0].names, [item.view for item in own])
+        else:
+            found += [_describe_one(store, item) for item in own]
     return found
+
+
+def _describe_one(store: ImageStore, item: _Item) -> Described:
+    """Describe a view by its stored segmentation."""
+    view = item.view
+    try:
+        image = store.pixels(view.image, view.sha256)
+        describe = stored_describer(store, item.names, view.region, view.empty_table)
+        levels = describe(image, json.loads(item.evidence)).levels
+        return Described(view.view_id, tuple(pack(levels, view.region)))
+    except (CatalogError, UsageError) as error:
+        return Described(view.view_id, reason=error.what)
+    except ValueError as error:
+        return Described(view.view_id, reason=str(error))

@@ -98,6 +98,8 @@ class Verification:
 class _Item(NamedTuple):
     """An image that must exist. ``described`` holds name, version, settings as JSON, and packed levels.
 
+    ``segmentation`` is the stored evidence as JSON.
+
     That of a result has no object, and the negative number of the result instead of an enrollment.
     """
 
@@ -110,6 +112,7 @@ class _Item(NamedTuple):
     file_bytes: int
     empty_table: EmptyTable | None = None
     described: tuple[tuple[str, int, str, bytes], ...] = ()
+    segmentation: str = "null"
 
     def finding(self, problem: Problem, repair: Repair | None = None, **details: Any) -> Finding:
         return Finding(problem, self.object_name, self.view_id, self.image, details, repair)
@@ -243,7 +246,16 @@ def _items(catalog: Catalog) -> tuple[list[_Item], int]:
         empty_table = (sessions.c.empty_table_image, sessions.c.empty_table_image_sha256)
         owner = (objects.c.name, enrollments.c.id)
         rows = connection.execute(
-            select(views.c.id, null(), *owner, views.c.image, views.c.image_sha256, views.c.image_bytes, *empty_table)
+            select(
+                views.c.id,
+                null(),
+                *owner,
+                views.c.image,
+                views.c.image_sha256,
+                views.c.image_bytes,
+                *empty_table,
+                views.c.segmentation,
+            )
             .select_from(objects)
             .join(enrollments)
             .join(views, views.c.enrollment_id == enrollments.c.id)
@@ -257,6 +269,7 @@ def _items(catalog: Catalog) -> tuple[list[_Item], int]:
                     (one.name, one.version, json.dumps(one.settings, sort_keys=True), one.packed)
                     for one in described.get(row.id, ())
                 ),
+                segmentation=json.dumps(row.segmentation),
             )
             for row in rows
         ]
@@ -308,8 +321,8 @@ def _check(store: ImageStore, item: _Item, quick: bool) -> _Checked:
         except CatalogError:
             continue  # the empty-table image is damaged: it is another item
         levels: NDArray[np.uint8] | None = None
-        with suppress(UsageError, ValueError):
-            levels = describe(image).levels[name]
+        with suppress(UsageError, KeyError, ValueError):
+            levels = describe(image, json.loads(item.segmentation)).levels[name]
         if levels is None or not matches(kind, packed, levels):
             different.append((name, version, None if levels is None else kind.pack(levels)))
     return _Checked(sha256, len(content), (image.shape[1], image.shape[0]), different=tuple(different))

@@ -42,9 +42,8 @@ def note_words(note: Note) -> str:
             )
         case NoteCode.MIXED_EMPTY_TABLE:
             names, one = v["objects"], len(v["objects"]) == 1
-            shown = joined(names[:3]) if len(names) <= 3 else f"{', '.join(names[:3])} and {len(names) - 3} more"
             return (
-                f"{shown} {'was' if one else 'were'} enrolled {'with' if v['with_image'] else 'without'} an "
+                f"{_some(names)} {'was' if one else 'were'} enrolled {'with' if v['with_image'] else 'without'} an "
                 "empty-table image, unlike the other objects, and such views compare badly; to repeat the enrollment: "
                 "rig enroll --replace"
             )
@@ -52,6 +51,12 @@ def note_words(note: Note) -> str:
             return (
                 "most objects were enrolled without an empty-table image, so the search does not use it; to repeat the "
                 "enrollment: rig enroll --replace"
+            )
+        case NoteCode.ENROLLED_BY_GUESS:
+            return (
+                f"the views of {_some(v['objects'])} were segmented one by one, by a guess, unlike those of a "
+                "search; to segment them together from their stored images: rig catalog redescribe --descriptor "
+                "edges+colours"
             )
         case NoteCode.EMPTY_TABLE_DOUBTED:
             return f"the empty-table image may be outdated ({_problems(v)}); {_NEXT_IMAGE}"
@@ -424,3 +429,7 @@ def distinct(a: float, b: float, *, decimals: int = 2) -> tuple[str, str]:
 def signed(value: float, decimals: int) -> str:
     """Return a number with its sign, a real minus."""
     return f"{round(value, decimals) + 0.0:+.{decimals}f}".replace("-", "−")  # + 0.0 removes the sign of a zero
+
+
+def _some(names: list[str]) -> str:
+    return joined(names[:3]) if len(names) <= 3 else f"{', '.join(names[:3])} and {len(names) - 3} more"

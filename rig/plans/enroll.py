@@ -56,7 +56,8 @@ def enroll(
     then taken at rest. The default is ``enroll.mode``; "auto" means at rest.
 
     Every view is described by `rig.views.description.DESCRIPTORS`. Segmentation uses the bench's empty-table image, if
-    there is one (`rig.plans.photograph_table`); the enrollment stores it.
+    there is one (`rig.plans.photograph_table`); the enrollment stores it. At the end all views are segmented again,
+    together (`Enrollment.revise`).
 
     Raises
     ------
@@ -124,6 +125,7 @@ def enroll(
                 with suppress(RigError):  # it has views to resume
                     enrollment.discard()  # a mistyped name, or a table that did not start, is not left in the catalog
             raise
+    enrollment.revise()
     enrollment.finish()
     done = Enrolled(enrollment.object_name, views, retakes, seconds_between(started_ns, bench.clock.now_ns()))
     yield done

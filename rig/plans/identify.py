@@ -85,7 +85,8 @@ def identify(
     if empty_table is None and isinstance(model, Model):
         empty_table, more = empty_table_for(bench, model)
         notes += more
-    describe = SearchDescriber(bench.config.view, search.descriptor, empty_table)
+    moving = isinstance(search, ArcSearch)
+    describe = SearchDescriber(bench.config.view, search.descriptor, empty_table, revise=not moving)
     yield Started(
         "identify",
         None,

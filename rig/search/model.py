@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 import hbr
 from rig.bench import Bench
 from rig.catalog import Catalog
-from rig.catalog.descriptions import camera_settings, empty_tables, has_descriptor, read_empty_table
+from rig.catalog.descriptions import camera_settings, empty_tables, guessed_objects, has_descriptor, read_empty_table
 from rig.catalog.jobs import JobProgress
 from rig.catalog.prepared import prepared_views
 from rig.core.errors import CatalogError, DescriptorOutdated
@@ -132,6 +132,8 @@ def _dense(catalog: Catalog, progress: Callable[[JobProgress], None] | None) -> 
     others = before.without_image if with_image else before.with_image
     if others:
         notes += (Note(NoteCode.MIXED_EMPTY_TABLE, {"objects": list(others), "with_image": not with_image}),)
+    if guessed := guessed_objects(catalog):
+        notes += (Note(NoteCode.ENROLLED_BY_GUESS, {"objects": list(guessed)}),)
     table = None
     if with_image and before.newest is not None:
         with suppress(CatalogError):  # rig catalog verify reports it; the bench has its own image

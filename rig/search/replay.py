@@ -71,9 +71,7 @@ def check(run: SavedRun, *, by: AnyStrategy | None = None) -> Check:
     tolerance = EARLIER_TOLERANCE if run.format_version < 4 else TOLERANCE
     found = Check(is_complete=run.error is not None and not run.is_cut)
     search: Search | None = None
-    single = ViewDescriber(run.config.view, (run.views.descriptor,), run.empty_table)
-    # runs of earlier formats, and searches in motion, have one segmentation of each view
-    several = SearchDescriber(run.config.view, run.views.descriptor, run.empty_table)
+    describe: ViewDescriber | None = None
     ranked: Ranked | None = None
     step: Rotate | Finish | None = None
     table_deg = 0.0
@@ -88,8 +86,9 @@ def check(run: SavedRun, *, by: AnyStrategy | None = None) -> Check:
                     search, _ = begin_search(
                         run.model, run.config, by or started.strategy, seed=started.seed or 0, top=top
                     )
-                whole = run.format_version < 5 or isinstance(search, ArcSearch)
-                view = (single if whole else several)(event.image_bgr)
+                    describe = _describer(run, moving=isinstance(search, ArcSearch))
+                assert describe is not None
+                view = describe(event.image_bgr)
                 levels = view.levels[search.descriptor]
                 if event.evidence.motion is not None:
                     table_deg = event.evidence.motion.angle_deg
@@ -119,6 +118,13 @@ def check(run: SavedRun, *, by: AnyStrategy | None = None) -> Check:
                 again.pop(name, None)
             found.differences += _compare(found.views, "", saved, again, tolerance)
     return found
+
+
+def _describer(run: SavedRun, *, moving: bool) -> ViewDescriber:
+    """Return what describes the views of a run; in runs of earlier formats each view has one segmentation."""
+    if run.format_version < 5:
+        return ViewDescriber(run.config.view, (run.views.descriptor,), run.empty_table)
+    return SearchDescriber(run.config.view, run.views.descriptor, run.empty_table, revise=not moving)
 
 
 def _decided(step: Rotate | Finish | None, saved: Decided) -> Decided | dict[str, Any]:

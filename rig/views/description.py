@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 import hbr
 from hbr.segmentation import MIN_AGREEMENT, Issue, IssueCode
+from hbr.segmentation.learned import LearnedBackground
+from hbr.segmentation.stored import evidence_together, stored_segmentation
 from rig.config import ViewConfig
 from rig.core.errors import UsageError
 from rig.views.table_problems import TableProblem, TableProblemCode
@@ -98,24 +100,29 @@ class ViewDescriber:
         self._low: list[float] = []
         self._reported = False
 
-    def __call__(self, image_bgr: NDArray[np.uint8]) -> DescribedView:
+    def __call__(self, image_bgr: NDArray[np.uint8], stored: Mapping[str, Any] | None = None) -> DescribedView:
         """Describe a frame, uint8 (H, W, 3).
+
+        ``stored`` is the evidence of an enrolled view: a view that was segmented together with others keeps its
+        silhouette (`hbr.segmentation.stored`).
 
         Raises
         ------
         UsageError
             The region does not lie within the frame.
         ValueError
-            The region is too small for a segmentation.
+            The region is too small for a segmentation, or the stored evidence is damaged.
         """
-        part = within(image_bgr, self.region)
-        found = self.segment(image_bgr) if self._segments else None
-        levels = {
-            one.name: one.describe(part if found is None or one.whole_image else found) for one in self._descriptors
-        }
+        found = self.segment(image_bgr, stored) if self._segments else None
+        levels = self._levels(within(image_bgr, self.region), found)
         if found is None:
             return DescribedView(levels, None)
         return DescribedView(levels, found.evidence(), self._table_problem(found.agreement))
+
+    def _levels(self, part: NDArray[np.uint8], found: hbr.Segmentation | None) -> dict[str, NDArray[np.uint8]]:
+        return {
+            one.name: one.describe(part if found is None or one.whole_image else found) for one in self._descriptors
+        }
 
     def _table_problem(self, agreement: float | None) -> TableProblem | None:
         """Return a problem after `IN_A_ROW` frames that differ from the empty-table image, but only once."""
@@ -128,18 +135,57 @@ class ViewDescriber:
         parameters = {"frames": IN_A_ROW, "agreement": round(max(self._low), 3)}
         return TableProblem(TableProblemCode.SURROUNDINGS, parameters)
 
-    def segment(self, image_bgr: NDArray[np.uint8]) -> hbr.Segmentation:
-        """Return the segmentation of the region of interest in a frame, uint8 (H, W, 3); errors as for a call."""
+    def segment(self, image_bgr: NDArray[np.uint8], stored: Mapping[str, Any] | None = None) -> hbr.Segmentation:
+        """Return the segmentation of the region of interest in a frame, uint8 (H, W, 3); as for a call."""
         part = within(image_bgr, self.region)
+        background, issues = self._prepared_table(image_bgr)
+        found = stored_segmentation(part, stored, empty_table=background)
+        return replace(found, issues=(*issues, *(one for one in found.issues if one not in issues)))
+
+    def _prepared_table(self, image_bgr: NDArray[np.uint8]) -> tuple[hbr.Background | None, tuple[Issue, ...]]:
+        """Return the empty-table image of the region, and the issue if it has another size than the frame."""
         if self._table is None:
-            return hbr.segment(part)
+            return None, ()
         if self._table.shape != image_bgr.shape:
             sizes = {"table_px": list(self._table.shape[1::-1]), "frame_px": list(image_bgr.shape[1::-1])}
-            found = hbr.segment(part)
-            return replace(found, issues=(Issue(IssueCode.TABLE_SIZE, sizes), *found.issues))
+            return None, (Issue(IssueCode.TABLE_SIZE, sizes),)
         if self._background is None:
             self._background = hbr.Background(within(self._table, self.region))
-        return hbr.segment(part, empty_table=self._background)
+        return self._background, ()
+
+
+class EnrollmentDescriber(ViewDescriber):
+    """Describes the views of one enrollment together, as a search segments its views.
+
+    First all images are learned from, one after the other, then each is described. No image is held in memory.
+    """
+
+    def __init__(
+        self, config: ViewConfig, names: tuple[str, ...] = DESCRIPTORS, empty_table: NDArray[np.uint8] | None = None
+    ) -> None:
+        super().__init__(config, names, empty_table)
+        self._learned = LearnedBackground()
+
+    def learn(self, image_bgr: NDArray[np.uint8]) -> int:
+        """Learn the background from the next view, uint8 (H, W, 3); return the number of the view.
+
+        Raises
+        ------
+        UsageError, ValueError
+            As for `ViewDescriber`, or the view has another size than the others.
+        """
+        self._learned.add(within(image_bgr, self.region))
+        return len(self._learned) - 1
+
+    def describe(self, view: int, image_bgr: NDArray[np.uint8]) -> DescribedView:
+        """Describe the image that was learned from as the view of this number."""
+        part = within(image_bgr, self.region)
+        background, issues = self._prepared_table(image_bgr)
+        (found,) = hbr.hypotheses(part, empty_table=background, learned=self._learned.of(view), most=1)
+        if found.box is None:
+            found = hbr.segment(part, empty_table=background)
+        found = replace(found, issues=(*issues, *found.issues))
+        return DescribedView(self._levels(part, found), evidence_together(found, len(self._learned)))
 
 
 class SearchDescriber(ViewDescriber):
@@ -154,6 +200,8 @@ class SearchDescriber(ViewDescriber):
         As for `ViewDescriber`.
     name
         The descriptor.
+    revise
+        Whether earlier views are segmented again with each new one; not in a search in motion, which has many views.
 
     Raises
     ------
@@ -161,24 +209,25 @@ class SearchDescriber(ViewDescriber):
         The descriptor is unknown.
     """
 
-    def __init__(self, config: ViewConfig, name: str, empty_table: NDArray[np.uint8] | None = None) -> None:
+    def __init__(
+        self, config: ViewConfig, name: str, empty_table: NDArray[np.uint8] | None = None, *, revise: bool = True
+    ) -> None:
         super().__init__(config, (name,), empty_table)
         self._name = name
+        self._revise = revise
         self._views: hbr.ViewsTogether | None = None
 
-    def __call__(self, image_bgr: NDArray[np.uint8]) -> DescribedView:
+    def __call__(self, image_bgr: NDArray[np.uint8], stored: Mapping[str, Any] | None = None) -> DescribedView:  # noqa: ARG002
         """Describe the next frame of the search; errors as for `ViewDescriber`."""
         if not self._segments:
             return super().__call__(image_bgr)
         part = within(image_bgr, self.region)
-        fits = self._table is None or self._table.shape == image_bgr.shape
+        background, issues = self._prepared_table(image_bgr)
         if self._views is None:
-            table = within(self._table, self.region) if self._table is not None and fits else None
-            self._views = hbr.ViewsTogether(self._name, empty_table=table)
-        found = self._views.add(part)[0]
-        if self._table is not None and not fits:
-            sizes = {"table_px": list(self._table.shape[1::-1]), "frame_px": list(image_bgr.shape[1::-1])}
-            found = replace(found, issues=(Issue(IssueCode.TABLE_SIZE, sizes), *found.issues))
+            self._views = hbr.ViewsTogether(self._name, empty_table=background)
+        found = self._views.add(part, revise=self._revise)[0]
+        found = replace(found, issues=(*issues, *found.issues))
         *earlier, levels = self._views.levels
         problem = self._table_problem(found.agreement)
-        return DescribedView({self._name: levels}, found.evidence(), problem, tuple(earlier))
+        revised = tuple(earlier) if self._revise else None
+        return DescribedView({self._name: levels}, found.evidence(), problem, revised)

@@ -1,5 +1,6 @@
 """Stage images for an import: check, copy and describe them, in several processes."""
 
+import json
 import os
 import zlib
 from collections.abc import Iterator
@@ -39,6 +40,8 @@ class Item(NamedTuple):
     given: tuple[PackedDescriptor, ...] = ()
     """Descriptors that came with the image, to be compared with those of the image."""
     empty_table: tuple[ImageSource, str | None] | None = None
+    segmentation: str = "null"
+    """The evidence that came with the image, as JSON."""
 
 
 class StagedImage(NamedTuple):
@@ -73,6 +76,7 @@ def items_of(plan: Plan, descriptors: tuple[str, ...] = ()) -> Iterator[Item]:
                     batch.regions.get(view.image),
                     tuple(one.as_packed() for one in view.descriptors if is_current(one.name, one.version)),
                     _empty_table(plan, enrollment.sessions[view.session]),
+                    json.dumps(view.segmentation),
                 )
             for k, session in enumerate(enrollment.sessions):
                 image, sha256 = session.empty_table_image, session.empty_table_image_sha256
@@ -103,7 +107,7 @@ def _stage_one(root: Path | None, item: Item, mode: int) -> StagedImage:
     if item.sha256 is not None and sha256 != item.sha256:
         return _rejected(ImportProblem.OTHER_IMAGE)
     for given in item.given:
-        if wrong := _check_descriptor(given, image, item.empty_table):
+        if wrong := _check_descriptor(given, image, item):
             return wrong
     if root is None:
         return StagedImage("", sha256, len(content))
@@ -127,16 +131,14 @@ def _rejected(code: ImportProblem, **values: Any) -> StagedImage:
     return StagedImage("", reason=Reason(code, values))
 
 
-def _check_descriptor(
-    given: PackedDescriptor, image: NDArray[np.uint8], empty_table: tuple[ImageSource, str | None] | None
-) -> StagedImage | None:
+def _check_descriptor(given: PackedDescriptor, image: NDArray[np.uint8], item: Item) -> StagedImage | None:
     """Return a rejected image if the descriptor is not that of the image, or if that cannot be checked."""
     kind = descriptor(given.name)
     try:
-        table = None if empty_table is None or kind.whole_image else _table(*empty_table)
+        table = None if item.empty_table is None or kind.whole_image else _table(*item.empty_table)
         config = ViewConfig(roi=region_of(given.settings))
-        levels = ViewDescriber(config, (given.name,), table)(image).levels[given.name]
-    except (CatalogError, UsageError, *_READ_ERRORS) as error:
+        levels = ViewDescriber(config, (given.name,), table)(image, json.loads(item.segmentation)).levels[given.name]
+    except (CatalogError, UsageError, ValueError, *_READ_ERRORS) as error:
         return _rejected(ImportProblem.DESCRIPTOR_NOT_CHECKED, name=given.name, error=str(error))
     return None if matches(kind, given.packed, levels) else _rejected(ImportProblem.OTHER_DESCRIPTOR, name=given.name)
 

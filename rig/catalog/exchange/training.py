@@ -65,6 +65,7 @@ class _Item(NamedTuple):
     sha256: str
     region: Region | None
     empty_table: tuple[str, str] | None
+    segmentation: str
 
 
 class _Mask(NamedTuple):
@@ -92,7 +93,7 @@ def write_training(
 ) -> Generator[JobProgress, None, TrainingExport]:
     """Write the views that searches use as a training set into a new folder, all or nothing.
 
-    Masks are not stored in a catalog: they are computed from the stored images, as for the descriptors.
+    Masks are those of the descriptors: the stored silhouettes, or computed from the stored images.
 
     Parameters
     ----------
@@ -171,7 +172,9 @@ def _items(item: Object, files: Mapping[str, Path]) -> list[_Item]:
         table, sha256 = session.empty_table_image, session.empty_table_image_sha256
         empty_table = None if table is None or sha256 is None else (str(files[table]), sha256)
         assert view.image_sha256 is not None  # read from a catalog
-        found.append(_Item(view.image, str(files[view.image]), view.image_sha256, region_of_view(view), empty_table))
+        evidence = json.dumps(view.segmentation)
+        file = str(files[view.image])
+        found.append(_Item(view.image, file, view.image_sha256, region_of_view(view), empty_table, evidence))
     return found
 
 
@@ -208,7 +211,7 @@ def _annotate(folder: Path, portion: tuple[_Item, ...]) -> list[_Mask]:
 
 
 def _mask(item: _Item, image: NDArray[np.uint8]) -> _Mask:
-    found = _describer(item.region, item.empty_table).segment(image)
+    found = _describer(item.region, item.empty_table).segment(image, json.loads(item.segmentation))
     height, width = image.shape[:2]
     x0, y0, w, h = item.region or (0, 0, width, height)
     whole = np.zeros((height, width), np.bool_)

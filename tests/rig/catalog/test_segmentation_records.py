@@ -11,6 +11,7 @@ from sqlalchemy import update
 
 import hbr
 from rig.catalog import Catalog
+from rig.catalog.descriptions import guessed_objects
 from rig.catalog.exchange import (
     import_objects,
     plan_import,
@@ -21,7 +22,7 @@ from rig.catalog.exchange import (
     write_bundle,
 )
 from rig.catalog.redescribe import redescribe
-from rig.catalog.schema import descriptors
+from rig.catalog.schema import descriptors, views
 from rig.catalog.seal import changing_enrollments
 from rig.catalog.verify import Problem, verify
 from rig.config import ViewConfig
@@ -73,6 +74,7 @@ def enrolled(catalog: Catalog, name: str, *, names: tuple[str, ...] = DESCRIPTOR
     for index in range(VIEWS):
         levels, segmentation = (described := describe(view(index))).levels, described.segmentation
         enrollment.add(record(index, descriptors=levels, region=REGION, segmentation=segmentation), view(index))
+    enrollment.revise()
     enrollment.finish()
 
 
@@ -99,9 +101,53 @@ def test_redescribe_works_without_an_empty_table_image(open_catalog: Callable[[s
     catalog = open_catalog("old")
     enrolled(catalog, "box", names=(PAPER_DESCRIPTOR,), empty_table=False)
     finished(redescribe(catalog, BENCH_DESCRIPTOR, jobs=1))
-    expected = hbr.describe(view(0)[:, 8:72], descriptor=BENCH_DESCRIPTOR)
-    assert np.array_equal(catalog.views(BENCH_DESCRIPTOR).views.descriptors[0], expected)
+    together = hbr.ViewsTogether(BENCH_DESCRIPTOR, several=False)
+    for index in range(VIEWS):
+        together.add(view(index)[:, 8:72], revise=False)
+    together.revise()
+    expected = [levels[0] for levels in together.levels]
+    assert np.array_equal(catalog.views(BENCH_DESCRIPTOR).views.descriptors, expected)
     assert all(view.record.segmentation["agreement"] is None for view in catalog.object("box").views)
+    assert finished(verify(catalog, jobs=1)).findings == ()
+    assert finished(redescribe(catalog, BENCH_DESCRIPTOR, jobs=1)).unchanged == VIEWS
+
+
+def test_redescribe_segments_views_again_that_were_guessed(open_catalog: Callable[[str], Catalog]) -> None:
+    catalog = open_catalog("old")
+    enrollment = catalog.begin("box", planned_azimuth_deg=plan(VIEWS), provenance=PROVENANCE)
+    describe = ViewDescriber(ViewConfig(roi=REGION))
+    for index in range(VIEWS):
+        found = describe(view(index))
+        assert found.segmentation is not None
+        assert found.segmentation["method"] == "guess"
+        enrollment.add(
+            record(index, descriptors=found.levels, region=REGION, segmentation=found.segmentation), view(index)
+        )
+    enrollment.finish()
+    assert finished(verify(catalog, jobs=1)).findings == ()  # by the guess
+    assert guessed_objects(catalog) == ("box",)
+    assert finished(redescribe(catalog, BENCH_DESCRIPTOR, jobs=1)).described == VIEWS
+    assert guessed_objects(catalog) == ()
+    assert {view.record.segmentation["together"] for view in catalog.object("box").views} == {VIEWS}
+    assert finished(verify(catalog, jobs=1)).findings == ()
+
+
+@pytest.mark.sqlite
+def test_a_view_is_described_again_by_its_stored_silhouette_alone(open_catalog: Callable[[str], Catalog]) -> None:
+    catalog = open_catalog("new")
+    enrolled(catalog, "box", empty_table=False)
+    before = catalog.views(BENCH_DESCRIPTOR).views.descriptors
+    next(catalog.path.rglob("001.png")).unlink()
+    found = finished(verify(catalog, jobs=1)).findings
+    assert [finding.problem for finding in found] == [Problem.MISSING_IMAGE]
+    # a silhouette that is not that of the levels is found
+    with catalog.database.write(1) as connection, changing_enrollments(connection, [1]):
+        evidence = dict(catalog.object("box").views[2].record.segmentation)
+        evidence["mask"] = catalog.object("box").views[0].record.segmentation["mask"]
+        connection.execute(update(views).where(views.c.view_index == 2).values(segmentation=evidence))
+    problems = {finding.problem for finding in finished(verify(catalog, jobs=1)).findings}
+    assert Problem.DESCRIPTOR_DIFFERS in problems
+    assert np.array_equal(before, catalog.views(BENCH_DESCRIPTOR).views.descriptors)
 
 
 def test_bundle_and_merge_keep_segmentation_and_empty_table(

@@ -143,6 +143,7 @@ def test_end_of_a_search_has_a_reason() -> None:
     [
         (NoteCode.PAPER_SEARCH, {"used": "cedd", "missing": "edges", "objects": 1}, "--descriptor edges"),
         (NoteCode.PAPER_SEARCH, {"used": "cedd", "missing": "edges", "objects": 0}, "the catalog is without it"),
+        (NoteCode.ENROLLED_BY_GUESS, {"objects": list("abcde")}, "the views of a, b, c and 2 more were segmented one"),
         (NoteCode.MIXED_EMPTY_TABLE, {"objects": ["a"], "with_image": False}, "a was enrolled without an empty-table"),
         (NoteCode.MIXED_EMPTY_TABLE, {"objects": list("abcde"), "with_image": True}, "a, b, c and 2 more were"),
         (NoteCode.ENROLLED_WITHOUT_EMPTY_TABLE, {}, "most objects were enrolled without"),

@@ -72,6 +72,7 @@ def test_enrollment_stores_every_view_at_the_angle_it_was_taken(simulated, catal
         x, y, width, height = s.bench.config.view.roi
         stored = catalog.read_image(view)[y : y + height, x : x + width]
         assert (hbr.describe(stored) == record.descriptors["cedd"]).all()
+        assert record.segmentation["together"] == VIEWS
     assert torque(s) == 0
 
 
@@ -446,6 +447,7 @@ def test_resume_finishes_an_enrollment_that_has_all_its_views(simulated, catalog
     events = list(enroll(s.bench, catalog, "dice", resume=True))
     assert [type(event) for event in events] == [Started, Enrolled]
     assert catalog.object("dice").summary.views == 4
+    assert {view.record.segmentation["together"] for view in catalog.object("dice").views} == {4}
 
 
 def test_old_views_stay_in_use_until_the_new_ones_are_complete(simulated, catalog):

@@ -1,0 +1,180 @@
+"""Segmentations: an object cut out of its frame, with the evidence."""
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from hbr.core.arrays import ImageArray
+from hbr.segmentation.background import Illumination
+from hbr.segmentation.evidence import Issue, Method
+
+#: Side of the square crop around an object.
+CROP_PX: Final = 160
+#: Side of the crop, as a multiple of the longer side of the box.
+_MARGIN: Final = 1.1
+#: Brightness of the grey that replaces the background, as a share of the object's brightness.
+_SURROUND: Final = 0.5
+
+Box = tuple[int, int, int, int]
+
+
+@dataclass(frozen=True, eq=False)
+class Segmentation:
+    """An object cut out of its frame, with the evidence.
+
+    Attributes
+    ----------
+    crop : uint8 array (160, 160, 3)
+        Square around the object, in BGR, after illumination correction.
+    mask : uint8 array (160, 160)
+        Share of each pixel that belongs to the object, 0..255; 255 everywhere if no object was found.
+    box : (int, int, int, int) or None
+        The object's x, y, width and height in pixels of the frame; None if no object was found.
+    gains : (float, float, float) or None
+        Factors of the illumination correction for B, G, R; None without correction.
+    agreement : float or None
+        Share of the frame's border that looks like the empty-table image; None without such an image.
+    method : Method
+        How the box was found.
+    issues : tuple of Issue
+        What could not be done, and why.
+    correction : Illumination or None
+        The illumination correction.
+    silhouette : bool array (h, w) or None
+        The object's pixels in the small image (`hbr.segmentation.background.shrunk`); None if they are not known.
+    """
+
+    crop: ImageArray
+    mask: NDArray[np.uint8]
+    box: Box | None
+    gains: tuple[float, float, float] | None
+    agreement: float | None
+    method: Method
+    issues: tuple[Issue, ...] = ()
+    correction: Illumination | None = field(default=None, repr=False)
+    silhouette: NDArray[np.bool_] | None = field(default=None, repr=False)
+
+    def evidence(self) -> dict[str, Any]:
+        """Return method, box, gains, agreement and issues as JSON values, to be stored with the view."""
+        return {
+            "method": self.method.value,
+            "box_px": None if self.box is None else list(self.box),
+            "gains_bgr": None if self.gains is None else [round(gain, 4) for gain in self.gains],
+            "agreement": None if self.agreement is None else round(self.agreement, 3),
+            "issues": [issue.as_json() for issue in self.issues],
+        }
+
+    def frame_mask(self, width: int, height: int) -> NDArray[np.bool_]:
+        """Return the object's pixels in its frame of this size, bool (height, width); none if no object was found."""
+        whole = np.zeros((height, width), np.bool_)
+        if self.box is None:
+            return whole
+        left, top, side = _square_around(self.box)
+        scale = CROP_PX / side
+        move = np.array([[scale, 0, scale * (0.5 - left) - 0.5], [0, scale, scale * (0.5 - top) - 0.5]])
+        share = cv2.warpAffine(self.mask, move, (width, height), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+        x, y, w, h = self.box
+        whole[y : y + h, x : x + w] = share[y : y + h, x : x + w] > 127
+        return whole
+
+    @cached_property
+    def alone(self) -> ImageArray:
+        """The crop with an even grey instead of the background, half as bright as the object, uint8 (160, 160, 3)."""
+        if self.box is None:
+            return self.crop
+        share = cv2.GaussianBlur(self.mask, (0, 0), 2.5)
+        level = _SURROUND * float(np.mean(cv2.mean(self.crop, mask=(self.mask > 127).astype(np.uint8))[:3]))
+        ground = np.full_like(self.crop, round(level))
+        weight = share.astype(np.float32) * np.float32(1 / 255)
+        return cv2.blendLinear(self.crop, ground, weight, 1 - weight).astype(np.uint8, copy=False)
+
+
+def cut_out(
+    image: ImageArray,
+    found: NDArray[np.bool_] | None,
+    box: Box | None,
+    correction: Illumination | None,
+    agreement: float | None,
+    method: Method,
+    issues: tuple[Issue, ...],
+) -> Segmentation:
+    """Return the segmentation of a frame whose silhouette or box was found."""
+    height, width = image.shape[:2]
+    if box is None and found is not None:
+        box = _box_of(found, width, height)
+    if box is None:
+        side = float(min(height, width))
+        left, top = (width - side) / 2, (height - side) / 2
+    else:
+        left, top, side = _square_around(box)
+    crop = _square(image, left, top, side)
+    if correction is not None:
+        crop = _corrected(crop, correction, left, top, side, width, height)
+    if found is not None:
+        ratio = found.shape[1] / width
+        mask = _square(found.astype(np.uint8) * 255, left * ratio, top * ratio, side * ratio, cv2.BORDER_CONSTANT)
+    elif box is not None:
+        mask = _box_mask(box, left, top, side)
+    else:
+        mask = np.full((CROP_PX, CROP_PX), 255, np.uint8)
+    gains = None if correction is None else correction.gains
+    return Segmentation(crop, mask, box, gains, agreement, method, issues, correction, found)
+
+
+def _square_around(box: Box) -> tuple[float, float, float]:
+    """Return left, top and side of the square that is cropped."""
+    side = max(box[2], box[3]) * _MARGIN
+    return box[0] + (box[2] - side) / 2, box[1] + (box[3] - side) / 2, side
+
+
+def _box_of(found: NDArray[np.bool_], width: int, height: int) -> Box:
+    x, y, w, h = cv2.boundingRect(found.astype(np.uint8))
+    across, down = width / found.shape[1], height / found.shape[0]
+    left, top = int(x * across), int(y * down)
+    return left, top, min(width, round((x + w) * across)) - left, min(height, round((y + h) * down)) - top
+
+
+def _box_mask(box: Box, left: float, top: float, side: float) -> NDArray[np.uint8]:
+    scale = CROP_PX / side
+    mask = np.zeros((CROP_PX, CROP_PX), np.uint8)
+    x, y = round((box[0] - left) * scale), round((box[1] - top) * scale)
+    mask[y : y + round(box[3] * scale), x : x + round(box[2] * scale)] = 255
+    return mask
+
+
+def _square(
+    image: NDArray[np.uint8], left: float, top: float, side: float, border: int = cv2.BORDER_REPLICATE
+) -> NDArray[np.uint8]:
+    """Return a square of the image, scaled to `CROP_PX`: averaged by area if it shrinks, linearly if it grows."""
+    scale = CROP_PX / side
+    if scale < 1:
+        # whole pixels, because INTER_AREA needs an integer region
+        x, y, size = round(left), round(top), max(1, round(side))
+        height, width = image.shape[:2]
+        out = max(0, -x), max(0, -y), max(0, x + size - width), max(0, y + size - height)
+        part = image[max(0, y) : y + size, max(0, x) : x + size]
+        if any(out):
+            part = cv2.copyMakeBorder(part, out[1], out[3], out[0], out[2], border).astype(np.uint8, copy=False)
+        return cv2.resize(part, (CROP_PX, CROP_PX), interpolation=cv2.INTER_AREA).astype(np.uint8, copy=False)
+    shift = (scale - 1) / 2
+    move = np.array([[scale, 0, shift - scale * left], [0, scale, shift - scale * top]])
+    return cv2.warpAffine(image, move, (CROP_PX, CROP_PX), flags=cv2.INTER_LINEAR, borderMode=border).astype(
+        np.uint8, copy=False
+    )
+
+
+def _corrected(
+    crop: ImageArray, correction: Illumination, left: float, top: float, side: float, width: int, height: int
+) -> ImageArray:
+    """Apply to the crop the correction, whose planes extend over the whole frame."""
+    local = correction.slopes.copy()
+    local[0] += local[1] * ((left + side / 2) / width - 0.5) + local[2] * ((top + side / 2) / height - 0.5)
+    local[1] *= side / width
+    local[2] *= side / height
+    coarse = cv2.exp(Illumination(local).over(8, 8))
+    factors = cv2.resize(coarse, (CROP_PX, CROP_PX), interpolation=cv2.INTER_LINEAR)
+    return cv2.multiply(crop, factors, dtype=cv2.CV_8U).astype(np.uint8, copy=False)

@@ -1,0 +1,155 @@
+"""The stored views of an enrollment, segmented and described together, as a search segments its views.
+
+Decision: docs/decisions/0054.
+"""
+
+from collections.abc import Iterable, Sequence
+from itertools import groupby
+from typing import Any, Final, NamedTuple
+
+from sqlalchemy import Connection, and_, bindparam, delete, insert, or_, select, update
+
+from hbr.descriptors import descriptor
+from hbr.segmentation import Method
+from hbr.segmentation.stored import TOGETHER
+from rig.catalog.describing import EmptyTable, is_current, pack, region_of
+from rig.catalog.image_store import ImageStore
+from rig.catalog.queries import packed_descriptors
+from rig.catalog.records import JsonObject, PackedDescriptor, Region
+from rig.catalog.schema import descriptors, sessions, views
+from rig.config import ViewConfig
+from rig.core.errors import CatalogError, UsageError
+from rig.views.description import EnrollmentDescriber
+
+FEWEST_VIEWS: Final = 4
+"""A session with fewer views, after an interruption, learns its background from all views of the enrollment."""
+
+
+class StoredImage(NamedTuple):
+    """The image of a view, with its SHA-256, its session, and what it is described with."""
+
+    view_id: int
+    image: str
+    sha256: str
+    session_id: int
+    region: Region | None
+    empty_table: EmptyTable | None
+
+
+class Described(NamedTuple):
+    """The packed levels of a view and its segmentation, or the reason why it cannot be described."""
+
+    view_id: int
+    packed: tuple[PackedDescriptor, ...] = ()
+    segmentation: JsonObject | None = None
+    reason: str = ""
+
+
+def needs_segmentation(segmentation: JsonObject | None) -> bool:
+    """Return whether a view has no segmentation, or one by a guess from this view alone."""
+    if segmentation is None:
+        return True
+    return TOGETHER not in segmentation and segmentation.get("method") in (Method.GUESS, Method.NONE)
+
+
+def describe_together(store: ImageStore, names: tuple[str, ...], items: Sequence[StoredImage]) -> list[Described]:
+    """Describe the views of one enrollment by these descriptors, in their order."""
+    found: dict[int, Described] = {}
+    for _, group in groupby(sorted(items, key=_session), _session):
+        own = list(group)
+        region, empty_table = own[0].region, own[0].empty_table
+        learned_from = own if len(own) >= FEWEST_VIEWS else [one for one in items if one.region == region]
+        try:
+            table = None if empty_table is None else store.pixels(*empty_table)
+        except CatalogError as error:
+            found |= {one.view_id: Described(one.view_id, reason=error.what) for one in own}
+            continue
+        describer = EnrollmentDescriber(ViewConfig(roi=region), names, table)
+        numbers: dict[int, int] = {}
+        for one in learned_from:
+            try:
+                numbers[one.view_id] = describer.learn(store.pixels(one.image, one.sha256))
+            except (CatalogError, UsageError, ValueError) as error:
+                found.setdefault(one.view_id, Described(one.view_id, reason=_reason(error)))
+        for one in own:
+            if one.view_id not in numbers:
+                continue
+            try:
+                described = describer.describe(numbers[one.view_id], store.pixels(one.image, one.sha256))
+            except (CatalogError, UsageError, ValueError) as error:
+                found[one.view_id] = Described(one.view_id, reason=_reason(error))
+                continue
+            packed = tuple(pack(described.levels, region))
+            found[one.view_id] = Described(one.view_id, packed, described.segmentation)
+    return [found[one.view_id] for one in items]
+
+
+def object_descriptors(connection: Connection, enrollment_id: int) -> tuple[str, ...]:
+    """Return the descriptors of the object alone by which views of an enrollment are described, in present versions."""
+    rows = connection.execute(
+        select(descriptors.c.name, descriptors.c.version)
+        .join(views, descriptors.c.view_id == views.c.id)
+        .where(views.c.enrollment_id == enrollment_id)
+        .distinct()
+        .order_by(descriptors.c.name)
+    )
+    return tuple(name for name, version in rows if is_current(name, version) and not descriptor(name).whole_image)
+
+
+def stored_images(connection: Connection, enrollment_id: int) -> list[StoredImage]:
+    """Return the images of an enrollment, with the regions that their descriptors of the object describe."""
+    rows = connection.execute(
+        select(
+            views.c.id,
+            views.c.image,
+            views.c.image_sha256,
+            views.c.session_id,
+            sessions.c.empty_table_image,
+            sessions.c.empty_table_image_sha256,
+        )
+        .join(sessions, views.c.session_id == sessions.c.id)
+        .where(views.c.enrollment_id == enrollment_id)
+        .order_by(views.c.view_index)
+    ).all()
+    described = packed_descriptors(connection, views.c.enrollment_id == enrollment_id)
+    found = []
+    for view_id, image, sha256, session_id, table, table_sha256 in rows:
+        settings = [one.settings for one in described.get(view_id, ()) if is_current(one.name, one.version)]
+        region = region_of(settings[0]) if settings else None
+        empty_table = None if table is None else (table, table_sha256)
+        found.append(StoredImage(view_id, image, sha256, session_id, region, empty_table))
+    return found
+
+
+def write_described(connection: Connection, found: Iterable[Described]) -> int:
+    """Replace levels and segmentations of views that still exist; return their number.
+
+    The caller holds the write lock, within `rig.catalog.seal.changing_enrollments`.
+    """
+    wanted = [one for one in found if one.packed]
+    ids = [one.view_id for one in wanted]
+    alive = set(connection.scalars(select(views.c.id).where(views.c.id.in_(ids))))
+    wanted = [one for one in wanted if one.view_id in alive]
+    rows = [{"view_id": one.view_id, **packed._asdict()} for one in wanted for packed in one.packed]
+    kinds = {(row["name"], row["version"]) for row in rows}
+    if not rows:
+        return 0
+    same = or_(*(and_(descriptors.c.name == name, descriptors.c.version == version) for name, version in kinds))
+    connection.execute(delete(descriptors).where(and_(descriptors.c.view_id.in_(alive), same)))
+    connection.execute(insert(descriptors), rows)
+    segmentations: list[dict[str, Any]] = [
+        {"of_view": one.view_id, "new": one.segmentation} for one in wanted if one.segmentation is not None
+    ]
+    if segmentations:
+        connection.execute(
+            update(views).where(views.c.id == bindparam("of_view")).values(segmentation=bindparam("new")), segmentations
+        )
+    return len(wanted)
+
+
+def _session(item: StoredImage) -> tuple[int, str]:
+    return item.session_id, repr(item.region)
+
+
+def _reason(error: Exception) -> str:
+    return error.what if isinstance(error, CatalogError | UsageError) else str(error)
