@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
+from sqlalchemy.engine import make_url
 from sqlalchemy.exc import DBAPIError, InterfaceError, OperationalError
 from sqlalchemy.exc import TimeoutError as PoolTimeout
 
@@ -81,7 +82,21 @@ def _of_server(error: DBAPIError, place: CatalogPlace, busy_timeout_s: float) ->
     return None
 
 
+def _accepts_connections(place: CatalogPlace) -> bool:
+    """Return whether the server answers. The error of a connection that was denied has no code."""
+    from psycopg.pq import PGconn, Ping
+
+    url = make_url(str(place.url)).set(drivername="postgresql").update_query_dict({"connect_timeout": "2"})
+    return bool(PGconn.ping(url.render_as_string(hide_password=False).encode()) == Ping.OK)
+
+
 def _unavailable(place: CatalogPlace, error: object) -> CatalogUnavailable:
+    if _accepts_connections(place):
+        return CatalogUnavailable(
+            f"the server of the catalog {place} denies the connection",
+            next_step="check catalog.url, the password in ~/.pgpass, and the rights of the user on the server",
+            evidence={"server": str(error).strip()},
+        )
     return CatalogUnavailable(
         f"the server of the catalog {place} does not answer",
         next_step="check the network and the server, then try again",

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from rig.catalog.places import LOST, file_mode, files_within, image_file, lost_file, make_folder_within
 from rig.config.catalog_place import CatalogPlace
-from rig.core.errors import CatalogUnavailable, ConfigError, ExtraMissing
+from rig.core.errors import CatalogError, CatalogUnavailable, ConfigError, ExtraMissing
 from rig.core.files import read as read_local
 from rig.core.files import write as write_local
 from rig.views import image_files as images
@@ -231,8 +231,15 @@ class FsspecImages(ImageStore):
         return path
 
     def write(self, name: str, content: bytes) -> None:
-        with self._store() as (files, root):
-            files.pipe_file(f"{root}/{name}", content)
+        try:
+            with self._store() as (files, root):
+                files.pipe_file(f"{root}/{name}", content)
+        except FileNotFoundError as error:
+            raise CatalogError(
+                f"the store {self.url} does not exist",
+                next_step="create its bucket, or correct catalog.images",
+                evidence={"error": str(error)},
+            ) from error
 
     def make_folder(self, name: str) -> None:
         """Do nothing: a store has no folders."""
@@ -288,8 +295,7 @@ class FsspecImages(ImageStore):
         return None
 
     def set_mark(self, catalog_id: str) -> None:
-        with self._store() as (files, root):
-            files.pipe_file(f"{root}/{MARK}", catalog_id.encode())
+        self.write(MARK, catalog_id.encode())
 
     @contextmanager
     def _store(self) -> Iterator[tuple[Any, str]]:

@@ -68,7 +68,7 @@ class Journal(Catalog):
         own = self.objects()
         names = {one.name for one in own}
         try:
-            with open_or_copy(self.server, self.clock) as shared:
+            with open_or_copy(self.server, self.clock, create=True) as shared:
                 others = [one for one in shared.objects() if one.enrolled_utc is not None]
         except CatalogUnavailable:
             others = []
@@ -83,11 +83,14 @@ class Journal(Catalog):
         resume: bool = False,
         replace: bool = False,
     ) -> None:
-        """Raise what `begin` or `resume` would raise now, also for a name that the server has."""
+        """Raise what `begin` or `resume` would raise now, also for a name that the server or the local copy has."""
         super().check_enrollable(name, label=label, note=note, resume=resume, replace=replace)
-        if not resume:
-            with suppress(CatalogUnavailable), self._reached() as server:
-                server.check_enrollable(name, label=label, note=note, replace=replace)
+        if resume:
+            return
+        with suppress(CatalogUnavailable), open_or_copy(self.server, self.clock, create=True) as shared:
+            if shared.copied_utc is None:
+                release(self, shared)
+            shared.check_enrollable(name, label=label, note=note, replace=replace)
 
     @contextmanager
     def _reached(self) -> Iterator[Catalog]:

@@ -80,8 +80,10 @@ def open_copy(place: CatalogPlace, clock: Clock) -> Catalog:
     return copy
 
 
-def open_or_copy(place: CatalogPlace, clock: Clock) -> Catalog:
+def open_or_copy(place: CatalogPlace, clock: Clock, *, create: bool = False) -> Catalog:
     """Return a catalog, open for reading; its local copy while its server or its store does not answer.
+
+    With ``create`` the catalog is created if there is none, and is open for writing.
 
     Raises
     ------
@@ -89,7 +91,7 @@ def open_or_copy(place: CatalogPlace, clock: Clock) -> Catalog:
         There is no copy either.
     """
     try:
-        return Catalog.open(place, clock=clock, create=False, read_only=True)
+        return Catalog.open(place, clock=clock, create=create, read_only=not create)
     except CatalogUnavailable as error:
         try:
             return open_copy(place, clock)

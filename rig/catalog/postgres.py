@@ -13,7 +13,7 @@ from typing import Any, Final
 
 from sqlalchemy import Column, Connection, MetaData, QueuePool, Table, Text, create_engine, func, select, text
 from sqlalchemy.engine import make_url
-from sqlalchemy.exc import ArgumentError, NoSuchModuleError
+from sqlalchemy.exc import ArgumentError
 
 from rig.catalog import audit
 from rig.catalog.columns import damaged
@@ -299,6 +299,8 @@ def _engine(place: CatalogPlace, busy_timeout_s: float) -> Any:
     options = " ".join(f"-c {key}={value}" for key, value in settings.items())
     try:
         url = make_url(place.url)
+        if url.drivername not in ("postgresql", "postgresql+psycopg"):
+            raise ArgumentError("another kind of database")
         given = url.query.get("options", "")
         return create_engine(
             url.difference_update_query(["options"]),
@@ -312,9 +314,9 @@ def _engine(place: CatalogPlace, busy_timeout_s: float) -> Any:
                 "tcp_user_timeout": 15_000,
             },
         )
-    except (ArgumentError, NoSuchModuleError) as error:
+    except ArgumentError as error:
         raise ConfigError(
-            f"catalog.url = {str(place)!r} is not the URL of a database",
+            f"catalog.url = {str(place)!r} is not the URL of a PostgreSQL database",
             next_step="give postgresql+psycopg://USER@HOST/DATABASE; the password belongs in ~/.pgpass",
         ) from error
     except ImportError as error:

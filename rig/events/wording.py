@@ -86,7 +86,7 @@ def note_words(note: Note) -> str:
         case NoteCode.NOT_RECORDED:
             return f"the answer is not recorded: {v['what']}"
         case NoteCode.LOCAL_COPY:
-            return f"the server of the catalog does not answer; this uses the copy of {v['copied_utc']}"
+            return f"the server of the catalog cannot be used; this uses the copy of {v['copied_utc']}"
         case NoteCode.EARLIER_VERSION:
             return str(v["text"])
 

@@ -1,5 +1,6 @@
 """A bench works without its server, and delivers later, each object exactly once, whenever it is killed."""
 
+import errno
 import json
 import os
 import sys
@@ -181,7 +182,8 @@ def test_names_of_the_server_are_known_before_the_table_is_cleared(
         postgres.stop()
         try:  # by the local copy
             assert [one.name for one in left_to_enroll(journal, items)] == ["cube", "cone"]
-            journal.check_enrollable("mug")  # its name is compared when the server is back
+            with pytest.raises(ObjectExists, match="'mug' is enrolled already"):
+                journal.check_enrollable("mug")
         finally:
             postgres.start()
 
@@ -231,6 +233,37 @@ def test_damage_in_the_journal_stays_there_and_is_reported(place: CatalogPlace) 
         assert finding.problem is Problem.MISSING_IMAGE  # of the answer, which is there all the same
 
 
+def test_password_that_is_wrong_is_told_from_a_server_that_is_gone(
+    postgres: PostgresServer, place: CatalogPlace, rig: Callable[..., Result], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = [word for one in settings_of(place) for word in ("--set", one)]
+    nowhere = str(place.url).replace("/postgres?", "/nowhere?")
+    denied = rig("catalog", "list", *words, "--set", f"catalog.url={json.dumps(nowhere)}")
+    assert (denied.exit_code, "denies the connection" in denied.stderr) == (7, True)
+    assert "~/.pgpass" in denied.stderr
+    other = rig("catalog", "list", *words, "--set", 'catalog.url="mysql://host/rig"')
+    assert (other.exit_code, "is not the URL of a PostgreSQL database" in other.stderr) == (3, True)
+    postgres.stop()
+    try:
+        gone = rig("catalog", "deliver", *words)
+    finally:
+        postgres.start()
+    assert (gone.exit_code, "does not answer" in gone.stderr) == (7, True)
+    missing = rig("catalog", "deliver", "--replace", "star", *words)
+    assert "there is no object 'star'" in missing.stderr
+    with Journal.of(place, CLOCK) as journal:
+        true_fill(journal, "star", 2, 30)
+    monkeypatch.setattr("rig.catalog.image_store.write_local", _full)
+    full = rig("identify", *words)
+    assert "is full" in full.stderr
+    assert "What is in the journal of this computer is delivered later" in full.stderr
+    assert waiting(place, CLOCK) == 1
+
+
+def _full(*_: object, **__: object) -> None:
+    raise OSError(errno.ENOSPC, "No space left on device")
+
+
 def test_bench_works_while_its_share_is_not_mounted(place: CatalogPlace, tmp_path: Path) -> None:
     share = tmp_path / "shared"
     share.rename(tmp_path / "not mounted")
@@ -251,8 +284,9 @@ def test_bench_works_while_its_share_is_not_mounted(place: CatalogPlace, tmp_pat
 
 
 def test_each_object_of_a_tray_is_delivered_and_none_is_asked_for_again(
-    place: CatalogPlace, rig: Callable[..., Result], tmp_path: Path
+    postgres: PostgresServer, rig: Callable[..., Result], tmp_path: Path
 ) -> None:
+    place = place_in(postgres.url, tmp_path / uuid.uuid4().hex, str(tmp_path / "shared"))
     words = [word for one in settings_of(place) for word in ("--set", one)]
     words += [
         "--views",
@@ -265,18 +299,21 @@ def test_each_object_of_a_tray_is_delivered_and_none_is_asked_for_again(
         "view.roi=[40,0,240,240]",
     ]
     seen = []
-    for listed in (["toy-house"], ["toy-house", "toy-car", "mug"]):
+    for listed in (["toy-house"], ["toy-house", "toy-car", "mug"]):  # the first one into an empty database
         (tmp_path / "tray.csv").write_text("name\n" + "\n".join(listed))
         done = rig("enroll", "--list", "tray.csv", "--json", *words)
         assert done.exit_code == 0, done.output
         events = [json.loads(line) for line in done.stdout.splitlines()]
         seen.append([(one["name"], one["action"]) for one in events if one["event"] == "item"])
         assert f"Delivered {listed[min(1, len(listed) - 1)]} with 4 views" in done.stderr
+        with Catalog.open(place, clock=CLOCK) as other_bench:
+            if "mug" not in names(place):
+                true_fill(other_bench, "mug", 2, 0)
     assert seen == [
         [("toy-house", "enroll")],
         [("toy-house", "skip"), ("toy-car", "enroll"), ("mug", "skip")],
     ]
-    assert names(place) == {"mug": 2, "tin": 2, "toy-house": 4, "toy-car": 4}
+    assert names(place) == {"mug": 2, "toy-house": 4, "toy-car": 4}
 
 
 def killed_enrollment() -> None:

@@ -40,13 +40,15 @@ def deliver(
     place = settings.load().catalog_place(settings.bench_name)
     if place.url is None:
         raise UsageError("the catalog is in a folder of this computer", next_step="nothing has to be delivered")
-    if rename is not None or discard is not None:
+    if rename is not None or discard is not None or replace:
         with Journal.of(place, SystemClock()) as journal:
+            for name in replace or ():
+                journal.summary(name)  # there must be one
             if rename is not None:
                 edit.rename(journal, *rename)
             if discard is not None:
                 remove(journal, discard)
-    done = settings.deliver(replacing=replace or ())
+    done = settings.deliver(replacing=replace or (), now=True)
     conflicts = [one for one in done if one.conflict is not None]
     if settings.json:
         rows = [{"name": one.name, "views": one.views, "conflict": one.conflict and one.conflict.what} for one in done]

@@ -262,7 +262,7 @@ class _Job:
                 others = prepared_views(shared)
         except RigError:  # no server, and no copy yet
             return views
-        kept = others.select(np.array([one != name for one in others.object_names])[others.object_index])
+        kept = others.select(np.array([one != name for one in others.object_names], bool)[others.object_index])
         return hbr.Views.concatenate([own, kept])
 
     def _complete(self) -> None:

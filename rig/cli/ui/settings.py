@@ -121,12 +121,15 @@ class Settings:
         if waiting(self.load().catalog_place(self.bench_name), SystemClock()):
             self.deliver()
 
-    def deliver(self, *, replacing: "Collection[str]" = ()) -> "list[Delivery]":
-        """Deliver the journal to the server of the catalog; print what was delivered, and why something was not."""
+    def deliver(self, *, replacing: "Collection[str]" = (), now: bool = False) -> "list[Delivery]":
+        """Deliver the journal to the server of the catalog; print what was delivered, and why something was not.
+
+        If the server cannot be used, print a note: the journal keeps everything. With ``now`` raise the error.
+        """
         from rig.catalog.delivery import deliver as job
         from rig.catalog.journal import Journal
         from rig.core.clock import SystemClock
-        from rig.core.errors import CatalogUnavailable
+        from rig.core.errors import CatalogBusy, CatalogError
 
         place = self.load().catalog_place(self.bench_name)
         if place.url is None:
@@ -134,8 +137,11 @@ class Settings:
         try:
             with Journal.of(place, SystemClock()) as journal, self.open_catalog(create=True) as server:
                 done = job(journal, server, replacing=replacing)
-        except CatalogUnavailable as error:
-            print(f"Note: {error.what}. The journal of this computer keeps it for later.", file=sys.stderr)
+        except (CatalogError, CatalogBusy) as error:
+            if now:
+                raise
+            kept = "What is in the journal of this computer is delivered later"
+            print(f"Note: {error.what}. {kept}. Next step: {error.next_step}", file=sys.stderr)
             return []
         for one in done:
             if one.conflict is not None:
