@@ -1,11 +1,14 @@
 """Jobs on a Dask cluster: the same results as without, and a dead worker costs its item alone."""
 
+import json
 import os
 import signal
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from typer.testing import Result
@@ -19,7 +22,9 @@ from rig.core.cluster import Cluster, map_on_cluster
 from rig.core.errors import ClusterFailed, UsageError
 from rig.core.processes import map_in_processes
 from sim.clock import VirtualClock
+from tests.programs import Program
 from tests.rig.catalog.catalog_samples import finished, true_fill
+from tests.rig.cli.test_evaluate import drawing
 
 distributed = pytest.importorskip("distributed", reason="Dask is not installed (make test-servers)")
 
@@ -113,3 +118,69 @@ def test_commands_take_a_cluster(cluster: Cluster, rig: Callable[..., Result]) -
     both = rig("catalog", "verify", "--cluster", cluster.address, "--jobs", "2")
     assert both.exit_code == 2
     assert "both given" in both.output
+
+
+@pytest.fixture(scope="module")
+def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("pictures")
+    for number in range(1, 7):
+        for angle in range(0, 360, 30):
+            assert cv2.imwrite(str(folder / f"obj{number}__{angle}.png"), drawing(number, angle))
+    return folder
+
+
+EVAL = ("--views", "4", "--trials", "2", "--noise", "mb", "--json")
+
+
+def results(out: Path) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads((out / "results.json").read_text())
+    found.pop("wall_clock")
+    return found
+
+
+def test_evaluation_survives_a_killed_worker_and_is_resumed(pictures: Path, tmp_path: Path) -> None:
+    def start(out: str, *words: str) -> Program:
+        return Program("eval", str(pictures), "--out", str(tmp_path / out), *EVAL, *words)
+
+    def searched(program: Program, number: int | None = None) -> int:
+        assert program.stdout is not None
+        count = 0
+        for line in program.stdout:
+            count += json.loads(line)["event"] == "searched"
+            if count == number:
+                break
+        return count
+
+    alone = start("alone", "--jobs", "1")
+    assert searched(alone) == 6
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50
+    ) as running:
+        spread = start("spread", "--cluster", running.scheduler_address)
+        assert searched(spread, 1) == 1
+        os.kill(running.workers[0].pid, signal.SIGKILL)
+        assert searched(spread) == 5
+        assert spread.wait() == 0
+        stopped = start("stopped", "--cluster", running.scheduler_address)
+        assert searched(stopped, 2) == 2
+        stopped.send_signal(signal.SIGINT)
+        assert stopped.communicate(60)[1].count("--resume") == 1
+        assert stopped.wait() == 130
+        resumed = start("stopped", "--cluster", running.scheduler_address, "--resume")
+        assert searched(resumed) <= 6
+        assert resumed.wait() == 0
+    for program in (alone, spread, stopped, resumed):
+        program.close()
+    assert results(tmp_path / "alone") == results(tmp_path / "spread") == results(tmp_path / "stopped")
+
+
+def test_import_gives_the_same(cluster: Cluster, pictures: Path, rig: Callable[..., Result]) -> None:
+    versions = []
+    for place, words in {"alone": ("--jobs", "1"), "spread": ("--cluster", cluster.address)}.items():
+        done = rig("import", pictures, *words, "--set", f'catalog.path="{place}"')
+        assert done.exit_code == 0, done.output
+        with Catalog.open(place, clock=VirtualClock(), read_only=True) as catalog:
+            model = catalog.views()
+            versions.append((model.views.object_names, model.views.packed().tobytes(), model.view_ids.tolist()))
+    assert versions[0] == versions[1]
+    assert len(versions[0][0]) == 6
