@@ -266,7 +266,7 @@ class FlyScan:
 
     def kickoff(self) -> WorkStatus:
         self._status = self._devices.start(self._scan)
-        return self._devices.start(lambda: None) if self._status.done else _Started()
+        return _Started()
 
     def _scan(self) -> None:
         for event in self._events:

@@ -6,6 +6,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from threading import Event
 from typing import Any
 
 import pytest
@@ -15,11 +16,15 @@ pytestmark = pytest.mark.filterwarnings("ignore")  # of the packages of bluesky
 
 import event_model  # noqa: E402
 from bluesky import RunEngine, plan_stubs, plans, protocols  # noqa: E402
+from bluesky.utils import FailedStatus, RunEngineInterrupted  # noqa: E402
 
 from rig.bench import open_bench  # noqa: E402
 from rig.bluesky import BenchDevices, FlyScan, enroll, identify  # noqa: E402
 from rig.catalog import Catalog  # noqa: E402
 from rig.config import load_config  # noqa: E402
+from rig.core.errors import MotionStopped  # noqa: E402
+from rig.devices.servo import ServoState  # noqa: E402
+from rig.safety.state_machine import TableState  # noqa: E402
 from rig.search.model import load_model  # noqa: E402
 from tests.rig.plans.test_fly import flying  # noqa: E402
 
@@ -82,6 +87,44 @@ def test_devices_have_the_protocols_and_scan(devices: BenchDevices) -> None:
     assert [round(event["data"]["table_encoder_deg"]) for event in events] == [0, 45, 90]
     assert all(event["data"]["camera_accepted"] for event in events)
     assert documents[0][1]["bench"] == "sim"
+
+
+@pytest.mark.parametrize("asked_by", ["device", "engine"])
+def test_stop_ends_a_rotation_with_the_torque_off_and_the_next_run_works(devices: BenchDevices, asked_by: str) -> None:
+    devices._hold = True
+    documents: Documents = []
+    engine = RunEngine({}, context_managers=[])
+    engine.subscribe(lambda name, document: documents.append((name, document)))
+    bench = devices.bench
+    readings: list[float] = []
+
+    def stop_in_motion(state: ServoState) -> None:
+        readings.append(state.position_deg)
+        if max(readings) - min(readings) > 20 and not bench.state.stop_requested():
+            if asked_by == "device":
+                devices.table.stop()
+            else:  # as Ctrl+C twice: the engine stops every device that moves
+                engine.request_pause(defer=False)
+                while not bench.state.stop_requested():
+                    Event().wait(0.01)
+
+    with devices:
+        bench.safety.observers.append(stop_in_motion)
+        expected = FailedStatus if asked_by == "device" else RunEngineInterrupted
+        with pytest.raises(expected) as error:
+            engine(plans.scan([devices.imu], devices.table, 0, 180, 2))
+        bench.safety.observers.remove(stop_in_motion)
+        if asked_by == "device":
+            assert isinstance(error.value.__cause__ or error.value.args[0].exception(), MotionStopped)
+        else:
+            engine.abort()
+        assert 20 < max(readings) - min(readings) < 120
+        assert bench.safety.state is TableState.STOPPED
+    assert documents[-1][1]["exit_status"] in ("fail", "abort")
+    documents.clear()
+    with BenchDevices(bench) as again:
+        engine(plans.scan([again.imu], again.table, 0, 30, 2))
+    assert documents[-1][1]["exit_status"] == "success"
 
 
 def test_plans_enroll_and_identify_and_tiled_reads_them_back(devices: BenchDevices, tmp_path: Path) -> None:
