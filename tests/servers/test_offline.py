@@ -233,7 +233,7 @@ def test_damage_in_the_journal_stays_there_and_is_reported(place: CatalogPlace) 
         assert finding.problem is Problem.MISSING_IMAGE  # of the answer, which is there all the same
 
 
-def test_password_that_is_wrong_is_told_from_a_server_that_is_gone(
+def test_wrong_password_and_absent_server_have_their_own_messages(
     postgres: PostgresServer, place: CatalogPlace, rig: Callable[..., Result], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     words = [word for one in settings_of(place) for word in ("--set", one)]
