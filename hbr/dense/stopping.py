@@ -28,8 +28,8 @@ SMALLEST_MIN_CONFIDENCE: Final = 0.9
 UNCALIBRATED_MIN_CONFIDENCE: Final = 0.98
 #: With fewer objects, leaving one out leaves no second candidate.
 FEWEST_OBJECTS: Final = 3
-#: With fewer objects, the open-set score is not fitted to changes of the bench.
-FEWEST_OBJECTS_SHIFTED: Final = 10
+#: With fewer objects, the open-set score is not fitted to changes of the bench: a share of 2 % needs that many.
+FEWEST_OBJECTS_SHIFTED: Final = 50
 #: Largest share of objects that are not enrolled, and are accepted under changes of the bench.
 FALSE_ACCEPT: Final = 0.02
 #: Changes of the bench up to this strength are mild: enrolled objects must be accepted at the rate that was asked for.

@@ -112,3 +112,10 @@ def test_photographs_are_enrolled_and_found(tmp_path):
     result = json.loads(done.stdout)
     assert (result["found"], result["of"]) == (3, 3)
     assert [t["object"] for t in result["trials"] if t["enrolled"]] == ["obj1", "obj2", "obj3"]
+
+
+@pytest.mark.nightly
+def test_default_demo_finds_all_objects_and_recognizes_both_unknown_ones(tmp_path):
+    done = demo("--json", "--out", str(tmp_path))
+    totals = json.loads(done.stdout.splitlines()[-1])
+    assert (totals["found"], totals["unknown_recognised"]) == (totals["of"], totals["of_unknown"]) == (16, 2)
