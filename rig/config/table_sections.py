@@ -1,0 +1,126 @@
+"""The sections of `rig.toml` for the table: how it moves, and when a motion is stopped."""
+
+from typing import Annotated, Literal
+
+from pydantic import Field, ValidationInfo, field_validator
+
+from rig.config.section import Section
+
+MAX_LIMIT_DEG = 90_000.0
+"""250 revolutions; extended position mode reaches 256 in each direction (e-manual, Operating Mode)."""
+
+Degrees = Annotated[float, Field(allow_inf_nan=False)]
+Harmonic = Annotated[float, Field(ge=-10, le=10)]
+
+
+class TableConfig(Section):
+    """The table: how it moves, and when it has settled."""
+
+    mode: Literal["turntable", "pan"] = Field(
+        "turntable",
+        description="turntable: rotates beyond one revolution and counts revolutions; pan: stays within one revolution",
+    )
+    direction: Literal[1, -1] = Field(
+        1, description="+1: a rising servo position rotates the table counter-clockwise, seen from above"
+    )
+    carries: Literal["object", "camera"] = Field(
+        "object",
+        description="what the servo rotates: the object in front of the camera, or the camera around the object",
+    )
+    zero_deg: float = Field(
+        180.0,
+        ge=-MAX_LIMIT_DEG,
+        le=MAX_LIMIT_DEG,
+        description="servo angle at home (table angle 0), on the table's side of the gear",
+    )
+    limits_deg: tuple[Degrees, Degrees] = Field(
+        (-400.0, 400.0), description="cable budget: lowest and highest table angle"
+    )
+    velocity_dps: float = Field(90.0, ge=0.1, le=200, description="cruise speed; must be within the gyro's range")
+    acceleration_dps2: float = Field(240.0, ge=0.1, le=5000, description="acceleration of the ramp")
+    approach_deg: float = Field(
+        3.0,
+        ge=0,
+        le=30,
+        description="each stop is approached upwards from at least this far below, which takes up the gears' backlash",
+    )
+    tolerance_deg: float = Field(
+        0.6, ge=0.001, le=5, description="largest distance from the goal that counts as arrived"
+    )
+    encoder_harmonics_deg: tuple[Harmonic, Harmonic, Harmonic, Harmonic] = Field(
+        (0.0, 0.0, 0.0, 0.0),
+        description="encoder error over a revolution: cosine and sine of the first and the second harmonic, from "
+        "calibration",
+    )
+    backlash_deg: float = Field(
+        0.5, ge=0, le=10, description="largest backlash between encoder and platter that is not a fault"
+    )
+    settle_s: float = Field(
+        0.46, ge=0.001, le=10, description="time from the end of a motion until the table is at rest, for estimates"
+    )
+    orientation: Literal["encoder", "imu"] = Field(
+        "encoder", description="source of a view's angle: the servo's encoder, or only the gyro on the platter"
+    )
+    quiet_dps: float = Field(0.35, ge=0.001, le=10, description="largest rate that the gyro may measure at rest")
+    quiet_s: float = Field(0.12, ge=0.02, le=1, description="how long encoder and gyro must be quiet")
+    poll_s: float = Field(0.04, ge=0.005, le=0.2, description="period of the control loop")
+    watchdog_s: float = Field(
+        0.5, ge=0.1, le=2.5, description="the servo stops by itself after this time without instructions"
+    )
+
+    @field_validator("limits_deg")
+    @classmethod
+    def _limits_hold_a_revolution(cls, limits_deg: tuple[float, float], others: ValidationInfo) -> tuple[float, float]:
+        low, high = limits_deg
+        pan = others.data.get("mode") == "pan"
+        if pan and not (low <= 0 <= high and low < high):
+            raise ValueError("must be the lowest and the highest angle and include 0, e.g. [-150, 150]")
+        if not pan and not (low <= 0 <= high and high - low >= 360):
+            raise ValueError('must span at least one revolution and include 0, e.g. [-400, 400], unless mode = "pan"')
+        if max(-low, high) > MAX_LIMIT_DEG:
+            raise ValueError(f"must be within ±{MAX_LIMIT_DEG:g}, the range of a servo in extended position mode")
+        return limits_deg
+
+    @field_validator("watchdog_s")
+    @classmethod
+    def _watchdog_outlasts_the_loop(cls, watchdog_s: float, others: ValidationInfo) -> float:
+        poll_s = others.data.get("poll_s", 0.0)
+        if watchdog_s < 2 * poll_s:
+            raise ValueError(f"must be at least twice poll_s, which is {poll_s:g}: the control loop feeds the watchdog")
+        return watchdog_s
+
+    @property
+    def orientation_sign(self) -> int:
+        """Sign of the camera's azimuth around the object: −1 if the table angle θ rotates the object, else +1."""
+        return 1 if self.carries == "camera" else -1
+
+
+class SafetyConfig(Section):
+    """When a motion is stopped: before the servo shuts down by itself, and long before something breaks."""
+
+    following_error_deg: float = Field(
+        12.0,
+        ge=0.01,
+        le=90,
+        description="largest distance of the shaft from the servo's motion profile, and from its path",
+    )
+    max_load_percent: float = Field(
+        70.0,
+        ge=0.1,
+        le=100,
+        description="largest part of the servo's torque (or current limit) that is not an overload",
+    )
+    stall_s: float = Field(0.25, ge=0.05, le=1, description="how long the servo may push without rotating")
+    overload_s: float = Field(
+        0.8, ge=0.1, le=5, description="how long the servo may rotate with overload, or lag behind its profile"
+    )
+    no_progress_s: float = Field(1.0, ge=0.3, le=5, description="how long the servo may stand still before its goal")
+    temperature_margin_c: float = Field(
+        5.0, ge=0, le=40, description="distance from the temperature at which the servo shuts down"
+    )
+    voltage_margin_v: float = Field(
+        0.2, ge=0, le=2, description="distance from the voltages at which the servo shuts down"
+    )
+    slip_deg: float = Field(
+        10.0, ge=0.01, le=90, description="difference of encoder and gyro (beyond 4 sigma) that stops a motion"
+    )
