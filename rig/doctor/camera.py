@@ -11,12 +11,18 @@ from numpy.typing import NDArray
 
 from rig.bench.hardware import camera_settings, store_focus
 from rig.core.clock import seconds_between
-from rig.devices.camera import Camera
 from rig.devices.opencv_camera import OpenCvCamera
 from rig.devices.v4l2 import choose_mode
 from rig.doctor.context import DoctorContext
 from rig.doctor.finding import Finding, FindingCode, bad, fine, warning
-from rig.doctor.flicker import mains_flicker
+from rig.doctor.flicker import (
+    MainsFlicker,
+    mains_flicker,
+    standing_flicker,
+    standing_mains_hz,
+    steady_levels,
+    whole_periods_us,
+)
 from rig.safety.saved_state import FileStore
 from rig.views.capture import ImageQuality, rejection_text
 
@@ -24,6 +30,12 @@ QUICK, SPACED, SPACING_S = 5, 6, 0.17
 """Consecutive frames, which show the frame rate, and frames spread over a second, which show flicker."""
 MAX_AGE_S = 0.25
 """Time from the start of an exposure until the program has the frame; the table waits that long at each view."""
+PER_EXPOSURE = 6
+"""Images of each exposure time that are compared to find bands that stand still."""
+DARK, BRIGHT = 12, 240
+"""Levels between which a pixel shows the light."""
+EXPOSURE_STEP_US = 100.0
+"""Cameras round exposure times to this step."""
 MAX_FLICKER = 0.05  # largest spread of the mean level of frames of one scene
 
 
@@ -133,7 +145,7 @@ def _text(value: float | None) -> str | None:
     return None if value is None else f"{value:g}"
 
 
-def _frames(context: DoctorContext, source: Camera) -> Iterator[Finding]:
+def _frames(context: DoctorContext, source: OpenCvCamera) -> Iterator[Finding]:
     clock = context.computer.clock
     again = "Unplug the camera, plug it in again, then: " + context.rig("doctor")
     frames: list[NDArray[np.uint8]] = []
@@ -166,14 +178,7 @@ def _frames(context: DoctorContext, source: Camera) -> Iterator[Finding]:
         yield warning("camera", FindingCode.FEW_FRAMES, fix, fps=source.identity.fps, **evidence)
     else:
         yield fine("camera", FindingCode.FRAMES, **evidence)
-    rows = np.array([frame.mean(axis=(1, 2)) for frame in frames])
-    spread = (max(levels) - min(levels)) / max(levels)
-    if (lamp := mains_flicker(rows, np.array(times_ns))) is not None:
-        fix = context.set("camera.exposure_us", f"{lamp.exposure_us(context.config.camera.exposure_us or 1e4):g}")
-        yield warning("camera", FindingCode.MAINS_FLICKER, fix, mains_hz=lamp.mains_hz, depth=lamp.depth)
-    elif spread > MAX_FLICKER:
-        fix = "Use a lamp that does not flicker, and keep daylight and shadows away, then: " + context.rig("doctor")
-        yield warning("camera", FindingCode.FLICKER, fix, spread=spread, seconds=SPACED * SPACING_S, **evidence)
+    yield from _flicker(context, source, frames, np.array(times_ns), evidence)
     quality = asdict(seen[-1])
     if reasons := seen[-1].reasons(context.config.view):
         fix = "Check light, exposure and focus (an empty table may look blurred): " + context.rig("config show view")
@@ -181,3 +186,59 @@ def _frames(context: DoctorContext, source: Camera) -> Iterator[Finding]:
         yield warning("camera", FindingCode.VIEW_REJECTED, fix, reasons=texts, codes=reasons, **quality)
     else:
         yield fine("camera", FindingCode.VIEW_ACCEPTED, **quality)
+
+
+def _flicker(
+    context: DoctorContext,
+    source: OpenCvCamera,
+    frames: list[NDArray[np.uint8]],
+    times_ns: NDArray[np.int64],
+    evidence: dict[str, Any],
+) -> Iterator[Finding]:
+    levels = evidence["mean_levels"]
+    spread = (max(levels) - min(levels)) / max(levels)
+    lamp = mains_flicker(np.array([frame.mean(axis=(1, 2)) for frame in frames]), times_ns)
+    if lamp is None and spread > MAX_FLICKER:
+        fix = "Use a lamp that does not flicker, and keep daylight and shadows away, then: " + context.rig("doctor")
+        yield warning("camera", FindingCode.FLICKER, fix, spread=spread, seconds=SPACED * SPACING_S, **evidence)
+        return
+    exposure_us = source.read_locks().exposure_us
+    if lamp is None:
+        standing = [hz for hz in standing_mains_hz(times_ns) if not _whole_periods(hz, exposure_us)]
+        if len(standing) == 1 and exposure_us is not None:
+            lamp = _standing_flicker(source, exposure_us, standing[0])
+        elif standing:
+            reason = "several mains frequencies are possible" if exposure_us else "its exposure time is not known"
+            yield fine("camera", FindingCode.STANDING_FLICKER_NOT_CHECKED, mains_hz=standing, reason=reason)
+    if lamp is not None:
+        fix = context.set("camera.exposure_us", f"{lamp.exposure_us(exposure_us or 1e4):g}")
+        yield warning("camera", FindingCode.MAINS_FLICKER, fix, mains_hz=lamp.mains_hz, depth=lamp.depth)
+
+
+def _whole_periods(mains_hz: float, exposure_us: float | None) -> bool:
+    """Return whether the exposure has no bands."""
+    return exposure_us is not None and abs(whole_periods_us(mains_hz, exposure_us) - exposure_us) <= EXPOSURE_STEP_US
+
+
+def _standing_flicker(source: OpenCvCamera, exposure_us: float, mains_hz: float) -> MainsFlicker | None:
+    """Compare images of the exposure in question with images of an exposure without bands."""
+    images: list[NDArray[np.uint8]] = []
+    times_ns: list[int] = []
+    try:
+        for time_us in (exposure_us, whole_periods_us(mains_hz, exposure_us)):
+            after_ns = source.change_exposure(time_us)
+            for _ in range(PER_EXPOSURE):
+                frame = source.capture(after_ns)
+                after_ns = frame.exposed_ns + 1
+                images.append(frame.image_bgr)
+                times_ns.append(frame.exposed_ns)
+    finally:
+        source.change_exposure(exposure_us)
+    grey = np.stack(images).mean(axis=3)
+    usable = ((grey > DARK) & (grey < BRIGHT)).all(axis=0)  # the same pixels in all images
+    rows = (grey * usable).sum(axis=2) / np.maximum(usable.sum(axis=1), 1)
+    times = np.array(times_ns)
+    with_bands, without = (
+        steady_levels(rows[part], times[part], mains_hz) for part in (slice(PER_EXPOSURE), slice(PER_EXPOSURE, None))
+    )
+    return standing_flicker(with_bands, without, mains_hz)

@@ -123,6 +123,9 @@ class FindingCode(Enum):
         "the lamps flicker with the mains ({mains_hz:.0f} Hz): bands of {depth:.0%} in the images; an exposure of "
         "whole periods of the lamp has none"
     )
+    STANDING_FLICKER_NOT_CHECKED = (
+        "bands that stand still in the images ({mains_hz} Hz mains) are not checked: {reason}"
+    )
     FLICKER = "the light changes by {spread:.0%} within {seconds:.0f} s"
     VIEW_ACCEPTED = (
         "a view would be accepted now: mean level {mean_level:.0f}, sharpness {sharpness:.0f}, {saturated_share:.1%} "

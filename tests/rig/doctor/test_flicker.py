@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from rig.doctor.finding import FindingCode
-from rig.doctor.flicker import mains_flicker
+from rig.doctor.flicker import mains_flicker, standing_flicker, standing_mains_hz
 from sim.faults import Faults
 from sim.faults.schedule import read_faults
 from tests.rig.doctor.doctor_parts import unopened
@@ -38,6 +38,29 @@ def test_steady_light_and_slow_changes_are_no_mains_flicker(scene):
     assert mains_flicker(*images(100, **scene)) is None
 
 
+@pytest.mark.parametrize(("fps", "mains_hz"), [(30, (60,)), (25, (50,)), (24, (60,)), (20, (50, 60)), (28, ())])
+def test_mains_frequencies_whose_bands_stand_still_are_known(fps, mains_hz):
+    assert standing_mains_hz((np.arange(11) / fps * 1e9).astype(np.int64)) == mains_hz
+
+
+def rows(depth, *, readout_s=0.02, gamma=1.0, exposure=1.0):
+    """Return the levels of rows under a lamp with bands that stand still, for a camera whose response has a gamma."""
+    y = np.linspace(0, 1, 480)
+    light = (40 + 60 * y + 25 * np.sin(7 * y)) * (1 + depth * np.cos(2 * np.pi * 120 * readout_s * y + 1))
+    return 255 * (light * exposure / 255) ** gamma + np.random.default_rng(1).normal(0, 0.05, 480)
+
+
+@pytest.mark.parametrize("readout_s", [0.008, 0.02, 0.033])
+@pytest.mark.parametrize("gamma", [1.0, 0.5])
+def test_bands_that_stand_still_are_found_by_two_exposure_times(readout_s, gamma):
+    scene = {"readout_s": readout_s, "gamma": gamma}
+    found = standing_flicker(rows(0.06, **scene, exposure=1.2), rows(0.0, **scene), 60.0)
+    assert found.mains_hz == 60
+    assert found.depth == pytest.approx(0.06 * gamma, rel=0.3)
+    assert standing_flicker(rows(0.0, **scene, exposure=1.2), rows(0.0, **scene), 60.0) is None
+    assert standing_flicker(np.zeros(480), np.zeros(480), 60.0) is None
+
+
 def test_exposure_is_a_whole_number_of_periods():
     at_50, at_60 = mains_flicker(*images(100, 0.1, fps=30)), mains_flicker(*images(120, 0.1))
     assert [at_50.exposure_us(wanted) for wanted in (3000, 12_000, 18_000)] == [10_000, 10_000, 20_000]
@@ -51,4 +74,16 @@ def test_doctor_names_the_mains_and_the_exposure_that_hides_it():
         assert found == {FindingCode.MAINS_FLICKER: "rig config set camera.exposure_us 10000"}
     with unopened() as bench:  # the default of 10 ms
         Faults(bench.devices).schedule(*read_faults(["mains_flicker"]))
+        assert bench.problems("camera") == {}
+
+
+def test_doctor_names_the_mains_whose_bands_stand_still():
+    fault = ["mains_flicker:hz=60"]  # 120 Hz is four times the frame rate
+    with unopened() as bench:
+        Faults(bench.devices).schedule(*read_faults(fault))
+        before = bench.devices.camera.exposure
+        assert bench.problems("camera") == {FindingCode.MAINS_FLICKER: "rig config set camera.exposure_us 8333"}
+        assert bench.devices.camera.exposure == before
+    with unopened("camera.exposure_us=8333") as bench:
+        Faults(bench.devices).schedule(*read_faults(fault))
         assert bench.problems("camera") == {}
