@@ -25,6 +25,7 @@ _FIFO_ENABLE, _FIFO_RESET, _FIFO_GYRO_XYZ = 0x40, 0x04, 0x70
 _RESET_S, _START_S = 0.1, 0.05
 """After DEVICE_RESET (register 107), and the gyro's start-up of 30 ms (PS 6.1) with the PLL's settling."""
 
+_BYTE_NS = 35_000  # a byte at 400 kHz with its acknowledge takes 22.5 µs
 _FRAME = 6  # bytes of a sample in the FIFO: three words
 
 NOISE_DPS_RTHZ = 0.005
@@ -137,7 +138,8 @@ class Mpu6050:
         if samples < 0.9 * due - 2:  # the sensor's clock is off by at most 5 % (PS 6.6): samples are missing
             self._check_settings()
             missing = round(due) - samples
-        data = self._pop(count) if count else b""
+        full_ns = before_ns + round((self.FIFO_BYTES - count) // _FRAME * self._times.period_ns)
+        data = self._pop(count, full_ns) if count else b""
         if data is None:
             return self._start_over()
         gyro = np.frombuffer(data, ">i2").reshape(-1, 3) / LSB_PER_DPS[self._range_dps]
@@ -212,16 +214,22 @@ class Mpu6050:
     def _fifo_count(self) -> int:
         return int.from_bytes(self._registers.read(_FIFO_COUNTH, 2), "big")
 
-    def _pop(self, count: int) -> bytes | None:
-        """Read ``count`` bytes of the FIFO; None if an interrupted transfer consumed some of them."""
+    def _pop(self, count: int, full_ns: int) -> bytes | None:
+        """Read ``count`` bytes of the FIFO.
+
+        None if an interrupted transfer consumed some of them, or if the FIFO may have overflowed at ``full_ns`` before
+        they were read, because this computer was busy: then its frames are shifted.
+        """
         repeated = False
 
         def pop() -> bytes | None:
             nonlocal repeated
-            if repeated and self._fifo_count() < count:
+            if (repeated and self._fifo_count() < count) or self._clock.now_ns() >= full_ns:
                 return None
             repeated = True
-            return self._registers.read_once(_FIFO_R_W, count)
+            data = self._registers.read_once(_FIFO_R_W, count)
+            in_time = self._clock.now_ns() < full_ns + count * _BYTE_NS
+            return data if in_time or self._fifo_count() < self.FIFO_BYTES - count else None
 
         return self._registers.transfer(pop)
 
@@ -294,7 +302,7 @@ class Mpu6050Clone(Mpu6050):
         least, most = _SELF_TEST_SAMPLES
         count = max(least, min(most, round(self.rate_hz)))
         self._clock.sleep(count / self.rate_hz)
-        words = self._pop(self._fifo_count() // _FRAME * _FRAME) or b""
+        words = self._registers.read(_FIFO_R_W, self._fifo_count() // _FRAME * _FRAME)
         self._registers.write(SMPLRT_DIV, *self._settings[SMPLRT_DIV])
         self._empty_fifo()
         late = np.frombuffer(words, ">i2").reshape(-1, 3)[count // 2 :]  # after the low-pass has settled

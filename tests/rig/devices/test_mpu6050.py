@@ -395,6 +395,30 @@ def test_fifo_overflow_is_reported_and_cleared(bench: Bench, imu: Mpu6050) -> No
     assert after.gyro_dps == pytest.approx(np.tile([0, 0, 30.0], (after.time_ns.size, 1)), abs=0.01)
 
 
+@pytest.mark.parametrize("pause_ms", [140, 240])
+def test_fifo_that_overflows_between_count_and_data_gives_no_corrupt_samples(
+    bench: Bench, pause_ms: int, imu: Mpu6050
+) -> None:
+    """A computer that is busy, or sleeps, continues late."""
+    bench.rotate(100.0)
+    imu.read_samples()
+    bench.clock.sleep(0.75)  # 150 of 170 samples
+    transfers = []
+
+    def pause(_: int) -> bool:
+        transfers.append(bench.clock.now_ns())
+        if len(transfers) == 3:  # the register of the data; 1 and 2 read the count
+            bench.clock.sleep(pause_ms * 1e-3)
+        return False
+
+    bench.bus.nack_conditions.append(pause)
+    samples = imu.read_samples()
+    assert samples.lost >= 150
+    assert samples.time_ns.size == 0
+    bench.clock.sleep(0.1)
+    assert imu.read_samples().gyro_dps[:, 2] == pytest.approx(100.0, abs=1)
+
+
 @given(frames=st.integers(168, 172), early_us=st.integers(-50, 250))
 @examples(35)
 def test_full_fifo_never_corrupts_samples(frames: int, early_us: int) -> None:
