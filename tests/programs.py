@@ -8,7 +8,7 @@ import os
 import signal
 import sys
 from contextlib import suppress
-from multiprocessing import get_context
+from multiprocessing import forkserver, get_context
 from multiprocessing.connection import Connection
 from pathlib import Path
 from subprocess import TimeoutExpired
@@ -19,6 +19,12 @@ _SERVER = get_context("forkserver")
 _SERVER.set_forkserver_preload(
     ["tests.programs", "rig.catalog", "rig.cli.main", "rig.plans.enroll", "rig.plans.identify", "sim.bench"]
 )
+
+
+def start_server(*modules: str) -> None:
+    """Start the server now, with other modules imported; without this it starts with the first program."""
+    _SERVER.set_forkserver_preload(["tests.programs", *modules])
+    forkserver.ensure_running()
 
 
 class Program:

@@ -18,6 +18,9 @@ PATIENT = {
 }
 """Settings for an emulated computer, which is slow: a request to a device takes it tens of milliseconds."""
 
+TRIGGERED = "--subsystem-match=usb --subsystem-match=usb-serial --subsystem-match=tty"
+"""The devices of the rule; without these words udev looks at all devices, which takes an emulated computer long."""
+
 
 @pytest.fixture(scope="session")
 def machine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Machine]:
@@ -58,15 +61,14 @@ class FirstDay:
 @pytest.fixture(scope="session")
 def first_day(guest: GuestBench) -> FirstDay:
     """Set the bench up as a technician does, once for all tests."""
-    latency = "cat /sys/bus/usb-serial/devices/ttyUSB0/latency_timer"
-    find, rules, before = guest.rig("find"), guest.rig("doctor", "--udev"), guest.sh(latency)
+    latency = "/sys/bus/usb-serial/devices/ttyUSB0/latency_timer"
+    find, rules, before = guest.rig("find"), guest.rig("doctor", "--udev"), guest.files(latency)[latency].strip()
     guest.sh(f"cat > {RULES_FILE} <<'END'\n{rules.output}END")
-    guest.sh("udevadm control --reload && udevadm trigger --action=add && udevadm settle")
-    after, link = guest.sh(latency), guest.sh("readlink -f /dev/rig-servo")
+    guest.sh(f"udevadm control --reload && udevadm trigger --action=add {TRIGGERED} && udevadm settle")
+    after, link = guest.files(latency)[latency].strip(), guest.sh("readlink -f /dev/rig-servo")
     setup = guest.rig("setup", "--yes")
-    for section, lines in PATIENT.items():
-        added = "\\n".join((f"[{section}]", *lines))
-        guest.sh(f"sed -i 's/^\\[{section}\\]/{added}/' rig.toml")
+    added = (f"s/^\\[{section}\\]/" + "\\n".join((f"[{section}]", *lines)) + "/" for section, lines in PATIENT.items())
+    guest.sh(f"sed -i '{'; '.join(added)}' rig.toml")
     settings, home = guest.rig("servo", "settings", "--write", "--yes"), guest.rig("home", "--here")
     return FirstDay(find, rules, before, after, link, setup, settings, home)
 

@@ -5,7 +5,7 @@ from pathlib import PurePosixPath
 from typing import Any, Final
 
 from rig.core.clock import SystemClock
-from tests.kernel.machine import GuestProcess, Machine, Result
+from tests.kernel.machine import PROJECT, GuestProcess, Machine, Result
 from tests.kernel.played_bench import PlayedBench
 from tests.kernel.usb.device import UsbDevice
 
@@ -38,9 +38,9 @@ class GuestBench:
         self.machine = machine
         self.played = played
         self._shown = {
-            played.servo: "ls /dev/serial/by-id/*",
-            played.imu: "grep -l i2c-tiny-usb /sys/class/i2c-dev/*/name",
-            played.camera: "ls /dev/v4l/by-id/*-index0",
+            played.servo: ("/dev/serial/by-id/*", ""),
+            played.imu: ("/sys/class/i2c-dev/*/name", "i2c-tiny-usb"),
+            played.camera: ("/dev/v4l/by-id/*-index0", ""),
         }
         self.sh(f"mkdir -p {FOLDER}", folder="/")
 
@@ -54,6 +54,15 @@ class GuestBench:
     def rig(self, *words: object, timeout: float = 120.0, **options: Any) -> Result:
         """Return how `rig ...` has ended."""
         return self.start(*words, **options).wait(timeout)
+
+    def python(self, code: str, timeout: float = 120.0) -> Result:
+        """Return how a piece of Python has ended, in the project's folder; it starts faster than with `sh`."""
+        return self.start(code=code, folder=str(PROJECT)).wait(timeout)
+
+    def files(self, pattern: object) -> dict[str, str]:
+        """Return the files of a pattern with their text; a device file has an empty one."""
+        found: dict[str, str] = self.machine.ask("files", pattern=str(pattern))
+        return found
 
     def start_sh(self, command: str, folder: str = str(FOLDER)) -> GuestProcess:
         """Start a command of the shell."""
@@ -72,8 +81,15 @@ class GuestBench:
         self.machine.ask("end_all")
         self.played.restore()
         self.plug_in(*(device for device in self.played.usb if device.plug is None))
-        if self.sh(f"tr -d ' \\0' < {LATCH} || true"):
+        if any(text.strip(" \0\n") for text in self.files(LATCH).values()):
             assert self.rig("acknowledge").code == 0
+
+    @property
+    def i2c_bus(self) -> str:
+        """The device file of the played I2C adapter; its number depends on the computer's other adapters."""
+        pattern, name = self._shown[self.played.imu]
+        (file,) = (path for path, text in self.files(pattern).items() if name in text)
+        return f"/dev/{PurePosixPath(file).parent.name}"
 
     # -- cables -----------------------------------------------------------------------------------------------------
 
@@ -94,7 +110,8 @@ class GuestBench:
             self.until(lambda device=device: not self._exists(device), f"{type(device).__name__} disappears")
 
     def _exists(self, device: UsbDevice) -> bool:
-        return self.sh(f"{self._shown[device]} 2>/dev/null || true", folder="/") != ""
+        pattern, name = self._shown[device]
+        return any(name in text for text in self.files(pattern).values())
 
     def until(self, condition: Callable[[], object], what: str, seconds: float = APPEAR_S) -> None:
         """Wait for a condition; raises AssertionError if it does not come true in ``seconds``."""

@@ -138,7 +138,7 @@ class Machine:
                 "project": PROJECT,
                 "port": listener.getsockname()[1],
             }
-            line = "console=ttyS0 quiet panic=-1 mitigations=off net.ifnames=0 nokaslr tsc=reliable"
+            line = "console=ttyS0 quiet panic=-1 mitigations=off no_timer_check net.ifnames=0 nokaslr tsc=reliable"
             line += "".join(f" rig.{name}={value}" for name, value in words.items())
             command = [
                 *_QEMU,

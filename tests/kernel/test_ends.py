@@ -17,7 +17,10 @@ def rotating(bench: GuestBench, *settings: object) -> GuestProcess:
     """Start a long rotation, and return when the table rotates."""
     away = 0 if bench.played.table()[0] > 200 else 390
     goto = bench.start("goto", away, *SLOW, *settings)
-    bench.until(lambda: abs(bench.played.table()[1]) > 5, "the table rotates", 60)
+    try:
+        bench.until(lambda: abs(bench.played.table()[1]) > 5, "the table rotates", 60)
+    except AssertionError as late:
+        raise AssertionError(f"{late}; the program has printed:\n{goto.output}") from None
     return goto
 
 
@@ -49,5 +52,5 @@ def test_stop_ends_the_program_that_rotates_the_table(bench: GuestBench) -> None
     assert stop.code == 0, stop.output
     bench.until(lambda: stands_without_torque(bench), "the table stands, and its torque is off", STOPPED_S)
     ended = goto.wait()
-    assert ended.code != 0
-    assert "rig stop" in ended.output or "stopped" in ended.output, ended.output
+    # A program that is too slow to notice the request gets SIGTERM.
+    assert ended.code == 143 or (ended.code != 0 and "stopped" in ended.output), ended.output

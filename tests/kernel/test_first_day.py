@@ -13,11 +13,11 @@ PORT = "/dev/serial/by-id/usb-FTDI_USB__-__Serial_Converter_FT7WBGZ1-if00-port0"
 CAMERA = "/dev/v4l/by-id/usb-046d_HD_Pro_Webcam_C920_8E2A9F0F-video-index0"
 
 
-def test_find_lists_the_devices(first_day: FirstDay) -> None:
+def test_find_lists_the_devices(bench: GuestBench, first_day: FirstDay) -> None:
     assert first_day.find.code == 0, first_day.find.output
     for text in (
         "/dev/ttyUSB0: XL430-W250, firmware 46, id 1 at 57600 baud",
-        "MPU-6050 at 0x68 of /dev/i2c-1",
+        f"MPU-6050 at 0x68 of {bench.i2c_bus}",
         "/dev/video0: HD Pro Webcam C920: 640x480",
         f'port = "{PORT}"',
         f'source = "{CAMERA}"',

@@ -6,15 +6,13 @@ from tests.kernel.guest_bench import GuestBench
 
 pytestmark = [pytest.mark.kernel, pytest.mark.timeout(600)]
 
-CLIENT = "/sys/bus/i2c/devices/i2c-1"
-
 
 def test_a_missing_acknowledge_is_reported_as_a_missing_sensor(bench: GuestBench) -> None:
     with bench.played.time.present():
         bench.played.devices.i2c.nack_conditions.append(lambda address: address == 0x68)
     goto = bench.rig("goto", 10)
     assert goto.code == 4
-    assert "No sensor answers at I2C address 0x68 of /dev/i2c-1" in goto.output
+    assert f"No sensor answers at I2C address 0x68 of {bench.i2c_bus}" in goto.output
     assert "errno: 6" in goto.output  # ENXIO
     bench.restore()
     assert bench.rig("goto", 10).code == 0
@@ -29,20 +27,22 @@ def test_a_bus_that_hangs_is_an_interrupted_transfer(bench: GuestBench) -> None:
 
 
 def test_a_kernel_driver_at_the_address_is_named_and_can_be_unbound(bench: GuestBench) -> None:
-    bench.sh(f"modprobe inv-mpu6050-i2c && echo mpu6050 0x68 > {CLIENT}/new_device && udevadm settle")
+    number = bench.i2c_bus.removeprefix("/dev/i2c-")
+    adapter = f"/sys/bus/i2c/devices/i2c-{number}"
+    bench.sh(f"modprobe inv-mpu6050-i2c && echo mpu6050 0x68 > {adapter}/new_device && udevadm settle")
     try:
         goto = bench.rig("goto", 30)
         assert goto.code == 4
-        assert "The kernel driver inv-mpu6050-i2c uses I2C address 0x68 of /dev/i2c-1" in goto.output
+        assert f"The kernel driver inv-mpu6050-i2c uses I2C address 0x68 of {bench.i2c_bus}" in goto.output
         find = bench.rig("find")
         assert "inv-mpu6050-i2c" in find.output
-        unbind = "echo 1-0068 | sudo tee /sys/bus/i2c/drivers/inv-mpu6050-i2c/unbind"
+        unbind = f"echo {number}-0068 | sudo tee /sys/bus/i2c/drivers/inv-mpu6050-i2c/unbind"
         assert unbind in goto.output
         assert unbind in find.output
         bench.sh(unbind.replace("sudo ", ""))
         assert bench.rig("goto", 30).code == 0
     finally:
-        bench.sh(f"echo 0x68 > {CLIENT}/delete_device; modprobe -r inv-mpu6050-i2c")
+        bench.sh(f"echo 0x68 > {adapter}/delete_device; modprobe -r inv-mpu6050-i2c")
 
 
 def test_another_error_of_a_bus_without_the_sensor_does_not_end_the_search(bench: GuestBench) -> None:
@@ -50,7 +50,7 @@ def test_another_error_of_a_bus_without_the_sensor_does_not_end_the_search(bench
     try:
         stub = bench.sh("basename $(dirname $(grep -l 'SMBus stub' /sys/bus/i2c/devices/i2c-*/name))")
         find = bench.rig("find", "--set", f"imu.bus=/dev/{stub}")
-        assert "MPU-6050 at 0x68 of /dev/i2c-1" in find.output
+        assert f"MPU-6050 at 0x68 of {bench.i2c_bus}" in find.output
         goto = bench.rig("goto", 40, "--set", f"imu.bus=/dev/{stub}")
         assert goto.code == 4
         assert "errno: 19" in goto.output  # ENODEV

@@ -15,7 +15,7 @@ from pathlib import Path
 from threading import Lock, Thread
 from typing import Any, Final
 
-from tests.programs import Program
+from tests.programs import Program, start_server
 
 HOST: Final = "10.0.2.2"
 """The computer that runs the tests, as QEMU shows it."""
@@ -26,6 +26,15 @@ os.setgid({gid})
 os.setuid({uid})
 """
 RIG = "from rig.cli.main import main\nmain()\n"
+IMPORTED = (
+    *("rig.bench.hardware", "rig.catalog", "rig.catalog.results", "rig.cli.main", "rig.cli.ui.live"),
+    *("rig.cli.ui.operator_prompts", "rig.cli.ui.present", "rig.doctor.checks", "rig.doctor.device_scan"),
+    *("rig.doctor.single_servo", "rig.motion.stop_request", "rig.plans.enroll", "rig.plans.identify"),
+    *("rig.plans.photograph_table", "rig.plans.record", "rig.plans.similar_objects", "rig.plans.tray"),
+    *("rig.plans.watch", "rig.report.contact_sheet", "rig.search.current_model", "dynamixel_easy_sdk"),
+    *("rich._emoji_codes", "typer._adapters"),
+)
+"""What the programs import, once for all of them: an emulated processor takes seconds for it."""
 
 
 class Agent:
@@ -72,11 +81,12 @@ class Agent:
         user: dict[str, Any] | None = None,
         variables: dict[str, str] | None = None,
         typed: str = "",
+        code: str = RIG,
     ) -> int:
-        """Start `rig ...`; return the number of the process."""
+        """Start `rig ...`, or a piece of Python; return the number of the process."""
         program = Program(
             *words,
-            code=("" if user is None else AS_USER.format(**user)) + RIG,
+            code=("" if user is None else AS_USER.format(**user)) + code,
             folder=Path(folder),
             **(variables or {}),
         )
@@ -90,6 +100,11 @@ class Agent:
             ["/bin/bash", "-c", command], cwd=folder, env=environment, stdin=pipe, stdout=pipe, stderr=pipe, text=True
         )
         return self._started(process, process.pid, "")
+
+    def do_files(self, pattern: str) -> dict[str, str]:
+        """Return the files of a pattern with their text; a file without one (a device) has an empty one."""
+        paths = Path("/").glob(pattern.removeprefix("/"))
+        return {str(path): path.read_text(errors="replace") if path.is_file() else "" for path in paths}
 
     def do_output(self, pid: int) -> str:
         """Return what the process has printed so far."""
@@ -141,6 +156,7 @@ def _read(stream: Any, is_result: bool, output: list[tuple[bool, str]]) -> None:
 
 def main() -> None:
     signal.signal(signal.SIGINT, signal.default_int_handler)
+    start_server(*IMPORTED)  # while the devices are plugged in
     with socket.create_connection((HOST, int(sys.argv[1]))) as connection:
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         Agent(connection).run()

@@ -15,8 +15,7 @@ ln -sfn "$modules" "/lib/modules/$release"
 echo "udev $(cut -d" " -f1 /proc/uptime)"; busybox hostname kernel-test
 busybox ifconfig lo 127.0.0.1 up
 if [ -x /lib/systemd/systemd-udevd ]; then /lib/systemd/systemd-udevd --daemon; else udevd --daemon; fi
-udevadm trigger --action=add
-modprobe -a virtio_net vhci-hcd i2c-dev
+modprobe -a virtio_net vhci-hcd i2c-dev  # nothing else that is there at the start is needed, so no `udevadm trigger`
 udevadm settle --timeout=60; echo "settled $(cut -d" " -f1 /proc/uptime)"
 for _ in {1..100}; do
     network=$(ls /sys/class/net | grep -v '^lo$' | head -1)
