@@ -24,7 +24,8 @@ PORT_GRABBERS = {
 }
 """Programs of a desktop that open every new serial port, and how to stop them."""
 
-RULES_FILE = "/etc/udev/rules.d/60-hbr-rig.rules"
+RULES_FILES = ("/etc/udev/rules.d/60-hbr-rig.rules", "/etc/udev/rules.d/99-hbr-rig.rules")
+"""The same rules before and after those of other programs: access and ModemManager need the first, brltty the last."""
 
 
 def bench_state(context: DoctorContext) -> Iterator[Finding]:
@@ -124,18 +125,18 @@ def disk(context: DoctorContext) -> Iterator[Finding]:
 
 def clock(context: DoctorContext) -> Iterator[Finding]:
     """Check the pace of the monotonic clock, and that the civil time is right."""
-    time = context.computer.clock
-    start_ns, start_utc = time.now_ns(), time.utc()
-    time.sleep(_PAUSE_S)
-    passed_s = seconds_between(start_ns, time.now_ns())
-    civil_s = (time.utc() - start_utc).total_seconds()
+    timer = context.computer.clock
+    start_ns, start_utc = timer.now_ns(), timer.utc()
+    timer.sleep(_PAUSE_S)
+    passed_s = seconds_between(start_ns, timer.now_ns())
+    civil_s = (timer.utc() - start_utc).total_seconds()
     pause = {"wanted_ms": 1e3 * _PAUSE_S, "pause_ms": 1e3 * passed_s}
     if not _PAUSE_S * 0.9 <= passed_s <= _PAUSE_S + _PAUSE_ERROR_S:
         fix = "Close other programs and switch power saving off, then: " + context.rig("doctor")
         yield warning("clock", FindingCode.LONG_PAUSE, fix, **pause)
     else:
         yield fine("clock", FindingCode.PAUSE, **pause)
-    now = time.utc()
+    now = timer.utc()
     synchronised = context.computer.time_synchronised()
     fix = "sudo timedatectl set-ntp true"
     if abs(civil_s - passed_s) > _STEP_S:
@@ -150,29 +151,32 @@ def clock(context: DoctorContext) -> Iterator[Finding]:
 
 
 def udev_rules(ports_found: list[SerialPort]) -> str:
-    """Return udev rules: a short latency, a permanent name, access for the logged-in user, no ModemManager.
+    """Return udev rules: a short latency, a permanent name, access for the logged-in user, no ModemManager, no brltty.
 
-    They cannot keep brltty away, because its own rules are read later.
+    brltty's rule (85-brltty.rules) starts it for many USB adapters by ``SYSTEMD_WANTS``; a later rule takes that back.
     """
     lines = [
-        f"# {RULES_FILE}: made by `rig doctor --udev`",
+        "# Made by `rig doctor --udev`, for two files:",
+        *(f"# {file}" for file in RULES_FILES),
         f'ACTION=="add", SUBSYSTEM=="usb-serial", DRIVER=="ftdi_sio", ATTR{{latency_timer}}="{LATENCY_MS}"',
     ]
     named = False
     for port in ports_found:
-        if port.usb.get("serial"):
-            link = "" if named else ', SYMLINK+="rig-servo"'
-            named = True
-            lines.append(
-                f'SUBSYSTEM=="tty", ATTRS{{idVendor}}=="{port.usb["idVendor"]}", '
-                f'ATTRS{{idProduct}}=="{port.usb.get("idProduct", "")}", ATTRS{{serial}}=="{port.usb["serial"]}", '
-                f'GROUP="dialout", MODE="0660", TAG+="uaccess", ENV{{ID_MM_PORT_IGNORE}}="1"{link}'
-            )
-            lines.append(
-                f'SUBSYSTEM=="usb", ENV{{DEVTYPE}}=="usb_device", ATTR{{idVendor}}=="{port.usb["idVendor"]}", '
-                f'ATTR{{idProduct}}=="{port.usb.get("idProduct", "")}", ATTR{{serial}}=="{port.usb["serial"]}", '
-                'ENV{ID_MM_DEVICE_IGNORE}="1"'
-            )
+        if not port.usb.get("idVendor"):
+            continue
+        keys = {key: port.usb[key] for key in ("idVendor", "idProduct", "serial") if port.usb.get(key)}
+        link = "" if named or "serial" not in keys else ', SYMLINK+="rig-servo"'
+        named = named or bool(link)
+        of_port = "".join(f'ATTRS{{{key}}}=="{value}", ' for key, value in keys.items())
+        of_device = "".join(f'ATTR{{{key}}}=="{value}", ' for key, value in keys.items())
+        lines.append(
+            f'SUBSYSTEM=="tty", {of_port}GROUP="dialout", MODE="0660", TAG+="uaccess", '
+            f'ENV{{ID_MM_PORT_IGNORE}}="1"{link}'
+        )
+        lines.append(
+            f'SUBSYSTEM=="usb", ENV{{DEVTYPE}}=="usb_device", {of_device}ENV{{ID_MM_DEVICE_IGNORE}}="1", '
+            'ENV{BRLTTY_BRAILLE_DRIVER}="", ENV{SYSTEMD_WANTS}=""'
+        )
     lines.append('SUBSYSTEM=="i2c-dev", GROUP="i2c", MODE="0660", TAG+="uaccess"')
     lines.append('SUBSYSTEM=="video4linux", GROUP="video", MODE="0660", TAG+="uaccess"')
     return "\n".join(lines) + "\n"
@@ -181,7 +185,7 @@ def udev_rules(ports_found: list[SerialPort]) -> str:
 def udev_command(context: DoctorContext) -> str:
     """Return the command that installs the rules."""
     return (
-        f"{context.rig('doctor --udev')} | sudo tee {RULES_FILE} && "
+        f"{context.rig('doctor --udev')} | sudo tee {' '.join(RULES_FILES)} && "
         "sudo udevadm control --reload && sudo udevadm trigger --action=add"
     )
 

@@ -1,5 +1,6 @@
 """The display of a running plan: a live table on a terminal, one line for each view in a pipe."""
 
+from abc import abstractmethod
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -84,18 +85,18 @@ class LiveView(AbstractContextManager["LiveView"]):
         if self.show(event):
             self._pause.point(self._show_pause)
 
+    @abstractmethod
     def show(self, event: Event) -> bool:
         """Show an event and return whether the plan can pause after it."""
-        raise NotImplementedError
 
     def note(self, text: str) -> None:
         """Print a line that stays on the screen, above the live table."""
         if text:
             self._console.print(text, markup=False, highlight=False, soft_wrap=not self._console.is_terminal)
 
+    @abstractmethod
     def render(self) -> RenderableType:
         """Return the present content of the live table."""
-        raise NotImplementedError
 
     def _show_pause(self, words: str) -> None:
         """Show in the live table that the plan pauses and how to resume it; in a pipe print a line."""

@@ -26,12 +26,6 @@ from tests.rig.doctor.doctor_parts import unopened
 PING, READ = 0x01, 0x02
 
 
-@pytest.fixture
-def bench():
-    with unopened() as bench:
-        yield bench
-
-
 def heard(bench, *bauds: int, protocol: int = 2) -> list[BaudScan]:
     return list(
         scan_servos(bench.devices.adapter, bench.context.computer.clock, bauds or BAUD_RATES, protocol=protocol)

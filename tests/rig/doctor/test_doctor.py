@@ -1,48 +1,31 @@
 """Findings of `rig doctor`: each problem is found with its fix, and stops no other check."""
 
-import os
 import sqlite3
 import threading
-from contextlib import contextmanager
-from datetime import UTC, datetime, timedelta
+from datetime import timedelta
 from pathlib import Path
 
 import pytest
 
-from rig.bench.computer import Disk, User
-from rig.bench.hardware import HardwareBench
 from rig.calibrations import CalibrationResult, CalibrationStatus, CalibrationStore, Estimate
 from rig.catalog import Catalog
 from rig.core.clock import SystemClock
-from rig.core.errors import BenchBusy, ConfigError, DeviceNotFound, DeviceSilent
+from rig.core.errors import ConfigError, DeviceNotFound, DeviceSilent
 from rig.doctor.checks import CHECKS
-from rig.doctor.computer import udev_rules
 from rig.doctor.examination import Check, run_checks
 from rig.doctor.finding import Finding, FindingCode, Severity, finding_words, fine
-from rig.doctor.single_servo import single_servo
-from rig.safety.saved_state import BenchLock, FileStore, LatchedFault, holder
-from rig.safety.saved_state import BenchState as State
-from sim.clock import VirtualClock
 from sim.faults import Faults, fault_kinds
 from sim.faults.schedule import read_faults
 from tests.rig.catalog.catalog_samples import fill
 from tests.rig.doctor.doctor_parts import unopened
 
 PING, READ = 0x01, 0x02
-GID = os.getgid()
-ADA = User("ada", 4242, frozenset({GID + 1}))
 
 
 def set_up(bench) -> None:
     """Give the servo the settings that the rig needs."""
     for name, value in {"Operating Mode": 4, "Return Delay Time": 0}.items():
         bench.devices.servo.memory[name] = value
-
-
-@pytest.fixture
-def bench():
-    with unopened() as bench:
-        yield bench
 
 
 def test_only_the_missing_calibration_of_a_new_bench_is_reported(bench):
@@ -65,210 +48,6 @@ def test_empty_computer_reports_each_missing_device():
         assert bad == {"port", "servo", "imu", "camera"}
         assert all(f.fix for f in findings if f.level is not Severity.FINE)
         assert {f.topic for f in findings if f.level is Severity.FINE} >= {"bench", "disk", "clock", "catalog"}
-
-
-# -- the computer -----------------------------------------------------------------------------------------------------
-
-
-def test_latency_timer_is_fixed_by_one_command():
-    with unopened(plugged=False) as bench:
-        bench.computer.serial_port(latency_ms=16)
-        bench.computer.i2c_bus()
-        bench.computer.camera()
-        problem = bench.problem("port")
-        assert (problem.code, problem.parameters["latency_ms"]) == (FindingCode.HIGH_LATENCY, 16)
-        assert problem.fix == "echo 1 | sudo tee /sys/bus/usb-serial/devices/ttyUSB0/latency_timer"
-
-
-@pytest.mark.parametrize(
-    ("members", "code", "command"),
-    [
-        ((), FindingCode.NOT_IN_GROUP, "sudo usermod -aG dialout ada"),
-        (("ada",), FindingCode.GROUP_AT_NEXT_LOGIN, "newgrp dialout"),
-    ],
-)
-def test_missing_permission_names_the_group_or_the_new_login(members, code, command):
-    with unopened(plugged=False, user=ADA) as bench:
-        bench.computer.group("dialout", GID, *members)
-        bench.computer.serial_port(mode=0o660)
-        bench.computer.i2c_bus(mode=0o666)
-        bench.computer.camera(mode=0o666)
-        problem = bench.problem("port")
-        assert (problem.code, problem.fix) == (code, command)
-        assert (problem.parameters["user"], problem.parameters["path"]) == ("ada", "/dev/ttyUSB0")
-
-
-def test_port_of_root_is_fixed_by_udev_rules():
-    with unopened(plugged=False, user=ADA) as bench:
-        bench.computer.group("root", GID)
-        bench.computer.serial_port(mode=0o600, serial="FT3M9M97")
-        bench.computer.i2c_bus(mode=0o666)
-        bench.computer.camera(mode=0o666)
-        problem = bench.problem("port")
-        assert problem.code is FindingCode.ROOT_ONLY
-        assert problem.fix.startswith("rig doctor --udev --bench sim | sudo tee /etc/udev/rules.d/")
-        rules = udev_rules(bench.context.computer.serial_ports())
-        assert 'ATTR{latency_timer}="1"' in rules
-        assert 'ATTRS{idVendor}=="0403", ATTRS{idProduct}=="6014", ATTRS{serial}=="FT3M9M97"' in rules
-        assert 'SYMLINK+="rig-servo"' in rules
-        assert rules.count("rig-servo") == 1
-        assert 'ENV{ID_MM_PORT_IGNORE}="1"' in rules
-        assert 'ATTR{serial}=="FT3M9M97", ENV{ID_MM_DEVICE_IGNORE}="1"' in rules
-
-
-def test_missing_port_is_explained_by_brltty():
-    with unopened(plugged=False) as bench:
-        bench.computer.i2c_bus()
-        bench.computer.camera()
-        bench.computer.process(77, "/usr/bin/brltty -b hd")
-        problem = bench.problem("port")
-        assert (problem.code, problem.fix) == (FindingCode.BRLTTY_TAKES_PORT, "sudo apt remove brltty")
-
-
-def test_port_that_modem_manager_will_open_is_reported(bench):
-    """It runs as root, so a user does not see that it has the port open."""
-    assert bench.problems("port") == {}
-    bench.computer.process(78, "/usr/sbin/ModemManager")
-    problem = bench.problem("port")
-    assert problem.code is FindingCode.MODEM_MANAGER
-    assert "udevadm trigger" in problem.fix
-    node = (bench.computer.root / "dev/ttyUSB0").stat().st_rdev
-    bench.computer.write(f"run/udev/data/c{os.major(node)}:{os.minor(node)}", "S:rig-servo\nE:ID_MM_PORT_IGNORE=1\n")
-    assert bench.problems("port") == {}
-
-
-def test_bench_is_not_opened_while_another_program_has_the_port_open(bench):
-    """The simulated computer opens the port: the other program has not locked it."""
-
-    class Local(HardwareBench):
-        @contextmanager
-        def computer(self, config, options, seed):
-            yield bench.context.computer
-
-    bench.computer.process(77, "minicom -D /dev/ttyUSB0", "/dev/ttyUSB0")
-    for opening in (
-        lambda: Local().open(bench.context.config, None, None),
-        lambda: single_servo(bench.context).__enter__(),
-    ):
-        with pytest.raises(BenchBusy, match=r"process 77 \(minicom") as caught:
-            opening()
-        assert "kill 77" in caught.value.next_step
-    assert not bench.sent
-
-
-@pytest.mark.parametrize(
-    ("command", "fix"),
-    [
-        ("dynamixel_wizard", "kill 77"),
-        ("/usr/sbin/ModemManager", "sudo systemctl disable --now ModemManager"),
-        ("/usr/bin/brltty -b hd", "sudo apt remove brltty"),
-    ],
-)
-def test_port_in_use_names_the_process(command, fix, bench):
-    bench.computer.process(77, command, "/dev/ttyUSB0")
-    problem = bench.problem("port")
-    assert (problem.code, problem.fix) == (FindingCode.DEVICE_FILE_IN_USE, fix)
-    assert f"in use by process 77 ({command})" in finding_words(problem)
-
-
-def test_other_port_is_proposed_by_its_permanent_name():
-    with unopened(plugged=False) as bench:
-        bench.computer.serial_port("ttyUSB3", serial="FT7")
-        bench.computer.i2c_bus(4)
-        bench.computer.camera(2, "Cam")
-        fixes = list(bench.problems("port").values())
-        assert fixes == [
-            "rig config set servo.port /dev/serial/by-id/usb-FTDI_USB__-__Serial_Converter_FT7-if00-port0",
-            "rig config set imu.bus 4",
-            "rig config set camera.source /dev/v4l/by-id/usb-Cam-video-index0",
-        ]
-        bench.computer.serial_port("ttyUSB4", serial="B")
-        assert next(iter(bench.problems("port").values())) == "rig setup --bench sim"
-
-
-def test_bench_in_use_is_not_touched(bench):
-    path = bench.context.config.state_path("sim")
-    lock = BenchLock(path, SystemClock())
-    bench.context.holder = holder(path)
-    findings = bench.findings()
-    lock.close()
-    warnings = {f.topic: f for f in findings if f.level is Severity.WARNING}
-    assert warnings["bench"].code is FindingCode.BENCH_IN_USE
-    assert warnings["bench"].parameters["pid"] == os.getpid()
-    assert {warnings[topic].code for topic in ("servo", "imu", "camera")} == {FindingCode.NOT_CHECKED}
-    assert warnings["servo"].fix == "rig stop --bench sim"
-    assert not bench.sent
-
-
-def test_latched_fault_and_damaged_state_are_reported(bench):
-    store = FileStore(bench.context.config.state_path("sim"))
-    utc = "2026-05-01T10:00:00+00:00"
-    store.save(State(fault=LatchedFault.of(DeviceSilent("Servo 1 is gone.", next_step="Look."), utc)))
-    problem = bench.problem("bench")
-    assert (problem.code, problem.parameters["code"]) == (FindingCode.FAULT_LATCHED, 402)
-    assert problem.parameters["what"] == "Servo 1 is gone."
-    assert problem.fix == "rig acknowledge --bench sim"
-    store.latch(None)
-    (store.path / "state.json").write_text("{")
-    problem = bench.problem("bench")
-    assert problem.code is FindingCode.STATE_DAMAGED
-    assert "rig home --turns" in problem.fix
-
-
-@pytest.mark.parametrize(("free", "level"), [(50e9, Severity.FINE), (1e9, Severity.WARNING), (1e8, Severity.BAD)])
-def test_free_space_is_reported_in_objects(monkeypatch, free, level, bench):
-    monkeypatch.setattr(type(bench.context.computer), "disk", lambda *_: Disk(int(free), network=False))
-    (finding,) = bench.findings("disk")
-    assert (finding.code, finding.level) == (FindingCode.FREE_SPACE, level)
-    assert finding.parameters["objects"] == int(free / 500_000) // 72
-
-
-@pytest.mark.parametrize(
-    ("disk", "code", "fixed_by"),
-    [
-        (Disk(10**11, network=True), FindingCode.NETWORK_DISK, ""),
-        (Disk(10**11, network=False, writable=False), FindingCode.NOT_WRITABLE, "rig config set catalog.path FOLDER"),
-    ],
-)
-def test_network_disk_and_read_only_folder_are_reported(monkeypatch, disk, code, fixed_by, bench):
-    monkeypatch.setattr(type(bench.context.computer), "disk", lambda *_: disk)
-    problem = bench.problem("disk")
-    assert problem.code is code
-    assert fixed_by in problem.fix
-
-
-def test_unsynchronized_clock_is_a_warning_and_wrong_date_is_bad():
-    with unopened(plugged=False) as bench:
-        assert bench.problem("clock").code is FindingCode.NO_TIME_SERVER
-        bench.computer.keeps_time(synchronised=False)
-        problem = bench.problem("clock")
-        assert problem.code is FindingCode.NOT_SYNCHRONIZED
-        assert problem.fix == "sudo timedatectl set-ntp true"
-        bench.computer.keeps_time()
-        assert not bench.problems("clock")
-        bench.context.computer.clock = VirtualClock(start_utc=datetime(1970, 1, 1, tzinfo=UTC))
-        (wrong,) = [f for f in bench.findings("clock") if f.level is Severity.BAD]
-        assert wrong.code is FindingCode.WRONG_DATE
-
-
-def test_time_jump_and_long_pause_are_reported():
-    class Bad(VirtualClock):
-        """Sleeps too long, and its civil time jumps meanwhile."""
-
-        jump = timedelta()
-
-        def sleep(self, seconds):
-            super().sleep(seconds + 1.0)
-            self.jump = timedelta(hours=1)
-
-        def utc(self):
-            return super().utc() + self.jump
-
-    with unopened() as bench:
-        bench.context.computer.clock = Bad()
-        problems = {f.code: f.parameters for f in bench.findings("clock")}
-        assert round(problems[FindingCode.LONG_PAUSE]["pause_ms"]) == 1020
-        assert problems[FindingCode.TIME_JUMPED]["jump_s"] == pytest.approx(3600, abs=1)
 
 
 # -- the servo --------------------------------------------------------------------------------------------------------

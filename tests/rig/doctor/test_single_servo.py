@@ -15,12 +15,6 @@ from tests.rig.doctor.doctor_parts import unopened
 WRITE = 0x03
 
 
-@pytest.fixture
-def bench():
-    with unopened() as bench:
-        yield bench
-
-
 @fuzz_settings(0.02)
 @given(
     at=st.tuples(st.integers(0, 252), st.sampled_from([57_600, 1_000_000, 9_600])),
