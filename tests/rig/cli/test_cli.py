@@ -198,6 +198,31 @@ def test_doctor_writes_a_support_bundle_with_a_picture_only_if_asked(rig):
         assert bundle.read("camera.png").startswith(b"\x89PNG")
 
 
+def test_support_bundle_has_no_passwords_and_tokens(rig):
+    secret = "pa,ss:w@rd"
+    Path("rig.toml").write_text(
+        f"""
+default_bench = "sim"
+[camera]
+source = "rtsp://me:{secret}@10.0.0.9/live?token={secret}&size=2"
+[catalog]
+url = "postgresql+psycopg://ada:{secret}@host.invalid/rig"
+images = "s3://bucket/rig?secret_key={secret}"
+[bench.other]
+api_token = "{secret}"
+users = [{{ name = "ada", password = "{secret}" }}]
+"""
+    )
+    rig("--config", "rig.toml", "doctor", "--bundle", "a.zip")
+    with ZipFile("a.zip") as bundle:
+        texts = {name: bundle.read(name).decode() for name in bundle.namelist()}
+    assert {"rig.toml", "findings.json", "configuration.json", "versions.json"} <= texts.keys()
+    for name, text in texts.items():
+        assert "w@rd" not in text, (name, text[max(text.index("w@rd") - 300, 0) :][:400])
+    assert "ada:***@host.invalid/rig" in texts["rig.toml"]
+    assert json.loads(texts["configuration.json"])["bench"]["other"]["api_token"] == "***"
+
+
 def test_table_rotates_without_a_camera(rig):
     missing = ("--set", 'bench.sim.faults=["camera.off"]')
     assert rig("goto", "20", *missing).exit_code == 0
