@@ -106,8 +106,9 @@ def standing_flicker(
 ) -> MainsFlicker | None:
     """Return the flicker whose bands stand still in the images of one exposure time; None if there is none.
 
-    The bands are not told from the scene by one exposure time. An exposure of whole periods of the lamp has no bands:
+    One exposure time does not separate bands from the scene. An exposure of whole periods of the lamp has no bands:
     the quotient of both is the bands, and a smooth function of the level if the camera's response is not linear.
+    Decision: docs/decisions/0057.
 
     Parameters
     ----------
