@@ -13,9 +13,11 @@ from tests.kernel.played_bench import PlayedBench
 RULES_FILE = "/etc/udev/rules.d/60-hbr-rig.rules"
 PATIENT = {
     "servo": ("retries = 10",),
-    "table": ("poll_s = 0.1", "quiet_dps = 2.0"),
+    "table": ("poll_s = 0.1", "quiet_dps = 2.0", "watchdog_s = 2.5"),
     "imu": ("rate_hz = 50", "bandwidth_hz = 20"),
+    "camera": ("width = 320", "height = 240"),
 }
+SMALL_REGION = "\n[view]\nroi = [40, 0, 240, 240]\n"
 """Settings for an emulated computer, which is slow: a request to a device takes it tens of milliseconds."""
 
 TRIGGERED = "--subsystem-match=usb --subsystem-match=usb-serial --subsystem-match=tty"
@@ -68,7 +70,7 @@ def first_day(guest: GuestBench) -> FirstDay:
     after, link = guest.files(latency)[latency].strip(), guest.sh("readlink -f /dev/rig-servo")
     setup = guest.rig("setup", "--yes")
     added = (f"s/^\\[{section}\\]/" + "\\n".join((f"[{section}]", *lines)) + "/" for section, lines in PATIENT.items())
-    guest.sh(f"sed -i '{'; '.join(added)}' rig.toml")
+    guest.sh(f"sed -i '{'; '.join(added)}' rig.toml && cat >> rig.toml <<'END'{SMALL_REGION}END")
     settings, home = guest.rig("servo", "settings", "--write", "--yes"), guest.rig("home", "--here")
     return FirstDay(find, rules, before, after, link, setup, settings, home)
 

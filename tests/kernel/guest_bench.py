@@ -122,9 +122,10 @@ class GuestBench:
             clock.sleep(_POLL_S)
 
     def until_printed(self, process: GuestProcess, text: str, seconds: float = 120.0) -> None:
-        """Wait until a program has printed a text; raises AssertionError with its output if it does not."""
+        """Wait until a program has printed a text; raises AssertionError with its output if it has not, or ends."""
         try:
-            self.until(lambda: text in process.output, text, seconds)
+            self.until(lambda: text in process.output or not process.runs, text, seconds)
+            assert text in process.output
         except AssertionError:
             raise AssertionError(f"it has not printed {text!r} in {seconds:g} s:\n{process.output}") from None
 

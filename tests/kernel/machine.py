@@ -212,6 +212,10 @@ class GuestProcess:
         """What it has printed so far."""
         return str(self._machine.ask("output", pid=self.pid))
 
+    @property
+    def runs(self) -> bool:
+        return bool(self._machine.ask("runs", pid=self.pid))
+
     def signal(self, number: int) -> None:
         self._machine.ask("signal", pid=self.pid, signal_number=number)
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from tests.kernel.guest_bench import GuestBench
+from tests.kernel.test_first_day import CAMERA
 
 pytestmark = [pytest.mark.kernel, pytest.mark.timeout(600)]
 
@@ -57,11 +58,11 @@ def test_a_view_is_rejected_after_a_setting_has_drifted(
 
 
 def test_the_same_scene_is_seen_in_both_formats(bench: GuestBench) -> None:
-    script = """
+    script = f"""
 import cv2
 from rig.devices.opencv_capture import open_capture
 for name in ("YUYV", "MJPG"):
-    camera = open_capture("/dev/video0")
+    camera = open_capture("{CAMERA}")
     camera.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*name))
     camera.grab(), camera.grab()
     ok, image = camera.retrieve()
@@ -81,8 +82,8 @@ def test_another_driver_delivers_frames_with_plausible_times(bench: GuestBench) 
     bench.sh("modprobe vivid n_devs=1 node_types=0x1 && udevadm settle")
     try:
         node = PurePosixPath(bench.sh("dirname $(grep -l vivid /sys/class/video4linux/*/name | head -1)")).name
-        source = ("--set", f"camera.source=/dev/{node}")
-        snapshot = bench.rig("snapshot", "vivid.png", *source)
+        settings = (f"camera.source=/dev/{node}", "camera.width=640", "camera.height=480")
+        snapshot = bench.rig("snapshot", "vivid.png", *(word for setting in settings for word in ("--set", setting)))
         assert snapshot.code == 0, snapshot.output
         assert "640x480 pixels" in snapshot.output
     finally:

@@ -3,6 +3,7 @@
 import pytest
 
 from tests.kernel.guest_bench import GuestBench
+from tests.kernel.test_first_day import CAMERA
 
 pytestmark = [pytest.mark.kernel, pytest.mark.timeout(600)]
 
@@ -17,7 +18,7 @@ CHOSEN = "test_camera or test_samples_come_once or test_gravity"
 def test_camera_and_imu_at_device_files_keep_to_the_contracts(bench: GuestBench) -> None:
     code = f"""
 import os, pytest
-os.environ |= {{"RIG_TEST_CAMERA": "/dev/video0", "RIG_TEST_I2C": "{bench.i2c_bus}"}}
+os.environ |= {{"RIG_TEST_CAMERA": "{CAMERA}", "RIG_TEST_I2C": "{bench.i2c_bus}"}}
 raise SystemExit(pytest.main([*{OPTIONS}, "-k", "{CHOSEN}", "tests/contract"]))
 """
     ended = bench.python(code, timeout=500)

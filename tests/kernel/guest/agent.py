@@ -110,6 +110,9 @@ class Agent:
         """Return what the process has printed so far."""
         return "".join(text for _, text in self._outputs[pid])
 
+    def do_runs(self, pid: int) -> bool:
+        return self._running[pid].poll() is None
+
     def do_wait(self, pid: int, timeout: float) -> dict[str, Any] | None:
         """Return exit code, all output and standard output of a process; None if it has not ended in ``timeout`` s."""
         process = self._running[pid]
