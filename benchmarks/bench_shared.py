@@ -84,7 +84,7 @@ def compare_evaluations(folder: Path, photographs: Path) -> None:
     for number in range(2):
         for name, words in ways.items():
             out = folder / f"{name.replace(' ', '-')}-{number}"
-            command = [*RIG, "eval", str(photographs), "--noise", "mb", "--trials", "2", "--out", str(out), *words]
+            command = [*RIG, "eval", str(photographs), "--noise", "mb", "--trials", "8", "--out", str(out), *words]
             start, before = default_timer(), os.times()
             subprocess.run(command, check=True, capture_output=True)
             after = os.times()

@@ -17,6 +17,9 @@ _T = TypeVar("_T")
 LOCAL: Final = "local"
 START_S: Final = 30
 
+_LOCAL: dict[int, Any] = {}
+"""The clusters that this program started, by their number of workers. Dask ends them with the program."""
+
 
 @dataclass(frozen=True)
 class Cluster:
@@ -68,7 +71,7 @@ def map_on_cluster(work: Callable[[_Item], _T], items: Iterable[_Item], cluster:
     if not todo:
         return
     try:
-        from distributed import Client, KilledWorker, LocalCluster, as_completed
+        from distributed import Client, KilledWorker, as_completed
     except ImportError as error:
         raise ExtraMissing.of("cluster", "jobs on a cluster", error) from error
     from hbr.descriptors import loaded_models
@@ -76,12 +79,7 @@ def map_on_cluster(work: Callable[[_Item], _T], items: Iterable[_Item], cluster:
     with ExitStack() as ends:
         try:
             count = cluster.workers()
-            where: Any = cluster.address
-            if count is not None:
-                started = LocalCluster(
-                    n_workers=count or None, threads_per_worker=1, dashboard_address=None, silence_logs=50
-                )
-                where = ends.enter_context(started)
+            where: Any = cluster.address if count is None else _local_cluster(count)
             client = ends.enter_context(Client(where, timeout=START_S))
         except (OSError, TimeoutError, ValueError) as error:
             raise ClusterFailed(
@@ -112,6 +110,18 @@ def map_on_cluster(work: Callable[[_Item], _T], items: Iterable[_Item], cluster:
         finally:
             for future in futures:
                 future.cancel()
+
+
+def _local_cluster(count: int) -> Any:
+    """Return a cluster on this computer; its start takes seconds, so that it works until the program ends."""
+    from distributed import LocalCluster
+
+    running = _LOCAL.get(count)
+    if running is None or running.status.name != "running":
+        running = _LOCAL[count] = LocalCluster(
+            n_workers=count or None, threads_per_worker=1, dashboard_address=None, silence_logs=50
+        )
+    return running
 
 
 def _call(content: bytes, digest: str, models: Sequence[str], item: Any) -> Any:

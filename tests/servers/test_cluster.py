@@ -70,6 +70,16 @@ def test_dead_worker_costs_its_item_alone(tmp_path: Path) -> None:
     assert sum(done.values()) <= 12 + 3  # with what lay finished on the dead worker
 
 
+def process(_: int) -> int:
+    return os.getpid()
+
+
+def test_local_cluster_is_started_once() -> None:
+    first, second = ({pid for _, pid in map_on_cluster(process, range(8), Cluster("local:1"))} for _ in range(2))
+    assert first == second
+    assert os.getpid() not in first
+
+
 def test_wrong_addresses_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("rig.core.cluster.START_S", 1)
     with pytest.raises(ClusterFailed, match="does not answer"):
