@@ -11,7 +11,7 @@ from sqlalchemy import Connection, Table, func, select, text
 from rig.catalog import audit
 from rig.catalog.catalog import Catalog
 from rig.catalog.jobs import JobProgress
-from rig.catalog.postgres import set_property
+from rig.catalog.postgres import LOST_READER_S, limit_idle, set_property
 from rig.catalog.rows import copied_columns, insert_copies
 from rig.catalog.schema import APPEND_ONLY, METADATA, SCHEMA_VERSION, objects, results, sessions, views
 from rig.catalog.seal import appended_digests, damage_of, enrollment_digests, object_digests
@@ -67,6 +67,8 @@ def copy_catalog(source: Catalog, target: Catalog) -> Generator[JobProgress, Non
         yield JobProgress(len(wanted), len(wanted))
         with target.database.write() as writing:
             _check_empty(writing, target)
+            if writing.dialect.name == "postgresql":
+                limit_idle(writing, LOST_READER_S)  # while the digests of the source are computed
             for table in _TABLES:
                 _copy_rows(reading, writing, table)
             _give_ids(writing, source.database.last_ids(reading))

@@ -38,12 +38,15 @@ _PROPERTIES: Final = Table(
     "catalog_properties", MetaData(), Column("key", Text, primary_key=True), Column("value", Text, nullable=False)
 )
 
-_LOST_BENCH_S: Final = 30
-"""After this time the server ends the transaction of a bench that lost its network or its power."""
+LOST_BENCH_S: Final = 30
+"""After this time the server ends a transaction that has locks, of a bench that lost its network or its power."""
+
+LOST_READER_S: Final = 12 * 3600
+"""The same for a transaction without locks: exports and copies read images and rows in turn."""
 
 _SETTINGS: Final = {
     "lock_timeout": "{busy_ms}",
-    "idle_in_transaction_session_timeout": str(1000 * _LOST_BENCH_S),
+    "idle_in_transaction_session_timeout": str(1000 * LOST_READER_S),
     "tcp_keepalives_idle": "10",
     "tcp_keepalives_interval": "5",
     "tcp_keepalives_count": "3",
@@ -238,6 +241,7 @@ def migrate_server(
             lock_catalog(connection)
             before = _version(properties(connection), place)
             if before < SCHEMA_VERSION:
+                limit_idle(connection, LOST_READER_S)  # a step may compute for long
                 run_steps(connection, before)
                 set_property(connection, "version", str(SCHEMA_VERSION))
                 audit.append(connection, clock, audit.Action.MIGRATED, before=before, after=SCHEMA_VERSION)
@@ -253,8 +257,15 @@ def _absent(place: CatalogPlace) -> CatalogError:
     )
 
 
+def limit_idle(connection: Connection, seconds: int) -> None:
+    """Let the server end this transaction when the program has asked for nothing for this time."""
+    statement = "SELECT set_config('idle_in_transaction_session_timeout', :ms, true)"
+    connection.execute(text(statement), {"ms": str(1000 * seconds)})
+
+
 def lock_catalog(connection: Connection, enrollment_id: int | None = None) -> None:
     """Wait for the lock of the catalog until the end of the transaction; or, shared, for that of one enrollment."""
+    limit_idle(connection, LOST_BENCH_S)
     catalog = "CAST(CAST('catalog_properties' AS regclass) AS oid)"
     if enrollment_id is None:
         connection.execute(text(f"SELECT pg_advisory_xact_lock(CAST({catalog} AS bigint))"))

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from sqlalchemy import text
 
 from rig.catalog import Catalog
 from rig.catalog.copying import copy_catalog
@@ -21,6 +22,7 @@ from rig.catalog.results import record as record_result
 from rig.catalog.upkeep import collect_garbage
 from rig.catalog.verify import Problem, Repair, verify
 from rig.config.catalog_place import CatalogPlace
+from rig.core.clock import SystemClock
 from rig.core.errors import CatalogError, CatalogUnavailable
 from sim.clock import VirtualClock
 from tests.rig.catalog.catalog_samples import finished, image, new_result, true_fill
@@ -160,6 +162,22 @@ def test_copies_in_both_directions_are_equal(postgres: PostgresServer, s3: S3Ser
             true_fill(back, "new", 1, 20)
             true_fill(shared, "new", 1, 20)
             assert back.object("new").enrollments[0].id == shared.object("new").enrollments[0].id == 5
+
+
+def test_transaction_without_locks_may_wait_and_one_with_locks_may_not(
+    postgres: PostgresServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("rig.catalog.postgres.LOST_BENCH_S", 1)
+    with opened(place_in(postgres.url, tmp_path / "shared")) as catalog:
+        true_fill(catalog, "mug", 1, 0)
+        with catalog.database.read() as reading:
+            before = reading.scalar(text("SELECT count(*) FROM views"))
+            SystemClock().sleep(1.5)  # an export writes its files
+            assert reading.scalar(text("SELECT count(*) FROM views")) == before == 1
+        with pytest.raises(CatalogUnavailable), catalog.database.write() as writing:
+            SystemClock().sleep(1.5)  # a bench that lost its network
+            writing.scalar(text("SELECT count(*) FROM views"))
+        assert catalog.objects()
 
 
 def test_store_that_does_not_answer_is_reported(postgres: PostgresServer, s3: S3Server, tmp_path: Path) -> None:

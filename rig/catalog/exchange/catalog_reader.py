@@ -1,6 +1,6 @@
 """Read objects from a catalog, one after the other, with everything that is stored of them."""
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Generator, Iterator, Sequence
 from pathlib import Path
 
 from sqlalchemy import Connection, select
@@ -24,7 +24,7 @@ from rig.catalog.seal import check_loaded
 from rig.views import image_files as images
 
 
-def read_objects(catalog: Catalog, names: Collection[str] = ()) -> Iterator[ExportedObject]:
+def read_objects(catalog: Catalog, names: Collection[str] = ()) -> Generator[ExportedObject, None, None]:
     """Yield objects in use in their order, each with the files of its images by their paths in the export.
 
     The paths number the objects and enrollments from 1. They do not depend on what else was in the catalog.

@@ -1,0 +1,68 @@
+"""Catalogs and bundles to import and export. No test waits for the disk."""
+
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from rig.catalog import Catalog
+from rig.catalog.exchange import (
+    read_objects,
+    write_bundle,
+)
+from sim.clock import VirtualClock
+from tests.rig.catalog.catalog_samples import (
+    true_fill,
+    without_waiting,
+)
+from tests.rig.catalog.exchange.exchange_samples import NOW, OpenCatalog, fill_full
+
+
+@pytest.fixture(autouse=True)
+def _fast(monkeypatch: pytest.MonkeyPatch) -> None:
+    without_waiting(monkeypatch)
+
+
+@pytest.fixture
+def open_catalog(tmp_path: Path) -> Iterator[OpenCatalog]:
+    opened = []
+
+    def open_one(name: str) -> Catalog:
+        opened.append(Catalog.open(tmp_path / name, clock=VirtualClock(NOW)))
+        return opened[-1]
+
+    yield open_one
+    for catalog in opened:
+        catalog.close()
+
+
+@pytest.fixture(scope="session")
+def full_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A catalog with replaced and unfinished enrollments, regions, a segmentation and an empty-table image."""
+    folder = tmp_path_factory.mktemp("exchange") / "full"
+    with pytest.MonkeyPatch.context() as patch, Catalog.open(folder, clock=VirtualClock(NOW)) as catalog:
+        without_waiting(patch)
+        fill_full(catalog)
+    return folder
+
+
+@pytest.fixture
+def full(full_folder: Path, open_catalog: OpenCatalog, tmp_path: Path) -> Catalog:
+    """A copy of that catalog."""
+    shutil.copytree(full_folder, tmp_path / "full")
+    return open_catalog("full")
+
+
+@pytest.fixture(scope="session")
+def good_bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("bundle")
+    with Catalog.open(folder / "source", clock=VirtualClock(NOW)) as catalog:
+        true_fill(catalog, "mug", 2, 0)
+        write_bundle(folder / "mug.rigcat.zip", read_objects(catalog))
+    return folder / "mug.rigcat.zip"
+
+
+@pytest.fixture
+def bundle(good_bundle: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copy(good_bundle, tmp_path))

@@ -1,0 +1,194 @@
+"""Folders and tables of photographs are imported; unusable ones are rejected with their reasons."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rig.catalog.exchange import (
+    ImportProblem,
+    plan_import,
+    preview_import,
+    read_folder,
+    read_table,
+)
+from rig.catalog.verify import verify
+from rig.core.errors import ImportRejected, UsageError
+from tests.rig.catalog.catalog_samples import (
+    finished,
+)
+from tests.rig.catalog.exchange.exchange_samples import NOW, OpenCatalog, photograph, run_import, untouched
+
+
+class TestFolders:
+    def test_file_names_give_object_and_angle(self, tmp_path: Path, open_catalog: OpenCatalog) -> None:
+        for seed, name in enumerate(
+            ["obj10__0.png", "obj10__90.5.png", "obj2__355.jpg", "obj2__360.PNG", "mug__10.png"]
+        ):
+            photograph(tmp_path / "in" / name, seed)
+        (tmp_path / "in" / "MISSING.txt").write_text("no image")
+        photograph(tmp_path / "in" / "IMG_0001.png", 9)
+        catalog = open_catalog("catalog")
+        done = run_import(catalog, read_folder(tmp_path / "in", now=NOW), label="coil")
+        (rejected,) = done.rejected
+        assert (rejected.path, rejected.reason.code) == ("IMG_0001.png", ImportProblem.NAME_PATTERN)
+        assert str(rejected.reason) == "does not match the pattern {object}__{angle}"
+        views = catalog.views().views
+        assert views.object_names == ("mug", "obj2", "obj10")
+        assert views.azimuth_deg.tolist() == [10.0, 0.0, 355.0, 0.0, 90.5]
+        assert {item.label for item in catalog.objects()} == {"coil"}
+        (first, _) = catalog.object("obj10").views
+        assert (first.record.encoder_deg, first.record.captured_ns, first.captured_utc) == (None, None, None)
+        assert catalog.image_path(first).read_bytes() == (tmp_path / "in" / "obj10__0.png").read_bytes()
+        assert catalog.object("obj2").views[1].image.endswith(".jpg")
+        assert finished(verify(catalog)).findings == ()
+
+    @pytest.mark.parametrize(
+        ("pattern", "names"),
+        [
+            ("{object}/{angle}", ["mug/0.png", "mug/90.png", "tin/0.png"]),
+            ("{object}/view_{angle}_*.png", ["mug/view_0_a.png", "mug/view_90_b.png", "tin/view_0_.png"]),
+            ("{angle}-{object}", ["0-mug.png", "90-mug.png", "0-tin.png"]),
+            ("run(1)/{object}.{angle}", ["run(1)/mug.0.png", "run(1)/mug.90.png", "run(1)/tin.0.png"]),
+        ],
+    )
+    def test_pattern_matches_other_names(self, tmp_path: Path, pattern: str, names: list[str]) -> None:
+        for seed, name in enumerate(names):
+            photograph(tmp_path / name, seed)
+        batch = read_folder(tmp_path, pattern=pattern, now=NOW)
+        assert {item.name: item.enrollments[0].planned_azimuth_deg for item in batch.objects} == {
+            "mug": (0.0, 90.0),
+            "tin": (0.0,),
+        }
+        assert batch.rejected == ()
+
+    @pytest.mark.parametrize("pattern", ["", "{object}", "{angle}", "{object}{object}{angle}", "image"])
+    def test_invalid_pattern_is_rejected(self, tmp_path: Path, pattern: str) -> None:
+        with pytest.raises(UsageError, match="does not contain"):
+            read_folder(tmp_path, pattern=pattern, now=NOW)
+
+    def test_table_angles_run_in_the_opposite_direction(self, tmp_path: Path) -> None:
+        for angle in (0, 5, 355):
+            photograph(tmp_path / f"obj1__{angle}.png", angle)
+        (item,) = read_folder(tmp_path, table_angles=True, now=NOW).objects
+        shown = {Path(view.image).stem: view.azimuth_deg for view in item.enrollments[0].views}
+        assert shown == {"obj1__0": 0.0, "obj1__5": 355.0, "obj1__355": 5.0}
+
+    def test_gaps_in_the_even_spacing_are_reported(self, tmp_path: Path) -> None:
+        for name, lacking in (("a", ()), ("b", (90, 270)), ("c", (0,))):
+            for angle in range(0, 360, 30):
+                if angle not in lacking:
+                    photograph(tmp_path / f"{name}__{angle}.png", angle)
+        rng = np.random.default_rng(0)
+        for angle in range(0, 360, 30):  # scatter is not a gap
+            photograph(tmp_path / f"d__{(angle + rng.uniform(-2, 2)) % 360:.4f}.png", angle)
+        gaps = read_folder(tmp_path, now=NOW).gaps
+        assert [(gap.object_name, gap.azimuth_deg) for gap in gaps] == [("b", 90.0), ("b", 270.0), ("c", 0.0)]
+
+    def test_each_object_has_its_own_step(self, tmp_path: Path) -> None:
+        for name, angles in (
+            ("many", range(0, 360, 10)),
+            ("few", range(0, 360, 60)),
+            ("lacks-one", range(0, 320, 40)),
+            ("front-only", range(0, 90, 10)),
+        ):
+            for angle in angles:
+                photograph(tmp_path / f"{name}__{angle}.png", angle)
+        gaps = read_folder(tmp_path, now=NOW).gaps
+        assert [(gap.object_name, gap.azimuth_deg) for gap in gaps] == [("lacks-one", 320.0)]
+
+    def test_unusable_files_are_rejected_one_by_one(self, tmp_path: Path, open_catalog: OpenCatalog) -> None:
+        folder = tmp_path / "in"
+        for angle in (0, 90, 180, 270):
+            photograph(folder / f"mug__{angle}.png", angle)
+        whole = (folder / "mug__90.png").read_bytes()
+        (folder / "mug__90.png").write_bytes(whole[: len(whole) // 2])
+        (folder / "tin__0.png").write_text("I am no image")
+        (folder / "mug__180.0.png").write_bytes(whole)
+        photograph(tmp_path / "secret.png", 5)
+        (folder / "mug__45.png").symlink_to(tmp_path / "secret.png")
+        os.mkfifo(folder / "mug__46.png")
+        (folder / "mug__47.png").mkdir()
+        batch = read_folder(folder, now=NOW)
+        catalog = open_catalog("catalog")
+        checked = finished(preview_import(plan_import(None, batch)))
+        done = run_import(catalog, batch)
+        assert {(Path(file.path).name, file.reason.code) for file in done.rejected} == {
+            ("mug__90.png", ImportProblem.INVALID_IMAGE),
+            ("tin__0.png", ImportProblem.INVALID_IMAGE),
+            ("mug__180.png", ImportProblem.SAME_AZIMUTH),
+            ("mug__45.png", ImportProblem.LINK_OUTSIDE),
+            ("mug__46.png", ImportProblem.NOT_A_FILE),
+            ("mug__47.png", ImportProblem.NOT_A_FILE),
+        }
+        assert (done.objects, done.views) == (checked.objects, checked.views) == (1, 3)
+        assert checked.rejected == done.rejected
+        assert catalog.views().views.azimuth_deg.tolist() == [0.0, 180.0, 270.0]
+        assert finished(verify(catalog)).findings == ()
+
+    def test_strict_import_rejects_all_for_one_file(self, tmp_path: Path, open_catalog: OpenCatalog) -> None:
+        photograph(tmp_path / "in" / "mug__0.png", 0)
+        (tmp_path / "in" / "mug__5.png").write_bytes(b"x")
+        catalog = open_catalog("catalog")
+        with pytest.raises(ImportRejected, match="was not imported") as error:
+            run_import(catalog, read_folder(tmp_path / "in", now=NOW), strict=True)
+        assert "mug__5.png" in str(error.value.evidence["rejected"])
+        assert untouched(catalog)
+
+    def test_folder_without_photographs_is_rejected(self, tmp_path: Path) -> None:
+        photograph(tmp_path / "IMG.png", 0)
+        with pytest.raises(ImportRejected) as error:
+            read_folder(tmp_path, now=NOW)
+        assert "--pattern" in error.value.next_step
+        with pytest.raises(ImportRejected, match="no folder"):
+            read_folder(tmp_path / "nowhere", now=NOW)
+
+
+class TestTables:
+    def write(self, folder: Path, *rows: str) -> Path:
+        for seed in range(3):
+            photograph(folder / f"{seed}.png", seed)
+        path = folder / "views.csv"
+        path.write_text("object,azimuth_deg,image,operator\n" + "\n".join(rows) + "\n", encoding="utf-8-sig")
+        return path
+
+    def test_unusable_rows_are_rejected_one_by_one(self, tmp_path: Path, open_catalog: OpenCatalog) -> None:
+        photograph(tmp_path / "outside.png", 9)
+        table = self.write(
+            tmp_path / "in",
+            "mug,0,0.png,ann",
+            "mug,-90,1.png,ann",
+            "mug,north,2.png,",
+            "mug,,2.png,",
+            "mug,20,7.png,",
+            "mug,30,../outside.png,",
+            "mug,nan,2.png,",
+            "mug,360,2.png,",
+            f"mug,40,{tmp_path / 'outside.png'},",
+        )
+        catalog = open_catalog("catalog")
+        done = run_import(catalog, read_table(table, now=NOW))
+        assert catalog.views().views.azimuth_deg.tolist() == [0.0, 270.0]
+        assert [str(file.reason) for file in done.rejected] == [
+            "azimuth_deg is 'north', not an angle in degrees",
+            "azimuth_deg missing",
+            "there is no image 7.png",
+            "the image ../outside.png is not in the folder of the table",
+            "azimuth_deg is 'nan', not an angle in degrees",
+            f"the image {tmp_path / 'outside.png'} is not in the folder of the table",
+            "shows 'mug' from the same azimuth as 0.png",
+        ]
+        assert done.rejected[0].path == "views.csv, line 4"
+
+    @pytest.mark.parametrize(
+        ("content", "words"),
+        [
+            *((b"", None), (b"\xff\xfe\x00", None), (b"object,azimuth_deg,image\n", None)),
+            *((b'object,azimuth_deg,image\n"', None), (b"object;angle\nmug;0\n", "no column object or azimuth_deg or")),
+        ],
+    )
+    def test_invalid_table_is_rejected(self, tmp_path: Path, content: bytes, words: str | None) -> None:
+        (tmp_path / "a.csv").write_bytes(content)
+        with pytest.raises(ImportRejected, match=words):
+            read_table(tmp_path / "a.csv", now=NOW)
