@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 import hbr
 from rig.config import ViewConfig
 from rig.core.errors import UsageError
-from rig.views.description import BENCH_DESCRIPTOR, DESCRIPTORS, PAPER_DESCRIPTOR, ViewDescriber
+from rig.views.description import BENCH_DESCRIPTOR, DESCRIPTORS, PAPER_DESCRIPTOR, SearchDescriber, ViewDescriber
 
 WHOLE = ViewConfig(roi=None)
 
@@ -57,6 +57,18 @@ def test_position_and_illumination_change_the_description_little() -> None:
 def test_descriptors_of_the_whole_image_need_no_segmentation() -> None:
     described = ViewDescriber(WHOLE, (PAPER_DESCRIPTOR, "cedd-blurred"))(_with_object(_table())[:12, :15])
     assert described.segmentation is None
+
+
+def test_search_in_motion_learns_the_background_and_leaves_earlier_views_alone() -> None:
+    table = _table()
+    frames = [_with_object(table, left) for left in (20, 60, 100)]
+    at_rest, moving = (SearchDescriber(WHOLE, BENCH_DESCRIPTOR, revise=revises) for revises in (True, False))
+    views = [(at_rest(frame), moving(frame)) for frame in frames]
+    assert [view.earlier for _, view in views] == [None] * 3
+    for view, other in views:  # the newest view is segmented with the same background
+        assert np.array_equal(view.levels[BENCH_DESCRIPTOR], other.levels[BENCH_DESCRIPTOR])
+    assert views[-1][0].earlier is not None
+    assert len(views[-1][0].earlier) == 2
 
 
 def test_empty_table_image_of_another_size_is_not_used_and_reported() -> None:
