@@ -4,14 +4,15 @@ Frames a few degrees apart show nearly the same. If the correlation of what they
 their distance d, a frame adds the share 1 - exp(-2 d / L) of a new one (the part of a Markov process that the frame
 before does not determine). With this weight, the evidence of an arc does not depend on the number of its frames.
 
-The stopping rule decides each time the frames have covered another step of the circle. Its limits come from
-leave-one-out searches along such arcs, with as many decisions and the same weights: `calibrate_arc_rule`.
+The search decides each time the frames have covered another step of the circle. The first view is decided by the rule
+of searches at rest, and so is which object is unknown, from a few frames far apart. The confidence that ends a search
+later comes from leave-one-out searches along such arcs, with as many decisions and the same weights.
 
 Decision: docs/decisions/0047.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import exp
 from typing import Final
 
@@ -19,17 +20,19 @@ import numpy as np
 
 from hbr.core.angles import size_deg
 from hbr.core.arrays import FloatArray, LevelArray
-from hbr.dense.filter import Belief
+from hbr.dense.filter import Belief, update_belief
 from hbr.dense.index import DenseIndex
-from hbr.dense.leave_one_out import leave_one_out
+from hbr.dense.leave_one_out import LeaveOneOut, leave_one_out
 from hbr.dense.next_view import expected_similarity, strongest
 from hbr.dense.session import DenseSession
 from hbr.dense.stopping import (
-    FEWEST_OBJECTS,
+    Limitation,
+    LimitationCode,
+    Outcome,
     StopDecision,
     StoppingRule,
-    calibrate_stopping_rule,
-    fit_stopping_rule,
+    StopReason,
+    fit_min_confidence,
 )
 
 STEP_DEG: Final = 15.0
@@ -43,6 +46,8 @@ FRAME_DEG: Final = 3.0
 """Usual distance of frames in motion: 30 frames/s at 90 °/s."""
 LEAST_ARC_DEG: Final = 45.0
 """A goal is so far ahead that the table does not slow down before the next decision."""
+SIDE_DEG: Final = 60.0
+"""Frames that are so far apart count as views of a search at rest in the open-set score."""
 MOST_SEARCHES: Final = 160
 _SHARPNESS: Final = 100.0
 
@@ -56,28 +61,64 @@ STEP_WEIGHT: Final = STEP_DEG / FRAME_DEG * frame_weight(FRAME_DEG)
 """What the frames between two decisions count together."""
 
 
-def calibrate_arc_rule(
-    index: DenseIndex, *, error_rate: float = 0.01, false_reject: float = 0.02, most_searches: int = MOST_SEARCHES
-) -> StoppingRule:
+@dataclass(frozen=True, eq=False)
+class ArcRule:
+    """When a search in motion ends.
+
+    Attributes
+    ----------
+    rest : StoppingRule
+        The rule of searches at rest. It decides after the first view, and says which objects are unknown.
+    min_confidence : float
+        Confidence that ends a search later.
+    limitations : tuple of Limitation
+        What the rule does not guarantee, in addition to those of ``rest``.
+    """
+
+    rest: StoppingRule
+    min_confidence: float
+    limitations: tuple[Limitation, ...] = ()
+
+
+def calibrate_arc_rule(index: DenseIndex, rest: StoppingRule, *, most_searches: int = MOST_SEARCHES) -> ArcRule:
     """Return the rule of searches in motion, from leave-one-out searches along arcs of `ARC_DEG`.
 
-    A catalog without candidates or with single views has the rule of searches at rest.
+    Searches that end with the first view count, too: ``rest.error_rate`` is that of all named objects. If there are
+    more objects than searches, some of them are searched for among each other. A catalog without candidates or with
+    single views has the confidence of searches at rest.
     """
     if len(index) < 2 or int(np.median((~index.left_out).sum(axis=1))) < 2:
-        return calibrate_stopping_rule(index, error_rate=error_rate, false_reject=false_reject).rule
+        return ArcRule(rest, rest.min_confidence)
+    limitations = []
+    if len(index) > most_searches:
+        limitations.append(Limitation(LimitationCode.SAMPLED, {"searched": most_searches, "objects": len(index)}))
+        index = index.only(np.unique(np.linspace(0, len(index) - 1, most_searches).astype(int)))
     searches = leave_one_out(
         index,
+        beta=rest.beta,
         views=DECISIONS,
         searches=max(1, min(most_searches // len(index), int(index.rows.shape[1]))),
         step_deg=STEP_DEG,
         weight=STEP_WEIGHT,
     )
-    objects = len(index) if len(index) >= FEWEST_OBJECTS else None
-    return fit_stopping_rule(searches, error_rate=error_rate, false_reject=false_reject, objects=objects)
+    rule = fit_arc_rule(searches, rest)
+    return replace(rule, limitations=(*limitations, *rule.limitations))
+
+
+def fit_arc_rule(searches: LeaveOneOut, rest: StoppingRule) -> ArcRule:
+    """Return the rule that keeps ``rest.error_rate`` in searches along arcs, with a decision every `STEP_DEG`."""
+    confidence = searches.confidence.copy()
+    confidence[:, 0] = confidence[:, 0] >= rest.min_confidence  # after the first view, the rule at rest decides
+    confidence[:, 1 : round(SIDE_DEG / STEP_DEG)] = 0.0  # no object is found there
+    found, limitation = fit_min_confidence(replace(searches, confidence=confidence), rest.error_rate)
+    return ArcRule(rest, found, () if limitation is None else (limitation,))
 
 
 class ArcSession(DenseSession):
     """A search in motion, the same for the bench and for replay.
+
+    All frames give the confidence. The open-set score comes from frames that are `SIDE_DEG` apart, because it was
+    measured on such views.
 
     Attributes
     ----------
@@ -87,10 +128,11 @@ class ArcSession(DenseSession):
         Whether the last view led to a decision.
     """
 
-    def __init__(self, index: DenseIndex, rule: StoppingRule) -> None:
-        super().__init__(index, rule, max_views=DECISIONS)
+    def __init__(self, index: DenseIndex, rule: ArcRule) -> None:
+        super().__init__(index, rule.rest, max_views=DECISIONS)
         self.decisions = 0
         self.is_new_decision = False
+        self._min_confidence = rule.min_confidence
         self._covered_deg = 0.0
 
     def add(
@@ -102,11 +144,10 @@ class ArcSession(DenseSession):
         decisions = 1 + int(self._covered_deg / STEP_DEG + 1e-9)
         self.is_new_decision = decisions > self.decisions
         self.decisions = decisions
-        before = self.decision if self.decisions > 1 or self._queries else None
-        decision = super().add(levels, orientation_deg, earlier=earlier)
-        if not self.is_new_decision and before is not None:
-            self.decision = before
-        return self.decision if before is not None else decision
+        if self.is_new_decision:
+            return super().add(levels, orientation_deg, earlier=earlier)
+        self._extend(levels, orientation_deg)
+        return self.decision
 
     def _apart_deg(self, orientation_deg: float) -> float:
         return float(size_deg(self.belief.orientation_deg - orientation_deg).min())
@@ -115,9 +156,38 @@ class ArcSession(DenseSession):
         return frame_weight(self._apart_deg(orientation_deg)) if self._queries else None
 
     def _decide(self, belief: Belief, *, last: bool = False) -> StopDecision:
-        return self.rule.decide(
-            belief, max_views=min(self.decisions, DECISIONS) if last else DECISIONS, decisions=self.decisions
+        sides = _sides(belief)
+        last = last or self.decisions >= DECISIONS
+        decision = self.rule.decide(sides, max_views=sides.queries if last else self.max_views)
+        if self.decisions == 1 or decision.reason is StopReason.BELOW_OPEN_SET_THRESHOLD:
+            return decision
+        enough = sides.queries > 1  # as at rest: an object that is not found by its first view is found by two
+        probability = belief.posterior(self.rule.beta).sum(axis=1)
+        best = int(probability.argmax())
+        confidence = float(probability[best])
+        outcome, reason = Outcome.CONTINUE, StopReason.NOT_CONFIDENT
+        if enough and confidence >= self._min_confidence:
+            outcome, reason = Outcome.FOUND, StopReason.CONFIDENT
+        elif last:
+            outcome, reason = Outcome.AMBIGUOUS, StopReason.MAX_VIEWS
+        return replace(
+            decision,
+            outcome=outcome,
+            reason=reason,
+            object_index=int(belief.index.object_index[best]),
+            confidence=confidence,
+            min_confidence=self._min_confidence,
         )
+
+
+def _sides(belief: Belief) -> Belief:
+    """Return the belief from the frames alone that are at least `SIDE_DEG` away from all earlier ones of them."""
+    sides: Belief | None = None
+    for levels, orientation_deg in zip(belief.levels, belief.orientation_deg.tolist(), strict=True):
+        if sides is None or size_deg(sides.orientation_deg - orientation_deg).min() >= SIDE_DEG:
+            sides = update_belief(levels, orientation_deg, sides or belief.index, kept=len(belief.index))
+    assert sides is not None
+    return sides
 
 
 @dataclass(frozen=True, eq=False)

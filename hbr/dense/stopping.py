@@ -298,14 +298,9 @@ def fit_stopping_rule(
         values = {"rate": false_reject, "searches": count, "needed": ceil(1 / false_reject) - 1, "reached": reached}
         limitations.append(Limitation(LimitationCode.FALSE_REJECT_RATE, values))
 
-    # Confidence that ends a search.
-    min_confidence = max(SMALLEST_MIN_CONFIDENCE, min_confidence_for(searches.confidence, searches.correct, error_rate))
-    if min_confidence > 1:
-        min_confidence, needed = UNCALIBRATED_MIN_CONFIDENCE, ceil(1 / error_rate)
-        ended, wrong = _ended(searches, min_confidence)
-        values = {"rate": error_rate, "searches": count, "needed": needed, "min_confidence": min_confidence}
-        code = LimitationCode.ERROR_RATE if count < needed else LimitationCode.SIMILAR_OBJECTS
-        limitations.append(Limitation(code, {**values, "wrong": wrong, "ended": len(ended)}))
+    min_confidence, limitation = fit_min_confidence(searches, error_rate)
+    if limitation is not None:
+        limitations.append(limitation)
     if objects < FEWEST_OBJECTS:
         limitations.append(Limitation(LimitationCode.UNKNOWN_NOT_MEASURED))
     return StoppingRule(
@@ -319,6 +314,18 @@ def fit_stopping_rule(
         searches=count,
         limitations=tuple(limitations),
     )
+
+
+def fit_min_confidence(searches: LeaveOneOut, error_rate: float) -> tuple[float, Limitation | None]:
+    """Return the confidence that ends a search, and a limitation if the searches do not guarantee the rate."""
+    found = max(SMALLEST_MIN_CONFIDENCE, min_confidence_for(searches.confidence, searches.correct, error_rate))
+    if found <= 1:
+        return found, None
+    count, needed = len(searches.confidence), ceil(1 / error_rate)
+    ended, wrong = _ended(searches, UNCALIBRATED_MIN_CONFIDENCE)
+    values = {"rate": error_rate, "searches": count, "needed": needed, "min_confidence": UNCALIBRATED_MIN_CONFIDENCE}
+    code = LimitationCode.ERROR_RATE if count < needed else LimitationCode.SIMILAR_OBJECTS
+    return UNCALIBRATED_MIN_CONFIDENCE, Limitation(code, {**values, "wrong": wrong, "ended": len(ended)})
 
 
 def fit_open_set(rule: StoppingRule, searches: ShiftedSearches) -> StoppingRule:

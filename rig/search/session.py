@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 import hbr
 from hbr.core.angles import wrap360
-from hbr.dense.arc import ArcSession, calibrate_arc_rule
+from hbr.dense.arc import ArcRule, ArcSession, calibrate_arc_rule
 from hbr.dense.pose import pose
 from hbr.model.symmetry import symmetry
 from rig.config import RigConfig
@@ -287,7 +287,7 @@ class ArcSearch(DenseSearch):
         top: int,
     ) -> None:
         super().__init__(index, rule, config, strategy, seed=seed, top=top)
-        self._arc = self._session = ArcSession(index, _arc_rule(index, rule.error_rate, rule.false_reject))
+        self._arc = self._session = ArcSession(index, _arc_rule(index, rule))
         self._step: Rotate | Finish | None = None
 
     @property
@@ -302,9 +302,9 @@ class ArcSearch(DenseSearch):
 
 
 @lru_cache(maxsize=4)
-def _arc_rule(index: hbr.DenseIndex, error_rate: float, false_reject: float) -> hbr.StoppingRule:
+def _arc_rule(index: hbr.DenseIndex, rule: hbr.StoppingRule) -> ArcRule:
     """Return the rule of searches in motion; it is fitted once for each model."""
-    return calibrate_arc_rule(index, error_rate=error_rate, false_reject=false_reject)
+    return calibrate_arc_rule(index, rule)
 
 
 def begin_search(

@@ -4,6 +4,9 @@ from rig.config import RigConfig, load_config
 from sim.frame_times import FrameTimes
 from sim.world import World
 
+SMALL = ("camera.width=320", "camera.height=240", "view.roi=[40, 0, 240, 240]", "view.max_smear_px=2")
+"""Settings for small frames, which take less computing."""
+
 
 def camera_time(world: World, *settings: str) -> RigConfig:
     """Return a configuration in which the camera's time is calibrated, with an error of 0.2 ms."""

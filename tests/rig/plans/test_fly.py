@@ -20,9 +20,7 @@ from sim.faults import Fault
 from sim.noise import NoiseModel
 from sim.objects.shelf import shelf
 from sim.world import World
-from tests.rig.motion.times import camera_time
-
-SMALL = ("camera.width=320", "camera.height=240", "view.roi=[40, 0, 240, 240]", "view.max_smear_px=2")
+from tests.rig.motion.times import SMALL, camera_time
 
 
 @contextmanager

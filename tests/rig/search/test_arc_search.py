@@ -4,11 +4,9 @@ from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 import hbr
-from hbr.dense.arc import DECISIONS, STEP_DEG, ArcSession, calibrate_arc_rule, frame_weight
 from rig import Catalog, enroll, identify, load_model
 from rig.bench import Bench
 from rig.core.errors import RigError, UsageError
@@ -21,7 +19,7 @@ from sim.bench import ShelfOperator, open_sim_bench
 from sim.faults import Fault
 from sim.objects.shelf import shelf
 from sim.world import World
-from tests.rig.motion.times import camera_time
+from tests.rig.motion.times import SMALL, camera_time
 
 NAMES = ("mug-white", "mug-star", "dice", "lamp")
 
@@ -31,17 +29,17 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Model]:
     """Return a model of four objects, two of them twins."""
     world = World(seed=5)
     with (
-        open_sim_bench(camera_time(world), ShelfOperator(world, shelf())) as bench,
+        open_sim_bench(camera_time(world, *SMALL), ShelfOperator(world, shelf())) as bench,
         Catalog.open(tmp_path_factory.mktemp("model"), clock=bench.clock) as catalog,
     ):
         for name in NAMES:
-            list(enroll(bench, catalog, name, views=18))
+            list(enroll(bench, catalog, name, views=12))
         yield load_model(catalog)
 
 
 def moving(world: World, *settings: str, faults: tuple[str, ...] = ()) -> Bench:
     operator = ShelfOperator(world, shelf(), next_object="mug-star", yaw_deg=200.0)
-    return open_sim_bench(camera_time(world, *settings), operator, faults=[Fault.parse(one) for one in faults])
+    return open_sim_bench(camera_time(world, *SMALL, *settings), operator, faults=[Fault.parse(one) for one in faults])
 
 
 def test_search_ends_in_mid_turn_and_can_be_replayed(model: Model, tmp_path: Path) -> None:
@@ -89,7 +87,8 @@ def test_search_at_rest_stays_without_calibration_and_motion_asks_for_it(model: 
 
 
 @pytest.mark.parametrize(
-    "fault", ["frozen_frame@0.5s", "stamps_backwards@0.6s", "stamp_jump:ms=20@0.6s+0.1s", "lost_frames:rate=0.6@0.3s"]
+    "fault",
+    ["frozen_frame@0.5s", "stamps_backwards@0.6s+0.4s", "stamp_jump:ms=20@0.6s+0.1s", "lost_frames:rate=0.6@0.3s"],
 )
 def test_faulty_frames_are_no_evidence(model: Model, fault: str) -> None:
     world = World(seed=2)
@@ -101,26 +100,3 @@ def test_faulty_frames_are_no_evidence(model: Model, fault: str) -> None:
                     middle_ns = event.evidence.exposed_ns - times.offset_ns + times.readout_ns // 2 + 5_000_000
                     assert abs(motion.angle_deg - world.table_deg(middle_ns) - 0.125) < 0.6
         assert not bench.servo.read_condition().torque
-
-
-def test_evidence_of_an_arc_does_not_depend_on_the_number_of_its_frames() -> None:
-    sums = [sum(frame_weight(step) for _ in np.arange(0, 90, step)) for step in (1.0, 2.0, 3.0)]
-    assert max(sums) / min(sums) < 1.05
-    assert frame_weight(0.0) == 0.0
-
-
-def test_rule_decides_at_looks_only(model: Model) -> None:
-    index = model.index
-    assert isinstance(index, hbr.DenseIndex)
-    rule = calibrate_arc_rule(index)
-    assert len(rule.open_set_thresholds) == DECISIONS
-    session = ArcSession(index, rule)
-    levels = index.views.levels(np.array([0]))[0]
-    is_new_decision = []
-    for angle in np.arange(0.0, 61.0, 3.0).tolist():
-        session.add(levels, angle)
-        is_new_decision.append(session.is_new_decision)
-    assert np.flatnonzero(is_new_decision).tolist() == [0, *range(5, 21, round(STEP_DEG / 3))]
-    session.add(levels, 30.0)  # seen before
-    assert not session.is_new_decision
-    assert session.belief.amount < session.belief.queries

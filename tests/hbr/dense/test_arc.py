@@ -1,0 +1,108 @@
+"""Searches in motion: when they decide, and by which rule."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hbr import DenseIndex, DenseSession, Outcome, Views, leave_one_out
+from hbr.dense.arc import (
+    DECISIONS,
+    SIDE_DEG,
+    STEP_DEG,
+    STEP_WEIGHT,
+    ArcRule,
+    ArcSession,
+    calibrate_arc_rule,
+    fit_arc_rule,
+    frame_weight,
+)
+from hbr.dense.stopping import UNCALIBRATED_MIN_CONFIDENCE, LimitationCode, StoppingRule, calibrate_stopping_rule
+from tests.hbr.dense.test_stopping import catalog
+
+
+@pytest.fixture(scope="module")
+def index() -> DenseIndex:
+    return DenseIndex(catalog(objects=6))
+
+
+@pytest.fixture(scope="module")
+def rest(index: DenseIndex) -> StoppingRule:
+    return calibrate_stopping_rule(index, most_searches=60).rule
+
+
+def pass_by(session: ArcSession, of: Views, row: int, degrees: float) -> list[Outcome]:
+    """Show the views of an object from one of them on, a frame every 4°; return the outcome after each."""
+    rows = of.of(int(of.object_index[row]))
+    found = []
+    for angle in np.arange(0.0, degrees + 1, 4.0).tolist():
+        away = np.abs((of.azimuth_deg[rows] - of.azimuth_deg[row] - angle + 180) % 360 - 180)
+        found.append(session.add(of.levels(rows[[int(away.argmin())]])[0], angle).outcome)
+    return found
+
+
+def test_evidence_of_an_arc_does_not_depend_on_the_number_of_its_frames() -> None:
+    sums = [sum(frame_weight(step) for _ in np.arange(0, 90, step)) for step in (1.0, 2.0, 3.0)]
+    assert max(sums) / min(sums) < 1.05
+    assert frame_weight(0.0) == 0.0
+
+
+def test_first_view_is_decided_as_at_rest(index: DenseIndex, rest: StoppingRule) -> None:
+    rule = calibrate_arc_rule(index, rest, most_searches=24)
+    for row in range(0, len(index.views), 9):
+        levels = index.views.levels(np.array([row]))[0]
+        at_rest, moving = DenseSession(index, rest), ArcSession(index, rule)
+        assert moving.add(levels, 0.0) == at_rest.add(levels, 0.0)
+
+
+def test_later_decisions_come_every_step_and_need_two_sides(index: DenseIndex, rest: StoppingRule) -> None:
+    certain = ArcRule(replace(rest, min_confidence=2.0), 0.0)  # the first view ends no search, any later frame does
+    session = ArcSession(index, certain)
+    levels = index.views.levels(np.array([0]))[0]
+    decided = []
+    for angle in np.arange(0.0, 31.0, 3.0).tolist():
+        session.add(levels, angle)
+        decided.append(session.is_new_decision)
+    assert np.flatnonzero(decided).tolist() == [0, 5, 10]
+    assert STEP_DEG == 15.0
+    session.add(levels, 20.0)  # seen before
+    assert not session.is_new_decision
+    assert session.belief.amount < session.belief.queries
+    outcomes = pass_by(ArcSession(index, certain), index.views, 0, 90.0)
+    assert outcomes.index(Outcome.FOUND) == SIDE_DEG // 4
+
+
+def test_search_ends_after_the_arc_as_ambiguous_or_unknown(index: DenseIndex, rest: StoppingRule) -> None:
+    never = ArcRule(replace(rest, min_confidence=2.0), 2.0)
+    session = ArcSession(index, never)
+    outcomes = pass_by(session, index.views, 0, 240.0)
+    assert outcomes[-1] is Outcome.AMBIGUOUS
+    assert session.decisions >= DECISIONS
+    short = ArcSession(index, never)
+    pass_by(short, index.views, 0, 45.0)
+    assert short.end().outcome is Outcome.AMBIGUOUS
+    strict = replace(rest, min_confidence=2.0, open_set_thresholds=(5.0,) * len(rest.open_set_thresholds))
+    outcomes = pass_by(ArcSession(index, ArcRule(strict, 0.0)), index.views, 0, 240.0)
+    assert outcomes.index(Outcome.UNKNOWN) == (len(rest.open_set_thresholds) - 1) * SIDE_DEG // 4
+
+
+def test_promised_rate_counts_only_where_a_search_can_end(index: DenseIndex, rest: StoppingRule) -> None:
+    searches = leave_one_out(index, views=DECISIONS, searches=4, step_deg=STEP_DEG, weight=STEP_WEIGHT)
+    rest = replace(rest, error_rate=0.05)
+    correct = searches.correct.copy()
+    correct[:, 1 : round(SIDE_DEG / STEP_DEG)] = False  # wrong where no decision is made
+    usual = fit_arc_rule(replace(searches, correct=correct), rest)
+    assert usual.limitations == ()
+    correct[:, 0] = False  # and where the first view ends the search
+    wrong = fit_arc_rule(replace(searches, correct=correct), replace(rest, min_confidence=0.0))
+    assert [one.code for one in wrong.limitations] == [LimitationCode.SIMILAR_OBJECTS]
+    assert wrong.limitations[0].values["wrong"] == len(correct)
+
+
+def test_rule_of_a_large_catalog_is_fitted_to_a_part_with_a_limitation(index: DenseIndex, rest: StoppingRule) -> None:
+    rule = calibrate_arc_rule(index, rest, most_searches=4)
+    assert rule.min_confidence == UNCALIBRATED_MIN_CONFIDENCE
+    assert [one.code for one in rule.limitations] == [LimitationCode.SAMPLED, LimitationCode.ERROR_RATE]
+    assert rule.limitations[0].values == {"searched": 4, "objects": len(index)}
+    single = DenseIndex(catalog(objects=1))
+    assert calibrate_arc_rule(single, rest).min_confidence == rest.min_confidence
