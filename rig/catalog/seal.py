@@ -12,6 +12,7 @@ import hashlib
 import json
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from itertools import chain
 from typing import Any, Final
 
 from sqlalchemy import Connection, Table, text
@@ -25,6 +26,9 @@ _PARTS: Final = (
     (views, "views", "enrollment_id, id"),
     (descriptors, "views JOIN descriptors ON view_id = views.id", "enrollment_id, view_id, name, version"),
 )
+
+_AT_ONCE: Final = 2_000
+"""Rows that are in memory at once."""
 
 FIRST: Final = ""
 """The digest before the first row of an append-only table."""
@@ -163,11 +167,12 @@ def _digest(before: str, row: Iterable[Any]) -> str:
 
 def _rows(
     connection: Connection, table: Table, first: str, source: str, key: str, order: str, ids: Collection[int] | None
-) -> Sequence[Any]:
+) -> Iterable[Any]:
     """Return a first column and the columns of a table for digests, of the rows whose ``key`` is among the ids."""
     statement = f"SELECT {first}, {_columns(table, connection)} FROM {source}"
-    if ids is None:
-        return connection.execute(text(f"{statement} ORDER BY {order}")).all()
+    if ids is None:  # in parts: the rows of a large catalog take gigabytes
+        every = connection.execute(text(f"{statement} ORDER BY {order}"), execution_options={"yield_per": _AT_ONCE})
+        return chain.from_iterable(every.partitions())
     wanted = f"{statement} WHERE {key} {_among(connection, 'ids')} ORDER BY {order}"
     return connection.execute(text(wanted), {"ids": _ids(connection, ids)}).all()
 

@@ -46,21 +46,21 @@ def list_(
 
     with settings.open_catalog(read_only=True) as catalog:
         found = deleted_objects(catalog) if deleted else catalog.objects()
-        path, damage = catalog.place, catalog.damage()
-    objects = [
-        item
-        for item in found
-        if (match is None or fnmatchcase(item.name, match))
-        and (label is None or item.label == label)
-        and (not unfinished or item.unfinished_views is not None)
-    ]
-    if settings.json:
-        settings.print_json({"catalog": str(path), "objects": plain(objects)})
-    elif objects:
-        _print_objects(objects)
-    else:
-        empty = "No deleted objects." if deleted else "No objects yet. Enroll one: rig enroll NAME"
-        print(f"None of the {len(found)} objects matches." if found else empty)
+        objects = [
+            item
+            for item in found
+            if (match is None or fnmatchcase(item.name, match))
+            and (label is None or item.label == label)
+            and (not unfinished or item.unfinished_views is not None)
+        ]
+        if settings.json:
+            settings.print_json({"catalog": str(catalog.place), "objects": plain(objects)})
+        elif objects:
+            _print_objects(objects)
+        else:
+            empty = "No deleted objects." if deleted else "No objects yet. Enroll one: rig enroll NAME"
+            print(f"None of the {len(found)} objects matches." if found else empty)
+        damage = catalog.damage()  # seconds for a large catalog, so the table is shown before
     if damage is not None:
         raise damage
 
