@@ -111,7 +111,8 @@ def fit_arc_rule(searches: LeaveOneOut, rest: StoppingRule) -> ArcRule:
     confidence[:, 0] = confidence[:, 0] >= rest.min_confidence  # after the first view, the rule at rest decides
     confidence[:, 1 : round(SIDE_DEG / STEP_DEG)] = 0.0  # no object is found there
     found, limitation = fit_min_confidence(replace(searches, confidence=confidence), rest.error_rate)
-    return ArcRule(rest, found, () if limitation is None else (limitation,))
+    # Where no confidence keeps the rate, a search in motion must not end sooner than one at rest.
+    return ArcRule(rest, max(found, rest.min_confidence), () if limitation is None else (limitation,))
 
 
 class ArcSession(DenseSession):

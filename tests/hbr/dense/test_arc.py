@@ -93,6 +93,7 @@ def test_promised_rate_counts_only_where_a_search_can_end(index: DenseIndex, res
     correct[:, 1 : round(SIDE_DEG / STEP_DEG)] = False  # wrong where no decision is made
     usual = fit_arc_rule(replace(searches, correct=correct), rest)
     assert usual.limitations == ()
+    assert usual.min_confidence >= rest.min_confidence
     correct[:, 0] = False  # and where the first view ends the search
     wrong = fit_arc_rule(replace(searches, correct=correct), replace(rest, min_confidence=0.0))
     assert [one.code for one in wrong.limitations] == [LimitationCode.SIMILAR_OBJECTS]
@@ -101,7 +102,9 @@ def test_promised_rate_counts_only_where_a_search_can_end(index: DenseIndex, res
 
 def test_rule_of_a_large_catalog_is_fitted_to_a_part_with_a_limitation(index: DenseIndex, rest: StoppingRule) -> None:
     rule = calibrate_arc_rule(index, rest, most_searches=4)
-    assert rule.min_confidence == UNCALIBRATED_MIN_CONFIDENCE
+    assert rule.min_confidence == max(UNCALIBRATED_MIN_CONFIDENCE, rest.min_confidence)
+    strict = replace(rest, min_confidence=0.9999)
+    assert calibrate_arc_rule(index, strict, most_searches=4).min_confidence == 0.9999
     assert [one.code for one in rule.limitations] == [LimitationCode.SAMPLED, LimitationCode.ERROR_RATE]
     assert rule.limitations[0].values == {"searched": 4, "objects": len(index)}
     single = DenseIndex(catalog(objects=1))
