@@ -1,6 +1,7 @@
 """Fixtures for the whole suite: a simulated bench with its world in reach."""
 
 import os
+import shutil
 import signal
 import sys
 import tempfile
@@ -38,6 +39,11 @@ typer.testing._get_command = cache(typer.testing._get_command)
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
 
+# The catalogs of the tests are durable, so that a disk would be waited for. Memory is used if there is room.
+MEMORY = Path("/dev/shm")
+if os.access(MEMORY, os.W_OK | os.X_OK) and shutil.disk_usage(MEMORY).free > 2e9:
+    os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", str(MEMORY))
+
 # A background job of a shell without job control ignores SIGINT, and so do the processes that it starts. Tests start
 # processes and interrupt them.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
@@ -50,7 +56,7 @@ def _nobodys_home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     home = tmp_path_factory.mktemp("home")
     get_temp_dir()  # Python removes this one at its own end
     with (
-        TemporaryDirectory(prefix="rig-tests-", ignore_cleanup_errors=True) as temporary,
+        TemporaryDirectory(prefix="rig-tests-", dir=home.parent, ignore_cleanup_errors=True) as temporary,
         pytest.MonkeyPatch.context() as patch,
     ):
         patch.setenv("TMPDIR", temporary)  # for what killed programs leave

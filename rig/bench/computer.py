@@ -22,6 +22,7 @@ from rig.bench.device_files import Process as Process
 from rig.bench.device_files import SerialPort as SerialPort
 from rig.bench.device_files import User as User
 from rig.config import RigConfig
+from rig.core.camera_node import camera_node
 from rig.core.clock import Clock, SystemClock
 from rig.core.errors import BenchBusy
 
@@ -174,8 +175,8 @@ class Computer:
 
             number = camera_number(source)
             return None if number is None else camera_id(number)
-        path = f"/dev/video{source}" if str(source).isdigit() else str(source)
-        if not path.startswith("/dev/"):
+        path = camera_node(source)
+        if path is None:
             return None
         file = self._at(path).resolve()
         usb = self._usb(self.root / _CAMERAS / file.name / "device")
@@ -189,9 +190,8 @@ class Computer:
 
     def device_node(self, source: int | str) -> tuple[int, ...] | None:
         """Return what identifies the device file of a camera until it is unplugged; None if there is no file."""
-        path = f"/dev/video{source}" if str(source).isdigit() else str(source)
         try:
-            status = self._at(path).stat()
+            status = self._at(camera_node(source) or str(source)).stat()
         except OSError:
             return None
         return status.st_dev, status.st_ino, status.st_rdev, status.st_ctime_ns

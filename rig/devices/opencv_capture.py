@@ -6,6 +6,7 @@ from typing import Any, Protocol
 
 import cv2
 
+from rig.core.camera_node import camera_node
 from rig.core.errors import DeviceNotFound
 from rig.devices import v4l2
 from rig.devices.picamera2_capture import Picamera2Capture, camera_number
@@ -69,11 +70,9 @@ def open_capture(source: int | str | Path) -> Capture:
     """
     if (number := camera_number(source)) is not None:
         return Picamera2Capture(number)
-    if isinstance(source, int) or str(source).isdigit():
-        source = f"/dev/video{source}"
-    path = str(source)
-    if not path.startswith("/dev/"):
-        return _opened(path, cv2.CAP_ANY, "Check the path or address, and that OpenCV can decode its format.")
+    path = camera_node(source)
+    if path is None:
+        return _opened(str(source), cv2.CAP_ANY, "Check the path or address, and that OpenCV can decode its format.")
     if not Path(path).exists():
         there = sorted(str(p) for p in Path("/dev").glob("video*"))
         raise DeviceNotFound(

@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 
 from rig.bench.computer import DeviceFile, SerialPort
+from rig.core.camera_node import camera_node
 from rig.core.clock import seconds_between
 from rig.doctor.context import DoctorContext
 from rig.doctor.finding import Finding, FindingCode, bad, fine, warning
@@ -84,10 +85,9 @@ def _i2c(context: DoctorContext) -> Iterator[Finding]:
 
 
 def _video(context: DoctorContext) -> Iterator[Finding]:
-    source = context.config.camera.source
-    if isinstance(source, str) and not source.isdigit() and not source.startswith("/dev/"):
+    camera = camera_node(context.config.camera.source)
+    if camera is None:
         return  # a file or a stream
-    camera = f"/dev/video{source}" if str(source).isdigit() else str(source)
     cameras = context.computer.cameras()
     node = next((n for n in cameras if context.computer.same_file(n.path, camera)), None)
     if node is not None:

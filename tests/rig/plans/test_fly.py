@@ -99,7 +99,7 @@ def outcome(tmp_path: Path, fault: str) -> tuple[RigError | None, list[Event], f
     """Return the error of an enrollment under a fault, its events, and the largest error of a stored angle."""
     events: list[Event] = []
     error, worst = None, 0.0
-    with suppress(DeviceSilent), flying(tmp_path, faults=(fault,)) as (bench, catalog, world):
+    with suppress(DeviceSilent), flying(tmp_path, faults=(fault,), camera_readout_ms=0.0) as (bench, catalog, world):
         try:
             for event in enroll(bench, catalog, "dice", views=12, fly=True):
                 events.append(event)
@@ -143,7 +143,7 @@ def test_failed_turn_stores_no_view(tmp_path: Path, fault: str, kind: type[RigEr
 
 
 def test_interrupted_turn_resumes(tmp_path: Path) -> None:
-    with flying(tmp_path) as (bench, catalog, _):
+    with flying(tmp_path, camera_readout_ms=0.0) as (bench, catalog, _):
         events = enroll(bench, catalog, "lamp", views=8, fly=True)
         for event in events:
             if isinstance(event, Accepted):
@@ -156,7 +156,10 @@ def test_interrupted_turn_resumes(tmp_path: Path) -> None:
 
 
 def test_moved_object_abandons_the_turn(tmp_path: Path) -> None:
-    with flying(tmp_path, faults=("object_falls@3s",)) as (bench, catalog, _), pytest.raises(ObjectMoved):
+    with (
+        flying(tmp_path, camera_readout_ms=0.0, faults=("object_falls@3s",)) as (bench, catalog, _),
+        pytest.raises(ObjectMoved),
+    ):
         list(enroll(bench, catalog, "dice", views=8, fly=True))
 
 
@@ -174,7 +177,7 @@ def test_scan_needs_camera_time_and_a_revolution_of_cable(tmp_path: Path) -> Non
 
 
 def test_trays_fly_if_the_camera_time_is_calibrated(tmp_path: Path) -> None:
-    with flying(tmp_path) as (bench, catalog, _):
+    with flying(tmp_path, camera_readout_ms=0.0) as (bench, catalog, _):
         tray = list(enroll_tray(bench, catalog, [TrayItem(2, "dice")], views=8))
         assert any(isinstance(event, ScanStarted) for event in tray)
         single = list(enroll(bench, catalog, "lamp", views=4))

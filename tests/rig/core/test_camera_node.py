@@ -1,0 +1,21 @@
+"""Which sources of a camera are device files."""
+
+import pytest
+
+from rig.core.camera_node import camera_node
+
+
+@pytest.mark.parametrize(
+    ("source", "node"),
+    [
+        (0, "/dev/video0"),
+        ("2", "/dev/video2"),
+        ("/dev/v4l/by-id/usb-camera", "/dev/v4l/by-id/usb-camera"),
+        ("/dev/shm/frames/img_%03d.png", None),
+        ("recording.avi", None),
+        ("rtsp://camera/stream", None),
+        ("picamera2:1", None),
+    ],
+)
+def test_device_files_are_told_from_recordings_and_streams(source, node):
+    assert camera_node(source) == node
