@@ -83,9 +83,24 @@ static inline double area_as_rounded(const uint8_t *quarter, int64_t stride, con
     return (double)(int64_t)(total * (4.0 / (double)(4 * grid->height * grid->width)));
 }
 
-/* Luminance of the quarters of a row, 0..255. */
+/* Whether all pixels of a row of quarters, (height, length), are grey. */
+static inline int is_grey(const uint8_t *image, int64_t stride, int64_t height, int64_t length) {
+    uint8_t differs[96] = {0};
+    for (int64_t k = 0; k < height; k++, image += stride) {
+        int64_t i = 0;
+        for (; i + 96 < length; i += 96)
+            for (int n = 0; n < 96; n++) differs[n] |= image[i + n] ^ image[i + n + 1];
+        for (; i + 1 < length; i++) differs[i % 96] |= image[i] ^ image[i + 1];
+    }
+    unsigned found = 0;
+    for (int n = 0; n < 96; n += 3) found |= differs[n] | differs[n + 1]; /* the third is between two pixels */
+    return !found;
+}
+
+/* Luminance of the quarters of a row, 0..255. `greys` are the luminances of grey pixels. */
 static inline void row_areas(const uint8_t *image, int64_t stride, const struct grid *grid, const int32_t *luminances,
-                             const double luminance[3][256], int32_t *rest, uint8_t *changes, double *areas) {
+                             const double luminance[3][256], const double *greys, int32_t *rest, uint8_t *changes,
+                             double *areas) {
     const int64_t quarters = 2 * grid->columns;
     const int32_t count = (int32_t)(grid->height * grid->width), unit = 1000 * count;
     const double inverse = 1.0 / unit, white = (double)(int64_t)(255.0 * count * (4.0 / (4.0 * count)));
@@ -97,6 +112,19 @@ static inline void row_areas(const uint8_t *image, int64_t stride, const struct 
         undecided += rest[q] == 0;
     }
     if (!undecided) return;
+    /* In grey images, a quarter of n pixels is undecided in one of n cases. */
+    if (count == 1 && is_grey(image, stride, 1, 3 * quarters)) {
+        for (int64_t q = 0; q < quarters; q++) areas[q] = (double)(int32_t)greys[image[3 * q]];
+        return;
+    }
+    if (grid->height == 2 && grid->width == 2 && is_grey(image, stride, 2, 6 * quarters)) {
+        for (int64_t q = 0; q < quarters; q++) {
+            const uint8_t *upper = image + 6 * q, *lower = upper + stride;
+            const double total = ((greys[upper[0]] + greys[upper[3]]) + greys[lower[0]]) + greys[lower[3]];
+            areas[q] = (double)(int32_t)(total * 0.25);
+        }
+        return;
+    }
     /* In drawings and other flat images, most quarters equal the one on their left, which is undecided, too. */
     const int64_t step = 3 * grid->width;
     const int flat = 4 * (int64_t)undecided > quarters;
@@ -184,11 +212,12 @@ EXPORT void hbr_cedd(const uint8_t *image, int64_t stride, int64_t rows, int64_t
     double *areas = scratch;
     int32_t *channels = (int32_t *)(areas + 2 * quarters), *rest = channels + 8 * quarters;
     uint16_t *sums = (uint16_t *)(rest + quarters);
-    double luminance[3][256], inverses[256], histogram[BINS] = {0};
+    double luminance[3][256], greys[256], inverses[256], histogram[BINS] = {0};
     for (int i = 0; i < 256; i++) {
         luminance[0][i] = 0.114 * i;
         luminance[1][i] = 0.587 * i;
         luminance[2][i] = 0.299 * i;
+        greys[i] = (luminance[0][i] + luminance[1][i]) + luminance[2][i];
         inverses[i] = i ? 1.0 / i : 0.0;
     }
     for (int64_t i = 0; i < grid.rows; i++) {
@@ -202,7 +231,7 @@ EXPORT void hbr_cedd(const uint8_t *image, int64_t stride, int64_t rows, int64_t
             case 8: add_columns(sums, quarters, 8, own); break;
             default: add_columns(sums, quarters, grid.width, own);
             }
-            row_areas(strip, stride, &grid, own + 3 * quarters, luminance, rest, (uint8_t *)sums,
+            row_areas(strip, stride, &grid, own + 3 * quarters, luminance, greys, rest, (uint8_t *)sums,
                       areas + quarters * half);
         }
         for (int64_t j = 0; j < columns; j++) {
