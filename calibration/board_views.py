@@ -70,7 +70,7 @@ def take_views(
     elsewhere = 0
     index, planned = 0, len(stands) * len(angles_deg)
     known = set(np.asarray(board.layout().getIds()).ravel().tolist())
-    viewer = Viewer(bench.camera, bench.config.view)
+    viewer = Viewer(bench.camera, bench.config)
     for number, (stand, words) in enumerate(stands.items()):
         yield Ask(
             f"Put the calibration board {words}. Fix it there, and take your hands off. Its squares are "

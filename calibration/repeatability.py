@@ -85,7 +85,7 @@ class Repeatability(Procedure):
                 f"{self.placements} placements are too few for an error rate of {self.error_rate:.1%}.",
                 next_step=f"Place the object {needed} times (--placements {needed}), or give a larger --error-rate.",
             )
-        viewer = Viewer(bench.camera, bench.config.view)
+        viewer = Viewer(bench.camera, bench.config)
         describe = ViewDescriber(bench.config.view, (PAPER_DESCRIPTOR,))
         placements: list[Placement] = []
         index = 0

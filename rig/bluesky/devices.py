@@ -180,7 +180,7 @@ class CameraDevice(Device):
         bench, table = self._devices.bench, self._devices.turntable
         if table is None:
             raise RuntimeError("the table is not held: open BenchDevices with hold=True")
-        viewer = Viewer(bench.camera, bench.config.view)
+        viewer = Viewer(bench.camera, bench.config)
         attempts = viewer.attempts(bench.clock.now_ns(), table.check_still, table.collect_gyro)
         attempt = next(one for one in attempts if one.accepted or one.number > bench.config.view.retakes)
         evidence = attempt.evidence

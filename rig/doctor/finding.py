@@ -140,6 +140,12 @@ class FindingCode(Enum):
     UNFINISHED = "unfinished enrollments: {objects}"
     CALIBRATION = "{standing}"
     NEVER_CALIBRATED = "{name} was never calibrated: {consequence}"
+    CAMERA_DELAY = (
+        "views wait {delay_ms:.0f} ms longer: by camera.time, exposures begin that long before their time stamp"
+    )
+    CAMERA_DELAY_UNKNOWN = (
+        "a delay inside the camera does not show in its time stamps; to measure it: {command} (table rotates)"
+    )
     # the scan of all devices
     NO_USB_PORT = "no serial port on USB (found: {found})"
     PORT_FAILED = "{port} failed: {reason}"

@@ -1,12 +1,14 @@
 """Check the stored data of the bench: its catalog and its calibrations."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
-from rig.calibrations import CalibrationStatus, CalibrationStore, apparatus
+from rig.calibrations import CalibrationStatus, CalibrationStore, apparatus, apply_results
+from rig.calibrations.store import CalibrationStanding
 from rig.catalog import Catalog
 from rig.core.errors import CatalogError
 from rig.doctor.context import DoctorContext
 from rig.doctor.finding import Finding, FindingCode, bad, fine, of_error, warning
+from rig.views.stream import exposed_before_stamp_ns
 
 IMAGES = 24  # number of images that are verified; `rig catalog verify` verifies all
 
@@ -63,15 +65,27 @@ def calibrations(context: DoctorContext) -> Iterator[Finding]:
             "status": standing.status,
             "id": standing.result.id,
         }
-        recalibrate = context.rig(f"calibrate {standing.result.name.partition('.')[0]}")
+        recalibrate = context.rig(standing.command.removeprefix("rig "))
         if standing.status is CalibrationStatus.IN_FORCE:
             yield fine("calibration", FindingCode.CALIBRATION, **found)
         else:
             yield warning("calibration", FindingCode.CALIBRATION, recalibrate, **found)
+    yield _camera_delay(context, standings)
     for name, without in WANTED.items():
         if name not in {standing.result.name for standing in standings} and not _configured(context, name):
             fix = context.rig(f"calibrate {name.partition('.')[0]}")
             yield warning("calibration", FindingCode.NEVER_CALIBRATED, fix, name=name, consequence=without)
+
+
+def _camera_delay(context: DoctorContext, standings: Iterable[CalibrationStanding]) -> Finding:
+    """Return how long views wait for a delay inside the camera, which its time stamps do not show."""
+    in_force = (one.result for one in standings if one.status is CalibrationStatus.IN_FORCE)
+    config, _ = apply_results(context.config, in_force)
+    if config.camera_time.offset_ms is None:
+        return fine("calibration", FindingCode.CAMERA_DELAY_UNKNOWN, command=context.rig("calibrate camera-time"))
+    delay_ms = exposed_before_stamp_ns(config) * 1e-6
+    found = config.camera_time.model_dump()
+    return fine("calibration", FindingCode.CAMERA_DELAY, delay_ms=delay_ms, **found)
 
 
 def _configured(context: DoctorContext, key: str) -> bool:

@@ -136,7 +136,7 @@ def _take_views(
     bench: Bench, enrollment: Enrollment, angles_deg: Mapping[int, float], describe: ViewDescriber
 ) -> Generator[Event, None, int]:
     """Take and store the views at these table angles, return to 0, and return the number of repeated images."""
-    viewer = Viewer(bench.camera, bench.config.view)
+    viewer = Viewer(bench.camera, bench.config)
     with Turntable(bench) as table:
         retakes, first, index = yield from _step_views(bench, enrollment, table, viewer, angles_deg, describe)
         # Return to the first view to check that the object was not moved, then to 0 to free the cable: without its
@@ -152,7 +152,7 @@ def _fly_and_complete(
     bench: Bench, enrollment: Enrollment, angles_deg: Mapping[int, float], describe: ViewDescriber
 ) -> Generator[Event, None, int]:
     """Take and store the views in one turn, the others at rest, return to 0; return the number of repeated images."""
-    viewer = Viewer(bench.camera, bench.config.view)
+    viewer = Viewer(bench.camera, bench.config)
     retakes = 0
     with Turntable(bench) as table:
         stored, start_deg, before, after = yield from fly_views(bench, enrollment, table, viewer, angles_deg, describe)

@@ -78,7 +78,7 @@ def identify(
     search, chosen = begin_search(model, bench.config, strategy, seed=seed, top=top)
     if isinstance(search, ArcSearch):
         require_camera_time(bench.config)
-    viewer = Viewer(bench.camera, bench.config.view)
+    viewer = Viewer(bench.camera, bench.config)
     notes = model.notes if isinstance(model, Model) else ()
     if isinstance(model, Model):
         check_camera(bench, model.camera)

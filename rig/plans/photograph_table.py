@@ -58,7 +58,7 @@ def photograph_table(bench: Bench, *, anyway: bool = False) -> Generator[Event, 
         raise UsageError(
             "The object on this bench cannot be taken away.", next_step="Continue without an empty-table image."
         )
-    viewer = Viewer(bench.camera, bench.config.view)
+    viewer = Viewer(bench.camera, bench.config)
     started_ns = bench.clock.now_ns()
     rotated = None
     with Turntable(bench) as table:

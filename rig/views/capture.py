@@ -9,10 +9,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.config import ViewConfig
+from rig.config import RigConfig, ViewConfig
 from rig.devices.camera import Camera, CameraLocks, Frame
 from rig.safety.gyro_rotation import Stillness
 from rig.views.description import within
+from rig.views.stream import exposed_before_stamp_ns
 
 DARK_LEVEL = 8
 """Pixels below this grey level carry no detail in an 8-bit frame."""
@@ -156,11 +157,16 @@ def image_similarity(image_bgr: NDArray[np.uint8], other_bgr: NDArray[np.uint8],
 
 
 class Viewer:
-    """Captures views with one camera, whose locked settings must not change after the viewer was made."""
+    """Captures views with one camera, whose locked settings must not change after the viewer was made.
 
-    def __init__(self, camera: Camera, config: ViewConfig) -> None:
+    A camera that delays its frames inside stamps them after their exposure. With the camera's time from calibration,
+    only frames count whose exposure began after the rest.
+    """
+
+    def __init__(self, camera: Camera, config: RigConfig) -> None:
         self._camera = camera
-        self._config = config
+        self._config = config.view
+        self._early_ns = exposed_before_stamp_ns(config)
         self._locks = camera.read_locks()
         self._last: NDArray[np.uint8] | None = None
 
@@ -178,10 +184,10 @@ class Viewer:
         meanwhile
             Called several times a second while the program waits for a slow camera.
         """
-        after_ns = settled_ns
+        after_ns = settled_ns + self._early_ns
         for number in range(1, 2 + self._config.retakes):
             frame = self._camera.capture(after_ns, meanwhile)
-            attempt = self._check(number, frame, settled_ns, check_still(after_ns))
+            attempt = self._check(number, frame, settled_ns, check_still(after_ns - self._early_ns))
             self._last = frame.image_bgr
             yield attempt
             if attempt.accepted:
@@ -204,7 +210,7 @@ class Viewer:
             stillness=stillness,
         )
         reasons = []
-        if frame.exposed_ns < settled_ns:
+        if frame.exposed_ns < settled_ns + self._early_ns:
             reasons.append(RejectReason.EXPOSED_EARLY)
         if not isfinite(stillness.peak_rate_dps):
             reasons.append(RejectReason.GYRO_INCOMPLETE)

@@ -6,13 +6,13 @@ how long after the frame's time stamp that is.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from math import isfinite, nan
+from math import hypot, isfinite, nan
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.config import CameraTimeConfig
+from rig.config import CameraTimeConfig, RigConfig
 from rig.core.clock import Clock
 from rig.devices.camera import Camera
 
@@ -22,6 +22,8 @@ GRID_MS: Final = 1.5
 """How far a stamp may be from the camera's regular rhythm, at least."""
 GRID_SIGMAS: Final = 5.0
 FEWEST_STAMPS: Final = 4
+SURE_SIGMAS: Final = 2.0
+"""A difference of the camera's time from that of its stamps counts from so many sigmas on."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -95,6 +97,19 @@ def middle_ns(stamp_ns: int, config: CameraTimeConfig) -> int:
     """Return the middle of the exposure of a frame with this time stamp; the camera's time must be calibrated."""
     assert config.offset_ms is not None
     return stamp_ns + round(config.offset_ms * 1e6)
+
+
+def exposed_before_stamp_ns(config: RigConfig) -> int:
+    """Return how long before its time stamp the exposure of a frame may begin: 0 if the camera's time is not known.
+
+    It begins in the first row, half the readout and half the exposure time before the middle of the middle row.
+    """
+    time, exposure_us = config.camera_time, config.camera.exposure_us
+    if time.offset_ms is None or exposure_us is None:
+        return 0
+    begins_ms = time.offset_ms - (exposure_us * 1e-3 + time.readout_ms) / 2
+    unsure_ms = SURE_SIGMAS * hypot(time.uncertainty_ms, time.jitter_ms)
+    return round(max(-begins_ms - unsure_ms, 0.0) * 1e6)
 
 
 def irregular_stamps(stamps_ns: Sequence[int], period_s: float, jitter_ms: float) -> NDArray[np.bool_]:

@@ -51,7 +51,7 @@ class GuestBench:
         asked = {"words": [str(word) for word in words], "folder": str(FOLDER), "variables": VARIABLES, **options}
         return GuestProcess(self.machine, self.machine.ask("start", **asked))
 
-    def rig(self, *words: object, timeout: float = 120.0, **options: Any) -> Result:
+    def rig(self, *words: object, timeout: float = 200.0, **options: Any) -> Result:
         """Return how `rig ...` has ended."""
         return self.start(*words, **options).wait(timeout)
 

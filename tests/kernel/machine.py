@@ -26,8 +26,8 @@ PACKAGES: Final = {"qemu-system-x86_64": "qemu-system-x86", "busybox": "busybox-
 """Programs, and the Debian packages that have them."""
 MODULES: Final = ("virtio_pci", "9pnet_virtio", "9p", "overlay")
 """What the kernel needs to find its files."""
-BOOT_S: Final = 180.0
-ANSWER_S: Final = 120.0
+BOOT_S: Final = 300.0
+ANSWER_S: Final = 300.0
 PROJECT: Final = Path(__file__).parents[2]
 _INIT = """#!/bin/busybox sh
 busybox=/bin/busybox

@@ -286,6 +286,19 @@ def result(bench, days_ago: float, valid_days: float | None = None, **device: ob
     )
 
 
+def test_delay_inside_the_camera_is_reported_from_its_calibration():
+    with unopened() as bench:
+        (found,) = (f for f in bench.findings("calibration") if f.level is Severity.FINE)
+        assert (found.code, found.parameters["command"]) == (
+            FindingCode.CAMERA_DELAY_UNKNOWN,
+            "rig calibrate camera-time --bench sim",
+        )
+    with unopened("camera_time.offset_ms=-90", "camera_time.readout_ms=10") as bench:
+        (found,) = (f for f in bench.findings("calibration") if f.level is Severity.FINE)
+        assert found.code is FindingCode.CAMERA_DELAY
+        assert found.parameters["delay_ms"] == pytest.approx(100, abs=2)  # and half of exposure and readout
+
+
 def test_missing_expired_and_other_device_calibrations_are_warnings(bench):
     set_up(bench)
     store = CalibrationStore(bench.context.config.calibration_path("sim"))

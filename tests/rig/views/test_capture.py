@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 
+from rig.config import CameraTimeConfig
 from rig.motion.turntable import Turntable
 from rig.views.capture import Attempt, MotionEvidence, RejectReason, Viewer, rejection_text
 from rig.views.description import ViewDescriber
@@ -18,7 +19,7 @@ def on_the_table(simulated):
     s = simulated()
     s.operator.place("mug-dots")
     with Turntable(s.bench) as table:
-        yield s, table, Viewer(s.bench.camera, s.bench.config.view)
+        yield s, table, Viewer(s.bench.camera, s.bench.config)
 
 
 def test_good_frame_is_accepted_at_once_with_its_evidence(on_the_table):
@@ -40,6 +41,20 @@ def test_frame_shows_the_table_after_it_came_to_rest(on_the_table):
     (attempt,) = viewer.attempts(move.settled_ns, table.check_still)
     assert attempt.evidence.exposed_ns >= move.settled_ns
     assert s.world.table_deg(attempt.evidence.exposed_ns) == pytest.approx(40.0, abs=0.3)
+
+
+def test_delay_inside_the_camera_is_waited_for(on_the_table):
+    """Its time stamps do not show it; `rig calibrate camera-time` has measured it."""
+    s, table, _ = on_the_table
+    camera = s.operator.devices.camera
+    camera.times.offset_ns, camera.times.readout_ns = 200_000_000, 10_000_000
+    settled_ns = s.bench.clock.now_ns()
+    for known, early in ((False, True), (True, False)):
+        time = CameraTimeConfig(offset_ms=-200 + (10 + 10) / 2, readout_ms=10) if known else CameraTimeConfig()
+        viewer = Viewer(s.bench.camera, s.bench.config.model_copy(update={"camera_time": time}))
+        settled_ns = s.bench.clock.now_ns()
+        (attempt,) = viewer.attempts(settled_ns, table.check_still)
+        assert (attempt.evidence.exposed_ns - camera.times.offset_ns < settled_ns - 2_000_000) is early
 
 
 def test_darkness_is_rejected_until_the_retakes_are_used_up(on_the_table):
@@ -95,7 +110,7 @@ def test_frame_out_of_focus_is_rejected(simulated):
     s = simulated("camera.focus=250", "view.min_sharpness=60")
     s.operator.place("mug-dots")
     with Turntable(s.bench) as table:
-        attempts = attempts_of(s, table, Viewer(s.bench.camera, s.bench.config.view))
+        attempts = attempts_of(s, table, Viewer(s.bench.camera, s.bench.config))
     assert RejectReason.BLURRED in attempts[0].reasons
 
 
