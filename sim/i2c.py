@@ -76,7 +76,8 @@ class SimI2cBus(AbstractContextManager["SimI2cBus"]):
     """A bus with a path that ``smbus2.SMBus(path)`` opens.
 
     Tests use `attach`, `detach` (unplug), `nack`, `nack_conditions` (called with an address; True: no acknowledge),
-    `cut_read`, `stuck`, `kernel_drivers` (addresses that a kernel driver uses), `errors` (address to the number of the
+    `cut_read`, `stuck`, `stuck_error` (ETIMEDOUT as the adapter of a Raspberry Pi, or EIO as an i2c-tiny-usb),
+    `kernel_drivers` (addresses that a kernel driver uses), `errors` (address to the number of the
     error at each transfer), and `wire`, the last acknowledged messages. `bit_ns` is the time of a bit. `stretch_errors`
     is the share of reads in which the controller does not wait for a stretched clock, as that of a Raspberry Pi 4 does
     above 20 kHz: it takes a bit too early, and all later bits are late by one.
@@ -89,6 +90,7 @@ class SimI2cBus(AbstractContextManager["SimI2cBus"]):
         self._nacks = 0
         self._cut: int | None = None
         self.stuck = False
+        self.stuck_error = ETIMEDOUT
         self.bit_ns = BIT_NS
         self.stretch_errors = 0.0
         self._rng = np.random.default_rng(0)
@@ -178,7 +180,7 @@ class SimI2cBus(AbstractContextManager["SimI2cBus"]):
     def _transaction(self, messages: Callable[[], None], *, stops: bool = True) -> None:
         if self.stuck:
             self._clock.sleep(TIMEOUT_S)
-            raise _os_error(ETIMEDOUT)
+            raise _os_error(self.stuck_error)
         try:
             messages()
         except OSError:

@@ -21,7 +21,7 @@ _SMBUS_BLOCK = 32
 _REASONS = {
     **dict.fromkeys(NO_DEVICE, "it does not acknowledge"),
     **dict.fromkeys(STUCK, "the bus is stuck: something holds SDA or SCL low"),
-    EIO: "a transfer was interrupted",
+    EIO: "a transfer was interrupted, or the bus hangs (a USB adapter does not report which)",
 }
 
 _T = TypeVar("_T")

@@ -2,6 +2,7 @@
 
 import stat
 from collections.abc import Iterator
+from errno import EIO, ENXIO, ETIMEDOUT
 from pathlib import Path
 from typing import Any
 
@@ -369,16 +370,16 @@ def test_nack_of_the_count_or_the_data_is_retried_and_loses_nothing(bench: Bench
     assert imu.statistics.retries == 1
 
 
-@pytest.mark.parametrize("fault", ["unplugged", "stuck"])
-def test_missing_sensor_raises_device_silent(bench: Bench, fault: str, imu: Mpu6050) -> None:
+@pytest.mark.parametrize("fault", [ENXIO, ETIMEDOUT, EIO], ids=["unplugged", "stuck", "stuck behind a USB adapter"])
+def test_missing_sensor_raises_device_silent(bench: Bench, fault: int, imu: Mpu6050) -> None:
     bench.clock.sleep(0.1)
-    if fault == "unplugged":
+    if fault == ENXIO:
         bench.bus.detach(AT)
     else:
-        bench.bus.stuck = True
+        bench.bus.stuck, bench.bus.stuck_error = True, fault
     with pytest.raises(DeviceSilent, match="0x68") as caught:
         imu.read_samples()
-    assert caught.value.evidence["attempts"] == 3
+    assert (caught.value.evidence["attempts"], caught.value.evidence["errno"]) == (3, fault)
 
 
 def test_fifo_overflow_is_reported_and_cleared(bench: Bench, imu: Mpu6050) -> None:

@@ -201,11 +201,14 @@ def test_unknown_chip_is_reported_and_other_addresses_are_not_asked(bench):
     assert not memory.written
 
 
-def test_stuck_bus_is_reported_once_with_its_error(bench):
-    bench.devices.i2c.stuck = True
-    assert {found.errno for found in scan_imus(bench.context.computer, 1)} == {ETIMEDOUT}
+@pytest.mark.parametrize(
+    ("number", "code"), [(ETIMEDOUT, FindingCode.I2C_STUCK), (EIO, FindingCode.I2C_FAILED)], ids=["Raspberry Pi", "USB"]
+)
+def test_stuck_bus_is_reported_once_with_its_error(number, code, bench):
+    bench.devices.i2c.stuck, bench.devices.i2c.stuck_error = True, number
+    assert {found.errno for found in scan_imus(bench.context.computer, 1)} == {number}
     codes = [f.code for f in run_checks(bench.context, DeviceScan().checks) if f.topic == "imu"]
-    assert codes == [FindingCode.I2C_STUCK, FindingCode.NO_IMU_FOUND]
+    assert codes == [code, FindingCode.NO_IMU_FOUND]
 
 
 @pytest.mark.parametrize("number", [ENXIO, EREMOTEIO, ENODEV, EIO, ETIMEDOUT])
