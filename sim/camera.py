@@ -45,6 +45,11 @@ MODES = tuple(
 """The modes that it offers; MJPG has no errors of compression."""
 _NO_CONTROLS = (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT, cv2.CAP_PROP_FPS, cv2.CAP_PROP_POS_MSEC)
 """What OpenCV answers without asking the camera."""
+_REMEMBERED = (
+    *(cv2.CAP_PROP_GAIN, cv2.CAP_PROP_SHARPNESS, cv2.CAP_PROP_BACKLIGHT),
+    *(v4l2.POWER_LINE_FREQUENCY, v4l2.EXPOSURE_DYNAMIC_FRAMERATE),
+)
+"""Controls of which the camera does not say that they change by themselves: the driver asks it once."""
 _BUFFERS_RANGE = (1, 10)
 
 _METER_FRAMES = 5  # the automatic settings change every so many frames
@@ -91,6 +96,9 @@ class SimCapture:
 
     Attributes
     ----------
+    remembers
+        Whether the driver remembers controls that it has set or asked for once, as ``uvcvideo`` does. A gain that the
+        camera changes by itself is not read back then.
     every
         The camera exposes every so many frames: more than 1 for a slow camera.
     latency_ns
@@ -117,6 +125,8 @@ class SimCapture:
     """
 
     def __init__(self, world: World) -> None:
+        self.remembers = True
+        self._remembered: dict[int, float] = {}
         self.every = 1
         self.latency_ns = 0
         self.grab_failures: list[Callable[[], bool]] = []
@@ -155,6 +165,7 @@ class SimCapture:
         if not self._plugged:
             self._plugged = True
             self._plugs += 1
+            self._remembered.clear()
             self._change(self._clock.now_ns(), Controls(autofocus=True, focus=0))
 
     def node(self) -> tuple[int, ...] | None:
@@ -267,7 +278,8 @@ class SimCapture:
         }
         if self._lost and prop not in _NO_CONTROLS:
             return -1.0
-        return float(values.get(prop, -1.0))
+        value = float(values.get(prop, -1.0))
+        return self._remembered.setdefault(prop, value) if self.remembers and prop in _REMEMBERED else value
 
     def set(self, prop: int, value: float) -> bool:
         """Change a setting for later frames; return False for settings that the camera controls automatically."""
@@ -310,6 +322,7 @@ class SimCapture:
             case _:
                 return False
         self._change(self._clock.now_ns(), now)
+        self._remembered.pop(prop, None)
         return True
 
     # -- time ---------------------------------------------------------------------------------------------------------

@@ -184,6 +184,7 @@ class CompletedRequest:
 
 def module(sensor: SimCapture, clock: Clock) -> ModuleType:
     """Return a module ``picamera2`` whose camera is ``sensor``; a test puts it into `sys.modules`."""
+    sensor.remembers = False  # libcamera reports the settings of each frame
     fake: Any = ModuleType("picamera2")
     fake.Picamera2 = type("Picamera2", (Picamera2,), {"sensor": sensor, "clock": clock, "in_use": False})
     return fake  # type: ignore[no-any-return]

@@ -187,6 +187,7 @@ class Webcam(UsbDevice):
         self._over = False
         self._odd = False
         camera.every = EVERY
+        camera.remembers = False  # Linux's driver does
         super().__init__()
         self._streamer = Thread(target=self._stream, name="stream", daemon=True)
         self._streamer.start()

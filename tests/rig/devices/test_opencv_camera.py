@@ -310,6 +310,7 @@ def test_fixed_lens_needs_no_focus(world: World) -> None:
 def test_drift_of_a_control_from_zero_is_noticed(world: World) -> None:
     """On V4L2, 0 is a value, and -1 says that the camera lacks the control."""
     capture = SimCapture(world)
+    capture.remembers = False
     camera = OpenCvCamera(capture, clock=world.clock, settings=CameraSettings(gain=None))
     before = camera.read_locks()
     assert (before.gain, before.backlight_compensation) == (0, 0)
@@ -317,6 +318,22 @@ def test_drift_of_a_control_from_zero_is_noticed(world: World) -> None:
     assert camera.read_locks() == replace(before, gain=6)
     capture.drift(gain_db=0, sharpness=80, power_line_frequency=1, dynamic_frame_rate=True)
     assert camera.read_locks() == replace(before, sharpness=80, power_line_frequency=1, dynamic_frame_rate=True)
+
+
+def test_gain_that_the_driver_remembers_is_read_back_as_it_was_set(world: World) -> None:
+    """As `uvcvideo` does, unless the camera says that its gain changes by itself. A replugged camera is asked again."""
+    capture = SimCapture(world)
+    camera = OpenCvCamera(capture, clock=world.clock)
+    before = camera.read_locks()
+    dark = camera.capture(world.clock.now_ns()).image_bgr.mean()
+    capture.drift(gain_db=12)
+    assert camera.read_locks() == before
+    assert camera.capture(world.clock.now_ns()).image_bgr.mean() > 2 * dark
+    capture.unplug()
+    capture.replug()
+    capture.drift(gain_db=12)
+    capture.reopen()
+    assert camera.read_locks().gain == 12
 
 
 def test_all_controls_that_the_camera_has_are_locked(world: World) -> None:
