@@ -6,11 +6,13 @@ from dataclasses import dataclass
 
 import pytest
 
+from rig.doctor.computer import RULES_FILES
 from tests.kernel.guest_bench import GuestBench
 from tests.kernel.machine import Machine, NotReady, Result, kernel_folder
 from tests.kernel.played_bench import PlayedBench
 
-RULES_FILE = "/etc/udev/rules.d/60-hbr-rig.rules"
+BRLTTY_RULE = '''SUBSYSTEM=="usb", ENV{PRODUCT}=="403/6014/*", ENV{SYSTEMD_WANTS}+="brltty-device@.service"'''
+"""What the rules of the package brltty do with a USB adapter that they take for a braille display."""
 PATIENT = {
     "servo": ("retries = 10",),
     "table": ("poll_s = 0.1", "quiet_dps = 2.0", "watchdog_s = 2.5"),
@@ -55,6 +57,8 @@ class FirstDay:
     latency_before: str
     latency_after: str
     link: str
+    brltty_before: str
+    brltty_after: str
     setup: Result
     settings: Result
     home: Result
@@ -65,14 +69,19 @@ def first_day(guest: GuestBench) -> FirstDay:
     """Set the bench up as a technician does, once for all tests."""
     latency = "/sys/bus/usb-serial/devices/ttyUSB0/latency_timer"
     find, rules, before = guest.rig("find"), guest.rig("doctor", "--udev"), guest.files(latency)[latency].strip()
-    guest.sh(f"cat > {RULES_FILE} <<'END'\n{rules.output}END")
-    guest.sh(f"udevadm control --reload && udevadm trigger --action=add {TRIGGERED} && udevadm settle")
+    trigger = f"udevadm control --reload && udevadm trigger --action=add {TRIGGERED} && udevadm settle"
+    adapter = "$(dirname $(grep -lx 6014 /sys/bus/usb/devices/*/idProduct))"
+    wants = f"udevadm info -q property {adapter} | grep ^SYSTEMD_WANTS= || true"
+    guest.sh(f"echo '{BRLTTY_RULE}' > /etc/udev/rules.d/85-brltty.rules && {trigger}")
+    brltty_before = guest.sh(wants)
+    guest.sh(f"tee {' '.join(RULES_FILES)} >/dev/null <<'END'\n{rules.output}END\n{trigger}")
+    brltty_after = guest.sh(wants)
     after, link = guest.files(latency)[latency].strip(), guest.sh("readlink -f /dev/rig-servo")
     setup = guest.rig("setup", "--yes")
     added = (f"s/^\\[{section}\\]/" + "\\n".join((f"[{section}]", *lines)) + "/" for section, lines in PATIENT.items())
     guest.sh(f"sed -i '{'; '.join(added)}' rig.toml && cat >> rig.toml <<'END'{SMALL_REGION}END")
     settings, home = guest.rig("servo", "settings", "--write", "--yes"), guest.rig("home", "--here")
-    return FirstDay(find, rules, before, after, link, setup, settings, home)
+    return FirstDay(find, rules, before, after, link, brltty_before, brltty_after, setup, settings, home)
 
 
 @pytest.fixture

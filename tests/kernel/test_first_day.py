@@ -30,6 +30,11 @@ def test_udev_rule_shortens_the_latency_timer_and_names_the_port(first_day: Firs
     assert first_day.link == "/dev/ttyUSB0"
 
 
+def test_udev_rules_keep_brltty_from_the_port(first_day: FirstDay) -> None:
+    assert first_day.brltty_before == "SYSTEMD_WANTS=brltty-device@.service"
+    assert first_day.brltty_after in ("", "SYSTEMD_WANTS=")
+
+
 def test_setup_writes_the_configuration_and_checks_it(first_day: FirstDay) -> None:
     output = first_day.setup.output
     assert "Wrote rig.toml." in output

@@ -6,6 +6,7 @@ import pytest
 
 from tests.kernel.guest_bench import GuestBench
 from tests.kernel.test_ends import STOPPED_S, rotating
+from tests.kernel.test_first_day import CAMERA
 
 pytestmark = [pytest.mark.kernel, pytest.mark.timeout(600)]
 
@@ -23,6 +24,18 @@ def test_without_the_servo_the_table_does_not_move_and_status_shows_the_others(b
         "1\n/dev/ttyUSB0"
     )
     assert bench.rig("goto", 30).code == 0
+
+
+def test_imu_and_camera_that_were_unplugged_at_rest_are_used_again(bench: GuestBench) -> None:
+    bus = bench.i2c_bus
+    bench.unplug(bench.played.imu, bench.played.camera)
+    goto, snapshot = bench.rig("goto", 10), bench.rig("snapshot", "missing.png")
+    assert (goto.code, snapshot.code) == (4, 4), (goto.output, snapshot.output)
+    assert bus in goto.output
+    assert CAMERA in snapshot.output
+    bench.plug_in(bench.played.imu, bench.played.camera)
+    assert bench.rig("goto", 10).code == 0
+    assert bench.rig("snapshot", "plugged.png").code == 0
 
 
 def test_table_stops_when_the_servo_is_unplugged_while_it_rotates(bench: GuestBench) -> None:
