@@ -1,7 +1,8 @@
 """`rig catalog calibrate`: fit the stopping rule of the dense search to the catalog."""
 
+import os
 import sys
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
@@ -11,6 +12,9 @@ from rig.cli.ui.settings import Settings
 
 if TYPE_CHECKING:
     from hbr import CalibratedRule
+
+_SEVERAL_PROCESSES: Final = 20_000
+"""Views from which the searches take longer than the start of further processes."""
 
 
 @command
@@ -59,6 +63,8 @@ def calibrate(
             progress(JobProgress(done, total))
 
         where = jobs_of(None, cluster)
+        if where is None and len(views) >= _SEVERAL_PROCESSES:
+            where = os.cpu_count() or 1
         found = calibrate_stopping_rule(
             index,
             error_rate=error_rate,
