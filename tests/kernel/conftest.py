@@ -18,8 +18,8 @@ PATIENT = {
     "table": ("poll_s = 0.1", "quiet_dps = 2.0", "watchdog_s = 2.5"),
     "imu": ("rate_hz = 50", "bandwidth_hz = 20"),
     "camera": ("width = 320", "height = 240"),
+    "view": ("roi = [40, 0, 240, 240]",),
 }
-SMALL_REGION = "\n[view]\nroi = [40, 0, 240, 240]\n"
 """Settings for an emulated computer, which is slow: a request to a device takes it tens of milliseconds."""
 
 TRIGGERED = "--subsystem-match=usb --subsystem-match=usb-serial --subsystem-match=tty"
@@ -79,7 +79,7 @@ def first_day(guest: GuestBench) -> FirstDay:
     after, link = guest.files(latency)[latency].strip(), guest.sh("readlink -f /dev/rig-servo")
     setup = guest.rig("setup", "--yes")
     added = (f"s/^\\[{section}\\]/" + "\\n".join((f"[{section}]", *lines)) + "/" for section, lines in PATIENT.items())
-    guest.sh(f"sed -i '{'; '.join(added)}' rig.toml && cat >> rig.toml <<'END'{SMALL_REGION}END")
+    guest.sh(f"sed -i '{'; '.join(added)}' rig.toml")
     settings, home = guest.rig("servo", "settings", "--write", "--yes"), guest.rig("home", "--here")
     return FirstDay(find, rules, before, after, link, brltty_before, brltty_after, setup, settings, home)
 
