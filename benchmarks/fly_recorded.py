@@ -68,7 +68,7 @@ def record(bench: Bench, operator: ShelfOperator, name: str) -> dict[str, Seen]:
         with Turntable(bench) as table:
             start_deg, step_deg = 0.0, 360.0 / VIEWS
             if kind == "rest":
-                found["motion"] = turn(bench, table, describe)
+                found["motion"] = revolution(bench, table, describe)
                 start_deg, step_deg = 360.0, -step_deg
             found[kind] = []
             for number in range(VIEWS):
@@ -79,7 +79,7 @@ def record(bench: Bench, operator: ShelfOperator, name: str) -> dict[str, Seen]:
     return found
 
 
-def turn(bench: Bench, table: Turntable, describe: ViewDescriber) -> Seen:
+def revolution(bench: Bench, table: Turntable, describe: ViewDescriber) -> Seen:
     """Rotate once, and return the frames at full speed."""
     table.goto(0.0)
     recorder, stream = table.recorder(), FrameStream(bench.camera, bench.clock)

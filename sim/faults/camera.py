@@ -87,10 +87,14 @@ def _doubled(devices: SimDevices, values: Values, rng: np.random.Generator) -> E
     return _filter(devices, again)
 
 
+def _shifted_stamps(devices: SimDevices, ms: float) -> End:
+    devices.camera.stamp_shift_ns = round(ms * 1e6)
+    return lambda: setattr(devices.camera, "stamp_shift_ns", 0)
+
+
 @simulated_fault("stamp_jump", "The time stamps of the frames jump.", ms=Parameter(12.0, "jump, ms", -1000, 1000))
 def _stamp_jump(devices: SimDevices, values: Values, _rng: np.random.Generator) -> End:
-    devices.camera.stamp_shift_ns = round(values["ms"] * 1e6)
-    return lambda: setattr(devices.camera, "stamp_shift_ns", 0)
+    return _shifted_stamps(devices, values["ms"])
 
 
 @simulated_fault(
@@ -99,8 +103,7 @@ def _stamp_jump(devices: SimDevices, values: Values, _rng: np.random.Generator) 
     ms=Parameter(80.0, "how far, ms", 0, 1000),
 )
 def _stamps_backwards(devices: SimDevices, values: Values, _rng: np.random.Generator) -> End:
-    devices.camera.stamp_shift_ns = -round(values["ms"] * 1e6)
-    return lambda: setattr(devices.camera, "stamp_shift_ns", 0)
+    return _shifted_stamps(devices, -values["ms"])
 
 
 @simulated_fault(
