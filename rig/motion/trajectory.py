@@ -138,10 +138,9 @@ class TrajectoryRecorder:
             self._time_ns.append(time_ns)
             self._rate.append(rate_dps)
 
-    @property
-    def readings(self) -> int:
-        """The number of encoder readings."""
-        return len(self._readings)
+    def newest_readings(self, count: int) -> list[tuple[int, float]]:
+        """Return the last encoder readings, times and table angles; at most ``count``."""
+        return self._readings[-count:]
 
     def fit(self) -> Trajectory | None:
         """Return the trajectory so far; None if there are too few readings or samples."""

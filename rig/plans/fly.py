@@ -22,6 +22,7 @@ from rig.events.events import Accepted, Event, Rejected, ScanStarted, plain
 from rig.motion.flight_views import FlightJudge
 from rig.motion.move import Move
 from rig.motion.scan_speed import require_camera_time, scan_speed
+from rig.motion.trajectory import TrajectoryRecorder
 from rig.motion.turntable import Flight, Turntable
 from rig.plans.capture import announced, capture, moved, warn_of_table
 from rig.views.capture import Attempt, Viewer
@@ -30,6 +31,8 @@ from rig.views.stream import FrameStream, StreamFrame, middle_ns
 
 NEAR_SHARE = 0.6
 """A frame stands for a planned angle if it is within this share of the step from it."""
+READINGS = 8
+"""Readings of the encoder from which the angle of a frame is estimated in the turn."""
 
 
 @dataclass
@@ -39,10 +42,10 @@ class Scan:
     bench: Bench
     table: Turntable
     stream: FrameStream
+    recorder: TrajectoryRecorder
     angles_deg: Mapping[int, float]
     nearest: dict[int, tuple[float, StreamFrame]] = field(default_factory=dict)
     stamps_ns: list[int] = field(default_factory=list)
-    _readings: list[tuple[int, float]] = field(default_factory=list)
 
     def each(self) -> None:
         """Wait for the next frame, and keep it if it is the nearest so far to a planned angle."""
@@ -54,16 +57,13 @@ class Scan:
             if away_deg < self.nearest.get(index, (15.0, None))[0]:
                 self.nearest[index] = away_deg, frame
 
-    def observe(self, time_ns: int, angle_deg: float) -> None:
-        """Take a reading of the encoder."""
-        self._readings = [*self._readings[-7:], (time_ns, angle_deg)]
-
     def _about_deg(self, time_ns: int) -> float:
         """Return the angle at a time, roughly: from the last readings of the encoder."""
-        if len(self._readings) < 2:
-            return self._readings[-1][1] if self._readings else self.table.rest_deg
-        times = np.array([(t - time_ns) * 1e-9 for t, _ in self._readings])
-        angles = np.array([angle for _, angle in self._readings])
+        readings = self.recorder.newest_readings(READINGS)
+        if len(readings) < 2:
+            return readings[-1][1] if readings else self.table.rest_deg
+        times = np.array([(t - time_ns) * 1e-9 for t, _ in readings])
+        angles = np.array([angle for _, angle in readings])
         if times[-1] >= 0:
             return float(np.interp(0.0, times, angles))
         rate = (angles[-1] - angles[-2]) / max(times[-1] - times[-2], 1e-3)
@@ -119,14 +119,7 @@ def fly_views(
     before = yield from capture(0, viewer, table, bench.clock.now_ns())
     yield ScanStarted(speed.dps, speed.limit, speed.value, start_deg, end_deg)
     recorder = table.recorder()
-    scan = Scan(bench, table, FrameStream(bench.camera, bench.clock), angles_deg)
-    add_reading = recorder.add_reading
-
-    def observed(time_ns: int, angle_deg: float) -> None:
-        add_reading(time_ns, angle_deg)
-        scan.observe(time_ns, angle_deg)
-
-    recorder.add_reading = observed  # type: ignore[method-assign]
+    scan = Scan(bench, table, FrameStream(bench.camera, bench.clock), recorder, angles_deg)
     begun_ns = bench.clock.now_ns()
     move = table.fly(end_deg, Flight(scan.each, (start_deg, end_deg), recorder, speed.dps))
     yield moved(len(angles_deg), move)
