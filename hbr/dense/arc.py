@@ -8,7 +8,7 @@ The search decides each time the frames have covered another step of the circle.
 of searches at rest, and so is which object is unknown, from a few frames far apart. The confidence that ends a search
 later comes from leave-one-out searches along such arcs, with as many decisions and the same weights.
 
-Decision: docs/decisions/0047.
+Decisions: docs/decisions/0047, docs/decisions/0056.
 """
 
 from collections.abc import Sequence

@@ -17,5 +17,5 @@ from rig.core.camera_node import camera_node
         ("picamera2:1", None),
     ],
 )
-def test_device_files_are_told_from_recordings_and_streams(source, node):
+def test_recordings_and_streams_are_no_device_files(source, node):
     assert camera_node(source) == node
