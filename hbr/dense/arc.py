@@ -137,7 +137,12 @@ class ArcSession(DenseSession):
         self._covered_deg = 0.0
 
     def add(
-        self, levels: LevelArray, orientation_deg: float, *, earlier: Sequence[LevelArray] | None = None
+        self,
+        levels: LevelArray,
+        orientation_deg: float,
+        *,
+        earlier: Sequence[LevelArray] | None = None,
+        reliable: bool = True,
     ) -> StopDecision:
         """Add the next frame and return the rule's last decision; `is_new_decision` says whether it is a new one."""
         if self._queries:
@@ -146,7 +151,7 @@ class ArcSession(DenseSession):
         self.is_new_decision = decisions > self.decisions
         self.decisions = decisions
         if self.is_new_decision:
-            return super().add(levels, orientation_deg, earlier=earlier)
+            return super().add(levels, orientation_deg, earlier=earlier, reliable=reliable)
         self._extend(levels, orientation_deg)
         return self.decision
 

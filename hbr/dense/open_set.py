@@ -13,14 +13,14 @@ verification systems", Digital Signal Processing 10, 2000 (comparison with a coh
 Decision: docs/decisions/0049.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hbr.core.arrays import FloatArray, LevelArray
+from hbr.core.arrays import FloatArray, IndexArray, LevelArray
 from hbr.dense.index import DenseIndex
 
 #: Candidates that the leader is compared with.
@@ -44,7 +44,7 @@ def evidence(
     queries: Sequence[LevelArray],
     *,
     units: Sequence[FloatArray] | None = None,
-    enrolled: FloatArray | None = None,
+    enrolled: Callable[[IndexArray], FloatArray] | None = None,
     without: int | None = None,
 ) -> tuple[int, FloatArray]:
     """Return the place of the leading candidate, and the numbers of `NUMBERS`.
@@ -61,8 +61,8 @@ def evidence(
         The queries.
     units : sequence of float64 arrays, optional
         Their whitened descriptions, if they are known.
-    enrolled : float64 array (m, d), optional
-        Whitened descriptions of all enrolled views, if they are known.
+    enrolled : callable, optional
+        Returns whitened descriptions of enrolled views, (n, d), from their rows, if they are known.
     without : int, optional
         Place of an object that does not count, as if it were not enrolled.
     """
@@ -83,7 +83,7 @@ def evidence(
     rotated_deg = orientation_deg - orientation_deg[0]
     places = zip(order.tolist(), pose_deg.tolist(), strict=True)
     rows = np.stack([index.nearest_views(place, at_deg + rotated_deg, _NEXT) for place, at_deg in places])
-    near = index.whitening.unit(index.views.levels(rows.ravel())) if enrolled is None else enrolled[rows.ravel()]
+    near = index.whitening.unit(index.views.levels(rows.ravel())) if enrolled is None else enrolled(rows.ravel())
     near = near.reshape(*rows.shape, -1)
     white = np.zeros(len(order))
     for n, unit in enumerate(units):

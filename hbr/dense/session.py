@@ -1,4 +1,7 @@
-"""One search by the dense filter: views in; belief, decision and next best view out."""
+"""One search by the dense filter: views in; belief, decision and next best view out.
+
+Decision: docs/decisions/0055.
+"""
 
 from collections.abc import Sequence
 from typing import Final
@@ -46,9 +49,15 @@ class DenseSession:
         self._index = index
         self._so_far: DenseIndex | Belief = index
         self._queries: list[LevelArray] = []
+        self._reliable = True
 
     def add(
-        self, levels: LevelArray, orientation_deg: float, *, earlier: Sequence[LevelArray] | None = None
+        self,
+        levels: LevelArray,
+        orientation_deg: float,
+        *,
+        earlier: Sequence[LevelArray] | None = None,
+        reliable: bool = True,
     ) -> StopDecision:
         """Add the next view, as for `update_belief`, and return the rule's decision.
 
@@ -60,7 +69,11 @@ class DenseSession:
             Orientation of the camera around the object, from any zero that all views share.
         earlier : sequence of uint8 arrays, optional
             The earlier views, described again: they were segmented better since.
+        reliable : bool
+            Whether the views were segmented reliably (`hbr.ViewsTogether.reliable`). If not, the search does not end
+            while it may take more views.
         """
+        self._reliable = reliable
         if earlier is not None:
             self._replace(earlier)
         self._extend(levels, orientation_deg)
@@ -104,7 +117,8 @@ class DenseSession:
         return None
 
     def _decide(self, belief: Belief, *, last: bool = False) -> StopDecision:
-        return self.rule.decide(belief, max_views=belief.queries if last else self.max_views)
+        most = belief.queries if last else self.max_views
+        return self.rule.decide(belief, max_views=most, reliable=self._reliable)
 
     def _complete(self) -> None:
         """Before an end: decide again if an object that was left out after the first view can be first or second."""

@@ -54,6 +54,7 @@ class StopReason(StrEnum):
     CONFIDENT = "confident"
     NOT_CONFIDENT = "not-confident"
     BELOW_OPEN_SET_THRESHOLD = "below-open-set-threshold"
+    BADLY_SEGMENTED = "badly-segmented"
     MARGIN = "margin"
     MAX_VIEWS = "max-views"
     NO_ROTATION_LEFT = "no-rotation-left"
@@ -186,14 +187,17 @@ class StoppingRule:
     unknown_thresholds: tuple[float, ...] = ()
     rates: tuple[ShiftRates, ...] = ()
 
-    def decide(self, belief: Belief, *, max_views: int = 8, decisions: int | None = None) -> StopDecision:
+    def decide(
+        self, belief: Belief, *, max_views: int = 8, decisions: int | None = None, reliable: bool = True
+    ) -> StopDecision:
         """Decide whether a search ends after these views; ``decisions`` counts instead of them in a search in motion.
 
         An object is found if it is confident and reaches the open-set threshold. Before the last calibrated view the
         highest of all thresholds counts: an unknown object that passes the first threshold gets another view, which
         costs an enrolled object little. From the last calibrated view on, an object below the threshold is unknown,
         however many views are left: no false-reject rate was measured for those. After ``max_views`` an object that is
-        not confident is ambiguous.
+        not confident is ambiguous. If the views were not segmented reliably, the search continues in any case until
+        ``max_views``: another view costs little, and the background is then known.
         """
         probability = belief.posterior(self.beta).sum(axis=1)
         best = int(probability.argmax())
@@ -216,6 +220,8 @@ class StoppingRule:
             outcome, reason = Outcome.CONTINUE, StopReason.NOT_CONFIDENT
         else:
             outcome, reason = Outcome.AMBIGUOUS, StopReason.MAX_VIEWS
+        if not reliable and outcome is not Outcome.CONTINUE and decisions < max_views:
+            outcome, reason = Outcome.CONTINUE, StopReason.BADLY_SEGMENTED
         object_index = int(belief.index.object_index[best])
         return StopDecision(outcome, reason, object_index, confidence, self.min_confidence, score, threshold)
 
@@ -332,7 +338,7 @@ def fit_open_set(rule: StoppingRule, searches: ShiftedSearches) -> StoppingRule:
     """Return the rule with an open-set score that is fitted to changes of the bench.
 
     An object is accepted from the first score on that at most 2 % of the objects that are not enrolled reach after any
-    number of views: such scores do not rise when the bench changes, while those of enrolled objects fall. If enrolled
+    number of views, under each strength of the change, none included: such scores do not rise when the bench changes, while those of enrolled objects fall. If enrolled
     objects are so similar to each other that more than ``false_reject`` of them would not reach it after a mild change,
     the threshold is lower. Objects are unknown if their score is below that of nearly all searches for enrolled
     objects; between the thresholds they are ambiguous.
@@ -340,7 +346,10 @@ def fit_open_set(rule: StoppingRule, searches: ShiftedSearches) -> StoppingRule:
     model = OpenSetModel.fitted(searches.known, searches.correct, searches.unknown)
     known, unknown = model.scores(searches.known), model.scores(searches.unknown)
     known_best = np.where(searches.correct, known, -np.inf).max(axis=1)
-    accepted_from = -conformal_threshold(-unknown.max(axis=1), max(FALSE_ACCEPT, 1.001 / (len(unknown) + 1)))
+    accepted_from = max(
+        -conformal_threshold(-own.max(axis=1), max(FALSE_ACCEPT, 1.001 / (len(own) + 1)))
+        for own in (unknown[searches.strength == strength] for strength in np.unique(searches.strength))
+    )
     mild = np.maximum(known_best[searches.strength <= _MILD], known.min())
     accepted_from = min(accepted_from, float(np.quantile(mild, rule.false_reject)))
     share = max(rule.false_reject, 1.001 / (len(known) + 1))

@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from hbr.core.arrays import FloatArray, LevelArray
+from hbr.core.arrays import FloatArray, IndexArray, LevelArray
 from hbr.descriptors import descriptor
 from hbr.model.views import Views
 
@@ -35,36 +35,65 @@ class Whitening:
         self._known: dict[bytes, FloatArray] = {}
 
     @cached_property
+    def _rows(self) -> IndexArray:
+        count = min(len(self._views), _MOST)
+        rows: IndexArray = np.unique(np.linspace(0, len(self._views) - 1, count).astype(int))
+        return rows
+
+    @cached_property
     def _transform(self) -> tuple[FloatArray, FloatArray]:
-        rows = np.unique(np.linspace(0, len(self._views) - 1, min(len(self._views), _MOST)).astype(int))
-        entries = descriptor(self._views.descriptor).entries(self._views.levels(rows))
+        entries = descriptor(self._views.descriptor).entries(self._views.levels(self._rows))
         mean = entries.mean(axis=0)
         apart = entries - mean
-        covariance = apart.T @ apart / max(1, len(rows) - 1)
+        covariance = apart.T @ apart / max(1, len(apart) - 1)
         size = len(covariance)
         covariance += (_SHRINKAGE * np.trace(covariance) / size + 1e-12) * np.eye(size)
         # with C = L Lᵀ, products of L⁻¹ a and L⁻¹ b are those of any whitening
         return mean, np.linalg.inv(np.linalg.cholesky(covariance)).T
 
-    def unit(self, levels: LevelArray) -> FloatArray:
-        """Return whitened descriptions of unit length, (n, d), of levels, uint8 (n, length).
-
-        A search asks for the same few rows after each view: they are computed once.
-        """
-        if len(levels) > _MOST_REMEMBERED // 8:
-            return self._unit(levels)
-        keys = [row.tobytes() for row in levels]
-        if len(self._known) > _MOST_REMEMBERED:
-            self._known = {}
-        known = self._known  # of this call, even if another thread begins a new one
-        missing = {key: i for i, key in enumerate(keys) if key not in known}
-        if missing:
-            known.update(zip(missing, self._unit(levels[list(missing.values())]), strict=True))
-        return np.stack([known[key] for key in keys])
-
-    def _unit(self, levels: LevelArray) -> FloatArray:
+    def white(self, levels: LevelArray) -> FloatArray:
+        """Return whitened descriptions, (n, d), of levels, uint8 (n, length)."""
         mean, transform = self._transform
-        white = (descriptor(self._views.descriptor).entries(levels) - mean) @ transform
-        length = np.sqrt(np.einsum("ij,ij->i", white, white))[:, None]
-        unit: FloatArray = np.divide(white, length, out=np.zeros_like(white), where=length > 0)
-        return unit
+        white: FloatArray = (descriptor(self._views.descriptor).entries(levels) - mean) @ transform
+        return white
+
+    def unit(self, levels: LevelArray) -> FloatArray:
+        """Return whitened descriptions of unit length, (n, d), of levels, uint8 (n, length)."""
+        return unit_rows(self.white(levels))
+
+    def without(self, rows: IndexArray) -> "WhiteningWithout":
+        """Return the whitening as if these views were not enrolled."""
+        used = rows[np.isin(rows, self._rows)]
+        return WhiteningWithout(self.white(self._views.levels(used)), len(self._rows))
+
+
+class WhiteningWithout:
+    """Whitening as if some views were not enrolled, without computing it again.
+
+    If C is the covariance with these views and U has their distances from the mean as columns, the covariance without
+    them is C - U Uᵀ (the mean stays). By the Woodbury identity its inverse is C⁻¹ + C⁻¹ U (I - Uᵀ C⁻¹ U)⁻¹ Uᵀ C⁻¹. The
+    second part adds entries to each whitened description, one for each view that is left out.
+
+    Parameters
+    ----------
+    own : float64 array (k, d)
+        Whitened descriptions of the views that are left out, as `Whitening.white` returns them.
+    views : int
+        Number of views from which the whitening was computed.
+    """
+
+    def __init__(self, own: FloatArray, views: int) -> None:
+        scaled = own / np.sqrt(max(1, views - 1))
+        inner = np.eye(len(own)) - scaled @ scaled.T
+        self._more: FloatArray = scaled.T @ np.linalg.cholesky(np.linalg.inv(inner))
+
+    def unit(self, white: FloatArray) -> FloatArray:
+        """Return the descriptions of unit length, (n, d + k), of whitened ones, (n, d)."""
+        return unit_rows(np.hstack([white, white @ self._more]))
+
+
+def unit_rows(white: FloatArray) -> FloatArray:
+    """Return rows of unit length; rows of zeros stay."""
+    length = np.sqrt(np.einsum("ij,ij->i", white, white))[:, None]
+    unit: FloatArray = np.divide(white, length, out=np.zeros_like(white), where=length > 0)
+    return unit

@@ -17,6 +17,8 @@ from hbr.segmentation.segment import MOST_HYPOTHESES
 
 #: Segmentations that other views do not improve.
 _FINAL: Final = (Method.PLAIN_BACKGROUND, Method.EMPTY_TABLE)
+#: Segmentations by a known background.
+RELIABLE: Final = (*_FINAL, Method.ROTATION)
 
 
 class ViewsTogether:
@@ -27,7 +29,8 @@ class ViewsTogether:
         views = hbr.ViewsTogether("edges+colours", empty_table=table)  # or without an empty-table image
         for frame, orientation_deg in frames:
             views.add(frame)
-            decision = session.add(views.levels[-1], orientation_deg, earlier=views.levels[:-1])
+            *earlier, levels = views.levels
+            decision = session.add(levels, orientation_deg, earlier=earlier, reliable=views.reliable)
 
     Parameters
     ----------
@@ -78,6 +81,11 @@ class ViewsTogether:
         else:
             self._describe(len(self._images) - 1)
         return self.segmentations[-1]
+
+    @property
+    def reliable(self) -> bool:
+        """Whether the last view was segmented by a known background; without an empty-table image the first is not."""
+        return self.segmentations[-1][0].method in RELIABLE
 
     def revise(self) -> None:
         """Segment all views again that other views can improve."""

@@ -130,7 +130,7 @@ def search_changed(
             azimuth_deg = item.photographs[place].azimuth_deg
             views.add(visit.photograph(*_cut_out(item, place), azimuth_deg).image)
             *earlier, levels = views.levels
-            decision = session.add(levels, azimuth_deg, earlier=earlier)
+            decision = session.add(levels, azimuth_deg, earlier=earlier, reliable=views.reliable)
             names = index.views.object_names
             leaders.append(names[int(session.belief.ranking().object_index[0])])
             if ended is None and decision.outcome is not Outcome.CONTINUE:

@@ -204,6 +204,8 @@ def stop_words(decision: StopDecision, views: int) -> str:
         case StopReason.CONFIDENT:
             known = f", and the open-set score is {abs(above):.3f} above its threshold"
             return f"the confidence {confidence} reaches {least}{known if isfinite(above) else ''}"
+        case StopReason.BADLY_SEGMENTED:
+            return "the background is not known yet; another view shows it"
         case StopReason.NOT_CONFIDENT:
             return f"not confident yet: {confidence}, and {least} ends the search"
         case StopReason.BELOW_OPEN_SET_THRESHOLD if decision.outcome is Outcome.CONTINUE:

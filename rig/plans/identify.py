@@ -123,7 +123,13 @@ def identify(
             yield from warn_of_table(bench, number, described)
             # Decide: rank the candidates, then rotate or finish.
             levels = described.levels[search.descriptor]
-            ranked, step = search.add(levels, azimuth_deg, table_deg=table.rest_deg, earlier=described.earlier)
+            ranked, step = search.add(
+                levels,
+                azimuth_deg,
+                table_deg=table.rest_deg,
+                earlier=described.earlier,
+                reliable=described.reliable,
+            )
             yield ranked
             if isinstance(step, Finish):
                 break

@@ -92,7 +92,13 @@ def check(run: SavedRun, *, by: AnyStrategy | None = None) -> Check:
                 levels = view.levels[search.descriptor]
                 if event.evidence.motion is not None:
                     table_deg = event.evidence.motion.angle_deg
-                ranked, step = search.add(levels, event.azimuth_deg, table_deg=table_deg, earlier=view.earlier)
+                ranked, step = search.add(
+                    levels,
+                    event.azimuth_deg,
+                    table_deg=table_deg,
+                    earlier=view.earlier,
+                    reliable=view.reliable or isinstance(search, ArcSearch),
+                )
                 found.views += 1
                 if event.segmentation is not None:
                     saved, again = event.segmentation, plain(view.segmentation)

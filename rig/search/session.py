@@ -55,6 +55,7 @@ class Search(ABC):
         self._rng = np.random.default_rng(seed)
         self._orientations: list[float] = []
         self._earlier: Sequence[NDArray[np.uint8]] | None = None
+        self._reliable = True
 
     def add(
         self,
@@ -63,6 +64,7 @@ class Search(ABC):
         *,
         table_deg: float,
         earlier: Sequence[NDArray[np.uint8]] | None = None,
+        reliable: bool = True,
     ) -> tuple[Ranked, Rotate | Finish]:
         """Add the next view; return the candidates, and the strategy's decision.
 
@@ -76,9 +78,11 @@ class Search(ABC):
             The table angle, unwrapped.
         earlier : sequence of uint8 arrays, optional
             The levels of the earlier views, which were segmented again.
+        reliable
+            Whether the view was segmented reliably, as for `hbr.DenseSession.add`.
         """
         self._orientations.append(azimuth_deg)
-        self._earlier = earlier
+        self._earlier, self._reliable = earlier, reliable
         ranked = self._rank(levels)
         return ranked, self._decide(ranked, table_deg)
 
@@ -201,7 +205,7 @@ class DenseSearch(Search):
 
     def _rank(self, levels: NDArray[np.uint8]) -> Ranked:
         revised = {} if self._earlier is None else {"earlier": self._earlier}
-        decision = self._session.add(levels, self._orientations[-1], **revised)
+        decision = self._session.add(levels, self._orientations[-1], reliable=self._reliable, **revised)
         belief = self._session.belief
         probability = belief.posterior(self._session.rule.beta).sum(axis=1)
         scores = belief.scores()

@@ -42,12 +42,15 @@ class DescribedView:
         Set for the view after which it is clear that the bench no longer looks like its empty-table image.
     earlier : tuple of uint8 arrays (k, length), optional
         In a search: the levels of all earlier views, which were segmented again; a row for each segmentation.
+    reliable
+        In a search: whether the view was segmented by a known background (`hbr.ViewsTogether.reliable`).
     """
 
     levels: Mapping[str, NDArray[np.uint8]]
     segmentation: dict[str, Any] | None
     table_problem: TableProblem | None = None
     earlier: tuple[NDArray[np.uint8], ...] | None = None
+    reliable: bool = True
 
 
 def within(image_bgr: NDArray[np.uint8], region: tuple[int, int, int, int] | None) -> NDArray[np.uint8]:
@@ -230,4 +233,4 @@ class SearchDescriber(ViewDescriber):
         *earlier, levels = self._views.levels
         problem = self._table_problem(found.agreement)
         revised = tuple(earlier) if self._revise else None
-        return DescribedView({self._name: levels}, found.evidence(), problem, revised)
+        return DescribedView({self._name: levels}, found.evidence(), problem, revised, self._views.reliable)

@@ -1,13 +1,18 @@
 """Segmentation of the views of one search together, and the open-set score under changes of the bench."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import hbr
 from hbr.dense.shifted_searches import can_shift
+from hbr.dense.whitening import Whitening
 from hbr.descriptors.shift import Shift
 from hbr.evaluation.changed_bench import HARD, Bench, Visit
 from hbr.segmentation import Method
+
+NAMES = tuple("abcdefghij")
 
 
 def frames(count: int) -> tuple[list[np.ndarray], np.ndarray, list[tuple[int, int, int, int]]]:
@@ -91,3 +96,42 @@ def test_a_descriptor_without_shifts_keeps_the_earlier_score() -> None:
         rng.integers(0, 8, (8, 144), dtype=np.uint8), np.arange(8) * 90.0 % 360, np.repeat([0, 1], 4), ("a", "b")
     )
     assert not can_shift(hbr.DenseIndex(views))
+
+
+def test_no_answer_on_a_guessed_view_while_another_one_is_possible() -> None:
+    images, empty, _ = frames(2)
+    alone = hbr.ViewsTogether("edges+colours", empty_table=empty)
+    alone.add(images[0])
+    assert alone.reliable  # by the empty-table image
+    views = hbr.ViewsTogether("edges+colours")
+    views.add(images[0])
+    index = hbr.DenseIndex(hbr.Views(views.levels[0][:1], np.zeros(1), np.zeros(1, np.intp), ("a",), "edges+colours"))
+    rule = hbr.calibrate_stopping_rule(index).rule
+    session = hbr.DenseSession(index, rule)
+    decision = session.add(views.levels[0], 0.0, reliable=views.reliable)
+    assert (decision.outcome, decision.reason) == (hbr.Outcome.CONTINUE, hbr.StopReason.BADLY_SEGMENTED)
+    assert session.end().outcome is hbr.Outcome.FOUND  # the table cannot turn: no further view
+    other = np.full_like(views.levels[0], 3)
+    unknown = hbr.DenseSession(index, replace(rule, open_set_thresholds=(2.0,)))
+    assert unknown.add(other, 0.0, reliable=False).outcome is hbr.Outcome.CONTINUE
+    assert hbr.DenseSession(index, unknown.rule, max_views=1).add(other, 0.0, reliable=False).outcome is (
+        hbr.Outcome.UNKNOWN
+    )
+    views.add(images[1])
+    *earlier, levels = views.levels
+    assert views.reliable
+    assert session.add(levels, 90.0, earlier=earlier, reliable=True).reason is not hbr.StopReason.BADLY_SEGMENTED
+
+
+def test_whitening_without_an_object_is_that_of_the_other_views() -> None:
+    rng = np.random.default_rng(1)
+    levels = rng.integers(0, 4, (60, 512), dtype=np.uint8)
+    index = hbr.DenseIndex(hbr.Views(levels, np.arange(60) * 60.0 % 360, np.repeat(np.arange(10), 6), NAMES, "edges"))
+    left_out = index.whitening.without(np.arange(6))
+    found = left_out.unit(index.whitening.white(levels[6:]))
+    expected = Whitening(index.views.select(np.arange(6, 60))).unit(levels[6:])
+    np.testing.assert_allclose(found @ found.T, expected @ expected.T, atol=0.03)
+    with_it = index.whitening.unit(levels[:6])
+    own = left_out.unit(index.whitening.white(levels[:6]))
+    gain = own @ found.T - with_it @ index.whitening.unit(levels[6:]).T
+    assert np.abs(gain).max() > 0.003  # an unknown object is compared differently

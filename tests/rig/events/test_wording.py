@@ -87,6 +87,7 @@ def test_dense_decisions_name_the_two_candidates() -> None:
             StopReason.MAX_VIEWS,
             "the best candidate after 3 views, with a confidence of 97.0 %",
         ),
+        (Outcome.CONTINUE, StopReason.BADLY_SEGMENTED, "the background is not known yet; another view shows it"),
         (Outcome.CONTINUE, StopReason.NOT_CONFIDENT, "not confident yet: 97.0 %, and 95.0 % ends the search"),
         (Outcome.CONTINUE, StopReason.BELOW_OPEN_SET_THRESHOLD, "the open-set score is still 0.100 below its"),
         (Outcome.UNKNOWN, StopReason.BELOW_OPEN_SET_THRESHOLD, "no enrolled object is similar enough: the open-set"),
