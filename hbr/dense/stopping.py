@@ -338,8 +338,9 @@ def fit_open_set(rule: StoppingRule, searches: ShiftedSearches) -> StoppingRule:
     """Return the rule with an open-set score that is fitted to changes of the bench.
 
     An object is accepted from the first score on that at most 2 % of the objects that are not enrolled reach after any
-    number of views, under each strength of the change, none included: such scores do not rise when the bench changes, while those of enrolled objects fall. If enrolled
-    objects are so similar to each other that more than ``false_reject`` of them would not reach it after a mild change,
+    number of views, under each strength of the change, none included: such scores do not rise when the bench changes,
+    while those of enrolled objects fall. If enrolled objects are so similar to each other that more than
+    ``false_reject`` of them would not reach it after a mild change,
     the threshold is lower. Objects are unknown if their score is below that of nearly all searches for enrolled
     objects; between the thresholds they are ambiguous.
     """
