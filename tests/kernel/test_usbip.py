@@ -186,9 +186,10 @@ def test_racing_ends_and_cancellations_never_give_both():
         # a thread of its own: the answers fill the connection unless they are read meanwhile
         asker = Thread(target=host.ask, args=[Unlink(number + 1, number) for number in reversed(numbers)])
         asker.start()
-        ended, cancelled = set(), set()
-        while len(ended) + len(cancelled) < len(numbers):
+        ended, cancelled, unlinked = set(), set(), 0
+        while len(ended) + len(cancelled) < len(numbers) or unlinked < len(numbers):  # each answer is read
             kind, number, status, _ = host.answers(1)[0]
+            unlinked += kind == usbip.RET_UNLINK
             if kind == usbip.RET_SUBMIT:
                 ended.add(number)
             elif status:
