@@ -73,6 +73,9 @@ class Catalog(AbstractContextManager["Catalog"]):
     copied_utc: datetime | None = None
     """When this local copy of a catalog on a server was made; None for the catalog itself."""
 
+    copy_of: CatalogPlace | None = None
+    """Where the catalog is whose local copy this is; None for the catalog itself."""
+
     def __init__(self, database: Database, clock: Clock) -> None:
         self.database = database
         self.clock = clock

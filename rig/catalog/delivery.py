@@ -6,20 +6,22 @@ twice. What cannot be delivered because of its name stays in the journal until a
 Decision: docs/decisions/0052.
 """
 
-from collections.abc import Collection
-from contextlib import suppress
+import fcntl
+import os
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from sqlalchemy import Connection, insert, select
 
 from rig.catalog import audit
 from rig.catalog.catalog import Catalog
 from rig.catalog.database import given_id, insert_row
-from rig.catalog.edit import delete
+from rig.catalog.edit import delete_in
 from rig.catalog.journal import DELIVERED, KEY, REPLACE, bench_id, release, waiting_results, with_conditions
-from rig.catalog.queries import in_use
+from rig.catalog.queries import find, in_use
 from rig.catalog.records import EnrollmentStatus, EnrollmentSummary, ImageFile, ObjectDetails, PackedDescriptor
 from rig.catalog.rows import (
     NewView,
@@ -27,6 +29,7 @@ from rig.catalog.rows import (
     empty_table_columns,
     insert_views,
     measured,
+    of_status,
     supersede,
     unfinished_and_complete,
 )
@@ -34,9 +37,11 @@ from rig.catalog.schema import audit as log
 from rig.catalog.schema import descriptors, enrollments, objects, results, sessions, views
 from rig.catalog.seal import changing_enrollments, seal_appended, seal_enrollments, seal_objects
 from rig.catalog.upkeep import collect_garbage
-from rig.core.errors import CatalogDamaged, ObjectExists, RigError
-from rig.core.files import write
+from rig.core.errors import CatalogBusy, CatalogDamaged, ObjectExists, RigError
+from rig.core.files import no_follow, write
 from rig.views import image_files as images
+
+_LOCK: Final = "delivering"
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,23 +67,53 @@ def deliver(journal: Catalog, server: Catalog, *, replacing: Collection[str] = (
     ------
     CatalogUnavailable
         The server stopped answering; what was not delivered stays in the journal.
+    CatalogBusy
+        Another program delivers this journal.
     """
+    with _alone(journal):
+        return _deliver_all(journal, server, replacing)
+
+
+@contextmanager
+def _alone(journal: Catalog) -> Iterator[None]:
+    """Let no other program deliver the journal: two of them would remove from it what the other one reads."""
+    lock = no_follow(str(journal.path / _LOCK), os.O_RDWR | os.O_CREAT, mode=0o600)
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # the system releases it when the process ends
+    except BlockingIOError as error:
+        raise CatalogBusy("another program delivers the journal now", next_step="try again later") from error
+    else:
+        yield
+    finally:
+        os.close(lock)
+
+
+def _deliver_all(journal: Catalog, server: Catalog, replacing: Collection[str]) -> list[Delivery]:
     done = []
     for summary in journal.objects():
         if summary.enrolled_utc is None:
             continue
         try:
             _deliver(journal, server, summary.name, replaces=summary.name in replacing)
+            _forget(journal, summary.name)
         except (ObjectExists, CatalogDamaged) as error:
             done.append(Delivery(summary.name, summary.views, error))
             continue
-        delete(journal, summary.name)
         done.append(Delivery(summary.name, summary.views))
     if any(one.conflict is None for one in done):
         collect_garbage(journal)
     _deliver_results(journal, server)
     release(journal, server)
     return done
+
+
+def _forget(journal: Catalog, name: str) -> None:
+    """Remove a delivered object from the journal, unless it is being enrolled again: the next delivery removes it."""
+    with journal.database.write() as connection:
+        object_id, name = find(connection, name)
+        unfinished = select(enrollments.c.id).where(of_status(object_id, EnrollmentStatus.IN_PROGRESS))
+        if connection.execute(unfinished).first() is None:
+            delete_in(connection, journal, name)
 
 
 def _complete(item: ObjectDetails) -> EnrollmentSummary:

@@ -1,6 +1,6 @@
 """Rename, label, delete and restore objects."""
 
-from sqlalchemy import update
+from sqlalchemy import Connection, update
 
 from rig.catalog import audit
 from rig.catalog.catalog import Catalog, checked_texts
@@ -61,11 +61,16 @@ def delete(catalog: Catalog, *names: str) -> None:
         There is no object of one of these names.
     """
     with catalog.database.write() as connection:
-        now = catalog.clock.utc()
-        for object_id, name in [find(connection, name) for name in dict.fromkeys(names)]:
-            with changing_object(connection, object_id):
-                connection.execute(update(objects).where(objects.c.id == object_id).values(deleted_utc=now))
-            audit.append(connection, catalog.clock, audit.Action.DELETED, name)
+        delete_in(connection, catalog, *names)
+
+
+def delete_in(connection: Connection, catalog: Catalog, *names: str) -> None:
+    """Delete objects in a transaction that is open. Errors as for `delete`."""
+    now = catalog.clock.utc()
+    for object_id, name in [find(connection, name) for name in dict.fromkeys(names)]:
+        with changing_object(connection, object_id):
+            connection.execute(update(objects).where(objects.c.id == object_id).values(deleted_utc=now))
+        audit.append(connection, catalog.clock, audit.Action.DELETED, name)
 
 
 def undelete(catalog: Catalog, name: str) -> None:

@@ -27,6 +27,7 @@ STATE: Final = "state.json"
 RULES: Final = "search_rules.json"
 _AT_ONCE: Final = 100
 """Enrollments that are read from the server at once."""
+_PATIENCE: Final = 20
 
 
 def update_copy(catalog: Catalog) -> bool:
@@ -76,14 +77,42 @@ def open_copy(place: CatalogPlace, clock: Clock) -> Catalog:
             next_step="a copy is made when a search uses the server",
         ) from error
     copy = Catalog.open(folder, clock=clock, create=False, read_only=True)
-    copy.copied_utc = copied_utc
+    copy.copied_utc, copy.copy_of = copied_utc, place
     return copy
 
 
-def open_or_copy(place: CatalogPlace, clock: Clock, *, create: bool = False) -> Catalog:
+class Attempts:
+    """Opens catalogs, and spares the operator to wait again and again for a server that does not answer.
+
+    An attempt that failed after a time t is repeated after 20 t: a host that rejects a connection takes milliseconds,
+    a network that drops packets takes seconds. Until then the same error is raised at once.
+    """
+
+    def __init__(self, clock: Clock) -> None:
+        self._clock = clock
+        self._not_before_ns = clock.now_ns()
+        self._error: CatalogUnavailable | None = None
+
+    def open(self, place: CatalogPlace, *, create: bool = False) -> Catalog:
+        """Open a catalog, for reading only unless it is created if there is none; errors as `Catalog.open`."""
+        begun_ns = self._clock.now_ns()
+        if self._error is not None and begun_ns < self._not_before_ns:
+            raise self._error
+        try:
+            return Catalog.open(place, clock=self._clock, create=create, read_only=not create)
+        except CatalogUnavailable as error:
+            now_ns = self._clock.now_ns()
+            self._error, self._not_before_ns = error, now_ns + _PATIENCE * (now_ns - begun_ns)
+            raise
+
+
+def open_or_copy(
+    place: CatalogPlace, clock: Clock, *, create: bool = False, attempts: Attempts | None = None
+) -> Catalog:
     """Return a catalog, open for reading; its local copy while its server or its store does not answer.
 
-    With ``create`` the catalog is created if there is none, and is open for writing.
+    With ``create`` the catalog is created if there is none, and is open for writing. ``attempts`` are those of a
+    program that opens the catalog often.
 
     Raises
     ------
@@ -91,7 +120,7 @@ def open_or_copy(place: CatalogPlace, clock: Clock, *, create: bool = False) -> 
         There is no copy either.
     """
     try:
-        return Catalog.open(place, clock=clock, create=create, read_only=not create)
+        return (attempts or Attempts(clock)).open(place, create=create)
     except CatalogUnavailable as error:
         try:
             return open_copy(place, clock)

@@ -139,7 +139,7 @@ def dry_run(
     LimitExceeded
         The cable budget does not allow the missing views.
     """
-    known = {} if catalog is None else {summary.name: summary for summary in catalog.objects()}
+    known = {} if catalog is None else {summary.name: summary for summary in catalog.known_objects()}
     table_deg = Turntable(bench).angle_deg()
     limits_deg, sign = bench.config.table.limits_deg, bench.config.table.orientation_sign
     model = MotionModel(bench.config)

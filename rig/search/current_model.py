@@ -2,9 +2,10 @@
 
 from contextlib import suppress
 from dataclasses import replace
+from typing import Self
 
 from rig.catalog import Catalog
-from rig.catalog.local_copy import update_copy
+from rig.catalog.local_copy import Attempts, update_copy
 from rig.core.errors import CatalogUnavailable, RigError
 from rig.events.events import Note, NoteCode
 from rig.search.model import Model, load_model
@@ -15,7 +16,8 @@ class CurrentModel:
     """Loads the enrolled views, and again after a change of the catalog or of its stopping rule.
 
     If the catalog is on a server, it brings the local copy up to date, too. While the server does not answer, the
-    loaded model stays in use, with a note that says how old it is.
+    loaded model stays in use, with a note that says how old it is. A local copy is given up when the server is back;
+    use the model in a ``with`` block, which closes what was opened for that.
 
     Attributes
     ----------
@@ -27,13 +29,23 @@ class CurrentModel:
         self._catalog = catalog
         self._descriptor = descriptor
         self._loaded_state: object = None
-        self._model: Model
+        self._model: Model | None = None
         self._seen = ""
+        self._server: Catalog | None = None
+        self._attempts = Attempts(catalog.clock)
         self.version = ""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._server is not None:
+            self._server.close()
 
     def __call__(self) -> Model:
         """Return the model; errors as `load_model`, and `CatalogUnavailable` if none was loaded before."""
         try:
+            self._leave_copy()
             rules = self._catalog.path / FILE
             changed = self._catalog.database.may_have_changed()
             version = self._catalog.version() if changed or not self.version else self.version
@@ -45,9 +57,22 @@ class CurrentModel:
                     with suppress(RigError):  # the copy is for later; the search itself has its model
                         update_copy(self._catalog)
         except CatalogUnavailable:
-            if self._loaded_state is None:
+            if self._model is None:
                 raise
+            if not self._seen:  # the model of the copy has its note
+                return self._model
             note = Note(NoteCode.LOCAL_COPY, {"copied_utc": self._seen})
             return replace(self._model, notes=(note, *self._model.notes))
-        self._seen = f"{self._catalog.clock.utc():%Y-%m-%d %H:%M:%S} UTC"
+        assert self._model is not None
+        if self._catalog.copied_utc is None:
+            self._seen = f"{self._catalog.clock.utc():%Y-%m-%d %H:%M:%S} UTC"
         return self._model
+
+    def _leave_copy(self) -> None:
+        """Replace a local copy by the catalog itself when its server answers again."""
+        place = self._catalog.copy_of
+        if place is None:
+            return
+        with suppress(RigError):
+            self._server = self._attempts.open(place)
+            self._catalog, self._loaded_state, self.version = self._server, None, ""

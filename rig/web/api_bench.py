@@ -21,6 +21,7 @@ def add_bench(api: APIRouter, server: Server) -> None:
             **server.worker.status,
             "bench": server.bench,
             "server": {"viewers": server.picture.viewers, "listeners": server.hub.listeners},
+            "catalog": server.catalog.state,
             "problem": problem(problem_now) if problem_now else None,
         }
 

@@ -1,6 +1,5 @@
 """The REST API: objects, views, import and export."""
 
-from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated, Any, Final
@@ -24,11 +23,6 @@ UPLOAD: Final = f"{API}/import"
 
 
 def add_catalog(api: APIRouter, server: Server) -> None:
-    @contextmanager
-    def reading() -> Any:
-        with server.open_catalog(True) as catalog:
-            yield catalog
-
     @api.get("/objects", tags=["catalog"])
     def objects(
         request: Request,
@@ -39,7 +33,7 @@ def add_catalog(api: APIRouter, server: Server) -> None:
         deleted: Annotated[bool, Query(description="list the deleted objects that can be restored")] = False,
     ) -> Response:
         """List the objects by name."""
-        with reading() as catalog:
+        with server.catalog.open_to_read() as catalog:
             found = deleted_objects(catalog) if deleted else catalog.objects()
             pictures = {} if deleted else catalog.first_views()
         wanted = search.casefold()
@@ -53,7 +47,7 @@ def add_catalog(api: APIRouter, server: Server) -> None:
     @api.get("/objects/{name:path}", tags=["catalog"])
     def one_object(name: str, _person: Watcher) -> dict[str, Any]:
         """Return an object with its enrollments and views."""
-        with reading() as catalog:
+        with server.catalog.open_to_read() as catalog:
             found = catalog.object(name)
             similar = similar_objects(prepared_views(catalog), found.summary.name) if found.views else None
         return {
@@ -85,7 +79,7 @@ def add_catalog(api: APIRouter, server: Server) -> None:
     @api.patch("/objects/{name:path}", tags=["catalog"])
     def change(name: str, body: ObjectBody, _person: OperatorPerson) -> dict[str, Any]:
         """Rename or label an object."""
-        with server.open_catalog(False) as catalog:
+        with server.catalog.open_to_change() as catalog:
             set_texts(catalog, name, label=body.label, note=body.note)
             if body.name is not None:
                 rename(catalog, name, body.name)
@@ -94,14 +88,14 @@ def add_catalog(api: APIRouter, server: Server) -> None:
     @api.delete("/objects/{name:path}", tags=["catalog"])
     def remove(name: str, _person: OperatorPerson) -> dict[str, Any]:
         """Delete an object. It can be restored until rig catalog gc removes it."""
-        with server.open_catalog(False) as catalog:
+        with server.catalog.open_to_change() as catalog:
             delete(catalog, name)
         return {"deleted": name}
 
     @api.post("/undelete", tags=["catalog"])
     def restore(body: NameBody, _person: OperatorPerson) -> dict[str, Any]:
         """Restore a deleted object."""
-        with server.open_catalog(False) as catalog:
+        with server.catalog.open_to_change() as catalog:
             undelete(catalog, body.name)
             return _summary(catalog.summary(body.name))
 
@@ -113,7 +107,7 @@ def add_catalog(api: APIRouter, server: Server) -> None:
         full: Annotated[bool, Query(description="the stored PNG instead of a small JPEG")] = False,
     ) -> Response:
         """Return the image of a view."""
-        with reading() as catalog:
+        with server.catalog.open_to_read() as catalog:
             view = catalog.view(view_id)
             etag = f'"{view.image_sha256}-{"full" if full else THUMB_PX}"'
             if request.headers.get("if-none-match") == etag:
@@ -147,7 +141,7 @@ def add_catalog(api: APIRouter, server: Server) -> None:
         folder = TemporaryDirectory(prefix="rig-export-")
         path = Path(folder.name) / "catalog.rigcat.zip"
         try:
-            with reading() as catalog:
+            with server.catalog.open_to_read() as catalog:
                 write_bundle(path, read_objects(catalog, name or [one.name for one in catalog.objects()]))
         except BaseException:
             folder.cleanup()
@@ -158,7 +152,7 @@ def add_catalog(api: APIRouter, server: Server) -> None:
 
 
 def _import(server: Server, path: Path, on_conflict: str) -> dict[str, Any]:
-    with server.open_catalog(False) as catalog:
+    with server.catalog.open_to_change() as catalog:
         plan = plan_import(catalog, read_bundle(path), Conflict(on_conflict))
         steps = import_objects(catalog, plan, jobs=1)
         while True:

@@ -80,7 +80,7 @@ def add_records(api: APIRouter, server: Server) -> None:
         outcome: Outcome | None = None,
     ) -> Response:
         """List the recorded answers, the newest first. Filters use the corrected values."""
-        with server.open_catalog(True) as catalog:
+        with server.catalog.open_to_read() as catalog:
             found = find_results(catalog, ResultFilter(sample, object_name, outcome))
         rows = [{**plain_row(one), "id": str(one.id)} for one in found]
         return page_of(request, rows[::-1], "id", limit, after)
@@ -90,7 +90,7 @@ def add_records(api: APIRouter, server: Server) -> None:
         body: CorrectionBody, person: OperatorPerson, result_id: Annotated[int, Field(ge=1, lt=2**62)]
     ) -> dict[str, Any]:
         """Correct the object or the sample of an answer, with the reason. The answer itself stays."""
-        with server.open_catalog(False) as catalog:
+        with server.catalog.open_to_change() as catalog:
             correct(
                 catalog,
                 result_id,
@@ -133,7 +133,7 @@ def add_records(api: APIRouter, server: Server) -> None:
         after: Annotated[str | None, Query(max_length=20)] = None,
     ) -> Response:
         """List the catalog's log, the newest first."""
-        with server.open_catalog(True) as catalog:
+        with server.catalog.open_to_read() as catalog:
             entries = catalog.log()
         rows = [{**plain(entry), "id": str(entry.id), "time_utc": time_text(entry.time_utc)} for entry in entries]
         return page_of(request, rows[::-1], "id", limit, after)

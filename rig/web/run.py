@@ -14,16 +14,16 @@ from typing import Any, Final
 import uvicorn
 
 from rig.bench import Bench, open_bench
-from rig.catalog import Catalog
 from rig.catalog.background import BackgroundCheck
 from rig.config import RigConfig
-from rig.core.clock import Clock, SystemClock
+from rig.core.clock import SystemClock
 from rig.core.errors import RigError, UsageError, os_errors_as
 from rig.core.files import write
 from rig.safety.saved_state import SERVER_FILE, SERVER_FOLDER, BenchLock, ServerAddress
 from rig.web.access import Lease, Sessions, Tokens
 from rig.web.api_catalog import UPLOAD
 from rig.web.app import create_app
+from rig.web.bench_catalog import BenchCatalog
 from rig.web.guard import Guard, PatientProtocol
 from rig.web.hub import Hub
 from rig.web.jobs import JobQueue
@@ -105,7 +105,7 @@ def run_server(
                 )
                 write(folder / SERVER_FILE, address.model_dump_json().encode(), mode=0o600)
                 ready(url)
-                with checked_catalog(server):
+                with checked_catalog(server), server.catalog.background_delivery():
                     server.worker.run()
             finally:
                 (folder / SERVER_FILE).unlink(missing_ok=True)
@@ -125,10 +125,15 @@ def checked_catalog(server: Server) -> AbstractContextManager[object]:
 
     def report(damage: RigError) -> None:
         server.damage = damage
-        with suppress(OSError):
-            print(f"Note: {damage.what}. Next step: {damage.next_step}", file=sys.stderr, flush=True)
+        print_note(f"{damage.what}. Next step: {damage.next_step}")
 
     return BackgroundCheck(place, server.clock, report)
+
+
+def print_note(text: str) -> None:
+    """Print a note on stderr, unless it is closed."""
+    with suppress(OSError):
+        print(f"Note: {text}", file=sys.stderr, flush=True)
 
 
 class _Web(uvicorn.Server):
@@ -169,14 +174,10 @@ def make_server(
     def opened() -> Bench:
         return open_bench(bench, config, seed=seed)
 
-    def catalog(clock_: Clock) -> Catalog:
-        return Catalog.open(config.catalog_place(bench), clock=clock_, create=True)
+    def catalog_changed(values: dict[str, Any]) -> None:
+        hub.publish("catalog", values)
 
-    def catalog_for(read_only: bool) -> Catalog:
-        place = config.catalog_place(bench)
-        create = not place.may_exist()
-        return Catalog.open(place, clock=clock, create=create, read_only=read_only and not create)
-
+    catalog = BenchCatalog(config.catalog_place(bench), clock, catalog_changed, print_note)
     queue = JobQueue(folder, clock, changed, arguments)
     runs = config.catalog_path(bench) / RUNS
     works = Works(catalog, runs, lambda: doctor_findings(bench, config, seed, arguments), seed or 0)
@@ -192,7 +193,7 @@ def make_server(
         sessions=Sessions(tokens, clock),
         lease=Lease(clock, lease_changed),
         runs=runs,
-        open_catalog=catalog_for,
+        catalog=catalog,
         needs_login=listening.needs_login,
         secure_cookies=listening.certfile is not None,
     )

@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -11,11 +10,11 @@ from typing import Annotated, Any, Final
 from fastapi import Depends, Query, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
 
-from rig.catalog import Catalog
 from rig.config import RigConfig
 from rig.core.clock import SystemClock
 from rig.core.errors import Forbidden, LoginRequired, RigError, UsageError
 from rig.web.access import LOCAL, Lease, Person, Role, Sessions
+from rig.web.bench_catalog import BenchCatalog
 from rig.web.hub import Hub
 from rig.web.jobs import JobQueue
 from rig.web.picture import LivePicture
@@ -35,8 +34,8 @@ class Server:
     ----------
     needs_login
         Whether requests need a token: always, unless the server listens to this computer only.
-    open_catalog
-        Opens the bench's catalog; ``True`` for reading only.
+    catalog
+        Opens the bench's catalog.
     damage
         Of the catalog; None if none is known.
     """
@@ -51,7 +50,7 @@ class Server:
     sessions: Sessions
     lease: Lease
     runs: Path
-    open_catalog: Callable[[bool], Catalog]
+    catalog: BenchCatalog
     needs_login: bool
     secure_cookies: bool = False
     damage: RigError | None = None

@@ -10,9 +10,9 @@ from typing import Any, Final, Protocol, assert_never
 from rig.bench import Bench, ObjectAlreadyPlaced, TableClearer
 from rig.calibrations import CalibrationResult
 from rig.catalog import Catalog, ObjectSummary
-from rig.catalog.prepared import prepared_views
+from rig.catalog.shared import comparable_views, journal_words
 from rig.config import RigConfig
-from rig.core.clock import Clock, SystemClock
+from rig.core.clock import SystemClock
 from rig.core.errors import RigError, TableNotEmpty, UsageError, ViewRejected
 from rig.events.events import Enrolled, Event, Failed, Identified, Started, event_dict, plain
 from rig.events.lines import line
@@ -35,6 +35,7 @@ from rig.search.strategies import strategy as strategy_named
 from rig.views.description import PAPER_DESCRIPTOR
 from rig.views.empty_table import empty_table_status
 from rig.views.object_presence import TableWatcher
+from rig.web.bench_catalog import BenchCatalog
 from rig.web.requests import (
     AcknowledgeRequest,
     CalibrateRequest,
@@ -93,8 +94,8 @@ class Works:
 
     Parameters
     ----------
-    open_catalog
-        Opens the bench's catalog for writing, with the clock that dates views.
+    catalog
+        Opens the bench's catalog.
     runs
         Folder of the saved runs.
     examine
@@ -103,7 +104,7 @@ class Works:
         For strategies that draw random numbers.
     """
 
-    open_catalog: Callable[[Clock], Catalog]
+    catalog: BenchCatalog
     runs: Path
     examine: Callable[[], Generator[dict[str, Any], None, None]]
     seed: int = 0
@@ -138,7 +139,7 @@ class Works:
 
     def _enroll(self, context: Context, request: EnrollRequest) -> None:
         bench = context.bench
-        with self.open_catalog(bench.clock) as catalog:
+        with self.catalog.open_to_enroll(bench.clock) as catalog:
             _check_free(catalog, request)
             _refresh_empty_table(context)
             events = enroll(
@@ -151,20 +152,34 @@ class Works:
                 resume=request.resume,
                 replace=request.replace,
             )
-            _run(context, _with_similar_objects(catalog, events))
+            self._run_enrollment(context, catalog, events)
 
     def _tray(self, context: Context, request: TrayRequest) -> None:
         items = tuple(
             TrayItem(number, one.name, one.label, one.note, one.views) for number, one in enumerate(request.objects, 1)
         )
-        with self.open_catalog(context.bench.clock) as catalog:
+        with self.catalog.open_to_enroll(context.bench.clock) as catalog:
             _refresh_empty_table(context)
             events = enroll_tray(context.bench, catalog, items, views=request.views, operator=_BrowserOperator(context))
-            _run(context, _with_similar_objects(catalog, events))
+            self._run_enrollment(context, catalog, events)
+
+    def _run_enrollment(self, context: Context, catalog: Catalog, events: Generator[Event, None, object]) -> None:
+        """Report the events; name similar objects, and deliver each object to the server of the catalog, if any."""
+        with closing(events):
+            for event in events:
+                if isinstance(event, Enrolled):  # it is stored now; Enrolled stays its last event
+                    _report(context, similar_objects(comparable_views(catalog, event.name), event.name))
+                _report(context, event)
+                if isinstance(event, Started) and (words := journal_words(catalog)):
+                    context.note(words)
+                if isinstance(event, Enrolled):
+                    for words in self.catalog.deliver():
+                        context.note(words)
+                        context.job.result_text = f"{context.job.result_text}\n{words}"
 
     def _dry_run(self, context: Context, request: DryRunRequest) -> None:
         names = {one.name: one.views for one in request.objects}
-        with self.open_catalog(context.bench.clock) as catalog:
+        with self.catalog.open_to_enroll(context.bench.clock) as catalog:
             found = dry_run(
                 context.bench, catalog, names, views=request.views, resume=request.resume, replace=request.replace
             )
@@ -184,8 +199,10 @@ class Works:
         chosen = None if name is None else strategy_named(name)
         operator = bench.operator
         try:
-            with self.open_catalog(bench.clock) as catalog:
-                model = CurrentModel(catalog, None if chosen is None else descriptor_for(chosen))
+            with (
+                self.catalog.open_to_read() as catalog,
+                CurrentModel(catalog, None if chosen is None else descriptor_for(chosen)) as model,
+            ):
                 known = model()  # report a catalog that cannot be searched before anything moves
                 if request.watch and isinstance(operator, ObjectAlreadyPlaced):
                     bench.operator = TableWatcher(bench)
@@ -198,7 +215,7 @@ class Works:
                     events = identify(bench, known, strategy=chosen, seed=self.seed)
                 if bench.config.identify.record != "none":
                     recorder = ResultRecorder(
-                        *(catalog.place, bench),
+                        *(self.catalog.place, bench),
                         clock=SystemClock(),
                         catalog_version=lambda: model.version,
                         operator=context.job.operator,
@@ -257,18 +274,13 @@ def _run(context: Context, events: Generator[Event, None, object]) -> None:
     """Report the events of a plan; an operator who cancels closes the plan, and so the torque goes off."""
     with closing(events):
         for event in events:
-            context.add(event)
-            if isinstance(event, Enrolled | Identified):
-                context.job.result, context.job.result_text = event_dict(event), line(event)
+            _report(context, event)
 
 
-def _with_similar_objects(catalog: Catalog, events: Generator[Event, None, object]) -> Generator[Event, None, None]:
-    """Yield the events; before each `Enrolled`, the objects that look similar."""
-    with closing(events):
-        for event in events:
-            if isinstance(event, Enrolled):
-                yield similar_objects(prepared_views(catalog), event.name)
-            yield event
+def _report(context: Context, event: Event) -> None:
+    context.add(event)
+    if isinstance(event, Enrolled | Identified):
+        context.job.result, context.job.result_text = event_dict(event), line(event)
 
 
 def _saved(
@@ -298,7 +310,7 @@ def _saved(
 
 def _check_free(catalog: Catalog, request: EnrollRequest) -> None:
     """Reject a name that is in use before the table is cleared or moves."""
-    known = {summary.name: summary for summary in catalog.objects()}.get(request.name)
+    known = {summary.name: summary for summary in catalog.known_objects()}.get(request.name)
     if known is None or request.resume or request.replace:
         return
     if known.unfinished_views is not None:

@@ -73,6 +73,10 @@ class PostgresServer:
     def url(self) -> str:
         return f"postgresql+psycopg://rig@/postgres?host={self.folder}"
 
+    @property
+    def runs(self) -> bool:
+        return self._process is not None
+
     def start(self) -> None:
         """Start the server, and return when it answers."""
         with (self.folder / "log").open("ab") as log:

@@ -16,7 +16,6 @@ from rig.cli.ui.settings import Settings
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from hbr import Views
     from rig.bench import Bench
     from rig.catalog import Catalog
     from rig.events.events import Event
@@ -171,7 +170,7 @@ class _Job:
 
     def run(self, events: Any, how_to_continue: list[str], report: Path | None) -> None:
         """Run the plan to its end; after an interruption print how to continue."""
-        from rig.catalog.prepared import prepared_views
+        from rig.catalog.shared import comparable_views
         from rig.cli.ui.jobs import progress_bar
         from rig.events.events import Enrolled, Item
         from rig.plans.similar_objects import similar_objects
@@ -183,7 +182,7 @@ class _Job:
                     self._heading = f"{event.number} of {event.of} "
                 if isinstance(event, Enrolled):  # it is in the catalog now; Enrolled stays its last event
                     with progress_bar("Preparing objects for searches") as progress:
-                        views = self._others(prepared_views(self._catalog, progress=progress), event.name)
+                        views = comparable_views(self._catalog, event.name, progress=progress)
                     self._show(similar_objects(views, event.name))
                 self._show(event)
                 if isinstance(event, Enrolled):
@@ -237,33 +236,10 @@ class _Job:
 
     def _report_journal(self) -> None:
         """Say that the server of the catalog does not answer, and that the views are stored all the same."""
-        from rig.catalog.journal import Journal
+        from rig.catalog.shared import journal_words
 
-        if isinstance(self._catalog, Journal) and self._catalog.unreachable is not None:
-            error = self._catalog.unreachable
-            text = f"Note: {error.what}. The views go into the journal of this computer. Next step: {error.next_step}"
-            print(text, file=sys.stderr)
-
-    def _others(self, views: "Views", name: str) -> "Views":
-        """Return the views of the journal's object with those of the server or of its local copy, if it is in one."""
-        import numpy as np
-
-        import hbr
-        from rig.catalog.journal import Journal
-        from rig.catalog.prepared import prepared_views
-        from rig.core.errors import RigError
-
-        if not isinstance(self._catalog, Journal):
-            return views
-        own = views.select(views.object_index == views.object_names.index(name))
-        own = hbr.Views.of_object(name, own.descriptors, own.azimuth_deg, own.descriptor)
-        try:
-            with self._settings.open_shared() as shared:
-                others = prepared_views(shared)
-        except RigError:  # no server, and no copy yet
-            return views
-        kept = others.select(np.array([one != name for one in others.object_names], bool)[others.object_index])
-        return hbr.Views.concatenate([own, kept])
+        if words := journal_words(self._catalog):
+            print(f"Note: {words}", file=sys.stderr)
 
     def _complete(self) -> None:
         """Add the views of earlier sessions to the record of a resumed enrollment."""
@@ -343,7 +319,7 @@ def _dry_run(
     from rig.events.events import plain
     from rig.plans.estimate import dry_run
 
-    with settings.open_bench() as bench, settings.catalog_there() or nullcontext() as catalog:
+    with settings.open_bench() as bench, settings.catalog_to_plan(bench.clock) or nullcontext() as catalog:
         found = dry_run(bench, catalog, names, views=views, resume=resume, replace=replace)
     if settings.json:
         settings.print_json({"dry_run": plain(found)})

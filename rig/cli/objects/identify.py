@@ -2,7 +2,7 @@
 
 import sys
 from collections.abc import Callable, Generator
-from contextlib import nullcontext
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -96,13 +96,17 @@ def identify(
     screen = console(stderr=settings.json)
     answer = None
     events: Generator[Event, None, object]
-    with settings.open_for_search() as catalog:
-        model = CurrentModel(catalog, None if chosen is None else descriptor_for(chosen))
+    with (
+        settings.open_for_search() as catalog,
+        CurrentModel(catalog, None if chosen is None else descriptor_for(chosen)) as model,
+    ):
         known = model()  # report a catalog that cannot be searched before the bench is opened
         if scan and not watch:
             sample = ask_sample()
-        check = settings.background_check() if watch else nullcontext()
-        with settings.open_bench() as bench, IdentifyView(screen, keys=not scan) as view, check:
+        with ExitStack() as beside, settings.open_bench() as bench, IdentifyView(screen, keys=not scan) as view:
+            if watch:
+                beside.enter_context(settings.background_check())
+                beside.enter_context(settings.background_delivery())
             # Prepare: notes about the catalog, the operator, the empty-table image.
             report_other_regions(settings, catalog, bench)
             seed = settings.seed or 0

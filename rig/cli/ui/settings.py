@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from rig.catalog import Action, Catalog
     from rig.catalog.background import BackgroundCheck
     from rig.catalog.delivery import Delivery
+    from rig.catalog.shared import BackgroundDelivery
     from rig.config import RigConfig
     from rig.core.clock import Clock
 
@@ -108,10 +109,14 @@ class Settings:
 
     def open_for_enrollment(self, clock: "Clock") -> "Catalog":
         """Open the catalog for new views: the journal of this computer if the catalog is on a server."""
-        from rig.catalog.journal import Journal
+        from rig.catalog.shared import open_for_enrollment
 
+        return open_for_enrollment(self.load().catalog_place(self.bench_name), clock)
+
+    def catalog_to_plan(self, clock: "Clock") -> "Catalog | None":
+        """Open the catalog that an enrollment would use; None if there is none yet."""
         place = self.load().catalog_place(self.bench_name)
-        return self.open_catalog(clock=clock, create=True) if place.url is None else Journal.of(place, clock)
+        return self.catalog_there() if place.url is None else self.open_for_enrollment(clock)
 
     def deliver_waiting(self) -> None:
         """Deliver the journal if something is in it."""
@@ -126,8 +131,7 @@ class Settings:
 
         If the server cannot be used, print a note: the journal keeps everything. With ``now`` raise the error.
         """
-        from rig.catalog.delivery import deliver as job
-        from rig.catalog.journal import Journal
+        from rig.catalog.shared import deliver_journal, delivery_words, failure_words
         from rig.core.clock import SystemClock
         from rig.core.errors import CatalogBusy, CatalogError
 
@@ -135,20 +139,22 @@ class Settings:
         if place.url is None:
             return []
         try:
-            with Journal.of(place, SystemClock()) as journal, self.open_catalog(create=True) as server:
-                done = job(journal, server, replacing=replacing)
+            done = deliver_journal(place, SystemClock(), replacing=replacing)
         except (CatalogError, CatalogBusy) as error:
             if now:
                 raise
-            kept = "What is in the journal of this computer is delivered later"
-            print(f"Note: {error.what}. {kept}. Next step: {error.next_step}", file=sys.stderr)
+            print(f"Note: {failure_words(error)}", file=sys.stderr)
             return []
         for one in done:
-            if one.conflict is not None:
-                print(f"Note: {one.conflict.what}. Next step: {one.conflict.next_step}", file=sys.stderr)
-            else:
-                print(f"Delivered {one.name} with {one.views} views to {place}.", file=sys.stderr)
+            print(f"{'' if one.conflict is None else 'Note: '}{delivery_words(one, place)}", file=sys.stderr)
         return done
+
+    def background_delivery(self) -> "BackgroundDelivery":
+        """Return a delivery of the journal beside the work of a ``with`` block; what becomes of it is on stderr."""
+        from rig.catalog.shared import BackgroundDelivery
+        from rig.core.clock import SystemClock
+
+        return BackgroundDelivery(self.load().catalog_place(self.bench_name), SystemClock(), _report)
 
     def background_check(self) -> "BackgroundCheck":
         """Return a check of the bench's catalog beside the work of a ``with`` block; damage is printed on stderr."""
@@ -156,8 +162,7 @@ class Settings:
         from rig.core.clock import SystemClock
 
         def report(damage: RigError) -> None:
-            with suppress(OSError):  # stderr is closed
-                print(f"Note: {damage.what}. Next step: {damage.next_step}", file=sys.stderr, flush=True)
+            _report(f"{damage.what}. Next step: {damage.next_step}")
 
         return BackgroundCheck(self.load().catalog_place(self.bench_name), SystemClock(), report)
 
@@ -199,3 +204,8 @@ class Settings:
     def print_json(self, value: Any) -> None:
         """Print one line of JSON on stdout, at once."""
         print(json.dumps(value, ensure_ascii=False, allow_nan=False, default=str), flush=True)
+
+
+def _report(text: str) -> None:
+    with suppress(OSError):  # stderr is closed
+        print(f"Note: {text}", file=sys.stderr, flush=True)

@@ -93,7 +93,7 @@ const tell = (kind, data) => (listeners[kind] || []).forEach((listener) => liste
 /** Listen to the server. The browser reconnects by itself, and sends the last event id. */
 export function listen() {
   const source = new EventSource(`${API}/events`);
-  for (const kind of ["plan", "job", "status", "lease", "stop"]) {
+  for (const kind of ["plan", "job", "status", "lease", "stop", "catalog"]) {
     source.addEventListener(kind, (event) => tell(kind, JSON.parse(event.data)));
   }
   source.addEventListener("hello", (event) => tell("hello", JSON.parse(event.data)));
@@ -121,6 +121,14 @@ on("status", (status) => {
   const [words, kind] = stateWords(status);
   $("state").textContent = words;
   $("state").className = `state ${kind}`;
+});
+
+/** Say what the catalog's server does not have, and how old the local copy is. */
+on("catalog", (state) => {
+  const words = [...state.reasons];
+  if (state.local_copy_utc) words.unshift(`The server of the catalog does not answer. The pages and searches use the copy of ${state.local_copy_utc}.`);
+  if (state.waiting) words.push(`Waiting in the journal of the bench's computer: ${state.waiting}.`);
+  $("catalog-state").replaceChildren(...words.map((text) => h("p", {}, text)));
 });
 
 async function loadMe() {
@@ -262,6 +270,11 @@ export function table(element, head, rows) {
 
 export async function start() {
   await act(loadMe); // leads to the login if there is none
-  on("hello", () => act(async () => { await loadMe(); tell("status", await request("GET", "/status")); }));
+  on("hello", () => act(async () => {
+    await loadMe();
+    const status = await request("GET", "/status");
+    tell("status", status);
+    tell("catalog", status.catalog);
+  }));
   listen();
 }

@@ -141,7 +141,7 @@ def test_lists_have_pages_and_etags(serve):
 
 def test_damage_of_the_catalog_is_in_the_status(serve, capsys):
     served = serve()
-    with served.server.open_catalog(False) as catalog, catalog.database.write() as connection:
+    with served.server.catalog.open_to_change() as catalog, catalog.database.write() as connection:
         connection.exec_driver_sql("INSERT INTO objects (name, label, note, created_utc) VALUES ('a', '', '', '')")
     assert served.client.get(f"{API}/status").json()["problem"] is None
     with checked_catalog(served.server) as check:
