@@ -5,6 +5,7 @@ with the median of the other views: behind the object most of them show the back
 median can show the object, too, and weighs it with what it sees.
 """
 
+from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
@@ -50,6 +51,22 @@ class LearnedBackground:
             return None
         if len(others) > _MOST:  # spread over all of them
             others = [others[n * len(others) // _MOST] for n in range(_MOST)]
-        return Background.learned(
-            np.median(np.stack([self._small[n] for n in others]), axis=0).astype(np.uint8), self._shape
-        )
+        return Background.learned(median([self._small[n] for n in others]), self._shape)
+
+
+def median(images: Sequence[ImageArray]) -> ImageArray:
+    """Return the median of each value of at most a few images of one shape, uint8, rounded down.
+
+    The images are sorted up to their middle by pairwise minima and maxima, which is ten times faster than a partition
+    of each pixel.
+    """
+    ranked = [image.copy() for image in images]
+    middle = len(ranked) // 2
+    for rank in range(middle + 1):
+        for n in range(len(ranked) - 1, rank, -1):
+            lower = np.minimum(ranked[n - 1], ranked[n])
+            np.maximum(ranked[n - 1], ranked[n], out=ranked[n])
+            ranked[n - 1] = lower
+    if len(ranked) % 2:
+        return ranked[middle]
+    return ((ranked[middle - 1].astype(np.uint16) + ranked[middle]) // 2).astype(np.uint8)

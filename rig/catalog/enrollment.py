@@ -15,7 +15,7 @@ from rig.catalog.records import EnrollmentStatus, ImageFile, Session, StoredView
 from rig.catalog.rows import NewView, empty_table_columns, insert_views, measured, supersede, unfinished_and_complete
 from rig.catalog.schema import enrollments, objects, sessions, views
 from rig.catalog.seal import changing_enrollments
-from rig.catalog.together import describe_together, object_descriptors, stored_images, write_described
+from rig.catalog.together import HeldImages, describe_together, object_descriptors, stored_images, write_described
 from rig.core.clock import Clock
 from rig.core.errors import CatalogError, UsageError
 from rig.views import image_files as images
@@ -45,6 +45,9 @@ class Enrollment:
     object_name: str
     session: Session
     planned_azimuth_deg: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        self._held = HeldImages(self._database.images)  # of this session: `revise` does not decode them again
 
     @property
     def folder(self) -> Path:
@@ -102,6 +105,7 @@ class Enrollment:
             new = NewView(index, measured(record), self.session.id, captured_utc, image, packed)
             with changing_enrollments(connection, [self.id]):
                 (view_id,) = insert_views(connection, self.id, [new])
+        self._held.hold(image.path, image_bgr)
         return StoredView(
             id=view_id,
             object_name=self.object_name,
@@ -127,6 +131,7 @@ class Enrollment:
                 connection.execute(
                     update(sessions).where(sessions.c.id == self.session.id).values(empty_table_columns(image))
                 )
+        self._held.hold(image.path, image_bgr)
         self.session = replace(self.session, empty_table_image=image.path)
 
     def revise(self) -> int:
@@ -147,7 +152,7 @@ class Enrollment:
             images = stored_images(connection, self.id)
         if not names:
             return 0
-        found = describe_together(self._database.images, names, images)
+        found = describe_together(self._held, names, images)
         for one in found:
             if one.reason:
                 raise CatalogError(

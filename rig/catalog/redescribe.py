@@ -21,7 +21,7 @@ from rig.catalog.jobs import JobProgress, portions_of_groups, processes
 from rig.catalog.records import EnrollmentStatus, JsonObject, Region
 from rig.catalog.schema import descriptors, enrollments, objects, sessions, views
 from rig.catalog.seal import changing_enrollments
-from rig.catalog.together import Described, StoredImage, describe_together, needs_segmentation, write_described
+from rig.catalog.together import Described, HeldImages, StoredImage, describe_together, needs_segmentation, write_described
 from rig.core.errors import CatalogError, UsageError
 from rig.core.processes import Jobs, map_in_processes
 from rig.views.description import PAPER_DESCRIPTOR
@@ -192,7 +192,7 @@ def _describe(store: ImageStore, portion: tuple[_Item, ...]) -> list[Described]:
     for (together, _), group in groupby(portion, _group):
         own = list(group)
         if together:
-            found += describe_together(store, own[0].names, [item.view for item in own])
+            found += describe_together(HeldImages(store), own[0].names, [item.view for item in own])
         else:
             found += [_describe_one(store, item) for item in own]
     return found

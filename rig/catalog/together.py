@@ -7,6 +7,8 @@ from collections.abc import Iterable, Sequence
 from itertools import groupby
 from typing import Any, Final, NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
 from sqlalchemy import Connection, and_, bindparam, delete, insert, or_, select, update
 
 from hbr.descriptors import descriptor
@@ -23,6 +25,9 @@ from rig.views.description import EnrollmentDescriber
 
 FEWEST_VIEWS: Final = 4
 """A session with fewer views, after an interruption, learns its background from all views of the enrollment."""
+
+MOST_HELD_BYTES: Final = 256_000_000
+"""Pixels of one enrollment that are held in memory: 277 views of 640x480."""
 
 
 class StoredImage(NamedTuple):
@@ -52,7 +57,30 @@ def needs_segmentation(segmentation: JsonObject | None) -> bool:
     return TOGETHER not in segmentation and segmentation.get("method") in (Method.GUESS, Method.NONE)
 
 
-def describe_together(store: ImageStore, names: tuple[str, ...], items: Sequence[StoredImage]) -> list[Described]:
+class HeldImages:
+    """Pixels of stored images, held up to `MOST_HELD_BYTES`, because decoding takes longer than describing."""
+
+    def __init__(self, store: ImageStore) -> None:
+        self._store = store
+        self._pixels: dict[str, NDArray[np.uint8]] = {}
+        self._bytes = 0
+
+    def hold(self, image: str, pixels: NDArray[np.uint8]) -> None:
+        """Hold the pixels of an image, uint8 (H, W, 3) BGR, if there is room. The caller does not change them."""
+        if image not in self._pixels and self._bytes + pixels.nbytes <= MOST_HELD_BYTES:
+            self._pixels[image] = pixels
+            self._bytes += pixels.nbytes
+
+    def pixels(self, image: str, sha256: str) -> NDArray[np.uint8]:
+        """Return the pixels of an image; errors as `ImageStore.pixels`."""
+        if image not in self._pixels:
+            pixels = self._store.pixels(image, sha256)
+            self.hold(image, pixels)
+            return pixels
+        return self._pixels[image]
+
+
+def describe_together(held: HeldImages, names: tuple[str, ...], items: Sequence[StoredImage]) -> list[Described]:
     """Describe the views of one enrollment by these descriptors, in their order."""
     found: dict[int, Described] = {}
     for _, group in groupby(sorted(items, key=_session), _session):
@@ -60,7 +88,7 @@ def describe_together(store: ImageStore, names: tuple[str, ...], items: Sequence
         region, empty_table = own[0].region, own[0].empty_table
         learned_from = own if len(own) >= FEWEST_VIEWS else [one for one in items if one.region == region]
         try:
-            table = None if empty_table is None else store.pixels(*empty_table)
+            table = None if empty_table is None else held.pixels(*empty_table)
         except CatalogError as error:
             found |= {one.view_id: Described(one.view_id, reason=error.what) for one in own}
             continue
@@ -68,14 +96,14 @@ def describe_together(store: ImageStore, names: tuple[str, ...], items: Sequence
         numbers: dict[int, int] = {}
         for one in learned_from:
             try:
-                numbers[one.view_id] = describer.learn(store.pixels(one.image, one.sha256))
+                numbers[one.view_id] = describer.learn(held.pixels(one.image, one.sha256))
             except (CatalogError, UsageError, ValueError) as error:
                 found.setdefault(one.view_id, Described(one.view_id, reason=_reason(error)))
         for one in own:
             if one.view_id not in numbers:
                 continue
             try:
-                described = describer.describe(numbers[one.view_id], store.pixels(one.image, one.sha256))
+                described = describer.describe(numbers[one.view_id], held.pixels(one.image, one.sha256))
             except (CatalogError, UsageError, ValueError) as error:
                 found[one.view_id] = Described(one.view_id, reason=_reason(error))
                 continue
