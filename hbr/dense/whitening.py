@@ -58,8 +58,20 @@ class Whitening:
         return white
 
     def unit(self, levels: LevelArray) -> FloatArray:
-        """Return whitened descriptions of unit length, (n, d), of levels, uint8 (n, length)."""
-        return unit_rows(self.white(levels))
+        """Return whitened descriptions of unit length, (n, d), of levels, uint8 (n, length).
+
+        A search asks for the same few rows after each view: they are computed once.
+        """
+        if len(levels) > _MOST_REMEMBERED // 8:
+            return unit_rows(self.white(levels))
+        keys = [row.tobytes() for row in levels]
+        if len(self._known) > _MOST_REMEMBERED:
+            self._known = {}
+        known = self._known  # of this call, even if another thread begins a new one
+        missing = {key: i for i, key in enumerate(keys) if key not in known}
+        if missing:
+            known.update(zip(missing, unit_rows(self.white(levels[list(missing.values())])), strict=True))
+        return np.stack([known[key] for key in keys])
 
     def without(self, rows: IndexArray) -> "WhiteningWithout":
         """Return the whitening as if these views were not enrolled."""
