@@ -8,6 +8,7 @@ Decision: docs/decisions/0025.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Final
 
 import numpy as np
@@ -103,16 +104,23 @@ class Belief:
         return azimuth_deg
 
     def posterior(self, beta: float = BETA) -> FloatArray:
-        """Return the probability of every hypothesis, (k, 72): proportional to exp(β A / √n).
+        """Return the probability of every hypothesis, (k, 72), not to be changed: proportional to exp(β A / √n).
 
         The root reduces it: views of one object are not independent, and each adds less than the one before. Weights
         say that already, so that with them there is no root.
         """
-        root = np.sqrt(self.queries) if self.weights is None else 1.0
-        exponent = self.support.astype(np.float64) * (beta / root)
-        weights = np.exp(exponent - exponent.max())
-        probability: FloatArray = weights / weights.sum()
-        return probability
+        if beta not in self._posteriors:  # the stopping rule and the next view ask for the same one
+            root = np.sqrt(self.queries) if self.weights is None else 1.0
+            exponent = self.support.astype(np.float64) * (beta / root)
+            weights = np.exp(exponent - exponent.max())
+            probability: FloatArray = weights / weights.sum()
+            probability.flags.writeable = False
+            self._posteriors[beta] = probability
+        return self._posteriors[beta]
+
+    @cached_property
+    def _posteriors(self) -> dict[float, FloatArray]:
+        return {}
 
 
 @dataclass(frozen=True, eq=False)

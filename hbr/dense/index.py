@@ -15,7 +15,7 @@ from functools import cached_property
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from hbr.core.angles import size_deg, wrap360
 from hbr.core.arrays import FloatArray, IndexArray, LevelArray
@@ -189,13 +189,21 @@ class DenseIndex:
         """Number of views of each object."""
         return self._segments.lengths
 
-    def nearest_views(self, place: int, at_deg: ArrayLike, count: int) -> IndexArray:
-        """Return the rows of an object's views that are nearest to azimuths, (..., count); of fewer, some twice."""
-        begin = self._segments.begin[place]
-        rows = self._segments.order[begin : begin + self._segments.lengths[place]]
-        away_deg = size_deg(self.views.azimuth_deg[rows] - np.asarray(at_deg)[..., None])
-        nearest = np.argsort(away_deg, axis=-1, kind="stable")[..., np.arange(count) % len(rows)]
-        return rows[nearest]
+    def nearest_views(self, places: IndexArray, at_deg: FloatArray, count: int) -> IndexArray:
+        """Return the rows of the views that are nearest to azimuths, (m, n, count), for objects (m,) and (m, n).
+
+        Of equally near views, the one with the smaller azimuth comes first. Of fewer views, some stand there twice.
+        """
+        away_deg = size_deg(self.azimuth_deg[places, None] - at_deg[..., None])
+        away_deg[np.broadcast_to(self.left_out[places, None], away_deg.shape)] = np.inf
+        nearest = np.empty((*at_deg.shape, count), np.intp)
+        for n in range(count):  # faster than a sort: only a few are wanted
+            nearest[..., n] = away_deg.argmin(axis=2)
+            np.put_along_axis(away_deg, nearest[..., n : n + 1], np.inf, axis=2)
+        again = np.arange(count) % self._segments.lengths[places, None]
+        nearest = np.take_along_axis(nearest, np.broadcast_to(again[:, None], nearest.shape), axis=2)
+        rows: IndexArray = self.rows[places[:, None, None], nearest]
+        return rows
 
     def nearest_view(self, place: IndexArray, at_deg: FloatArray) -> tuple[IndexArray, FloatArray]:
         """Return the view of each object, (m,), that is nearest to an azimuth, (a, m), and how far away it is.

@@ -81,8 +81,7 @@ def evidence(
         units = [index.whitening.unit(np.atleast_2d(query)) for query in queries]
     pose_deg = support[order].argmax(axis=1) * _BIN_DEG
     rotated_deg = orientation_deg - orientation_deg[0]
-    places = zip(order.tolist(), pose_deg.tolist(), strict=True)
-    rows = np.stack([index.nearest_views(place, at_deg + rotated_deg, _NEXT) for place, at_deg in places])
+    rows = index.nearest_views(order, pose_deg[:, None] + rotated_deg, _NEXT)
     near = index.whitening.unit(index.views.levels(rows.ravel())) if enrolled is None else enrolled(rows.ravel())
     near = near.reshape(*rows.shape, -1)
     white = np.zeros(len(order))

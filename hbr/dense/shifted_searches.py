@@ -75,7 +75,7 @@ def shifted_searches(
     """
     kind = descriptor(index.views.descriptor)
     rng = np.random.default_rng(_SEED)
-    rows_of = [index.nearest_views(place, 0.0, int(count)) for place, count in enumerate(index.view_counts)]
+    rows_of = [index.rows[place, :count] for place, count in enumerate(index.view_counts)]
     places = [place for place, rows in enumerate(rows_of) if len(rows) >= max(2, views)]
     if not places:
         raise ValueError(f"no object has {max(2, views)} views; enroll more of each, or search with fewer views")
@@ -87,7 +87,6 @@ def shifted_searches(
             progress(n, searches)
         place = places[n % len(places)]
         rows = rows_of[place]
-        rows = rows[np.argsort(index.views.azimuth_deg[rows], kind="stable")]
         azimuth_deg = index.views.azimuth_deg[rows]
         chosen = spread(azimuth_deg, int(rng.integers(len(rows))), views)
         # a different strength in each round, and for neighbouring objects

@@ -71,7 +71,7 @@ class Whitening:
         missing = {key: i for i, key in enumerate(keys) if key not in known}
         if missing:
             known.update(zip(missing, unit_rows(self.white(levels[list(missing.values())])), strict=True))
-        return np.stack([known[key] for key in keys])
+        return np.array([known[key] for key in keys])
 
     def without(self, rows: IndexArray) -> "WhiteningWithout":
         """Return the whitening as if these views were not enrolled."""

@@ -21,7 +21,14 @@ from rig.catalog.jobs import JobProgress, portions_of_groups, processes
 from rig.catalog.records import EnrollmentStatus, JsonObject, Region
 from rig.catalog.schema import descriptors, enrollments, objects, sessions, views
 from rig.catalog.seal import changing_enrollments
-from rig.catalog.together import Described, HeldImages, StoredImage, describe_together, needs_segmentation, write_described
+from rig.catalog.together import (
+    Described,
+    HeldImages,
+    StoredImage,
+    describe_together,
+    needs_segmentation,
+    write_described,
+)
 from rig.core.errors import CatalogError, UsageError
 from rig.core.processes import Jobs, map_in_processes
 from rig.views.description import PAPER_DESCRIPTOR
