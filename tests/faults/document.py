@@ -12,7 +12,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from sim.faults import fault_kinds
-from tests.faults.fault_runs import SHORT, VIEWS, Outcome, answer, enrollment, identification, new_rig
+from tests.faults.fault_runs import LATE, SHORT, VIEWS, Outcome, answer, enrollment, identification, new_rig
 from tests.faults.scenarios import SCENARIOS, Scenario
 
 PAGE = Path(__file__).parents[2] / "docs" / "faults.md"
@@ -35,8 +35,8 @@ This page lists the faults that the simulator can produce. For each fault it sho
 and how to recover.
 
 Each row is a test (`pytest tests/faults/test_every_fault.py -k jam`). With the real drivers on the simulated bench, the
-test runs an enrollment of {VIEWS} views ({SHORT} if the fault does not stop it) and an identification. Both complete or
-stop with the error code in the row. Afterwards:
+test runs an enrollment of {VIEWS} views ({SHORT} if the fault does not stop it, {LATE} if the last view shows it)
+and an identification. Both complete or stop with the error code in the row. Afterwards:
 
 - The table stands still and the servo's torque is off. Only a servo that cannot be reached holds the table.
 - No view that was reported as stored is lost or damaged.
@@ -114,8 +114,8 @@ def documented() -> dict[str, tuple[str, ...]]:
 
 
 def planned_views(scenario: Scenario) -> int:
-    """Return how many views the enrollment plans: a full revolution in small moves, or few if nothing stops it."""
-    return SHORT if scenario.code is None else VIEWS
+    """Return how many views the enrollment plans: in small moves, or few if nothing stops it there."""
+    return SHORT if scenario.code is None else LATE if scenario.late else VIEWS
 
 
 def measure(name: str) -> tuple[str, ...]:

@@ -31,8 +31,10 @@ from sim.world import World
 from tests.faults.angle_code import Coded, coded_deg
 
 VIEWS = 72
-SHORT = 12
+SHORT = 6
 """Views of an enrollment that need not be longer."""
+LATE = 24
+"""Views of an enrollment that detects the fault only at its end."""
 NAME = "toy-car"
 KNOWN = (NAME, "cereal-puzzle", "dice")
 NOISE = NoiseModel(full_well_e=0, read_noise_e=0)

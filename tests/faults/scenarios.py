@@ -56,6 +56,8 @@ class Scenario:
         Whether the stored images show the object, and with it the angle.
     torque
         Whether the servo's torque stays on because the servo cannot be reached.
+    late
+        Whether the enrollment detects the fault only at its end, however large its moves are.
     """
 
     fault: str
@@ -68,6 +70,7 @@ class Scenario:
     step: Step | None = None
     shown: bool = True
     torque: bool = False
+    late: bool = False
 
     @property
     def name(self) -> str:
@@ -232,6 +235,7 @@ SCENARIOS: dict[str, Scenario] = {
             after=After.REPLACE,
             answer=FOUND,
             shown=False,
+            late=True,
         ),
         stopped("disk_full@move3", 700, "a write fails", "free some disk space", answer=FOUND),
         survived("clock_jump@view3", "not detected: durations use the monotonic clock", identify="clock_jump@view0"),
