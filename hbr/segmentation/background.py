@@ -8,7 +8,7 @@ Decision: docs/decisions/0024.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Final
 
 import cv2
@@ -117,13 +117,6 @@ class Background:
     empty_table_bgr : uint8 array (H, W, 3)
         The table without an object, from the same camera position as the frames. The light may differ.
 
-    Attributes
-    ----------
-    correction : Illumination or None
-        Makes a plain backdrop grey; None if its colour cannot be taken for grey.
-    issue : IssueCode or None
-        Why the correction is missing or incomplete.
-
     Raises
     ------
     TypeError, ValueError
@@ -155,7 +148,16 @@ class Background:
         self._grey_levels = small
         self._log = _logarithm(small)
         self._useful = _useful(small)
-        self.correction, self.issue = self._backdrop_correction()
+
+    @property
+    def correction(self) -> Illumination | None:
+        """Makes a plain backdrop grey; None if its colour cannot be taken for grey."""
+        return self._backdrop[0]
+
+    @property
+    def issue(self) -> IssueCode | None:
+        """Why the correction is missing or incomplete."""
+        return self._backdrop[1]
 
     def difference(self, small: ImageArray) -> Difference:
         """Compare a small frame, as `shrunk` returns it, with the empty-table image."""
@@ -189,7 +191,8 @@ class Background:
             return difference.correction
         return Illumination(difference.correction.slopes + self.correction.slopes)
 
-    def _backdrop_correction(self) -> tuple[Illumination | None, IssueCode | None]:
+    @cached_property
+    def _backdrop(self) -> tuple[Illumination | None, IssueCode | None]:
         """Return the correction that makes a plain, nearly grey backdrop grey, and what prevents it or a part of it."""
         cells = [
             np.median(cell[ok], axis=0)
@@ -265,11 +268,12 @@ def _fit(ratio: Floats, useful: Mask) -> FloatArray:
     basis = np.column_stack([np.ones(len(rows)), x, y])
     values = ratio[2::_EVERY, 2::_EVERY][keep].astype(np.float64)
     slopes = np.zeros((3, 3))
-    slopes[0] = np.median(values, axis=0)
+    slopes[0] = np.median(np.ascontiguousarray(values.T), axis=1)
     quarter = len(values) // 4
     for tolerance in (0.35, 0.2, 0.12, 0.12):
-        away = np.abs(values - basis @ slopes).max(axis=1)
-        inlier = away <= max(tolerance, float(np.partition(away, quarter)[quarter]))
-        gram = basis[inlier].T @ basis[inlier] + 1e-9 * np.eye(3)
-        slopes = np.linalg.solve(gram, basis[inlier].T @ values[inlier])
+        away = np.maximum.reduce(np.abs(values - basis @ slopes).T)
+        inlier = np.flatnonzero(away <= max(tolerance, float(np.partition(away, quarter)[quarter])))
+        own = basis.take(inlier, axis=0)
+        gram = own.T @ own + 1e-9 * np.eye(3)
+        slopes = np.linalg.solve(gram, own.T @ values.take(inlier, axis=0))
     return slopes
