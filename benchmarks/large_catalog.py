@@ -1,25 +1,39 @@
 """Builds a catalog of 1,000 objects with 72 views, with the records of a real bench and tiny images.
 
-python -m benchmarks.large_catalog FOLDER [OBJECTS]
+python -m benchmarks.large_catalog FOLDER [OBJECTS] [--images]
 
-All objects but the first are copies of its records, with descriptors of their own and without images.
+All objects but the first are copies of its records, with descriptors of their own and without images. With
+``--images`` each view has an image, for `rig catalog verify` and `redescribe`: a frame of 320x240 of one of four
+objects of the simulator. Views that show the same are hard links to one file.
 """
 
+import argparse
+import json
+import os
+import shutil
 import sqlite3
-import sys
+from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from benchmarks.bench_search import VIEWS_OF_AN_OBJECT, model
 from hbr import Views, descriptor
 from hbr.core.arrays import LevelArray
 from rig.catalog import Catalog, Provenance, ViewRecord
+from rig.catalog.describing import pack
 from rig.catalog.seal import seal_enrollments, seal_objects
+from rig.config import ViewConfig
 from rig.core.clock import SystemClock
-from rig.views.description import BENCH_DESCRIPTOR
+from rig.views import image_files
+from rig.views.description import BENCH_DESCRIPTOR, ViewDescriber
+from sim.camera import SimCapture
+from sim.objects.shelf import shelf
+from sim.world import World
 
 OBJECTS = 1_000
 #: The evidence that a bench stores with a view.
@@ -53,21 +67,81 @@ _PROVENANCE = Provenance(
 )
 
 
-def build(folder: Path, objects: int = OBJECTS) -> Views:
+_SMALL_REGION = (40, 0, 240, 240)
+_SHOWN = ("mug-star", "teapot", "toy-car", "radio")
+
+
+def build(folder: Path, objects: int = OBJECTS, *, images: bool = False) -> Views:
     """Make the catalog in a new folder, and return the views in it."""
     views = model(objects)
+    frames = _frames() if images else [[np.zeros((480, 560, 3), np.uint8)] * VIEWS_OF_AN_OBJECT]
     with Catalog.open(folder, clock=SystemClock()) as catalog:
-        _enroll(catalog, views)
+        _enroll(catalog, views, frames[0])
     with closing(sqlite3.connect(folder / "catalog.sqlite", isolation_level=None)) as connection:
         _copy(connection, views)
+        if images:
+            _link_images(connection, folder, frames)
     with Catalog.open(folder, clock=SystemClock()) as catalog, catalog.database.write() as writing:
         seal_objects(writing, None)
         seal_enrollments(writing, None)
     return views
 
 
-def _enroll(catalog: Catalog, views: Views) -> None:
+def _frames() -> list[list[NDArray[np.uint8]]]:
+    """Return frames of each object in `_SHOWN`, uint8 (240, 320, 3), at the azimuths of its views."""
+    world = World(seed=1)
+    capture = SimCapture(world)
+    capture.set(cv2.CAP_PROP_FRAME_WIDTH, 320)
+    capture.set(cv2.CAP_PROP_FRAME_HEIGHT, 240)
+    capture.set(cv2.CAP_PROP_AUTO_EXPOSURE, 1)
+    capture.set(cv2.CAP_PROP_AUTO_WB, 0)
+    found: list[list[NDArray[np.uint8]]] = []
+    for name in _SHOWN:
+        found.append([])
+        for i in range(VIEWS_OF_AN_OBJECT):
+            world.put(shelf()[name], i * 360 / VIEWS_OF_AN_OBJECT)
+            taken, frame = capture.read()
+            assert taken
+            found[-1].append(np.asarray(frame, np.uint8))
+    return found
+
+
+def _link_images(connection: sqlite3.Connection, folder: Path, frames: Sequence[Sequence[NDArray[np.uint8]]]) -> None:
+    """Give each view an image of its own name, and what describes it."""
+    describe = ViewDescriber(ViewConfig(roi=_SMALL_REGION))
+    kept = folder / "frames"
+    kept.mkdir()
+    shown = {}
+    for j, of_object in enumerate(frames):
+        for i, frame in enumerate(of_object):
+            png, described = image_files.encode(frame), describe(frame)
+            path = kept / f"{j}-{i:03d}.png"
+            path.write_bytes(png)
+            packed = {one.name: one.packed for one in pack(described.levels, _SMALL_REGION)}
+            shown[j, i] = path, image_files.digest(png), len(png), json.dumps(described.segmentation), packed
+    rows = connection.execute("SELECT id, enrollment_id, view_index, image FROM views").fetchall()
+    connection.execute("BEGIN IMMEDIATE")
+    for view, enrollment, i, image in rows:
+        path, digest, size, segmentation, packed = shown[(enrollment - 1) % len(frames), i]
+        if enrollment > 1:
+            image = Path(image_files.IMAGE_FOLDER, f"{enrollment:06d}-large", f"{enrollment:06d}", f"{i:03d}.png")
+            (folder / image).parent.mkdir(parents=True, exist_ok=True)
+            os.link(path, folder / image)
+        connection.execute(
+            "UPDATE views SET image = ?, image_sha256 = ?, image_bytes = ?, segmentation = ? WHERE id = ?",
+            (str(image), digest, size, segmentation, view),
+        )
+        connection.executemany(
+            "UPDATE descriptors SET packed = ? WHERE view_id = ? AND name = ?",
+            [(levels, view, name) for name, levels in packed.items()],
+        )
+    connection.execute("COMMIT")
+    shutil.rmtree(kept)
+
+
+def _enroll(catalog: Catalog, views: Views, frames: Sequence[NDArray[np.uint8]]) -> None:
     """Enroll the first object."""
+    region = _SMALL_REGION if frames[0].shape[0] == 240 else (80, 0, 480, 480)
     own = descriptor(BENCH_DESCRIPTOR)
     levels = own.unpack_rows(_rotating(own.size_bytes, VIEWS_OF_AN_OBJECT, 0).tobytes())
     azimuths_deg = views.azimuth_deg[:VIEWS_OF_AN_OBJECT].tolist()
@@ -85,9 +159,9 @@ def _enroll(catalog: Catalog, views: Views) -> None:
             captured_ns=i,
             evidence=_EVIDENCE,
             descriptors={"cedd": views.descriptors[i], own.name: levels[i]},
-            region=(80, 0, 480, 480),
+            region=region,
         )
-        enrollment.add(view, np.zeros((480, 560, 3), np.uint8))
+        enrollment.add(view, frames[i])
     enrollment.finish()
 
 
@@ -136,5 +210,10 @@ def _rotating(size: int, views: int, seed: int) -> LevelArray:
 
 
 if __name__ == "__main__":
-    build(Path(sys.argv[1]), int(sys.argv[2]) if len(sys.argv) > 2 else OBJECTS)
-    print(f"{sys.argv[1]}: {VIEWS_OF_AN_OBJECT} views an object")
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("objects", type=int, nargs="?", default=OBJECTS)
+    parser.add_argument("--images", action="store_true")
+    arguments = parser.parse_args()
+    build(arguments.folder, arguments.objects, images=arguments.images)
+    print(f"{arguments.folder}: {VIEWS_OF_AN_OBJECT} views an object")
