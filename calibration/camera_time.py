@@ -23,7 +23,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.procedure import Evaluation, Measured, Procedure, Progress, lower_end, returning
+from calibration import pictures
+from calibration.camera_light import BOARD
+from calibration.procedure import Ask, Evaluation, Measured, Procedure, Progress, lower_end, returning
 from rig.bench import Bench
 from rig.calibrations import CalibrationResult, RejectionCode
 from rig.charts.xy import MEASURED, MODEL, Axis, Chart, Series
@@ -91,8 +93,8 @@ class CameraTime(Procedure):
     names, title, devices, plots = (NAME,), "time of the frames", ("servo", "camera", "exposure"), (plot,)
     valid_days = 90
     """Time stamps depend on camera, driver and USB port; three months find a changed kernel."""
-    thing: str | None = None
-    """The object that the operator puts on the table; None: it is there."""
+    thing: str = BOARD
+    """What the simulated bench puts on the table: the board, or an object with texture."""
     rounds: int = 1
 
     def measure(self, bench: Bench, *_: CalibrationResult) -> Measured:
@@ -101,8 +103,11 @@ class CameraTime(Procedure):
         if config.camera.exposure_us is None:
             yield found.reject(RejectionCode.EXPOSURE_NOT_LOCKED)
             return
-        if self.thing is not None:
-            bench.operator.place(self.thing)
+        yield Ask(
+            "Put the board upright in the middle of the platter, or any object with texture. Take your hands off.",
+            pictures.BOARD_UPRIGHT,
+        )
+        bench.operator.place(self.thing)
         speeds = [speed for speed in SPEEDS if speed < config.table.velocity_dps] + [config.table.velocity_dps]
         passes: list[Pass] = []
         lost = frames = 0

@@ -142,19 +142,21 @@ def camera_time(
     thing: Annotated[
         str | None,
         typer.Option(
-            "--object", metavar="NAME", help="Object with texture that the simulated bench puts on the table."
+            "--object", metavar="NAME", help="Object that the simulated bench puts on the table (default: the board)."
         ),
     ] = None,
 ) -> None:
     """Calibrate when frames are exposed, so that views can be taken while the table rotates.
 
-    Put an object with texture, or the board, on the table. Exit code 6 if the frames' times jitter too much.
+    Put the board, or an object with texture, on the table. Exit code 6 if the frames' times jitter too much.
+
+    Example: rig calibrate camera-time --bench sim
 
     Example: rig calibrate camera-time --bench sim --object mug-star
     """
     from calibration.procedures import CameraTime
 
-    run(settings, CameraTime(thing))
+    run(settings, CameraTime() if thing is None else CameraTime(thing))
 
 
 @app.command("noise")

@@ -277,7 +277,7 @@ def calibrate(bench: Bench, store: CalibrationStore) -> None:
         *notes,
         *(error.what for error in store.unreadable),
         *(
-            f"{standing}; calibrate again with `{standing.command}`"
+            f"{str(standing).removesuffix('.')}. To calibrate again: `{standing.command}`"
             for standing in standings
             if standing.status is not CalibrationStatus.IN_FORCE
         ),
