@@ -145,6 +145,11 @@ class Catalog(AbstractContextManager["Catalog"]):
         replace: bool = False,
     ) -> None:
         """Raise what `begin`, or with ``resume`` `resume`, would raise for this object now; change nothing."""
+        self._check_here(name, label, note, resume=resume, replace=replace)
+        if not resume:
+            self._check_elsewhere(clean_name(name), replace=replace)
+
+    def _check_here(self, name: str, label: str | None, note: str | None, *, resume: bool, replace: bool) -> None:
         name = clean_name(name)
         checked_texts(label, note)
         with self.database.read() as connection:
@@ -152,6 +157,9 @@ class Catalog(AbstractContextManager["Catalog"]):
                 _unfinished(connection, *find(connection, name))
             elif not replace and (object_id := connection.scalar(select(objects.c.id).where(in_use(name)))) is not None:
                 _check_not_enrolled(connection, object_id, name)
+
+    def _check_elsewhere(self, name: str, *, replace: bool) -> None:
+        """Check nothing: only the names of a journal are also those of another catalog."""
 
     def begin(
         self,

@@ -74,23 +74,12 @@ class Journal(Catalog):
             others = []
         return [*own, *(one for one in others if one.name not in names)]
 
-    def check_enrollable(
-        self,
-        name: str,
-        *,
-        label: str | None = None,
-        note: str | None = None,
-        resume: bool = False,
-        replace: bool = False,
-    ) -> None:
-        """Raise what `begin` or `resume` would raise now, also for a name that the server or the local copy has."""
-        super().check_enrollable(name, label=label, note=note, resume=resume, replace=replace)
-        if resume:
-            return
+    def _check_elsewhere(self, name: str, *, replace: bool) -> None:
+        """Reject a name that the server has, or the local copy while the server does not answer."""
         with suppress(CatalogUnavailable), open_or_copy(self.server, self.clock, create=True) as shared:
             if shared.copied_utc is None:
                 release(self, shared)
-            shared.check_enrollable(name, label=label, note=note, replace=replace)
+            shared.check_enrollable(name, replace=replace)
 
     @contextmanager
     def _reached(self) -> Iterator[Catalog]:
@@ -111,7 +100,7 @@ class Journal(Catalog):
     ) -> Enrollment:
         """Start to enroll an object; reserve its name if the server answers. Errors as for `Catalog.begin`."""
         options = {"planned_azimuth_deg": planned_azimuth_deg, "label": label, "note": note}
-        Catalog.check_enrollable(self, name, label=label, note=note, replace=replace)
+        self._check_here(name, label, note, resume=False, replace=replace)
         more: dict[str, Any] = {KEY: secrets.token_hex(16), BENCH: bench_id(self)}
         keyed = with_conditions(provenance, {**more, REPLACE: True} if replace else more)
         try:

@@ -316,80 +316,57 @@ def test_each_object_of_a_tray_is_delivered_and_none_is_asked_for_again(
     assert names(place) == {"mug": 2, "toy-house": 4, "toy-car": 4}
 
 
-def killed_enrollment() -> None:
-    """Enroll an object through the journal, and die before a durable step."""
-    folder, url, shared_images, step = sys.argv[1:5]
-    here = CatalogPlace(Path(folder), url, shared_images)
-    with Journal.of(here, CLOCK) as journal:
-        die_at(int(step))
-        true_fill(journal, f"object {step}", 2, int(step))
-    print("enrolled", flush=True)
-    os._exit(0)
-
-
-@pytest.mark.parametrize("every", [7, pytest.param(1, marks=pytest.mark.nightly)])
-def test_enrollment_is_continued_after_a_kill_at_any_point(place: CatalogPlace, every: int) -> None:
-    code = "from tests.servers.test_offline import killed_enrollment; killed_enrollment()"
-    expected = names(place)
-    for step in range(1, 200, every):
-        name = f"object {step}"
-        expected[name] = 2
-        program = Program(str(place.path), str(place.url), str(place.images), str(step), code=code)
-        out, errors = program.communicate(60)
-        with Journal.of(place, CLOCK) as journal, Catalog.open(place, clock=CLOCK) as shared:
-            known = {one.name: one for one in journal.known_objects()}.get(name)
-            if known is None:
-                true_fill(journal, name, 2, step)
-            elif known.unfinished_views is not None:
-                enrollment = journal.resume(name, provenance=PROVENANCE)
-                for index in enrollment.missing():
-                    enrollment.add(described(index, step + index), image(step + index))
-                enrollment.finish()
-            assert [one.conflict for one in deliver(journal, shared)] == [None]
-        assert names(place) == expected, step
-        if "enrolled" in out:
-            break
-        assert program.returncode == -9, errors
-    else:
-        raise AssertionError("the enrollment has more steps")
-    assert step > 10
-    with Catalog.open(place, clock=CLOCK) as shared:
-        assert finished(verify(shared, jobs=1)).findings == ()
-        assert {one.unfinished_views for one in shared.objects()} == {None}
-
-
-def killed_delivery() -> None:
-    """Deliver, and die before a durable step."""
+def killed(kind: str) -> None:
+    """Enroll an object through the journal, or deliver the journal, and die before a durable step."""
     folder, url, shared_images, step = sys.argv[1:5]
     here = CatalogPlace(Path(folder), url, shared_images)
     with Journal.of(here, CLOCK) as journal, Catalog.open(here, clock=CLOCK) as shared:
         die_at(int(step))
-        deliver(journal, shared)
-    print("all delivered", flush=True)
+        if kind == "enrollment":
+            true_fill(journal, f"object {step}", 2, int(step))
+        else:
+            deliver(journal, shared)
+    print("not killed", flush=True)
     os._exit(0)
 
 
-@pytest.mark.parametrize("every", [5, pytest.param(1, marks=pytest.mark.nightly)])
-def test_kill_at_any_point_loses_and_doubles_nothing(place: CatalogPlace, every: int) -> None:
-    code = "from tests.servers.test_offline import killed_delivery; killed_delivery()"
+def finish(journal: Journal, name: str, step: int) -> None:
+    """Enroll an object, or what a killed program has left to do of it."""
+    known = {one.name: one for one in journal.known_objects()}.get(name)
+    if known is None:
+        true_fill(journal, name, 2, step)
+    elif known.unfinished_views is not None:
+        enrollment = journal.resume(name, provenance=PROVENANCE)
+        for index in enrollment.missing():
+            enrollment.add(described(index, step + index), image(step + index))
+        enrollment.finish()
+
+
+@pytest.mark.parametrize("every", [7, pytest.param(1, marks=pytest.mark.nightly)])
+@pytest.mark.parametrize("kind", ["enrollment", "delivery"])
+def test_kill_at_any_point_loses_and_doubles_nothing(place: CatalogPlace, kind: str, every: int) -> None:
     expected = names(place)
     for step in range(1, 200, every):
         name = f"object {step}"
-        with Journal.of(place, CLOCK) as journal:
-            true_fill(journal, name, 2, step)
         expected[name] = 2
+        if kind == "delivery":
+            with Journal.of(place, CLOCK) as journal:
+                true_fill(journal, name, 2, step)
+        code = f"from tests.servers.test_offline import killed; killed({kind!r})"
         program = Program(str(place.path), str(place.url), str(place.images), str(step), code=code)
         out, errors = program.communicate(60)
         with Journal.of(place, CLOCK) as journal, Catalog.open(place, clock=CLOCK) as shared:
-            deliver(journal, shared)
+            finish(journal, name, step)
+            assert {one.conflict for one in deliver(journal, shared)} <= {None}
             assert journal.objects() == []
         assert names(place) == expected, step
-        if "all delivered" in out:
+        if "not killed" in out:
             break
         assert program.returncode == -9, errors
     else:
-        raise AssertionError("the delivery has more steps")
+        raise AssertionError(f"the {kind} has more steps")
     assert step > 10
     with Catalog.open(place, clock=CLOCK) as shared:
         found = {one.problem for one in finished(verify(shared, quick=True, jobs=1)).findings}
-        assert found <= {Problem.ORPHANED_FILE}
+        assert found <= ({Problem.ORPHANED_FILE} if kind == "delivery" else set())
+        assert {one.unfinished_views for one in shared.objects()} == {None}

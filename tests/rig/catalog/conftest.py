@@ -6,6 +6,7 @@ from collections.abc import Iterator
 import pytest
 
 from rig.config.catalog_place import CatalogPlace
+from tests.rig.catalog.catalog_samples import without_waiting
 from tests.servers.postgres import VARIABLE, server, use_postgres
 
 
@@ -20,6 +21,12 @@ def _back_end() -> Iterator[None]:
         use_postgres()
         yield
         CatalogPlace.of = before  # type: ignore[method-assign]
+
+
+@pytest.fixture(autouse=True)
+def _without_waiting(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    if request.path.stem != "test_durability":
+        without_waiting(monkeypatch)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -44,11 +44,6 @@ pytestmark = pytest.mark.sqlite
 SECRET = b"not a part of the catalog"
 
 
-@pytest.fixture(autouse=True)
-def _fast(monkeypatch: pytest.MonkeyPatch) -> None:
-    without_waiting(monkeypatch)
-
-
 @pytest.fixture(scope="module")
 def sample(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A catalog with a complete, a superseded, an unfinished and a deleted enrollment."""

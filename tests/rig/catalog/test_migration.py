@@ -21,7 +21,7 @@ from rig.catalog.upkeep import statistics
 from rig.catalog.verify import verify
 from rig.core.errors import CatalogBusy, CatalogDamaged, CatalogError, CatalogOutdated
 from sim.clock import VirtualClock
-from tests.rig.catalog.catalog_samples import PROVENANCE, finished, image, new_result, record, without_waiting
+from tests.rig.catalog.catalog_samples import PROVENANCE, finished, image, new_result, record
 
 pytestmark = pytest.mark.sqlite
 
@@ -44,11 +44,6 @@ def catalog_of_version(version: int, root: Path) -> Path:
     with closing(sqlite3.connect(root / "catalog.sqlite", isolation_level=None)) as connection:
         connection.executescript(DUMPS[version].read_text(encoding="utf-8"))
     return root
-
-
-@pytest.fixture(autouse=True)
-def _without_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
-    without_waiting(monkeypatch)
 
 
 @pytest.fixture(params=DUMPS)

@@ -33,11 +33,6 @@ from tests.rig.catalog.catalog_samples import (
 )
 
 
-@pytest.fixture(autouse=True)
-def _without_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
-    without_waiting(monkeypatch)
-
-
 @pytest.fixture(scope="module")
 def three_results(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("results") / "catalog"

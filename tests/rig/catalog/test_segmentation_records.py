@@ -30,7 +30,7 @@ from rig.core.clock import SystemClock
 from rig.core.errors import DescriptorOutdated, UsageError
 from rig.views.description import BENCH_DESCRIPTOR, DESCRIPTORS, PAPER_DESCRIPTOR, ViewDescriber
 from rig.views.segmentation_evidence import SegmentationSummary
-from tests.rig.catalog.catalog_samples import PROVENANCE, finished, plan, record, without_waiting
+from tests.rig.catalog.catalog_samples import PROVENANCE, finished, plan, record
 
 REGION = (8, 0, 64, 64)
 VIEWS = 3
@@ -46,11 +46,6 @@ def view(index: int) -> NDArray[np.uint8]:
     image[20:50, 25 + 3 * index : 50 + 3 * index] = (20, 20, 230)
     image[28:38, 30 + 3 * index : 40 + 3 * index] = (230, 230, 20)
     return image
-
-
-@pytest.fixture(autouse=True)
-def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    without_waiting(monkeypatch)
 
 
 @pytest.fixture

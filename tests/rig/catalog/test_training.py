@@ -30,11 +30,6 @@ VIEWS = 4
 AREA = np.pi * 28 * 44
 
 
-@pytest.fixture(autouse=True)
-def _without_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
-    without_waiting(monkeypatch)
-
-
 def scene(index: int | None, colour: tuple[int, int, int] = (40, 60, 200)) -> NDArray[np.uint8]:
     """A plain frame with an ellipse; without it for None."""
     frame = np.random.default_rng(index or 0).normal(128, 1.5, (144, 192, 3)).clip(0, 255).astype(np.uint8)

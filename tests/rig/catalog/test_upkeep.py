@@ -31,13 +31,7 @@ from tests.rig.catalog.catalog_samples import (
     plan,
     record,
     true_fill,
-    without_waiting,
 )
-
-
-@pytest.fixture(autouse=True)
-def _fast(monkeypatch: pytest.MonkeyPatch) -> None:
-    without_waiting(monkeypatch)
 
 
 @pytest.fixture

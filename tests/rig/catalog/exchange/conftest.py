@@ -19,11 +19,6 @@ from tests.rig.catalog.catalog_samples import (
 from tests.rig.catalog.exchange.exchange_samples import NOW, OpenCatalog, fill_full
 
 
-@pytest.fixture(autouse=True)
-def _fast(monkeypatch: pytest.MonkeyPatch) -> None:
-    without_waiting(monkeypatch)
-
-
 @pytest.fixture
 def open_catalog(tmp_path: Path) -> Iterator[OpenCatalog]:
     opened = []
