@@ -1,6 +1,8 @@
-"""Benches enroll and identify at once, with kills and restarts of the server: nothing is lost or doubled."""
+"""Benches enroll and identify at once, with kills and restarts of the server.
 
-import json
+Nothing is lost or doubled, and each answer is that of one process that does the same with the same objects.
+"""
+
 import os
 import random
 import signal
@@ -17,9 +19,9 @@ from rig.catalog.verify import Problem, verify
 from rig.config.catalog_place import CatalogPlace
 from rig.core.clock import seconds_between
 from tests.programs import Program
-from tests.rig.catalog.catalog_samples import finished
+from tests.rig.catalog.catalog_samples import finished, without_waiting
 from tests.servers.postgres import place_in, server
-from tests.servers.soak import CLOCK, VIEWS, WORK, levels
+from tests.servers.soak import CLOCK, VIEWS, WORK, Answers, levels
 
 MADE = {f"e{n}": "enroll" for n in range(4)} | {f"i{n}": "identify" for n in range(4)}
 """The programs with their kinds."""
@@ -46,7 +48,7 @@ def wait_for_work(place: CatalogPlace, process: str, before: int) -> None:
 
 
 @pytest.mark.parametrize("seconds", [8, pytest.param(180, marks=pytest.mark.nightly)])
-def test_nothing_is_lost_or_doubled(tmp_path: Path, seconds: float) -> None:
+def test_nothing_is_lost_or_doubled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seconds: float) -> None:
     seconds = float(os.environ.get("RIG_TEST_SOAK_S", seconds))
     rng = random.Random(1)
     with server() as running:
@@ -89,12 +91,15 @@ def test_nothing_is_lost_or_doubled(tmp_path: Path, seconds: float) -> None:
             not np.array_equal(index.descriptors[index.object_index == j], [levels(name, i) for i in range(VIEWS)])
             for j, name in enumerate(index.object_names)
         )
-        searches = [line for process in MADE if MADE[process] == "identify" for line in lines(place, process)]
-        answers = [json.loads(line) for line in searches]
-        wrong = [one for one in answers if one[0] != one[1] or one[2:] != [VIEWS, VIEWS]]
+        answers = Answers(line for process in MADE if MADE[process] == "identify" for line in lines(place, process))
+        without_waiting(monkeypatch)
+        other, wrong = answers.compare(tmp_path / "serial", index.object_names)
     print(f"{seconds:g} s, {kills} kills, {restarts} restarts of the server: {len(complete)} objects of {VIEWS} views")
     print(f"lost {len(lost)}, doubled {len(doubled)}, wrong rows {wrong_levels}; {dict(problems)}")
-    print(f"{len(answers)} answers, {len(wrong)} wrong")
-    assert (lost, doubled, wrong_levels, wrong) == ([], [], 0, [])
+    print(f"{answers.number} answers on {len(answers.models)} states of the catalog; {answers.cut} lines cut by kills")
+    print(f"against a serial run: {len(other)} other states, {len(wrong)} other answers")
+    assert (lost, doubled, wrong_levels, other, wrong) == ([], [], 0, [], [])
+    assert answers.number
+    assert answers.cut <= kills + len(MADE)
     assert set(problems) <= {Problem.ORPHANED_FILE}
     assert complete
