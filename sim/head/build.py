@@ -46,7 +46,12 @@ def pty_program() -> Path:
 
 def avr_image() -> bytes:
     """Return the flash of an ATmega328P: the bytes that `make flash` writes."""
-    return _built("avr", "head.bin").read_bytes()
+    return (avr_folder() / "head.bin").read_bytes()
+
+
+def avr_folder() -> Path:
+    """Return the folder with what `make` has built for an ATmega328P: ``head.elf`` and ``head.bin``."""
+    return _built("avr", "head.bin").parent
 
 
 def avr_library() -> Path:

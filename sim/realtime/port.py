@@ -52,6 +52,11 @@ class PtyPort:
         """Return the file descriptor that becomes readable when a program writes; -1 while unplugged."""
         return self._far
 
+    @property
+    def near(self) -> int:
+        """The end of programs, as a file descriptor: its settings are those that a program has made."""
+        return self._near
+
     def pump(self) -> bool:
         """Transfer the waiting bytes in both directions; return whether there were any."""
         moved = False
