@@ -105,7 +105,7 @@ class ServoBus:
         self._devices: list[Device] = []
         self._deliver: Callable[[Frame], None] | None = None
         self._sent_until_ns = 0
-        self._parsers: dict[int, PacketParser1 | PacketParser] = {1: PacketParser1(), 2: PacketParser()}
+        self._parsers: dict[int, PacketParser] = {1: PacketParser1(), 2: PacketParser()}
         self._heard = Frame(Source.HOST, 0, 1, b"")
 
     def attach(self, device: Device) -> None:

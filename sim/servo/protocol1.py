@@ -6,7 +6,7 @@ inverted sum of all bytes except the header; nothing is stuffed, and the sum has
 
 from enum import IntFlag
 
-from sim.servo.protocol2 import BROADCAST_ID, InstructionPacket, Status
+from sim.servo.protocol2 import BROADCAST_ID, InstructionPacket, PacketParser, Status
 
 _HEADER = b"\xff\xff"
 _FIXED = 4  # header, id, length
@@ -31,15 +31,8 @@ def checksum(body: bytes) -> int:
     return ~sum(body) & 0xFF
 
 
-class PacketParser1:
-    """Finds instruction packets in a stream of bytes that arrives in pieces of any size, with noise."""
-
-    def __init__(self) -> None:
-        self._buffer = bytearray()
-
-    def reset(self) -> None:
-        """Drop an incomplete packet."""
-        self._buffer.clear()
+class PacketParser1(PacketParser):
+    """Finds instruction packets of Protocol 1.0."""
 
     def feed(self, data: bytes) -> list[InstructionPacket]:
         """Return the packets that ``data`` completes."""

@@ -180,8 +180,8 @@ def test_identify_names_redescribe_for_a_new_descriptor(two: Rig, monkeypatch: p
 
 def test_identify_reports_another_region(rig: Rig) -> None:
     assert rig("enroll", "dice", "--views", "4").exit_code == 0
-    moved = ("--set", "view.roi=[90, 0, 460, 480]", "--set", "bench.sim.object=dice", "--max-views", "2")
-    assert "now it is [90, 0, 460, 480]" in rig("identify", *moved).stderr
+    moved = ("--set", "view.roi=[45, 0, 230, 240]", "--set", "bench.sim.object=dice", "--max-views", "2")
+    assert "now it is [45, 0, 230, 240]" in rig("identify", *moved).stderr
     assert rig("catalog", "redescribe", "--region", "config", *moved[:2]).exit_code == 0
     assert "view.roi" not in rig("identify", *moved).stderr
 

@@ -68,7 +68,7 @@ def test_tray_asks_for_each_object_and_skips_one(serve):
     assert served.client.post(f"/api/v1/jobs/{job['id']}/answer", json={"choice": "restart"}).status_code == 409
     served.client.post(f"/api/v1/jobs/{job['id']}/answer", json={"choice": "skip"})
     while "mug-star" not in (served.wait(job["id"], "waiting")["question"] or {"text": ""})["text"]:
-        pass
+        threading.Event().wait(0.02)
     served.client.post(f"/api/v1/jobs/{job['id']}/answer", json={"choice": "continue"})
     assert served.wait(job["id"])["state"] == "done"
     names = [one["name"] for one in served.client.get("/api/v1/objects").json()["items"]]
@@ -80,7 +80,7 @@ def test_stop_in_a_motion_stops_the_table_and_cancels_all_jobs(serve):
     first = served.client.post("/api/v1/jobs", json={"kind": "goto", "angle_deg": 350}).json()
     second = served.client.post("/api/v1/jobs", json={"kind": "home"}).json()
     while served.client.get("/api/v1/status").json().get("table_deg", 0.0) < 20.0:
-        pass
+        threading.Event().wait(0.02)
     assert served.client.post("/api/v1/stop").json()["ended"]
     assert served.wait(first["id"])["state"] == "cancelled"
     assert served.wait(second["id"])["state"] == "cancelled"
@@ -92,7 +92,7 @@ def test_listeners_learn_when_a_job_ends_after_the_answer_to_a_stop(serve):
     served = serve("bench.sim.speed=2")
     job = served.client.post("/api/v1/jobs", json={"kind": "goto", "angle_deg": 350}).json()
     while served.client.get("/api/v1/status").json().get("table_deg", 0.0) < 20.0:
-        pass
+        threading.Event().wait(0.02)
     worker, hub = served.server.worker, served.server.hub
     assert not worker.stop(wait_s=0.0)
     assert served.wait(job["id"])["state"] == "cancelled"
