@@ -7,13 +7,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from calibration.outcome import as_json, in_force, outcome_text, plain_value, stored_results
 from rig.cli.ui.command import command
 from rig.cli.ui.settings import Settings
 
 if TYPE_CHECKING:
     from calibration.procedure import Ask, Procedure
     from rig.bench import Bench
-    from rig.calibrations import CalibrationResult, CalibrationStanding, CalibrationStore
+    from rig.calibrations import CalibrationResult
     from rig.views.charuco_board import Board
 
 EXIT_QUALITY = 6
@@ -229,7 +230,7 @@ def report(
     from calibration.report import write_page
 
     with settings.open_bench(tell=False) as bench:
-        store, standings = _stored(bench)
+        store, standings = stored_results(bench)
         notes = [error.what for error in store.unreadable]
         write_page(out, standings, store.history(), bench=bench.name, now_utc=bench.clock.utc(), notes=notes)
     if settings.json:
@@ -249,9 +250,9 @@ def show(settings: Settings) -> None:
     from rig.events.events import plain
 
     with settings.open_bench(tell=False) as bench:
-        store, standings = _stored(bench)
+        store, standings = stored_results(bench)
         if settings.json:
-            rows = [{"state": s.status, "words": str(s), **_json(s.result)} for s in standings]
+            rows = [{"state": s.status, "words": str(s), **as_json(s.result)} for s in standings]
             settings.print_json({"folder": str(store.folder), "calibrations": plain(rows)})
             return
         for finding in bench.findings:
@@ -261,7 +262,7 @@ def show(settings: Settings) -> None:
                 print(f"✓ {standing}")
                 print("\n".join(f"    {name} = {estimate}" for name, estimate in standing.result.estimates.items()))
                 for key, value in standing.result.settings.items():
-                    print(f"    sets {key} = {_plain(value)}")
+                    print(f"    sets {key} = {plain_value(value)}")
         if not standings:
             print(f"No calibrations in {store.folder} yet: run `rig calibrate all`.")
 
@@ -283,7 +284,7 @@ def history(
     for error in store.unreadable:
         print(f"! {error.what}", file=sys.stderr)
     if settings.json:
-        settings.print_json({"folder": str(store.folder), "calibrations": [_json(result) for result in results]})
+        settings.print_json({"folder": str(store.folder), "calibrations": [as_json(result) for result in results]})
         return
     for result in results:
         values = ", ".join(f"{key} {estimate}" for key, estimate in result.estimates.items())
@@ -314,7 +315,7 @@ def run(settings: Settings, *procedures: "Procedure") -> None:
                 path = store.add(result)
                 if settings.json:
                     outcome = {"event": "calibrated", "passed": result.passed, "id": result.id, "file": str(path)}
-                    settings.print_json({**outcome, **_json(result)})
+                    settings.print_json({**outcome, **as_json(result)})
                 else:
                     then = ", in force from now on." if result.passed else "; earlier results stay in force."
                     print(f"{outcome_text(result)}\nStored in {path}{then}")
@@ -334,27 +335,6 @@ def _board(columns: int, rows: int, square_mm: float) -> "Board":
     from rig.views.charuco_board import Board
 
     return Board(columns, rows, square_mm, square_mm * MARKER_SHARE)
-
-
-def _stored(bench: "Bench") -> "tuple[CalibrationStore, list[CalibrationStanding]]":
-    """Return the bench's calibration results and their standings."""
-    from rig.calibrations import CalibrationStore
-
-    store = CalibrationStore(bench.config.calibration_path(bench.name))
-    return store, store.standings(bench.apparatus(), bench.clock.utc())
-
-
-def in_force(bench: "Bench", name: str) -> "CalibrationResult":
-    """Return the result called ``name`` that is in force on the bench. Raises `UsageError` if there is none."""
-    from rig.calibrations import CalibrationStatus
-    from rig.core.errors import UsageError
-
-    for standing in _stored(bench)[1]:
-        if standing.result.name == name and standing.status is CalibrationStatus.IN_FORCE:
-            return standing.result
-    raise UsageError(
-        f"{name} is not calibrated on this bench.", next_step=f"Run `rig calibrate {name.partition('.')[0]}` first."
-    )
 
 
 def _results(settings: Settings, bench: "Bench", procedure: "Procedure") -> "Iterator[CalibrationResult]":
@@ -385,28 +365,3 @@ def _ask(request: "Ask", *, with_picture: bool) -> None:
     print(f"{request.words}{request.picture if with_picture else ''}", file=sys.stderr)
     if sys.stdin.isatty():
         typer.prompt("Then press Enter", default="", show_default=False, err=True)
-
-
-def _json(result: "CalibrationResult") -> dict[str, Any]:
-    """Return a result as JSON; each rejection also in words."""
-    from rig.events.events import plain
-
-    rejections = [{"code": r.code.name.lower(), "values": plain(r.values), "text": str(r)} for r in result.rejections]
-    return {**plain(result), "rejections": rejections}
-
-
-def outcome_text(result: "CalibrationResult") -> str:
-    """Return the outcome of a calibration: its values, or why it did not pass and the next step."""
-    residual = ""
-    if result.residual is not None and result.limit is not None:
-        unit = result.residual_unit
-        residual = f" (worst residual {result.residual:.3g} {unit}, limit {result.limit:.3g} {unit})"
-    lines = [f"{'PASS' if result.passed else 'FAIL'} {result.name}{residual}"]
-    lines += [f"  {name} = {estimate}" for name, estimate in result.estimates.items()]
-    lines += [f"  sets {key} = {_plain(value)}" for key, value in result.settings.items()]
-    return "\n".join([*lines, *(f"  {rejection}" for rejection in result.rejections)])
-
-
-def _plain(value: Any) -> str:
-    """Return a value of the configuration in a few digits."""
-    return f"{value:.6g}" if isinstance(value, float) else str(value)

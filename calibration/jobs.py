@@ -4,7 +4,7 @@ from collections.abc import Callable, Generator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 
-from calibration.command import in_force, outcome_text
+from calibration.outcome import in_force, outcome_text
 from calibration.procedure import Ask, Procedure, Progress
 from calibration.procedures import (
     Backlash,

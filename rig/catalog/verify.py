@@ -4,80 +4,21 @@ import json
 from collections.abc import Generator, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from enum import StrEnum
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-from sqlalchemy import Connection, Table, delete, func, null, select, true, update
+from sqlalchemy import Connection, Table, delete, func, select, update
 
-from hbr.descriptors import descriptor
 from rig.catalog import audit
 from rig.catalog.catalog import Catalog
-from rig.catalog.describing import EmptyTable, is_current, matches, region_of, stored_describer
-from rig.catalog.image_store import ImageStore
 from rig.catalog.jobs import JobProgress, portions, processes
-from rig.catalog.queries import packed_descriptors
 from rig.catalog.schema import audit as audit_log
 from rig.catalog.schema import corrections, descriptors, enrollments, objects, results, sessions, views
 from rig.catalog.seal import appended_digests, changing_enrollments, enrollment_digests, object_digests
-from rig.core.errors import CatalogDamaged, CatalogError, UsageError
+from rig.catalog.verify_images import Checked, Finding, Item, Problem, Repair, check_portion, stored_images
+from rig.core.errors import CatalogDamaged
 from rig.core.processes import Jobs, map_in_processes
 from rig.views import image_files as images
-
-
-class Problem(StrEnum):
-    """Kind of a problem, with the keys of `Finding.details`."""
-
-    DAMAGED_DATABASE = "database damaged"
-    """``message`` of SQLite."""
-    ORPHANED_ROW = "orphaned row"
-    """``row`` of ``table`` refers to a missing row of ``parent``."""
-    MISSING_IMAGE = "image missing"
-    """``reason`` of the system; ``copy``: path of a file with the stored content, or None."""
-    CHANGED_IMAGE = "image changed"
-    """``bytes`` found and ``stored_bytes``; ``copy``: as above."""
-    UNREADABLE_IMAGE = "image unreadable"
-    """``reason`` of the decoder."""
-    SIZES_DIFFER = "sizes differ"
-    """``size_px`` of the image and of the first view of its enrollment, ``first_size_px``."""
-    NOT_DESCRIBED = "not described"
-    DESCRIPTOR_DIFFERS = "descriptor differs"
-    """The stored levels of ``descriptor`` are not those of the image."""
-    OBJECT_CHANGED = "object changed"
-    """Its name, label, note or dates are not those that were stored."""
-    ENROLLMENT_CHANGED = "enrollment changed"
-    """Something that ``enrollment_id`` says of its sessions, views or descriptors is not what was stored."""
-    LOG_CHANGED = "log changed"
-    """Entry ``entry_id`` of the audit log is not the one that was written, or entries before it are missing."""
-    RESULT_CHANGED = "result changed"
-    """Row ``entry_id`` of ``table`` (results or corrections) is not the one that was written, or rows are missing."""
-    SETTING_CHANGED = "setting changed"
-    """``setting`` of the database is ``found``, not ``stored``."""
-    ORPHANED_FILE = "orphaned file"
-    """``moved_to``: path after a repair, or None."""
-
-
-class Repair(StrEnum):
-    """What was done about a problem."""
-
-    RESTORED = "restored from a copy"
-    DESCRIBED = "described again"
-    REMOVED = "removed and recorded in the log"
-    MOVED = "moved to lost+found"
-
-
-@dataclass(frozen=True, slots=True)
-class Finding:
-    """A problem of a catalog, and how it was repaired; None if it was not."""
-
-    problem: Problem
-    object_name: str | None = None
-    view_id: int | None = None
-    path: str | None = None
-    details: Mapping[str, Any] = field(default_factory=dict)
-    repair: Repair | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,42 +34,6 @@ class Verification:
     @property
     def unrepaired(self) -> tuple[Finding, ...]:
         return tuple(finding for finding in self.findings if finding.repair is None)
-
-
-class _Item(NamedTuple):
-    """An image that must exist. ``described`` holds name, version, settings as JSON, and packed levels.
-
-    ``segmentation`` is the stored evidence as JSON.
-
-    That of a result has no object, and the negative number of the result instead of an enrollment.
-    """
-
-    view_id: int | None
-    session_id: int | None
-    object_name: str
-    enrollment_id: int
-    image: str
-    sha256: str
-    file_bytes: int
-    empty_table: EmptyTable | None = None
-    described: tuple[tuple[str, int, str, bytes], ...] = ()
-    segmentation: str = "null"
-
-    def finding(self, problem: Problem, repair: Repair | None = None, **details: Any) -> Finding:
-        return Finding(problem, self.object_name, self.view_id, self.image, details, repair)
-
-
-class _Checked(NamedTuple):
-    """What was found for an item: SHA-256 and size of its file, and width and height of the image.
-
-    ``different`` holds name and version of each descriptor with wrong levels, and the right levels if known.
-    """
-
-    sha256: str | None
-    file_bytes: int = 0
-    size_px: tuple[int, int] | None = None
-    reason: str = ""
-    different: tuple[tuple[str, int, bytes | None], ...] = ()
 
 
 @dataclass
@@ -166,15 +71,15 @@ def verify(
     # The files are listed before the rows: an image whose row is committed in the meantime is not an orphan.
     with catalog.database.catalog_errors():
         files = catalog.database.images.names()
-    items, object_count = _items(catalog)
+    items, object_count = stored_images(catalog)
     for item in items:  # before anything is repaired
         catalog.database.images.check(item.image)
     if _check_rows(state):
-        items, object_count = _items(catalog)
+        items, object_count = stored_images(catalog)
 
     yield JobProgress(0, len(items))
-    checked: dict[_Item, _Checked] = {}
-    work = partial(_check_portion, catalog.database.images, quick)
+    checked: dict[Item, Checked] = {}
+    work = partial(check_portion, catalog.database.images, quick)
     for portion, found in map_in_processes(work, portions(items), processes(jobs, len(items))):
         checked.update(zip(portion, found, strict=True))
         yield JobProgress(len(checked), len(items))
@@ -238,96 +143,6 @@ def _row(connection: Connection, table: str, rowid: int | None) -> dict[str, Any
     return json.loads(json.dumps(dict(row._mapping), default=str)) if row is not None else {}
 
 
-def _items(catalog: Catalog) -> tuple[list[_Item], int]:
-    """Return an item for each view and each empty-table image, and the number of objects."""
-    with catalog.database.read() as connection:
-        count = len(connection.execute(select(objects.c.id)).all())
-        described = packed_descriptors(connection, true())
-        empty_table = (sessions.c.empty_table_image, sessions.c.empty_table_image_sha256)
-        owner = (objects.c.name, enrollments.c.id)
-        rows = connection.execute(
-            select(
-                views.c.id,
-                null(),
-                *owner,
-                views.c.image,
-                views.c.image_sha256,
-                views.c.image_bytes,
-                *empty_table,
-                views.c.segmentation,
-            )
-            .select_from(objects)
-            .join(enrollments)
-            .join(views, views.c.enrollment_id == enrollments.c.id)
-            .join(sessions, views.c.session_id == sessions.c.id)
-            .order_by(views.c.id)
-        ).all()
-        items = [
-            _Item(*row[:7])._replace(
-                empty_table=None if row[7] is None else (row[7], row[8]),
-                described=tuple(
-                    (one.name, one.version, json.dumps(one.settings, sort_keys=True), one.packed)
-                    for one in described.get(row.id, ())
-                ),
-                segmentation=json.dumps(row.segmentation),
-            )
-            for row in rows
-        ]
-        items += [
-            _Item(*row)
-            for row in connection.execute(
-                select(null(), sessions.c.id, *owner, *empty_table, sessions.c.empty_table_image_bytes)
-                .select_from(objects)
-                .join(enrollments)
-                .join(sessions, sessions.c.enrollment_id == enrollments.c.id)
-                .where(sessions.c.empty_table_image.is_not(None))
-            )
-        ]
-        if catalog.database.has_results:
-            image = (results.c.image, results.c.image_sha256, results.c.image_bytes)
-            recorded = select(-results.c.id, *image).where(results.c.image.is_not(None))
-            items += [_Item(None, None, "", *row) for row in connection.execute(recorded)]
-    return items, count
-
-
-def _check_portion(store: ImageStore, quick: bool, portion: tuple[_Item, ...]) -> list[_Checked]:
-    return [_check(store, item, quick) for item in portion]
-
-
-def _check(store: ImageStore, item: _Item, quick: bool) -> _Checked:
-    try:
-        content = store.read(item.image)
-    except OSError as error:
-        return _Checked(None, reason=error.strerror or str(error))
-    sha256 = images.digest(content)
-    if quick or sha256 != item.sha256:
-        return _Checked(sha256, len(content))
-    try:
-        image = images.decode(content)
-    except images.BadImage as error:
-        return _Checked(sha256, len(content), reason=str(error))
-    different: list[tuple[str, int, bytes | None]] = []
-    for name, version, settings, packed in item.described:
-        if not is_current(name, version):
-            continue
-        kind = descriptor(name)
-        try:
-            region = region_of(json.loads(settings))
-        except CatalogError:
-            different.append((name, version, None))
-            continue
-        try:
-            describe = stored_describer(store, (name,), region, item.empty_table)
-        except CatalogError:
-            continue  # the empty-table image is damaged: it is another item
-        levels: NDArray[np.uint8] | None = None
-        with suppress(UsageError, KeyError, ValueError):
-            levels = describe(image, json.loads(item.segmentation)).levels[name]
-        if levels is None or not matches(kind, packed, levels):
-            different.append((name, version, None if levels is None else kind.pack(levels)))
-    return _Checked(sha256, len(content), (image.shape[1], image.shape[0]), different=tuple(different))
-
-
 def _referenced(state: _State, connection: Connection) -> set[str]:
     recorded = results.c.image.is_not(None)
     return {
@@ -337,7 +152,7 @@ def _referenced(state: _State, connection: Connection) -> set[str]:
     }
 
 
-def _find_copies(state: _State, checked: Mapping[_Item, _Checked], orphans: Iterable[str]) -> None:
+def _find_copies(state: _State, checked: Mapping[Item, Checked], orphans: Iterable[str]) -> None:
     """Look for the content of missing and changed images under other names."""
     store = state.catalog.database.images
     if all(found.sha256 == item.sha256 for item, found in checked.items()):
@@ -350,7 +165,7 @@ def _find_copies(state: _State, checked: Mapping[_Item, _Checked], orphans: Iter
             state.copies.setdefault(images.digest(store.read(name)), name)
 
 
-def _report_images(state: _State, checked: Mapping[_Item, _Checked]) -> None:
+def _report_images(state: _State, checked: Mapping[Item, Checked]) -> None:
     store = state.catalog.database.images
     wrong = {item: found for item, found in checked.items() if found.sha256 != item.sha256}
     copies = {item: state.copies[item.sha256] for item in wrong if item.sha256 in state.copies}
@@ -376,7 +191,7 @@ def _report_images(state: _State, checked: Mapping[_Item, _Checked]) -> None:
         state.findings.append(finding)
 
 
-def _report_sizes(state: _State, checked: Mapping[_Item, _Checked]) -> None:
+def _report_sizes(state: _State, checked: Mapping[Item, Checked]) -> None:
     first: dict[int, tuple[int, int]] = {}
     for item, found in checked.items():
         if found.size_px is None:
@@ -387,7 +202,7 @@ def _report_sizes(state: _State, checked: Mapping[_Item, _Checked]) -> None:
             state.findings.append(finding)
 
 
-def _report_descriptors(state: _State, checked: Mapping[_Item, _Checked]) -> None:
+def _report_descriptors(state: _State, checked: Mapping[Item, Checked]) -> None:
     for item, found in checked.items():
         for name, version, packed in found.different:
             repair = None

@@ -11,7 +11,8 @@ from rig.bench import bench_kind
 from rig.bench.computer import Computer, ComputerProvider
 from rig.config import RigConfig
 from rig.config.values import validate
-from rig.safety.saved_state import Holder, busy, holder
+from rig.safety.bench_lock import busy, holder
+from rig.safety.saved_state import Holder
 
 
 @dataclass

@@ -22,19 +22,15 @@ from rig.events.events import (
     Waiting,
     Warned,
 )
+from rig.events.phrases import angle_words, azimuth_words, counted, duration_words, signed
 from rig.events.wording import (
-    angle_words,
     answer_lines,
-    azimuth_words,
-    counted,
     decision_words,
-    duration_words,
     move_words,
     next_step_words,
     note_words,
     scan_words,
     share_words,
-    signed,
     similar_objects_words,
     unwinding_words,
     wait_words,

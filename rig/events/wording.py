@@ -1,6 +1,5 @@
 """What happened, in words: the same on the terminal and in the report."""
 
-from collections.abc import Iterable, Sequence
 from math import ceil, isfinite, nan
 from typing import Any, Final
 
@@ -20,6 +19,7 @@ from rig.events.events import (
     Unwinding,
     WaitReason,
 )
+from rig.events.phrases import angle_words, counted, distinct, joined, percent, percent_words, sentence, signed
 from rig.motion.scan_speed import SpeedLimit
 from rig.views.table_problems import problem_text
 
@@ -238,18 +238,6 @@ def share_words(one: Candidate, decision: StopDecision | None) -> str:
     return "" if unknown or one.probability is None else percent_words(one.probability)
 
 
-def percent_words(probability: float) -> str:
-    """Return a probability in percent; below 0.1 % and above 99.9 % only that."""
-    if probability > 0.999:
-        return ">99.9 %"
-    return "<0.1 %" if probability < 0.001 else percent(probability)
-
-
-def percent(share: float, decimals: int = 1) -> str:
-    """Return a share in percent: "2.0 %"."""
-    return f"{100 * share:.{decimals}f} %"
-
-
 def move_words(moved: Moved) -> str:
     """Return the table's rotation as encoder and gyro measured it, and whether they agree."""
     words = f"rotation {signed(moved.rotation_encoder_deg, 2)}° (encoder)"
@@ -375,62 +363,6 @@ def similar_objects_words(similar: SimilarObjects) -> list[str]:
         f"looks like {similar_object_words(one)} (similarity up to {one.similarity:.3f})" for one in similar.objects
     ]
     return lines if similar.objects else [*lines, "looks like no other enrolled object"]
-
-
-def duration_words(seconds: float) -> str:
-    """Return a time as people read it: "43 s", "2 min 05 s", "1 h 20 min"."""
-    whole = round(seconds)
-    if whole < 60:
-        return f"{whole} s"
-    if whole < 3600:
-        return f"{whole // 60} min {whole % 60:02d} s"
-    return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
-
-
-def sentence(words: str) -> str:
-    """Return ``words`` with a capital and a full stop."""
-    return f"{words[:1].upper()}{words[1:]}."
-
-
-def azimuth_words(azimuth_deg: float) -> str:
-    """Return an azimuth to a tenth of a degree, from 0.0 to 359.9, without its sign for degrees."""
-    return f"{round(azimuth_deg, 1) % 360:.1f}"
-
-
-def counted(n: int, noun: str) -> str:
-    """Return "1 view", "2 views"."""
-    return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
-
-
-def angle_words(angle_deg: float, decimals: int = 1) -> str:
-    """Return an angle of the table: "−12.5°"."""
-    return f"{round(angle_deg, decimals) + 0.0:.{decimals}f}°".replace("-", "−")  # + 0.0 removes the sign of a zero
-
-
-def joined(items: Sequence[str], conjunction: str = "and") -> str:
-    """Return items as an English list: "a, b and c"."""
-    return f"{', '.join(items[:-1])} {conjunction} {items[-1]}" if len(items) > 1 else "".join(items)
-
-
-def short(words: str, letters: int) -> str:
-    """Return words cut to so many letters, the last of them "…"."""
-    return words if len(words) <= letters else f"{words[: letters - 1]}…"
-
-
-def listed(items: Iterable[str]) -> str:
-    """Return distinct items, in the order of their first appearance, separated by semicolons."""
-    return "; ".join(dict.fromkeys(items))
-
-
-def distinct(a: float, b: float, *, decimals: int = 2) -> tuple[str, str]:
-    """Return two numbers with enough decimals to show their difference: at least ``decimals``, at most five."""
-    enough = next((d for d in range(decimals, 5) if f"{a:.{d}f}" != f"{b:.{d}f}"), 5) if a != b else decimals
-    return f"{a:.{enough}f}", f"{b:.{enough}f}"
-
-
-def signed(value: float, decimals: int) -> str:
-    """Return a number with its sign, a real minus."""
-    return f"{round(value, decimals) + 0.0:+.{decimals}f}".replace("-", "−")  # + 0.0 removes the sign of a zero
 
 
 def _some(names: list[str]) -> str:

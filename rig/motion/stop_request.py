@@ -10,7 +10,8 @@ from rig.bench import open_servo
 from rig.config import RigConfig
 from rig.core.clock import Clock, seconds_between
 from rig.core.errors import BenchBusy, StateNotStored, TorqueStaysOn
-from rig.safety.saved_state import FileStore, Holder, LatchedFault, holder
+from rig.safety.bench_lock import holder
+from rig.safety.saved_state import FileStore, Holder, LatchedFault
 
 REACTION_S = 2.0
 """How long a program may take to notice the request: many rounds of its control loop, and a long exposure."""

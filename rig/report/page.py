@@ -22,18 +22,14 @@ from rig.charts.score_chart import score_chart
 from rig.core.errors import UsageError, os_errors_as
 from rig.core.files import write
 from rig.events.events import Candidate, Ranked
+from rig.events.phrases import azimuth_words, counted, listed, sentence, signed
 from rig.events.wording import (
     answer_words,
-    azimuth_words,
-    counted,
     decision_words,
-    listed,
     move_words,
     note_words,
     outcome_words,
-    sentence,
     share_words,
-    signed,
     stop_words,
 )
 from rig.report.contact_sheet import Image, contact_sheet, thumbnail

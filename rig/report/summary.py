@@ -6,7 +6,8 @@ from typing import NamedTuple
 
 from hbr import Outcome
 from rig.events.events import SimilarObjects
-from rig.events.wording import counted, listed, outcome_words, percent_words, similar_object_words
+from rig.events.phrases import counted, listed, percent_words
+from rig.events.wording import outcome_words, similar_object_words
 from rig.report.records import EnrollmentRecord, IdentificationRecord
 
 

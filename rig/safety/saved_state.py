@@ -3,23 +3,20 @@
 Decision: docs/decisions/0009.
 """
 
-import errno
-import fcntl
 import hashlib
 import json
 import os
-import signal
 import sys
 from contextlib import AbstractContextManager, suppress
 from enum import StrEnum
 from pathlib import Path
-from typing import Any, Protocol, TextIO
+from typing import Any, Protocol
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from rig.core import files
 from rig.core.clock import Clock
-from rig.core.errors import BenchBusy, MotionStopped, RigError, StateNotStored, os_errors_as
+from rig.core.errors import MotionStopped, RigError, StateNotStored, os_errors_as
 from rig.core.files import no_follow
 
 VERSION = 3
@@ -27,7 +24,6 @@ VERSION = 3
 LATCH_BYTES = 8192
 """Size of the file of the latched fault. It is written again in place, which needs no room on the disk."""
 SESSION = "session.json"
-LOCK_ATTEMPTS = 3
 SERVER_FOLDER = "web"
 SERVER_FILE = "server.json"
 _MAKE_ROOM = "Make room on the disk, or set state_dir to a folder that you may write to."
@@ -291,8 +287,8 @@ class FileStore:
         return state.model_copy(update={"fault": state.fault or fault, "version": VERSION, "checksum": None})
 
     def latch(self, fault: LatchedFault | None) -> None:
-        with _storing(self._latch):
-            _make_folder(self.path)
+        with storing(self._latch):
+            make_folder(self.path)
             self._write_latch(fault)
 
     def _write_latch(self, fault: LatchedFault | None) -> None:
@@ -315,8 +311,8 @@ class FileStore:
         return self._latch.is_file() and self._latch.stat().st_size == LATCH_BYTES
 
     def save(self, state: BenchState) -> None:
-        with _storing(self._file):
-            _make_folder(self.path)
+        with storing(self._file):
+            make_folder(self.path)
             if not self._latch_is_reserved():
                 self._write_latch(state.fault)
             stored = state.with_checksum().model_dump_json(indent=1, exclude={"damage"})
@@ -333,8 +329,8 @@ class FileStore:
         self._stop.unlink(missing_ok=True)
 
     def request_stop(self) -> None:
-        with _storing(self._stop):
-            _make_folder(self.path)
+        with storing(self._stop):
+            make_folder(self.path)
             os.close(no_follow(str(self._stop), os.O_WRONLY | os.O_CREAT))
 
     def read_file(self, name: str) -> bytes | None:
@@ -347,7 +343,7 @@ class FileStore:
 
     def store_file(self, name: str, content: bytes) -> None:
         with os_errors_as(StateNotStored, f"{name} cannot be stored in {self.path}.", next_step=_MAKE_ROOM):
-            _make_folder(self.path)
+            make_folder(self.path)
             files.write(self.path / name, content)
 
     def remove_file(self, name: str) -> None:
@@ -358,7 +354,7 @@ class FileStore:
 def begin_session(store: StateStore, clock: Clock) -> SavedSession | None:
     """Store that this program uses the bench, and return the session before; None if it is not known."""
     before = _session(store)
-    _store_session(store, SavedSession(command=_this_command(), since_utc=clock.utc().isoformat(timespec="seconds")))
+    _store_session(store, SavedSession(command=this_command(), since_utc=clock.utc().isoformat(timespec="seconds")))
     return before
 
 
@@ -380,105 +376,9 @@ def _store_session(store: StateStore, session: SavedSession) -> None:
         store.store_file(SESSION, session.model_dump_json().encode())
 
 
-def _this_command() -> str:
+def this_command() -> str:
     command = " ".join([Path(sys.argv[0]).name, *sys.argv[1:]])
     return command.encode(errors="replace").decode()  # arguments may have bytes that are not UTF-8
-
-
-class BenchLock:
-    """Reserves a bench for this process until it is closed; the kernel releases it when the process dies.
-
-    Raises
-    ------
-    BenchBusy
-        Another process uses the bench; the message says which.
-    StateNotStored
-        The folder cannot be created.
-    """
-
-    def __init__(self, path: Path, clock: Clock) -> None:
-        with _storing(path / "lock"):
-            _make_folder(path)
-            self._file: TextIO = open(path / "lock", "a+", encoding="utf-8", opener=no_follow)  # noqa: SIM115
-        for attempt in range(LOCK_ATTEMPTS):
-            if _try_lock(self._file):
-                break
-            if attempt + 1 == LOCK_ATTEMPTS:
-                self._file.close()
-                raise busy(path, holder(path))
-            clock.sleep(0.02)  # another program may be reading who holds the lock
-        FileStore(path).clear_stop()  # an old request, meant for an earlier program
-        mine = Holder(
-            pid=os.getpid(),
-            command=_this_command(),
-            since_utc=clock.utc().isoformat(timespec="seconds"),
-            terminates=callable(signal.getsignal(signal.SIGTERM)),
-        )
-        with suppress(OSError):  # full disk: the lock works, only the holder's name is missing
-            self._file.truncate(0)
-            self._file.write(mine.model_dump_json())
-            self._file.flush()
-
-    def close(self) -> None:
-        with suppress(OSError):
-            self._file.truncate(0)
-        self._file.close()
-
-
-def holder(path: Path) -> Holder | None:
-    """Return the program that uses the bench with the state folder ``path``; None if there is none.
-
-    The name of a killed program does not count, because its lock is gone. A holder whose name is not known has pid 0.
-    """
-    try:
-        with open(path / "lock", encoding="utf-8", opener=no_follow) as file:
-            if _try_lock(file):
-                return None
-            text = file.read()
-    except OSError:  # never locked, or not readable for this user
-        return None
-    try:
-        return Holder.model_validate_json(text)
-    except ValidationError:
-        return Holder(pid=0, command="", since_utc="")
-
-
-def server_address(path: Path) -> ServerAddress | None:
-    """Return the running server of the bench with the state folder ``path``; None if there is none."""
-    who = holder(path / SERVER_FOLDER)
-    try:
-        found = ServerAddress.model_validate_json((path / SERVER_FOLDER / SERVER_FILE).read_bytes())
-    except (OSError, ValidationError):
-        return None
-    return found if who is not None and who.pid == found.pid else None
-
-
-def _try_lock(file: TextIO) -> bool:
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
-        if error.errno in (errno.EWOULDBLOCK, errno.EACCES):
-            return False
-        raise
-    return True
-
-
-def busy(path: Path, who: Holder | None) -> BenchBusy:
-    """Return the error that ``who`` uses the bench with the state folder ``path``."""
-    name = f"process {who.pid} (`{who.command}`, since {who.since_utc})" if who and who.pid else "another process"
-    server = server_address(path)
-    if server is not None and who is not None and who.pid == server.pid:
-        return BenchBusy(
-            f"The bench is served to browsers by {name}.",
-            next_step=f"Open {server.url} and work there, or end the server first.",
-            evidence={"state": str(path), "page": server.url},
-        )
-    return BenchBusy(
-        f"The bench is in use by {name}.",
-        next_step="Wait until it ends, or run `rig stop` (stops the table, torque off). "
-        "A second bench on this computer needs its own state_dir.",
-        evidence={"state": str(path)},
-    )
 
 
 def _fault_of_damage(damage: str) -> LatchedFault:
@@ -491,12 +391,12 @@ def _fault_of_damage(damage: str) -> LatchedFault:
     )
 
 
-def _make_folder(path: Path) -> None:
+def make_folder(path: Path) -> None:
     if not path.is_dir():
         path.mkdir(parents=True, exist_ok=True)
 
 
-def _storing(path: Path) -> AbstractContextManager[None]:
+def storing(path: Path) -> AbstractContextManager[None]:
     """Raise `StateNotStored` if the system does not let the ``with`` block write to ``path``."""
     what = f"The bench's state cannot be written to {path}; the table may not move without it."
     return os_errors_as(StateNotStored, what, next_step=_MAKE_ROOM)

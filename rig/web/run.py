@@ -19,7 +19,8 @@ from rig.config import RigConfig
 from rig.core.clock import SystemClock
 from rig.core.errors import RigError, UsageError, os_errors_as
 from rig.core.files import write
-from rig.safety.saved_state import SERVER_FILE, SERVER_FOLDER, BenchLock, ServerAddress
+from rig.safety.bench_lock import BenchLock
+from rig.safety.saved_state import SERVER_FILE, SERVER_FOLDER, ServerAddress
 from rig.web.access import Lease, Sessions, Tokens
 from rig.web.api_catalog import UPLOAD
 from rig.web.app import create_app

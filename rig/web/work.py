@@ -16,7 +16,7 @@ from rig.core.clock import SystemClock
 from rig.core.errors import RigError, TableNotEmpty, UsageError, ViewRejected
 from rig.events.events import Enrolled, Event, Failed, Identified, Started, event_dict, plain
 from rig.events.lines import line
-from rig.events.wording import counted, duration_words
+from rig.events.phrases import counted, duration_words
 from rig.motion.turntable import Turntable
 from rig.plans.capture import announced, moved
 from rig.plans.enroll import enroll

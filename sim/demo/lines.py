@@ -5,7 +5,8 @@ from typing import ClassVar
 from hbr import StopDecision
 from rig.events.events import Accepted, Candidate, Decided, Event, Identified, Moved, Ranked
 from rig.events.lines import line
-from rig.events.wording import azimuth_words, distinct, share_words, signed
+from rig.events.phrases import azimuth_words, distinct, signed
+from rig.events.wording import share_words
 
 
 class MoveLines:

@@ -23,7 +23,7 @@ from rig.core.clock import SystemClock, seconds_between
 from rig.core.errors import UsageError, os_errors_as
 from rig.events.events import Accepted, Started
 from rig.events.lines import line
-from rig.events.wording import duration_words, signed
+from rig.events.phrases import duration_words, signed
 from rig.plans.enroll import enroll
 from rig.plans.identify import identify
 from rig.plans.photograph_table import photograph_table

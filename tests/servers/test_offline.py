@@ -19,7 +19,8 @@ from rig.catalog.journal import Journal, journal_folder, waiting
 from rig.catalog.local_copy import open_copy, open_or_copy, update_copy
 from rig.catalog.results import find_results
 from rig.catalog.results import record as record_result
-from rig.catalog.verify import Problem, verify
+from rig.catalog.verify import verify
+from rig.catalog.verify_images import Problem
 from rig.cli.ui.complete import object_names
 from rig.config.catalog_place import CatalogPlace
 from rig.core.clock import SystemClock

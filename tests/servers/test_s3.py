@@ -20,7 +20,8 @@ from rig.catalog.exchange import Conflict, import_objects, plan_import
 from rig.catalog.exchange.catalog_reader import read_catalog
 from rig.catalog.results import record as record_result
 from rig.catalog.upkeep import collect_garbage
-from rig.catalog.verify import Problem, Repair, verify
+from rig.catalog.verify import verify
+from rig.catalog.verify_images import Problem, Repair
 from rig.config.catalog_place import CatalogPlace
 from rig.core.clock import SystemClock
 from rig.core.errors import CatalogError, CatalogUnavailable

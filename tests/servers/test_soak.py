@@ -15,7 +15,8 @@ import pytest
 from rig.catalog import Action, Catalog
 from rig.catalog.delivery import deliver
 from rig.catalog.journal import Journal
-from rig.catalog.verify import Problem, verify
+from rig.catalog.verify import verify
+from rig.catalog.verify_images import Problem
 from rig.config.catalog_place import CatalogPlace
 from rig.core.clock import seconds_between
 from tests.programs import Program

@@ -109,7 +109,7 @@ def status(settings: Settings) -> None:
     """
     from rig.core.errors import DeviceMismatch, DeviceNotFound, DeviceSilent
     from rig.events.events import plain
-    from rig.safety.saved_state import server_address
+    from rig.safety.bench_lock import server_address
 
     if server := server_address(settings.load().state_path(settings.bench_name)):
         _served_status(settings, server)

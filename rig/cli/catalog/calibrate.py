@@ -87,7 +87,8 @@ def calibrate(
 def _lines(found: "CalibratedRule", objects: int, seconds: float) -> list[str]:
     from math import isfinite
 
-    from rig.events.wording import counted, limitation_words, percent, percent_words, sentence
+    from rig.events.phrases import counted, percent, percent_words, sentence
+    from rig.events.wording import limitation_words
 
     rule = found.rule
     lines = [

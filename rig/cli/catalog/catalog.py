@@ -111,7 +111,7 @@ def show(
 
 
 def _print_object(details: "ObjectDetails", folder: str, *, full: bool) -> None:
-    from rig.events.wording import counted
+    from rig.events.phrases import counted
     from rig.views.segmentation_evidence import SegmentationSummary
 
     summary = details.summary
@@ -204,7 +204,7 @@ def delete_(
     Example: rig catalog delete mug-white --yes --bench sim
     """
     from rig.catalog.edit import delete
-    from rig.events.wording import counted
+    from rig.events.phrases import counted
 
     with settings.open_catalog() as catalog:
         found = [catalog.summary(name) for name in dict.fromkeys(names)]
@@ -229,7 +229,7 @@ def undelete_(
     Example: rig catalog undelete mug-white --bench sim
     """
     from rig.catalog.edit import undelete
-    from rig.events.wording import counted
+    from rig.events.phrases import counted
 
     with settings.open_catalog() as catalog:
         undelete(catalog, name)

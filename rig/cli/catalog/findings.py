@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from rig.catalog.verify import Finding
+    from rig.catalog.verify_images import Finding
 
 
 def finding_text(finding: "Finding") -> str:
@@ -15,7 +15,7 @@ def finding_text(finding: "Finding") -> str:
 
 
 def _evidence(finding: "Finding") -> list[str]:
-    from rig.catalog.verify import Problem
+    from rig.catalog.verify_images import Problem
 
     details = finding.details
     match finding.problem:
@@ -47,7 +47,7 @@ def _evidence(finding: "Finding") -> list[str]:
 
 
 def _fix(finding: "Finding") -> str:
-    from rig.catalog.verify import Problem
+    from rig.catalog.verify_images import Problem
 
     match finding.problem:
         case Problem.OBJECT_CHANGED | Problem.ENROLLMENT_CHANGED:

@@ -140,7 +140,7 @@ def export(
     """
     from rig.catalog.exchange.results_table import TableFormat, write_results
     from rig.core.errors import UsageError
-    from rig.events.wording import counted
+    from rig.events.phrases import counted
 
     try:
         form = TableFormat(target.suffix.lower().removeprefix("."))

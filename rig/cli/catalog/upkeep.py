@@ -35,7 +35,7 @@ def verify(
     from rig.catalog.verify import verify as job
     from rig.cli.catalog.findings import finding_text
     from rig.events.events import plain
-    from rig.events.wording import counted
+    from rig.events.phrases import counted
 
     with settings.open_catalog(read_only=not repair) as catalog:
         found = run_job(
@@ -88,7 +88,7 @@ def redescribe(
     """
     from rig.catalog.redescribe import redescribe as job
     from rig.events.events import plain
-    from rig.events.wording import counted
+    from rig.events.phrases import counted
 
     part = _region(settings, region)
     with settings.open_catalog() as catalog:
@@ -124,7 +124,7 @@ def gc(
     """
     from rig.catalog.upkeep import GarbageReport, collect_garbage
     from rig.events.events import plain
-    from rig.events.wording import counted
+    from rig.events.phrases import counted
 
     def words(found: GarbageReport) -> str:
         names = ", ".join(found.objects[:10]) + (" and others" if len(found.objects) > 10 else "")
@@ -184,7 +184,7 @@ def copy(
     from rig.catalog.copying import copy_catalog
     from rig.config.catalog_place import CatalogPlace
     from rig.core.clock import SystemClock
-    from rig.events.wording import counted
+    from rig.events.phrases import counted
 
     def place(text: str) -> CatalogPlace:
         if "://" not in text:

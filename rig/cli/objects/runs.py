@@ -43,7 +43,7 @@ def replay(
     from rig.cli.ui.live import IdentifyView
     from rig.cli.ui.present import console
     from rig.events.events import event_dict
-    from rig.events.wording import counted
+    from rig.events.phrases import counted
 
     if settings.json:
         for event in saved.events():
@@ -87,7 +87,7 @@ def report(
 def _check(settings: Settings, saved: "SavedRun", *, every: bool) -> None:
     from rig.core.errors import ReplayMismatch, RunIncomplete
     from rig.events.events import plain
-    from rig.events.wording import counted
+    from rig.events.phrases import counted
     from rig.search.replay import check
 
     with saved.damage():

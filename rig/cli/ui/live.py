@@ -31,18 +31,8 @@ from rig.events.events import (
     Waiting,
 )
 from rig.events.lines import line
-from rig.events.wording import (
-    angle_words,
-    azimuth_words,
-    counted,
-    decision_words,
-    duration_words,
-    move_words,
-    share_words,
-    signed,
-    similar_objects_words,
-    stop_words,
-)
+from rig.events.phrases import angle_words, azimuth_words, counted, duration_words, signed
+from rig.events.wording import decision_words, move_words, share_words, similar_objects_words, stop_words
 from rig.motion.motion_model import MotionModel
 from rig.plans.estimate import TimeLeft
 from rig.views.capture import ViewEvidence, rejection_text

@@ -13,7 +13,7 @@ from rich.segment import Segment
 
 from rig.cli.ui.terminal import unguarded
 from rig.core.control_characters import neutral
-from rig.events.wording import angle_words, azimuth_words, counted, duration_words
+from rig.events.phrases import angle_words, azimuth_words, counted, duration_words
 from rig.plans.estimate import DryRun, Obstacle
 
 _PIPE_COLUMNS: Final = 240

@@ -20,7 +20,8 @@ from rig.catalog.exchange.results_table import COLUMNS, TableFormat, write_resul
 from rig.catalog.records import Outcome
 from rig.catalog.results import ResultFilter, correct, find_result, find_results, record
 from rig.catalog.upkeep import collect_garbage
-from rig.catalog.verify import Problem, verify
+from rig.catalog.verify import verify
+from rig.catalog.verify_images import Problem
 from rig.core.errors import CatalogError, ExportFailed, ObjectNotFound, UsageError
 from sim.clock import VirtualClock
 from tests.rig.catalog.catalog_samples import (

@@ -24,7 +24,8 @@ from rig.catalog.exchange import (
 from rig.catalog.redescribe import redescribe
 from rig.catalog.schema import descriptors, views
 from rig.catalog.seal import changing_enrollments
-from rig.catalog.verify import Problem, verify
+from rig.catalog.verify import verify
+from rig.catalog.verify_images import Problem
 from rig.config import ViewConfig
 from rig.core.clock import SystemClock
 from rig.core.errors import DescriptorOutdated, UsageError

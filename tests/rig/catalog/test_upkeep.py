@@ -18,7 +18,8 @@ from rig.catalog.redescribe import redescribe
 from rig.catalog.seal import seal_enrollments
 from rig.catalog.staging import staging
 from rig.catalog.upkeep import collect_garbage, statistics
-from rig.catalog.verify import Problem, Verification, verify
+from rig.catalog.verify import Verification, verify
+from rig.catalog.verify_images import Problem
 from rig.cli.catalog.findings import finding_text
 from rig.core.errors import CatalogDamaged, CatalogError, DescriptorOutdated, ObjectExists, ObjectNotFound, UsageError
 from sim.clock import VirtualClock

@@ -22,19 +22,17 @@ from rig.events.events import (
     WaitReason,
     Weighed,
 )
+from rig.events.phrases import distinct, percent_words, signed
 from rig.events.wording import (
     answer_words,
     decision_words,
-    distinct,
     limitation_words,
     move_words,
     next_step_words,
     note_words,
     outcome_words,
-    percent_words,
     reason_words,
     share_words,
-    signed,
     similar_objects_words,
     stop_words,
     wait_words,

@@ -14,16 +14,8 @@ from hypothesis import strategies as st
 from rig.config import load_config
 from rig.core.clock import SystemClock
 from rig.core.errors import BenchBusy, Stalled, StateNotStored
-from rig.safety.saved_state import (
-    LATCH_BYTES,
-    BenchLock,
-    BenchState,
-    FileStore,
-    Holder,
-    LatchedFault,
-    SavedTable,
-    holder,
-)
+from rig.safety.bench_lock import BenchLock, holder
+from rig.safety.saved_state import LATCH_BYTES, BenchState, FileStore, Holder, LatchedFault, SavedTable
 from sim import disk
 from tests.fuzzing import fuzz_settings
 
@@ -31,7 +23,7 @@ HOLD = """
 import sys, time
 from pathlib import Path
 from rig.core.clock import SystemClock
-from rig.safety.saved_state import BenchLock
+from rig.safety.bench_lock import BenchLock
 lock = BenchLock(Path(sys.argv[1]), SystemClock())
 print("held", flush=True)
 time.sleep(60)

@@ -21,7 +21,7 @@ from rig.config import load_config
 from rig.core.clock import SystemClock
 from rig.core.errors import UsageError, ViewRejected
 from rig.events.events import Event, Item, Moved, SimilarObject, SimilarObjects, SkipReason, Waiting, WaitReason
-from rig.events.wording import angle_words
+from rig.events.phrases import angle_words
 from rig.plans.tray import TrayDecision, TrayItem
 from tests.programs import Program
 from tests.rig.report.report_samples import enrolling, identifying, searching_densely

@@ -1,0 +1,53 @@
+"""The results of a bench's calibrations, in force or not, in words and as JSON."""
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rig.bench import Bench
+    from rig.calibrations import CalibrationResult, CalibrationStanding, CalibrationStore
+
+
+def stored_results(bench: "Bench") -> "tuple[CalibrationStore, list[CalibrationStanding]]":
+    """Return the bench's calibration results and their standings."""
+    from rig.calibrations import CalibrationStore
+
+    store = CalibrationStore(bench.config.calibration_path(bench.name))
+    return store, store.standings(bench.apparatus(), bench.clock.utc())
+
+
+def in_force(bench: "Bench", name: str) -> "CalibrationResult":
+    """Return the result called ``name`` that is in force on the bench. Raises `UsageError` if there is none."""
+    from rig.calibrations import CalibrationStatus
+    from rig.core.errors import UsageError
+
+    for standing in stored_results(bench)[1]:
+        if standing.result.name == name and standing.status is CalibrationStatus.IN_FORCE:
+            return standing.result
+    raise UsageError(
+        f"{name} is not calibrated on this bench.", next_step=f"Run `rig calibrate {name.partition('.')[0]}` first."
+    )
+
+
+def as_json(result: "CalibrationResult") -> dict[str, Any]:
+    """Return a result as JSON; each rejection also in words."""
+    from rig.events.events import plain
+
+    rejections = [{"code": r.code.name.lower(), "values": plain(r.values), "text": str(r)} for r in result.rejections]
+    return {**plain(result), "rejections": rejections}
+
+
+def outcome_text(result: "CalibrationResult") -> str:
+    """Return the outcome of a calibration: its values, or why it did not pass and the next step."""
+    residual = ""
+    if result.residual is not None and result.limit is not None:
+        unit = result.residual_unit
+        residual = f" (worst residual {result.residual:.3g} {unit}, limit {result.limit:.3g} {unit})"
+    lines = [f"{'PASS' if result.passed else 'FAIL'} {result.name}{residual}"]
+    lines += [f"  {name} = {estimate}" for name, estimate in result.estimates.items()]
+    lines += [f"  sets {key} = {plain_value(value)}" for key, value in result.settings.items()]
+    return "\n".join([*lines, *(f"  {rejection}" for rejection in result.rejections)])
+
+
+def plain_value(value: Any) -> str:
+    """Return a value of the configuration in a few digits."""
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
