@@ -1,9 +1,7 @@
 """The display of a running plan: a live table on a terminal, one line for each view in a pipe."""
 
 from abc import abstractmethod
-from collections.abc import Callable
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
 from types import TracebackType
 from typing import Final, Self
 
@@ -14,6 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from rig.cli.ui.keys import HINT, Pause
+from rig.cli.ui.view_rows import COLUMNS, COLUMNS_IN_MOTION, NARROW, WIDE, Columns, ViewRow
 from rig.config import RigConfig
 from rig.events.events import (
     Accepted,
@@ -31,7 +30,7 @@ from rig.events.events import (
     Waiting,
 )
 from rig.events.lines import line
-from rig.events.phrases import angle_words, azimuth_words, counted, duration_words, signed
+from rig.events.phrases import azimuth_words, counted, duration_words, signed
 from rig.events.wording import decision_words, move_words, share_words, similar_objects_words, stop_words
 from rig.motion.motion_model import MotionModel
 from rig.plans.estimate import TimeLeft
@@ -39,8 +38,6 @@ from rig.views.capture import ViewEvidence, rejection_text
 
 ROWS: Final = 12
 """Largest number of rows in the live table."""
-WIDE, NARROW = 88, 60
-"""Width of a terminal, in characters, that fits all columns of a table, and most of them."""
 
 
 class LiveView(AbstractContextManager["LiveView"]):
@@ -122,38 +119,6 @@ class LiveView(AbstractContextManager["LiveView"]):
         return Text(f"{HINT}, {stop}" if self._pause.listens else stop, style="dim")
 
 
-@dataclass(frozen=True, slots=True)
-class _Row:
-    """An image of an enrollment, accepted or rejected."""
-
-    number: int
-    move: Moved | None
-    evidence: ViewEvidence
-    result: str
-    accepted: bool
-
-    @property
-    def imu(self) -> str:
-        """The table angle by the gyro, with its uncertainty."""
-        if self.move is None or self.move.rotation_imu_deg is None:
-            return "–"
-        angle_deg = self.move.encoder_deg - self.move.rotation_encoder_deg + self.move.rotation_imu_deg
-        sigma = "" if self.move.imu_sigma_deg is None else f" ± {self.move.imu_sigma_deg:.2f}"
-        return f"{angle_words(angle_deg, 2).removesuffix('°')}{sigma}°"
-
-
-COLUMNS: Final[tuple[tuple[str, int, Callable[[_Row], str]], ...]] = (
-    ("view", 0, lambda row: str(row.number)),
-    ("asked", NARROW, lambda row: "–" if row.move is None else angle_words(row.move.commanded_deg, 2)),
-    ("encoder", 0, lambda row: "–" if row.move is None else angle_words(row.move.encoder_deg, 2)),
-    ("IMU", NARROW, lambda row: row.imu),
-    ("sharpness", NARROW, lambda row: f"{row.evidence.sharpness:.1f}"),
-    ("brightness", WIDE, lambda row: f"{row.evidence.mean_level:.0f}"),
-    ("saturated", WIDE, lambda row: f"{row.evidence.saturated_share * 100:.0f} %"),
-)
-"""Columns of an enrollment's table: heading, width that the terminal needs to show it, and cell."""
-
-
 class EnrollView(LiveView):
     """The table of an enrollment, with a row for each image.
 
@@ -174,7 +139,7 @@ class EnrollView(LiveView):
         self._name = ""
         self._of = 0
         self._taken = 0
-        self._rows: list[_Row] = []
+        self._rows: list[ViewRow] = []
         self._move: Moved | None = None
         self._left: TimeLeft | None = None
         self._findings: list[str] = []
@@ -216,18 +181,22 @@ class EnrollView(LiveView):
     def _title(self) -> str:
         return f"{self._heading} {self._name}".strip()
 
+    @property
+    def _columns(self) -> Columns:
+        return COLUMNS_IN_MOTION if any(row.evidence.motion for row in self._rows) else COLUMNS
+
     def _add(self, evidence: ViewEvidence, result: str, *, accepted: bool) -> None:
-        row = _Row(self._taken if accepted else self._taken + 1, self._move, evidence, result, accepted)
+        row = ViewRow(self._taken if accepted else self._taken + 1, self._move, evidence, result, accepted)
         self._rows.append(row)
         del self._rows[:-ROWS]
         if not self._console.is_terminal:
             left = f"  {duration_words(self._left.seconds)} left" if self._left and accepted else ""
-            cells = "  ".join(f"{heading} {cell(row)}" for heading, _, cell in COLUMNS[1:])
+            cells = "  ".join(f"{heading} {cell(row)}" for heading, _, cell in self._columns[1:])
             self.note(f"view {row.number} of {self._of}  {cells}  {result}{left}")
 
     def render(self) -> RenderableType:
         width = self._console.width
-        columns = [(heading, cell) for heading, needed, cell in COLUMNS if width >= needed]
+        columns = [(heading, cell) for heading, needed, cell in self._columns if width >= needed]
         table = Table(box=None, pad_edge=False)
         for heading, _ in columns:
             table.add_column(heading, justify="right", no_wrap=True)

@@ -8,6 +8,7 @@ import select
 import signal
 import termios
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 
@@ -20,9 +21,21 @@ from rig.cli.ui.operator_prompts import OperatorPrompts
 from rig.config import load_config
 from rig.core.clock import SystemClock
 from rig.core.errors import UsageError, ViewRejected
-from rig.events.events import Event, Item, Moved, SimilarObject, SimilarObjects, SkipReason, Waiting, WaitReason
+from rig.events.events import (
+    Accepted,
+    Event,
+    Item,
+    Moved,
+    Rejected,
+    SimilarObject,
+    SimilarObjects,
+    SkipReason,
+    Waiting,
+    WaitReason,
+)
 from rig.events.phrases import angle_words
 from rig.plans.tray import TrayDecision, TrayItem
+from rig.views.capture import MotionEvidence
 from tests.programs import Program
 from tests.rig.report.report_samples import enrolling, identifying, searching_densely
 
@@ -79,6 +92,35 @@ def test_enrollment_in_a_pipe_has_one_line_for_each_view():
         "its pose is known up to that angle",
         "  looks like mug-03 from 120–200° (similarity up to 0.990)",
     ]
+
+
+def in_motion(events: list[Event]) -> list[Event]:
+    """Return events as if the views had been taken in one turn, 45° apart."""
+    return [
+        replace(one, evidence=replace(one.evidence, stillness=None, motion=flight(45.0 * one.index)))
+        if isinstance(one, Accepted | Rejected)
+        else one
+        for one in events
+    ]
+
+
+def flight(angle_deg: float) -> MotionEvidence:
+    return MotionEvidence(0, angle_deg, 0.0612, 90.04, 3.78, 0.02)
+
+
+def test_views_in_motion_have_their_own_angles_in_a_pipe():
+    console = screen(80, terminal=False)
+    text = shown(console, EnrollView(console, load_config()), in_motion(enrolled_with_similar_objects()))
+    assert "view 2 of 8  table angle 45.00 ± 0.06°  speed and smear 90 °/s, 3.8 px  sharpness" in text
+    assert "asked" not in text
+
+
+@pytest.mark.parametrize("width", [30, 60, 120])
+def test_views_in_motion_fit_the_terminal(width):
+    console = screen(width)
+    text = shown(console, EnrollView(console, load_config()), in_motion(enrolled_with_similar_objects()))
+    assert "45.00 ± 0.06°" in text
+    assert ("speed and smear" in text) == (width >= 60)
 
 
 @pytest.mark.parametrize("width", [30, 60, 120])
