@@ -22,6 +22,7 @@ from calibration.procedures import (
     CameraCard,
     CameraModel,
     CameraNoise,
+    CameraTime,
     Encoder,
     GyroNoise,
     GyroScale,
@@ -172,6 +173,21 @@ def axis(seed: int) -> tuple[CalibrationResult, Truth]:
     }
 
 
+def frame_time(seed: int) -> tuple[CalibrationResult, Truth]:
+    readout_ms = float(np.random.default_rng(seed).uniform(5, 25))
+    noise = NoiseModel(camera_readout_ms=readout_ms)
+    with opened(seed, noise) as (bench, parts):
+        exposure_ms = bench.config.camera.exposure_us * 1e-3
+        result = last(CameraTime("mug-star").live(bench))
+        offset_ms = (exposure_ms + readout_ms) / 2 - parts.camera.times.offset_ns * 1e-6
+    return result, {
+        "offset": (offset_ms, "ms"),
+        "readout": (readout_ms, "ms"),
+        "jitter": (noise.stamp_jitter_ms, "ms"),
+        "lost_frames": (noise.lost_frames, ""),
+    }
+
+
 PROCEDURES: dict[str, Callable[[int], tuple[CalibrationResult, Truth]]] = {
     "servo.backlash": backlash,
     "servo.encoder": encoder,
@@ -184,6 +200,7 @@ PROCEDURES: dict[str, Callable[[int], tuple[CalibrationResult, Truth]]] = {
     "camera.drift": steadiness,
     "camera.intrinsics": lens,
     "table.axis": axis,
+    "camera.time": frame_time,
 }
 
 

@@ -5,12 +5,17 @@
 The frames are those of a rotation by 180° on the simulated bench in 640x480, before its plain background and before
 that of another bench. The catalog has random descriptions, which a search compares as it does any others. Drawing the
 frames is not counted. The median and the 95 % quantile of the CPU time of one thread are given for each step.
+
+Then the same frames are fed in real time at 30 frames/s for ten seconds (``--seconds``), and those are counted that
+the search drops because it is too slow. That says something on an idle computer only; the load is printed.
 """
 
 import argparse
+import os
 import time
 from collections import defaultdict
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -19,33 +24,45 @@ import numpy as np
 import hbr
 from hbr.dense.arc import ArcRule, ArcSession
 from hbr.dense.stopping import StoppingRule
-from rig.config import load_config
+from rig.config import RigConfig, load_config
+from rig.core.clock import SystemClock
+from rig.devices.camera import Frame
 from rig.motion.flight_views import FlightJudge
 from rig.motion.turntable import Flight, Turntable
 from rig.views.description import BENCH_DESCRIPTOR, SearchDescriber
-from rig.views.stream import FrameStream
+from rig.views.stream import FrameStream, StreamFrame
 from sim.bench import ShelfOperator, open_sim_bench
 from sim.change import another_bench
+from sim.objects.projection import Image
 from sim.objects.shelf import shelf
 from sim.world import World
 
 FPS = 30
+Work = Callable[[StreamFrame], None]
 
 
 def main() -> None:
     options = argparse.ArgumentParser()
     options.add_argument("--objects", type=int, default=100)
     options.add_argument("--views", type=int, default=72)
+    options.add_argument("--seconds", type=float, default=10.0)
     given = options.parse_args()
     cv2.setNumThreads(1)
     rng = np.random.default_rng(0)
     index = random_index(rng, given.objects, given.views)
     print(f"| frames of 640x480, {given.objects} objects with {given.views} views | median | 95 % | median / period |")
     print("|---|--:|--:|--:|")
+    counted = []
     for background in ("plain", "another bench"):
-        for step, spent in measured(index, background).items():
+        steps, images, begin = measured(index, background)
+        for step, spent in steps.items():
             median, high = np.median(spent) * 1e3, np.percentile(spent, 95) * 1e3
             print(f"| {background}: {step} | {median:.1f} ms | {high:.1f} ms | {median * FPS / 1e3:.2f} |")
+        counted.append((background, *fed(images, begin, given.seconds)))
+    print()
+    for background, used, dropped in counted:
+        print(f"{background}: {dropped} of {used + dropped} frames dropped at {FPS} frames/s")
+    print(f"load of the computer {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
 
 
 def random_index(rng: np.random.Generator, objects: int, views: int) -> hbr.DenseIndex:
@@ -57,27 +74,28 @@ def random_index(rng: np.random.Generator, objects: int, views: int) -> hbr.Dens
     return hbr.DenseIndex(hbr.Views(levels, azimuth_deg, np.repeat(np.arange(objects), views), names, BENCH_DESCRIPTOR))
 
 
-def measured(index: hbr.DenseIndex, background: str) -> dict[str, list[float]]:
-    """Return the CPU time of each step for each frame of a turn, in seconds."""
+def measured(index: hbr.DenseIndex, background: str) -> tuple[dict[str, list[float]], list[Image], Callable[[], Work]]:
+    """Return the CPU time of each step for each frame of a turn in seconds, the images, and what begins a search."""
     operator = ShelfOperator(World(seed=2), shelf(), next_object="mug-star")
     config = load_config(None, ("camera_time.offset_ms=1", "camera_time.jitter_ms=0.2"))
     spent: dict[str, list[float]] = defaultdict(list)
-    never = StoppingRule(30.0, 2.0, np.zeros((len(index), 4)), (-9.0,) * 4, 0.01, 0.02, 0.0, 0)
-    session = ArcSession(index, ArcRule(never, 2.0))
+    images: list[Image] = []
     with open_sim_bench(config, operator) as bench:
         assert operator.devices is not None
         bench.operator.place(None)
         if background != "plain":
             operator.devices.camera.backdrop = another_bench(np.random.default_rng(1))
-        describe = SearchDescriber(bench.config.view, BENCH_DESCRIPTOR, revise=False)
         locks = bench.camera.read_locks()
         with Turntable(bench) as table:
             recorder, stream = table.recorder(), FrameStream(bench.camera, bench.clock)
             judge = FlightJudge(config, locks, True, bench.clock.now_ns(), stream.period_s)
 
-            def each() -> None:
-                frame = stream.next(table.collect_gyro)
-                begun = time.thread_time()
+            def begin() -> Work:
+                describe, session = begun(index, config)
+                return lambda frame: work(frame, describe, session)
+
+            def work(frame: StreamFrame, describe: SearchDescriber, session: ArcSession) -> None:
+                started = time.thread_time()
                 trajectory = timed(spent["angle"], recorder.fit)
                 if trajectory is None:
                     return
@@ -86,10 +104,55 @@ def measured(index: hbr.DenseIndex, background: str) -> dict[str, list[float]]:
                 motion = attempt.evidence.motion
                 assert motion is not None
                 timed(spent["search"], lambda: session.add(levels, motion.angle_deg % 360))
-                spent["sum"].append(time.thread_time() - begun)
+                spent["sum"].append(time.thread_time() - started)
+
+            use = begin()
+
+            def each() -> None:
+                frame = stream.next(table.collect_gyro)
+                images.append(frame.image_bgr)
+                use(frame)
 
             table.fly(180.0, Flight(each, (0.0, 180.0), recorder, config.table.velocity_dps))
-    return spent
+    return {step: list(times) for step, times in spent.items()}, images, begin
+
+
+def begun(index: hbr.DenseIndex, config: RigConfig) -> tuple[SearchDescriber, ArcSession]:
+    """Return the beginning of a search that never ends."""
+    never = StoppingRule(30.0, 2.0, np.zeros((len(index), 4)), (-9.0,) * 4, 0.01, 0.02, 0.0, 0)
+    return SearchDescriber(config.view, BENCH_DESCRIPTOR, revise=False), ArcSession(index, ArcRule(never, 2.0))
+
+
+class PlayedCamera:
+    """A camera that delivers JPEG images in real time and decodes them, again from the first one after the last."""
+
+    def __init__(self, images: list[Image], clock: SystemClock) -> None:
+        self.identity = SimpleNamespace(fps=float(FPS))
+        self._images = [cv2.imencode(".jpg", image)[1] for image in images]
+        self._clock = clock
+        self._begun_ns = clock.now_ns()
+
+    def capture(self, after_ns: int, _meanwhile: Callable[[], object] | None = None) -> Frame:
+        """Return the first frame after a time, or wait for it."""
+        number = max(-(-(after_ns - self._begun_ns) * FPS // 1_000_000_000), 0)
+        stamp_ns = self._begun_ns + number * 1_000_000_000 // FPS
+        self._clock.sleep((stamp_ns - self._clock.now_ns()) * 1e-9)
+        image = cv2.imdecode(self._images[number % len(self._images)], cv2.IMREAD_COLOR)
+        assert image is not None
+        return Frame(np.asarray(image, np.uint8), stamp_ns)
+
+
+def fed(images: list[Image], begin: Callable[[], Work], seconds: float) -> tuple[int, int]:
+    """Search again and again in real time; return how many frames were used, and how many were dropped."""
+    clock = SystemClock()
+    stream = FrameStream(PlayedCamera(images, clock), clock)  # type: ignore[arg-type]
+    used, until_ns = 0, clock.now_ns() + round(seconds * 1e9)
+    while clock.now_ns() < until_ns:
+        work = begin()
+        for _ in images:
+            work(stream.next(newest=True))
+        used += len(images)
+    return used, stream.skipped
 
 
 def timed(spent: list[float], work: Callable[[], Any]) -> Any:

@@ -72,12 +72,13 @@ class NoiseModel:
     stamp_jitter_ms: float = 0.2
     """Standard deviation of that time from frame to frame. The V4L2 documentation expects a few scan lines; a line of
     the OV5647 takes 0.023 ms, and the computer's interrupt adds its own."""
-    lost_frames: float = 0.0
-    """Share of frames that never arrive: USB does not repeat a broken isochronous transfer (USB 2.0, 5.6.4). No vendor
-    publishes a share; the measurements of views in motion use 0.01."""
-    usb_latency_ms: float = 0.0
-    """Mean of the delay of a frame, distributed exponentially, in addition to a constant 15 ms; the measurements of
-    views in motion use 1 ms, a frame of USB (USB 2.0, 5.3.3)."""
+    lost_frames: float = 0.01
+    """Share of frames that never arrive: USB does not repeat a broken isochronous transfer (USB 2.0, 5.6.4). A Logitech
+    046d:0991 on a Raspberry Pi lost 1 % on average (github.com/raspberrypi/linux/issues/238, 25 March 2013)."""
+    usb_latency_ms: float = 2.0
+    """Mean of the delay of a frame, distributed exponentially, in addition to a constant 15 ms. Linux (uvcvideo) waits
+    until a transfer of 32 packets is full, one for each microframe of 0.125 ms: a frame ends 2 ms before that, on
+    average."""
 
     camera_mount: float = 0.0
     """Error of the camera's position and direction: 1 means some millimetres and degrees (`sim.optics`)."""

@@ -127,7 +127,11 @@ class ArcSession(DenseSession):
         Decisions so far; the first view is the first one.
     is_new_decision
         Whether the last view led to a decision.
+    present : StopDecision
+        What the rule would decide after the last frame, if it decided after each one.
     """
+
+    present: StopDecision
 
     def __init__(self, index: DenseIndex, rule: ArcRule) -> None:
         super().__init__(index, rule.rest, max_views=DECISIONS)
@@ -135,6 +139,7 @@ class ArcSession(DenseSession):
         self.is_new_decision = False
         self._min_confidence = rule.min_confidence
         self._covered_deg = 0.0
+        self._sides: tuple[Belief, int] | None = None
 
     def add(
         self,
@@ -151,8 +156,11 @@ class ArcSession(DenseSession):
         self.is_new_decision = decisions > self.decisions
         self.decisions = decisions
         if self.is_new_decision:
-            return super().add(levels, orientation_deg, earlier=earlier, reliable=reliable)
-        self._extend(levels, orientation_deg)
+            self.present = super().add(levels, orientation_deg, earlier=earlier, reliable=reliable)
+        else:
+            self._reliable = reliable
+            self._extend(levels, orientation_deg)
+            self.present = self._decide(self.belief)
         return self.decision
 
     def _apart_deg(self, orientation_deg: float) -> float:
@@ -162,9 +170,10 @@ class ArcSession(DenseSession):
         return frame_weight(self._apart_deg(orientation_deg)) if self._queries else None
 
     def _decide(self, belief: Belief, *, last: bool = False) -> StopDecision:
-        sides = _sides(belief)
+        sides = self._frames_apart(belief)
         last = last or self.decisions >= DECISIONS
-        decision = self.rule.decide(sides, max_views=sides.queries if last else self.max_views)
+        most = sides.queries if last else self.max_views
+        decision = self.rule.decide(sides, max_views=most, reliable=self._reliable)
         if self.decisions == 1 or decision.reason is StopReason.BELOW_OPEN_SET_THRESHOLD:
             return decision
         enough = sides.queries > 1  # as at rest: an object that is not found by its first view is found by two
@@ -174,6 +183,8 @@ class ArcSession(DenseSession):
         outcome, reason = Outcome.CONTINUE, StopReason.NOT_CONFIDENT
         if enough and confidence >= self._min_confidence:
             outcome, reason = Outcome.FOUND, StopReason.CONFIDENT
+            if not (self._reliable or last):
+                outcome, reason = Outcome.CONTINUE, StopReason.BADLY_SEGMENTED
         elif last:
             outcome, reason = Outcome.AMBIGUOUS, StopReason.MAX_VIEWS
         return replace(
@@ -185,15 +196,15 @@ class ArcSession(DenseSession):
             min_confidence=self._min_confidence,
         )
 
-
-def _sides(belief: Belief) -> Belief:
-    """Return the belief from the frames alone that are at least `SIDE_DEG` away from all earlier ones of them."""
-    sides: Belief | None = None
-    for levels, orientation_deg in zip(belief.levels, belief.orientation_deg.tolist(), strict=True):
-        if sides is None or size_deg(sides.orientation_deg - orientation_deg).min() >= SIDE_DEG:
-            sides = update_belief(levels, orientation_deg, sides or belief.index, kept=len(belief.index))
-    assert sides is not None
-    return sides
+    def _frames_apart(self, belief: Belief) -> Belief:
+        """Return the belief from the frames alone that are at least `SIDE_DEG` away from all earlier ones of them."""
+        sides, seen = self._sides if self._sides and self._sides[0].index is belief.index else (None, 0)
+        for levels, orientation_deg in zip(belief.levels[seen:], belief.orientation_deg[seen:].tolist(), strict=True):
+            if sides is None or size_deg(sides.orientation_deg - orientation_deg).min() >= SIDE_DEG:
+                sides = update_belief(levels, orientation_deg, sides or belief.index, kept=len(belief.index))
+        assert sides is not None
+        self._sides = sides, belief.queries
+        return sides
 
 
 @dataclass(frozen=True, eq=False)

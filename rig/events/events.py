@@ -189,6 +189,24 @@ class Ranked:
 
 
 @dataclass(frozen=True, slots=True)
+class FrameUsed:
+    """A search in motion used a frame: what it knew then.
+
+    ``seconds`` is the time since the search began, ``rejected`` the number of frames that were not used so far.
+    ``name`` is the best candidate with its ``probability``. ``outcome`` is what the stopping rule would decide here; it
+    decides only when the frames have covered another step of the circle.
+    """
+
+    index: int
+    azimuth_deg: float
+    seconds: float
+    rejected: int
+    name: str
+    probability: float
+    outcome: Outcome
+
+
+@dataclass(frozen=True, slots=True)
 class Weighed:
     """All rotations that the dense search weighed before it chose one.
 
@@ -392,6 +410,7 @@ Event = (
     | Rejected
     | Accepted
     | Ranked
+    | FrameUsed
     | Decided
     | Enrolled
     | Identified

@@ -1,5 +1,8 @@
 """One line of text for each event: for terminals, web pages and logs."""
 
+from typing import Final
+
+from hbr import Outcome
 from rig.events.events import (
     Accepted,
     Candidate,
@@ -8,6 +11,7 @@ from rig.events.events import (
     Enrolled,
     Event,
     Failed,
+    FrameUsed,
     Identified,
     Item,
     Moved,
@@ -22,7 +26,7 @@ from rig.events.events import (
     Waiting,
     Warned,
 )
-from rig.events.phrases import angle_words, azimuth_words, counted, duration_words, signed
+from rig.events.phrases import angle_words, azimuth_words, counted, duration_words, percent_words, signed
 from rig.events.wording import (
     answer_lines,
     decision_words,
@@ -39,6 +43,12 @@ from rig.views.capture import rejection_text
 
 SHOWN = 3
 """Candidates in the line of a ranking."""
+_ENOUGH: Final = {
+    Outcome.CONTINUE: "",
+    Outcome.FOUND: ", enough to end the search",
+    Outcome.UNKNOWN: ", resembles no enrolled object enough",
+    Outcome.AMBIGUOUS: ", ambiguous",
+}
 
 
 def line(event: Event) -> str:
@@ -61,6 +71,8 @@ def line(event: Event) -> str:
         case Ranked():
             leaders = ", ".join(_leader(c, event) for c in event.candidates[:SHOWN])
             return f"  candidates: {leaders} (margin {signed(event.margin, 3)})"
+        case FrameUsed():
+            return f"  {_frame_words(event)}"
         case Decided():
             return f"  {decision_words(event)} The table rotates to {angle_words(event.target_deg)}."
         case Enrolled():
@@ -97,6 +109,14 @@ def line(event: Event) -> str:
 def _leader(one: Candidate, ranked: Ranked) -> str:
     share = share_words(one, ranked.decision)
     return f"{one.name} {one.score:.3f}{f' ({share})' if share else ''} at {azimuth_words(one.pose_deg)}°"
+
+
+def _frame_words(used: FrameUsed) -> str:
+    """Return what a frame of a turn showed."""
+    best = f"{used.name} {percent_words(used.probability)}{_ENOUGH[used.outcome]}"
+    where = f"azimuth {azimuth_words(used.azimuth_deg)}°, {used.seconds:.1f} s"
+    rejected = f" ({counted(used.rejected, 'frame')} rejected)" if used.rejected else ""
+    return f"in motion: {best}; view {used.index + 1}, {where}{rejected}"
 
 
 def _skip_words(item: Item) -> str:

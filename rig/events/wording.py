@@ -175,6 +175,8 @@ def rotation_words(decided: Decided) -> str:
                 f"distinguishes {first} from {second}, similarity {here:.2f} there "
                 f"({min(similarity):.2f}–{max(similarity):.2f} all around)"
             )
+        case RotationReason.SEPARATES_CANDIDATES if len(decided.candidates) >= 2:
+            return f"what is seen on the way distinguishes {decided.candidates[0]} from {decided.candidates[1]}"
         case RotationReason.ONE_CANDIDATE | RotationReason.NEW_SIDE:
             return "no second object is likely, so a new side is viewed"
         case RotationReason.EVEN_STEPS:

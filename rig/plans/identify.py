@@ -3,7 +3,7 @@
 Decision: docs/decisions/0002.
 """
 
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ from rig.bench import Bench
 from rig.config import RigConfig
 from rig.core.clock import seconds_between
 from rig.core.errors import RigError
-from rig.events.events import Accepted, Event, Identified, Started
+from rig.events.events import Accepted, Event, FrameUsed, Identified, Started
 from rig.motion.scan_speed import can_fly, require_camera_time
 from rig.motion.turntable import Turntable
 from rig.plans.capture import announced, capture, check_camera, moved, unwind, warn_of_table
@@ -35,6 +35,7 @@ def identify(
     seed: int = 0,
     top: int = SHOWN,
     empty_table: NDArray[np.uint8] | None = None,
+    live: Callable[[FrameUsed], object] = lambda _: None,
 ) -> Generator[Event, None, Identified]:
     """Identify the object on the table; yields events and returns the answer.
 
@@ -60,6 +61,9 @@ def identify(
         The number of candidates that the events name.
     empty_table : uint8 array (H, W, 3), optional
         The empty-table image for the segmentation; by default the one from `rig.search.model.empty_table_for`.
+    live
+        Called with the event of each frame of a search in motion while the table rotates; the plan yields these events
+        when it has stopped. It must return at once.
 
     Raises
     ------
@@ -100,7 +104,7 @@ def identify(
     bench.operator.place(None)
     started_ns = bench.clock.now_ns()
     if isinstance(search, ArcSearch):
-        found = yield from search_in_motion(bench, search, viewer, describe, top=top, started_ns=started_ns)
+        found = yield from search_in_motion(bench, search, viewer, describe, top=top, started_ns=started_ns, live=live)
         answer = search.answer(found.ranked, found.end, travelled_deg=found.travelled_deg, seconds=found.seconds)
         yield answer
         if found.failed:

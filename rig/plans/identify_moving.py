@@ -7,7 +7,7 @@ or gives the table another goal without a stop. If the table arrives first, the 
 Decision: docs/decisions/0047.
 """
 
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -16,7 +16,7 @@ from hbr.core.angles import wrap360
 from rig.bench import Bench
 from rig.core.clock import seconds_between
 from rig.core.errors import RigError
-from rig.events.events import Accepted, Decided, Event, Ranked, Rejected
+from rig.events.events import Accepted, Decided, Event, FrameUsed, Ranked, Rejected
 from rig.motion.flight_views import FlightJudge
 from rig.motion.scan_speed import scan_speed
 from rig.motion.trajectory import TrajectoryRecorder
@@ -33,6 +33,8 @@ FIRST_REST_S: Final = 0.15
 STAMPS: Final = 30
 """Time stamps that are compared with each other: a second of frames."""
 MOST_FLIGHTS: Final = 8
+MOST_REJECTED: Final = 15
+"""After so many rejected frames in a row the table stops, and the next view is taken at rest."""
 NEW_GOAL_DEG: Final = 10.0
 
 
@@ -59,11 +61,15 @@ class _Passing:
     judge: FlightJudge
     describe: ViewDescriber
     top: int
+    live: Callable[[FrameUsed], object]
+    started_ns: int
     number: int
+    rejected: int
     ranked: Ranked
     step: Rotate | Finish
     goal_deg: float
     ended_ns: int | None = None
+    rejected_in_a_row: int = 0
     events: list[Event] = field(default_factory=list)
     stamps_ns: list[int] = field(default_factory=list)
 
@@ -71,7 +77,7 @@ class _Passing:
         """Take the next frame as evidence; return a new goal, or where the table stops if the search has ended."""
         frame = self.stream.next(self.table.collect_gyro, newest=True)
         self.stamps_ns = [*self.stamps_ns[1 - STAMPS :], frame.stamp_ns]
-        if self.ended_ns is not None:
+        if self.ended_ns is not None or self.rejected_in_a_row >= MOST_REJECTED:
             return self.goal_deg
         trajectory = self.recorder.fit()
         if trajectory is None:
@@ -81,8 +87,11 @@ class _Passing:
         motion = attempt.evidence.motion
         assert motion is not None
         if not attempt.accepted:
+            self.rejected += 1
+            self.rejected_in_a_row += 1
             self.events.append(Rejected(self.number + 1, 1, attempt.reasons, attempt.evidence))
-            return None
+            return self._stop() if self.rejected_in_a_row >= MOST_REJECTED else None
+        self.rejected_in_a_row = 0
         self.number += 1
         sign = self.bench.config.table.orientation_sign
         azimuth_deg = float(wrap360(sign * motion.angle_deg))
@@ -91,14 +100,19 @@ class _Passing:
             Accepted(self.number, azimuth_deg, attempt.evidence, attempt.image_bgr, described.segmentation)
         )
         levels = described.levels[self.search.descriptor]
-        self.ranked, self.step = self.search.add(levels, azimuth_deg, table_deg=motion.angle_deg)
+        self.ranked, self.step = self.search.add(
+            levels, azimuth_deg, table_deg=motion.angle_deg, reliable=described.reliable
+        )
+        seconds = seconds_between(self.started_ns, self.bench.clock.now_ns())
+        used = self.search.frame_used(self.number, azimuth_deg, seconds, self.rejected)
+        self.live(used)
+        self.events.append(used)
         if not self.search.is_new_decision:
             return None
         self.events.append(self.ranked)
         if isinstance(self.step, Finish):
             self.ended_ns = self.bench.clock.now_ns()
-            self.goal_deg = self.table.stopping_deg(self.bench.servo.read_state())
-            return self.goal_deg
+            return self._stop()
         goal_deg = motion.angle_deg + sign * self.step.rotation_deg
         if abs(goal_deg - self.goal_deg) <= NEW_GOAL_DEG:
             return None
@@ -106,19 +120,32 @@ class _Passing:
         self.events.append(decided(self.number, self.step, goal_deg, self.top))
         return goal_deg
 
+    def _stop(self) -> float:
+        """Return where the table stops if it brakes now."""
+        self.goal_deg = self.table.stopping_deg(self.bench.servo.read_state())
+        return self.goal_deg
+
 
 def search_in_motion(
-    bench: Bench, search: ArcSearch, viewer: Viewer, describe: ViewDescriber, *, top: int, started_ns: int
+    bench: Bench,
+    search: ArcSearch,
+    viewer: Viewer,
+    describe: ViewDescriber,
+    *,
+    top: int,
+    started_ns: int,
+    live: Callable[[FrameUsed], object],
 ) -> Generator[Event, None, Found]:
     """Search along arcs until the stopping rule ends the search; the frames of an arc become events at its end.
 
-    Raises what `rig.plans.identify.identify` raises.
+    ``live`` gets its event of each frame in the turn already. It must return at once, because it is called in the
+    control loop. Raises what `rig.plans.identify.identify` raises.
     """
     config = bench.config
     sign = config.table.orientation_sign
     speed = scan_speed(config, fps=config.camera.fps, gyro_range_dps=bench.imu.range_dps, spacing_deg=None)
     travelled_deg = 0.0
-    number = 0
+    number = rejected = 0
     failed: RigError | None = None
     with Turntable(bench, first_rest_s=FIRST_REST_S) as table:
         low_deg, high_deg = table.limits_deg
@@ -132,7 +159,12 @@ def search_in_motion(
             described = describe(captured.image_bgr)
             yield Accepted(number, azimuth_deg, captured.evidence, captured.image_bgr, described.segmentation)
             yield from warn_of_table(bench, number, described)
-            ranked, step = search.add(described.levels[search.descriptor], azimuth_deg, table_deg=table.rest_deg)
+            ranked, step = search.add(
+                described.levels[search.descriptor],
+                azimuth_deg,
+                table_deg=table.rest_deg,
+                reliable=described.reliable,
+            )
             ended_ns = bench.clock.now_ns()
             if search.is_new_decision:
                 yield ranked
@@ -146,14 +178,28 @@ def search_in_motion(
             stream = stream or FrameStream(bench.camera, bench.clock)
             judge = FlightJudge(config, captured.evidence.locks, True, bench.clock.now_ns(), stream.period_s)
             passing = _Passing(
-                bench, table, search, stream, recorder, judge, describe, top, number, ranked, step, goal_deg
+                bench,
+                table,
+                search,
+                stream,
+                recorder,
+                judge,
+                describe,
+                top,
+                live,
+                started_ns,
+                number,
+                rejected,
+                ranked,
+                step,
+                goal_deg,
             )
             reach_deg = max(low_deg, table.rest_deg - 360.0), min(high_deg, table.rest_deg + 360.0)
             try:
                 move = table.fly(goal_deg, Flight(passing.each, reach_deg, recorder, speed.dps, quiet=False))
             finally:
                 yield from passing.events
-            number, ranked, step = passing.number, passing.ranked, passing.step
+            number, rejected, ranked, step = passing.number, passing.rejected, passing.ranked, passing.step
             travelled_deg += abs(move.rotation_deg)
             yield moved(number, move)
             if passing.ended_ns is not None:

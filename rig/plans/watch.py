@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 import hbr
 from rig.bench import Bench
 from rig.core.errors import ViewRejected
-from rig.events.events import Event, Failed, Waiting, WaitReason
+from rig.events.events import Event, Failed, FrameUsed, Waiting, WaitReason
 from rig.motion.turntable import Turntable
 from rig.plans.capture import moved
 from rig.plans.identify import identify
@@ -25,6 +25,7 @@ def watch(
     seed: int = 0,
     top: int = SHOWN,
     empty_table: NDArray[np.uint8] | None = None,
+    live: Callable[[FrameUsed], object] = lambda _: None,
 ) -> Generator[Event, None, None]:
     """Identify one object after the other, until closed; yields a `Waiting` before the events of each.
 
@@ -38,7 +39,7 @@ def watch(
         An open bench.
     model
         Returns the model before each search, so that objects enrolled meanwhile are found.
-    strategy, seed, top, empty_table
+    strategy, seed, top, empty_table, live
         As for `identify`.
 
     Raises
@@ -53,7 +54,9 @@ def watch(
         yield Waiting(WaitReason.NEXT_OBJECT if started else WaitReason.FIRST_OBJECT)
         started = True
         try:
-            answer = yield from identify(bench, model(), strategy=strategy, seed=seed, top=top, empty_table=empty_table)
+            answer = yield from identify(
+                bench, model(), strategy=strategy, seed=seed, top=top, empty_table=empty_table, live=live
+            )
             views = answer.views
         except ViewRejected as error:
             yield Failed(**{key: error.as_dict()[key] for key in ("error", "code", "what", "evidence", "next_step")})

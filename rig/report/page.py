@@ -13,8 +13,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from markupsafe import Markup
 
 from hbr import Outcome
-from hbr.core.angles import wrap180, wrap360
-from rig.charts.arc_chart import arc_chart
+from hbr.core.angles import wrap360
 from rig.charts.azimuth_ring import RingView, azimuth_ring
 from rig.charts.decision_chart import decision_chart
 from rig.charts.polar_path import polar_path
@@ -32,6 +31,7 @@ from rig.events.wording import (
     share_words,
     stop_words,
 )
+from rig.report.arc_figure import ArcFigure, arc_figure
 from rig.report.contact_sheet import Image, contact_sheet, thumbnail
 from rig.report.records import TILE, EnrollmentRecord, IdentificationRecord
 from rig.report.summary import SummaryItem, enrollment_items, totals
@@ -167,7 +167,7 @@ class _Retrieval(NamedTuple):
     path: Markup
     compared: bool
     scores: Markup
-    arc: Markup
+    arc: ArcFigure
     notes: list[str]
     decisions: list[Markup]
     frames: list[_Frame]
@@ -221,31 +221,12 @@ def _retrieval(number: int, record: IdentificationRecord, *, unfold: bool) -> _R
         path=path,
         compared=any(event.s_left is not None for event in record.decided),
         scores=scores,
-        arc=_arc(record),
+        arc=arc_figure(record),
         notes=[sentence(note_words(note)) for note in record.notes],
         decisions=_decisions(record),
         frames=_frames(record),
         unfold=unfold or record.correct is False,
     )
-
-
-def _arc(record: IdentificationRecord) -> Markup:
-    """Return the chart of the probability along the arc; empty for a search at rest."""
-    rotated_deg, last_deg, rotated = 0.0, None, {}
-    for view in record.views:
-        if last_deg is not None:
-            rotated_deg += abs(wrap180(view.azimuth_deg - last_deg))
-        last_deg = view.azimuth_deg
-        rotated[view.index] = rotated_deg
-    decisions = [
-        (rotated[ranked.index], {c.name: c.probability or 0.0 for c in ranked.candidates})
-        for ranked in record.ranked
-        if ranked.index in rotated
-    ]
-    confidence = next((ranked.decision.min_confidence for ranked in record.ranked if ranked.decision), None)
-    if confidence is None or len(decisions) < 2 or all(view.evidence.motion is None for view in record.views):
-        return Markup()
-    return Markup(arc_chart(decisions, min_confidence=confidence).svg(themed=True))
 
 
 def _truth(record: IdentificationRecord) -> str:

@@ -5,6 +5,7 @@ A record has thumbnails instead of images, so that a long run needs little memor
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import Any, Final
 
 from hbr.core.angles import wrap180
@@ -15,6 +16,7 @@ from rig.events.events import (
     Decided,
     Enrolled,
     Event,
+    FrameUsed,
     Identified,
     Moved,
     Note,
@@ -162,6 +164,7 @@ class IdentificationRecord:
         self.conditions: Mapping[str, Any] = {}
         self.notes: tuple[Note, ...] = ()
         self.ranked: list[Ranked] = []
+        self.used: list[FrameUsed] = []
         self.decided: list[Decided] = []
         self.answer: Identified | None = None
         self._collector = _ViewCollector(FRAME, region)
@@ -179,6 +182,8 @@ class IdentificationRecord:
                 self.conditions, self.notes = event.conditions, event.notes
             case Ranked():
                 self.ranked.append(event)
+            case FrameUsed():
+                self.used.append(event)
             case Decided():
                 self.decided.append(event)
             case Identified():
@@ -214,18 +219,20 @@ class IdentificationRecord:
 
     @property
     def steps(self) -> list[PathStep]:
-        """The camera's rotations between the views, as the table made them.
+        """The camera's rotations between the views, as the table made them; in motion, those between decisions.
 
         The cable's limits may make the table rotate the long way: the azimuths show where a rotation ended, the encoder
         how many times around it went.
         """
-        steps = []
-        for k in range(1, len(self.views)):
-            before, after = self.views[k - 1], self.views[k]
+        steps: list[PathStep] = []
+        last: Decided | None = None
+        for before, after in pairwise(self.views):
             rotation_deg = wrap180(after.azimuth_deg - before.azimuth_deg)
             if after.move is not None:
                 rotation_deg += 360.0 * round((-after.move.rotation_encoder_deg - rotation_deg) / 360.0)
-            # In motion one decision counts for several frames.
             decided = next(d for d in reversed(self.decided) if d.index <= before.index)
+            if decided is last and after.evidence.motion is not None:
+                rotation_deg += steps.pop().rotation_deg
             steps.append(PathStep(rotation_deg, decided.s_left, decided.s_right, decided.candidates[:2]))
+            last = decided
         return steps

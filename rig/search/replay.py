@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 from math import isclose
 from typing import Any, Final
 
-from rig.events.events import Accepted, Decided, Identified, Moved, Ranked, RotationReason, plain
+from rig.events.events import Accepted, Decided, FrameUsed, Identified, Moved, Ranked, RotationReason, plain
 from rig.search.saved_run import SavedRun
 from rig.search.session import ArcSearch, Search, begin_search
 from rig.search.strategies import AnyStrategy, Finish, Rotate
@@ -97,7 +97,7 @@ def check(run: SavedRun, *, by: AnyStrategy | None = None) -> Check:
                     event.azimuth_deg,
                     table_deg=table_deg,
                     earlier=view.earlier,
-                    reliable=view.reliable or isinstance(search, ArcSearch),
+                    reliable=view.reliable,
                 )
                 found.views += 1
                 if event.segmentation is not None:
@@ -106,6 +106,8 @@ def check(run: SavedRun, *, by: AnyStrategy | None = None) -> Check:
             case Ranked() if ranked is not None:
                 # A run names as many candidates as it was asked for.
                 computed = replace(ranked, candidates=ranked.candidates[: len(event.candidates)])
+            case FrameUsed() if isinstance(search, ArcSearch):
+                computed = search.frame_used(event.index, event.azimuth_deg, event.seconds, event.rejected)
             case Decided():
                 found.decisions += 1
                 computed = _decided(step, event)

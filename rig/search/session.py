@@ -17,7 +17,7 @@ from hbr.dense.pose import pose
 from hbr.model.symmetry import symmetry
 from rig.config import RigConfig
 from rig.core.errors import CatalogError, UsageError
-from rig.events.events import Candidate, Identified, Ranked
+from rig.events.events import Candidate, FrameUsed, Identified, Ranked
 from rig.search.model import Model
 from rig.search.strategies import (
     Arc,
@@ -297,6 +297,12 @@ class ArcSearch(DenseSearch):
     @property
     def is_new_decision(self) -> bool:
         return self._arc.is_new_decision
+
+    def frame_used(self, number: int, azimuth_deg: float, seconds: float, rejected: int) -> FrameUsed:
+        """Return the event of the last frame; ``number`` counts the views from 0."""
+        present = self._arc.present
+        name = self._arc.belief.index.views.object_names[present.object_index]
+        return FrameUsed(number, azimuth_deg, seconds, rejected, name, present.confidence, present.outcome)
 
     def _decide(self, ranked: Ranked, table_deg: float) -> Rotate | Finish:  # noqa: ARG002
         if self._step is None or self.is_new_decision:

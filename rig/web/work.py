@@ -14,7 +14,7 @@ from rig.catalog.shared import comparable_views, journal_words
 from rig.config import RigConfig
 from rig.core.clock import SystemClock
 from rig.core.errors import RigError, TableNotEmpty, UsageError, ViewRejected
-from rig.events.events import Enrolled, Event, Failed, Identified, Started, event_dict, plain
+from rig.events.events import Enrolled, Event, Failed, FrameUsed, Identified, Started, event_dict, plain
 from rig.events.lines import line
 from rig.events.phrases import counted, duration_words
 from rig.motion.turntable import Turntable
@@ -210,9 +210,9 @@ class Works:
                     _refresh_empty_table(context)
                 events: Generator[Event, None, object]
                 if request.watch:
-                    events = watch(bench, model, strategy=chosen, seed=self.seed)
+                    events = watch(bench, model, strategy=chosen, seed=self.seed, live=context.add)
                 else:
-                    events = identify(bench, known, strategy=chosen, seed=self.seed)
+                    events = identify(bench, known, strategy=chosen, seed=self.seed, live=context.add)
                 if bench.config.identify.record != "none":
                     recorder = ResultRecorder(
                         *(self.catalog.place, bench),
@@ -274,7 +274,8 @@ def _run(context: Context, events: Generator[Event, None, object]) -> None:
     """Report the events of a plan; an operator who cancels closes the plan, and so the torque goes off."""
     with closing(events):
         for event in events:
-            _report(context, event)
+            if not isinstance(event, FrameUsed):  # reported in the turn
+                _report(context, event)
 
 
 def _report(context: Context, event: Event) -> None:

@@ -74,7 +74,7 @@ def identify(
     from rig.cli.ui.present import console
     from rig.cli.ui.prompts import ask_sample
     from rig.core.clock import SystemClock
-    from rig.events.events import Identified, Recorded, Waiting, event_dict
+    from rig.events.events import FrameUsed, Identified, Recorded, Waiting, event_dict
     from rig.events.lines import line
     from rig.plans.identify import identify as identify_one
     from rig.plans.record import ResultRecorder
@@ -115,11 +115,21 @@ def identify(
             uses_image = known.descriptor != PAPER_DESCRIPTOR and known.with_empty_table is not False
             if uses_image and isinstance(bench.operator, TableClearer):
                 ensure_empty_table_image(settings, bench, ask=False)
+
+            def show(event: "Event") -> None:
+                if settings.json:
+                    settings.print_json(event_dict(event))
+                # in a pipe, the text on stderr would only repeat the JSON
+                if isinstance(event, Recorded):
+                    print(line(event), file=sys.stderr)
+                elif not settings.json or screen.is_terminal or isinstance(event, Waiting):
+                    view.add(event)
+
             # Search, and show and save each event.
             if watch:
-                events = watch_table(bench, model, strategy=chosen, seed=seed, top=top)
+                events = watch_table(bench, model, strategy=chosen, seed=seed, top=top, live=show)
             else:
-                events = identify_one(bench, model(), strategy=chosen, seed=seed, top=top)
+                events = identify_one(bench, model(), strategy=chosen, seed=seed, top=top, live=show)
             recorder = ResultRecorder(
                 *(settings.load().catalog_place(settings.bench_name), bench),
                 clock=SystemClock(),
@@ -135,13 +145,8 @@ def identify(
                 with saver:
                     for event in events:
                         saver.add(event)
-                        if settings.json:
-                            settings.print_json(event_dict(event))
-                        # in a pipe, the text on stderr would only repeat the JSON
-                        if isinstance(event, Recorded):
-                            print(line(event), file=sys.stderr)
-                        elif not settings.json or screen.is_terminal or isinstance(event, Waiting):
-                            view.add(event)
+                        if not isinstance(event, FrameUsed):  # shown in the turn
+                            show(event)
                         if isinstance(event, Identified):
                             answer = event
                         elif isinstance(event, Waiting) and scan:

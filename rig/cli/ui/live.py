@@ -20,6 +20,7 @@ from rig.events.events import (
     Decided,
     Enrolled,
     Event,
+    FrameUsed,
     Identified,
     Moved,
     Note,
@@ -234,6 +235,7 @@ class IdentifyView(LiveView):
         super().__init__(console, keys=keys)
         self._notes: tuple[Note, ...] = ()
         self._ranked: Ranked | None = None
+        self._used: FrameUsed | None = None
         self._taken = 0
         self._of = 0
         self._azimuth_deg = 0.0
@@ -248,16 +250,20 @@ class IdentifyView(LiveView):
                 if event.notes != self._notes:  # of one search after the other, once
                     self._notes = event.notes
                     self.note(line(event))
-            case Moved() if plain:
-                self.note(line(event))
-            case Moved(agrees=False):
-                self.note(f"  {move_words(event)}")
             case Moved():
-                pass
-            case Accepted():
-                self._taken, self._azimuth_deg = event.index + 1, event.azimuth_deg
+                self._used = None
                 if plain:
                     self.note(line(event))
+                elif not event.agrees:
+                    self.note(f"  {move_words(event)}")
+            case Accepted():
+                self._taken, self._azimuth_deg = event.index + 1, event.azimuth_deg
+                if plain and event.evidence.motion is None:  # a frame of a turn has its own line
+                    self.note(line(event))
+            case FrameUsed() if plain:
+                self.note(line(event))
+            case FrameUsed():
+                self._used = event
             case Ranked():
                 self._ranked = event
                 if plain:
@@ -329,7 +335,8 @@ class IdentifyView(LiveView):
             return table if candidates else Group()
         where = f", azimuth {azimuth_words(self._azimuth_deg)}°" if self._taken else ""
         lead = f", margin {signed(self._ranked.margin, 3)}" if self._ranked else ""
-        status = Text(f"view {self._taken} of {self._of} at most{where}{lead}", style="bold")
+        taken = f"view {self._taken} of {self._of} at most{where}{lead}"
+        status = Text(line(self._used).strip() if self._used else taken, style="bold")
         if not self._paused:
             status.append("   ").append_text(self._hint)
         lines = [Text(self._decision)] if self._decision else []

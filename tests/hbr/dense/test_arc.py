@@ -17,7 +17,13 @@ from hbr.dense.arc import (
     fit_arc_rule,
     frame_weight,
 )
-from hbr.dense.stopping import UNCALIBRATED_MIN_CONFIDENCE, LimitationCode, StoppingRule, calibrate_stopping_rule
+from hbr.dense.stopping import (
+    UNCALIBRATED_MIN_CONFIDENCE,
+    LimitationCode,
+    StoppingRule,
+    StopReason,
+    calibrate_stopping_rule,
+)
 from tests.hbr.dense.test_stopping import catalog
 
 
@@ -70,6 +76,23 @@ def test_later_decisions_come_every_step_and_need_two_sides(index: DenseIndex, r
     assert session.belief.amount < session.belief.queries
     outcomes = pass_by(ArcSession(index, certain), index.views, 0, 90.0)
     assert outcomes.index(Outcome.FOUND) == SIDE_DEG // 4
+
+
+def test_rule_is_asked_after_every_frame_but_ends_no_search_on_a_guess(index: DenseIndex, rest: StoppingRule) -> None:
+    certain = ArcRule(replace(rest, min_confidence=2.0), 0.0)
+    for reliable in (True, False):
+        session, present = ArcSession(index, certain), []
+        levels = index.views.levels(np.array([0]))[0]
+        for angle in np.arange(0.0, 71.0, 2.0).tolist():
+            session.add(levels, angle, reliable=reliable)
+            present.append(session.present.outcome)
+            if session.is_new_decision:
+                assert session.decision == session.present
+        if reliable:
+            assert present.index(Outcome.FOUND) == SIDE_DEG // 2
+        else:
+            assert set(present) == {Outcome.CONTINUE}
+            assert session.present.reason is StopReason.BADLY_SEGMENTED
 
 
 def test_search_ends_after_the_arc_as_ambiguous_or_unknown(index: DenseIndex, rest: StoppingRule) -> None:

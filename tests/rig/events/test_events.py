@@ -17,6 +17,7 @@ from rig.events.events import (
     Candidate,
     Event,
     Failed,
+    FrameUsed,
     Note,
     NoteCode,
     ScanStarted,
@@ -138,6 +139,7 @@ def test_every_event_that_the_plans_emit_is_as_documented(simulated, tmp_path):
     error = caught.value.as_dict()
     seen |= {check_event(Failed(**error)), check_event(Waiting(WaitReason.NEXT_OBJECT))}
     seen.add(check_event(Warned(3, Note(NoteCode.EMPTY_TABLE_CHANGED, {"problem": {"code": "missing"}}))))
+    seen.add(check_event(FrameUsed(3, 30.0, 1.0, 0, "dice", 0.5, hbr.Outcome.CONTINUE)))
     seen.add(check_event(ScanStarted(90.0, SpeedLimit.SMEAR, 10.0, 0.0, 360.0)))
     seen.add(check_event(Unwinding(0, 330.0, 0.0, 1, (-400.0, 400.0))))
     assert seen == {event_kind(kind) for kind in get_args(Event)}

@@ -10,7 +10,7 @@ import hbr
 from rig import Catalog, enroll, identify, load_model
 from rig.bench import Bench
 from rig.core.errors import RigError, UsageError
-from rig.events.events import Accepted, Decided, Identified, Moved, Ranked
+from rig.events.events import Accepted, Decided, FrameUsed, Identified, Moved, Ranked
 from rig.report.run_report import run_report
 from rig.search.model import Model
 from rig.search.replay import check
@@ -43,11 +43,14 @@ def moving(world: World, *settings: str, faults: tuple[str, ...] = ()) -> Bench:
 
 
 def test_search_ends_in_mid_turn_and_can_be_replayed(model: Model, tmp_path: Path) -> None:
+    live: list[FrameUsed] = []
     with moving(World(seed=2)) as bench, RunWriter(tmp_path / "run", bench, model) as writer:
         events = []
-        for event in identify(bench, model):
+        for event in identify(bench, model, live=live.append):
             writer.add(event)
             events.append(event)
+            if isinstance(event, Accepted) and event.evidence.motion is not None:
+                assert live  # its event was reported in the turn
         answer = events[-1]
         assert isinstance(answer, Identified)
         assert answer.name == "bottle-harvest"
@@ -62,9 +65,30 @@ def test_search_ends_in_mid_turn_and_can_be_replayed(model: Model, tmp_path: Pat
     assert found.is_complete
     assert found.differences == []
     assert found.views == 1 + len(in_motion)
-    assert "Probability along the arc" in run_report(load_run(tmp_path / "run"))
+    assert live == [e for e in events if isinstance(e, FrameUsed)]
+    assert [one.index for one in live] == [e.index for e in in_motion]
+    assert live[-1].name == answer.name
+    assert live[-1].outcome is hbr.Outcome.FOUND
+    enough = next(one for one in live if one.outcome is not hbr.Outcome.CONTINUE)
+    report = run_report(load_run(tmp_path / "run"))
+    assert "Probability along the arc" in report
+    assert f"enough for an answer from view {enough.index + 1} on: {enough.seconds:.1f} s after the start" in report
     decisions = [e.candidates[0].probability for e in events if isinstance(e, Ranked)]
     assert len(decisions) < 1 + len(in_motion)
+
+
+def test_guessed_view_does_not_end_the_search(model: Model, monkeypatch: pytest.MonkeyPatch) -> None:
+    reasons = []
+    for reliable in (True, False):
+        monkeypatch.setattr(hbr.ViewsTogether, "reliable", property(lambda _, now=reliable: now))
+        with moving(World(seed=2)) as bench:
+            bench.operator.next_object = "can-peach"  # type: ignore[attr-defined]
+            events = identify(bench, model)
+            first = next(event for event in events if isinstance(event, Ranked))
+            events.close()
+        assert first.decision is not None
+        reasons.append(first.decision.reason)
+    assert reasons == [hbr.StopReason.CONFIDENT, hbr.StopReason.BADLY_SEGMENTED]
 
 
 def test_unknown_object_is_recognised_within_the_arc(model: Model) -> None:

@@ -143,7 +143,7 @@ def test_watch_finds_objects_enrolled_meanwhile(simulated, tmp_path):
 
 
 def test_one_object_is_found_by_similarity_to_its_own_views(simulated, tmp_path):
-    s = simulated(*SMALL)
+    s = simulated(*SMALL, seed=1)
     with Catalog.open(tmp_path, clock=s.bench.clock) as catalog:
         list(enroll(s.bench, catalog, "lamp", views=6))
         model = load_model(catalog)
