@@ -4,6 +4,7 @@ A start takes milliseconds instead of a second of computing. Signals, locks, pip
 process. Tests of the start or the end of the interpreter start Python instead.
 """
 
+import gc
 import os
 import signal
 import sys
@@ -125,6 +126,7 @@ def _run(
     words: tuple[str, ...], code: str, folder: Path, environment: dict[str, str], streams: list[Connection]
 ) -> None:
     """Become the program."""
+    gc.freeze()  # its garbage collector need not visit what the server has imported
     for number, stream in enumerate(streams):
         os.dup2(stream.fileno(), number)
         stream.close()

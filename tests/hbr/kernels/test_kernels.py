@@ -8,7 +8,7 @@ from shutil import copytree, which
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 import hbr
@@ -17,6 +17,7 @@ from hbr.kernels import compile as compiling
 from hbr.kernels import library, without_library
 from hbr.kernels.library import load
 from hbr.paper.hough import Extension
+from tests.fuzzing import examples
 
 compiled = pytest.mark.skipif(library() is None, reason="the kernels are not compiled: there is no C compiler")
 seeds = st.integers(0, 2**32 - 1)
@@ -43,7 +44,7 @@ def images(draw: st.DrawFn) -> np.ndarray:
 
 
 @compiled
-@settings(max_examples=150)
+@examples(60)
 @given(images())
 def test_cedd_has_the_bits_of_the_reference(image: np.ndarray) -> None:
     with without_library():
@@ -73,7 +74,7 @@ def rows_of(kind: str, count: int, rng: np.random.Generator) -> np.ndarray:
 
 
 @compiled
-@settings(max_examples=60)
+@examples(25)
 @given(st.sampled_from(["edges", "colours", "edges+colours"]), st.integers(0, 5), st.integers(0, 300), seeds)
 def test_similarity_has_the_bits_of_the_reference(kind: str, queries: int, count: int, seed: int) -> None:
     rng, descriptor = np.random.default_rng(seed), hbr.descriptor(kind)
@@ -97,7 +98,7 @@ def test_similarity_has_the_bits_of_the_reference(kind: str, queries: int, count
 
 
 @compiled
-@settings(max_examples=60)
+@examples(25)
 @given(queries=st.integers(0, 9), count=st.integers(1, 200), length=st.sampled_from([1, 31, 144, 4096]), seed=seeds)
 def test_tanimoto_has_the_bits_of_the_reference(queries: int, count: int, length: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -116,7 +117,7 @@ def test_tanimoto_has_the_bits_of_the_reference(queries: int, count: int, length
 
 
 @compiled
-@settings(max_examples=40)
+@examples(25)
 @given(st.integers(1, 300), st.integers(0, 50), st.integers(1, 320), seeds)
 def test_the_paper_s_search_returns_what_it_returns_without_kernels(count: int, more: int, k: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -135,7 +136,7 @@ def test_the_paper_s_search_returns_what_it_returns_without_kernels(count: int, 
 
 
 @compiled
-@settings(max_examples=60)
+@examples(25)
 @given(
     counts=st.lists(st.integers(1, 40), min_size=1, max_size=6),
     step_deg=st.sampled_from([0.0, 2.5, 5.0, 90.0]),
@@ -164,7 +165,7 @@ def test_support_has_the_bits_of_the_reference(
 
 
 @compiled
-@settings(max_examples=60)
+@examples(25)
 @given(st.lists(st.integers(1, 150), min_size=1, max_size=12), st.integers(1, 12), seeds)
 def test_the_nearest_objects_are_those_of_the_reference(counts: list[int], kept: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -246,7 +247,7 @@ def test_missing_compiler_keeps_the_earlier_library(tmp_path: Path, monkeypatch:
 
 
 @compiled
-@settings(max_examples=60)
+@examples(25)
 @given(
     counts=st.lists(st.integers(1, 40), min_size=1, max_size=6),
     step_deg=st.sampled_from([0.0, 2.5, 5.0, 90.0]),

@@ -38,6 +38,11 @@ def opened(request):
         yield h
 
 
+AVR_NIGHTLY = pytest.mark.parametrize(
+    "opened", ["memory", pytest.param("avr", marks=pytest.mark.nightly)], indirect=True
+)
+
+
 def switch_on(h):
     h.imu.set_power(True)
     h.imu.set_light(1.0)
@@ -261,6 +266,7 @@ def test_outputs_and_faults_do_not_depend_on_the_sensor(opened):
 # -- a bad line ---------------------------------------------------------------------------------------------------
 
 
+@AVR_NIGHTLY
 def test_corrupt_frames_cost_samples_but_give_no_wrong_value(opened):
     rng = np.random.default_rng(1)
     opened.world.drive(to_velocity(opened.clock.now_ns() * 1e-9, 0.0, 60.0, 60.0, 1e3))
@@ -286,6 +292,7 @@ def test_corrupt_frames_cost_samples_but_give_no_wrong_value(opened):
     assert opened.imu.status.state is HeadState.ACTIVE  # a beat that is lost is beaten again in time
 
 
+@AVR_NIGHTLY
 def test_noise_in_both_directions_is_tolerated(opened):
     rng = np.random.default_rng(2)
     for _ in range(20):

@@ -2,6 +2,7 @@
 
 import threading
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -49,24 +50,24 @@ class Served:
         pytest.fail(f"the job is still {job['state']}")
 
 
-@pytest.fixture
-def serve(tmp_path: Path) -> Iterator[Callable[..., Served]]:
-    """Return a function that starts a server: settings as ``KEY=VALUE``."""
+@contextmanager
+def starting(folder: Path) -> Iterator[Callable[..., Served]]:
+    """Yield a function that starts a server with its data in a folder."""
     running: list[tuple[Served, threading.Thread]] = []
 
     def start(*settings: str, needs_login: bool = False) -> Served:
-        folders = [f"catalog.path='{tmp_path}/catalog'", f"state_dir='{tmp_path}/state'"]
+        folders = [f"catalog.path='{folder}/catalog'", f"state_dir='{folder}/state'"]
         small = ("camera.width=320", "camera.height=240", "view.roi=[40, 0, 240, 240]")  # takes less computing
-        config = load_config(None, [*folders, f"calibration_dir='{tmp_path}/cal'", *small, *settings])
-        folder = config.state_path("sim") / "web"
+        config = load_config(None, [*folders, f"calibration_dir='{folder}/cal'", *small, *settings])
+        web = config.state_path("sim") / "web"
         listening = Listening("127.0.0.1", 0, (), None, None, needs_login, 2_000_000)
-        tokens = Tokens(folder, SystemClock())
-        server = make_server("sim", config, 1, ("--bench", "sim"), listening, tokens, SystemClock(), folder)
+        tokens = Tokens(web, SystemClock())
+        server = make_server("sim", config, 1, ("--bench", "sim"), listening, tokens, SystemClock(), web)
         guard = Guard(create_app(server), hosts={"127.0.0.1"}, upload_path=UPLOAD, max_upload_bytes=2_000_000)
         client = TestClient(guard, base_url="http://127.0.0.1", client=("127.0.0.1", 50000))
         thread = threading.Thread(target=server.worker.run, daemon=True)
         thread.start()
-        running.append((Served(server, client, tmp_path), thread))
+        running.append((Served(server, client, folder), thread))
         return running[-1][0]
 
     yield start
@@ -74,3 +75,17 @@ def serve(tmp_path: Path) -> Iterator[Callable[..., Served]]:
         served.server.worker.end()
         thread.join(20)
         assert not thread.is_alive()
+
+
+@pytest.fixture
+def serve(tmp_path: Path) -> Iterator[Callable[..., Served]]:
+    """Return a function that starts a server: settings as ``KEY=VALUE``."""
+    with starting(tmp_path) as start:
+        yield start
+
+
+@pytest.fixture(scope="module")
+def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    """Return a running server for requests that change nothing."""
+    with starting(tmp_path_factory.mktemp("served")) as start:
+        yield start()

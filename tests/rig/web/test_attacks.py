@@ -8,8 +8,8 @@ from rig.web.run import checked_catalog
 API = "/api/v1"
 
 
-def test_other_hosts_and_origins_are_rejected(serve):
-    client = serve().client
+def test_other_hosts_and_origins_are_rejected(served):
+    client = served.client
     assert client.get(f"{API}/status", headers={"Host": "evil.example"}).status_code == 421
     assert client.get(f"{API}/status", headers={"Host": "127.0.0.1.evil.example"}).status_code == 421
     for headers in ({"Origin": "http://evil.example"}, {"Origin": "null"}, {"Sec-Fetch-Site": "cross-site"}):
@@ -71,8 +71,8 @@ def test_second_operator_needs_the_lease(serve):
         f"{API}/views/-1/image",
     ],
 )
-def test_path_of_a_request_reaches_no_file(serve, path):
-    answer = serve().client.get(path)
+def test_path_of_a_request_reaches_no_file(served, path):
+    answer = served.client.get(path)
     assert answer.status_code in (404, 422), answer.text
     assert "import" not in answer.text.replace("/import", "")
 
@@ -108,11 +108,11 @@ def test_large_bodies_are_rejected(serve):
         {"kind": "tray", "objects": []},
     ],
 )
-def test_impossible_requests_are_rejected_with_their_mistakes(serve, body):
+def test_impossible_requests_are_rejected_with_their_mistakes(served, body):
     import json
 
     text = json.dumps(body).replace("Infinity", "1e400")
-    answer = serve().client.post(f"{API}/jobs", content=text, headers={"Content-Type": "application/json"})
+    answer = served.client.post(f"{API}/jobs", content=text, headers={"Content-Type": "application/json"})
     assert answer.status_code == 422
     assert answer.headers["content-type"] == "application/problem+json"
     assert answer.json()["evidence"]["mistakes"]

@@ -35,7 +35,7 @@ def on_head(simulated):
 
 
 def test_object_is_enrolled_and_found_with_the_binarys_gyro_alone(on_head, tmp_path):
-    s = on_head("avr", "identify.first_step_deg=90")
+    s = on_head("avr", "identify.first_step_deg=90", "table.velocity_dps=180")  # each second is half a second of work
     truth_deg = []
     with Catalog.open(tmp_path, clock=s.bench.clock) as catalog:
         for name in ("lamp", "mug-dots"):
