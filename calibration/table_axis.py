@@ -223,6 +223,7 @@ class _Axis:
         self._known_sigma = np.array([PIVOT_MM / 2, *(estimate.uncertainty for estimate in camera)])
         self._known_sigma[1:3] *= sqrt(2)  # both focal lengths err together: they count once
         self._points = [points(board, view) for view in views]
+        self._corners_px = np.concatenate([view.corners_px for view in views])
         self._middle = board.points_mm().mean(axis=0)
         self._stands = sorted({view.stand for view in views})
         self._up, self._origin = _first_axis(views, poses, self._middle)
@@ -321,10 +322,9 @@ class _Axis:
             c, s = np.cos(2 * angle), np.sin(2 * angle)
             leaning = (c * lean[0] - s * lean[1]) * self._across[0] + (s * lean[0] + c * lean[1]) * self._across[1]
             rotation = cv2.Rodrigues(leaning)[0] @ cv2.Rodrigues(up * angle)[0]
-            now = point + (at_zero - point) @ rotation.T
-            parts.append((self._seen(now, p) - view.corners_px).ravel())
-        parts.append(CORNER_PX * (p[6:FIRST_POSE] - self._known) / self._known_sigma)
-        return np.concatenate(parts)
+            parts.append(point + (at_zero - point) @ rotation.T)
+        corners = (self._seen(np.concatenate(parts), p) - self._corners_px).ravel()
+        return np.concatenate([corners, CORNER_PX * (p[6:FIRST_POSE] - self._known) / self._known_sigma])
 
 
 def _pose(board: Board, view: BoardView, matrix: Floats, distortion: Sequence[float]) -> tuple[Floats, Floats]:

@@ -15,7 +15,7 @@ from sim.world import World
 WARM_UP_S = 300.0  # time constant of the warming of a sensor on a small board in still air
 Words = np.ndarray[tuple[int, int], np.dtype[np.int16]]
 
-_NOTHING = 1e-12  # share of an input that a 16-bit register cannot show
+_BLOCK = 64  # samples that are filtered together
 
 
 class InertialModel:
@@ -106,32 +106,34 @@ class InertialModel:
 
 @cache
 def _low_pass(rate_hz: float, bandwidth_hz: float) -> tuple[float, float, float, Floats]:
-    """Return b₀, a₁ and a₂ of a Butterworth low-pass of second order (bilinear transform), and its impulse response.
+    """Return b₀, a₁ and a₂ of a Butterworth low-pass of second order (bilinear transform), and its response matrix.
 
-    b₁ = 2b₀, b₂ = b₀. The response of the recursion ends where it is negligible.
+    b₁ = 2b₀, b₂ = b₀. The matrix (`_BLOCK`, `_BLOCK`) is the response of the recursion to a block of samples.
     """
     k = tan(pi * bandwidth_hz / rate_hz)
     norm = 1 / (1 + sqrt(2) * k + k * k)
     a1, a2 = 2 * (k * k - 1) * norm, (1 - sqrt(2) * k + k * k) * norm
-    echo = [1.0, -a1]
-    while max(abs(echo[-1]), abs(echo[-2])) > _NOTHING:
-        echo.append(-a1 * echo[-1] - a2 * echo[-2])
-    return k * k * norm, a1, a2, np.array(echo)
+    response = np.eye(_BLOCK)
+    for row in range(1, _BLOCK):
+        response[row] -= a1 * response[row - 1] + (a2 * response[row - 2] if row > 1 else 0.0)
+    return k * k * norm, a1, a2, response
 
 
 def _filtered(felt: Floats, filtered_before: Floats, rate_hz: float, bandwidth_hz: float) -> Floats:
     """Return the low-pass of ``felt`` (n + 2, 6) from its third row, (n, 6); the first two rows belong to earlier ones.
 
-    y[n] + a₁·y[n−1] + a₂·y[n−2] = b₀·(x[n] + 2x[n−1] + x[n−2]), solved by the impulse response: importing scipy's
-    filters would take longer than all other imports of the simulator.
+    y[n] + a₁·y[n−1] + a₂·y[n−2] = b₀·(x[n] + 2x[n−1] + x[n−2]), solved block by block: importing scipy's filters would
+    take longer than all other imports of the simulator.
     """
-    b0, a1, a2, echo = _low_pass(rate_hz, bandwidth_hz)
+    b0, a1, a2, response = _low_pass(rate_hz, bandwidth_hz)
     right = b0 * (felt[2:] + 2 * felt[1:-1] + felt[:-2])
-    right[0] -= a1 * filtered_before[1] + a2 * filtered_before[0]
-    if len(right) > 1:
-        right[1] -= a2 * filtered_before[1]
-    columns = [np.convolve(column, echo[: len(right)])[: len(right)] for column in right.T]
-    return np.stack(columns, axis=1)
+    done = filtered_before
+    for start in range(0, len(right), _BLOCK):
+        block = right[start : start + _BLOCK]
+        block[0] -= a1 * done[-1] + a2 * done[-2]
+        block[1:2] -= a2 * done[-1]
+        done = np.concatenate([done, response[: len(block), : len(block)] @ block])
+    return done[2:]
 
 
 def _steps(before: float, values: NDArray[np.int64] | Floats) -> Floats:
