@@ -72,8 +72,9 @@ class WaitReason(StrEnum):
 class Started:
     """A plan starts: ``plan`` is "enroll" or "identify", ``views`` the largest number of views.
 
-    ``angles_deg`` are the table angles of an enrollment. An identification has a ``strategy`` with its ``seed``, the
-    ``descriptor`` that views are compared by, and ``notes`` on what its answer is worth.
+    ``angles_deg`` are the table angles of an enrollment, whose views are taken in one turn if ``in_motion``. An
+    identification has a ``strategy`` with its ``seed``, the ``descriptor`` that views are compared by, and ``notes`` on
+    what its answer is worth.
     """
 
     plan: str
@@ -86,6 +87,7 @@ class Started:
     schema: int = SCHEMA
     descriptor: str | None = None
     notes: tuple[Note, ...] = ()
+    in_motion: bool = False
 
 
 @dataclass(frozen=True, slots=True)

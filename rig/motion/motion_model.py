@@ -29,15 +29,27 @@ class MotionModel:
             seconds += motion_seconds(table.approach_deg, profile) + 2 * table.poll_s
         return seconds
 
+    def park_s(self, from_deg: float) -> float:
+        """Return the duration of the way back to 0 after views in motion: the table need not be quiet there."""
+        table = self.config.table
+        return motion_seconds(from_deg, MotionProfile(table.velocity_dps, table.acceleration_dps2))
+
     @property
     def view_s(self) -> float:
         """The duration of a view: the time until a frame arrives."""
         return FRAMES / self.config.camera.fps
 
-    def enrollment_s(self, start_deg: float, angles_deg: Sequence[float]) -> float:
-        """Return the duration of views at these table angles, from ``start_deg`` and back home."""
+    def enrollment_s(self, start_deg: float, angles_deg: Sequence[float], *, in_motion: bool = False) -> float:
+        """Return the duration of views at these table angles, from ``start_deg`` and back home.
+
+        ``in_motion``: all are taken in one turn at `table.velocity_dps`; a long exposure makes it slower.
+        """
         if not angles_deg:
             return 0.0
+        if in_motion:
+            first_deg = angles_deg[0]
+            before_s = self.move_s(first_deg - start_deg) if first_deg != start_deg else 0.0
+            return FIRST_REST_S + before_s + 2 * self.view_s + self.move_s(360.0) + self.park_s(first_deg + 360.0)
         stops = [start_deg, *angles_deg]
         moves = sum(self.move_s(b - a) for a, b in pairwise(stops))
         return FIRST_REST_S + moves + len(angles_deg) * self.view_s + self.move_s(-angles_deg[-1])

@@ -65,6 +65,18 @@ def can_fly(config: RigConfig) -> bool:
     return config.camera_time.offset_ms is not None and config.camera.exposure_us is not None
 
 
+def takes_in_motion(config: RigConfig, fly: bool | None, *, tray: bool = False) -> bool:
+    """Return whether an enrollment takes its views in one turn; ``fly`` overrides ``enroll.mode``.
+
+    "auto" means at rest, but for a tray in motion where that is possible.
+    """
+    if fly is not None:
+        return fly
+    low_deg, high_deg = config.table.limits_deg
+    possible = low_deg <= 0.0 and high_deg >= 360.0 and can_fly(config)
+    return config.enroll.mode == "fly" or (tray and config.enroll.mode == "auto" and possible)
+
+
 def require_camera_time(config: RigConfig) -> None:
     """Raise `UsageError` unless views can be taken in motion."""
     exposure_s(config)

@@ -19,7 +19,7 @@ from rig.core.clock import seconds_between
 from rig.core.errors import ObjectMoved, RigError, RotationDisagreement
 from rig.events.events import Accepted, Enrolled, Event, Started, plain
 from rig.motion.move import Move
-from rig.motion.scan_speed import require_camera_time
+from rig.motion.scan_speed import require_camera_time, takes_in_motion
 from rig.motion.turntable import Turntable
 from rig.plans.capture import announced, capture, check_camera, moved, warn_of_table
 from rig.plans.estimate import even_azimuths, table_angles
@@ -74,8 +74,8 @@ def enroll(
         See `rig.views.capture` and `rig.motion.turntable`; the views stored so far stay.
     """
     limits_deg, sign = bench.config.table.limits_deg, bench.config.table.orientation_sign
-    fly = bench.config.enroll.mode == "fly" if fly is None else fly
-    if fly:
+    in_motion = takes_in_motion(bench.config, fly)
+    if in_motion:
         require_camera_time(bench.config)
     status = empty_table_status(bench)
     provenance = Provenance(
@@ -105,7 +105,12 @@ def enroll(
     missing = enrollment.missing()
     to_go = {index: angles_deg[index] for index in missing}
     yield Started(
-        "enroll", enrollment.object_name, len(missing), dict(provenance.conditions), angles_deg=tuple(to_go.values())
+        "enroll",
+        enrollment.object_name,
+        len(missing),
+        dict(provenance.conditions),
+        angles_deg=tuple(to_go.values()),
+        in_motion=in_motion,
     )
     started_ns = bench.clock.now_ns()
     retakes = 0
@@ -116,7 +121,7 @@ def enroll(
             if empty_table is not None:
                 enrollment.store_empty_table(empty_table)
             describe = ViewDescriber(bench.config.view, DESCRIPTORS, empty_table)
-            if fly:
+            if in_motion:
                 retakes = yield from _fly_and_complete(bench, enrollment, to_go, describe)
             else:
                 retakes = yield from _take_views(bench, enrollment, to_go, describe)

@@ -14,6 +14,7 @@ from rig.core.clock import seconds_between
 from rig.core.errors import LimitExceeded
 from rig.events.events import Accepted, Event
 from rig.motion.motion_model import MotionModel
+from rig.motion.scan_speed import takes_in_motion
 from rig.motion.turntable import Turntable
 
 _FLOAT_DEG: Final = 1e-6
@@ -93,7 +94,7 @@ class DryRun:
     ``action`` is "enroll", "resume", "replace", "skip" or "reject"; the last two have an ``obstacle``.
     ``enrolled_views`` is the number of views that the object has already. ``angles_deg`` and ``azimuths_deg`` are those
     of the views in their order. ``table_deg`` is the table angle before; ``travel_deg`` is the sum of all rotations,
-    unwinding included.
+    unwinding included. ``in_motion``: the views are taken in one turn.
     """
 
     name: str
@@ -107,6 +108,7 @@ class DryRun:
     limits_deg: tuple[float, float]
     travel_deg: float
     seconds: float
+    in_motion: bool = False
 
 
 def dry_run(
@@ -117,6 +119,7 @@ def dry_run(
     views: int | None = None,
     resume: bool = False,
     replace: bool = False,
+    fly: bool | None = None,
 ) -> tuple[DryRun, ...]:
     """Return what enrolling these objects would do. Nothing moves and nothing is stored.
 
@@ -129,7 +132,7 @@ def dry_run(
     names
         Names of the objects, with their own number of views if they have one. Of several objects, complete ones are
         skipped and interrupted ones resumed, as in a tray.
-    views, resume, replace
+    views, resume, replace, fly
         As for `enroll`.
 
     Raises
@@ -158,7 +161,9 @@ def dry_run(
             angles = tuple(every[index] for index in kept.missing)
         else:
             angles = ()
-        stops = [table_deg, *angles, 0.0] if angles else [table_deg]
+        in_motion = takes_in_motion(bench.config, fly, tray=len(names) > 1)
+        scan = (angles[0], angles[0] + 360.0) if in_motion and angles else angles
+        stops = [table_deg, *scan, 0.0] if angles else [table_deg]
         found.append(
             DryRun(
                 name=name,
@@ -171,7 +176,8 @@ def dry_run(
                 table_deg=table_deg,
                 limits_deg=limits_deg,
                 travel_deg=sum(abs(b - a) for a, b in pairwise(stops)),
-                seconds=model.enrollment_s(table_deg, angles),
+                seconds=model.enrollment_s(table_deg, angles, in_motion=in_motion),
+                in_motion=in_motion,
             )
         )
         table_deg = 0.0 if angles else table_deg
@@ -199,11 +205,14 @@ class TimeLeft:
         Motion model of the bench.
     angles_deg
         Table angles of the coming views, in their order.
+    in_motion
+        Whether they are taken in one turn; they are reported after it.
     """
 
-    def __init__(self, model: MotionModel, angles_deg: Sequence[float]) -> None:
+    def __init__(self, model: MotionModel, angles_deg: Sequence[float], *, in_motion: bool = False) -> None:
         self._model = model
         self._angles_deg = angles_deg
+        self._in_motion = in_motion
         self._done = 0
         self._exposed_ns: list[int] = []
 
@@ -220,7 +229,9 @@ class TimeLeft:
         if not angles:
             return 0.0
         if not done:
-            return model.enrollment_s(angles[0], angles)
+            return model.enrollment_s(angles[0], angles, in_motion=self._in_motion)
+        if self._in_motion:
+            return model.park_s(angles[0] + 360.0)
         left = sum(model.move_s(b - a) + model.view_s for a, b in pairwise(angles[done - 1 :]))
         expected = sum(model.move_s(b - a) + model.view_s for a, b in pairwise(angles[:done]))
         if done > 1 and expected > 0:

@@ -14,7 +14,7 @@ from rig.catalog import Catalog, ObjectSummary, clean_name
 from rig.core.errors import ObjectNotFound, RigError, RotationDisagreement, UsageError, ViewRejected
 from rig.core.files import read
 from rig.events.events import Event, Item, SkipReason
-from rig.motion.scan_speed import can_fly
+from rig.motion.scan_speed import takes_in_motion
 from rig.plans.enroll import enroll
 
 COLUMNS: Final = ("name", "label", "note", "views")
@@ -194,7 +194,7 @@ def enroll_tray(
                     note=item.note,
                     resume=resume,
                     replace=interrupted is not None and not resume,
-                    fly=_flies(bench) if fly is None else fly,
+                    fly=takes_in_motion(bench.config, fly, tray=True),
                 )
             except OBJECT_ERRORS as error:
                 decision = operator.decide_after_error(item, error)
@@ -205,13 +205,6 @@ def enroll_tray(
                     break
             else:
                 break
-
-
-def _flies(bench: Bench) -> bool:
-    mode = bench.config.enroll.mode
-    low_deg, high_deg = bench.config.table.limits_deg
-    room = low_deg <= 0.0 and high_deg >= 360.0
-    return mode == "fly" or (mode == "auto" and room and can_fly(bench.config))
 
 
 def _rows(text: str) -> Generator[tuple[int, list[str]], None, None]:

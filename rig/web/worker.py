@@ -218,7 +218,9 @@ class BenchWorker:
             job.progress = Progress(done=0, total=event.views)
             bench = self._bench()
             self._outline = Outliner(bench)
-            self._left = TimeLeft(MotionModel(bench.config), event.angles_deg) if event.angles_deg else None
+            model = MotionModel(bench.config)
+            left = TimeLeft(model, event.angles_deg, in_motion=event.in_motion)
+            self._left = left if event.angles_deg else None
         if self._left is not None:
             self._left.add(event)
         if isinstance(event, Accepted):

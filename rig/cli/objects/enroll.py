@@ -94,7 +94,7 @@ def enroll(
     items = read_tray(tray) if tray else ()
     if dry_run:
         names = {name: None} if name else {item.name: item.views for item in items}
-        _dry_run(settings, names, views, resume=resume, replace=replace)
+        _dry_run(settings, names, views, resume=resume, replace=replace, fly=fly)
         return
 
     settings.deliver_waiting()
@@ -312,7 +312,13 @@ def _check_writable(report: Path) -> None:
 
 
 def _dry_run(
-    settings: Settings, names: "Mapping[str, int | None]", views: int | None, *, resume: bool, replace: bool
+    settings: Settings,
+    names: "Mapping[str, int | None]",
+    views: int | None,
+    *,
+    resume: bool,
+    replace: bool,
+    fly: bool | None,
 ) -> None:
     """Print the plan of an enrollment; nothing moves and nothing is stored."""
     from rig.cli.ui.present import console, dry_run_lines
@@ -320,7 +326,7 @@ def _dry_run(
     from rig.plans.estimate import dry_run
 
     with settings.open_bench() as bench, settings.catalog_to_plan(bench.clock) or nullcontext() as catalog:
-        found = dry_run(bench, catalog, names, views=views, resume=resume, replace=replace)
+        found = dry_run(bench, catalog, names, views=views, resume=resume, replace=replace, fly=fly)
     if settings.json:
         settings.print_json({"dry_run": plain(found)})
         return

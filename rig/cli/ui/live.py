@@ -152,7 +152,7 @@ class EnrollView(LiveView):
         match event:
             case Started():
                 self._name, self._of = event.name or "", event.views
-                self._left = TimeLeft(self._model, event.angles_deg)
+                self._left = TimeLeft(self._model, event.angles_deg, in_motion=event.in_motion)
                 self._start()
                 if not self._console.is_terminal:
                     self.note(f"{self._title}: {counted(self._of, 'view')}, about {duration_words(self._left.seconds)}")

@@ -47,7 +47,10 @@ def dry_run_lines(found: Sequence[DryRun]) -> list[str]:
         if not one.views:
             lines.append(f"{one.name}: {'skipped' if one.action == 'skip' else 'not possible'}, {_obstacle_words(one)}")
             continue
-        lines.append(f"{one.name}: {one.action}, {counted(one.views, 'view')}, about {duration_words(one.seconds)}")
+        way = " in one turn" if one.in_motion else ""
+        lines.append(
+            f"{one.name}: {one.action}, {counted(one.views, 'view')}{way}, about {duration_words(one.seconds)}"
+        )
         if len(found) > 1:
             continue
         first, last = one.angles_deg[0], one.angles_deg[-1]
