@@ -25,8 +25,8 @@ from rig.events.events import (
     SimilarObjects,
     Started,
 )
+from rig.events.reading import built
 from rig.report.contact_sheet import Image, Region, thumbnail
-from rig.search.saved_run import built
 from rig.views.capture import ViewEvidence, rejection_text
 
 TILE: Final = (96, 96)

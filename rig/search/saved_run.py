@@ -10,13 +10,12 @@ Decision: docs/decisions/0018.
 import json
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, fields, is_dataclass
-from enum import Enum
+from dataclasses import dataclass
 from importlib.metadata import version
-from math import isfinite, nan
+from math import isfinite
 from pathlib import Path
-from types import NoneType, TracebackType, UnionType
-from typing import Any, Final, Self, TextIO, Union, get_args, get_origin, get_type_hints
+from types import TracebackType
+from typing import Any, Final, Self, TextIO
 
 import cv2
 import numpy as np
@@ -30,7 +29,8 @@ from rig.config import RigConfig
 from rig.config.values import validate
 from rig.core.errors import CatalogError, RigError, UsageError
 from rig.core.files import json_values, read, write
-from rig.events.events import Accepted, Event, Identified, Moved, Ranked, Started, event_dict, event_kind
+from rig.events.events import Accepted, Event, Identified, Moved, Ranked, Started, event_dict
+from rig.events.reading import event_of
 from rig.search.earlier_runs import NOT_SAVED, upgraded
 from rig.search.model import Model, empty_table_for, model_of
 from rig.search.stopping_rules import FILE as STOPPING_RULE
@@ -50,8 +50,6 @@ _MAX_BYTES: Final = {"run.json": 1_000_000, "model.jsonl": 32_000_000, "events.j
 """Larger than the files of all real runs. Values of JSON can need twenty times as much memory as their text."""
 _DAMAGE: Final = (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError, cv2.error)
 """Exceptions because of values of a wrong type."""
-
-_KINDS: Final[dict[str, type]] = {event_kind(kind): kind for kind in get_args(Event)}
 
 
 class RunWriter:
@@ -286,53 +284,6 @@ def load_run(folder: Path) -> SavedRun:
 def frame_path(folder: Path, index: int) -> Path:
     """Return the file of the frame of an accepted view."""
     return folder / "frames" / f"{index:03d}.png"
-
-
-def event_of(values: dict[str, Any], frame: Any) -> Event:
-    """Return the event of JSON ``values`` from `event_dict`; ``frame`` returns the image of an accepted view.
-
-    Numbers that were not finite become nan.
-
-    Raises
-    ------
-    LookupError, TypeError, ValueError, ArithmeticError
-        The values are not an event, or a field has a wrong type.
-    """
-    values = dict(values)
-    name = values.pop("event")
-    if name not in _KINDS:
-        raise ValueError(f"there is no event {name!r}")
-    if name == "accepted":
-        values["image_bgr"] = frame(values["index"])
-    event: Event = built(_KINDS[name], values)
-    return event
-
-
-def built(kind: Any, value: Any) -> Any:
-    """Return JSON values as an object of type ``kind``; fields that a newer program added are left out."""
-    origin = get_origin(kind)
-    if is_dataclass(kind):
-        hints = get_type_hints(kind)
-        given = {f.name: built(hints[f.name], value[f.name]) for f in fields(kind) if f.name in value}
-        return kind(**given)  # type: ignore[operator]
-    if origin in (Union, UnionType):
-        if value is None and NoneType in get_args(kind):
-            return None
-        return built(next(k for k in get_args(kind) if k is not NoneType), value)
-    if origin is tuple:
-        items = get_args(kind)
-        return tuple(built(items[0] if items[-1] is Ellipsis else items[i], item) for i, item in enumerate(value))
-    if isinstance(kind, type) and issubclass(kind, Enum):
-        return kind(value)
-    if kind is float:
-        if value is None:
-            return nan
-        if type(value) not in (int, float) or not isfinite(value):
-            raise TypeError(f"{value!r} is not a finite number")
-        return float(value)
-    if kind in (str, bool, int) and type(value) is not kind:
-        raise TypeError(f"{value!r} is not of type {kind.__name__}")
-    return value
 
 
 def _model_lines(views: hbr.Views) -> Iterator[str]:

@@ -236,7 +236,7 @@ def _candidates(result: "Result") -> str:
 def _event(result: "Result") -> "Identified | None":
     """Return the recorded event; None if another version of the program recorded it."""
     from rig.events.events import Identified
-    from rig.search.saved_run import built
+    from rig.events.reading import built
 
     try:
         answer: Identified = built(Identified, result.details)

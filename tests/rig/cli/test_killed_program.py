@@ -249,8 +249,10 @@ NIGHTLY = [
     "command", [["goto", "90"], *(pytest.param(words, marks=pytest.mark.nightly) for words in NIGHTLY)], ids=" ".join
 )
 def test_guardian_switches_the_torque_off_of_each_command_that_moves(running_sim_bench, tmp_path, command):
-    config = ["--config", str(running_sim_bench / "rig.toml")]
-    assert CliRunner().invoke(app, ["home", "--here", *config]).exit_code == 0
+    # On a busy computer the program that simulates the bench answers late.
+    config = ["--config", str(running_sim_bench / "rig.toml"), "--set", "servo.retries=20"]
+    done = CliRunner().invoke(app, ["home", "--here", *config])
+    assert done.exit_code == 0, done.output
     if command[0] == "identify":
         enroll = ["enroll", "mug-white", "--views", "4", "--yes", "--bench", "sim"]
         done = CliRunner().invoke(app, [*enroll, "--set", f"catalog.path={str(tmp_path / 'catalog')!r}"])

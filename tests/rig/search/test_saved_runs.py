@@ -29,12 +29,13 @@ from rig.events.events import (
     Started,
     event_dict,
 )
+from rig.events.reading import event_of
 from rig.plans.enroll import enroll
 from rig.plans.identify import identify
 from rig.plans.photograph_table import photograph_table
 from rig.search.model import load_model
 from rig.search.replay import check
-from rig.search.saved_run import RunWriter, event_of, load_run
+from rig.search.saved_run import RunWriter, load_run
 from sim.bench import ShelfOperator, open_sim_bench
 from sim.objects.shelf import shelf
 from sim.world import World
