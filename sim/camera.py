@@ -3,7 +3,7 @@
 from collections import deque
 from collections.abc import Callable
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 from math import ceil, cos, radians, sin
 from threading import get_ident
@@ -16,29 +16,22 @@ from numpy.typing import NDArray
 
 from rig.devices import v4l2
 from sim.calibration_board import BoardOnPlatter
-from sim.frame_times import FrameTimes
+from sim.camera_controls import BUFFERS_RANGE, EXPOSURE_RANGE, KELVIN_RANGE, NOMINAL_EXPOSURE, SHARP_AT, Controls
+from sim.frame_times import FPS, FrameTimes, frame_after, start_ns
 from sim.noise import NoiseModel
 from sim.objects.projection import HEIGHT, PX_PER_MM, WIDTH, Image, Visible
 from sim.objects.solid import empty_platter
 from sim.optics import Optics
-from sim.sensor import Gains, Sensor, white_balance
+from sim.rolling_shutter import bands, row_weights
+from sim.sensor import Sensor
 from sim.world import HISTORY_S, Activity, Scene, World
 
 CAMERA_DEVICE = "simulated camera"
 """What identifies the camera of a simulated bench; a bench has one."""
-FPS = 30
-NOMINAL_EXPOSURE = 100  # exposure at which the frame has the scene's grey levels, in V4L2's unit of 100 µs
 READOUT_NS = 15_000_000  # time from the end of the exposure until the computer has the frame
 SELECT_S = 10.0  # how long OpenCV's V4L2 backend waits for a frame (OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT)
-V4L2_EXPOSURE_MANUAL, V4L2_EXPOSURE_APERTURE_PRIORITY = 1, 3
 
-_EXPOSURE_RANGE = (1, 10_000 // FPS)
-_GAIN_RANGE_DB = (0, 24)
-_KELVIN_RANGE = (2800, 6500)
-_FOCUS_RANGE = (0, 255)
-_SHARP_AT = 120
 _FOCUS_STEP = 15  # by which the autofocus moves the lens between two measurements
-_SHARPNESS_RANGE = (0, 255)
 MODES = tuple(
     v4l2.VideoMode(fourcc, WIDTH // n, HEIGHT // n, float(FPS)) for fourcc in ("MJPG", "YUYV") for n in (1, 2)
 )
@@ -50,37 +43,13 @@ _REMEMBERED = (
     *(v4l2.POWER_LINE_FREQUENCY, v4l2.EXPOSURE_DYNAMIC_FRAMERATE),
 )
 """Controls of which the camera does not say that they change by themselves: the driver asks it once."""
-_BUFFERS_RANGE = (1, 10)
+
 
 _METER_FRAMES = 5  # the automatic settings change every so many frames
 _METER_TARGET = 70.0
 _EDGE_PX_PER_DEG = radians(1.0) * 80 * PX_PER_MM  # motion in the image of a point 80 mm from the axis
 _STILL_PX = 0.25
 _MAX_SUBFRAMES = 16
-
-
-@dataclass(frozen=True, slots=True)
-class Controls:
-    """The camera's settings: exposure in 100 µs, gain in dB, white balance in kelvin."""
-
-    auto_exposure: bool = True
-    exposure: float = NOMINAL_EXPOSURE
-    gain_db: float = 0.0
-    auto_white_balance: bool = True
-    kelvin: float = 4600.0
-    autofocus: bool = False
-    focus: float = _SHARP_AT
-    buffers: int = 4
-    sharpness: float = 3
-    backlight_compensation: float = 0
-    power_line_frequency: float = 2
-    dynamic_frame_rate: bool = True
-
-    @property
-    def gains(self) -> Gains:
-        gain = 10 ** (self.gain_db / 20)
-        b, g, r = white_balance(self.kelvin)
-        return gain * b, gain * g, gain * r
 
 
 class SimCapture:
@@ -149,7 +118,7 @@ class SimCapture:
         self._lost = False
         self._plugs = 1
         self._queue: deque[int] = deque()
-        self._next = _frame_after(self._clock.now_ns())
+        self._next = frame_after(self._clock.now_ns())
         self._grabbed: int | None = None
         self._controls: list[tuple[int, Controls]] = [(self._clock.now_ns(), Controls())]
         self._metered = self._next
@@ -176,7 +145,7 @@ class SimCapture:
         """Open the stream again with the same settings; return whether the camera is plugged in."""
         if self._plugged and (self._lost or not self._open):
             self._queue.clear()
-            self._next = self._exposed_from(_frame_after(self._clock.now_ns()))
+            self._next = self._exposed_from(frame_after(self._clock.now_ns()))
             self._open, self._lost = True, False
         return self._plugged
 
@@ -263,18 +232,7 @@ class SimCapture:
             cv2.CAP_PROP_FPS: FPS,
             cv2.CAP_PROP_FOURCC: v4l2.fourcc_number(self._fourcc),
             cv2.CAP_PROP_POS_MSEC: 0.0 if self._grabbed is None else self._stamp_ns(self._grabbed) * 1e-6,
-            cv2.CAP_PROP_BUFFERSIZE: now.buffers,
-            cv2.CAP_PROP_AUTO_EXPOSURE: V4L2_EXPOSURE_APERTURE_PRIORITY if now.auto_exposure else V4L2_EXPOSURE_MANUAL,
-            cv2.CAP_PROP_EXPOSURE: round(now.exposure),
-            cv2.CAP_PROP_GAIN: now.gain_db,
-            cv2.CAP_PROP_AUTO_WB: now.auto_white_balance,
-            cv2.CAP_PROP_WB_TEMPERATURE: round(now.kelvin),
-            cv2.CAP_PROP_AUTOFOCUS: now.autofocus,
-            cv2.CAP_PROP_FOCUS: now.focus,
-            cv2.CAP_PROP_SHARPNESS: now.sharpness,
-            cv2.CAP_PROP_BACKLIGHT: now.backlight_compensation,
-            v4l2.POWER_LINE_FREQUENCY: now.power_line_frequency,
-            v4l2.EXPOSURE_DYNAMIC_FRAMERATE: now.dynamic_frame_rate,
+            **now.values,
         }
         if self._lost and prop not in _NO_CONTROLS:
             return -1.0
@@ -292,35 +250,15 @@ class SimCapture:
                 self._binning = round(WIDTH / value)
             case cv2.CAP_PROP_FRAME_WIDTH | cv2.CAP_PROP_FRAME_HEIGHT | cv2.CAP_PROP_FPS:
                 return value == self.get(prop)
-            case cv2.CAP_PROP_BUFFERSIZE if _BUFFERS_RANGE[0] <= value <= _BUFFERS_RANGE[1]:
+            case cv2.CAP_PROP_BUFFERSIZE if BUFFERS_RANGE[0] <= value <= BUFFERS_RANGE[1]:
                 self._queue.clear()  # OpenCV frees its buffers and starts the stream again
-                self._next = _frame_after(self._clock.now_ns())
+                self._next = frame_after(self._clock.now_ns())
                 now = replace(now, buffers=int(value))
-            case cv2.CAP_PROP_AUTO_EXPOSURE if value in (V4L2_EXPOSURE_MANUAL, V4L2_EXPOSURE_APERTURE_PRIORITY):
-                auto = value == V4L2_EXPOSURE_APERTURE_PRIORITY
-                now = replace(now, auto_exposure=auto, exposure=round(now.exposure))
-            case cv2.CAP_PROP_EXPOSURE if not now.auto_exposure:
-                now = replace(now, exposure=_within(value, _EXPOSURE_RANGE))
-            case cv2.CAP_PROP_GAIN:
-                now = replace(now, gain_db=_within(value, _GAIN_RANGE_DB))
-            case cv2.CAP_PROP_AUTO_WB:
-                now = replace(now, auto_white_balance=bool(value), kelvin=round(now.kelvin))
-            case cv2.CAP_PROP_WB_TEMPERATURE if not now.auto_white_balance:
-                now = replace(now, kelvin=_within(value, _KELVIN_RANGE))
-            case cv2.CAP_PROP_AUTOFOCUS:
-                now = replace(now, autofocus=bool(value))
-            case cv2.CAP_PROP_FOCUS if not now.autofocus:
-                now = replace(now, focus=_within(value, _FOCUS_RANGE))
-            case cv2.CAP_PROP_SHARPNESS:
-                now = replace(now, sharpness=_within(value, _SHARPNESS_RANGE))
-            case cv2.CAP_PROP_BACKLIGHT:
-                now = replace(now, backlight_compensation=_within(value, (0, 1)))
-            case v4l2.POWER_LINE_FREQUENCY if 0 <= value <= 2:
-                now = replace(now, power_line_frequency=int(value))
-            case v4l2.EXPOSURE_DYNAMIC_FRAMERATE:
-                now = replace(now, dynamic_frame_rate=bool(value))
             case _:
-                return False
+                changed = now.with_value(prop, value)
+                if changed is None:
+                    return False
+                now = changed
         self._change(self._clock.now_ns(), now)
         self._remembered.pop(prop, None)
         return True
@@ -333,12 +271,12 @@ class SimCapture:
         now_ns = self._clock.now_ns()
         room = self._controls[-1][1].buffers
         if self.hangs:
-            self._next = max(self._next, self._exposed_from(_frame_after(now_ns)))
+            self._next = max(self._next, self._exposed_from(frame_after(now_ns)))
         while len(self._queue) < room and self._arrival_ns(self._next) <= now_ns:
             self._queue.append(self._next)
             self._next = self._exposed_from(self._next + 1)
         if len(self._queue) == room:
-            self._next = max(self._next, self._exposed_from(_frame_after(now_ns - self.latency_ns) - 2))
+            self._next = max(self._next, self._exposed_from(frame_after(now_ns - self.latency_ns) - 2))
             while self._arrival_ns(self._next) <= now_ns:
                 self._next = self._exposed_from(self._next + 1)
 
@@ -354,7 +292,7 @@ class SimCapture:
 
     def _arrival_ns(self, frame: int) -> int:
         start = start_ns(frame)
-        return start + _exposure_ns(self._controls_at(start)) + READOUT_NS + self.times.late_ns(frame) + self.latency_ns
+        return start + self._controls_at(start).exposure_ns + READOUT_NS + self.times.late_ns(frame) + self.latency_ns
 
     def _controls_at(self, time_ns: int) -> Controls:
         return next((c for since, c in reversed(self._controls) if since <= time_ns), self._controls[0][1])
@@ -372,13 +310,13 @@ class SimCapture:
         controls = self._controls_at(start)
         exposed = self.times.exposed_ns(start, frame)
         scene = self._world.scene_at(exposed)
-        seen = self._exposed(scene, exposed, _exposure_ns(controls))
-        blur = max(abs(controls.focus - _SHARP_AT) * 0.04, self.blur_px)
+        seen = self._exposed(scene, exposed, controls.exposure_ns)
+        blur = max(abs(controls.focus - SHARP_AT) * 0.04, self.blur_px)
         if blur > 0.1:
             seen = np.asarray(cv2.GaussianBlur(seen, (0, 0), blur), dtype=np.float32)
         if self.lamp is not None:
             seen = np.asarray(
-                seen * _bands(*self.lamp, start, _exposure_ns(controls), self.times.readout_ns), dtype=np.float32
+                seen * bands(*self.lamp, start, controls.exposure_ns, self.times.readout_ns), dtype=np.float32
             )
         return _sensor(self._noise, self._world.seed, self._binning, get_ident()).expose(
             seen,
@@ -399,12 +337,7 @@ class SimCapture:
         if path_px < _STILL_PX:
             return self._picture(scene, float(angles[0]))
         n = min(1 + ceil(path_px / self._binning), _MAX_SUBFRAMES * (1 + readout // max(exposure, 1)))
-        steps = (np.arange(n) + 0.5) / n * (exposure + readout)
-        begins = (np.arange(HEIGHT) + 0.5) / HEIGHT * readout
-        half = (exposure + readout) / n / 2  # a step counts as far as it lies within the row's exposure
-        ends = np.minimum(steps[:, None] + half, begins + exposure)
-        weights = np.clip(ends - np.maximum(steps[:, None] - half, begins), 0, None)
-        weights = (weights / weights.sum(axis=0)).astype(np.float32)
+        steps, weights = row_weights(exposure, readout, n)
         seen = np.zeros((HEIGHT, WIDTH, 3), dtype=np.float32)
         for angle, weight in zip(self._world.table_motion(start + steps.astype(np.int64))[0], weights, strict=True):
             rows = np.flatnonzero(weight)
@@ -440,13 +373,13 @@ class SimCapture:
         and blue equal (the grey world), for objects of any colour.
         """
         now_ns = self._clock.now_ns()
-        self._metered = max(self._metered, _frame_after(now_ns - round(HISTORY_S * 1e9)))
+        self._metered = max(self._metered, frame_after(now_ns - round(HISTORY_S * 1e9)))
         while start_ns(self._metered + _METER_FRAMES) <= now_ns:
             self._metered += _METER_FRAMES
             time_ns = start_ns(self._metered)
             controls = self._controls[-1][1]
-            if controls.autofocus and controls.focus != _SHARP_AT:
-                step = min(max(_SHARP_AT - controls.focus, -_FOCUS_STEP), _FOCUS_STEP)
+            if controls.autofocus and controls.focus != SHARP_AT:
+                step = min(max(SHARP_AT - controls.focus, -_FOCUS_STEP), _FOCUS_STEP)
                 controls = replace(controls, focus=controls.focus + step)
                 self._change(time_ns, controls)
             if not (controls.auto_exposure or controls.auto_white_balance):
@@ -456,10 +389,10 @@ class SimCapture:
             mean *= np.array(scene.light) * controls.gains * controls.exposure / NOMINAL_EXPOSURE
             if controls.auto_exposure:
                 factor = np.clip(_METER_TARGET / max(mean.mean(), 1e-3), 0.25, 4.0) ** 0.5
-                controls = replace(controls, exposure=float(np.clip(controls.exposure * factor, *_EXPOSURE_RANGE)))
+                controls = replace(controls, exposure=float(np.clip(controls.exposure * factor, *EXPOSURE_RANGE)))
             if controls.auto_white_balance and mean.min() > 0:
                 factor = (mean[0] / mean[2]) ** 0.3
-                controls = replace(controls, kelvin=float(np.clip(controls.kelvin * factor, *_KELVIN_RANGE)))
+                controls = replace(controls, kelvin=float(np.clip(controls.kelvin * factor, *KELVIN_RANGE)))
             self._change(time_ns, controls)
 
 
@@ -467,31 +400,3 @@ class SimCapture:
 def _sensor(noise: NoiseModel, seed: int, binning: int, _thread: int) -> Sensor:
     """Return the sensor of a world, built for the first frame and shared by all benches of that world in a thread."""
     return Sensor(noise, np.random.default_rng([seed, crc32(b"camera")]), binning)
-
-
-def start_ns(frame: int) -> int:
-    """Return when the exposure of a frame begins; V4L2 stamps whole microseconds."""
-    return frame * 1_000_000 // FPS * 1000
-
-
-def _frame_after(time_ns: int) -> int:
-    """Return the first frame that begins at or after a time."""
-    frame = max(time_ns, 0) * FPS // 1_000_000_000
-    return frame if start_ns(frame) >= time_ns else frame + 1
-
-
-def _exposure_ns(controls: Controls) -> int:
-    return round(controls.exposure * 100_000)
-
-
-def _within(value: float, limits: tuple[int, int]) -> int:
-    """Return ``value`` as V4L2 takes it: a whole number, brought into the range."""
-    return int(min(max(int(value), limits[0]), limits[1]))
-
-
-def _bands(hz: float, depth: float, start: int, exposure: int, readout: int) -> NDArray[np.float32]:
-    """Return the light that each row receives from a flickering lamp during its exposure, (HEIGHT, 1, 1)."""
-    begins_s = start * 1e-9 + np.arange(HEIGHT) / HEIGHT * readout * 1e-9
-    middle_s = begins_s + exposure * 0.5e-9
-    light = 1 + depth * np.sinc(hz * exposure * 1e-9) * np.cos(2 * np.pi * hz * middle_s)
-    return light.astype(np.float32)[:, None, None]

@@ -11,6 +11,7 @@ from zlib import crc32
 from sim.world import World
 
 _NORMAL = NormalDist()
+FPS = 30
 
 
 class FrameTimes:
@@ -61,3 +62,14 @@ class FrameTimes:
     def _uniform(self, what: bytes, frame: int) -> float:
         """Return a number in (0, 1) that looks random."""
         return (crc32(b"%s %d %d" % (what, self._seed, frame)) + 0.5) / 2**32
+
+
+def start_ns(frame: int) -> int:
+    """Return when the exposure of a frame begins; V4L2 stamps whole microseconds."""
+    return frame * 1_000_000 // FPS * 1000
+
+
+def frame_after(time_ns: int) -> int:
+    """Return the first frame that begins at or after a time."""
+    frame = max(time_ns, 0) * FPS // 1_000_000_000
+    return frame if start_ns(frame) >= time_ns else frame + 1

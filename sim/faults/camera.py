@@ -5,9 +5,9 @@ from math import pi, sin
 
 import numpy as np
 
-from sim.camera import FPS
 from sim.devices import SimDevices
 from sim.faults.kind import End, Parameter, repeatedly, share, simulated_fault
+from sim.frame_times import FPS
 from sim.objects.projection import Image
 
 Values = Mapping[str, float]

@@ -9,7 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from sim.camera import FPS, READOUT_NS, SimCapture, start_ns
+from sim.camera import READOUT_NS, SimCapture
+from sim.frame_times import FPS, start_ns
 from sim.motion import to_velocity
 from sim.noise import NoiseModel
 from sim.objects.projection import CENTRE_PX, PX_PER_MM, Image

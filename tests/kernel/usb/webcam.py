@@ -16,7 +16,9 @@ from numpy.typing import NDArray
 
 from rig.core.clock import SystemClock
 from rig.devices import v4l2
-from sim.camera import FPS, V4L2_EXPOSURE_APERTURE_PRIORITY, V4L2_EXPOSURE_MANUAL, SimCapture
+from sim.camera import SimCapture
+from sim.camera_controls import V4L2_EXPOSURE_APERTURE_PRIORITY, V4L2_EXPOSURE_MANUAL
+from sim.frame_times import FPS
 from sim.objects.projection import HEIGHT, WIDTH
 from sim.realtime.pace import RealTime
 from tests.kernel.usb.descriptors import BULK, Identity, configuration, endpoint, interface

@@ -20,8 +20,9 @@ from rig.devices.opencv_camera import CameraSettings, OpenCvCamera, TimeBase
 from rig.devices.opencv_capture import open_capture
 from rig.events.events import Rejected
 from rig.plans.enroll import enroll
-from sim.camera import FPS, SimCapture
+from sim.camera import SimCapture
 from sim.computer import ComputerFiles
+from sim.frame_times import FPS
 from sim.noise import NoiseModel
 from sim.objects.shelf import shelf
 from sim.world import World
