@@ -1,6 +1,6 @@
 """Searches in motion compared with searches at rest, computed from frames that were recorded once.
 
-`python -m benchmarks.fly_recorded RECORDING [--trials 240] [--strength 0] [--objects 40] [--json FILE]`
+`python -m benchmarks.fly_recorded RECORDING [--trials 240] [--seed 0] [--strength 0] [--objects 40] [--json FILE]`
 
 `benchmarks.fly_search` runs both searches on the simulated bench, which draws some 50 frames for each. Here each
 built-in object is recorded once: 24 views at rest, which are enrolled, and, placed again, a turn in motion and 24 views
@@ -163,6 +163,7 @@ def main() -> None:
     options.add_argument("recording", type=Path)
     options.add_argument("--trials", type=int, default=240)
     options.add_argument("--objects", type=int, default=40)
+    options.add_argument("--seed", type=int, default=0)
     options.add_argument("--strength", type=float, default=0.0)
     options.add_argument("--json", type=Path)
     given = options.parse_args()
@@ -173,7 +174,7 @@ def main() -> None:
             recorded = {name: record(bench, operator, name) for name in list(things)[: given.objects]}
         given.recording.write_bytes(pickle.dumps(recorded))
     recorded = pickle.loads(given.recording.read_bytes())
-    names, config, rng = sorted(recorded), configured(), np.random.default_rng(0)
+    names, config, rng = sorted(recorded), configured(), np.random.default_rng(given.seed)
     rows: list[dict[str, Any]] = []
     for number in range(CATALOGS):
         unknown = names[number :: 2 * CATALOGS][:LEFT_OUT]

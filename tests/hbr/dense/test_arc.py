@@ -8,6 +8,7 @@ import pytest
 from hbr import DenseIndex, DenseSession, Outcome, Views, leave_one_out
 from hbr.dense.arc import (
     DECISIONS,
+    MOTION_LOSS,
     SIDE_DEG,
     STEP_DEG,
     STEP_WEIGHT,
@@ -105,7 +106,10 @@ def test_search_ends_after_the_arc_as_ambiguous_or_unknown(index: DenseIndex, re
     pass_by(short, index.views, 0, 45.0)
     assert short.end().outcome is Outcome.AMBIGUOUS
     strict = replace(rest, min_confidence=2.0, open_set_thresholds=(5.0,) * len(rest.open_set_thresholds))
-    outcomes = pass_by(ArcSession(index, ArcRule(strict, 0.0)), index.views, 0, 240.0)
+    outcomes = pass_by(missed := ArcSession(index, ArcRule(strict, 0.0)), index.views, 0, 240.0)
+    just_above = missed.decision.open_set_score + MOTION_LOSS / 2
+    doubtful = replace(strict, open_set_thresholds=(just_above,) * len(rest.open_set_thresholds))
+    assert pass_by(ArcSession(index, ArcRule(doubtful, 0.0)), index.views, 0, 240.0)[-1] is Outcome.AMBIGUOUS
     assert outcomes.index(Outcome.UNKNOWN) == (len(rest.open_set_thresholds) - 1) * SIDE_DEG // 4
 
 

@@ -157,7 +157,7 @@ def test_failed_turn_stores_no_view(tmp_path: Path, fault: str, kind: type[RigEr
     assert not any(isinstance(event, Accepted) for event in events)
 
 
-def test_interrupted_turn_resumes(tmp_path: Path) -> None:
+def test_interrupted_turn_resumes_and_can_be_paused(tmp_path: Path) -> None:
     with flying(tmp_path, *FAST, camera_readout_ms=0.0) as (bench, catalog, _):
         events = enroll(bench, catalog, "block", views=8, fly=True)
         for event in events:
@@ -165,7 +165,10 @@ def test_interrupted_turn_resumes(tmp_path: Path) -> None:
                 break
         events.close()
         assert not bench.servo.read_condition().torque
-        *_, done = enroll(bench, catalog, "block", resume=True, fly=True)
+        for done in enroll(bench, catalog, "block", resume=True, fly=True):
+            if isinstance(done, ScanStarted | Accepted):  # the operator pauses before the turn, and between its views
+                assert abs(bench.servo.read_state().velocity_dps) < 1
+                bench.clock.sleep(40.0)
         assert isinstance(done, Enrolled)
         assert len(catalog.object("block").views) == 8
 

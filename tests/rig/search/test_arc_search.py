@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import hbr
@@ -75,6 +76,25 @@ def test_search_ends_in_mid_turn_and_can_be_replayed(model: Model, tmp_path: Pat
     assert f"enough for an answer from view {enough.index + 1} on: {enough.seconds:.1f} s after the start" in report
     decisions = [e.candidates[0].probability for e in events if isinstance(e, Ranked)]
     assert len(decisions) < 1 + len(in_motion)
+
+
+def test_arc_stays_within_the_cable_budget_and_waits_for_a_pause(model: Model) -> None:
+    world = World(seed=2)
+    angles_deg: list[float] = []
+    with moving(world, "table.limits_deg=[-30, 30]", "table.mode=pan") as bench:
+        events = identify(bench, model, live=lambda _: angles_deg.append(world.table_deg()))
+        paused = False
+        for event in events:
+            if isinstance(event, Decided) and not paused:
+                bench.clock.sleep(40.0)  # the operator pauses before the arc
+                paused = True
+            if isinstance(event, Moved):
+                break
+        events.close()
+        assert not bench.servo.read_condition().torque
+    assert paused
+    assert len(angles_deg) >= 6
+    assert 20 < max(np.abs(angles_deg)) < 31  # an arc without a cable budget is longer
 
 
 def test_guessed_view_does_not_end_the_search(model: Model, monkeypatch: pytest.MonkeyPatch) -> None:
