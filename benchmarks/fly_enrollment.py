@@ -33,7 +33,7 @@ from sim.objects.photographs import photographs
 from sim.objects.shelf import shelf
 from sim.world import World
 
-NOISE = NoiseModel(lost_frames=0.01, usb_latency_ms=1.0)
+NOISE = NoiseModel()
 KINDS = ("rest", "again", "motion")
 
 
