@@ -129,13 +129,15 @@ MISTIMED = ("stamp_jump:ms=15", "stamps_backwards", "stamp_jitter")
 UNRELIABLE = ("camera.slow:fps=10", "camera.intermittent")
 
 
-@pytest.mark.parametrize("kinds", [MISSING, MISTIMED, UNRELIABLE, ("camera.delayed",)])
+@pytest.mark.parametrize("kinds", [MISSING, MISTIMED, UNRELIABLE])
 def test_faulty_frames_leave_only_true_views(tmp_path: Path, kinds: tuple[str, ...]) -> None:
     check_true_views(tmp_path, *(f"{kind}@{1.5 + 1.1 * i:.1f}s+0.8s" for i, kind in enumerate(kinds)))
 
 
-@pytest.mark.nightly
-@pytest.mark.parametrize("kind", [*MISSING, *MISTIMED, *UNRELIABLE, "camera.delayed"])
+@pytest.mark.parametrize(
+    "kind",
+    ["camera.delayed", *(pytest.param(one, marks=pytest.mark.nightly) for one in (*MISSING, *MISTIMED, *UNRELIABLE))],
+)
 def test_long_fault_of_frames_leaves_only_true_views(tmp_path: Path, kind: str) -> None:
     check_true_views(tmp_path, f"{kind}@1.5s+2s")
 
