@@ -3,20 +3,13 @@
 from typing import Any
 from warnings import warn
 
+from hbr.dense.calibration import CalibratedRule, calibrate_stopping_rule, fit_stopping_rule
 from hbr.dense.filter import Belief, update_belief
 from hbr.dense.index import DenseIndex
 from hbr.dense.leave_one_out import LeaveOneOut, leave_one_out
 from hbr.dense.next_view import NextBestView, next_best_view
 from hbr.dense.session import DenseSession
-from hbr.dense.stopping import (
-    CalibratedRule,
-    Outcome,
-    StopDecision,
-    StoppingRule,
-    StopReason,
-    calibrate_stopping_rule,
-    fit_stopping_rule,
-)
+from hbr.dense.stopping import Outcome, StopDecision, StoppingRule, StopReason
 from hbr.descriptors import Descriptor, descriptor
 from hbr.descriptors.cedd import cedd
 from hbr.descriptors.cedd_packing import pack, unpack, unpack_rows

@@ -20,20 +20,13 @@ import numpy as np
 
 from hbr.core.angles import size_deg
 from hbr.core.arrays import FloatArray, LevelArray
+from hbr.dense.calibration import fit_min_confidence
 from hbr.dense.filter import Belief, update_belief
 from hbr.dense.index import DenseIndex
 from hbr.dense.leave_one_out import LeaveOneOut, leave_one_out
 from hbr.dense.next_view import expected_similarity, strongest
 from hbr.dense.session import DenseSession
-from hbr.dense.stopping import (
-    Limitation,
-    LimitationCode,
-    Outcome,
-    StopDecision,
-    StoppingRule,
-    StopReason,
-    fit_min_confidence,
-)
+from hbr.dense.stopping import Limitation, LimitationCode, Outcome, StopDecision, StoppingRule, StopReason
 
 STEP_DEG: Final = 15.0
 """The rule decides whenever the frames have covered so much more of the circle."""

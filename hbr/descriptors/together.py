@@ -72,15 +72,19 @@ class ViewsTogether:
         TypeError, ValueError
             As for `hbr.segment`, or the view has another size than the others.
         """
-        self._learned.add(image_bgr)
-        self._images.append(image_bgr)
-        self.segmentations.append(())
-        self.levels.append(np.empty((0, self._descriptor.length), np.uint8))
+        self.learn(image_bgr)
         if revise:
             self.revise()
         else:
             self._describe(len(self._images) - 1)
         return self.segmentations[-1]
+
+    def learn(self, image_bgr: ImageArray) -> None:
+        """Add a view that `revise` segments and describes together with the others; errors as for `add`."""
+        self._learned.add(image_bgr)
+        self._images.append(image_bgr)
+        self.segmentations.append(())
+        self.levels.append(np.empty((0, self._descriptor.length), np.uint8))
 
     @property
     def reliable(self) -> bool:

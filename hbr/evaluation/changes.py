@@ -100,7 +100,7 @@ def enroll_changed(item: PhotographedObject, changes: Changes) -> tuple[LevelArr
     views = ViewsTogether(DESCRIPTOR, empty_table=visit.empty() if changes.picture else None, several=False)
     for place in places:
         azimuth_deg = item.photographs[place].azimuth_deg
-        views.add(visit.photograph(*_cut_out(item, place), azimuth_deg).image, revise=False)
+        views.learn(visit.photograph(*_cut_out(item, place), azimuth_deg).image)
     views.revise()
     return np.stack([levels[0] for levels in views.levels]), item.azimuth_deg[places]
 

@@ -13,11 +13,12 @@ from numpy.typing import NDArray
 
 from hbr.core.angles import wrap180
 from hbr.core.arrays import FloatArray, IndexArray, LevelArray
+from hbr.dense.calibration import calibrate_stopping_rule
 from hbr.dense.filter import Belief, update_belief
 from hbr.dense.index import DenseIndex
 from hbr.dense.next_view import most_informative_rotation
 from hbr.dense.session import DenseSession
-from hbr.dense.stopping import Outcome, StoppingRule, calibrate_stopping_rule
+from hbr.dense.stopping import Outcome, StoppingRule
 from hbr.descriptors import descriptor
 from hbr.evaluation.draws import generator
 from hbr.evaluation.methods import Method

@@ -6,8 +6,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hbr.core.arrays import BoolArray
+from hbr.dense.calibration import conformal_threshold
 from hbr.dense.leave_one_out import Leaders, usual_scores
-from hbr.dense.stopping import StoppingRule, conformal_threshold
+from hbr.dense.stopping import StoppingRule
 from hbr.evaluation.draws import generator
 from hbr.evaluation.protocol import Protocol, Runs
 

@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hbr.core.arrays import LevelArray
+from hbr.dense.calibration import calibrate_stopping_rule
 from hbr.dense.index import DenseIndex
-from hbr.dense.stopping import StoppingRule, calibrate_stopping_rule
+from hbr.dense.stopping import StoppingRule
 from hbr.evaluation.changes import (
     DESCRIPTOR,
     Changes,

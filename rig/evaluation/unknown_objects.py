@@ -7,9 +7,10 @@ from typing import Any, Final
 
 import numpy as np
 
+from hbr.dense.calibration import calibration_searches, fit_stopping_rule
 from hbr.dense.index import DenseIndex
 from hbr.dense.leave_one_out import LeaveOneOut
-from hbr.dense.stopping import StoppingRule, calibration_searches, fit_stopping_rule
+from hbr.dense.stopping import StoppingRule
 from hbr.evaluation.descriptors import query_levels
 from hbr.evaluation.methods import METHODS
 from hbr.evaluation.protocol import Protocol, Runs, run_object, views_of_trial

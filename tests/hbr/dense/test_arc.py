@@ -18,13 +18,8 @@ from hbr.dense.arc import (
     fit_arc_rule,
     frame_weight,
 )
-from hbr.dense.stopping import (
-    UNCALIBRATED_MIN_CONFIDENCE,
-    LimitationCode,
-    StoppingRule,
-    StopReason,
-    calibrate_stopping_rule,
-)
+from hbr.dense.calibration import UNCALIBRATED_MIN_CONFIDENCE, calibrate_stopping_rule
+from hbr.dense.stopping import LimitationCode, StoppingRule, StopReason
 from tests.hbr.dense.test_stopping import catalog
 
 

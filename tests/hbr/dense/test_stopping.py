@@ -8,16 +8,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hbr import Belief, DenseIndex, DenseSession, Outcome, StopReason, Views, leave_one_out, tanimoto, update_belief
-from hbr.dense.leave_one_out import Leaders, usual_scores
-from hbr.dense.stopping import (
+from hbr.dense.calibration import (
     UNCALIBRATED_MIN_CONFIDENCE,
-    LimitationCode,
-    StoppingRule,
     calibrate_stopping_rule,
     conformal_threshold,
     fit_stopping_rule,
     min_confidence_for,
 )
+from hbr.dense.leave_one_out import Leaders, usual_scores
+from hbr.dense.stopping import LimitationCode, StoppingRule
 from tests.fuzzing import examples
 
 BETA = 60.0

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 import hbr
+from hbr.dense.calibration import UNCALIBRATED_MIN_CONFIDENCE
 from hbr.dense.leave_one_out import leave_one_out
-from hbr.dense.stopping import UNCALIBRATED_MIN_CONFIDENCE, LimitationCode
+from hbr.dense.stopping import LimitationCode
 from rig.catalog import Catalog
 from rig.config import RigConfig
 from rig.core.errors import CatalogError, DescriptorOutdated, UsageError
@@ -138,7 +139,7 @@ def test_confused_objects_are_named():
     searches = leave_one_out(hbr.DenseIndex(hbr.Views.concatenate(twins)))
     leading = replace(searches.known, object_index=searches.unknown.object_index)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("hbr.dense.stopping.leave_one_out", lambda *_, **__: replace(searches, known=leading))
+        patch.setattr("hbr.dense.calibration.leave_one_out", lambda *_, **__: replace(searches, known=leading))
         again = hbr.calibrate_stopping_rule(hbr.DenseIndex(hbr.Views.concatenate(twins)), false_reject=0.4)
     assert again.confused
     assert all(one != other for one, other in again.confused)

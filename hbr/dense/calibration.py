@@ -1,0 +1,347 @@
+"""The thresholds of the stopping rule, from searches for the objects of a catalog among each other.
+
+`leave_one_out` searches for every object, `fit_stopping_rule` sets the thresholds from these searches, and
+`fit_open_set` fits the open-set score to changes of the bench (`hbr.dense.shifted_searches`).
+
+Decisions: docs/decisions/0026, docs/decisions/0049.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from math import ceil, floor, inf, nan
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hbr.core.arrays import FloatArray
+from hbr.dense.filter import BETA, update_belief
+from hbr.dense.index import DenseIndex
+from hbr.dense.leave_one_out import Found, Leaders, LeaveOneOut, Task, leader, leave_one_out, usual_scores
+from hbr.dense.open_set import OpenSetModel
+from hbr.dense.shifted_searches import STRENGTHS, ShiftedSearches, can_shift, shifted_searches
+from hbr.dense.stopping import Limitation, LimitationCode, ShiftRates, StoppingRule
+
+#: No search ends at a smaller confidence, however well the leave-one-out searches went: real views may be less clear.
+SMALLEST_MIN_CONFIDENCE: Final = 0.9
+#: Confidence that ends a search if the catalog has too little data for the error rate that was asked for.
+UNCALIBRATED_MIN_CONFIDENCE: Final = 0.98
+#: With fewer objects, leaving one out leaves no second candidate.
+FEWEST_OBJECTS: Final = 3
+#: With fewer objects, the open-set score is not fitted to changes of the bench: a share of 2 % needs that many.
+FEWEST_OBJECTS_SHIFTED: Final = 50
+#: Largest share of objects that are not enrolled, and are accepted under changes of the bench.
+FALSE_ACCEPT: Final = 0.02
+#: Changes of the bench up to this strength are mild: enrolled objects must be accepted at the rate that was asked for.
+_MILD: Final = 0.5
+#: Views of a leave-one-out search, if most objects have enough; searches in a calibration.
+CALIBRATED_VIEWS: Final = 4
+MOST_SEARCHES: Final = 400
+
+
+def conformal_threshold(scores: ArrayLike, false_reject: float) -> float:
+    """Return the score below which no more than this share of further scores of the same kind fall.
+
+    The ⌊α(n + 1)⌋-th smallest of n scores; -inf if n is too small, that is, below 1/α - 1. The guarantee holds on
+    average for scores that are exchangeable with these, for any distribution.
+
+    Source: V. Vovk, A. Gammerman and G. Shafer, "Algorithmic Learning in a Random World", Springer 2005.
+
+    Raises
+    ------
+    ValueError
+        The share is not between 0 and 1, or a score is not finite.
+    """
+    ordered = np.sort(np.asarray(scores, np.float64).ravel())
+    if not 0 < false_reject < 1:
+        raise ValueError(f"false_reject is {false_reject}; a share between 0 and 1 is needed, e.g. 0.02")
+    if not np.isfinite(ordered).all():
+        raise ValueError("a score is not finite; leave such searches out")
+    place = floor(false_reject * (len(ordered) + 1) + 1e-9)
+    return float(ordered[place - 1]) if place else -inf
+
+
+def min_confidence_for(confidence: FloatArray, correct: NDArray[np.bool_], error_rate: float) -> float:
+    """Return the smallest confidence that ends searches with no more than this share of wrong ones.
+
+    A search, a row, ends at the first view whose leading candidate has at least this confidence; searches that never
+    reach it do not count. One more error is counted than there was, so that few searches guarantee little: with fewer
+    than ``1 / error_rate`` searches the result is inf.
+    """
+    for least in np.unique(np.concatenate([[0.5], confidence[confidence > 0.5]])).tolist():
+        ends = confidence >= least
+        at = np.flatnonzero(ends.any(axis=1))
+        wrong = int((~correct[at, ends[at].argmax(axis=1)]).sum())
+        if len(at) and (wrong + 1) / (len(at) + 1) <= error_rate:
+            return float(least)
+    return inf
+
+
+def fit_stopping_rule(
+    searches: LeaveOneOut, *, error_rate: float = 0.01, false_reject: float = 0.02, objects: int | None = None
+) -> StoppingRule:
+    """Fit the rule that keeps the error rates in leave-one-out searches.
+
+    If there is too little data for a rate, the rule does what the data allows and states a limitation: a search ends at
+    `UNCALIBRATED_MIN_CONFIDENCE`, and objects that score less than every search did are unknown.
+
+    Parameters
+    ----------
+    searches : LeaveOneOut
+        As `leave_one_out` returns it.
+    error_rate, false_reject : float
+        Share of wrong objects among those named, and of enrolled objects called unknown.
+    objects : int, optional
+        How many objects were searched for, if that was only a sample of those in the model set.
+    """
+    count, views = searches.confidence.shape
+    objects = searches.objects if objects is None else objects
+    usual = usual_scores(searches.known, searches.correct, searches.objects)
+    known, unknown = searches.known.open_set_score(usual), searches.unknown.open_set_score(usual)
+    limitations = []
+    if objects < searches.objects:
+        limitations.append(Limitation(LimitationCode.SAMPLED, {"searched": objects, "objects": searches.objects}))
+
+    # Thresholds for unknown objects; with too few searches, the smallest score of all.
+    thresholds = tuple(conformal_threshold(known[:, n], false_reject) for n in range(views))
+    if thresholds[-1] == -inf:
+        reached = 1 / (count + 1)
+        thresholds = tuple(conformal_threshold(known[:, n], reached + 1e-9) for n in range(views))
+        values = {"rate": false_reject, "searches": count, "needed": ceil(1 / false_reject) - 1, "reached": reached}
+        limitations.append(Limitation(LimitationCode.FALSE_REJECT_RATE, values))
+
+    min_confidence, limitation = fit_min_confidence(searches, error_rate)
+    if limitation is not None:
+        limitations.append(limitation)
+    if objects < FEWEST_OBJECTS:
+        limitations.append(Limitation(LimitationCode.UNKNOWN_NOT_MEASURED))
+    return StoppingRule(
+        beta=searches.beta,
+        min_confidence=min_confidence,
+        usual_scores=usual,
+        open_set_thresholds=thresholds,
+        error_rate=error_rate,
+        false_reject=false_reject,
+        false_accept=float((unknown[:, -1] >= thresholds[-1]).mean()) if objects >= FEWEST_OBJECTS else nan,
+        searches=count,
+        limitations=tuple(limitations),
+    )
+
+
+def fit_min_confidence(searches: LeaveOneOut, error_rate: float) -> tuple[float, Limitation | None]:
+    """Return the confidence that ends a search, and a limitation if the searches do not guarantee the rate."""
+    found = max(SMALLEST_MIN_CONFIDENCE, min_confidence_for(searches.confidence, searches.correct, error_rate))
+    if found <= 1:
+        return found, None
+    count, needed = len(searches.confidence), ceil(1 / error_rate)
+    ended, wrong = _ended(searches, UNCALIBRATED_MIN_CONFIDENCE)
+    values = {"rate": error_rate, "searches": count, "needed": needed, "min_confidence": UNCALIBRATED_MIN_CONFIDENCE}
+    code = LimitationCode.ERROR_RATE if count < needed else LimitationCode.SIMILAR_OBJECTS
+    return UNCALIBRATED_MIN_CONFIDENCE, Limitation(code, {**values, "wrong": wrong, "ended": len(ended)})
+
+
+def fit_open_set(rule: StoppingRule, searches: ShiftedSearches) -> StoppingRule:
+    """Return the rule with an open-set score that is fitted to changes of the bench.
+
+    An object is accepted from the first score on that at most 2 % of the objects that are not enrolled reach after any
+    number of views, under each strength of the change, none included: such scores do not rise when the bench changes,
+    while those of enrolled objects fall. If enrolled objects are so similar to each other that more than
+    ``false_reject`` of them would not reach it after a mild change,
+    the threshold is lower. Objects are unknown if their score is below that of nearly all searches for enrolled
+    objects; between the thresholds they are ambiguous.
+    """
+    model = OpenSetModel.fitted(searches.known, searches.correct, searches.unknown)
+    known, unknown = model.scores(searches.known), model.scores(searches.unknown)
+    known_best = np.where(searches.correct, known, -np.inf).max(axis=1)
+    accepted_from = max(
+        -conformal_threshold(-own.max(axis=1), max(FALSE_ACCEPT, 1.001 / (len(own) + 1)))
+        for own in (unknown[searches.strength == strength] for strength in np.unique(searches.strength))
+    )
+    mild = np.maximum(known_best[searches.strength <= _MILD], known.min())
+    accepted_from = min(accepted_from, float(np.quantile(mild, rule.false_reject)))
+    share = max(rule.false_reject, 1.001 / (len(known) + 1))
+    views = known.shape[1]
+    unknown_below = tuple(min(accepted_from, conformal_threshold(known[:, n], share)) for n in range(views))
+    rates = []
+    for strength in STRENGTHS:
+        own = searches.strength == strength
+        rates.append(
+            ShiftRates(
+                strength,
+                int(own.sum()),
+                int((known_best[own] >= accepted_from).sum()),
+                int(((known[own] < accepted_from).all(axis=1) & (known[own, -1] < unknown_below[-1])).sum()),
+                int((unknown[own] >= accepted_from).any(axis=1).sum()),
+            )
+        )
+    return replace(
+        rule,
+        open_set=model,
+        open_set_thresholds=(accepted_from,) * views,
+        unknown_thresholds=unknown_below,
+        false_accept=float((unknown >= accepted_from).any(axis=1).mean()),
+        rates=tuple(rates),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class CalibratedRule:
+    """A stopping rule, and what it does in the leave-one-out searches that it comes from.
+
+    Attributes
+    ----------
+    rule : StoppingRule
+        Its ``limitations`` say what it does not guarantee.
+    views
+        Views of each search.
+    ended, wrong
+        Searches that ended by their confidence, and how many of them with a wrong object.
+    mean_views
+        Views that the ended searches took; nan if none ended.
+    rejected
+        Searches for enrolled objects that ended as unknown after the last view.
+    accepted
+        Searches for left-out objects that did not; None if there are too few objects to measure that.
+    confused : tuple of (str, str)
+        Left-out objects and the objects they were taken for, the most frequent pairs first.
+    """
+
+    rule: StoppingRule
+    views: int = 1
+    ended: int = 0
+    wrong: int = 0
+    mean_views: float = nan
+    rejected: int = 0
+    accepted: int | None = None
+    confused: tuple[tuple[str, str], ...] = ()
+
+
+def calibrate_stopping_rule(
+    index: DenseIndex,
+    *,
+    error_rate: float = 0.01,
+    false_reject: float = 0.02,
+    most_searches: int = MOST_SEARCHES,
+    most_shifted_searches: int = MOST_SEARCHES,
+    sample: int | None = None,
+    progress: Callable[[int, int], object] | None = None,
+    tasks: Callable[[Callable[[Task], Found], Sequence[Task]], Iterable[tuple[Task, Found]]] | None = None,
+) -> CalibratedRule:
+    """Search for the enrolled objects among each other, and return the rule that follows.
+
+    Parameters
+    ----------
+    index : DenseIndex
+        Of at least one object.
+    error_rate, false_reject
+        As for `fit_stopping_rule`.
+    most_searches
+        Searches in all, from different first views; each object is searched for at least once.
+    most_shifted_searches
+        Searches under changes of the bench, from which the open-set score is fitted (`fit_open_set`).
+    sample
+        Search only for so many objects, among each other.
+    progress, tasks
+        As for `leave_one_out`.
+    """
+    searches = calibration_searches(index, most_searches=most_searches, sample=sample, progress=progress, tasks=tasks)
+    if searches is None:
+        return CalibratedRule(_rule_without_candidates(index, error_rate, false_reject))
+    objects = len(index) if sample is None else min(len(index), max(2, sample))
+    rule = fit_stopping_rule(searches, error_rate=error_rate, false_reject=false_reject, objects=objects)
+    if sample is None and len(index) >= FEWEST_OBJECTS_SHIFTED and can_shift(index):
+        views = searches.confidence.shape[1]
+        rule = fit_open_set(rule, shifted_searches(index, views=views, searches=most_shifted_searches))
+        return _calibrated(rule, searches)
+    known, unknown = (part.open_set_score(rule.usual_scores)[:, -1] for part in (searches.known, searches.unknown))
+    ended, wrong = _ended(searches, rule.min_confidence)
+    accepted = unknown >= rule.open_set_thresholds[-1]
+    pairs = np.stack([searches.searched, searches.unknown.object_index[:, -1]], axis=1)[accepted]
+    confused, first, times = np.unique(pairs, axis=0, return_index=True, return_counts=True)
+    names = index.views.object_names
+    return CalibratedRule(
+        rule,
+        views=searches.confidence.shape[1],
+        ended=len(ended),
+        wrong=wrong,
+        mean_views=float(ended.mean() + 1) if len(ended) else nan,
+        rejected=int((known < rule.open_set_thresholds[-1]).sum()),
+        accepted=int(accepted.sum()) if objects >= FEWEST_OBJECTS else None,
+        confused=tuple((names[a], names[b]) for a, b in confused[np.lexsort((first, -times))].tolist()),
+    )
+
+
+def _calibrated(rule: StoppingRule, searches: LeaveOneOut) -> CalibratedRule:
+    """Return what a rule with weights does: the numbers of searches under changes of the bench."""
+    ended, wrong = _ended(searches, rule.min_confidence)
+    return CalibratedRule(
+        rule,
+        views=searches.confidence.shape[1],
+        ended=len(ended),
+        wrong=wrong,
+        mean_views=float(ended.mean() + 1) if len(ended) else nan,
+        rejected=sum(one.rejected for one in rule.rates),
+        accepted=sum(one.false_accepts for one in rule.rates),
+    )
+
+
+def calibration_searches(
+    index: DenseIndex,
+    *,
+    most_searches: int = MOST_SEARCHES,
+    sample: int | None = None,
+    progress: Callable[[int, int], object] | None = None,
+    tasks: Callable[[Callable[[Task], Found], Sequence[Task]], Iterable[tuple[Task, Found]]] | None = None,
+) -> LeaveOneOut | None:
+    """Return the leave-one-out searches of a calibration; None if objects cannot be compared with each other."""
+    usual_views = int(np.median((~index.left_out).sum(axis=1)))
+    if len(index) < 2 or usual_views < 2:
+        return None
+    places = np.arange(len(index))
+    if sample is not None:
+        places = np.unique(np.linspace(0, len(index) - 1, max(2, sample)).astype(int))
+    return leave_one_out(
+        index.only(places),
+        views=min(CALIBRATED_VIEWS, usual_views),
+        searches=max(1, min(most_searches // len(index), int(index.rows.shape[1]))),
+        progress=progress,
+        tasks=tasks,
+    )
+
+
+def _rule_without_candidates(index: DenseIndex, error_rate: float, false_reject: float) -> StoppingRule:
+    """Return the rule of a catalog in which objects cannot be compared: one object, or single views.
+
+    One object is found if it scores at least what its own views score when they are left out one by one. With single
+    views no object is called unknown.
+    """
+    threshold, searches, code = -inf, 0, LimitationCode.SINGLE_VIEWS
+    usual = np.zeros((len(index.views.object_names), 1))
+    if len(index) == 1 and len(index.views) > 1:
+        code, searches = LimitationCode.ONE_OBJECT, len(index.views)
+        levels, azimuth_deg = index.views.descriptors, index.views.azimuth_deg
+        left_out = [
+            update_belief(levels[row], azimuth_deg[row], index.without(np.array([row]))).scores()
+            for row in range(searches)
+        ]
+        leaders = Leaders.of([leader(index.object_index, scores) for scores in left_out], (searches, 1))
+        threshold = float(leaders.open_set_score(usual).min())
+    return StoppingRule(
+        beta=BETA,
+        min_confidence=UNCALIBRATED_MIN_CONFIDENCE,
+        usual_scores=usual,
+        open_set_thresholds=(threshold,),
+        error_rate=error_rate,
+        false_reject=false_reject,
+        false_accept=nan,
+        searches=searches,
+        limitations=(Limitation(code),),
+    )
+
+
+def _ended(searches: LeaveOneOut, min_confidence: float) -> tuple[NDArray[np.intp], int]:
+    """Return after which view (from 0) each ended search ends at this confidence, and how many of them are wrong."""
+    ends = searches.confidence >= min_confidence
+    at = np.flatnonzero(ends.any(axis=1))
+    view = ends[at].argmax(axis=1)
+    return view, int((~searches.correct[at, view]).sum())
