@@ -144,6 +144,7 @@ class ArcSession(DenseSession):
         *,
         earlier: Sequence[LevelArray] | None = None,
         reliable: bool = True,
+        same_bench: bool | None = None,
     ) -> StopDecision:
         """Add the next frame and return the rule's last decision; `is_new_decision` says whether it is a new one."""
         if self._queries:
@@ -152,9 +153,11 @@ class ArcSession(DenseSession):
         self.is_new_decision = decisions > self.decisions
         self.decisions = decisions
         if self.is_new_decision:
-            self.present = super().add(levels, orientation_deg, earlier=earlier, reliable=reliable)
+            self.present = super().add(
+                levels, orientation_deg, earlier=earlier, reliable=reliable, same_bench=same_bench
+            )
         else:
-            self._reliable = reliable
+            self._reliable, self._same_bench = reliable, same_bench
             self._extend(levels, orientation_deg)
             self.present = self._decide(self.belief)
         return self.decision
@@ -169,7 +172,7 @@ class ArcSession(DenseSession):
         sides = self._frames_apart(belief)
         last = last or self.decisions >= DECISIONS
         most = sides.queries if last else self.max_views
-        decision = self.rule.decide(sides, max_views=most, reliable=self._reliable)
+        decision = self.rule.decide(sides, max_views=most, reliable=self._reliable, same_bench=self._same_bench)
         if decision.outcome is Outcome.UNKNOWN and self.decisions > 1 and self._is_doubtful(decision):
             return replace(decision, outcome=Outcome.AMBIGUOUS if last else Outcome.CONTINUE)
         if self.decisions == 1 or decision.reason is StopReason.BELOW_OPEN_SET_THRESHOLD:

@@ -32,6 +32,8 @@ FEWEST_OBJECTS: Final = 3
 FEWEST_OBJECTS_SHIFTED: Final = 50
 #: Largest share of objects that are not enrolled, and are accepted under changes of the bench.
 FALSE_ACCEPT: Final = 0.02
+#: Largest share of them that is accepted before the last view.
+_EARLY_ACCEPT: Final = 0.0025
 #: Changes of the bench up to this strength are mild: enrolled objects must be accepted at the rate that was asked for.
 _MILD: Final = 0.5
 #: Views of a leave-one-out search, if most objects have enough; searches in a calibration.
@@ -143,45 +145,61 @@ def fit_min_confidence(searches: LeaveOneOut, error_rate: float) -> tuple[float,
 def fit_open_set(rule: StoppingRule, searches: ShiftedSearches) -> StoppingRule:
     """Return the rule with an open-set score that is fitted to changes of the bench.
 
-    An object is accepted from the first score on that at most 2 % of the objects that are not enrolled reach after any
-    number of views, under each strength of the change, none included: such scores do not rise when the bench changes,
-    while those of enrolled objects fall. If enrolled objects are so similar to each other that more than
-    ``false_reject`` of them would not reach it after a mild change,
-    the threshold is lower. Objects are unknown if their score is below that of nearly all searches for enrolled
-    objects; between the thresholds they are ambiguous.
+    An object is accepted before the last view from a score on that almost no object reaches that is not enrolled: a
+    view more costs little. After the last view it is accepted from the score on with which at most 2 % of the objects
+    that are not enrolled are accepted in all, over changes of all strengths, none included. If enrolled objects are so
+    similar to each other that more than ``false_reject`` of them would not reach a threshold after a mild change, the
+    threshold is lower. Objects are unknown if their score is below that of nearly all searches for enrolled objects;
+    between the thresholds they are ambiguous.
+
+    On a bench that is known to have changed, the searches without a change do not count.
     """
     model = OpenSetModel.fitted(searches.known, searches.correct, searches.unknown)
     known, unknown = model.scores(searches.known), model.scores(searches.unknown)
-    known_best = np.where(searches.correct, known, -np.inf).max(axis=1)
-    accepted_from = max(
-        -conformal_threshold(-own.max(axis=1), max(FALSE_ACCEPT, 1.001 / (len(own) + 1)))
-        for own in (unknown[searches.strength == strength] for strength in np.unique(searches.strength))
-    )
-    mild = np.maximum(known_best[searches.strength <= _MILD], known.min())
-    accepted_from = min(accepted_from, float(np.quantile(mild, rule.false_reject)))
-    share = max(rule.false_reject, 1.001 / (len(known) + 1))
-    views = known.shape[1]
-    unknown_below = tuple(min(accepted_from, conformal_threshold(known[:, n], share)) for n in range(views))
-    rates = []
-    for strength in STRENGTHS:
-        own = searches.strength == strength
-        rates.append(
-            ShiftRates(
-                strength,
-                int(own.sum()),
-                int((known_best[own] >= accepted_from).sum()),
-                int(((known[own] < accepted_from).all(axis=1) & (known[own, -1] < unknown_below[-1])).sum()),
-                int((unknown[own] >= accepted_from).any(axis=1).sum()),
-            )
-        )
+    found = np.where(searches.correct, known, -np.inf)
+    count, views = known.shape
+    is_mild = searches.strength <= _MILD
+    highest = float(np.quantile(np.maximum(found[is_mild].max(axis=1), known.min()), rule.false_reject))
+    thresholds = np.minimum(_accepted_from(unknown), highest)
+    changed = np.minimum(_accepted_from(unknown[searches.strength > 0]), thresholds)
+    share = max(rule.false_reject, 1.001 / (count + 1))
+    unknown_below = np.array([conformal_threshold(known[:, n], share) for n in range(views)])
+    unknown_below = np.minimum(unknown_below, thresholds)
+    # as a search decides that knows whether the bench has changed
+    limits = np.where(searches.strength[:, None] > 0, changed, thresholds.max())
+    is_accepted, is_false = (np.any(scores >= limits, axis=1) for scores in (found, unknown))
+    is_rejected = (known < limits).all(axis=1) & (known[:, -1] < unknown_below[-1])
+    rates = [
+        ShiftRates(strength, int(own.sum()), *(int(what[own].sum()) for what in (is_accepted, is_rejected, is_false)))
+        for strength in STRENGTHS
+        for own in [searches.strength == strength]
+    ]
     return replace(
         rule,
         open_set=model,
-        open_set_thresholds=(accepted_from,) * views,
-        unknown_thresholds=unknown_below,
-        false_accept=float((unknown >= accepted_from).any(axis=1).mean()),
+        open_set_thresholds=tuple(thresholds.tolist()),
+        unknown_thresholds=tuple(unknown_below.tolist()),
+        changed_bench_thresholds=tuple(changed.tolist()),
+        false_accept=float(is_false.mean()),
         rates=tuple(rates),
     )
+
+
+def _accepted_from(unknown: FloatArray) -> FloatArray:
+    """Return the scores from which an object is accepted after 1, 2, ... views.
+
+    Of objects that are not enrolled, with the scores (searches, views), at most `FALSE_ACCEPT` are accepted.
+    """
+    count, views = unknown.shape
+    thresholds = np.empty(views)
+    is_accepted = np.zeros(count, np.bool_)
+    if views > 1:
+        before = unknown[:, :-1].max(axis=1)
+        thresholds[:-1] = -conformal_threshold(-before, max(_EARLY_ACCEPT, 1.001 / (count + 1)))
+        is_accepted = before >= thresholds[0]
+    at_end = np.where(is_accepted, np.finfo(np.float64).max, unknown[:, -1])
+    thresholds[-1] = -conformal_threshold(-at_end, max(FALSE_ACCEPT, 2.001 / (count + 1)))
+    return np.minimum.accumulate(thresholds)
 
 
 @dataclass(frozen=True, eq=False)

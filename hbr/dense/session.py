@@ -50,6 +50,7 @@ class DenseSession:
         self._so_far: DenseIndex | Belief = index
         self._queries: list[LevelArray] = []
         self._reliable = True
+        self._same_bench: bool | None = None
 
     def add(
         self,
@@ -58,6 +59,7 @@ class DenseSession:
         *,
         earlier: Sequence[LevelArray] | None = None,
         reliable: bool = True,
+        same_bench: bool | None = None,
     ) -> StopDecision:
         """Add the next view, as for `update_belief`, and return the rule's decision.
 
@@ -72,8 +74,10 @@ class DenseSession:
         reliable : bool
             Whether the views were segmented reliably (`hbr.ViewsTogether.reliable`). If not, the search does not end
             while it may take more views.
+        same_bench : bool, optional
+            Whether the bench is that of the enrollment; None: not known.
         """
-        self._reliable = reliable
+        self._reliable, self._same_bench = reliable, same_bench
         if earlier is not None:
             self._replace(earlier)
         self._extend(levels, orientation_deg)
@@ -118,7 +122,7 @@ class DenseSession:
 
     def _decide(self, belief: Belief, *, last: bool = False) -> StopDecision:
         most = belief.queries if last else self.max_views
-        return self.rule.decide(belief, max_views=most, reliable=self._reliable)
+        return self.rule.decide(belief, max_views=most, reliable=self._reliable, same_bench=self._same_bench)
 
     def _complete(self) -> None:
         """Before an end: decide again if an object that was left out after the first view can be first or second."""

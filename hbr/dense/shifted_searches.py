@@ -22,7 +22,7 @@ from hbr.descriptors import descriptor
 from hbr.descriptors.shift import Shift
 
 #: Strengths of the changes, in turn; 1 is a hard change of the bench.
-STRENGTHS: Final = (0.0, 0.5, 1.0, 1.3)
+STRENGTHS: Final = (0.0, 0.25, 0.5, 1.0, 1.3)
 #: Probabilities of one, two and three segmentations of a view, as searches without an empty-table image have them.
 _SEVERAL: Final = (0.45, 0.35, 0.2)
 #: Further segmentations are worse: strength relative to the first one, and at least.

@@ -146,6 +146,8 @@ class StoppingRule:
     unknown_thresholds : tuple of float
         With weights: open-set scores after 1, 2, ... views below which an object is unknown. Between them and
         ``open_set_thresholds`` it is ambiguous. Without weights both thresholds are one.
+    changed_bench_thresholds : tuple of float
+        With weights: ``open_set_thresholds`` of a search that knows that the bench has changed since the enrollment.
     rates : tuple of ShiftRates
         Measured rates under changes of the bench.
     """
@@ -161,10 +163,17 @@ class StoppingRule:
     limitations: tuple[Limitation, ...] = ()
     open_set: OpenSetModel | None = None
     unknown_thresholds: tuple[float, ...] = ()
+    changed_bench_thresholds: tuple[float, ...] = ()
     rates: tuple[ShiftRates, ...] = ()
 
     def decide(
-        self, belief: Belief, *, max_views: int = 8, decisions: int | None = None, reliable: bool = True
+        self,
+        belief: Belief,
+        *,
+        max_views: int = 8,
+        decisions: int | None = None,
+        reliable: bool = True,
+        same_bench: bool | None = None,
     ) -> StopDecision:
         """Decide whether a search ends after these views; ``decisions`` counts instead of them in a search in motion.
 
@@ -173,18 +182,24 @@ class StoppingRule:
         costs an enrolled object little. From the last calibrated view on, an object below the threshold is unknown,
         however many views are left: no false-reject rate was measured for those. After ``max_views`` an object that is
         not confident is ambiguous. If the views were not segmented reliably, the search continues in any case until
-        ``max_views``: another view costs little, and the background is then known.
+        ``max_views``: another view costs little, and the background is then known. ``same_bench`` says whether the
+        bench is that of the enrollment; None: the search does not know. On the same bench enrolled objects score far
+        more than others, so that the highest threshold holds after the last view, too.
         """
         probability = belief.posterior(self.beta).sum(axis=1)
         best = int(probability.argmax())
-        calibrated = len(self.open_set_thresholds)
+        thresholds = self.open_set_thresholds
+        if same_bench is False and self.changed_bench_thresholds:
+            thresholds = self.changed_bench_thresholds
+        calibrated = len(thresholds)
         decisions = belief.queries if decisions is None else decisions
         n = min(decisions, calibrated) - 1
         score = self._open_set_score(belief, n)
         early = decisions < min(calibrated, max_views)
-        threshold = max(self.open_set_thresholds) if early else self.open_set_thresholds[n]
+        highest = early or (same_bench is True and self.open_set is not None)
+        threshold = max(thresholds) if highest else thresholds[n]
         confidence = float(probability[best])
-        unknown_below = self.unknown_thresholds[n] if self.unknown_thresholds else threshold
+        unknown_below = min(threshold, self.unknown_thresholds[n]) if self.unknown_thresholds else threshold
         if score < threshold:
             outcome = Outcome.CONTINUE if early else Outcome.UNKNOWN
             reason = StopReason.BELOW_OPEN_SET_THRESHOLD

@@ -22,6 +22,7 @@ from hbr.evaluation.changed_bench import ENROLLMENT, HARD, MILD, Bench, Visit
 from hbr.evaluation.condition import object_mask
 from hbr.evaluation.datasets import Dataset, PhotographedObject, read_photograph
 from hbr.evaluation.draws import generator
+from hbr.segmentation import Background
 
 Kind = Literal["mild", "hard"]
 #: Views of a search, and the step between them.
@@ -95,7 +96,7 @@ def enroll_changed(item: PhotographedObject, changes: Changes) -> tuple[LevelArr
     DatasetError
         A photograph cannot be used.
     """
-    visit = Visit(_enrollment_bench(), ENROLLMENT, np.random.default_rng(1))
+    visit = _enrollment_visit()
     places = _places(item, np.arange(changes.enrolled) * 360 / changes.enrolled)
     views = ViewsTogether(DESCRIPTOR, empty_table=visit.empty() if changes.picture else None, several=False)
     for place in places:
@@ -106,9 +107,16 @@ def enroll_changed(item: PhotographedObject, changes: Changes) -> tuple[LevelArr
 
 
 def search_changed(
-    item: PhotographedObject, changes: Changes, index: DenseIndex, rule: StoppingRule
+    item: PhotographedObject,
+    changes: Changes,
+    index: DenseIndex,
+    rule: StoppingRule,
+    example: PhotographedObject,
 ) -> list[SearchResult]:
     """Search for an object, once for each trial.
+
+    As on the rig, the first frame is compared with the enrollment's picture, or without one with a view of an enrolled
+    object, the ``example``.
 
     Raises
     ------
@@ -116,21 +124,27 @@ def search_changed(
         A photograph cannot be used.
     """
     results = []
+    before = _bench_image(None if changes.picture else example)
     for trial in range(changes.trials):
         rng = generator(changes.seed, item.name, "trial", trial)
         hard = changes.kind == "hard"
         bench = _benches()[int(rng.integers(_BENCHES))] if hard else _enrollment_bench()
         visit = Visit(bench, HARD if hard else MILD, rng)
         first_deg = rng.uniform(0, 360)
-        views = ViewsTogether(DESCRIPTOR, empty_table=visit.empty() if changes.picture else None)
+        empty_table = visit.empty() if changes.picture else None
+        same_bench: bool | None = None
+        views = ViewsTogether(DESCRIPTOR, empty_table=empty_table)
         session = DenseSession(index, rule, max_views=_MAX_VIEWS)
         leaders: list[str] = []
         ended: SearchResult | None = None
         for n, place in enumerate(_places(item, first_deg + _STEP_DEG * np.arange(VIEWS, dtype=np.float64))):
             azimuth_deg = item.photographs[place].azimuth_deg
-            views.add(visit.photograph(*_cut_out(item, place), azimuth_deg).image)
+            frame = visit.photograph(*_cut_out(item, place), azimuth_deg).image
+            if same_bench is None:
+                same_bench = before.looks_like(frame)
+            views.add(frame)
             *earlier, levels = views.levels
-            decision = session.add(levels, azimuth_deg, earlier=earlier, reliable=views.reliable)
+            decision = session.add(levels, azimuth_deg, earlier=earlier, reliable=views.reliable, same_bench=same_bench)
             names = index.views.object_names
             leaders.append(names[int(session.belief.ranking().object_index[0])])
             if ended is None and decision.outcome is not Outcome.CONTINUE:
@@ -173,6 +187,18 @@ def _cut_out(item: PhotographedObject, place: int) -> tuple[ImageArray, NDArray[
 
 def _places(item: PhotographedObject, azimuth_deg: NDArray[np.float64]) -> list[int]:
     return [int(np.abs(wrap180(item.azimuth_deg - one)).argmin()) for one in azimuth_deg.tolist()]
+
+
+def _bench_image(example: PhotographedObject | None) -> Background:
+    """Return what a catalog knows of the enrollment's bench: its empty-table image, or a view of an object."""
+    visit = _enrollment_visit()
+    if example is None:
+        return Background(visit.empty())
+    return Background(visit.photograph(*_cut_out(example, 0), example.photographs[0].azimuth_deg).image)
+
+
+def _enrollment_visit() -> Visit:
+    return Visit(_enrollment_bench(), ENROLLMENT, np.random.default_rng(1))
 
 
 @cache

@@ -185,6 +185,13 @@ class Background:
             np.asarray(coloured, np.float32),
         )
 
+    def looks_like(self, image_bgr: ImageArray) -> bool:
+        """Return whether another image of this size, uint8 (H, W, 3), shows the same bench in any light.
+
+        Only the border counts: an object may stand on the table in both images.
+        """
+        return image_bgr.shape[:2] == self.shape and self.difference(shrunk(image_bgr)).reliable
+
     def whole_correction(self, difference: Difference) -> Illumination:
         """Return the correction of a frame to the light of this image, and to a plain grey backdrop if it shows one."""
         if self.correction is None:

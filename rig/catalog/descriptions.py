@@ -96,8 +96,23 @@ def guessed_objects(catalog: Catalog) -> tuple[str, ...]:
         return tuple(name for name, segmentation in rows if needs_segmentation(segmentation))
 
 
-def read_empty_table(catalog: Catalog, empty_table: EmptyTable) -> NDArray[np.uint8]:
-    """Return the pixels of an empty-table image, uint8 (H, W, 3) BGR.
+def newest_view(catalog: Catalog) -> EmptyTable | None:
+    """Return path and SHA-256 of the first view of the newest enrollment in use; None if there is none."""
+    with catalog.database.read() as connection:
+        row = connection.execute(
+            select(views.c.image, views.c.image_sha256)
+            .select_from(objects)
+            .join(enrollments)
+            .join(views, views.c.enrollment_id == enrollments.c.id)
+            .where(retrieved(), views.c.view_index == 0)
+            .order_by(views.c.id.desc())
+            .limit(1)
+        ).first()
+    return None if row is None else (str(row[0]), str(row[1]))
+
+
+def read_image(catalog: Catalog, stored: EmptyTable) -> NDArray[np.uint8]:
+    """Return the pixels of a stored image, uint8 (H, W, 3) BGR.
 
     Raises
     ------
@@ -105,7 +120,7 @@ def read_empty_table(catalog: Catalog, empty_table: EmptyTable) -> NDArray[np.ui
         The file is missing, is not the stored one, or the system denies access.
     """
     with catalog.database.catalog_errors():
-        return catalog.database.images.pixels(*empty_table)
+        return catalog.database.images.pixels(*stored)
 
 
 def described_regions(catalog: Catalog, bench: str) -> set[tuple[Region | None, tuple[str, ...]]]:

@@ -88,4 +88,5 @@ def _enroll(dataset: Dataset, changes: Changes, names: list[str], j: int) -> tup
 
 
 def _search(dataset: Dataset, changes: Changes, views: Views, rule: StoppingRule, j: int) -> list[SearchResult]:
-    return search_changed(dataset.objects[j], changes, DenseIndex(views), rule)
+    example = next(item for item in dataset.objects if item.name == views.object_names[0])
+    return search_changed(dataset.objects[j], changes, DenseIndex(views), rule, example)

@@ -153,7 +153,8 @@ class Rejected:
 class Accepted:
     """A view was taken (and, when enrolling, is durable).
 
-    ``segmentation`` is `hbr.Segmentation.evidence` as JSON values; None if no segmentation was made.
+    ``segmentation`` is `hbr.Segmentation.evidence` as JSON values; None if no segmentation was made. ``same_bench``
+    says whether a search's first view shows the bench of the enrollment; None: not known.
     """
 
     index: int
@@ -161,6 +162,7 @@ class Accepted:
     evidence: ViewEvidence
     image_bgr: NDArray[np.uint8] = field(metadata=_OUTSIDE, repr=False)
     segmentation: dict[str, Any] | None = None
+    same_bench: bool | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -90,7 +90,12 @@ def identify(
         empty_table, more = empty_table_for(bench, model)
         notes += more
     moving = isinstance(search, ArcSearch)
-    describe = SearchDescriber(bench.config.view, search.descriptor, empty_table, revise=not moving)
+    bench_image = model.bench_image if isinstance(model, Model) else None
+    if bench.config.table.carries == "camera":
+        bench_image = None  # what the camera sees behind the object changes with each view
+    describe = SearchDescriber(
+        bench.config.view, search.descriptor, empty_table, revise=not moving, bench_image=bench_image
+    )
     yield Started(
         "identify",
         None,
@@ -123,7 +128,14 @@ def identify(
             captured = yield from capture(number, viewer, table, move.settled_ns)
             azimuth_deg = float(wrap360(orientation_deg))
             described = describe(captured.image_bgr)
-            yield Accepted(number, azimuth_deg, captured.evidence, captured.image_bgr, described.segmentation)
+            yield Accepted(
+                number,
+                azimuth_deg,
+                captured.evidence,
+                captured.image_bgr,
+                described.segmentation,
+                described.same_bench,
+            )
             yield from warn_of_table(bench, number, described)
             # Decide: rank the candidates, then rotate or finish.
             levels = described.levels[search.descriptor]
@@ -133,6 +145,7 @@ def identify(
                 table_deg=table.rest_deg,
                 earlier=described.earlier,
                 reliable=described.reliable,
+                same_bench=described.same_bench,
             )
             yield ranked
             if isinstance(step, Finish):

@@ -97,11 +97,22 @@ class _Passing:
         azimuth_deg = float(wrap360(sign * motion.angle_deg))
         described = self.describe(attempt.image_bgr)
         self.events.append(
-            Accepted(self.number, azimuth_deg, attempt.evidence, attempt.image_bgr, described.segmentation)
+            Accepted(
+                self.number,
+                azimuth_deg,
+                attempt.evidence,
+                attempt.image_bgr,
+                described.segmentation,
+                described.same_bench,
+            )
         )
         levels = described.levels[self.search.descriptor]
         self.ranked, self.step = self.search.add(
-            levels, azimuth_deg, table_deg=motion.angle_deg, reliable=described.reliable
+            levels,
+            azimuth_deg,
+            table_deg=motion.angle_deg,
+            reliable=described.reliable,
+            same_bench=described.same_bench,
         )
         seconds = seconds_between(self.started_ns, self.bench.clock.now_ns())
         used = self.search.frame_used(self.number, azimuth_deg, seconds, self.rejected)
@@ -157,13 +168,21 @@ def search_in_motion(
             captured = yield from capture(number, viewer, table, settled_ns)
             azimuth_deg = float(wrap360(sign * table.rest_deg))
             described = describe(captured.image_bgr)
-            yield Accepted(number, azimuth_deg, captured.evidence, captured.image_bgr, described.segmentation)
+            yield Accepted(
+                number,
+                azimuth_deg,
+                captured.evidence,
+                captured.image_bgr,
+                described.segmentation,
+                described.same_bench,
+            )
             yield from warn_of_table(bench, number, described)
             ranked, step = search.add(
                 described.levels[search.descriptor],
                 azimuth_deg,
                 table_deg=table.rest_deg,
                 reliable=described.reliable,
+                same_bench=described.same_bench,
             )
             ended_ns = bench.clock.now_ns()
             if search.is_new_decision:

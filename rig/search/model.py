@@ -14,7 +14,14 @@ from numpy.typing import NDArray
 import hbr
 from rig.bench import Bench
 from rig.catalog import Catalog
-from rig.catalog.descriptions import camera_settings, empty_tables, guessed_objects, has_descriptor, read_empty_table
+from rig.catalog.descriptions import (
+    camera_settings,
+    empty_tables,
+    guessed_objects,
+    has_descriptor,
+    newest_view,
+    read_image,
+)
 from rig.catalog.jobs import JobProgress
 from rig.catalog.prepared import prepared_views
 from rig.core.errors import CatalogError, DescriptorOutdated
@@ -42,6 +49,8 @@ class Model:
         The camera's settings of the enrollments, each combination once.
     empty_table : uint8 array (H, W, 3), optional
         The newest empty-table image of the enrollments.
+    bench_image : uint8 array (H, W, 3), optional
+        An image that shows the bench of the newest enrollment: its empty-table image, or one of its views.
     """
 
     index: hbr.ViewIndex | hbr.DenseIndex
@@ -50,6 +59,7 @@ class Model:
     with_empty_table: bool | None = None
     camera: tuple[Mapping[str, Any], ...] = field(default=(), repr=False)
     empty_table: NDArray[np.uint8] | None = field(default=None, repr=False)
+    bench_image: NDArray[np.uint8] | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         if isinstance(self.index, hbr.DenseIndex) and self.rule is None:
@@ -134,11 +144,13 @@ def _dense(catalog: Catalog, progress: Callable[[JobProgress], None] | None) -> 
         notes += (Note(NoteCode.MIXED_EMPTY_TABLE, {"objects": list(others), "with_image": not with_image}),)
     if guessed := guessed_objects(catalog):
         notes += (Note(NoteCode.ENROLLED_BY_GUESS, {"objects": list(guessed)}),)
-    table = None
-    if with_image and before.newest is not None:
-        with suppress(CatalogError):  # rig catalog verify reports it; the bench has its own image
-            table = read_empty_table(catalog, before.newest)
-    return Model(index, rule, notes, with_image, tuple(camera_settings(catalog)), table)
+    table = bench_image = None
+    with suppress(CatalogError):  # rig catalog verify reports it; the bench has its own image
+        if with_image and before.newest is not None:
+            table = bench_image = read_image(catalog, before.newest)
+        elif (view := newest_view(catalog)) is not None:
+            bench_image = read_image(catalog, view)
+    return Model(index, rule, notes, with_image, tuple(camera_settings(catalog)), table, bench_image)
 
 
 def empty_table_for(bench: Bench, model: Model) -> tuple[NDArray[np.uint8] | None, tuple[Note, ...]]:

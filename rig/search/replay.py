@@ -98,6 +98,7 @@ def check(run: SavedRun, *, by: AnyStrategy | None = None) -> Check:
                     table_deg=table_deg,
                     earlier=view.earlier,
                     reliable=view.reliable,
+                    same_bench=event.same_bench,
                 )
                 found.views += 1
                 if event.segmentation is not None:

@@ -56,6 +56,7 @@ class Search(ABC):
         self._orientations: list[float] = []
         self._earlier: Sequence[NDArray[np.uint8]] | None = None
         self._reliable = True
+        self._same_bench: bool | None = None
 
     def add(
         self,
@@ -65,6 +66,7 @@ class Search(ABC):
         table_deg: float,
         earlier: Sequence[NDArray[np.uint8]] | None = None,
         reliable: bool = True,
+        same_bench: bool | None = None,
     ) -> tuple[Ranked, Rotate | Finish]:
         """Add the next view; return the candidates, and the strategy's decision.
 
@@ -78,11 +80,12 @@ class Search(ABC):
             The table angle, unwrapped.
         earlier : sequence of uint8 arrays, optional
             The levels of the earlier views, which were segmented again.
-        reliable
-            Whether the view was segmented reliably, as for `hbr.DenseSession.add`.
+        reliable, same_bench
+            Whether the view was segmented reliably, and whether the bench is that of the enrollment, as for
+            `hbr.DenseSession.add`.
         """
         self._orientations.append(azimuth_deg)
-        self._earlier, self._reliable = earlier, reliable
+        self._earlier, self._reliable, self._same_bench = earlier, reliable, same_bench
         ranked = self._rank(levels)
         return ranked, self._decide(ranked, table_deg)
 
@@ -204,8 +207,13 @@ class DenseSearch(Search):
         self._session = hbr.DenseSession(index, rule, max_views=config.identify.max_views)
 
     def _rank(self, levels: NDArray[np.uint8]) -> Ranked:
-        revised = {} if self._earlier is None else {"earlier": self._earlier}
-        decision = self._session.add(levels, self._orientations[-1], reliable=self._reliable, **revised)
+        decision = self._session.add(
+            levels,
+            self._orientations[-1],
+            earlier=self._earlier,
+            reliable=self._reliable,
+            same_bench=self._same_bench,
+        )
         belief = self._session.belief
         probability = belief.posterior(self._session.rule.beta).sum(axis=1)
         scores = belief.scores()

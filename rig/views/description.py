@@ -44,6 +44,8 @@ class DescribedView:
         In a search: the levels of all earlier views, which were segmented again; a row for each segmentation.
     reliable
         In a search: whether the view was segmented by a known background (`hbr.ViewsTogether.reliable`).
+    same_bench
+        In a search: whether the bench is that of the enrollment; None: not known.
     """
 
     levels: Mapping[str, NDArray[np.uint8]]
@@ -51,6 +53,7 @@ class DescribedView:
     table_problem: TableProblem | None = None
     earlier: tuple[NDArray[np.uint8], ...] | None = None
     reliable: bool = True
+    same_bench: bool | None = None
 
 
 def within(image_bgr: NDArray[np.uint8], region: tuple[int, int, int, int] | None) -> NDArray[np.uint8]:
@@ -205,6 +208,8 @@ class SearchDescriber(ViewDescriber):
         The descriptor.
     revise
         Whether earlier views are segmented again with each new one; not in a search in motion, which has many views.
+    bench_image : uint8 array (H, W, 3), optional
+        Shows the bench of the enrollment; the first frame is compared with it.
 
     Raises
     ------
@@ -213,11 +218,19 @@ class SearchDescriber(ViewDescriber):
     """
 
     def __init__(
-        self, config: ViewConfig, name: str, empty_table: NDArray[np.uint8] | None = None, *, revise: bool = True
+        self,
+        config: ViewConfig,
+        name: str,
+        empty_table: NDArray[np.uint8] | None = None,
+        *,
+        revise: bool = True,
+        bench_image: NDArray[np.uint8] | None = None,
     ) -> None:
         super().__init__(config, (name,), empty_table)
         self._name = name
         self._revise = revise
+        self._bench_image = bench_image
+        self._same_bench: bool | None = None
         self._views: hbr.ViewsTogether | None = None
 
     def __call__(self, image_bgr: NDArray[np.uint8], stored: Mapping[str, Any] | None = None) -> DescribedView:  # noqa: ARG002
@@ -228,9 +241,13 @@ class SearchDescriber(ViewDescriber):
         background, issues = self._prepared_table(image_bgr)
         if self._views is None:
             self._views = hbr.ViewsTogether(self._name, empty_table=background)
+            if self._bench_image is not None and self._bench_image.shape == image_bgr.shape:
+                self._same_bench = hbr.Background(within(self._bench_image, self.region)).looks_like(part)
         found = self._views.add(part, revise=self._revise)[0]
         found = replace(found, issues=(*issues, *found.issues))
         *earlier, levels = self._views.levels
         problem = self._table_problem(found.agreement)
         revised = tuple(earlier) if self._revise else None
-        return DescribedView({self._name: levels}, found.evidence(), problem, revised, self._views.reliable)
+        return DescribedView(
+            {self._name: levels}, found.evidence(), problem, revised, self._views.reliable, self._same_bench
+        )

@@ -95,3 +95,18 @@ def test_three_frames_in_a_row_that_differ_are_reported_once() -> None:
     assert problems[5] is not None
     assert problems[5].parameters["frames"] == 3
     assert problems[5].parameters["agreement"] < 0.65
+
+
+def test_first_view_of_a_search_shows_whether_the_bench_is_that_of_the_enrollment() -> None:
+    table, other = _table(), _table()[:, ::-1].copy()
+    enrolled = _with_object(table, 30)
+    for image, frame, expected in (
+        (table, _with_object(table, gain=0.8), True),
+        (enrolled, _with_object(table), True),
+        (table, _with_object(other), False),
+        (_table(240, 320), _with_object(table), None),
+        (None, _with_object(table), None),
+    ):
+        describe = SearchDescriber(WHOLE, BENCH_DESCRIPTOR, bench_image=image)
+        assert describe(frame).same_bench is expected
+        assert describe(_with_object(other)).same_bench is expected  # the first view decides for the whole search
