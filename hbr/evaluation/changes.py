@@ -141,7 +141,7 @@ def search_changed(
             azimuth_deg = item.photographs[place].azimuth_deg
             frame = visit.photograph(*_cut_out(item, place), azimuth_deg).image
             if same_bench is None:
-                same_bench = before.looks_like(frame)
+                same_bench = before.shows_same_bench(frame)
             views.add(frame)
             *earlier, levels = views.levels
             decision = session.add(levels, azimuth_deg, earlier=earlier, reliable=views.reliable, same_bench=same_bench)

@@ -185,7 +185,7 @@ class Background:
             np.asarray(coloured, np.float32),
         )
 
-    def looks_like(self, image_bgr: ImageArray) -> bool:
+    def shows_same_bench(self, image_bgr: ImageArray) -> bool:
         """Return whether another image of this size, uint8 (H, W, 3), shows the same bench in any light.
 
         Only the border counts: an object may stand on the table in both images.
