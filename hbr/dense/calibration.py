@@ -36,6 +36,8 @@ FALSE_ACCEPT: Final = 0.02
 _EARLY_ACCEPT: Final = 0.0025
 #: Changes of the bench up to this strength are mild: enrolled objects must be accepted at the rate that was asked for.
 _MILD: Final = 0.5
+#: The strengths up to this one are those of a bench that has not changed.
+_SAME: Final = 0.25
 #: Views of a leave-one-out search, if most objects have enough; searches in a calibration.
 CALIBRATED_VIEWS: Final = 4
 MOST_SEARCHES: Final = 400
@@ -152,7 +154,8 @@ def fit_open_set(rule: StoppingRule, searches: ShiftedSearches) -> StoppingRule:
     threshold is lower. Objects are unknown if their score is below that of nearly all searches for enrolled objects;
     between the thresholds they are ambiguous.
 
-    On a bench that is known to have changed, the searches without a change do not count.
+    On a bench that is known to have changed, the searches without a change do not count; on one that is known to be
+    the same, only those with the smallest changes count.
     """
     model = OpenSetModel.fitted(searches.known, searches.correct, searches.unknown)
     known, unknown = model.scores(searches.known), model.scores(searches.unknown)
@@ -162,11 +165,12 @@ def fit_open_set(rule: StoppingRule, searches: ShiftedSearches) -> StoppingRule:
     highest = float(np.quantile(np.maximum(found[is_mild].max(axis=1), known.min()), rule.false_reject))
     thresholds = np.minimum(_accepted_from(unknown), highest)
     changed = np.minimum(_accepted_from(unknown[searches.strength > 0]), thresholds)
+    same = np.minimum(_accepted_from(unknown[searches.strength <= _SAME]), highest)
     share = max(rule.false_reject, 1.001 / (count + 1))
     unknown_below = np.array([conformal_threshold(known[:, n], share) for n in range(views)])
     unknown_below = np.minimum(unknown_below, thresholds)
     # as a search decides that knows whether the bench has changed
-    limits = np.where(searches.strength[:, None] > 0, changed, thresholds.max())
+    limits = np.where(searches.strength[:, None] > 0, changed, same)
     is_accepted, is_false = (np.any(scores >= limits, axis=1) for scores in (found, unknown))
     is_rejected = (known < limits).all(axis=1) & (known[:, -1] < unknown_below[-1])
     rates = [
@@ -180,6 +184,7 @@ def fit_open_set(rule: StoppingRule, searches: ShiftedSearches) -> StoppingRule:
         open_set_thresholds=tuple(thresholds.tolist()),
         unknown_thresholds=tuple(unknown_below.tolist()),
         changed_bench_thresholds=tuple(changed.tolist()),
+        same_bench_thresholds=tuple(same.tolist()),
         false_accept=float(is_false.mean()),
         rates=tuple(rates),
     )

@@ -146,8 +146,9 @@ class StoppingRule:
     unknown_thresholds : tuple of float
         With weights: open-set scores after 1, 2, ... views below which an object is unknown. Between them and
         ``open_set_thresholds`` it is ambiguous. Without weights both thresholds are one.
-    changed_bench_thresholds : tuple of float
-        With weights: ``open_set_thresholds`` of a search that knows that the bench has changed since the enrollment.
+    changed_bench_thresholds, same_bench_thresholds : tuple of float
+        With weights: ``open_set_thresholds`` of a search that knows that the bench has changed since the enrollment, or
+        that it has not.
     rates : tuple of ShiftRates
         Measured rates under changes of the bench.
     """
@@ -164,6 +165,7 @@ class StoppingRule:
     open_set: OpenSetModel | None = None
     unknown_thresholds: tuple[float, ...] = ()
     changed_bench_thresholds: tuple[float, ...] = ()
+    same_bench_thresholds: tuple[float, ...] = ()
     rates: tuple[ShiftRates, ...] = ()
 
     def decide(
@@ -183,21 +185,18 @@ class StoppingRule:
         however many views are left: no false-reject rate was measured for those. After ``max_views`` an object that is
         not confident is ambiguous. If the views were not segmented reliably, the search continues in any case until
         ``max_views``: another view costs little, and the background is then known. ``same_bench`` says whether the
-        bench is that of the enrollment; None: the search does not know. On the same bench enrolled objects score far
-        more than others, so that the highest threshold holds after the last view, too.
+        bench is that of the enrollment; None: the search does not know.
         """
         probability = belief.posterior(self.beta).sum(axis=1)
         best = int(probability.argmax())
-        thresholds = self.open_set_thresholds
-        if same_bench is False and self.changed_bench_thresholds:
-            thresholds = self.changed_bench_thresholds
+        known = {True: self.same_bench_thresholds, False: self.changed_bench_thresholds, None: ()}[same_bench]
+        thresholds = known or self.open_set_thresholds
         calibrated = len(thresholds)
         decisions = belief.queries if decisions is None else decisions
         n = min(decisions, calibrated) - 1
         score = self._open_set_score(belief, n)
         early = decisions < min(calibrated, max_views)
-        highest = early or (same_bench is True and self.open_set is not None)
-        threshold = max(thresholds) if highest else thresholds[n]
+        threshold = max(thresholds) if early else thresholds[n]
         confidence = float(probability[best])
         unknown_below = min(threshold, self.unknown_thresholds[n]) if self.unknown_thresholds else threshold
         if score < threshold:

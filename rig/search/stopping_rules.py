@@ -231,10 +231,12 @@ def read_stopping_rule(folder: Path) -> StoredRule | None:
             open_set=_open_set(values.get("open_set")),
             unknown_thresholds=tuple(_or(threshold, -inf) for threshold in values.get("unknown_thresholds", ())),
             changed_bench_thresholds=tuple(map(float, values.get("changed_bench_thresholds", ()))),
+            same_bench_thresholds=tuple(map(float, values.get("same_bench_thresholds", ()))),
             rates=tuple(ShiftRates(**one) for one in values.get("rates", ())),
         )
         views = len(rule.open_set_thresholds)
-        if not {len(rule.unknown_thresholds), len(rule.changed_bench_thresholds)} <= {0, views}:
+        more = (rule.unknown_thresholds, rule.changed_bench_thresholds, rule.same_bench_thresholds)
+        if not {len(thresholds) for thresholds in more} <= {0, views}:
             raise ValueError("it does not have one threshold for each number of views")
         scores = rule.usual_scores
         if scores.ndim != 2 or scores.shape[1] != len(rule.open_set_thresholds) or not np.isfinite(scores).all():

@@ -44,6 +44,7 @@ def test_thresholds_keep_the_rate_of_accepted_unknown_objects(plain: StoppingRul
     for thresholds, own in (
         (rule.open_set_thresholds, scores),
         (rule.changed_bench_thresholds, scores[searches.strength > 0]),
+        (rule.same_bench_thresholds, scores[searches.strength <= 0.25]),
     ):
         accepted = (own >= thresholds).any(axis=1)
         early = (own[:, :-1] >= thresholds[:-1]).any(axis=1)
@@ -81,6 +82,7 @@ def test_decision_depends_on_what_is_known_of_the_bench(
         open_set=model,
         open_set_thresholds=(1.0, 1.0, 1.0, -1.0),
         changed_bench_thresholds=(-1.0,) * VIEWS,
+        same_bench_thresholds=(1.0,) * VIEWS,
         unknown_thresholds=(-2.0,) * VIEWS,
     )
     for count, outcome in ((2, early), (4, last)):
