@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
+from hbr import Outcome
 from rig.catalog import ObjectSummary
 from rig.cli.ui.live import EnrollView, IdentifyView, LiveView
 from rig.cli.ui.operator_prompts import OperatorPrompts
@@ -24,6 +25,7 @@ from rig.core.errors import UsageError, ViewRejected
 from rig.events.events import (
     Accepted,
     Event,
+    FrameUsed,
     Item,
     Moved,
     Rejected,
@@ -157,6 +159,18 @@ def test_dense_search_shows_probabilities_and_the_stopping_rule(width, answer):
     assert "left 80.0°: distinguishes mug-white from mug-star, similarity 0.50 there (0.50–0.95 all around)" in flat
     assert ("% confident (3 views)" in flat) == (answer is not None)
     assert ("Unknown object. The most similar enrolled objects are mug-white (score 0.900)" in flat) == (answer is None)
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_frames_are_shown_while_the_table_rotates(terminal: bool) -> None:
+    used = FrameUsed(11, 34.8, 1.04, 2, "mug-star", 0.622, Outcome.CONTINUE)
+    first = list(islice(searching_densely(), 4))
+    console = screen(100, terminal=terminal)
+    text = shown(console, IdentifyView(console), [*first, used])
+    assert "in motion: mug-star 62.2 %; view 12, azimuth 34.8°, 1.0 s (2 frames rejected)" in text
+    enough = replace(used, outcome=Outcome.FOUND)
+    console = screen(100, terminal=terminal)
+    assert "enough to end the search" in shown(console, IdentifyView(console), [*first, enough])
 
 
 def test_dense_search_in_a_pipe_is_printed_as_lines():
