@@ -6,7 +6,7 @@ import sys
 import termios
 import tty
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
@@ -83,7 +83,8 @@ def _keys_at_once() -> Iterator[None]:
     try:
         yield
     finally:
-        termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)
+        with suppress(termios.error):  # the terminal is gone
+            termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)
 
 
 def _pressed() -> "Iterator[JogKey | None]":
@@ -94,7 +95,10 @@ def _pressed() -> "Iterator[JogKey | None]":
         if not select.select([sys.stdin], [], [], _WAIT_S)[0]:
             yield None
             continue
-        data = os.read(sys.stdin.fileno(), 64)
+        try:
+            data = os.read(sys.stdin.fileno(), 64)
+        except OSError:  # the terminal is gone
+            return
         if not data:
             return
         yield next((JogKey(name) for code, name in _KEYS.items() if data.startswith(code)), None)
