@@ -5,6 +5,7 @@ import sys
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
+from copy import copy
 from importlib.metadata import entry_points, version
 from io import TextIOWrapper
 from typing import Annotated, Any
@@ -161,6 +162,17 @@ for _point in sorted(entry_points(group=GROUP), key=lambda point: point.name):
         app.command(_point.name, rich_help_panel=MORE)(_plugin)
 
 
+def _with_command(first: list[str]) -> typer.Typer:
+    """Return the app with only the command that the first argument names; with all if it names none.
+
+    Typer builds every command that an app has, at each start: half the computing of a short command such as status.
+    """
+    only = copy(app)
+    only.registered_commands = [one for one in app.registered_commands if one.name in first]
+    only.registered_groups = [one for one in app.registered_groups if one.name in first]
+    return only if only.registered_commands or only.registered_groups else app
+
+
 def main() -> None:
     """Run the command line."""
     if "--no-color" in sys.argv:
@@ -171,7 +183,7 @@ def main() -> None:
     with checked_output():
         try:
             try:
-                app()
+                _with_command(sys.argv[1:2])()
             finally:
                 sys.stdout.flush()
         except OutputFailed as error:

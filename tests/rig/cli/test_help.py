@@ -11,7 +11,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from rig.cli.main import app
+from rig.cli.main import _with_command, app
 from rig.cli.ui.exit_codes import EXIT_CODES
 from rig.core.errors import RigError
 
@@ -106,3 +106,10 @@ def test_terminal_without_unicode_shows_question_marks(tmp_path):
     )
     assert done.returncode == 0
     assert "(asked 20.00?)" in done.stdout
+
+
+def test_a_start_builds_only_the_command_that_is_called():
+    for one in (*app.registered_commands, *app.registered_groups):
+        assert list(typer.main.get_command(_with_command([one.name])).commands) == [one.name]
+    for first in ([], ["--bench"], ["gotoo"], ["--help"]):
+        assert _with_command(first) is app
