@@ -12,7 +12,7 @@ import sys
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from threading import Lock, Thread
+from threading import Event, Lock, Thread
 from typing import Any, Final
 
 from tests.programs import Program, start_server
@@ -157,10 +157,19 @@ def _read(stream: Any, is_result: bool, output: list[tuple[bool, str]]) -> None:
         output.append((is_result, text.decode(errors="replace")))
 
 
+def _connected(port: int) -> socket.socket:
+    """Connect to the other computer as soon as the network is there."""
+    while True:
+        try:
+            return socket.create_connection((HOST, port))
+        except OSError:
+            Event().wait(0.1)
+
+
 def main() -> None:
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    start_server(*IMPORTED)  # while the devices are plugged in
-    with socket.create_connection((HOST, int(sys.argv[1]))) as connection:
+    start_server(*IMPORTED)  # while the network starts and the devices are plugged in
+    with _connected(int(sys.argv[1])) as connection:
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         Agent(connection).run()
 

@@ -12,17 +12,20 @@ mount -t devpts devpts /dev/pts
 mount -t tmpfs shm /dev/shm
 mkdir -p /lib/modules
 ln -sfn "$modules" "/lib/modules/$release"
-echo "udev $(cut -d" " -f1 /proc/uptime)"; busybox hostname kernel-test
-busybox ifconfig lo 127.0.0.1 up
-if [ -x /lib/systemd/systemd-udevd ]; then /lib/systemd/systemd-udevd --daemon; else udevd --daemon; fi
-modprobe -a virtio_net vhci-hcd i2c-dev  # nothing else that is there at the start is needed, so no `udevadm trigger`
-udevadm settle --timeout=60; echo "settled $(cut -d" " -f1 /proc/uptime)"
-for _ in {1..100}; do
-    network=$(ls /sys/class/net | grep -v '^lo$' | head -1)
-    [ -n "$network" ] && break
-    sleep 0.1
-done
-busybox ifconfig "$network" 10.0.2.15 netmask 255.255.255.0 up
-busybox route add default gw 10.0.2.2
+start_devices_and_network() {
+    echo "udev $(cut -d" " -f1 /proc/uptime)"; busybox hostname kernel-test
+    busybox ifconfig lo 127.0.0.1 up
+    if [ -x /lib/systemd/systemd-udevd ]; then /lib/systemd/systemd-udevd --daemon; else udevd --daemon; fi
+    modprobe -a virtio_net vhci-hcd i2c-dev  # nothing else that is there at the start is needed, so no `udevadm trigger`
+    udevadm settle --timeout=60; echo "settled $(cut -d" " -f1 /proc/uptime)"
+    for _ in {1..100}; do
+        network=$(ls /sys/class/net | grep -v '^lo$' | head -1)
+        [ -n "$network" ] && break
+        sleep 0.1
+    done
+    busybox ifconfig "$network" 10.0.2.15 netmask 255.255.255.0 up
+    busybox route add default gw 10.0.2.2
+}
+start_devices_and_network &  # while the agent imports what the programs need
 cd "$project" || exit 1
 echo "agent $(cut -d" " -f1 /proc/uptime)"; exec "$python" -m tests.kernel.guest.agent "$port"
