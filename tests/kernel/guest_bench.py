@@ -102,6 +102,19 @@ class GuestBench:
             self.until(lambda device=device: self._exists(device), f"{type(device).__name__} appears")
         self.sh("udevadm settle --timeout=30")
 
+    def plug_in_adapter(self, adapter: UsbDevice, driver: str) -> str:
+        """Plug in another I2C adapter, and return its device file."""
+        number = len(self.played.usb)
+        self.machine.ask("attach", port=adapter.port, hub_port=number, device=number + 1, speed=int(adapter.speed))
+
+        def buses() -> list[str]:
+            names = self.files("/sys/class/i2c-dev/*/name").items()
+            return [PurePosixPath(file).parent.name for file, text in names if driver in text]
+
+        self.until(buses, f"{driver} appears")
+        self.sh("udevadm settle --timeout=30")
+        return f"/dev/{buses()[0]}"
+
     def unplug(self, *devices: UsbDevice) -> None:
         """Pull the cables of devices, and wait until the kernel has noticed."""
         for device in devices:

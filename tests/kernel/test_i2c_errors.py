@@ -1,8 +1,11 @@
 """Errors of the I2C bus, as Linux's drivers report them."""
 
+from contextlib import closing
+
 import pytest
 
 from tests.kernel.guest_bench import GuestBench
+from tests.kernel.usb.diolan_u2c import DiolanU2c
 
 pytestmark = [pytest.mark.kernel, pytest.mark.timeout(600)]
 
@@ -24,6 +27,21 @@ def test_a_bus_that_hangs_is_an_interrupted_transfer(bench: GuestBench) -> None:
     goto = bench.rig("goto", 20)
     assert goto.code == 4
     assert "errno: 5" in goto.output  # EIO: the adapter did not answer
+
+
+def test_a_bus_that_hangs_is_a_timeout_at_an_adapter_that_reports_it(bench: GuestBench) -> None:
+    played = bench.played
+    with closing(DiolanU2c(played.devices.i2c, played.time)) as adapter:
+        bus = bench.plug_in_adapter(adapter, "i2c-diolan-u2c")
+        found = bench.rig("find")
+        assert f"MPU-6050 at 0x68 of {bus}" in found.output
+        with played.time.present():
+            played.devices.i2c.stuck = True
+        goto = bench.rig("goto", 20, "--set", f"imu.bus={bus}")
+        assert goto.code == 4
+        assert "errno: 110" in goto.output  # ETIMEDOUT
+        bench.restore()
+        assert f"MPU-6050 at 0x68 of {bus}" in bench.rig("find").output
 
 
 def test_a_kernel_driver_at_the_address_is_named_and_can_be_unbound(bench: GuestBench) -> None:

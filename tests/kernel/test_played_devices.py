@@ -2,7 +2,7 @@
 
 import struct
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import closing, suppress
 from errno import ENXIO
 
 import cv2
@@ -20,6 +20,7 @@ from sim.world import World
 from tests.fuzzing import examples
 from tests.kernel.usb import descriptors
 from tests.kernel.usb.device import TO_HOST, UsbDevice
+from tests.kernel.usb.diolan_u2c import TO_DEVICE, DiolanU2c
 from tests.kernel.usb.ftdi import FtdiAdapter, baud_rate
 from tests.kernel.usb.i2c_tiny_usb import I2cTinyUsb
 from tests.kernel.usb.usbip import Hang, Stall
@@ -179,6 +180,48 @@ def test_adapter_hangs_while_its_bus_hangs(i2c: I2cTinyUsb, bus: SimI2cBus) -> N
         read_register(i2c, 0x68)
     bus.stuck = False
     assert read_register(i2c, 0x68) == b"\x68"
+
+
+@pytest.fixture
+def u2c(world: World, bus: SimI2cBus) -> Iterator[DiolanU2c]:
+    u2c = DiolanU2c(bus, RealTime(world.clock))
+    yield u2c
+    u2c.close()
+
+
+def exchanged(u2c: DiolanU2c, *commands: int) -> list[bytes]:
+    """Return the answers to the commands of one transfer."""
+    u2c.receive(TO_DEVICE, bytes(commands))
+    answers = list(u2c.answers)
+    u2c.answers.clear()
+    return answers
+
+
+def who_am_i(u2c: DiolanU2c, address: int) -> list[bytes]:
+    """Read a register as the driver does: start, address, register, start again, address, a byte."""
+    read = (0x0C, 0x13, address << 1, 0x13, WHO_AM_I, 0x0E, 0x13, address << 1 | 1, 0x14, 0)
+    return exchanged(u2c, *read) + exchanged(u2c, 0x0D)
+
+
+def test_second_adapter_reads_a_register_of_a_sensor(u2c: DiolanU2c) -> None:
+    assert who_am_i(u2c, 0x68) == [b"\0", b"\0", b"\0", b"\0", b"\0", b"\x68\0", b"\0"]
+
+
+def test_second_adapter_tells_a_missing_acknowledge_from_a_timeout(u2c: DiolanU2c, bus: SimI2cBus) -> None:
+    assert who_am_i(u2c, 0x50)[1] == b"\x07"
+    bus.stuck = True
+    assert who_am_i(u2c, 0x68)[1] == b"\x09"
+    bus.stuck = False
+    assert who_am_i(u2c, 0x68)[5] == b"\x68\0"
+
+
+@examples(50)
+@given(st.binary(max_size=64))
+def test_second_adapter_survives_any_commands(data: bytes) -> None:
+    world = World(seed=1)
+    with SimI2cBus(world.clock) as bus, closing(DiolanU2c(bus, RealTime(world.clock))) as u2c:
+        u2c.receive(TO_DEVICE, data)
+        assert all(answers[-1] in (0, 7, 9) for answers in u2c.answers)
 
 
 # -- webcam ---------------------------------------------------------------------------------------------------------
