@@ -29,6 +29,7 @@ from rig.catalog.verify_images import Problem
 from rig.config import ViewConfig
 from rig.core.clock import SystemClock
 from rig.core.errors import DescriptorOutdated, UsageError
+from rig.search.model import load_model
 from rig.views.description import BENCH_DESCRIPTOR, DESCRIPTORS, PAPER_DESCRIPTOR, ViewDescriber
 from rig.views.segmentation_evidence import SegmentationSummary
 from tests.rig.catalog.catalog_samples import PROVENANCE, finished, plan, record
@@ -218,3 +219,16 @@ def test_import_computes_requested_descriptors(open_catalog: Callable[[str], Cat
     assert len(catalog.views(BENCH_DESCRIPTOR).views) == len(catalog.views().views) == VIEWS
     assert segmentations(catalog, "obj1").views == VIEWS
     assert finished(verify(catalog, jobs=1)).findings == ()
+
+
+def test_search_compares_the_bench_with_the_newest_enrollment(open_catalog: Callable[[str], Catalog]) -> None:
+    catalog = open_catalog("new")
+    enrolled(catalog, "box", empty_table=False)
+    enrolled(catalog, "can", empty_table=False)
+    (first, *_) = catalog.object("can").views
+    model = load_model(catalog)
+    assert model.empty_table is None
+    assert model.bench_image is not None
+    assert np.array_equal(model.bench_image, view(0))
+    (catalog.path / first.image).unlink()
+    assert load_model(catalog).bench_image is None
