@@ -185,6 +185,7 @@ class Webcam(UsbDevice):
         self._time = time
         self._mode = (Format.YUYV, 1, _INTERVALS[0])
         self._streaming = Event()
+        self._streams = 0
         self._wanted = Event()
         self._over = False
         self._odd = False
@@ -261,6 +262,9 @@ class Webcam(UsbDevice):
                 if selector == 2:
                     with self._time.present():
                         self._camera.set(cv2.CAP_PROP_FRAME_WIDTH, SIZES[self._mode[1] - 1][0])
+                        while not self._camera.wait_ns() and self._camera.grab():
+                            pass  # a webcam has no frames from before the stream
+                    self._streams += 1
                     self._streaming.set()
                 return b""
             case Setting.ABILITIES:
@@ -281,16 +285,17 @@ class Webcam(UsbDevice):
             if not self._streaming.wait(LONGEST_WAIT_S):
                 continue
             with self._time.present():
+                stream = self._streams
                 wait_ns = 1 if self.stopped else self._camera.wait_ns()
                 draw = None if wait_ns or not self._camera.grab() else self._camera.retrieval()
             image = None if draw is None else draw()[1]  # while the world continues
             if image is None:
                 clock.sleep(min(max(wait_ns * 1e-9, 0.001), LONGEST_WAIT_S))
                 continue
-            self._send(encoded(image, self._mode[0]))
+            self._send(encoded(image, self._mode[0]), stream)
 
-    def _send(self, data: bytes) -> None:
-        """Send an image in payloads, as the host asks for them."""
+    def _send(self, data: bytes, stream: int) -> None:
+        """Send an image of a stream in payloads, as the host asks for them; nothing of it in the next stream."""
         self._odd = not self._odd
         position = 0
 
@@ -302,7 +307,7 @@ class Webcam(UsbDevice):
             ticks = self._time.now_ns() * CLOCK_HZ // 1_000_000_000 & 0xFFFF_FFFF
             return struct.pack("<BBIIH", HEADER_BYTES, flags, ticks, ticks, ticks & 0x7FF) + part
 
-        while position < len(data) and self._streaming.is_set() and not self._over:
+        while position < len(data) and self._streaming.is_set() and stream == self._streams and not self._over:
             plug = self.plug
             if plug is None:
                 return
