@@ -40,8 +40,6 @@ def test_a_bus_that_hangs_is_a_timeout_at_an_adapter_that_reports_it(bench: Gues
         goto = bench.rig("goto", 20, "--set", f"imu.bus={bus}")
         assert goto.code == 4
         assert "errno: 110" in goto.output  # ETIMEDOUT
-        bench.restore()
-        assert f"MPU-6050 at 0x68 of {bus}" in bench.rig("find").output
 
 
 def test_a_kernel_driver_at_the_address_is_named_and_can_be_unbound(bench: GuestBench) -> None:
