@@ -159,12 +159,12 @@ def test_plans_enroll_and_identify_and_tiled_reads_them_back(devices: BenchDevic
 def test_flyer_enrolls_in_one_turn(tmp_path: Path) -> None:
     documents: Documents = []
     with flying(tmp_path) as (bench, catalog, _), BenchDevices(bench, hold=False) as devices:
-        flyer = FlyScan(devices, catalog, "toy-house", views=12)
+        flyer = FlyScan(devices, catalog, "block", views=12)
         assert isinstance(flyer, protocols.Flyable)
         engine = RunEngine({}, context_managers=[])
         engine.subscribe(lambda name, document: documents.append((name, document)))
         engine(plans.fly([flyer], md=devices.provenance()))
-        assert catalog.object("toy-house").summary.views == 12
+        assert catalog.object("block").summary.views == 12
     validated(documents)
     assert sum(len(d["seq_num"]) if n == "event_page" else n == "event" for n, d in documents) == 12
     assert documents[-1][1]["exit_status"] == "success"
