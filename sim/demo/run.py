@@ -7,7 +7,7 @@ import statistics
 import sys
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -157,6 +157,7 @@ def run_demo(
         if change is not None:
             operator.change_bench(change)
             _photograph(bench, operator)
+            model = replace(model, camera=())  # a real bench refuses to search with other settings of the camera
         trials = [
             _identify(
                 bench, model, chosen, operator, thing, enrolled=name in enrolled, say=number == 0 and not settings.json

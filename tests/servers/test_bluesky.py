@@ -116,7 +116,8 @@ def test_stop_ends_a_rotation_with_the_torque_off_and_the_next_run_works(devices
         if asked_by == "device":
             assert isinstance(error.value.__cause__ or error.value.args[0].exception(), MotionStopped)
         else:
-            engine.abort()
+            with suppress(FailedStatus):  # the failure of the move can arrive before the engine expects it
+                engine.abort()
         devices.run(lambda: bench.safety.observers.remove(stop_in_motion))  # after the end of the motion
         assert 20 < max(readings) - min(readings) < 120
         assert bench.safety.state is TableState.STOPPED

@@ -41,6 +41,13 @@ def in_json(tmp_path_factory):
     return demo(*SMALL, "--seed", "3", "--json", "--out", str(out)), out
 
 
+def test_demo_searches_on_a_changed_bench_with_other_camera_settings(tmp_path):
+    few = ("--set", "enroll.views=4", "--set", "identify.max_views=1")
+    done = demo(*SMALL, *few, "--change", "bench", "--json", "--out", str(tmp_path))
+    assert done.exit_code in (0, 6), done.output  # with one view an answer can be wrong
+    assert len(json.loads(done.stdout)["trials"]) == 4
+
+
 def test_demo_enrolls_and_finds_objects_and_recognizes_unknown_ones(small):
     done, _ = small
     assert done.exit_code in (0, 6)  # with so few views an answer can be wrong: exit code 6
