@@ -42,9 +42,9 @@ def in_json(tmp_path_factory):
 
 
 def test_demo_searches_on_a_changed_bench_with_other_camera_settings(tmp_path):
-    few = ("--set", "enroll.views=4", "--set", "identify.max_views=1")
+    few = ("--set", "enroll.views=4", "--set", "identify.max_views=2")
     done = demo(*SMALL, *few, "--change", "bench", "--json", "--out", str(tmp_path))
-    assert done.exit_code in (0, 6), done.output  # with one view an answer can be wrong
+    assert done.exit_code in (0, 6), done.output  # with so few views an answer can be wrong
     assert len(json.loads(done.stdout)["trials"]) == 4
 
 
