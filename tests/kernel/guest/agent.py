@@ -103,8 +103,11 @@ class Agent:
 
     def do_files(self, pattern: str) -> dict[str, str]:
         """Return the files of a pattern with their text; a file without one (a device) has an empty one."""
-        paths = Path("/").glob(pattern.removeprefix("/"))
-        return {str(path): path.read_text(errors="replace") if path.is_file() else "" for path in paths}
+        found = {}
+        for path in Path("/").glob(pattern.removeprefix("/")):
+            with suppress(OSError):  # a device that was unplugged meanwhile has no files
+                found[str(path)] = path.read_text(errors="replace") if path.is_file() else ""
+        return found
 
     def do_output(self, pid: int) -> str:
         """Return what the process has printed so far."""
