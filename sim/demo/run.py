@@ -157,7 +157,7 @@ def run_demo(
         if change is not None:
             operator.change_bench(change)
             _photograph(bench, operator)
-            model = replace(model, camera=())  # a real bench refuses to search with other settings of the camera
+            model = replace(model, camera=())  # a real bench rejects a search with other settings of the camera
         trials = [
             _identify(
                 bench, model, chosen, operator, thing, enrolled=name in enrolled, say=number == 0 and not settings.json
