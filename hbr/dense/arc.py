@@ -147,6 +147,8 @@ class ArcSession(DenseSession):
         same_bench: bool | None = None,
     ) -> StopDecision:
         """Add the next frame and return the rule's last decision; `is_new_decision` says whether it is a new one."""
+        if earlier is not None:
+            self._sides = None  # they are of other descriptions
         if self._queries:
             self._covered_deg += min(self._apart_deg(orientation_deg), STEP_DEG)
         decisions = 1 + int(self._covered_deg / STEP_DEG + 1e-9)

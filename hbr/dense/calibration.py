@@ -275,27 +275,31 @@ def calibrate_stopping_rule(
     if sample is None and len(index) >= FEWEST_OBJECTS_SHIFTED and can_shift(index):
         views = searches.confidence.shape[1]
         rule = fit_open_set(rule, shifted_searches(index, views=views, searches=most_shifted_searches))
-        return _calibrated(rule, searches)
+        rejected = sum(one.rejected for one in rule.rates)  # in searches under changes of the bench
+        return _calibrated(rule, searches, rejected=rejected, accepted=sum(one.false_accepts for one in rule.rates))
     known, unknown = (part.open_set_score(rule.usual_scores)[:, -1] for part in (searches.known, searches.unknown))
-    ended, wrong = _ended(searches, rule.min_confidence)
     accepted = unknown >= rule.open_set_thresholds[-1]
     pairs = np.stack([searches.searched, searches.unknown.object_index[:, -1]], axis=1)[accepted]
     confused, first, times = np.unique(pairs, axis=0, return_index=True, return_counts=True)
     names = index.views.object_names
-    return CalibratedRule(
+    return _calibrated(
         rule,
-        views=searches.confidence.shape[1],
-        ended=len(ended),
-        wrong=wrong,
-        mean_views=float(ended.mean() + 1) if len(ended) else nan,
+        searches,
         rejected=int((known < rule.open_set_thresholds[-1]).sum()),
         accepted=int(accepted.sum()) if objects >= FEWEST_OBJECTS else None,
         confused=tuple((names[a], names[b]) for a, b in confused[np.lexsort((first, -times))].tolist()),
     )
 
 
-def _calibrated(rule: StoppingRule, searches: LeaveOneOut) -> CalibratedRule:
-    """Return what a rule with weights does: the numbers of searches under changes of the bench."""
+def _calibrated(
+    rule: StoppingRule,
+    searches: LeaveOneOut,
+    *,
+    rejected: int,
+    accepted: int | None,
+    confused: tuple[tuple[str, str], ...] = (),
+) -> CalibratedRule:
+    """Return the rule with how its leave-one-out searches end."""
     ended, wrong = _ended(searches, rule.min_confidence)
     return CalibratedRule(
         rule,
@@ -303,8 +307,9 @@ def _calibrated(rule: StoppingRule, searches: LeaveOneOut) -> CalibratedRule:
         ended=len(ended),
         wrong=wrong,
         mean_views=float(ended.mean() + 1) if len(ended) else nan,
-        rejected=sum(one.rejected for one in rule.rates),
-        accepted=sum(one.false_accepts for one in rule.rates),
+        rejected=rejected,
+        accepted=accepted,
+        confused=confused,
     )
 
 
