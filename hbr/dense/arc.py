@@ -249,12 +249,13 @@ def next_arc(
     new = np.minimum(apart_deg / STEP_DEG, 1.0) * STEP_WEIGHT
     probability, place, bin_of = strongest(belief.posterior(beta))
     cost = second_costs * seconds
-    pairs = probability[:, None] * probability * (place[:, None] != place)
+    first, second = np.nonzero(np.triu(place[:, None] != place))  # pairs of different objects
+    pairs = probability[first] * probability[second]
     confusion = np.zeros(len(rotations_deg))
     pair = None
     if pairs.any():
-        similar, known = expected_similarity(belief, place, bin_of, rotations_deg)
-        exponent = new[:, None, None] * np.sqrt(known[:, :, None] * known[:, None, :]) * (1 - similar)
+        similar, known = expected_similarity(belief, place, bin_of, rotations_deg, first, second)
+        exponent = new[:, None] * np.sqrt(known[:, first] * known[:, second]) * (1 - similar)
     for side in (1.0, -1.0):
         way = np.flatnonzero(np.sign(rotations_deg) == side)
         way = way[np.argsort(np.abs(rotations_deg[way]))]
@@ -262,13 +263,13 @@ def next_arc(
             continue
         if pairs.any():
             remaining = pairs * np.exp(-_SHARPNESS * np.cumsum(exponent[way], axis=0))
-            confusion[way] = np.log(np.maximum(remaining.sum(axis=(1, 2)), 1e-300))
+            confusion[way] = np.log(np.maximum(2 * remaining.sum(axis=1), 1e-300))
         else:  # one object alone: a new side helps to find its azimuth
             confusion[way] = -_SHARPNESS * np.cumsum(new[way])
     sums = np.where(np.abs(rotations_deg) >= LEAST_ARC_DEG, confusion + cost, np.inf)
     chosen = int((sums if np.isfinite(sums).any() else confusion + cost).argmin())
     if pairs.any():
-        first, second = np.unravel_index(int(pairs.argmax()), pairs.shape)
+        most = int(pairs.argmax())
         objects = belief.index.object_index
-        pair = int(objects[place[first]]), int(objects[place[second]])
+        pair = int(objects[place[first[most]]]), int(objects[place[second[most]]])
     return NextArc(float(rotations_deg[chosen]), pair, rotations_deg, confusion, cost)

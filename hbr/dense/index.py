@@ -210,6 +210,9 @@ class DenseIndex:
 
         Of equally near views, the one with the smaller azimuth.
         """
+        compiled = calls.nearest_view(self._segments, self.views.azimuth_deg, place, at_deg)
+        if compiled is not None:
+            return compiled
         count, columns = self._segments.lengths[place], np.arange(len(place))
         own_deg = np.where(self.left_out[place], 900.0, self.azimuth_deg[place])
         keys = (

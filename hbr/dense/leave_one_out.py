@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,9 @@ _USUAL_WEIGHT: Final = 1.0
 _GOLDEN: Final = 0.618034
 #: Distance between the views of a search.
 _STEP_DEG: Final = 90.0
+
+
+Scores = TypeVar("Scores", float, FloatArray)
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,22 +49,33 @@ class Leaders:
     def open_set_score(self, usual_scores: FloatArray) -> FloatArray:
         """Return the open-set score after each view of each search, (searches, views).
 
-        It is the score plus half of the margin, less what the leader usually scores above other objects. An unknown
-        object resembles several enrolled objects a little; an enrolled object resembles one of them closely. An object
-        that looks the same from all sides usually scores more, so it must match better.
-
         Parameters
         ----------
         usual_scores : float64 array (objects, views)
             As `usual_scores` returns it.
         """
         views = np.arange(self.score.shape[1])
-        typical = np.median(usual_scores, axis=0)
-        return (
-            self.score
-            + _MARGIN_WEIGHT * self.margin
-            - _USUAL_WEIGHT * (usual_scores[self.object_index, views] - typical)
-        )
+        usual = usual_scores[self.object_index, views]
+        return open_set_score(self.score, self.margin, usual, np.median(usual_scores, axis=0))
+
+
+def open_set_score(score: Scores, margin: Scores, usual: Scores, typical: Scores) -> Scores:
+    """Return the open-set score of a leading candidate.
+
+    It is the score plus half of the margin, less what the leader usually scores above other objects. An unknown object
+    resembles several enrolled objects a little; an enrolled object resembles one of them closely. An object that looks
+    the same from all sides usually scores more, so it must match better.
+
+    Parameters
+    ----------
+    score, margin
+        As in `Leaders`.
+    usual
+        What the leader usually scores, see `usual_scores`.
+    typical
+        The median of all objects.
+    """
+    return score + _MARGIN_WEIGHT * margin - _USUAL_WEIGHT * (usual - typical)
 
 
 Task = tuple[int, float]

@@ -14,12 +14,16 @@ from hbr.core.arrays import FloatArray, IndexArray
 from hbr.dense.filter import BETA, Belief
 from hbr.dense.index import BINS
 from hbr.descriptors import Packed
+from hbr.kernels import calls
 
 #: Largest number of compared hypotheses, and the share of the belief that is not compared.
 _STRONGEST: Final = 16
 _NEGLIGIBLE: Final = 1e-3
 #: A view this near to an earlier one adds little.
 _NEAR_DEG: Final = 15.0
+#: Every 5 degrees, the shorter way round.
+_ALL_ROTATIONS_DEG: Final = np.delete(np.arange(-BINS // 2 + 1.0, BINS // 2 + 1), BINS // 2 - 1) * (360 / BINS)
+_ALL_ROTATIONS_DEG.flags.writeable = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +92,7 @@ def next_best_view(
     ValueError
         There is no rotation to choose from, or not one time for each.
     """
-    angles_deg = _all_rotations() if rotations_deg is None else np.asarray(rotations_deg, np.float64)
+    angles_deg = _ALL_ROTATIONS_DEG if rotations_deg is None else np.asarray(rotations_deg, np.float64)
     if angles_deg.ndim != 1 or not len(angles_deg) or not np.isfinite(angles_deg).all():
         raise ValueError(
             f"rotations_deg is {angles_deg}; at least one finite rotation is needed, check the cable's limits"
@@ -107,8 +111,7 @@ def next_best_view(
     cost = second_costs * times_s
     first, second = np.nonzero(np.triu(place[:, None] != place))  # pairs of different objects
     if len(first):
-        similar, known = expected_similarity(belief, place, bin_of, angles_deg)
-        similar = similar[:, first, second]
+        similar, known = expected_similarity(belief, place, bin_of, angles_deg, first, second)
         tells = novelty[:, None] * np.sqrt(known[:, first] * known[:, second])
         pairs = probability[first] * probability[second]
         remaining = pairs * np.exp(-sharpness * tells * (1 - similar))
@@ -139,9 +142,10 @@ def most_informative_rotation(belief: Belief, *, beta: float = BETA, rotations_d
     belief, beta, rotations_deg
         As for `next_best_view`.
     """
-    angles_deg = _all_rotations() if rotations_deg is None else np.asarray(rotations_deg, np.float64)
+    angles_deg = _ALL_ROTATIONS_DEG if rotations_deg is None else np.asarray(rotations_deg, np.float64)
     probability, place, bin_of = strongest(belief.posterior(beta))
-    similar, _ = expected_similarity(belief, place, bin_of, angles_deg, of_one_object=True)
+    rows, _ = expected_views(belief, place, bin_of, angles_deg)
+    similar = belief.index.compared.among(rows)
     weights = probability * np.exp(
         beta / np.sqrt(belief.queries + 1) * (np.maximum(similar, 0) ** belief.index.power - 1)
     )
@@ -152,46 +156,67 @@ def most_informative_rotation(belief: Belief, *, beta: float = BETA, rotations_d
     return float(angles_deg[int((entropy @ probability).argmin())])
 
 
-def _all_rotations() -> FloatArray:
-    steps: FloatArray = np.delete(np.arange(-BINS // 2 + 1.0, BINS // 2 + 1), BINS // 2 - 1)
-    return steps * (360 / BINS)
-
-
 def strongest(posterior: FloatArray) -> tuple[FloatArray, IndexArray, IndexArray]:
-    """Probability, object (its place) and bin of the strongest hypotheses, one peak of an object after the other."""
-    around = np.concatenate([posterior[:, -1:], posterior, posterior[:, :1]], axis=1)
-    is_peak = (posterior >= around[:, :-2]) & (posterior >= around[:, 2:])
-    # a peak stands for the slopes beside it
-    mass = posterior.sum(axis=1)
-    total = (posterior * is_peak).sum(axis=1)
-    share = np.divide(mass, total, out=np.zeros_like(mass), where=total > 0)
-    weight = (posterior * is_peak * share[:, None]).ravel()
-    count = min(_STRONGEST, len(weight))
-    best = np.argpartition(-weight, count - 1)[:count]  # of all: of equal weights, earlier runs chose the same ones
-    best = best[np.argsort(-weight[best], kind="stable")]
-    weight = weight[best]
+    """Return probability, object (its place) and bin of the strongest hypotheses: of equal ones, the first come first.
+
+    A hypothesis is a peak of its object. It stands for the slopes beside it.
+    """
+    best, weight = _strongest(posterior, min(_STRONGEST, posterior.size))
     place, bin_of = np.divmod(best, posterior.shape[1])
     second = int((place != place[0]).argmax())  # a decision is between two objects, however unlikely the second
     enough = max(1 + int(np.searchsorted(np.cumsum(weight), 1 - _NEGLIGIBLE)), second + 1)
     return weight[:enough], place[:enough], bin_of[:enough]
 
 
+def _strongest(posterior: FloatArray, count: int) -> tuple[IndexArray, FloatArray]:
+    compiled = calls.strongest(posterior, count)
+    if compiled is not None:
+        return compiled
+    around = np.concatenate([posterior[:, -1:], posterior, posterior[:, :1]], axis=1)
+    peaks = posterior * ((posterior >= around[:, :-2]) & (posterior >= around[:, 2:]))
+    mass, total = posterior.sum(axis=1), peaks.sum(axis=1)
+    share = np.divide(mass, total, out=np.zeros_like(mass), where=total > 0)
+    weight = (peaks * share[:, None]).ravel()
+    candidates = np.flatnonzero(weight >= np.partition(weight, -count)[-count])
+    best = candidates[np.argsort(-weight[candidates], kind="stable")[:count]]
+    return best, weight[best]
+
+
 def expected_similarity(
-    belief: Belief, place: IndexArray, bin_of: IndexArray, angles_deg: FloatArray, *, of_one_object: bool = False
+    belief: Belief,
+    place: IndexArray,
+    bin_of: IndexArray,
+    angles_deg: FloatArray,
+    first: IndexArray,
+    second: IndexArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return what the hypotheses would show after each rotation.
+    """Return what pairs of hypotheses would show after each rotation.
+
+    Parameters
+    ----------
+    place, bin_of
+        As `strongest` returns them, (m,).
+    first, second
+        The two of each pair, (p,): pairs with the same first one follow each other.
 
     Returns
     -------
-    similar : float64 array (a, m, m)
-        Similarity of each two; of one object, only if that is asked for.
+    similar : float64 array (a, p)
+        Similarity of the two.
     known : float64 array (a, m)
-        How well that is known.
+        How well the view of each hypothesis is known.
     """
-    index = belief.index
-    seen_deg = bin_of * (360.0 / BINS) + belief.rotated_deg + angles_deg[:, None]
-    rows, away_deg = index.nearest_view(place, seen_deg)
+    compared = belief.index.compared
+    rows, away_deg = expected_views(belief, place, bin_of, angles_deg)
     known = np.exp(-0.5 * (away_deg / _NEAR_DEG) ** 2)
-    if isinstance(index.compared, Packed) and not of_one_object:
-        return index.compared.among(rows, place), known
-    return index.compared.among(rows), known
+    if isinstance(compared, Packed):
+        return compared.pairs(rows, first, second), known
+    return compared.among(rows)[:, first, second], known
+
+
+def expected_views(
+    belief: Belief, place: IndexArray, bin_of: IndexArray, angles_deg: FloatArray
+) -> tuple[IndexArray, FloatArray]:
+    """Return the enrolled view that each hypothesis expects after each rotation, (a, m), and how far away it is."""
+    seen_deg = bin_of * (360.0 / BINS) + belief.rotated_deg + angles_deg[:, None]
+    return belief.index.nearest_view(place, seen_deg)

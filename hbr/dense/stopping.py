@@ -7,11 +7,14 @@ Decision: docs/decisions/0026.
 
 from dataclasses import dataclass, field
 from enum import StrEnum
+from functools import cached_property
 from typing import Any
+
+import numpy as np
 
 from hbr.core.arrays import FloatArray
 from hbr.dense.filter import Belief
-from hbr.dense.leave_one_out import Leaders, leader
+from hbr.dense.leave_one_out import leader, open_set_score
 from hbr.dense.open_set import OpenSetModel, evidence
 
 
@@ -142,7 +145,7 @@ class StoppingRule:
     limitations : tuple of Limitation
         What the rule does not guarantee; empty if it guarantees both rates.
     open_set : OpenSetModel, optional
-        The weights of the open-set score. Without them the score is that of `Leaders.open_set_score`.
+        The weights of the open-set score. Without them the score is that of `hbr.dense.leave_one_out.open_set_score`.
     unknown_thresholds : tuple of float
         With weights: open-set scores after 1, 2, ... views below which an object is unknown. Between them and
         ``open_set_thresholds`` it is ambiguous. Without weights both thresholds are one.
@@ -219,5 +222,10 @@ class StoppingRule:
         if self.open_set is not None:
             _, numbers = evidence(belief.index, belief.support, belief.orientation_deg, belief.levels)
             return self.open_set.score(numbers, belief.queries)
-        leaders = Leaders.of([leader(belief.index.object_index, belief.scores())], (1, 1))
-        return float(leaders.open_set_score(self.usual_scores[:, n : n + 1])[0, 0])
+        best, score, margin = leader(belief.index.object_index, belief.scores())
+        return open_set_score(score, margin, float(self.usual_scores[best, n]), self._typical_scores[n])
+
+    @cached_property
+    def _typical_scores(self) -> list[float]:
+        typical: list[float] = np.median(self.usual_scores, axis=0).tolist()
+        return typical

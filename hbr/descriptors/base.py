@@ -254,6 +254,9 @@ class Packed:
     def only(self, rows: IndexArray, /) -> "Packed":
         return Packed(self._kind, self._rows.only(rows))
 
-    def among(self, rows: IndexArray, kinds: IndexArray | None = None, /) -> FloatArray:
-        """Return the similarity of rows to each other within groups; of rows of one kind, (k,), 1."""
-        return self._rows.among(rows, kinds)
+    def among(self, rows: IndexArray, /) -> FloatArray:
+        return self._rows.among(rows)
+
+    def pairs(self, rows: IndexArray, first: IndexArray, second: IndexArray) -> FloatArray:
+        """Return the similarity of two rows of each group, (g, p): see `PackedRows.pairs`."""
+        return self._rows.pairs(rows, first, second)

@@ -161,18 +161,25 @@ class PackedRows:
         )  # fmt: skip
         return similar
 
-    def among(self, rows: IndexArray, kinds: IndexArray | None = None) -> FloatArray:
-        """Return the similarity of rows to each other within groups: indices (g, k) in, (g, k, k) out.
+    def pairs(self, rows: IndexArray, first: IndexArray, second: IndexArray) -> FloatArray:
+        """Return the similarity of two rows of each group, (g, p): indices (g, k), and which two of them, (p,) each.
 
-        Rows of one kind, (k,), are not compared: 1.
+        Pairs with the same first one follow each other.
         """
         places = _whole(rows if self._places is None else self._places[rows])
-        kinds = None if kinds is None else _whole(kinds)
-        similar = np.empty((*places.shape, places.shape[1]))
-        self._library.hbr_among(
+        first, second = _whole(first), _whole(second)
+        similar = np.empty((len(places), len(first)))
+        self._library.hbr_pairs(
             self._by_address, *self._at, address(self.squares), address(places), *places.shape,
-            0 if kinds is None else address(kinds), address(similar),
+            address(first), address(second), len(first), address(similar),
         )  # fmt: skip
+        return similar
+
+    def among(self, rows: IndexArray) -> FloatArray:
+        """Return the similarity of rows to each other within groups: indices (g, k) in, (g, k, k) out."""
+        first, second = np.triu_indices(rows.shape[1])
+        similar = np.empty((*rows.shape, rows.shape[1]))
+        similar[:, first, second] = similar[:, second, first] = self.pairs(rows, first, second)
         return similar
 
     def bounds(self, query: LevelArray, segments: Segments) -> FloatArray:
@@ -280,6 +287,33 @@ def support(
         slope, part_deg, whole, address(scratch), room, address(added),
     )  # fmt: skip
     return added
+
+
+def strongest(posterior: FloatArray, kept: int) -> tuple[IndexArray, FloatArray] | None:
+    """Return the strongest hypotheses of a posterior, (k, 72), as flat indices; and their weights; see next_view.py."""
+    found = library()
+    if found is None:
+        return None
+    posterior = np.ascontiguousarray(posterior)
+    best, weight = np.empty(kept, np.int64), np.empty(kept)
+    found.hbr_strongest(address(posterior), len(posterior), kept, address(best), address(weight))
+    return best, weight
+
+
+def nearest_view(
+    segments: Segments, azimuth_deg: FloatArray, places: IndexArray, at_deg: FloatArray
+) -> tuple[IndexArray, FloatArray] | None:
+    """Return which view of each object, (m,), is nearest to azimuths, (a, m), and how far away it is."""
+    found = library()
+    if found is None:
+        return None
+    places, at_deg = _whole(places), np.ascontiguousarray(at_deg)
+    rows, away_deg = np.empty(at_deg.shape, np.int64), np.empty(at_deg.shape)
+    found.hbr_nearest_view(
+        *map(address, segments[:3]), address(azimuth_deg), address(places), len(places),
+        address(at_deg), len(at_deg), address(rows), address(away_deg),
+    )  # fmt: skip
+    return rows, away_deg
 
 
 def rotated(

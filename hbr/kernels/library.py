@@ -22,7 +22,9 @@ _SIGNATURES: Final[dict[str, tuple[Any, ...]]] = {
     "hbr_similarity": (
         *[_POINTER] * 2, _INTEGER, _INTEGER, _POINTER, _INTEGER, _POINTER, _POINTER, _INTEGER, _POINTER,
     ),
-    "hbr_among": (_POINTER, _POINTER, _INTEGER, _POINTER, _POINTER, _INTEGER, _INTEGER, _POINTER, _POINTER),
+    "hbr_pairs": (
+        _POINTER, _POINTER, _INTEGER, _POINTER, _POINTER, _INTEGER, _INTEGER, _POINTER, _POINTER, _INTEGER, _POINTER,
+    ),
     "hbr_bounds": (*[_POINTER] * 3, _INTEGER, *[_POINTER] * 3),
     "hbr_nearest": (*[_POINTER] * 3, _INTEGER, *[_POINTER] * 4, _INTEGER, _POINTER, _POINTER),
     "hbr_byte_squares": (_POINTER, *[_INTEGER] * 3, _POINTER),
@@ -31,6 +33,8 @@ _SIGNATURES: Final[dict[str, tuple[Any, ...]]] = {
     "hbr_support": (
         *[_POINTER] * 3, _INTEGER, _POINTER, _POINTER, _REAL, _REAL, _INTEGER, _POINTER, _INTEGER, _POINTER,
     ),
+    "hbr_strongest": (_POINTER, _INTEGER, _INTEGER, _POINTER, _POINTER),
+    "hbr_nearest_view": (*[_POINTER] * 5, _INTEGER, _POINTER, _INTEGER, _POINTER, _POINTER),
     "hbr_rotated": (_POINTER, _POINTER, _INTEGER, *[_POINTER] * 5),
     "hbr_paths": (
         _POINTER, _INTEGER, _INTEGER, _INTEGER, _POINTER, _INTEGER, *[_POINTER] * 3, _REAL, *[_POINTER] * 7,

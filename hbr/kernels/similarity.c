@@ -22,6 +22,8 @@ struct measure {
 
 struct query {
     const struct measure *measure;
+    uint64_t at_level[3][EDGE_LEVELS / 64] __attribute__((aligned(64))); /* where the levels are 1, 2, 3, a bit each */
+    int64_t base;                                                        /* product with a row whose levels are all 0 */
     int16_t edges[EDGE_LEVELS] __attribute__((aligned(32))); /* values, in the order in which a row is read */
     int16_t colours[COLOUR_BYTES] __attribute__((aligned(32)));
     int16_t weights[COLOUR_BYTES] __attribute__((aligned(32)));
@@ -31,16 +33,19 @@ struct query {
 
 /* The loops over rows: products of edges, squared distances of colours. */
 struct loops {
-    void (*expand)(const int32_t v[4], const uint8_t *edges, int16_t *values); /* of a query, in the order of a row */
+    void (*prepare)(struct query *q, const uint8_t *edges); /* for `edges`, in the order in which a row is read */
+    void (*coarsen)(struct query *q, const uint8_t *edges); /* for `edge_bounds`; null if nothing is needed */
     void (*edges)(const struct query *q, const uint8_t *const *rows, int64_t count, double *dots);
     void (*edge_bounds)(const struct query *q, const uint8_t *const *rows, int64_t count, double *dots);
     void (*colours)(const struct query *q, const uint8_t *const *rows, int64_t count, int32_t *distances);
 };
 
 /* In the plain order, all levels in the two highest bits of the bytes come first, then those in the next two. */
-static void expand_plain(const int32_t v[4], const uint8_t *edges, int16_t *values) {
+static void prepare_plain(struct query *q, const uint8_t *edges) {
+    const int32_t *v = q->measure->edge_values;
     for (int field = 0; field < 4; field++)
-        for (int i = 0; i < EDGE_BYTES; i++) *values++ = (int16_t)v[edges[i] >> (6 - 2 * field) & 3];
+        for (int i = 0; i < EDGE_BYTES; i++)
+            q->edges[field * EDGE_BYTES + i] = (int16_t)v[edges[i] >> (6 - 2 * field) & 3];
 }
 
 static void edges_plain(const struct query *q, const uint8_t *const *rows, int64_t count, double *dots) {
@@ -77,7 +82,7 @@ static void colours_plain(const struct query *q, const uint8_t *const *rows, int
     }
 }
 
-static const struct loops PLAIN = {expand_plain, edges_plain, edges_plain, colours_plain};
+static const struct loops PLAIN = {prepare_plain, 0, edges_plain, edges_plain, colours_plain};
 
 #if defined(__x86_64__)
 #define AVX2 __attribute__((target("avx2")))
@@ -99,11 +104,12 @@ AVX2 static inline int64_t sum_of(__m256i a, __m256i b) {
     return _mm_extract_epi64(two, 0) + _mm_extract_epi64(two, 1);
 }
 
-AVX2 static void expand_avx2(const int32_t v[4], const uint8_t *edges, int16_t *values) {
+AVX2 static void prepare_avx2(struct query *q, const uint8_t *edges) {
+    const int32_t *v = q->measure->edge_values;
     const __m256i half = _mm256_set1_epi8(15);
     const __m256i low[2] = {values_of_halves(v, 0, 0), values_of_halves(v, 1, 0)};
     const __m256i high[2] = {values_of_halves(v, 0, 8), values_of_halves(v, 1, 8)};
-    __m256i *own = (__m256i *)values;
+    __m256i *own = (__m256i *)q->edges;
     for (int vector = 0; vector < EDGE_BYTES / 32; vector++) {
         const __m256i packed = _mm256_loadu_si256((const __m256i *)edges + vector);
         for (int field = 0; field < 4; field++, own += 2) {
@@ -139,6 +145,15 @@ AVX2 static void edges_avx2(const struct query *q, const uint8_t *const *rows, i
         }
         dots[k] = (double)sum_of(one, two);
     }
+}
+
+static void coarsen_avx2(struct query *q, const uint8_t *edges) {
+    for (int vector = 0; vector < EDGE_BYTES / 32; vector++)
+        for (int field = 0; field < 4; field++)
+            for (int i = 0; i < 32; i++) {
+                const int32_t value = q->measure->edge_values[edges[32 * vector + i] >> (6 - 2 * field) & 3];
+                q->coarse[(4 * vector + field) * 32 + i] = (int8_t)((value + COARSE - 1) / COARSE);
+            }
 }
 
 AVX2 static inline __m256i coarse_of_halves(const int32_t v[4], int second) {
@@ -191,29 +206,82 @@ AVX2 static void colours_avx2(const struct query *q, const uint8_t *const *rows,
     }
 }
 
-static const struct loops WITH_AVX2 = {expand_avx2, edges_avx2, edge_bounds_avx2, colours_avx2};
+static const struct loops WITH_AVX2 = {prepare_avx2, coarsen_avx2, edges_avx2, edge_bounds_avx2, colours_avx2};
+
+#define AVX512 __attribute__((target("avx512f,avx512bw,avx512vpopcntdq,avx512ifma")))
+
+/* The low and the high bit of all levels of a row, a bit each, in the same order for every row. */
+AVX512 static inline void bits_of_levels(const uint8_t *edges, __m512i *low, __m512i *high) {
+    const __m512i first = _mm512_loadu_si512(edges), second = _mm512_loadu_si512(edges + EDGE_BYTES / 2);
+    const __m512i even = _mm512_set1_epi8(0x55);
+    const int chosen = 0xCA; /* where the first operand has ones the second one, elsewhere the third */
+    *low = _mm512_ternarylogic_epi64(even, first, _mm512_slli_epi64(second, 1), chosen);
+    *high = _mm512_ternarylogic_epi64(even, _mm512_srli_epi64(first, 1), second, chosen);
+}
+
+AVX512 static void prepare_avx512(struct query *q, const uint8_t *edges) {
+    const int32_t *v = q->measure->edge_values;
+    __m512i low, high;
+    bits_of_levels(edges, &low, &high);
+    const __m512i at_level[3] = {_mm512_andnot_si512(high, low), _mm512_andnot_si512(low, high),
+                                 _mm512_and_si512(low, high)};
+    q->base = EDGE_LEVELS * v[0];
+    for (int level = 1; level < 4; level++) {
+        _mm512_store_si512(q->at_level[level - 1], at_level[level - 1]);
+        q->base += (v[level] - v[0]) * _mm512_reduce_add_epi64(_mm512_popcnt_epi64(at_level[level - 1]));
+    }
+    q->base *= v[0];
+}
+
+/* The levels are counted that are i in the query and j in the row, for i and j from 1 to 3, and those that are j in the
+   row. Each count times its weight makes the product larger than that with a row whose levels are all 0. */
+AVX512 static void edges_avx512(const struct query *q, const uint8_t *const *rows, int64_t count, double *dots) {
+    const int32_t *v = q->measure->edge_values;
+    const __m512i one = _mm512_load_si512(q->at_level[0]), two = _mm512_load_si512(q->at_level[1]),
+                  three = _mm512_load_si512(q->at_level[2]);
+    __m512i weights[3][4];
+    for (int j = 1; j < 4; j++) {
+        weights[j - 1][0] = _mm512_set1_epi64((int64_t)v[0] * (v[j] - v[0]));
+        for (int i = 1; i < 4; i++) weights[j - 1][i] = _mm512_set1_epi64((int64_t)(v[i] - v[0]) * (v[j] - v[0]));
+    }
+    for (int64_t k = 0; k < count; k++) {
+        const uint8_t *row = rows[k] + q->measure->edges_at;
+        for (int line = 0; line < 3; line++) /* rows mostly follow each other */
+            _mm_prefetch((const char *)row + 2560 + 64 * line, _MM_HINT_T0);
+        __m512i low, high;
+        bits_of_levels(row, &low, &high);
+        const __m512i at_level[3] = {_mm512_andnot_si512(high, low), _mm512_andnot_si512(low, high),
+                                     _mm512_and_si512(low, high)};
+        __m512i sums[3];
+#pragma GCC unroll 3
+        for (int j = 0; j < 3; j++) { /* modulo 2^52: weights can be negative, the product is not */
+            const __m512i *w = weights[j], here = at_level[j], zero = _mm512_setzero_si512();
+            sums[j] = _mm512_madd52lo_epu64(zero, _mm512_popcnt_epi64(here), w[0]);
+            sums[j] = _mm512_madd52lo_epu64(sums[j], _mm512_popcnt_epi64(_mm512_and_si512(one, here)), w[1]);
+            sums[j] = _mm512_madd52lo_epu64(sums[j], _mm512_popcnt_epi64(_mm512_and_si512(two, here)), w[2]);
+            sums[j] = _mm512_madd52lo_epu64(sums[j], _mm512_popcnt_epi64(_mm512_and_si512(three, here)), w[3]);
+        }
+        const __m512i total = _mm512_add_epi64(_mm512_add_epi64(sums[0], sums[1]), sums[2]);
+        dots[k] = (double)((q->base + _mm512_reduce_add_epi64(total)) & ((INT64_C(1) << 52) - 1));
+    }
+}
+
+static const struct loops WITH_AVX512 = {prepare_avx512, 0, edges_avx512, edges_avx512, colours_avx2};
 #endif
 
 static const struct loops *fastest(void) {
 #if defined(__x86_64__)
+    if (__builtin_cpu_supports("avx512bw") && __builtin_cpu_supports("avx512vpopcntdq") &&
+        __builtin_cpu_supports("avx512ifma"))
+        return &WITH_AVX512;
     if (__builtin_cpu_supports("avx2")) return &WITH_AVX2;
 #endif
     return &PLAIN;
 }
 
-FOR_EVERY_PROCESSOR
-static double square_of(const int16_t *values) {
-    int64_t total = 0;
-    for (int i = 0; i < EDGE_LEVELS; i++) total += values[i] * values[i];
-    return (double)total;
-}
-
 static void begin_query(struct query *q, const struct measure *m, const uint8_t *packed, const struct loops *loops) {
     q->measure = m;
-    if (m->edges_at >= 0) {
-        const uint8_t *edges = packed + m->edges_at;
-        loops->expand(m->edge_values, edges, q->edges);
-    }
+    if (m->edges_at >= 0) loops->prepare(q, packed + m->edges_at);
     if (m->colours_at >= 0)
         for (int i = 0; i < COLOUR_BYTES; i++) {
             q->colours[i] = packed[m->colours_at + i];
@@ -221,17 +289,12 @@ static void begin_query(struct query *q, const struct measure *m, const uint8_t 
         }
 }
 
-/* Prepare a query for bounds, too. */
-static void begin_bounds(struct query *q, const struct measure *m, const uint8_t *packed, const struct loops *loops) {
+/* Prepare a query of unknown length, for bounds, too. */
+static void begin_new(struct query *q, const struct measure *m, const uint8_t *packed, const struct loops *loops) {
     begin_query(q, m, packed, loops);
-    q->square = square_of(q->edges);
-    const uint8_t *edges = packed + m->edges_at;
-    for (int vector = 0; vector < EDGE_BYTES / 32; vector++)
-        for (int field = 0; field < 4; field++)
-            for (int i = 0; i < 32; i++) {
-                const int32_t value = m->edge_values[edges[32 * vector + i] >> (6 - 2 * field) & 3];
-                q->coarse[(4 * vector + field) * 32 + i] = (int8_t)((value + COARSE - 1) / COARSE);
-            }
+    if (m->edges_at < 0) return;
+    loops->edges(q, &packed, 1, &q->square);
+    if (loops->coarsen) loops->coarsen(q, packed + m->edges_at);
 }
 
 /* Store the similarity of a query to at most CHUNK rows, or bounds of it, from above. */
@@ -286,8 +349,7 @@ EXPORT void hbr_similarity(const struct measure *m, const uint8_t *queries, int6
     const uint8_t *chosen[CHUNK];
     double lengths[CHUNK];
     for (int64_t k = 0; k < query_count; k++, similar += count) {
-        begin_query(&q, m, queries + k * query_stride, loops);
-        q.square = square_of(q.edges);
+        begin_new(&q, m, queries + k * query_stride, loops);
         for (int64_t first = 0; first < count; first += CHUNK) {
             const int64_t some = count - first < CHUNK ? count - first : CHUNK;
             for (int64_t i = 0; i < some; i++) {
@@ -300,39 +362,27 @@ EXPORT void hbr_similarity(const struct measure *m, const uint8_t *queries, int6
     }
 }
 
-/* Store the similarity of rows to each other within groups: places (groups, size) -> (groups, size, size). Rows of one
-   kind are not compared, 1 is stored; kinds (size) may be null, for as many kinds as rows. */
-EXPORT void hbr_among(const struct measure *m, const uint8_t *rows, int64_t stride, const double *squares,
-                      const int64_t *places, int64_t groups, int64_t size, const int64_t *kinds, double *similar) {
+/* Store the similarity of two rows of each group, for all pairs: places (groups, size) -> (groups, pairs). Pairs with
+   the same first one follow each other. */
+EXPORT void hbr_pairs(const struct measure *m, const uint8_t *rows, int64_t stride, const double *squares,
+                      const int64_t *places, int64_t groups, int64_t size, const int64_t *first, const int64_t *second,
+                      int64_t pairs, double *similar) {
     const struct loops *loops = fastest();
     struct query q;
     const uint8_t *chosen[CHUNK];
-    double lengths[CHUNK], found[CHUNK];
-    int64_t others[CHUNK];
-    for (int64_t g = 0; g < groups; g++, places += size, similar += size * size)
-        for (int64_t a = 0; a < size; a++) {
-            int prepared = 0;
-            for (int64_t next = a; next < size;) {
-                int64_t some = 0;
-                for (; next < size && some < CHUNK; next++) {
-                    if (kinds && kinds[next] == kinds[a]) {
-                        similar[a * size + next] = similar[next * size + a] = 1.0;
-                        continue;
-                    }
-                    others[some] = next;
-                    chosen[some] = rows + places[next] * stride;
-                    lengths[some++] = squares[places[next]];
-                }
-                if (!some) break;
-                if (!prepared) {
-                    begin_query(&q, m, rows + places[a] * stride, loops);
-                    q.square = squares[places[a]];
-                    prepared = 1;
-                }
-                compare(&q, loops, 0, chosen, lengths, some, found);
-                for (int64_t i = 0; i < some; i++)
-                    similar[a * size + others[i]] = similar[others[i] * size + a] = found[i];
+    double lengths[CHUNK];
+    for (int64_t g = 0; g < groups; g++, places += size, similar += pairs)
+        for (int64_t p = 0; p < pairs;) {
+            const int64_t with = places[first[p]], begin = p;
+            int64_t some = 0;
+            for (; p < pairs && first[p] == first[begin] && some < CHUNK; p++) {
+                const int64_t place = places[second[p]];
+                chosen[some] = rows + place * stride;
+                lengths[some++] = squares[place];
             }
+            begin_query(&q, m, rows + with * stride, loops);
+            q.square = squares[with];
+            compare(&q, loops, 0, chosen, lengths, some, similar + begin);
         }
 }
 
@@ -369,7 +419,7 @@ EXPORT void hbr_bounds(const struct measure *m, const uint8_t *query, const uint
     const struct loops *loops = fastest();
     struct query q;
     double of_rows[CHUNK];
-    begin_bounds(&q, m, query, loops);
+    begin_new(&q, m, query, loops);
     for (int64_t j = 0; j < s->objects; j++) {
         double most = -1;
         for (int64_t first = 0; first < s->count[j];) {
@@ -393,7 +443,7 @@ EXPORT void hbr_nearest(const struct measure *m, const uint8_t *query, const uin
                         const double *bounds, int64_t kept, int64_t *nearest, double *similar) {
     const struct loops *loops = fastest();
     struct query q;
-    begin_bounds(&q, m, query, loops);
+    begin_new(&q, m, query, loops);
     int64_t found = 0; /* a heap: the furthest object first */
     for (int64_t k = 0; k < s->objects; k++) {
         const int64_t object = by_bound[k];

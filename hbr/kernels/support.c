@@ -35,18 +35,22 @@ EXPORT void hbr_support(const int64_t *rows, const int64_t *begin, const int64_t
             ring_deg[n + i] = deg + 360;
             own[i] = own[n + i] = levels[row];
         }
-        for (int64_t i = 0; i + 1 < two; i++) {
-            ring_deg[i] = (ring_deg[i + 1] + ring_deg[i]) / 2;
-            penalty[i] = (float)(ring_deg[i] * slope);
-        }
-        before[0] = none;
-        for (int64_t i = 0; i + 1 < two; i++) before[i + 1] = larger(before[i], own[i] + penalty[i]);
-        behind[two - 1] = none;
-        for (int64_t i = two - 2; i >= 0; i--) behind[i] = larger(behind[i + 1], own[i + 1] - penalty[i]);
         const double shift = 2 * FAR_DEG * (double)j; /* as the reference searches all objects at once */
+        for (int64_t i = 0; i + 1 < two; i++) {
+            const double end_deg = (ring_deg[i + 1] + ring_deg[i]) / 2;
+            penalty[i] = (float)(end_deg * slope);
+            ring_deg[i] = end_deg + shift;
+        }
+        float largest_before = none, largest_behind = none;
+        before[0] = behind[two - 1] = none;
+        for (int64_t i = 0, k = two - 2; i + 1 < two; i++, k--) { /* together: each waits for its last maximum */
+            before[i + 1] = largest_before = larger(largest_before, own[i] + penalty[i]);
+            behind[k] = largest_behind = larger(largest_behind, own[k + 1] - penalty[k]);
+        }
         int64_t nearest = 0;
         for (int b = 0; b < BINS; b++) {
-            while (nearest + 1 < two && ring_deg[nearest] + shift < seen_deg[b] + shift) nearest++;
+            const double seen = seen_deg[b] + shift;
+            while (nearest + 1 < two && ring_deg[nearest] < seen) nearest++;
             const float beside = larger(before[nearest] - slope_at[b], behind[nearest] + slope_at[b]);
             best[b] = larger(beside, own[nearest]);
         }

@@ -12,6 +12,7 @@ from hbr import DenseIndex, Views, tanimoto, update_belief
 from hbr.core.angles import size_deg
 from hbr.dense.filter import Belief, completed
 from hbr.dense.index import BINS
+from hbr.kernels import without_library
 from tests.fuzzing import examples
 from tests.hbr.dense.searches import belief_after
 
@@ -172,3 +173,7 @@ def test_nearest_view_is_that_of_a_search_among_all_views(seed: int, step_deg: f
     far_deg[:, index.left_out[place]] = np.inf
     np.testing.assert_array_equal(rows, index.rows[place, far_deg.argmin(axis=2)])
     np.testing.assert_array_equal(away_deg, far_deg.min(axis=2))
+    with without_library():
+        reference = index.nearest_view(place, at_deg)
+    np.testing.assert_array_equal(rows, reference[0])
+    np.testing.assert_array_equal(away_deg, reference[1])

@@ -15,6 +15,11 @@ void hbr_similarity(const struct measure *, const uint8_t *, int64_t, int64_t, c
                     const int64_t *, int64_t, double *);
 void hbr_support(const int64_t *, const int64_t *, const int64_t *, int64_t, const double *, const float *, double,
                  double, int64_t, double *, int64_t, float *);
+void hbr_pairs(const struct measure *, const uint8_t *, int64_t, const double *, const int64_t *, int64_t, int64_t,
+               const int64_t *, const int64_t *, int64_t, double *);
+void hbr_strongest(const double *, int64_t, int64_t, int64_t *, double *);
+void hbr_nearest_view(const int64_t *, const int64_t *, const int64_t *, const double *, const int64_t *, int64_t,
+                      const double *, int64_t, int64_t *, double *);
 void hbr_rotated(const int64_t *, const double *, int64_t, const int64_t *, const int64_t *, const int64_t *,
                  const double *, int64_t *);
 void hbr_paths(const uint8_t *, int64_t, int64_t, int64_t, const uint8_t *, int64_t, const int64_t *, const double *,
@@ -35,17 +40,20 @@ static void add(const void *data, size_t size) {
     for (const uint8_t *byte = data; size--; byte++) sum = (sum ^ *byte) * 1099511628211ULL;
 }
 
+static uint8_t packed[300 * 160];
+static double squares[300], similar[3 * 300];
+static struct measure measure = {0, 128, .6, .4, 0, 0, 0, 0};
+
 static void similarity(void) {
-    static uint8_t rows[300 * 160];
     static int32_t values[4] = {114, 1062, 2173, 3713}, weights[32];
-    static double far[6000], near[4096], squares[300], similar[3 * 300];
-    for (size_t i = 0; i < sizeof rows; i++) rows[i] = (uint8_t)(random_bits() >> 20);
+    static double far[6000], near[4096];
+    for (size_t i = 0; i < sizeof packed; i++) packed[i] = (uint8_t)(random_bits() >> 20);
     for (int i = 0; i < 32; i++) weights[i] = i < 12 ? 16 : 9;
     for (int i = 0; i < 6000; i++) far[i] = 1.0 / (1 + i * .3);
     for (int i = 0; i < 4096; i++) near[i] = 1 - 1e-5 * i;
-    const struct measure measure = {0, 128, .6, .4, values, weights, far, near};
-    hbr_squares(&measure, rows, 160, 300, squares);
-    hbr_similarity(&measure, rows, 160, 3, rows, 160, squares, 0, 300, similar);
+    measure = (struct measure){0, 128, .6, .4, values, weights, far, near};
+    hbr_squares(&measure, packed, 160, 300, squares);
+    hbr_similarity(&measure, packed, 160, 3, packed, 160, squares, 0, 300, similar);
     add(squares, sizeof squares);
     add(similar, sizeof similar);
 }
@@ -62,6 +70,32 @@ static void support(void) {
     for (int i = 0; i < 10; i++) begin[i] = i * 30, count[i] = 30;
     hbr_support(order, begin, count, 10, azimuth_deg, levels, 2 / 360., 1.7, 13, scratch, 60, found);
     add(found, sizeof found);
+}
+
+static void next_view(void) {
+    static double posterior[10 * 72], weight[16], azimuth_deg[300], at_deg[60], away_deg[60];
+    static int64_t best[16], order[300], begin[10], count[10], places[6], rows[60];
+    for (int i = 0; i < 10 * 72; i++) posterior[i] = (double)(random_bits() % 50) * .013;
+    for (int i = 0; i < 300; i++) {
+        order[i] = i;
+        azimuth_deg[i] = (i % 30) * 12 + (double)(random_bits() % 1000) * .01;
+    }
+    for (int j = 0; j < 10; j++) {
+        begin[j] = 30 * j;
+        count[j] = 30 - j;
+    }
+    for (int i = 0; i < 6; i++) places[i] = random_bits() % 10;
+    for (int i = 0; i < 60; i++) at_deg[i] = (double)(random_bits() % 200000) * .01 - 1000;
+    static const int64_t groups[2][4] = {{7, 299, 0, 12}, {5, 5, 80, 1}}, first[5] = {0, 0, 1, 3, 2};
+    static const int64_t second[5] = {1, 3, 2, 0, 3};
+    hbr_pairs(&measure, packed, 160, squares, groups[0], 2, 4, first, second, 5, similar);
+    add(similar, 10 * sizeof *similar);
+    hbr_strongest(posterior, 10, 16, best, weight);
+    hbr_nearest_view(order, begin, count, azimuth_deg, places, 6, at_deg, 10, rows, away_deg);
+    add(best, sizeof best);
+    add(weight, sizeof weight);
+    add(rows, sizeof rows);
+    add(away_deg, sizeof away_deg);
 }
 
 static void paths(void) {
@@ -124,5 +158,7 @@ int main(void) {
     printf("cedd %016llx\n", (unsigned long long)sum);
     paths();
     printf("paths %016llx\n", (unsigned long long)sum);
+    next_view();
+    printf("next_view %016llx\n", (unsigned long long)sum);
     return 0;
 }

@@ -1,0 +1,91 @@
+/* What the next view is chosen by, with the same bits as hbr/dense/next_view.py and hbr/dense/index.py. */
+#include "kernels.h"
+
+#define BINS 72
+#define LANES 8
+
+/* Add up a row in the order in which NumPy does. */
+static inline __attribute__((always_inline)) double sum_of_row(const double *row) {
+    double part[LANES];
+    for (int i = 0; i < LANES; i++) part[i] = row[i];
+    for (int b = LANES; b < BINS; b += LANES)
+        for (int i = 0; i < LANES; i++) part[i] += row[b + i];
+    return ((part[0] + part[1]) + (part[2] + part[3])) + ((part[4] + part[5]) + (part[6] + part[7]));
+}
+
+/* Store the `kept` strongest hypotheses of a posterior, (objects, 72), and their weights, the strongest first; of equal
+   ones, the first. A hypothesis is a peak of its object, and stands for the slopes beside it. */
+FOR_EVERY_PROCESSOR
+EXPORT void hbr_strongest(const double *posterior, int64_t objects, int64_t kept, int64_t *best, double *weight) {
+    int64_t found = 0;
+    for (int64_t j = 0; j < objects; j++, posterior += BINS) {
+        double around[BINS + 2], peaks[BINS], most[LANES] = {0}, largest = 0;
+        around[0] = posterior[BINS - 1];
+        for (int b = 0; b < BINS; b++) around[b + 1] = posterior[b];
+        around[BINS + 1] = posterior[0];
+        for (int b = 0; b < BINS; b++) {
+            const double here = around[b + 1];
+            peaks[b] = here >= around[b] && here >= around[b + 2] ? here : 0.0;
+        }
+        for (int b = 0; b < BINS; b += LANES)
+            for (int i = 0; i < LANES; i++) most[i] = peaks[b + i] > most[i] ? peaks[b + i] : most[i];
+        for (int i = 0; i < LANES; i++) largest = most[i] > largest ? most[i] : largest;
+        const double total = sum_of_row(peaks), share = total > 0 ? sum_of_row(posterior) / total : 0.0;
+        if (found == kept && largest * share <= weight[kept - 1]) continue;
+        for (int b = 0; b < BINS; b++) {
+            const double own = peaks[b] * share;
+            if (found == kept && own <= weight[kept - 1]) continue;
+            int64_t at = found < kept ? found++ : kept - 1;
+            for (; at && weight[at - 1] < own; at--) {
+                weight[at] = weight[at - 1];
+                best[at] = best[at - 1];
+            }
+            weight[at] = own;
+            best[at] = j * BINS + b;
+        }
+    }
+}
+
+/* The nearest whole number, the even one of two, below 2^51. */
+static inline double nearest_whole(double value) { return (value + 6755399441055744.0) - 6755399441055744.0; }
+
+/* The size of a difference of directions, 0..180. */
+static inline double size_deg(double difference) {
+    const double size = difference - 360.0 * nearest_whole(difference / 360.0);
+    return size < 0 ? -size : size;
+}
+
+/* The remainder, in [0, 360), of an angle below 10^9: the product and the differences are exact. */
+static inline double wrap360(double deg) {
+    double rest = deg - 360.0 * (double)(int64_t)(deg / 360.0);
+    if (rest >= 360.0) rest -= 360.0;
+    if (rest < 0) rest += 360.0;
+    return rest == 360.0 ? 0.0 : rest; /* a tiny negative angle is rounded up */
+}
+
+/* Store which view of each object is nearest to azimuths, (angles, size), and how far away it is; of equally near ones,
+   the one with the smaller azimuth.
+
+   Object j has the `count[j]` rows from `order[begin[j]]` on, by rising azimuth. */
+EXPORT void hbr_nearest_view(const int64_t *order, const int64_t *begin, const int64_t *count,
+                             const double *azimuth_deg, const int64_t *places, int64_t size, const double *at_deg,
+                             int64_t angles, int64_t *rows, double *away_deg) {
+    for (int64_t m = 0; m < size; m++) {
+        const int64_t *own = order + begin[places[m]], n = count[places[m]];
+        const double shift = 1000.0 * (double)m; /* as the reference searches all objects at once */
+        int64_t next = 0;                        /* the first view at or behind the azimuth: often near the last one */
+        for (int64_t a = 0; a < angles; a++) {
+            const double at = at_deg[a * size + m], key = wrap360(at) + shift;
+            while (next < n && azimuth_deg[own[next]] + shift < key) next++;
+            while (next && azimuth_deg[own[next - 1]] + shift >= key) next--;
+            const int64_t behind = next == n ? 0 : next;
+            int64_t before = next ? next - 1 : n - 1;
+            while (before && azimuth_deg[own[before - 1]] == azimuth_deg[own[before]]) before--;
+            const double before_deg = size_deg(azimuth_deg[own[before]] - at);
+            const double behind_deg = size_deg(azimuth_deg[own[behind]] - at);
+            const int is_before = before_deg < behind_deg || (before_deg == behind_deg && before < behind);
+            rows[a * size + m] = own[is_before ? before : behind];
+            away_deg[a * size + m] = is_before ? before_deg : behind_deg;
+        }
+    }
+}
