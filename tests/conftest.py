@@ -29,7 +29,7 @@ from sim.world import World
 
 # A deadline measures the machine, not the code; pytest-timeout catches what hangs. A clone passes or fails the same way
 # for everybody; `--hypothesis-profile=nightly` looks for what no run has seen.
-settings.register_profile("rig", deadline=None, derandomize=True, database=None, max_examples=30)
+settings.register_profile("rig", deadline=None, derandomize=True, database=None, max_examples=15)
 settings.register_profile("nightly", deadline=None, max_examples=1000)
 settings.load_profile("rig")
 

@@ -136,9 +136,9 @@ def test_all_calibrates_the_bench_and_report_shows_it(rig, tmp_path, monkeypatch
     known = {result.name: result for folder, _ in (imu_calibration, servo_calibration) for result in results_in(folder)}
     for procedure in (Backlash, Encoder, MotionModel, GyroScale, ImuMounting, GyroNoise, GyroRotation):
         monkeypatch.setattr(procedure, "live", lambda self, *_: (known[name] for name in self.names))
-    monkeypatch.setattr(camera_light, "CARD_FRAMES", 12)
-    monkeypatch.setattr(camera_light, "PAIRS", 12)
-    monkeypatch.setattr(camera_model, "ANGLES_DEG", camera_model.ANGLES_DEG[::2])
+    monkeypatch.setattr(camera_light, "CARD_FRAMES", 8)
+    monkeypatch.setattr(camera_light, "PAIRS", 8)
+    monkeypatch.setattr(camera_model, "ANGLES_DEG", camera_model.ANGLES_DEG[::3])
     monkeypatch.setattr(table_axis, "ANGLES_DEG", table_axis.ANGLES_DEG[::3])
     rejected = rig("calibrate", "table")
     assert rejected.exit_code == 2

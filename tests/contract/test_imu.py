@@ -118,7 +118,10 @@ SENSORS: dict[str, Callable[[NoiseModel], Opened]] = {
 }
 
 
-@pytest.fixture(params=[pytest.param(name, marks=[pytest.mark.kernel] * (name == "device-file")) for name in SENSORS])
+MARKS = {"device-file": pytest.mark.kernel, "head-avr": NIGHTLY}
+
+
+@pytest.fixture(params=[pytest.param(name, marks=MARKS.get(name, ())) for name in SENSORS])
 def open_sensor(request: pytest.FixtureRequest) -> Callable[[NoiseModel], Opened]:
     return SENSORS[request.param]
 

@@ -35,8 +35,8 @@ This page lists the faults that the simulator can produce. For each fault it sho
 and how to recover.
 
 Each row is a test (`pytest tests/faults/test_every_fault.py -k jam`). With the real drivers on the simulated bench, the
-test runs an enrollment of {VIEWS} views ({SHORT} if the fault does not stop it, {LATE} if the last view shows it)
-and an identification. Both complete or stop with the error code in the row. Afterwards:
+test runs an enrollment of {VIEWS} views ({SHORT} if the fault does not stop it, {LATE} if the last view or
+only a large move shows it) and an identification. Both complete or stop with the error code in the row. Afterwards:
 
 - The table stands still and the servo's torque is off. Only a servo that cannot be reached holds the table.
 - No view that was reported as stored is lost or damaged.

@@ -31,10 +31,10 @@ from sim.world import World
 from tests.faults.angle_code import Coded, coded_deg
 
 VIEWS = 72
-SHORT = 6
+SHORT = 5
 """Views of an enrollment that need not be longer."""
-LATE = 24
-"""Views of an enrollment that detects the fault only at its end."""
+LATE = 12
+"""Views of an enrollment that detects the fault only at its end, or only in a large move."""
 NAME = "toy-car"
 KNOWN = (NAME, "cereal-puzzle", "dice")
 NOISE = NoiseModel(full_well_e=0, read_noise_e=0)
@@ -157,7 +157,7 @@ def known_views() -> hbr.ViewIndex:
     """Return the views of three objects, enrolled without a fault."""
     with TemporaryDirectory() as folder, new_rig(Path(folder), seed=1) as rig, rig.opened() as (bench, catalog):
         for name in KNOWN:
-            for _ in enroll(bench, catalog, name, views=12):
+            for _ in enroll(bench, catalog, name, views=8):
                 pass
         return hbr.ViewIndex(catalog.views().views)
 

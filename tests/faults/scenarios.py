@@ -57,7 +57,7 @@ class Scenario:
     torque
         Whether the servo's torque stays on because the servo cannot be reached.
     late
-        Whether the enrollment detects the fault only at its end, however large its moves are.
+        Whether the enrollment detects the fault only at its end, or only in a large move.
     """
 
     fault: str
@@ -117,7 +117,12 @@ SCENARIOS: dict[str, Scenario] = {
         ),
         survived("servo.slow", "not detected: answers within the timeout are valid"),
         stopped(
-            "servo.delayed", 502, "encoder and gyro disagree on the way back to home", "restart the servo", step=ACK
+            "servo.delayed",
+            502,
+            "encoder and gyro disagree in a move of more than 10°",
+            "restart the servo",
+            step=ACK,
+            late=True,
         ),
         survived("servo.intermittent", "timeout; the transaction is repeated and counted"),
         # -- the gyro --------------------------------------------------------------------------------------------

@@ -24,6 +24,8 @@ roi = [40, 0, 240, 240]
 """
 KILLS = int(os.environ.get("RIG_TEST_KILLS", "1"))
 """Kills of each command; `make test-kills` asks for more."""
+SIMILAR = ("merge", "delete", "gc", "calibrate", "verify")
+"""Commands that store their work as others do; with one kill, only the nightly tests run them."""
 
 Rig = Callable[..., Result]
 
@@ -71,7 +73,9 @@ def state(rig: Rig, home: Path) -> dict[str, Any]:
     }
 
 
-@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize(
+    "command", [pytest.param(one, marks=[pytest.mark.nightly] * (KILLS == 1 and one in SIMILAR)) for one in COMMANDS]
+)
 def test_killed_command_loses_nothing_and_completes(folder: Path, rig: Rig, command: str) -> None:
     process = Program(
         str(folder), str(KILLS), "1", command, code="from tests.faults.killed_commands import main; main()"

@@ -252,7 +252,10 @@ def test_unknown_bench_and_unknown_command_are_rejected(rig):
     assert rig("fly").exit_code == 2
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
+@pytest.mark.parametrize(
+    ("number", "code"),
+    [(signal.SIGINT, 130), (signal.SIGTERM, 143), pytest.param(signal.SIGHUP, 129, marks=pytest.mark.nightly)],
+)
 def test_signals_end_an_enrollment_with_their_exit_code_and_resume_continues_it(rig, number, code):
     options = ["--views", "18", "--note", "the owner's", "--report", "a b.html", "--yes", "--json"]
     # as a background job of a script begins

@@ -128,6 +128,7 @@ def test_impossible_deadman_is_rejected(opened):
 # -- outputs -----------------------------------------------------------------------------------------------------
 
 
+@AVR_NIGHTLY
 def test_light_and_power_follow_requests(opened):
     switch_on(opened)
     opened.imu.set_light(0.2)
@@ -144,6 +145,7 @@ def test_light_and_power_follow_requests(opened):
     assert not opened.imu.status.faults  # it rests in peace
 
 
+@AVR_NIGHTLY
 def test_trigger_pulse_has_the_requested_width_and_time(opened):
     opened.clock.sleep(1.0)
     began_ns = opened.imu.trigger(0.002)
@@ -218,6 +220,7 @@ def test_estop_acts_within_a_millisecond_without_the_computer(opened):
     assert not opened.head.relay_closed
 
 
+@AVR_NIGHTLY
 def test_restarted_head_reports_it_and_continues_to_measure(opened):
     switch_on(opened)
     opened.clock.sleep(0.5)
@@ -396,6 +399,7 @@ def test_port_in_use_is_reported():
 # -- the sensor ------------------------------------------------------------------------------------------------------
 
 
+@AVR_NIGHTLY
 def test_lost_sensor_is_reported_and_recovered(opened):
     opened.clock.sleep(0.2)
     opened.imu.read_samples()
@@ -442,6 +446,7 @@ def test_permanently_stuck_bus_is_reported(opened):
         opened.imu.read_samples()
 
 
+@AVR_NIGHTLY
 def test_unacknowledged_addresses_cost_no_sample(opened):
     opened.clock.sleep(0.2)
     opened.imu.read_samples()
@@ -452,6 +457,7 @@ def test_unacknowledged_addresses_cost_no_sample(opened):
     assert opened.imu.counters().nacks == 40
 
 
+@AVR_NIGHTLY
 def test_samples_without_data_ready_have_a_larger_time_uncertainty(opened):
     opened.sensor.next_edge_ns = lambda _after_ns: None  # INT is not wired
     opened.clock.sleep(0.3)

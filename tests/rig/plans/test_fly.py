@@ -129,7 +129,9 @@ MISTIMED = ("stamp_jump:ms=15", "stamps_backwards", "stamp_jitter")
 UNRELIABLE = ("camera.slow:fps=10", "camera.intermittent")
 
 
-@pytest.mark.parametrize("kinds", [MISSING, MISTIMED, UNRELIABLE])
+@pytest.mark.parametrize(
+    "kinds", [MISTIMED, *(pytest.param(one, marks=pytest.mark.nightly) for one in (MISSING, UNRELIABLE))]
+)
 def test_faulty_frames_leave_only_true_views(tmp_path: Path, kinds: tuple[str, ...]) -> None:
     check_true_views(tmp_path, *(f"{kind}@{1.5 + 1.1 * i:.1f}s+0.8s" for i, kind in enumerate(kinds)))
 
@@ -151,7 +153,11 @@ def check_true_views(tmp_path: Path, *faults: str) -> None:
 
 @pytest.mark.parametrize(
     ("fault", "kind"),
-    [("slip:angle=3@2s", RotationDisagreement), ("jam@2s", RigError), ("unplug@2s", RigError)],
+    [
+        ("slip:angle=3@2s", RotationDisagreement),
+        pytest.param("jam@2s", RigError, marks=pytest.mark.nightly),
+        pytest.param("unplug@2s", RigError, marks=pytest.mark.nightly),
+    ],
 )
 def test_failed_turn_stores_no_view(tmp_path: Path, fault: str, kind: type[RigError]) -> None:
     error, events, _ = outcome(tmp_path, fault)

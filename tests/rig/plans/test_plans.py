@@ -28,7 +28,7 @@ from sim.bench import ShelfOperator, open_sim_bench
 from sim.objects.shelf import shelf
 from sim.world import World
 
-VIEWS = 18
+VIEWS = 12
 SMALL = ("camera.width=320", "camera.height=240", "view.roi=[40, 0, 240, 240]")
 
 
@@ -411,7 +411,7 @@ def test_events_depend_on_nothing_but_the_seed(simulated, tmp_path):
     def run(seed: int, folder: str) -> list[dict]:
         s = simulated(seed=seed)
         with Catalog.open(tmp_path / folder, clock=s.bench.clock) as catalog:
-            events = [event_dict(e) for e in enroll(s.bench, catalog, "toy-car", views=6)]
+            events = [event_dict(e) for e in enroll(s.bench, catalog, "toy-car", views=4)]
             return events + [event_dict(e) for e in identify(s.bench, hbr.ViewIndex(catalog.views().views))]
 
     events = run(5, "a")

@@ -34,8 +34,9 @@ def on_head(simulated):
     return open_one
 
 
-def test_object_is_enrolled_and_found_with_the_binarys_gyro_alone(on_head, tmp_path):
-    s = on_head("avr", "identify.first_step_deg=90", "table.velocity_dps=180")  # each second is half a second of work
+@pytest.mark.parametrize("kind", ["memory", pytest.param("avr", marks=pytest.mark.nightly)])
+def test_object_is_enrolled_and_found_with_the_heads_gyro_alone(on_head, tmp_path, kind):
+    s = on_head(kind, "identify.first_step_deg=90", "table.velocity_dps=180")  # each second is half a second of work
     truth_deg = []
     with Catalog.open(tmp_path, clock=s.bench.clock) as catalog:
         for name in ("lamp", "mug-dots"):
