@@ -99,13 +99,13 @@ def files() -> Iterator[Path]:
 def retired_terms() -> list[str]:
     """Return every retired term that is used: file, line and term."""
     patterns = {term: re.compile(rf"\b(?:{term.replace('_', ' ')})\b", re.IGNORECASE) for term in RETIRED}
-    any_of_them = re.compile("|".join(pattern.pattern for pattern in patterns.values()), re.IGNORECASE)
+    any_of_them = re.compile("|".join(pattern.pattern for pattern in patterns.values()))  # in lower case: it is faster
     found = []
     for path in files():
         name = path.relative_to(ROOT).as_posix()
         allowed = EXCEPTIONS.get(name, ())
         content = path.read_text(encoding="utf-8")
-        if not any_of_them.search(words(content)):
+        if not any_of_them.search(words(content).lower()):
             continue
         for number, line in enumerate(content.splitlines(), 1):
             text = words(line)
@@ -133,11 +133,11 @@ def named(tree: ast.AST) -> Iterator[tuple[str, int]]:
 
 
 def test_no_name_has_a_retired_word():
-    any_of_them = re.compile(rf"\b(?:{'|'.join(RETIRED_NAMES)})\b", re.IGNORECASE)
+    any_of_them = re.compile(rf"\b(?:{'|'.join(RETIRED_NAMES)})\b")
     found = [
         f"{path.relative_to(ROOT)}:{line}: {name}"
         for path in files()
-        if path.suffix == ".py" and any_of_them.search(words(content := path.read_text(encoding="utf-8")))
+        if path.suffix == ".py" and any_of_them.search(words(content := path.read_text(encoding="utf-8")).lower())
         for name, line in named(ast.parse(content))
         if name not in ALLOWED_NAMES
         and not name.startswith("test_")
