@@ -4,6 +4,7 @@ They share a background, which is learned while the table turns (`hbr.segmentati
 improves the segmentation of the earlier ones.
 """
 
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -13,7 +14,7 @@ from hbr.descriptors.base import Descriptor
 from hbr.descriptors.registry import descriptor as descriptor_of
 from hbr.segmentation import Background, Method, Segmentation, hypotheses
 from hbr.segmentation.learned import LearnedBackground
-from hbr.segmentation.segment import MOST_HYPOTHESES
+from hbr.segmentation.segment import MOST_HYPOTHESES, without_background
 
 #: Segmentations that other views do not improve.
 _FINAL: Final = (Method.PLAIN_BACKGROUND, Method.EMPTY_TABLE)
@@ -61,11 +62,14 @@ class ViewsTogether:
         self._several = several
         self._images: list[ImageArray] = []
         self._learned = LearnedBackground()
+        self._alone: dict[int, tuple[Segmentation, ...]] = {}
         self.segmentations: list[tuple[Segmentation, ...]] = []
         self.levels: list[LevelArray] = []
 
     def add(self, image_bgr: ImageArray, *, revise: bool = True) -> tuple[Segmentation, ...]:
         """Add a view, and segment the earlier ones again if asked for; return the segmentations of the new view.
+
+        The object is also guessed in each view, except in those of many that are not segmented again.
 
         Raises
         ------
@@ -95,11 +99,24 @@ class ViewsTogether:
         """Segment all views again that other views can improve."""
         for view, found in enumerate(self.segmentations):
             if not found or found[0].method not in _FINAL:
-                self._describe(view)
+                self._describe(view, guess=self._several)
 
-    def _describe(self, view: int) -> None:
-        learned = self._learned.of(view)
-        most = MOST_HYPOTHESES if self._several else 1
-        found = hypotheses(self._images[view], empty_table=self._table, learned=learned, most=most)
-        self.segmentations[view] = found
-        self.levels[view] = np.stack([self._descriptor.describe(one) for one in found])
+    def _describe(self, view: int, *, guess: bool = False) -> None:
+        found = hypotheses(
+            self._images[view],
+            empty_table=self._table,
+            learned=self._learned.of(view),
+            alone=partial(self._without_background, view) if guess else None,
+            most=MOST_HYPOTHESES if self._several else 1,
+        )
+        described = {id(one): row for one, row in zip(self.segmentations[view], self.levels[view], strict=True)}
+        rows = [described[id(one)] if id(one) in described else self._descriptor.describe(one) for one in found]
+        self.segmentations[view], self.levels[view] = found, np.stack(rows)
+
+    def _without_background(self, view: int) -> tuple[Segmentation, ...]:
+        """Return the segmentations of a view that no other view changes; they are computed once."""
+        if view not in self._alone:
+            known = self.segmentations[view]
+            is_first = bool(known) and known[0].method is Method.GUESS
+            self._alone[view] = known if is_first else without_background(self._images[view])
+        return self._alone[view]

@@ -1,5 +1,6 @@
 """Segmentation of a frame: the object's box, mask and illumination, and a crop of fixed size."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Final
 
@@ -22,9 +23,12 @@ _PATCH_SPREAD: Final = 12.0
 
 #: Probabilities above which a pixel belongs to the object: of the first segmentation, and of further ones.
 _LEVELS: Final = (0.5, 0.2, 0.8)
+#: The same of an enrolled view with a learned background: where an object looks the same from all sides, it is part of
+#: that background, and less probable.
+_ENROLLED_LEVEL: Final = 0.25
 #: Boxes that overlap by more are one.
 _SAME_BOX: Final = 0.85
-MOST_HYPOTHESES: Final = 4
+MOST_HYPOTHESES: Final = 5
 
 
 @renamed_keyword("reference", "empty_table")
@@ -144,6 +148,7 @@ def hypotheses(
     *,
     empty_table: Background | ImageArray | None = None,
     learned: Background | None = None,
+    alone: Callable[[], Sequence[Segmentation]] | None = None,
     most: int = MOST_HYPOTHESES,
 ) -> tuple[Segmentation, ...]:
     """Return several segmentations of a frame, the likeliest first, whose boxes differ.
@@ -158,6 +163,9 @@ def hypotheses(
     learned : Background, optional
         The background that the other views of the search show (`hbr.segmentation.learned.LearnedBackground.of`). The
         object is not guessed then.
+    alone : callable, optional
+        Returns what `without_background` returns for this frame: segmentations that count besides those with the
+        learned background. No other view changes them. By default the network's alone counts.
     most : int
         Largest number of segmentations.
 
@@ -187,15 +195,33 @@ def hypotheses(
         nothing = cut_out(image_bgr, None, None, None, agreement, Method.NONE, (*issues, Issue(IssueCode.NO_OBJECT)))
         like = replace(nothing, issues=tuple(issues))
         share = shares(small, learned.difference(small), learned=True).object
-        found = _by_network(image_bgr, share, Method.ROTATION, like, levels=_LEVELS[: max(1, most - 1)])
+        levels = _LEVELS if most > 1 else (_ENROLLED_LEVEL,)
+        found = _by_network(image_bgr, share, Method.ROTATION, like, levels=levels)
         if most > 1:
-            found += _by_network(image_bgr, shares(small).object, Method.NETWORK, like)
+            by_itself = None if alone is None else alone()
+            found += by_itself or _by_network(image_bgr, shares(small).object, Method.NETWORK, like)
         found = found or [nothing]
     several: list[Segmentation] = []
     for one in found:
         if not any(_same(known, one) for known in several):
             several.append(one)
     return tuple(several[:most])
+
+
+def without_background(image_bgr: ImageArray) -> tuple[Segmentation, ...]:
+    """Return the guess and the network's segmentation of a frame, if they found an object.
+
+    Raises
+    ------
+    TypeError, ValueError
+        As for `segment`.
+    """
+    _, small, _ = compared(image_bgr, None)
+    guess = _segmented(image_bgr, small, None, None)
+    return (
+        *([] if guess.box is None else [guess]),
+        *_by_network(image_bgr, shares(small).object, Method.NETWORK, guess),
+    )
 
 
 def _by_network(

@@ -50,6 +50,21 @@ def test_further_views_revise_the_segmentation_of_earlier_ones() -> None:
     assert [len(levels) for levels in views.levels] == [len(found) for found in views.segmentations]
 
 
+def test_the_guess_counts_beside_the_segmentations_with_a_learned_background() -> None:
+    images, _, _ = frames(3)
+    views, again = hbr.ViewsTogether("edges+colours"), hbr.ViewsTogether("edges+colours", several=False)
+    for image in images:
+        views.add(image)
+        again.learn(image)
+    again.revise()
+    for image, found, levels in zip(images, views.segmentations, views.levels, strict=True):
+        guess = hbr.segment(image).box
+        assert max(overlap(one.box, guess) for one in found) >= 0.85
+        for one, row in zip(found, levels, strict=True):  # also of those that were described after an earlier view
+            np.testing.assert_array_equal(hbr.descriptor("edges+colours").describe(one), row)
+    assert [len(found) for found in again.segmentations] == [1] * 3  # an enrollment has one
+
+
 def test_the_network_uses_the_empty_table_image() -> None:
     images, empty, boxes = frames(1)
     found = hbr.hypotheses(images[0], empty_table=empty, most=1)

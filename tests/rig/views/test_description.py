@@ -65,8 +65,9 @@ def test_search_in_motion_learns_the_background_and_leaves_earlier_views_alone()
     at_rest, moving = (SearchDescriber(WHOLE, BENCH_DESCRIPTOR, revise=revises) for revises in (True, False))
     views = [(at_rest(frame), moving(frame)) for frame in frames]
     assert [view.earlier for _, view in views] == [None] * 3
-    for view, other in views:  # the newest view is segmented with the same background
-        assert np.array_equal(view.levels[BENCH_DESCRIPTOR], other.levels[BENCH_DESCRIPTOR])
+    for view, other in views:  # the newest view is segmented with the same background; at rest, it is guessed, too
+        rows = {row.tobytes() for row in view.levels[BENCH_DESCRIPTOR]}
+        assert {row.tobytes() for row in other.levels[BENCH_DESCRIPTOR]} <= rows
     assert views[-1][0].earlier is not None
     assert len(views[-1][0].earlier) == 2
 
