@@ -38,10 +38,17 @@ class Trajectory:
     def at(self, time_s: ArrayLike) -> tuple[Floats, Floats]:
         """Return position and velocity at ``time_s``; before the first piece, its beginning."""
         t = np.asarray(time_s, dtype=np.float64)
-        i = np.maximum(np.searchsorted(self.start_s, t, side="right") - 1, 0)
+        i = np.maximum(self.start_s.searchsorted(t, side="right") - 1, 0)
         tau = np.maximum(t - self.start_s[i], 0.0)
         v, a = self.velocity_dps[i], self.acceleration_dps2[i]
         return self.position_deg[i] + v * tau + 0.5 * a * tau**2, v + a * tau
+
+    def state_at(self, time_s: float) -> tuple[float, float, float]:
+        """Return position, velocity and acceleration at one time: as `at`, which takes ten times as long for it."""
+        i = max(int(self.start_s.searchsorted(time_s, side="right")) - 1, 0)
+        tau = max(time_s - self.start_s.item(i), 0.0)
+        x, v, a = self.position_deg.item(i), self.velocity_dps.item(i), self.acceleration_dps2.item(i)
+        return x + v * tau + 0.5 * a * (tau * tau), v + a * tau, a
 
     def acceleration_at(self, time_s: ArrayLike) -> Floats:
         """Return the acceleration at ``time_s``."""
@@ -161,6 +168,11 @@ class Ripple:
         self._amplitude_deg = share * self._PERIOD_DEG / (2 * np.pi)
         self._per_deg = 2 * np.pi / self._PERIOD_DEG
 
+    def angle_deg(self, angle_deg: float, speed_dps: float) -> float:
+        """Return what the ripple adds to the angle of a shaft: as `at`, for one time."""
+        fade = min(abs(speed_dps) / self._FADES_DPS, 1.0)
+        return self._amplitude_deg * fade * float(np.sin(angle_deg * self._per_deg))
+
     def at(self, shaft: "Trajectory", time_s: ArrayLike) -> tuple[Floats, Floats]:
         """Return what the ripple adds to the angle and to the rate (°, °/s)."""
         t = np.asarray(time_s, dtype=np.float64)
@@ -211,17 +223,20 @@ class Platter:
         """Return the platter's angle and rate (°, °/s) at times within this path."""
         t = np.asarray(time_s, dtype=np.float64)
         angle, rate = self._rigid(t)
+        if self._omega == 0:
+            return angle, rate
         deflection, deflection_rate = self._vibration(t)
         return angle + deflection, rate + deflection_rate
 
     def _knot(self, t: Floats) -> NDArray[np.intp]:
-        return np.maximum(np.searchsorted(self.shaft.start_s, t, side="right") - 1, 0)
+        return np.maximum(self.shaft.start_s.searchsorted(t, side="right") - 1, 0)
 
     def _rigid(self, t: Floats) -> tuple[Floats, Floats]:
         x, v = self.shaft.at(t)
         held = self._platter[self._knot(t)]
-        angle = np.clip(held, x - self._half_play, x + self._half_play)
-        engaged = ((v > 0) & (angle <= x - self._half_play)) | ((v < 0) & (angle >= x + self._half_play))
+        low, high = x - self._half_play, x + self._half_play
+        angle = np.minimum(np.maximum(held, low), high)
+        engaged = ((v > 0) & (angle <= low)) | ((v < 0) & (angle >= high))
         return angle, np.where(engaged, v, 0.0)
 
     def _vibration(self, t: Floats) -> tuple[Floats, Floats]:

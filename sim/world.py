@@ -112,14 +112,13 @@ class World:
     def shaft(self, time_ns: int | None = None) -> tuple[float, float]:
         """Return angle (°) and speed (°/s) of the servo's shaft, without ripple."""
         t = self.clock.now_ns() if time_ns is None else time_ns
-        x, v = self._motions[self._index(t)][1].shaft.at(t * 1e-9)
-        return float(x), float(v)
+        x, v, _ = self._motions[self._index(t)][1].shaft.state_at(t * 1e-9)
+        return x, v
 
     def rippled_deg(self) -> float:
         """Return the angle of the servo's shaft with the ripple of its speed, as the encoder sees it."""
-        t = self.clock.now_ns()
-        shaft = self._motions[self._index(t)][1].shaft
-        return float(shaft.at(t * 1e-9)[0] + self._ripple.at(shaft, t * 1e-9)[0])
+        angle_deg, speed_dps = self.shaft()
+        return angle_deg + self._ripple.angle_deg(angle_deg, speed_dps)
 
     def table_deg(self, time_ns: int | None = None) -> float:
         """Return the true angle of the platter, now or at a time not longer ago than `HISTORY_S`."""

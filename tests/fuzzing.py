@@ -9,7 +9,7 @@ from typing import NoReturn
 
 from hypothesis import HealthCheck, settings
 
-CASES, NIGHTLY_CASES = 60, 20_000
+CASES, NIGHTLY_CASES = 30, 20_000
 
 
 def fuzz_settings(share: float = 1.0) -> settings:
@@ -23,8 +23,8 @@ def fuzz_settings(share: float = 1.0) -> settings:
 
 
 def examples(count: int) -> settings:
-    """Return settings for ``count`` cases, and 20 times as many in the nightly profile."""
-    return settings(max_examples=count * (20 if _is_nightly() else 1), deadline=None)
+    """Return settings for ``count`` cases, and 40 times as many in the nightly profile."""
+    return settings(max_examples=count * (40 if _is_nightly() else 1), deadline=None)
 
 
 def _is_nightly() -> bool:

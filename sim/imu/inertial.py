@@ -91,8 +91,7 @@ class InertialModel:
         felt[:, :3] = rate_dps[:, None] * (self.gyro_gain * self.up) + bias
         felt[:, :3] += self.warmth_c(times_ns)[:, None] * self.gyro_slope_dps_c
         felt[:, 3:] = self.up + self.accel_bias_g
-        settled = np.tile(felt[0], (2, 1))
-        before, filtered_before = (settled, settled) if self._filter_state is None else self._filter_state
+        before, filtered_before = self._filter_state or (felt[[0, 0]],) * 2
         felt += self._density * sqrt(rate_hz / 2) * draws[:, :6]
         felt = np.concatenate([before, felt])
         filtered = np.concatenate([filtered_before, _filtered(felt, filtered_before, rate_hz, bandwidth_hz)])

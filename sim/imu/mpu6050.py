@@ -224,7 +224,7 @@ class SimMpu6050:
         values[:, :3] = accel * LSB_PER_G[self._registers[ACCEL_CONFIG] >> 3 & 3]
         values[:, 3] = (die_c - self.ZERO_C) * self.LSB_PER_C
         values[:, 4:] = gyro * LSB_PER_DPS[self._registers[GYRO_CONFIG] >> 3 & 3]
-        words: Words = np.clip(np.rint(values), -32768, 32767).astype(">i2")
+        words: Words = np.minimum(np.maximum(np.rint(values), -32768), 32767).astype(">i2")
         return words
 
 

@@ -89,8 +89,7 @@ class Motor:
     def state(self) -> MotorState:
         now_s = self._now_s()
         angle, speed = self._world.shaft()
-        position, velocity = self.commanded.at(now_s)
-        target, target_dps = float(position), float(velocity)
+        target, target_dps, acceleration = self.commanded.state_at(now_s)
         load = pwm = 0.0
         if self.driven:
             pushing = (target - angle) / _ERROR_AT_STALL_DEG
@@ -98,7 +97,7 @@ class Motor:
                 load = _clamp(pushing)
             else:
                 friction = FRICTION_LOAD * ((speed > 0) - (speed < 0))
-                inertia = (1 - FRICTION_LOAD) * float(self.commanded.acceleration_at(now_s)) / self.steepest_dps2
+                inertia = (1 - FRICTION_LOAD) * acceleration / self.steepest_dps2
                 load = _clamp(friction + inertia + (pushing if self._friction else 0.0))
             pwm = _clamp(speed / self.fastest_dps + load)
         return MotorState(angle, speed, target, target_dps, load, pwm)

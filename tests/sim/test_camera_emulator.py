@@ -115,7 +115,7 @@ def test_number_of_buffers_can_be_chosen(buffers: int) -> None:
     assert at_once == buffers
 
 
-@examples(12)
+@examples(6)
 @given(st.lists(st.integers(0, 400_000_000), min_size=1, max_size=12))
 def test_stamps_rise_and_no_frame_comes_before_it_is_exposed(waits_ns: list[int]) -> None:
     world = World(noise=QUIET)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from sim.clock import EPOCH, VirtualClock
 from tests.fuzzing import examples
 
-quick = examples(21)
+quick = examples(10)
 times = st.lists(st.integers(0, 1_000), max_size=30)
 
 

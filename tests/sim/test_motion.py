@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from sim.motion import Platter, Trajectory, dragged, rest, to_position, to_velocity
 from tests.fuzzing import examples
 
-quick = examples(21)
+quick = examples(10)
 angles = st.floats(-2_000, 2_000)
 speeds = st.floats(-300, 300)
 limits = st.floats(1, 400)
@@ -97,6 +97,14 @@ def test_goal_too_near_to_stop_at_is_overshot_without_a_jump() -> None:
     assert path.at([0.5, 1.0])[0] == pytest.approx([3.75, 5.0])
     assert path.end_s == pytest.approx(1.0 + 2 * sqrt(1.0 / 10.0))
     assert path.at(path.end_s - 1e-9)[0] == pytest.approx(4.0)
+
+
+@quick
+@given(trajectories(), st.floats(-1.0, 30.0))
+def test_state_at_one_time_is_that_of_an_array_of_times(path: Trajectory, after_s: float) -> None:
+    time_s = float(path.start_s[0]) + after_s
+    position, velocity = path.at([time_s])
+    assert path.state_at(time_s) == (position[0], velocity[0], path.acceleration_at([time_s])[0])
 
 
 @quick

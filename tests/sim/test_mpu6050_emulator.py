@@ -110,7 +110,7 @@ def test_ad0_changes_the_address_not_the_identity() -> None:
 
 
 @given(register=st.integers(0, 0x7F), value=st.integers(0, 255))
-@examples(70)
+@examples(35)
 def test_only_the_writable_bits_of_writable_registers_change(register: int, value: int) -> None:
     kept = {DIV: 0xFF, CONFIG: 0x3F, GYRO_CONFIG: 0xF8, ACCEL_CONFIG: 0xF8, FIFO_EN: 0xFF, USER_CTRL: 0x70, PWR: 0x6F}
     sensor = SimMpu6050(World(noise=NoiseModel.none()))
@@ -166,7 +166,7 @@ def test_temperature_follows_the_datasheets_formula(chip: Chip) -> None:
     fifo=st.integers(0, 31).map(lambda bits: bits << 3),
     wait_ms=st.integers(1, 80),
 )
-@examples(21)
+@examples(10)
 def test_fifo_fills_at_the_sample_rate_with_the_chosen_words(divider: int, dlpf: int, fifo: int, wait_ms: int) -> None:
     words = 3 * bool(fifo & 0x08) + sum(bool(fifo & bit) for bit in (0x80, 0x40, 0x20, 0x10))
     with Chip() as chip:
@@ -263,7 +263,7 @@ def test_old_samples_show_the_rate_of_their_own_time(chip: Chip) -> None:
 
 
 @given(slip_deg=st.floats(-0.8, 0.8), after_ms=st.integers(0, 20), view_first=st.booleans())
-@examples(14)
+@examples(7)
 def test_short_knock_is_measured(slip_deg: float, after_ms: int, view_first: bool) -> None:
     with Chip() as chip:
         chip.wake(divider=1, fifo=0x10)
@@ -336,7 +336,7 @@ def test_rate_and_gravity_come_through_the_tilted_mounting() -> None:
 
 
 @given(views_ms=st.lists(st.integers(1, 120), min_size=1, max_size=12), seed=st.integers(0, 2**32))
-@examples(14)
+@examples(7)
 def test_samples_do_not_depend_on_the_reading_rate(views_ms: list[int], seed: int) -> None:
     """The same seed gives the same bytes, in whatever portions they are fetched."""
 

@@ -12,7 +12,7 @@ from sim.noise import NoiseModel
 from sim.world import HISTORY_S, Scene, World
 from tests.fuzzing import examples
 
-quick = examples(14)
+quick = examples(7)
 perfect = NoiseModel.none()
 
 

@@ -47,7 +47,7 @@ def written_out(queries: np.ndarray, angles: list[float], views: Views, omega: f
     return total
 
 
-@examples(12)
+@examples(6)
 @given(
     st.integers(0, 10**6),
     st.floats(0, 8),
@@ -70,7 +70,7 @@ def test_support_follows_the_formula_at_every_azimuth_of_every_object(
 
 
 @given(st.integers(0, 10**6), st.integers(2, 5))
-@examples(12)
+@examples(6)
 def test_no_object_that_can_lead_or_be_second_is_lost(seed: int, queries: int) -> None:
     """Only one object is considered after the first view; the others come back if they can still win."""
     views = catalog(seed, objects=12)
@@ -89,7 +89,7 @@ def test_no_object_that_can_lead_or_be_second_is_lost(seed: int, queries: int) -
 
 
 @given(st.integers(0, 10**6), st.integers(1, 3))
-@examples(12)
+@examples(6)
 def test_kept_objects_are_the_strongest_and_their_scores_do_not_change(seed: int, kept: int) -> None:
     views = catalog(seed, objects=6)
     index = DenseIndex(views)
@@ -158,7 +158,7 @@ def test_index_of_another_process_whitens_in_the_same_way() -> None:
     )
 
 
-@examples(30)
+@examples(15)
 @given(st.integers(0, 10**6), st.sampled_from([0.0, 5.0, 40.0]))
 def test_nearest_view_is_that_of_a_search_among_all_views(seed: int, step_deg: float) -> None:
     views = catalog(seed)

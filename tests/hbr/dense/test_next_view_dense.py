@@ -75,7 +75,7 @@ def test_visited_view_has_no_expected_gain() -> None:
     assert see.confusion[visited].min() >= see.confusion.max() - 1e-9
 
 
-@examples(10)
+@examples(5)
 @given(st.integers(0, 23), st.floats(5, 100))
 def test_expected_confusion_equals_the_formula(start: int, sharpness: float) -> None:
     """Once more from the posterior of single hypotheses that the decision keeps, written out."""

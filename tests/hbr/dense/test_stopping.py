@@ -36,7 +36,7 @@ def catalog(objects: int = 8, noise: float = 0.15, seed: int = 0) -> Views:
     return Views.concatenate(parts)
 
 
-@examples(12)
+@examples(6)
 @given(st.integers(0, 10**6), st.sampled_from([0.01, 0.02, 0.05, 0.2]), st.integers(120, 400))
 def test_conformal_threshold_rejects_the_stated_share_on_average(seed: int, share: float, count: int) -> None:
     rng = np.random.default_rng(seed)

@@ -72,7 +72,7 @@ def images(draw: st.DrawFn) -> Image:
     return np.ascontiguousarray(image)
 
 
-@examples(21)
+@examples(10)
 @given(images())
 def test_equals_the_literal_definition(image: Image) -> None:
     assert cedd(image).tolist() == cedd_reference(image)
@@ -260,7 +260,7 @@ def test_describe_scales_to_covered_sides(size: tuple[int, int], brought_to: tup
     assert (describe(covered) == cedd(covered)).all()
 
 
-@examples(18)
+@examples(9)
 @given(st.integers(1, 2000), st.integers(1, 2000))
 def test_scaled_sides_are_covered_and_close(width: int, height: int) -> None:
     covered = _covered_size(width, height)

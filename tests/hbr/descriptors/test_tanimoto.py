@@ -14,7 +14,7 @@ def levels(rows: int) -> st.SearchStrategy[np.ndarray]:
     return arrays(np.uint8, (rows, 144), elements=st.integers(0, 7), fill=st.sampled_from([0, 0, 7]))
 
 
-@examples(18)
+@examples(9)
 @given(levels(3), levels(4))
 def test_equals_exact_fractions(a: np.ndarray, b: np.ndarray) -> None:
     found = tanimoto(a, b)

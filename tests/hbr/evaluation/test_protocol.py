@@ -118,7 +118,7 @@ def test_seeds_and_trials_differ() -> None:
     assert len(orders) == 3
 
 
-@examples(12)
+@examples(6)
 @given(st.sets(st.integers(0, 23), min_size=1, max_size=5), st.sampled_from([5.0, 15.0, 15.1, 31.0]))
 def test_near_views_are_taken_out_and_no_others(seen: set[int], near_deg: float) -> None:
     trials = _Trials(0, QUERIES[:24], VIEWS, replace(PROTOCOL, near_deg=near_deg), None, lambda: 0)

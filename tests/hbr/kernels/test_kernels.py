@@ -45,7 +45,7 @@ def images(draw: st.DrawFn) -> np.ndarray:
 
 
 @compiled
-@examples(60)
+@examples(30)
 @given(images())
 def test_cedd_has_the_bits_of_the_reference(image: np.ndarray) -> None:
     with without_library():
@@ -75,7 +75,7 @@ def rows_of(kind: str, count: int, rng: np.random.Generator) -> np.ndarray:
 
 
 @compiled
-@examples(25)
+@examples(12)
 @given(st.sampled_from(["edges", "colours", "edges+colours"]), st.integers(0, 5), st.integers(0, 300), seeds)
 def test_similarity_has_the_bits_of_the_reference(kind: str, queries: int, count: int, seed: int) -> None:
     rng, descriptor = np.random.default_rng(seed), hbr.descriptor(kind)
@@ -98,7 +98,7 @@ def test_similarity_has_the_bits_of_the_reference(kind: str, queries: int, count
 
 
 @compiled
-@examples(25)
+@examples(12)
 @given(queries=st.integers(0, 9), count=st.integers(1, 200), length=st.sampled_from([1, 31, 144, 4096]), seed=seeds)
 def test_tanimoto_has_the_bits_of_the_reference(queries: int, count: int, length: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -117,7 +117,7 @@ def test_tanimoto_has_the_bits_of_the_reference(queries: int, count: int, length
 
 
 @compiled
-@examples(25)
+@examples(12)
 @given(st.integers(1, 300), st.integers(0, 50), st.integers(1, 320), seeds)
 def test_the_paper_s_search_returns_what_it_returns_without_kernels(count: int, more: int, k: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -136,7 +136,7 @@ def test_the_paper_s_search_returns_what_it_returns_without_kernels(count: int, 
 
 
 @compiled
-@examples(25)
+@examples(12)
 @given(
     counts=st.lists(st.integers(1, 40), min_size=1, max_size=6),
     step_deg=st.sampled_from([0.0, 2.5, 5.0, 90.0]),
@@ -165,7 +165,7 @@ def test_support_has_the_bits_of_the_reference(
 
 
 @compiled
-@examples(25)
+@examples(12)
 @given(st.lists(st.integers(1, 150), min_size=1, max_size=12), st.integers(1, 12), seeds)
 def test_the_nearest_objects_are_those_of_the_reference(counts: list[int], kept: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -191,7 +191,7 @@ def test_the_nearest_objects_are_those_of_the_reference(counts: list[int], kept:
 
 
 @compiled
-@examples(25)
+@examples(12)
 @given(st.integers(1, 40), st.sampled_from([1, 3, 1000]), seeds)
 def test_the_strongest_hypotheses_are_those_of_the_reference(objects: int, values: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -263,7 +263,7 @@ def test_missing_compiler_keeps_the_earlier_library(tmp_path: Path, monkeypatch:
 
 
 @compiled
-@examples(25)
+@examples(12)
 @given(
     counts=st.lists(st.integers(1, 40), min_size=1, max_size=6),
     step_deg=st.sampled_from([0.0, 2.5, 5.0, 90.0]),

@@ -13,7 +13,7 @@ from tests.hbr.segmentation.test_views_together import frames
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 40), st.integers(1, 40))
-@examples(20)
+@examples(10)
 def test_a_silhouette_survives_its_text(seed: int, height: int, width: int) -> None:
     found = np.random.default_rng(seed).random((height, width)) < 0.3
     found[0, 0] = True
@@ -21,7 +21,7 @@ def test_a_silhouette_survives_its_text(seed: int, height: int, width: int) -> N
 
 
 @given(st.text(max_size=60) | st.binary(max_size=60).map(lambda data: data.hex()) | st.none() | st.integers())
-@examples(40)
+@examples(20)
 def test_damaged_text_is_an_error_of_the_value(text: object) -> None:
     with pytest.raises(ValueError, match="silhouette"):
         mask_from(text, (96, 128))  # type: ignore[arg-type]

@@ -45,7 +45,7 @@ def begin(catalog: Catalog, name: str, views: int = 3, **options: object) -> Enr
     return catalog.begin(name, planned_azimuth_deg=plan(views), provenance=PROVENANCE, **options)  # type: ignore[arg-type]
 
 
-@examples(14)
+@examples(7)
 @given(
     name=NAMES.filter(lambda name: clean_name(name) == name),
     commanded_deg=ANGLES,
@@ -378,7 +378,7 @@ class CatalogMachine(RuleBasedStateMachine):
 
 
 TestCatalogMachine = CatalogMachine.TestCase
-TestCatalogMachine.settings = settings(examples(12), stateful_step_count=20)
+TestCatalogMachine.settings = settings(examples(6), stateful_step_count=20)
 
 
 def test_discard_rejects_enrollment_with_views(catalog: Catalog) -> None:

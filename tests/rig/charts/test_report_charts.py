@@ -77,7 +77,7 @@ class TestPolarPath:
         assert polar(100, 0)[1] < CENTRE[1]
         assert polar(100, 90)[0] < CENTRE[0]
 
-    @examples(14)
+    @examples(7)
     @given(start=ANGLE, rotations=st.lists(ROTATION, max_size=8))
     def test_views_are_at_their_azimuths_and_arcs_connect_them(self, start: float, rotations: list[float]) -> None:
         svg = polar_path(start, [PathStep(r) for r in rotations], scale="azimuth")
@@ -92,7 +92,7 @@ class TestPolarPath:
                 assert way[-1] == pytest.approx(centre(stops[k + 1]), abs=0.02)
                 azimuth += rotations[k]
 
-    @examples(14)
+    @examples(7)
     @given(start=ANGLE, rotation=ROTATION)
     def test_arc_covers_the_whole_rotation_in_its_direction(self, start: float, rotation: float) -> None:
         way = [azimuth_of(*p) for p in points(having(polar_path(start, [PathStep(rotation)], scale=""), "step")[0])]
@@ -104,7 +104,7 @@ class TestPolarPath:
         radii = [hypot(x - CENTRE[0], y - CENTRE[1]) for arc in having(svg, "step") for x, y in points(arc)]
         assert radii == pytest.approx(sorted(radii), abs=0.02)
 
-    @examples(14)
+    @examples(7)
     @given(start=ANGLE, rotation=st.floats(30, 300) | st.floats(-300, -30))
     def test_arrow_points_at_the_end_of_the_arc(self, start: float, rotation: float) -> None:
         svg = polar_path(start, [PathStep(rotation)], scale="")
@@ -223,7 +223,7 @@ class TestScoreChart:
         assert rows[0] > 20  # below the axis' title, though all scores are at the top
         assert words(having(svg, "winner", "name")) == ["0.900 n0"]
 
-    @examples(21)
+    @examples(10)
     @given(
         rounds=st.lists(
             st.dictionaries(st.sampled_from("abcdefg"), st.floats(-1, 1), min_size=1), min_size=1, max_size=9
@@ -302,7 +302,7 @@ TURNS = tuple(float(rotate) for rotate in range(-175, 185, 5) if rotate)
 
 
 class TestDecisionChart:
-    @examples(12)
+    @examples(6)
     @given(here=ANGLE, chosen=st.sampled_from(TURNS), seen=st.lists(ANGLE, min_size=1, max_size=4))
     def test_chosen_rotation_is_innermost_at_its_azimuth(self, here: float, chosen: float, seen: list[float]) -> None:
         away = tuple(abs(rotate - chosen) for rotate in TURNS)

@@ -101,7 +101,7 @@ def test_missing_sensor_names_address_and_next_step(bench: Bench) -> None:
 # -- readings ----------------------------------------------------------------------------------------------------------
 
 
-@examples(12)
+@examples(6)
 @given(
     angles=st.lists(st.floats(-300.0, 300.0), min_size=1, max_size=3),
     pause_s=st.floats(0.012, 0.3),

@@ -65,7 +65,7 @@ def test_torque_on_sets_the_goal_to_the_present_position_first(wires, servo):
     assert abs(wires.world.shaft()[0] - before) < 0.2
 
 
-@examples(12)
+@examples(6)
 @given(goal_deg=st.floats(-700, 700))
 def test_goal_is_reached_within_one_count_over_many_revolutions(goal_deg):
     wires = servo_wires(NoiseModel.none())

@@ -287,7 +287,7 @@ def test_rates_are_in_degrees_per_second_up_to_the_end_of_all_ranges(bench: Benc
 
 
 @given(pauses_ms=st.lists(st.integers(0, 300), min_size=2, max_size=10), divider=st.integers(2, 40))
-@examples(18)
+@examples(9)
 def test_sample_times_are_even_and_correct(pauses_ms: list[int], divider: int) -> None:
     """Times come out of the count and the rate alone; they must still be those at which the sensor sampled."""
     period_ns = divider * 1_000_000
@@ -421,7 +421,7 @@ def test_fifo_that_overflows_between_count_and_data_gives_no_corrupt_samples(
 
 
 @given(frames=st.integers(168, 172), early_us=st.integers(-50, 250))
-@examples(35)
+@examples(17)
 def test_full_fifo_never_corrupts_samples(frames: int, early_us: int) -> None:
     """Another sample may arrive between the reading of the count and that of the data."""
     with Bench() as bench:

@@ -96,7 +96,7 @@ def test_ax12_is_rejected_as_a_turntable() -> None:
     assert 'In [table] set mode = "pan"' in caught.value.next_step
 
 
-@examples(12)
+@examples(6)
 @given(goal_deg=st.floats(0.0, 300.0))
 def test_ax12_pans_within_its_300_degrees(goal_deg: float) -> None:
     devices = parts_of(*AX)
@@ -172,7 +172,7 @@ def test_limits_beyond_the_reach_are_rejected_before_anything_moves(simulated) -
 # -- gear and pan ------------------------------------------------------------------------------------------------------
 
 
-@examples(12)
+@examples(6)
 @given(ratio=st.floats(0.3, 12.0), angle_deg=st.floats(20.0, 300.0), sign=st.sampled_from([1, -1]))
 def test_gear_converts_angles_and_rates_to_the_table(ratio: float, angle_deg: float, sign: int) -> None:
     angle_deg *= sign

@@ -80,7 +80,7 @@ modes = st.builds(
 )
 
 
-@examples(30)
+@examples(15)
 @given(st.lists(modes, max_size=8), st.sampled_from((320, 640, 1000)), st.sampled_from((5.0, 30.0)))
 def test_no_offered_mode_is_better_than_the_chosen_one(offered, width, fps):
     chosen = choose_mode(offered, width, 480, fps)

@@ -32,7 +32,7 @@ def flown(goals: list[float], velocity_dps: float, seed: int, noise: NoiseModel 
         return motion.angle_deg - (angle - offset_deg), motion.sigma_deg, motion.rate_dps - rate, trajectory
 
 
-@examples(4)
+@examples(5)
 @given(
     st.integers(0, 1000),
     st.sampled_from([[120.0], [200.0, 60.0], [90.0, 30.0, 200.0]]),

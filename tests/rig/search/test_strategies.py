@@ -52,7 +52,7 @@ def run(chosen: Strategy | str, *, seed: int = 0, **config: float) -> tuple[list
 
 
 @pytest.mark.parametrize("name", PAPERS)
-@examples(12)
+@examples(6)
 @given(max_views=st.integers(1, 12), seed=st.integers(0, 3))
 def test_every_strategy_takes_all_allowed_views_without_a_margin(name, max_views, seed):
     rotations, end, _ = run(name, seed=seed, max_views=max_views, min_views=1, margin=1.0)

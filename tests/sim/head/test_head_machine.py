@@ -183,4 +183,4 @@ class Head(RuleBasedStateMachine):
 
 
 TestHead = pytest.mark.skipif(bool(missing("memory")), reason=missing("memory"))(Head.TestCase)
-TestHead.settings = settings(examples(12), stateful_step_count=30)
+TestHead.settings = settings(examples(6), stateful_step_count=30)

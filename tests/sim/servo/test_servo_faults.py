@@ -29,7 +29,7 @@ FOLLOWING_ERROR = 0x08
 
 
 @given(units=st.integers(1, 127), last_read_s=st.floats(0.0, 1.0))
-@examples(12)
+@examples(6)
 def test_watchdog_trips_after_its_time_without_instructions(units: int, last_read_s: float) -> None:
     line = Line()
     servo = line.add()

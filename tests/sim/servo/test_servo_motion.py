@@ -33,7 +33,7 @@ def arrival_s(line: Line) -> float:
     velocity=st.integers(1, 265),
     acceleration=st.integers(1, 139),
 )
-@examples(12)
+@examples(6)
 def test_move_takes_the_profiles_time_and_ends_on_the_count(goal: int, velocity: int, acceleration: int) -> None:
     line = Line()
     line.add()
@@ -179,7 +179,7 @@ def test_position_mode_loses_the_revolutions_when_torque_is_switched_on(line: Li
 
 
 @given(rotations_deg=st.floats(-2000, 2000), center=st.integers(0, 4095))
-@examples(12)
+@examples(6)
 def test_power_up_reads_within_one_revolution(rotations_deg: float, center: int) -> None:
     line = Line()
     line.add(1, center_counts=center)

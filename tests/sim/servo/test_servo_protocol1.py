@@ -17,7 +17,7 @@ from sim.servo.protocol2 import InstructionPacket, Status
 from sim.world import World
 from tests.fuzzing import examples
 
-quick = examples(35)
+quick = examples(17)
 GOAL, SPEED, POSITION, VOLTAGE = 30, 32, 36, 42
 
 

@@ -19,7 +19,7 @@ from sim.servo.protocol2 import (
 from tests.fuzzing import examples
 
 SDK = Protocol2PacketHandler()
-quick = examples(35)
+quick = examples(17)
 
 # Bytes that make headers, stuffing and near misses of both likely.
 tricky_bytes = st.lists(st.sampled_from([0xFF, 0xFF, 0xFF, 0xFD, 0xFD, 0x00, 0x01, 0x55, 0xAB]), max_size=40).map(bytes)

@@ -159,4 +159,4 @@ class ServoMachine(RuleBasedStateMachine):
 
 
 TestServo = ServoMachine.TestCase
-TestServo.settings = settings(examples(14), stateful_step_count=30)
+TestServo.settings = settings(examples(7), stateful_step_count=30)

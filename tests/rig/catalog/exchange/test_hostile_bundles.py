@@ -160,7 +160,7 @@ class TestHostileBundles:
         good = (folder / "good.zip").read_bytes()
         victims = [Catalog.open(folder / "victim", clock=VirtualClock(NOW))]
 
-        @examples(88)
+        @examples(44)
         @given(data=st.data())
         def spoil(data: st.DataObject) -> None:
             content = bytearray(good)

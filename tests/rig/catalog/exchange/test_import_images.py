@@ -32,13 +32,13 @@ class TestImages:
         with pytest.raises(images.BadImage, match=reason):
             images.decode(content)
 
-    @examples(105)
+    @examples(52)
     @given(st.binary(max_size=64), st.sampled_from([b"", b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"]))
     def test_arbitrary_bytes_are_rejected(self, content: bytes, head: bytes) -> None:
         with pytest.raises(images.BadImage):
             images.decode(head + content)
 
-    @examples(52)
+    @examples(26)
     @given(st.data())
     def test_damaged_image_is_decoded_or_rejected(self, data: st.DataObject) -> None:
         suffix = data.draw(st.sampled_from([".png", ".jpg"]))
