@@ -83,6 +83,7 @@ def test_simulated_result_is_applied(simulated):
     assert 0 < config.identify.margin < 0.1
 
 
+@pytest.mark.nightly
 def test_light_drifting_during_measurement_is_rejected(simulated):
     s = simulated(*SMALL, seed=1)
     light = 1.0

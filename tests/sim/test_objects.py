@@ -1,5 +1,7 @@
 """The built-in objects: geometry, orientation, symmetry, and differences."""
 
+from collections.abc import Iterable
+
 import cv2
 import numpy as np
 import pytest
@@ -17,6 +19,12 @@ from sim.objects.revolution import Revolution
 from sim.objects.shelf import CONFUSABLE, shelf
 from sim.objects.solid import Part, Solid, empty_platter
 from sim.objects.tube import Tube
+
+
+def some(names: Iterable[str]) -> list[object]:
+    """Return every fourth name for the default tests, and the others for the nightly tests."""
+    return [name if i % 4 == 0 else pytest.param(name, marks=pytest.mark.nightly) for i, name in enumerate(names)]
+
 
 RED, BLUE = (30, 30, 220), (220, 30, 30)
 
@@ -131,7 +139,7 @@ def test_built_in_objects_include_symmetric_and_confusable_ones() -> None:
     assert all(a in objects and b in objects for a, b in CONFUSABLE)
 
 
-@pytest.mark.parametrize("name", shelf())
+@pytest.mark.parametrize("name", some(shelf()))
 def test_every_object_fits_the_frame_and_rotates_smoothly(name: str) -> None:
     solid, empty = shelf()[name], empty_platter()
     for azimuth in (0.0, 77.0, 201.0):
@@ -154,7 +162,7 @@ def test_symmetric_objects_look_the_same_after_their_rotation(name: str) -> None
         assert tanimoto(describe(a), describe(b)).item() > 0.99
 
 
-@pytest.mark.parametrize("name", [n for n, t in shelf().items() if t.symmetry_deg == 360])
+@pytest.mark.parametrize("name", some(n for n, t in shelf().items() if t.symmetry_deg == 360))
 def test_objects_without_symmetry_look_different_after_a_rotation(name: str) -> None:
     solid = shelf()[name]
     views = [render(solid, azimuth) for azimuth in range(0, 360, 30)]

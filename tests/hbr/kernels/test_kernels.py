@@ -209,7 +209,7 @@ def test_the_strongest_hypotheses_are_those_of_the_reference(objects: int, value
     [
         # vectors of at most 256 bits, and of at most 128
         (["cc"], [[], ["qemu-x86_64", "-cpu", "Haswell"], ["qemu-x86_64", "-cpu", "Nehalem"]]),
-        (["aarch64-linux-gnu-gcc", "-static"], [["qemu-aarch64"]]),
+        pytest.param(["aarch64-linux-gnu-gcc", "-static"], [["qemu-aarch64"]], marks=pytest.mark.nightly),
     ],
     ids=["this machine", "aarch64"],
 )

@@ -402,24 +402,29 @@ def test_wrong_descriptors_of_another_catalog_are_rejected(root: Path, tmp_path:
     [
         "UPDATE views SET azimuth_deg = 'north'",
         "UPDATE views SET evidence = '{'",
-        "UPDATE views SET evidence = '[1]'",
-        "UPDATE views SET segmentation = '{\"issues\": 5}'",
         "UPDATE views SET captured_utc = 'yesterday'",
-        "UPDATE views SET captured_utc = 5",
-        "UPDATE views SET captured_utc = '9999-99-99 00:00:00.000000'",
         "UPDATE views SET image = x'00ff'",
-        "UPDATE views SET image_bytes = 'many'",
-        "UPDATE views SET imu_deg = 1, imu_sigma_deg = NULL",
-        "UPDATE views SET session_id = 99",
         "UPDATE enrollments SET status = 'lost'",
         "UPDATE enrollments SET planned_azimuth_deg = '[null]'",
-        "UPDATE enrollments SET started_utc = ''",
-        "UPDATE objects SET label = x'ff', note = CAST(x'ff' AS TEXT)",
         "UPDATE sessions SET devices = '7'",
-        "UPDATE sessions SET bench = 5.5",
         "UPDATE descriptors SET packed = 'text'",
-        "UPDATE descriptors SET packed = x''",
-        'UPDATE descriptors SET settings = \'{"region": "evil"}\'',
+        *(
+            pytest.param(statement, marks=pytest.mark.nightly)
+            for statement in (
+                "UPDATE views SET evidence = '[1]'",
+                "UPDATE views SET segmentation = '{\"issues\": 5}'",
+                "UPDATE views SET captured_utc = 5",
+                "UPDATE views SET captured_utc = '9999-99-99 00:00:00.000000'",
+                "UPDATE views SET image_bytes = 'many'",
+                "UPDATE views SET imu_deg = 1, imu_sigma_deg = NULL",
+                "UPDATE views SET session_id = 99",
+                "UPDATE enrollments SET started_utc = ''",
+                "UPDATE objects SET label = x'ff', note = CAST(x'ff' AS TEXT)",
+                "UPDATE sessions SET bench = 5.5",
+                "UPDATE descriptors SET packed = x''",
+                'UPDATE descriptors SET settings = \'{"region": "evil"}\'',
+            )
+        ),
     ],
 )
 def test_invalid_values_end_in_an_error(root: Path, tmp_path: Path, statement: str) -> None:

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from rig.cli.main import app
 
 SETTINGS = (
-    *("enroll.views=8", "identify.max_views=4"),
+    *("enroll.views=6", "identify.max_views=3"),
     *("camera.width=320", "camera.height=240", "view.roi=[40, 0, 240, 240]"),
 )
 SMALL = ("--count", "2", *(word for setting in SETTINGS for word in ("--set", setting)))
@@ -64,7 +64,7 @@ def test_demo_enrolls_and_finds_objects_and_recognizes_unknown_ones(small):
         assert leader
         assert 0 < float(percent) < 100
     assert text.count("(not enrolled)") == 2
-    assert "2 objects enrolled with 16 views" in text
+    assert "2 objects enrolled with 12 views" in text
 
 
 def test_demo_leaves_only_the_report(small):

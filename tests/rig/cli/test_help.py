@@ -89,7 +89,14 @@ def test_help_imports_no_heavy_module():
 
 
 @pytest.mark.parametrize(
-    "arguments", [("--help", "--no-color"), ("--no-color", "enroll", "--help"), ("fly", "--no-color")]
+    "arguments",
+    [
+        ("--no-color", "enroll", "--help"),
+        *(
+            pytest.param(words, marks=pytest.mark.nightly)
+            for words in (("--help", "--no-color"), ("fly", "--no-color"))
+        ),
+    ],
 )
 def test_no_color_works_in_every_place(arguments):
     environment = {**os.environ, "FORCE_COLOR": "1", "TERM": "xterm-256color", "COLUMNS": "90"}

@@ -154,7 +154,12 @@ IN_IMAGES = {"frozen_frame", "black_frame", "blur", "exposure_jump", "light_flic
 """Faults that only the camera may show. The camera is not checked for other faults, because its frames take time."""
 
 
-@pytest.mark.parametrize("name", sorted(fault_kinds()))
+INVISIBLE = sorted(fault_kinds().keys() - FOUND.keys())
+
+
+@pytest.mark.parametrize(
+    "name", [*FOUND, INVISIBLE[0], *(pytest.param(name, marks=pytest.mark.nightly) for name in INVISIBLE[1:])]
+)
 def test_all_checks_end_under_every_fault_and_find_visible_ones(name, bench):
     set_up(bench)
     faults = Faults(bench.devices)

@@ -40,7 +40,9 @@ def interrupt_at(bench, wires, angle_deg: float) -> None:
 
 
 @pytest.mark.parametrize("speed", [(), FAST], ids=["90 °/s", "200 °/s"])
-@pytest.mark.parametrize("pause_after_reads", [0, 1, 2, 3])
+@pytest.mark.parametrize(
+    "pause_after_reads", [1, *(pytest.param(reads, marks=pytest.mark.nightly) for reads in (0, 2, 3))]
+)
 def test_stop_stays_within_the_limits_after_a_pause_of_the_computer(speed, pause_after_reads):
     with motion_bench(*speed) as (bench, wires):
         table = Turntable(bench, trust_gyro=False)

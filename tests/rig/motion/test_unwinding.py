@@ -22,7 +22,9 @@ def catalog(tmp_path, simulated):
         yield catalog
 
 
-@pytest.mark.parametrize("limits", ["[-400, 400]", "[-300, 60]", "[0, 360]"])
+@pytest.mark.parametrize(
+    "limits", ["[-300, 60]", *(pytest.param(one, marks=pytest.mark.nightly) for one in ("[-400, 400]", "[0, 360]"))]
+)
 def test_enrollment_stays_within_the_budget_and_unwinds_the_cable(simulated, catalog, limits):
     s = simulated(*SMALL, f"table.limits_deg={limits}")
     low, high = s.bench.config.table.limits_deg
@@ -43,7 +45,12 @@ def test_enrollment_stays_within_the_budget_and_unwinds_the_cable(simulated, cat
 
 @pytest.mark.parametrize(
     ("start_deg", "step_deg", "rotates_to"),
-    [(390.0, -90, [120.0]), (-395.0, 90, [-125.0]), (250.0, 5, [-115.0]), (30.0, 90, [])],
+    [
+        (390.0, -90, [120.0]),
+        (30.0, 90, []),
+        pytest.param(-395.0, 90, [-125.0], marks=pytest.mark.nightly),
+        pytest.param(250.0, 5, [-115.0], marks=pytest.mark.nightly),
+    ],
 )
 def test_search_unwinds_when_necessary_and_reports_it(simulated, catalog, start_deg, step_deg, rotates_to):
     s = simulated(*SMALL, "identify.max_views=2", f"identify.first_step_deg={step_deg}", seed=3)

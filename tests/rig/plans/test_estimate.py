@@ -56,7 +56,7 @@ def test_enrollment_with_a_short_cable_takes_all_views_within_its_limits(simulat
         ]  # fmt: skip
 
 
-@pytest.mark.parametrize("views", [8, 36])
+@pytest.mark.parametrize("views", [8, pytest.param(36, marks=pytest.mark.nightly)])
 def test_motion_model_predicts_the_duration_within_10_percent(simulated, tmp_path, views):
     s = simulated(*SMALL, seed=3)
     with Catalog.open(tmp_path, clock=s.bench.clock) as catalog:

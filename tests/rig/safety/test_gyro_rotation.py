@@ -155,7 +155,12 @@ def test_fifo_is_read_in_time_at_each_rate(rate_hz: float) -> None:
     ("noise", "scale_sigma"),
     [
         pytest.param(NoiseModel(), 0.01, id="uncalibrated"),
-        pytest.param(NoiseModel().with_values(gyro_scale_error=0, imu_tilt_deg=0), 0.0, id="scale-calibrated"),
+        pytest.param(
+            NoiseModel().with_values(gyro_scale_error=0, imu_tilt_deg=0),
+            0.0,
+            id="scale-calibrated",
+            marks=pytest.mark.nightly,
+        ),
     ],
 )
 def test_errors_match_the_stated_uncertainty(noise: NoiseModel, scale_sigma: float) -> None:

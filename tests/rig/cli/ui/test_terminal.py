@@ -115,7 +115,16 @@ def test_every_console_guards_its_text():
     assert [path for path in sources if re.search(r"\bConsole\(", path.read_text(encoding="utf-8"))] == []
 
 
-@pytest.mark.parametrize("arguments", [["config", "show"], ["config", "path", "--json"], ["--help"], ["nix", "--json"]])
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["config", "show"],
+        *(
+            pytest.param(words, marks=pytest.mark.nightly)
+            for words in (["config", "path", "--json"], ["--help"], ["nix", "--json"])
+        ),
+    ],
+)
 def test_full_output_device_is_an_error_with_a_next_step(arguments, tmp_path):
     with Path("/dev/full").open("w") as full:
         done = subprocess.run([*RIG, *arguments], stdout=full, stderr=subprocess.PIPE, text=True, cwd=tmp_path)
