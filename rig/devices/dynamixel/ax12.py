@@ -52,7 +52,7 @@ class Ax12Servo(RegisterServo):
         away = abs(values["Present Position"] - values["Goal Position"])
         return ServoState(
             time_ns=time_ns,
-            sampled_ns=self._sampled_ns,
+            sampled_ns=self.bus.sampled_ns,
             position_deg=values["Present Position"] * self.resolution_deg,
             velocity_dps=_signed(values["Present Speed"]) * self._dps_per_unit,
             load_percent=_signed(values["Present Load"]) * 0.1,

@@ -26,6 +26,7 @@ DOUBT_S = 60.0
 CONFIRM_ATTEMPTS = 16
 """How often a reading is repeated until nothing else arrives beside its reply."""
 
+_BITS = 10  # a byte with its start and stop bit
 _ECHO_SIZE = 2  # in Protocol 1.0, an echoed instruction that reads this number of bytes is a valid reply to itself
 
 READ_LENGTHS = {1: 16, 2: 4}
@@ -70,12 +71,18 @@ class DynamixelBus:
         (a read, or a write of a value), so a repetition is harmless.
     protocol
         2 (X series, and MX series with firmware for it), or 1 (AX-12A).
+
+    Attributes
+    ----------
+    sampled_ns
+        When the device began to send the last block that was read: it had sampled its registers just before.
     """
 
     def __init__(self, port: ClockedPort, retries: int = 3, protocol: int = 2) -> None:
         self.port = port
         self.statistics = BusStatistics()
         self.protocol = protocol
+        self.sampled_ns = 0
         self._packets: Packets = Packets1() if protocol == 1 else Packets2()
         self._retries = retries
         self._lock = RLock()
@@ -107,16 +114,16 @@ class DynamixelBus:
         In doubt, a reading is confirmed by a second one. If the reply to the first was an old one, its own reply is
         there already or arrives before that to the second; then both are discarded.
         """
-        data = self._read_once(device_id, address, size)
+        data, self.sampled_ns = self._read_once(device_id, address, size)
         if dated or not (self.protocol == 1 or self._repeats_replies()):
             return data
         counts = self.statistics
         for _ in range(CONFIRM_ATTEMPTS):
             alone, before = not self._drop_foreign(), (counts.late, counts.retries)
-            again = self._read_once(device_id, address, size)
+            again, sampled_ns = self._read_once(device_id, address, size)
             if alone and (counts.late, counts.retries) == before:
                 return data
-            data = again
+            data, self.sampled_ns = again, sampled_ns
         what = f"read of {size} bytes at {address}"
         raise self._silent(what, (device_id,), "replies arrive twice", "Check the adapter and its driver.")
 
@@ -133,7 +140,8 @@ class DynamixelBus:
         """Return whether a reply that belongs to no request arrived recently."""
         return self._foreign_ns is not None and seconds_between(self._foreign_ns, self.port.clock.now_ns()) <= DOUBT_S
 
-    def _read_once(self, device_id: int, address: int, size: int) -> bytes:
+    def _read_once(self, device_id: int, address: int, size: int) -> tuple[bytes, int]:
+        """Return the bytes, and when the device began to send them."""
         skipped = 0
 
         def attempt() -> Answers:
@@ -143,7 +151,8 @@ class DynamixelBus:
             return self._ask(device_id, READ, self._packets.read_parameters(start, asked), asked)
 
         reply = self._transact(f"read of {size} bytes at {address}", (device_id,), attempt)[device_id]
-        return reply.data[skipped : skipped + size]
+        sent_ns = reply.size * _BITS * 1_000_000_000 // self.port.baudrate
+        return reply.data[skipped : skipped + size], self.port.clock.now_ns() - sent_ns
 
     def write(self, device_id: int, register: Register, value: int, *, answered: bool = True) -> None:
         """Write a register; with ``answered`` False do not wait for a reply, which the servo may be set not to send."""

@@ -24,13 +24,15 @@ class Reply:
     """A status packet: the device's id, why it rejected the instruction (0: it did not), its parameters.
 
     ``alert`` is not 0 if the hardware has a fault: in Protocol 2.0 the alert bit (Hardware Error Status has the
-    details), in Protocol 1.0 the bits of the faults, as in Hardware Error Status.
+    details), in Protocol 1.0 the bits of the faults, as in Hardware Error Status. ``size`` is the length of the packet
+    on the bus in bytes.
     """
 
     bus_id: int
     error: int
     alert: int
     data: bytes
+    size: int
 
 
 class Packets(Protocol):
@@ -83,8 +85,9 @@ class Packets2(Protocol2PacketHandler):  # type: ignore[misc]
             return None, result
         body = packet[8:-2]
         if not body:
-            return Reply(_MALFORMED, 0, 0, b""), result
-        return Reply(packet[4], body[0] & 0x7F, body[0] & 0x80, bytes(body[1:])), result
+            return Reply(_MALFORMED, 0, 0, b"", len(packet)), result
+        size = len(packet) + bytes(packet[7:-2]).count(_HEADER)  # each is followed by a stuffed byte on the bus
+        return Reply(packet[4], body[0] & 0x7F, body[0] & 0x80, bytes(body[1:]), size), result
 
     def reply_size(self, size: int) -> int:
         return 11 + size
@@ -134,9 +137,9 @@ class Packets1(Protocol1PacketHandler):  # type: ignore[misc]
             return None, result
         end = 4 + packet[3]
         if packet[3] < 2 or len(packet) < end:
-            return Reply(_MALFORMED, 0, 0, b""), result
+            return Reply(_MALFORMED, 0, 0, b"", len(packet)), result
         rejected = next((bit for bit in self.rejections if packet[4] & bit), 0)
-        return Reply(packet[2], rejected, packet[4] & 0x25, bytes(packet[5 : end - 1])), result
+        return Reply(packet[2], rejected, packet[4] & 0x25, bytes(packet[5 : end - 1]), end), result
 
     def reply_size(self, size: int) -> int:
         return 6 + size

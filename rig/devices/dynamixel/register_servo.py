@@ -2,7 +2,6 @@
 
 from abc import ABC, abstractmethod
 from dataclasses import asdict
-from typing import Final
 
 from rig.core.clock import Clock
 from rig.core.errors import DeviceFault, DeviceMismatch, DeviceNotFound, DeviceSilent, TorqueStaysOn
@@ -19,9 +18,6 @@ BOOT_ALLOWANCE_S = 3.0
 TORQUE_OFF_ATTEMPTS = 3
 """How often the torque is switched off and read back before it counts as on."""
 
-_STATUS_BYTES: Final = {1: 6, 2: 11}
-"""Bytes of an answer beside its registers, by protocol."""
-_BITS: Final = 10
 _HARDWARE_ERRORS = {0: "input voltage", 2: "overheating", 3: "motor encoder", 4: "electrical shock", 5: "overload"}
 
 
@@ -74,7 +70,6 @@ class RegisterServo(ABC):
         self._guardian = guardian
         self.resolution_deg = self.deg_per_count / gear_ratio
         self._blocks: dict[tuple[str, str], Block] = {}
-        self._sampled_ns = 0
         try:
             number = bus.ping(bus_id)
         except DeviceSilent as silent:
@@ -241,8 +236,6 @@ class RegisterServo(ABC):
         begun_ns = self._clock.now_ns()
         image = self.bus.read_block(self._id, block.address, block.layout.size, dated=dated)
         ended_ns = self._clock.now_ns()
-        answer_bytes = block.layout.size + _STATUS_BYTES[self.bus.protocol]
-        self._sampled_ns = ended_ns - answer_bytes * _BITS * 1_000_000_000 // self.bus.port.baudrate
         return (begun_ns + ended_ns) // 2, block.values(image)
 
 

@@ -52,7 +52,7 @@ class DynamixelServo(RegisterServo):
         time_ns, values = self._read_fresh()
         return ServoState(
             time_ns=time_ns,
-            sampled_ns=self._sampled_ns,
+            sampled_ns=self.bus.sampled_ns,
             position_deg=values["Present Position"] * self.resolution_deg,
             velocity_dps=values["Present Velocity"] * self._dps_per_unit,
             load_percent=self._load_percent(values),

@@ -14,6 +14,7 @@ from rig.devices.dynamixel.bus import DynamixelBus, watchdog_units
 from rig.devices.dynamixel.port import ClockedPort, open_serial
 from rig.devices.dynamixel.registers import control_table
 from sim.servo import Frame
+from sim.servo.bus import Source
 from tests.fuzzing import examples
 from tests.rig.bench_parts import open_bus, servo_wires
 
@@ -137,3 +138,13 @@ def test_reply_to_an_interrupted_request_never_answers_the_next_one(wires, bus):
     with pytest.raises(KeyboardInterrupt):
         bus.read(1, TABLE["Present Temperature"])
     assert bus.read(1, TABLE["Torque Enable"]) == 0
+
+
+def test_block_has_the_time_at_which_its_reply_began(wires, bus):
+    begun = []
+    wires.bus.taps.append(lambda frame: begun.append(frame.start_ns) if frame.source is Source.DEVICE else None)
+    for number in range(8):  # replies of different lengths
+        if number == 4:
+            wires.device.memory["Goal Velocity"] = 0x00FDFFFF  # FF FF FD: another byte follows on the bus
+        bus.read_block(1, 100, 30)
+        assert bus.sampled_ns == pytest.approx(begun[-1], abs=2000)
