@@ -4,13 +4,14 @@ The gyro measures the platter's rate every few milliseconds, but its integral dr
 is read some thirty times per second, and the backlash is between it and the platter. With the integral G of the gyro's
 rate since the first sample, a reading E at the time t obeys
 
-    E(t) = θ₀ + (1 + s)·G(t + τ) − β·t + o + noise
+    E(t) = θ₀ + (1 + s)·G(t + τ) − β·t + c·α(t + τ) + o + noise
 
 where s is the error of the gyro's scale, β that of its bias, τ the delay of its samples, and o the backlash that the
-shaft has run through. The parameters follow by weighted least squares over all readings of the motion. Prior knowledge
-enters as further readings: the bias that was measured at rest, and the uncertainty of the scale. The platter's angle is
-the same sum without o. Angles are those that the encoder shows when the platter is driven upwards, as in the views of
-a table that stops from below.
+shaft has run through. The platter is not rigid on its shaft: while it is accelerated by α, it stays behind by c·α, with
+c one over the square of its natural frequency. The parameters follow by weighted least squares over all readings of the
+motion. Prior knowledge enters as further readings: the bias that was measured at rest, and the uncertainty of the
+scale. The platter's angle is the same sum without c·α and o. Angles are those that the encoder shows when the platter
+is driven upwards, as in the views of a table that stops from below.
 
 Decision: docs/decisions/0046.
 """
@@ -28,6 +29,8 @@ DELAY_S: Final = (0.004, 0.004)
 """Delay of a gyro's samples, and its standard uncertainty: a low-pass filter of 42 Hz takes 4.8 ms (MPU-6050)."""
 BIAS_DRIFT_DPS: Final = 0.003
 """Change of the bias between its rest and a motion."""
+COMPLIANCE_S2: Final = 3e-4
+"""How far the platter may stay behind an acceleration: a natural frequency of 9 Hz or more (1 σ)."""
 READ_TIME_S: Final = 0.0004
 """Standard uncertainty of the time of an encoder reading: it is taken somewhere within its transaction."""
 ACCELERATION_DPS2: Final = 400.0
@@ -165,21 +168,23 @@ class TrajectoryRecorder:
         t, e, o = encoder_t[used], encoder_deg[used], played[used]
         # What is known before: the mean and the standard uncertainty of each parameter.
         mean = np.concatenate(
-            [[0.0, 0.0, 0.0, DELAY_S[0]], np.zeros(len(gaps)), [-self.backlash_deg / 2, -self.backlash_deg / 4]]
+            [[0.0, 0.0, 0.0, DELAY_S[0]], np.zeros(len(gaps)), [0.0, -self.backlash_deg / 2, -self.backlash_deg / 4]]
         )
         known = np.concatenate(
             [
                 [1e4, np.hypot(self.bias_sigma_dps, BIAS_DRIFT_DPS), self.scale_sigma, DELAY_S[1]],
                 ACCELERATION_DPS2 / 8 * np.square(steps_s[missing]) + 0.02,
-                [self.backlash_deg / 2, self.backlash_deg / 2],
+                [COMPLIANCE_S2, self.backlash_deg / 2, self.backlash_deg / 2],
             ]
         )
         rates = np.abs(np.interp(t, time_s, rate))
+        acceleration = np.gradient(rate, time_s)
         noise = np.hypot(self.resolution_deg / 2, rates * READ_TIME_S)
         values, weight = mean.copy(), 1 / noise
         for _ in range(4):
             at_s = t + values[3]
-            design = np.column_stack([_design(at_s, t, time_s, rate, integral, gaps), o == -1, o == 0]).astype(float)
+            platter = _design(at_s, t, time_s, rate, integral, gaps)
+            design = np.column_stack([platter, np.interp(at_s, time_s, acceleration), o == -1, o == 0])
             base = np.interp(at_s, time_s, integral) - design[:, 3] * values[3]
             rows = np.vstack([design * weight[:, None], np.diag(1 / known)])
             right = np.concatenate([(e - base) * weight, mean / known])

@@ -49,6 +49,25 @@ def test_angle_and_its_uncertainty_are_true_at_any_time(
     assert trajectory.consistent
 
 
+def test_angle_of_a_fast_platter_is_neither_late_nor_early() -> None:
+    """A platter at rest and at full speed, in both directions: a late angle would change its sign with the speed."""
+    late_ms = []
+    for seed in range(3):
+        for start_deg, end_deg in ((0.0, 150.0), (150.0, 0.0)):
+            with motion_bench(seed=seed) as (bench, wires), Turntable(bench) as table:
+                table.goto(start_deg)
+                recorder, clock = table.recorder(), wires.world.clock
+                table.fly(end_deg, Flight(lambda: clock.sleep(0.033), (0.0, 150.0), recorder, 90.0))
+                trajectory = recorder.fit()
+                assert trajectory is not None
+                times = np.linspace(trajectory.start_ns + 5e6, trajectory.end_ns - 1e7, 400).astype(np.int64)
+                angle, rate = wires.world.table_motion(times)
+            error = trajectory.at(times).angle_deg - angle
+            fast, resting = np.abs(rate) > 85, np.abs(rate) < 0.5
+            late_ms.append((error[resting].mean() - error[fast].mean()) / rate[fast].mean() * 1e3)
+    assert abs(np.mean(late_ms)) < 0.25
+
+
 def test_missing_gyro_samples_widen_the_uncertainty_where_they_are_missing() -> None:
     recorder = TrajectoryRecorder(0.088, 0.5, 0.01, 0.0035, 0.0, 0.005)
     times = np.arange(0, 2_000_000_000, 5_000_000)
