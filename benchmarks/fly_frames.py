@@ -109,7 +109,8 @@ def measured(index: hbr.DenseIndex, background: str) -> tuple[dict[str, list[flo
             use = begin()
 
             def each() -> None:
-                frame = stream.next(table.collect_gyro)
+                if (frame := stream.next(table.collect_gyro)) is None:
+                    return
                 images.append(frame.image_bgr)
                 use(frame)
 
@@ -150,7 +151,9 @@ def fed(images: list[Image], begin: Callable[[], Work], seconds: float) -> tuple
     while clock.now_ns() < until_ns:
         work = begin()
         for _ in images:
-            work(stream.next(newest=True))
+            frame = stream.next(lambda: None, newest=True)
+            assert frame is not None
+            work(frame)
         used += len(images)
     return used, stream.skipped
 

@@ -86,7 +86,8 @@ def revolution(bench: Bench, table: Turntable, describe: ViewDescriber) -> Seen:
     frames: list[tuple[int, Any]] = []
 
     def each() -> None:
-        frame = stream.next(table.collect_gyro)
+        if (frame := stream.next(table.collect_gyro)) is None:
+            return
         middle = middle_ns(frame.stamp_ns, bench.config.camera_time)
         frames.append((middle, describe(frame.image_bgr).levels[BENCH_DESCRIPTOR]))
 

@@ -159,6 +159,8 @@ def _take_pass(
     def each() -> None:
         nonlocal usable
         frame = stream.next(table.collect_gyro)
+        if frame is None:
+            return
         usable = usable and frame.stamped
         if not frame.repeated:
             stamps.append(frame.stamp_ns)

@@ -205,6 +205,11 @@ class SimCapture:
             return round(SELECT_S * 1e9)
         return max(self._arrival_ns(self._next) - self._clock.now_ns(), 0)
 
+    def wait(self, seconds: float) -> bool:
+        """Wait for a frame at most so long; return whether `grab` then returns at once."""
+        self._clock.advance_to(self._clock.now_ns() + min(self.wait_ns(), round(seconds * 1e9)))
+        return not self.wait_ns()
+
     def retrieve(self) -> tuple[bool, Image | None]:
         """Return the frame that was grabbed last, uint8 (480, 640, 3)."""
         if self._grabbed is None or not self._delivers:

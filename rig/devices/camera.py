@@ -67,7 +67,8 @@ class Camera(Protocol):
     def capture(self, after_ns: int, meanwhile: Callable[[], object] | None = None) -> Frame:
         """Return the first frame whose exposure began at or after ``after_ns``; older frames are dropped.
 
-        ``meanwhile`` is called several times per second while the method waits for a slow camera.
+        ``meanwhile`` is called several times per second while the method waits for a slow camera. If it raises an
+        error, the wait ends, and the next call waits again.
         """
 
     def read_locks(self) -> CameraLocks:

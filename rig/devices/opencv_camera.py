@@ -25,7 +25,7 @@ from rig.devices import v4l2
 from rig.devices.camera import CameraIdentity, CameraLocks, Frame
 from rig.devices.camera_settings import CameraSettings as CameraSettings
 from rig.devices.camera_settings import RejectedSetting as RejectedSetting
-from rig.devices.opencv_capture import Capture, modes_of
+from rig.devices.opencv_capture import Capture, modes_of, waiter_of
 from rig.devices.v4l2 import choose_mode
 
 V4L2_EXPOSURE_MANUAL = 1
@@ -36,8 +36,8 @@ _PROBES = 16  # frames to examine when opened: more than a driver buffers
 _RETRIES = 5  # attempts to grab a frame
 _FRESH_S = 1.0  # largest age of a frame that the camera just delivered
 _STAMP_ERROR_NS = 2_000_000  # how far a stamp may be ahead of the clock
-_SLICE_S = 0.2  # longest wait for a frame between two calls of ``meanwhile``
-_REPLUG_PAUSE_S = 0.25
+_SLICE_S = 0.1  # longest wait for a frame between two calls of ``meanwhile``
+_REPLUG_PAUSE_S = 0.1
 _UNKNOWN_PROPERTY = cv2.CAP_PROP_XI_AEAG  # V4L2 answers -1, other sources 0
 _EXPOSURE_CHANGE_FRAMES = 4  # a sensor applies a new exposure time up to so many frames later
 _FOCUS_STILL_S, _FOCUS_LIMIT_S = 1.0, 8.0
@@ -133,7 +133,8 @@ class OpenCvCamera:
     def capture(self, after_ns: int, meanwhile: Callable[[], object] | None = None) -> Frame:
         """Return the first frame whose exposure began at or after ``after_ns``; older frames are dropped.
 
-        ``meanwhile`` is called several times per second while the method waits for a slow or an unplugged camera.
+        ``meanwhile`` is called several times per second while the method waits for a slow or an unplugged camera. If it
+        raises an error, the wait ends, and the next call waits again.
 
         Raises
         ------
@@ -147,8 +148,6 @@ class OpenCvCamera:
         while True:
             if self.time_base is TimeBase.RECORDED:
                 self._clock.sleep(seconds_between(self._clock.now_ns(), after_ns))
-            elif meanwhile is not None:
-                self._await(meanwhile)
             exposed_ns = self._grab(meanwhile)
             if exposed_ns is not None and exposed_ns >= after_ns:
                 return Frame(self._retrieve(), exposed_ns, self.time_base is TimeBase.STAMPED)
@@ -288,7 +287,22 @@ class OpenCvCamera:
         return TimeBase.PACED
 
     def _await(self, meanwhile: Callable[[], object]) -> None:
-        """Wait until shortly before the next frame, estimated from the last ones, because `grab` blocks."""
+        """Wait until `grab` returns at once, because it blocks: for ten seconds if a stream of V4L2 hangs.
+
+        If the source cannot tell, wait until shortly before the next frame, estimated from the last ones.
+
+        Raises
+        ------
+        DeviceSilent
+            The stream hangs.
+        """
+        if wait := waiter_of(self._capture):
+            limit_s, begun_ns = max(self._timeout_s, 3 * max(self._waits_s)), self._clock.now_ns()
+            while not wait(_SLICE_S):
+                if seconds_between(begun_ns, self._clock.now_ns()) > limit_s:
+                    raise self._no_frames(1, limit_s)
+                meanwhile()
+            return
         spacing_s, now_ns = max(self._waits_s), self._clock.now_ns()
         frames = 1 + floor(seconds_between(self._arrived_ns, now_ns) / spacing_s)
         due_ns = self._arrived_ns + round((frames * spacing_s - _SLICE_S / 2) * 1e9)
@@ -298,14 +312,16 @@ class OpenCvCamera:
 
     def _grab(self, meanwhile: Callable[[], object] | None = None) -> int | None:
         """Grab the next frame; return the start of its exposure on the bench's clock, or None if it may be old."""
-        try:
-            return self._grab_now()
-        except DeviceSilent:
-            unplugged = not self._capture.isOpened() or self._node() != self._node_opened
-            if self._reopen is None or self.time_base is TimeBase.RECORDED or not unplugged:
-                raise
-            self._reconnect(self._reopen, meanwhile or (lambda: None))
-            return self._grab_now()
+        if self._reopen is None or self.time_base is TimeBase.RECORDED:
+            return self._grab_now(meanwhile)
+        if self._capture.isOpened():
+            try:
+                return self._grab_now(meanwhile)
+            except DeviceSilent:
+                if self._capture.isOpened() and self._node() == self._node_opened:
+                    raise
+        self._reconnect(self._reopen, meanwhile or (lambda: None))
+        return self._grab_now(meanwhile)
 
     def _reconnect(self, reopen: Callable[[], Capture], meanwhile: Callable[[], object]) -> None:
         """Wait until the camera is connected again, and set it up as before."""
@@ -346,19 +362,24 @@ class OpenCvCamera:
             )
         self.returns += 1
 
-    def _grab_now(self) -> int | None:
+    def _grab_now(self, meanwhile: Callable[[], object] | None) -> int | None:
         first_ns = self._clock.now_ns()
         attempts, waited_s = 0, 0.0
         while attempts < _RETRIES and waited_s <= self._timeout_s:  # V4L2 itself waits long for a hanging stream
             if attempts:
                 self._clock.sleep(self._period_s)
             asked_ns = self._clock.now_ns()
+            if meanwhile is not None and self.time_base is not TimeBase.RECORDED:
+                self._await(meanwhile)
             if self._capture.grab():
                 self._note_arrival(asked_ns)
                 return self._exposed_ns(asked_ns)
             attempts += 1
             waited_s = seconds_between(first_ns, self._clock.now_ns())
-        raise DeviceSilent(
+        raise self._no_frames(attempts, waited_s)
+
+    def _no_frames(self, attempts: int, waited_s: float) -> DeviceSilent:
+        return DeviceSilent(
             f"{self.identity.name} delivers no frames: {attempts} attempts failed."
             if attempts > 1
             else f"{self.identity.name} hangs: no frame in {waited_s:.0f} s.",

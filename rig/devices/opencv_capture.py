@@ -1,6 +1,7 @@
 """Opens cameras, video files and streams through OpenCV."""
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -35,6 +36,13 @@ class V4l2Capture:
         self.retrieve = capture.retrieve
         self.release = capture.release
 
+    def wait(self, seconds: float) -> bool:
+        """Wait for a frame at most so long; return whether `grab` then returns at once: it has a frame, or fails."""
+        try:
+            return bool(cv2.VideoCapture.waitAny([self._capture], max(round(seconds * 1e9), 1))[0])
+        except cv2.error:
+            return True
+
     def get(self, propId: int, /) -> float:
         """Return a property or a control; -1 if the camera lacks it."""
         if propId < v4l2.FIRST_CONTROL:
@@ -56,6 +64,12 @@ def modes_of(capture: Capture) -> tuple[v4l2.VideoMode, ...]:
     """Return the modes that a source offers; empty for a file or a stream."""
     modes: tuple[v4l2.VideoMode, ...] = capture.modes() if hasattr(capture, "modes") else ()
     return modes
+
+
+def waiter_of(capture: Capture) -> Callable[[float], bool] | None:
+    """Return the function that waits for a frame of a source at most so many seconds; None if it has none."""
+    wait: Callable[[float], bool] | None = getattr(capture, "wait", None)
+    return wait
 
 
 def open_capture(source: int | str | Path) -> Capture:

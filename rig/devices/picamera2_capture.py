@@ -104,6 +104,8 @@ class Picamera2Capture:
         self._request: Any = None
         self._metadata: Mapping[str, Any] = {}
         self._open, self._running, self._settling = True, False, False
+        self._waiting = False
+        """Whether `wait` has taken a frame that `grab` has not returned yet."""
 
     # -- interface of cv2.VideoCapture --------------------------------------------------------------------------------
 
@@ -114,15 +116,28 @@ class Picamera2Capture:
         """Take the next frame; False if none arrives in time."""
         if not self._open:
             return False
+        if not self._waiting:
+            self._take(_FRAME_WAIT_S)
+        self._waiting = False
+        return self._request is not None
+
+    def wait(self, seconds: float) -> bool:
+        """Wait for a frame at most so long; return whether `grab` then returns at once."""
+        if self._open and not self._waiting:
+            self._take(seconds)
+            self._waiting = self._request is not None
+        return self._waiting or not self._open
+
+    def _take(self, seconds: float) -> None:
+        """Take the next frame in place of the last one; none if none arrives in time."""
         self._start()
         self._release_request()
         try:
-            self._request = self._camera.capture_request(wait=_FRAME_WAIT_S)
+            self._request = self._camera.capture_request(wait=seconds)
         except (TimeoutError, RuntimeError):  # the sensor hangs, or the camera stopped
             self._camera.cancel_all_and_flush()  # or the request would later take a buffer that is never given back
-            return False
+            return
         self._metadata = self._request.get_metadata()
-        return True
 
     def retrieve(self) -> tuple[bool, NDArray[np.uint8] | None]:
         """Return the frame that was grabbed last, uint8 (H, W, 3) BGR."""
@@ -253,6 +268,7 @@ class Picamera2Capture:
 
     def _release_request(self) -> None:
         """Give the buffer of the last frame back; without free buffers the camera stops."""
+        self._waiting = False
         if self._request is not None:
             self._request.release()
             self._request = None

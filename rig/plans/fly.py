@@ -50,6 +50,8 @@ class Scan:
     def each(self) -> None:
         """Wait for the next frame, and keep it if it is the nearest so far to a planned angle."""
         frame = self.stream.next(self.table.collect_gyro)
+        if frame is None:
+            return
         self.stamps_ns.append(frame.stamp_ns)
         about_deg = self._about_deg(middle_ns(frame.stamp_ns, self.bench.config.camera_time))
         for index, angle_deg in self.angles_deg.items():

@@ -76,6 +76,8 @@ class _Passing:
     def each(self) -> float | None:
         """Take the next frame as evidence; return a new goal, or where the table stops if the search has ended."""
         frame = self.stream.next(self.table.collect_gyro, newest=True)
+        if frame is None:
+            return None
         self.stamps_ns = [*self.stamps_ns[1 - STAMPS :], frame.stamp_ns]
         if self.ended_ns is not None or self.rejected_in_a_row >= MOST_REJECTED:
             return self.goal_deg

@@ -22,6 +22,8 @@ GRID_MS: Final = 1.5
 """How far a stamp may be from the camera's regular rhythm, at least."""
 GRID_SIGMAS: Final = 5.0
 FEWEST_STAMPS: Final = 4
+PATIENCE_S: Final = 0.1
+"""How long the control loop of a moving table waits for a frame: the servo's watchdog needs to be fed meanwhile."""
 SURE_SIGMAS: Final = 2.0
 """A difference of the camera's time from that of its stamps counts from so many sigmas on."""
 
@@ -40,6 +42,10 @@ class StreamFrame:
     arrived_ns: int
     repeated: bool
     stamped: bool
+
+
+class _NoFrameYet(Exception):
+    """Ends the wait for a frame."""
 
 
 class FrameStream:
@@ -64,13 +70,20 @@ class FrameStream:
         fps = self._camera.identity.fps
         return 1 / fps if 1 <= fps <= 1000 else 1 / 30
 
-    def next(self, meanwhile: Callable[[], object] | None = None, *, newest: bool = False) -> StreamFrame:
-        """Return the next frame, or wait for it; with ``newest``, drop frames that have waited for two periods.
+    def next(self, meanwhile: Callable[[], object], *, newest: bool = False) -> StreamFrame | None:
+        """Return the next frame; None if the camera has delivered none after `PATIENCE_S`, so that the caller can work.
+
+        Parameters
+        ----------
+        meanwhile
+            Called while the method waits for a slow camera.
+        newest
+            Drop frames that have waited for two periods.
 
         Raises
         ------
         DeviceSilent
-            The camera delivers no frames.
+            The camera has failed.
         """
         after_ns = self._after_ns
         if newest and self._last is not None:
@@ -79,7 +92,17 @@ class FrameStream:
             if oldest_ns > after_ns:
                 self.skipped += max(int((oldest_ns - after_ns) * 1e-9 / self.period_s), 0)
                 after_ns = oldest_ns
-        frame = self._camera.capture(after_ns, meanwhile)
+        until_ns = self._clock.now_ns() + round(PATIENCE_S * 1e9)
+
+        def waited() -> None:
+            meanwhile()
+            if self._clock.now_ns() >= until_ns:
+                raise _NoFrameYet
+
+        try:
+            frame = self._camera.capture(after_ns, waited)
+        except _NoFrameYet:
+            return None
         last = self._last
         found = StreamFrame(
             0 if last is None else last.number + 1,

@@ -40,6 +40,11 @@ class RemoteCapture:
     def grab(self) -> bool:
         return bool(self._ask("grab")[0].get("ok"))
 
+    def wait(self, seconds: float) -> bool:
+        """Wait for a frame at most so long; return whether `grab` then returns at once."""
+        answer = self._ask("wait", seconds=seconds)[0]
+        return bool(answer.get("ok", True))  # `grab` fails if the simulated bench has ended
+
     def retrieve(self) -> tuple[bool, Any]:
         answer, pixels = self._ask("retrieve")
         if not answer.get("ok"):

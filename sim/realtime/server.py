@@ -87,8 +87,11 @@ class Session:
 
     def _camera(self, call: str, rest: Mapping[object, Any]) -> Answer:
         camera = self._devices.camera
-        if call == "grab":
-            return {"ok": self._grab()}, b""
+        match call, rest:
+            case "grab", {}:
+                return {"ok": self._grab()}, b""
+            case "wait", {"seconds": int() | float() as seconds} if seconds >= 0:
+                return {"ok": self._wait(min(seconds, SELECT_S))}, b""
         if call == "release":
             self.close()
             return {"ok": True}, b""
@@ -111,17 +114,23 @@ class Session:
         raise NotARequest
 
     def _grab(self) -> bool:
-        """Wait for the next frame, without holding the world meanwhile."""
-        camera, deadline_ns = self._devices.camera, self._time.now_ns() + round(SELECT_S * 1e9)
+        if not self._wait(SELECT_S):
+            return False
+        with self._time.present():
+            return self._devices.camera.grab()
+
+    def _wait(self, seconds: float) -> bool:
+        """Wait for the next frame, without holding the world meanwhile; return whether it is there."""
+        camera, deadline_ns = self._devices.camera, self._time.now_ns() + round(seconds * 1e9)
         while True:
             self._time.wait()
             with self._time.present():
                 wait_ns = camera.wait_ns()
-                if not wait_ns:
-                    return camera.grab()
-            if self._time.now_ns() > deadline_ns:
+            if not wait_ns:
+                return True
+            if (left_ns := deadline_ns - self._time.now_ns()) <= 0:
                 return False
-            SystemClock().sleep(min(wait_ns * 1e-9, _POLL_S))
+            SystemClock().sleep(min(wait_ns * 1e-9, left_ns * 1e-9, _POLL_S))
 
     # -- I2C --------------------------------------------------------------------------------------------------------
 

@@ -138,7 +138,7 @@ def test_faulty_frames_leave_only_true_views(tmp_path: Path, kinds: tuple[str, .
 
 @pytest.mark.parametrize(
     "kind",
-    ["camera.delayed", *(pytest.param(one, marks=pytest.mark.nightly) for one in (*MISSING, *MISTIMED, *UNRELIABLE))],
+    ["camera.delayed", "camera.stuck", "camera.off", *(pytest.param(one, marks=pytest.mark.nightly) for one in (*MISSING, *MISTIMED, *UNRELIABLE))],
 )
 def test_long_fault_of_frames_leaves_only_true_views(tmp_path: Path, kind: str) -> None:
     check_true_views(tmp_path, f"{kind}@1.5s+2s")

@@ -130,6 +130,19 @@ def test_search_at_rest_stays_without_calibration_and_motion_asks_for_it(model: 
             list(identify(bench, model, strategy="arc"))
 
 
+@pytest.mark.parametrize(("fault", "at_rest"), [("camera.stuck@0.8s+1.5s", 1), ("camera.off@0.8s+4s", 2)])
+def test_table_rotates_on_while_the_camera_delivers_nothing(model: Model, fault: str, at_rest: int) -> None:
+    """Frames of the same arc end the search, or a view at rest where the arc has ended."""
+    with moving(World(seed=2), faults=(fault,)) as bench:
+        *events, answer = identify(bench, model)
+        assert bench.operator.faults.history  # type: ignore[attr-defined]
+        assert not bench.servo.read_condition().torque
+    assert isinstance(answer, Identified)
+    assert answer.name == "bottle-harvest"
+    assert answer.seconds > 1.5
+    assert sum(isinstance(e, Accepted) and e.evidence.motion is None for e in events) == at_rest
+
+
 FAULTS = (
     "stamp_jump:ms=20@0.5s+0.1s",
     "stamps_backwards@0.7s+0.1s",
