@@ -1,5 +1,7 @@
 """The platter's angle in motion, compared with the simulated world's truth."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -56,8 +58,8 @@ def test_angle_of_a_fast_platter_is_neither_late_nor_early() -> None:
         for start_deg, end_deg in ((0.0, 150.0), (150.0, 0.0)):
             with motion_bench(seed=seed) as (bench, wires), Turntable(bench) as table:
                 table.goto(start_deg)
-                recorder, clock = table.recorder(), wires.world.clock
-                table.fly(end_deg, Flight(lambda: clock.sleep(0.033), (0.0, 150.0), recorder, 90.0))
+                recorder, pause = table.recorder(), partial(wires.world.clock.sleep, 0.033)
+                table.fly(end_deg, Flight(pause, (0.0, 150.0), recorder, 90.0))
                 trajectory = recorder.fit()
                 assert trajectory is not None
                 times = np.linspace(trajectory.start_ns + 5e6, trajectory.end_ns - 1e7, 400).astype(np.int64)

@@ -127,6 +127,7 @@ def outcome(tmp_path: Path, *faults: str) -> tuple[RigError | None, list[Event],
 MISSING = ("lost_frames:rate=0.4", "doubled_frame", "frozen_frame")
 MISTIMED = ("stamp_jump:ms=15", "stamps_backwards", "stamp_jitter")
 UNRELIABLE = ("camera.slow:fps=10", "camera.intermittent")
+OTHERS = ("camera.delayed", "camera.off", *MISSING, *MISTIMED, *UNRELIABLE)
 
 
 @pytest.mark.parametrize(
@@ -136,10 +137,7 @@ def test_faulty_frames_leave_only_true_views(tmp_path: Path, kinds: tuple[str, .
     check_true_views(tmp_path, *(f"{kind}@{1.5 + 1.1 * i:.1f}s+0.8s" for i, kind in enumerate(kinds)))
 
 
-@pytest.mark.parametrize(
-    "kind",
-    ["camera.delayed", "camera.stuck", "camera.off", *(pytest.param(one, marks=pytest.mark.nightly) for one in (*MISSING, *MISTIMED, *UNRELIABLE))],
-)
+@pytest.mark.parametrize("kind", ["camera.stuck", *(pytest.param(one, marks=pytest.mark.nightly) for one in OTHERS)])
 def test_long_fault_of_frames_leaves_only_true_views(tmp_path: Path, kind: str) -> None:
     check_true_views(tmp_path, f"{kind}@1.5s+2s")
 
