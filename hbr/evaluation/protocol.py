@@ -6,7 +6,7 @@ for all methods.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
-from typing import Final, Literal, get_args
+from typing import Final, Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +25,7 @@ from hbr.evaluation.methods import Method
 from hbr.model.symmetry import symmetry
 from hbr.model.views import Views
 from hbr.paper.hough import Ranking, retrieve
-from hbr.paper.index import ViewIndex
+from hbr.paper.index import ViewIndex, largest
 from hbr.paper.next_view import Side, next_view
 
 Removal = Literal["near", "paper79", "queries"]
@@ -155,6 +155,16 @@ class _Draws:
     coins: NDArray[np.bool_]
 
 
+class _Model(NamedTuple):
+    """The views that a search looks among: some of all views."""
+
+    views: Views
+    mask: NDArray[np.bool_]
+    """Which of all views they are."""
+    place: IndexArray
+    """Where each of them is among them."""
+
+
 def run_object(
     object_index: int,
     queries: LevelArray,
@@ -195,7 +205,7 @@ def run_object(
     runs = Runs.blank(len(methods), 1, protocol.trials, protocol.max_views)
     for t in range(protocol.trials):
         draws = trial.draw(t)
-        models: dict[bytes, Views] = {}
+        models: dict[bytes, _Model] = {}
         for m, method in enumerate(methods):
             trial.run(method, draws, models, runs, (m, 0, t))
     return runs
@@ -250,7 +260,7 @@ class _Trials:
         )
 
     def run(
-        self, method: Method, draws: _Draws, models: dict[bytes, Views], runs: Runs, at: tuple[int, int, int]
+        self, method: Method, draws: _Draws, models: dict[bytes, _Model], runs: Runs, at: tuple[int, int, int]
     ) -> None:
         """Store the results of one trial with one method in `runs`."""
         if method.dense:
@@ -265,12 +275,13 @@ class _Trials:
             keep = self._keep(np.array(seen))
             key = keep.tobytes()
             if key not in models:
-                models[key] = self._without(keep)
+                models[key] = self._model(keep)
             # a new index for each method: lists of another method would shorten the measured time
-            index = ViewIndex(models[key])
+            model = models[key]
+            index = ViewIndex(model.views)
             is_measured = at[2] == 0
             if not is_measured:
-                self._share_lists(index, keep, seen, method.list_length)
+                self._share_lists(index, model, seen, method.list_length)
             measured_deg = self._azimuth_deg[seen] + draws.error_deg[: n + 1]
             start_ns = self._now_ns()
             ranking = retrieve(
@@ -289,18 +300,15 @@ class _Trials:
             travelled_deg += abs(float(wrap180(self._azimuth_deg[following] - self._azimuth_deg[seen[-1]])))
             seen.append(following)
 
-    def _share_lists(self, index: ViewIndex, keep: NDArray[np.bool_], seen: list[int], list_length: int) -> None:
+    def _share_lists(self, index: ViewIndex, model: _Model, seen: list[int], list_length: int) -> None:
         """Let an index know the retrieval lists, from the similarities to all views that are computed once."""
-        mask = self._mask(keep)
-        place = np.cumsum(mask) - 1
         for i in seen:
             if (i, list_length) not in self._nearest_views:
                 longest = list_length + len(self._rows)  # at most the object's own views are missing
-                nearest = np.argsort(-self._similar[i], kind="stable")[:longest]
-                self._nearest_views[i, list_length] = nearest
+                self._nearest_views[i, list_length] = largest(self._similar[i], longest)[0]
             nearest = self._nearest_views[i, list_length]
-            rows = nearest[mask[nearest]][:list_length]
-            index.remember(self._queries[i], place[rows], self._similar[i, rows])
+            rows = nearest[model.mask[nearest]][:list_length]
+            index.remember(self._queries[i], model.place[rows], self._similar[i, rows])
 
     def _run_dense(self, method: Method, draws: _Draws, runs: Runs, at: tuple[int, int, int]) -> None:
         assert self._rule is not None
@@ -378,13 +386,11 @@ class _Trials:
             )
         return keep
 
-    def _mask(self, keep: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    def _model(self, keep: NDArray[np.bool_]) -> _Model:
+        """Return the enrolled views, of the searched object only those to keep."""
         mask = self._enrolled.copy()
         mask[self._rows] = keep
-        return mask
-
-    def _without(self, keep: NDArray[np.bool_]) -> Views:
-        return self._views.select(self._mask(keep))
+        return _Model(self._views.select(mask), mask, np.cumsum(mask) - 1)
 
     def _next(self, method: Method, draws: _Draws, seen: list[int], ranking: Ranking) -> int:
         """Return the next query: a photograph that was not a query yet."""

@@ -120,8 +120,9 @@ class Views:
         """Return the views of these indices, or of a mask. Every object keeps its index and name."""
         chosen = copy(self)  # which has been checked
         chosen.__dict__.pop("by_object", None)
+        rows = np.flatnonzero(rows) if rows.dtype == np.bool_ else rows
         for name in ("descriptors", "azimuth_deg", "object_index"):
-            object.__setattr__(chosen, name, _read_only(getattr(self, name)[rows]))
+            object.__setattr__(chosen, name, _read_only(np.take(getattr(self, name), rows, axis=0)))
         return chosen
 
     def of(self, object_index: int) -> IndexArray:

@@ -192,7 +192,7 @@ class _Flat:
     def top(self, query: LevelArray, k: int) -> tuple[IndexArray, FloatArray]:
         q = query.astype(np.float32)
         dots = (self._rows @ q).astype(np.float64)
-        return _best(tanimoto_of_dots(dots, squares(q[None]), self._squares), k)
+        return largest(tanimoto_of_dots(dots, squares(q[None]), self._squares), k)
 
 
 class _Bound:
@@ -247,7 +247,7 @@ class _Bound:
         promising = _promising(bounds, k)
         reached = np.sort(self._similarities(query, promising))[-k]
         rows = np.flatnonzero(bounds >= np.float32(reached * (1 - 1e-5)))
-        best, similarities = _best(self._similarities(query, rows), k)
+        best, similarities = largest(self._similarities(query, rows), k)
         return rows[best], similarities
 
     def _similarities(self, query: LevelArray, rows: IndexArray) -> FloatArray:
@@ -282,19 +282,19 @@ class _Tree:
             # slightly larger: a view on the border can be as similar as the k-th
             radius = np.sqrt(q @ q * (alpha * alpha - 1)) * (1 + 1e-9) + 1e-6
             rows = np.sort(np.array(self._tree.query_ball_point(alpha * q, radius), np.intp))
-        best, similarities = _best(tanimoto(query, self._descriptors[rows])[0], k)
+        best, similarities = largest(tanimoto(query, self._descriptors[rows])[0], k)
         return rows[best], similarities
 
 
-def _best(values: FloatArray, k: int) -> tuple[IndexArray, FloatArray]:
+def largest(values: FloatArray, k: int) -> tuple[IndexArray, FloatArray]:
     """Return indices and values of the `k` largest values, best first; equal values by rising index."""
     rows = np.arange(len(values))
-    if len(values) >= k * _GROUP:
+    if len(values) > 2 * k > 0:
         # k groups have a maximum of at least `limit`, therefore at least k values do
-        limit = np.partition(_group_maxima(values), -k)[-k]
-        rows = np.flatnonzero(values >= limit)
-    best = rows[np.argsort(-values[rows], kind="stable")[:k]]
-    return best, values[best]
+        candidates = _group_maxima(values) if len(values) >= k * _GROUP else values
+        rows = np.flatnonzero(values >= np.partition(candidates, -k)[-k])
+    chosen = rows[np.argsort(-values[rows], kind="stable")[:k]]
+    return chosen, values[chosen]
 
 
 def _promising(values: NDArray[np.float32], k: int) -> IndexArray:

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hbr import ViewIndex, Views, tanimoto
-from hbr.paper.index import Method, _best, _Bound, _promising
+from hbr.paper.index import Method, _Bound, _promising, largest
 from tests.fuzzing import examples
 
 METHODS = get_args(Method)
@@ -121,7 +121,7 @@ def test_results_are_cached_and_returned_as_copies(monkeypatch: pytest.MonkeyPat
 
 @given(st.lists(st.integers(0, 5), min_size=1, max_size=400), st.integers(1, 10))
 def test_best_of_equal_values_has_the_lower_index(values: list[int], k: int) -> None:
-    rows, best = _best(np.array(values, float), k)
+    rows, best = largest(np.array(values, float), k)
     expected = sorted(range(len(values)), key=lambda i: (-values[i], i))[:k]
     assert rows.tolist() == expected
     assert best.tolist() == [values[i] for i in expected]
