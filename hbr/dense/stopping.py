@@ -37,6 +37,7 @@ class StopReason(StrEnum):
     MARGIN = "margin"
     MAX_VIEWS = "max-views"
     NO_ROTATION_LEFT = "no-rotation-left"
+    LOCAL_DIFFERENCE = "local-difference"
     CUSTOM = "custom"
     EARLIER_VERSION = "earlier-version"
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hbr import Outcome, StopDecision, StopReason
+from rig.events.compared import Compared
 from rig.motion.scan_speed import SpeedLimit
 from rig.views.capture import ViewEvidence
 
@@ -35,6 +36,7 @@ class NoteCode(StrEnum):
     STOPPING_RULE_OUTDATED = "stopping-rule-outdated"
     RATES_NOT_GUARANTEED = "rates-not-guaranteed"
     NOT_RECORDED = "not-recorded"
+    NOT_COMPARED = "not-compared"
     LOCAL_COPY = "local-copy"
     EARLIER_VERSION = "earlier-version"
 
@@ -415,6 +417,7 @@ Event = (
     | Accepted
     | Ranked
     | FrameUsed
+    | Compared
     | Decided
     | Enrolled
     | Identified

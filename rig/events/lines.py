@@ -3,6 +3,7 @@
 from typing import Final
 
 from hbr import Outcome
+from rig.events.compared import Compared
 from rig.events.events import (
     Accepted,
     Candidate,
@@ -26,9 +27,10 @@ from rig.events.events import (
     Waiting,
     Warned,
 )
-from rig.events.phrases import angle_words, azimuth_words, counted, duration_words, percent_words, signed
+from rig.events.phrases import angle_words, azimuth_words, counted, duration_words, percent_words, sentence, signed
 from rig.events.wording import (
     answer_lines,
+    comparison_words,
     decision_words,
     move_words,
     next_step_words,
@@ -79,6 +81,8 @@ def line(event: Event) -> str:
             retakes = f", {counted(event.retakes, 'rejected image')}" if event.retakes else ""
             took = duration_words(event.seconds)
             return f"{event.name}: {counted(event.views, 'view')} enrolled in {took}{retakes}"
+        case Compared():
+            return f"  {sentence(comparison_words(event))}"
         case Identified():
             least = "" if event.min_score is None else f" (unknown below {event.min_score:.3f})"
             numbers = (

@@ -5,6 +5,7 @@ from typing import Any, Final
 
 from hbr import Outcome, StopDecision, StopReason
 from hbr.dense.stopping import Limitation, LimitationCode
+from rig.events.compared import Compared
 from rig.events.events import (
     Candidate,
     Decided,
@@ -85,6 +86,8 @@ def note_words(note: Note) -> str:
             )
         case NoteCode.NOT_RECORDED:
             return f"the answer is not recorded: {v['what']}"
+        case NoteCode.NOT_COMPARED:
+            return f"the leading candidates are not compared pixel by pixel: {v['what']}"
         case NoteCode.LOCAL_COPY:
             return f"the server of the catalog cannot be used; this uses the copy of {v['copied_utc']}"
         case NoteCode.EARLIER_VERSION:
@@ -218,6 +221,19 @@ def stop_words(decision: StopDecision, views: int) -> str:
             return f"the best candidate after {counted(views, 'view')}, with a confidence of {confidence} below {least}"
 
 
+def comparison_words(compared: Compared) -> str:
+    """Return what the comparison of two candidates found, as a sentence without its full stop."""
+    first, second = compared.names
+    begin = f"compared with {first} and {second} pixel by pixel where they differ most"
+    if compared.winner is not None:
+        bound = percent_words(compared.error_bound)
+        score = signed(compared.score, 2)
+        return f"{begin}: it is {compared.winner}, with an error rate of at most {bound} (score {score})"
+    if not compared.views:
+        return f"{begin}: their enrolled views show no difference from these sides"
+    return f"{begin}: the difference does not tell which one it is (score {signed(compared.score, 2)})"
+
+
 def reason_words(answer: Identified) -> str:
     """Return why a search ended."""
     match answer.reason:
@@ -225,6 +241,10 @@ def reason_words(answer: Identified) -> str:
             return f"the margin {answer.margin:.3f} per view reaches {answer.min_margin:g}"
         case StopReason.NO_ROTATION_LEFT:
             return "the cable allows no other view"
+        case StopReason.LOCAL_DIFFERENCE if answer.outcome is Outcome.FOUND:
+            return "the leading candidates were compared pixel by pixel where they differ most"
+        case StopReason.LOCAL_DIFFERENCE:
+            return "the views fit two enrolled objects up to noise, and do not tell which one it is"
         case StopReason.CUSTOM | StopReason.EARLIER_VERSION:
             return answer.note
         case StopReason.MAX_VIEWS if answer.confidence is None:

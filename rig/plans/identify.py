@@ -13,15 +13,16 @@ from hbr.core.angles import wrap360
 from rig.bench import Bench
 from rig.config import RigConfig
 from rig.core.clock import seconds_between
-from rig.core.errors import RigError
-from rig.events.events import Accepted, Event, FrameUsed, Identified, Started
+from rig.core.errors import CatalogError, RigError
+from rig.events.events import Accepted, Event, FrameUsed, Identified, Note, NoteCode, Started, Warned
 from rig.motion.scan_speed import can_fly, require_camera_time
 from rig.motion.turntable import Turntable
 from rig.plans.capture import announced, capture, check_camera, moved, unwind, warn_of_table
 from rig.plans.identify_moving import decided as decided_event
 from rig.plans.identify_moving import search_in_motion
+from rig.search.local_step import compare_leaders
 from rig.search.model import Model, empty_table_for
-from rig.search.session import SHOWN, ArcSearch, begin_search
+from rig.search.session import SHOWN, ArcSearch, Search, begin_search
 from rig.search.strategies import AnyStrategy, Finish
 from rig.views.capture import Viewer
 from rig.views.description import SearchDescriber
@@ -111,6 +112,7 @@ def identify(
     if isinstance(search, ArcSearch):
         found = yield from search_in_motion(bench, search, viewer, describe, top=top, started_ns=started_ns, live=live)
         answer = search.answer(found.ranked, found.end, travelled_deg=found.travelled_deg, seconds=found.seconds)
+        answer = yield from _compared(search, answer, describe, model)
         yield answer
         if found.failed:
             raise found.failed
@@ -164,10 +166,28 @@ def identify(
         except RigError as error:
             failed = error  # report the answer first
     answer = search.answer(ranked, step, travelled_deg=travelled_deg, seconds=seconds)
+    answer = yield from _compared(search, answer, describe, model)
     yield answer
     if failed:
         raise failed
     return answer
+
+
+def _compared(
+    search: Search, answer: Identified, describe: SearchDescriber, model: Model | hbr.ViewIndex
+) -> Generator[Event, None, Identified]:
+    """Compare the two leaders pixel by pixel if the search does not end with one object; return the answer."""
+    if not isinstance(model, Model) or model.leader_views is None:
+        return answer
+    try:
+        found = compare_leaders(search, answer, describe.segmentations, model.leader_views)
+    except CatalogError as error:  # an image is missing: the search has its answer without it
+        yield Warned(answer.views - 1, Note(NoteCode.NOT_COMPARED, {"what": error.what, "next_step": error.next_step}))
+        return answer
+    if found is None:
+        return answer
+    yield found.event
+    return found.answer_of(answer)
 
 
 def flies(config: RigConfig, model: Model | hbr.ViewIndex) -> bool:

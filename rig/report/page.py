@@ -24,6 +24,7 @@ from rig.events.events import Candidate, Ranked
 from rig.events.phrases import azimuth_words, counted, listed, sentence, signed
 from rig.events.wording import (
     answer_words,
+    comparison_words,
     decision_words,
     move_words,
     note_words,
@@ -170,6 +171,8 @@ class _Retrieval(NamedTuple):
     arc: ArcFigure
     notes: list[str]
     decisions: list[Markup]
+    differs: str
+    comparison: str
     frames: list[_Frame]
     unfold: bool
 
@@ -187,7 +190,7 @@ class _Object(NamedTuple):
 
 
 def _retrieval(number: int, record: IdentificationRecord, *, unfold: bool) -> _Retrieval:
-    answer, views = record.answer, record.views
+    answer, views, compared = record.answer, record.views, record.compared
     error_deg = record.pose_error_deg
     path = scores = Markup()
     if views:
@@ -224,6 +227,8 @@ def _retrieval(number: int, record: IdentificationRecord, *, unfold: bool) -> _R
         arc=arc_figure(record),
         notes=[sentence(note_words(note)) for note in record.notes],
         decisions=_decisions(record),
+        differs="" if compared is None or compared.picture_bgr is None else _data_uri(compared.picture_bgr),
+        comparison="" if compared is None else sentence(comparison_words(compared)),
         frames=_frames(record),
         unfold=unfold or record.correct is False,
     )

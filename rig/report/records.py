@@ -11,6 +11,7 @@ from typing import Any, Final
 from hbr.core.angles import wrap180
 from rig.catalog import ViewRecord
 from rig.charts.polar_path import PathStep
+from rig.events.compared import Compared
 from rig.events.events import (
     Accepted,
     Decided,
@@ -166,6 +167,7 @@ class IdentificationRecord:
         self.ranked: list[Ranked] = []
         self.used: list[FrameUsed] = []
         self.decided: list[Decided] = []
+        self.compared: Compared | None = None
         self.answer: Identified | None = None
         self._collector = _ViewCollector(FRAME, region)
 
@@ -184,6 +186,8 @@ class IdentificationRecord:
                 self.ranked.append(event)
             case FrameUsed():
                 self.used.append(event)
+            case Compared():
+                self.compared = event
             case Decided():
                 self.decided.append(event)
             case Identified():
@@ -230,7 +234,9 @@ class IdentificationRecord:
             rotation_deg = wrap180(after.azimuth_deg - before.azimuth_deg)
             if after.move is not None:
                 rotation_deg += 360.0 * round((-after.move.rotation_encoder_deg - rotation_deg) / 360.0)
-            decided = next(d for d in reversed(self.decided) if d.index <= before.index)
+            decided = next((d for d in reversed(self.decided) if d.index <= before.index), None)
+            if decided is None:  # a damaged run
+                continue
             if decided is last and after.evidence.motion is not None:
                 rotation_deg += steps.pop().rotation_deg
             steps.append(PathStep(rotation_deg, decided.s_left, decided.s_right, decided.candidates[:2]))

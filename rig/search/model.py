@@ -3,15 +3,17 @@
 Decision: docs/decisions/0030.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 import hbr
+from hbr.dense.local_difference import LocalView
 from rig.bench import Bench
 from rig.catalog import Catalog
 from rig.catalog.descriptions import (
@@ -23,6 +25,7 @@ from rig.catalog.descriptions import (
     read_image,
 )
 from rig.catalog.jobs import JobProgress
+from rig.catalog.local_views import local_views
 from rig.catalog.prepared import prepared_views
 from rig.core.errors import CatalogError, DescriptorOutdated
 from rig.events.events import Note, NoteCode
@@ -51,6 +54,9 @@ class Model:
         The newest empty-table image of the enrollments.
     bench_image : uint8 array (H, W, 3), optional
         An image that shows the bench of the newest enrollment: its empty-table image, or one of its views.
+    leader_views
+        Returns the enrolled views of an object near some azimuths (`rig.catalog.local_views`); None if the model does
+        not come from a catalog.
     """
 
     index: hbr.ViewIndex | hbr.DenseIndex
@@ -60,6 +66,7 @@ class Model:
     camera: tuple[Mapping[str, Any], ...] = field(default=(), repr=False)
     empty_table: NDArray[np.uint8] | None = field(default=None, repr=False)
     bench_image: NDArray[np.uint8] | None = field(default=None, repr=False)
+    leader_views: Callable[[str, Sequence[float]], Sequence[LocalView]] | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         if isinstance(self.index, hbr.DenseIndex) and self.rule is None:
@@ -150,7 +157,8 @@ def _dense(catalog: Catalog, progress: Callable[[JobProgress], None] | None) -> 
             table = bench_image = read_image(catalog, before.newest)
         elif (view := newest_view(catalog)) is not None:
             bench_image = read_image(catalog, view)
-    return Model(index, rule, notes, with_image, tuple(camera_settings(catalog)), table, bench_image)
+    camera = tuple(camera_settings(catalog))
+    return Model(index, rule, notes, with_image, camera, table, bench_image, partial(local_views, catalog))
 
 
 def empty_table_for(bench: Bench, model: Model) -> tuple[NDArray[np.uint8] | None, tuple[Note, ...]]:

@@ -5,7 +5,9 @@ from dataclasses import dataclass, field, replace
 from math import isclose
 from typing import Any, Final
 
+from rig.events.compared import Compared
 from rig.events.events import Accepted, Decided, FrameUsed, Identified, Moved, Ranked, RotationReason, plain
+from rig.search.local_step import Comparison, compare_leaders, saved_leader_views
 from rig.search.saved_run import SavedRun
 from rig.search.session import ArcSearch, Search, begin_search
 from rig.search.strategies import AnyStrategy, Finish, Rotate
@@ -74,6 +76,7 @@ def check(run: SavedRun, *, by: AnyStrategy | None = None) -> Check:
     describe: ViewDescriber | None = None
     ranked: Ranked | None = None
     step: Rotate | Finish | None = None
+    compared: Comparison | None = None
     table_deg = 0.0
     for event in run.events():
         computed: Any = None
@@ -112,10 +115,18 @@ def check(run: SavedRun, *, by: AnyStrategy | None = None) -> Check:
             case Decided():
                 found.decisions += 1
                 computed = _decided(step, event)
+            case Compared() if ranked is not None and search is not None and isinstance(describe, SearchDescriber):
+                end = step if isinstance(step, Finish) else Finish()
+                compared = compare_leaders(
+                    search, search.answer(ranked, end), describe.segmentations, saved_leader_views(event)
+                )
+                computed = {} if compared is None else compared.event
             case Identified() if ranked is not None and search is not None:
                 found.decisions += 1
                 end = step if isinstance(step, Finish) else Finish()
                 answer = search.answer(ranked, end, travelled_deg=event.travelled_deg, seconds=event.seconds)
+                if compared is not None:
+                    answer = compared.answer_of(answer)
                 computed = replace(answer, candidates=answer.candidates[: len(event.candidates)])
                 found.is_complete = not run.is_cut
             case _:

@@ -3,6 +3,7 @@
 ``run.json`` contains the conditions and settings, ``model.jsonl`` the enrolled views (one object in each line),
 ``events.jsonl`` the events (one in each line), ``frames/000.png``, ... the accepted frames without loss. The folder of
 a dense search also contains the stopping rule (``search_rules.json``) and the empty-table image (``empty_table.png``).
+``leaders/`` has the enrolled views of two candidates that were compared pixel by pixel, as crop and mask.
 
 Decision: docs/decisions/0018.
 """
@@ -10,7 +11,7 @@ Decision: docs/decisions/0018.
 import json
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from math import isfinite
 from pathlib import Path
@@ -29,6 +30,7 @@ from rig.config import RigConfig
 from rig.config.values import validate
 from rig.core.errors import CatalogError, RigError, UsageError
 from rig.core.files import json_values, read, write
+from rig.events.compared import Compared
 from rig.events.events import Accepted, Event, Identified, Moved, Ranked, Started, event_dict
 from rig.events.reading import event_of
 from rig.search.earlier_runs import NOT_SAVED, upgraded
@@ -38,10 +40,12 @@ from rig.search.stopping_rules import read_stopping_rule, write_stopping_rule
 from rig.views import image_files as images
 
 FORMAT: Final = "hbr-rig run"
-VERSION: Final = 5
+VERSION: Final = 6
 """Version 2 brought the dense search; version 3 stores codes instead of sentences, and terms of the glossary.
-Since version 4 similarities are the same on every computer."""
+Since version 4 similarities are the same on every computer. Version 6 brought the comparison of the two leaders."""
 EMPTY_TABLE: Final = "empty_table.png"
+LEADERS: Final = "leaders"
+DIFFERS_HERE: Final = f"{LEADERS}/differs_here.png"
 
 MAX_FRAME_PIXELS: Final = 64_000_000
 """8000 x 8000, the largest frame of the configuration."""
@@ -134,9 +138,19 @@ class RunWriter:
         try:
             if isinstance(event, Accepted):
                 write(frame_path(self._folder, event.index), images.encode(event.image_bgr))
+            elif isinstance(event, Compared):
+                self._add_compared(event)
             self._line(event_dict(event))
         except OSError as error:
             raise _not_writable(self._folder, error) from error
+
+    def _add_compared(self, event: Compared) -> None:
+        (self._folder / LEADERS).mkdir(exist_ok=True)
+        if event.picture_bgr is not None:
+            write(self._folder / DIFFERS_HERE, images.encode(event.picture_bgr))
+        for side, own in enumerate(event.leaders):
+            for number, image in enumerate(own):
+                write(leader_path(self._folder, side, number), images.encode(image))
 
     def _line(self, value: dict[str, Any]) -> None:
         self._events.write(json.dumps(value, ensure_ascii=False, allow_nan=False, default=str) + "\n")
@@ -189,6 +203,8 @@ class SavedRun:
             try:
                 event = event_of(upgraded(line) if self.format_version < 3 else line, self._frame)
                 _check_event(event)
+                if isinstance(event, Compared):
+                    event = self._with_images(event)
             except _DAMAGE as error:
                 raise _damaged(self.folder, f"events.jsonl, line {number}: {_reason(error)}") from error
             yield event
@@ -231,6 +247,14 @@ class SavedRun:
     def format_version(self) -> int:
         """The version of the run's format."""
         return int(self.about["version"])
+
+    def _with_images(self, event: Compared) -> Compared:
+        picture = _image(self.folder, self.folder / DIFFERS_HERE) if event.views else None
+        leaders = tuple(
+            tuple(_image(self.folder, leader_path(self.folder, side, number)) for number in range(len(azimuths_deg)))
+            for side, azimuths_deg in enumerate(event.azimuths_deg)
+        )
+        return replace(event, picture_bgr=picture, leaders=leaders)
 
     def _frame(self, index: int) -> NDArray[np.uint8]:
         frame = _image(self.folder, frame_path(self.folder, index))
@@ -284,6 +308,11 @@ def load_run(folder: Path) -> SavedRun:
 def frame_path(folder: Path, index: int) -> Path:
     """Return the file of the frame of an accepted view."""
     return folder / "frames" / f"{index:03d}.png"
+
+
+def leader_path(folder: Path, side: int, number: int) -> Path:
+    """Return the file of an enrolled view of the first (0) or second (1) leader that were compared."""
+    return folder / LEADERS / f"{side}-{number:03d}.png"
 
 
 def _model_lines(views: hbr.Views) -> Iterator[str]:

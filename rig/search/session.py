@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 from math import isfinite
-from typing import Final, cast
+from typing import Any, Final, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,6 +88,11 @@ class Search(ABC):
         self._earlier, self._reliable, self._same_bench = earlier, reliable, same_bench
         ranked = self._rank(levels)
         return ranked, self._decide(ranked, table_deg)
+
+    @property
+    def orientations_deg(self) -> tuple[float, ...]:
+        """Orientation of each view so far."""
+        return tuple(self._orientations)
 
     @abstractmethod
     def _rank(self, levels: NDArray[np.uint8]) -> Ranked: ...
@@ -247,21 +252,42 @@ class DenseSearch(Search):
         )
         return self._strategy.next(state)
 
+    @property
+    def belief(self) -> hbr.Belief:
+        """The belief after the last view."""
+        return self._session.belief
+
+    @property
+    def beta(self) -> float:
+        """As for `hbr.Belief.posterior`."""
+        return self._session.rule.beta
+
+    @property
+    def error_rate(self) -> float:
+        """The largest share of wrong objects among those named."""
+        return self._session.rule.error_rate
+
+    def pose_fields(self, object_index: int) -> dict[str, Any]:
+        """Return the fields of the answer that say how an object is rotated."""
+        found = pose(self._session.belief, object_index)
+        yaws_deg = tuple(float(wrap360(self._orientations[-1] - azimuth_deg)) for azimuth_deg in found.azimuth_deg)
+        return {
+            "yaw_deg": yaws_deg[0] if len(yaws_deg) == 1 else None,
+            "yaw_sigma_deg": found.sigma_deg,
+            "yaw_set_deg": yaws_deg,
+            "period_deg": found.period_deg,
+        }
+
     def answer(self, ranked: Ranked, end: Finish, *, travelled_deg: float = 0.0, seconds: float = 0.0) -> Identified:
         answer = super().answer(ranked, end, travelled_deg=travelled_deg, seconds=seconds)
         decision = self._session.end()
-        found = pose(self._session.belief, decision.object_index)
-        yaws_deg = tuple(float(wrap360(self._orientations[-1] - azimuth_deg)) for azimuth_deg in found.azimuth_deg)
         threshold = decision.open_set_threshold
         return replace(
             answer,
             name=None if decision.outcome is hbr.Outcome.UNKNOWN else answer.name,
             outcome=decision.outcome,
             possible=self._possible(decision),
-            yaw_deg=yaws_deg[0] if len(yaws_deg) == 1 else None,
-            yaw_sigma_deg=found.sigma_deg,
-            yaw_set_deg=yaws_deg,
-            period_deg=found.period_deg,
+            **self.pose_fields(decision.object_index),
             confidence=decision.confidence,
             min_confidence=decision.min_confidence,
             open_set_score=decision.open_set_score,

@@ -233,6 +233,11 @@ class SearchDescriber(ViewDescriber):
         self._same_bench: bool | None = None
         self._views: hbr.ViewsTogether | None = None
 
+    @property
+    def segmentations(self) -> list[hbr.Segmentation]:
+        """The likeliest segmentation of each view so far; empty if the descriptor needs none."""
+        return [] if self._views is None else [several[0] for several in self._views.segmentations]
+
     def __call__(self, image_bgr: NDArray[np.uint8], stored: Mapping[str, Any] | None = None) -> DescribedView:  # noqa: ARG002
         """Describe the next frame of the search; errors as for `ViewDescriber`."""
         if not self._segments:

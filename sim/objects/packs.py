@@ -62,9 +62,9 @@ def _offer(s: Sheet) -> None:
     s.text("2x", 0.5, 0.62, 0.1, p.RED, width=0.16)
 
 
-def _honey() -> Solid:
+def _honey(name: str, lid: Colour) -> Solid:
     def label(s: Sheet) -> None:
-        s.band(0.0, 0.42, p.YELLOW)
+        s.band(0.0, 0.42, lid)
         s.dots(28, 2, 0.012, p.ORANGE, top=0.29, bottom=0.42)
         s.panel(0.28, 0.56, 0.72, 0.92, p.WHITE)
         for u, v in ((0.36, 0.68), (0.36, 0.8), (0.405, 0.74), (0.64, 0.68), (0.64, 0.8), (0.595, 0.74)):
@@ -75,10 +75,10 @@ def _honey() -> Solid:
         *((0.0, 104.0), (36.0, 104.0), (37.0, 84.0), (34.0, 82.0)),
         *smooth((34, 82), (45, 74), (46, 60), (46, 12), (42, 0)),
     )
-    return Solid("jar-honey", (Revolution(profile, painted((24, 128, 214), label), shine=0.8),))
+    return Solid(name, (Revolution(profile, painted((24, 128, 214), label), shine=0.8),))
 
 
-def _milk() -> Solid:
+def _milk(name: str, *, with_handle: bool) -> Solid:
     def label(s: Sheet) -> None:
         s.band(0.0, 0.17, p.BLUE)
         for u, v, r in ((0.1, 0.6, 0.07), (0.2, 0.75, 0.09), (0.8, 0.58, 0.08), (0.93, 0.8, 0.07), (0.02, 0.85, 0.05)):
@@ -87,7 +87,8 @@ def _milk() -> Solid:
 
     body = smooth((0, 172), (20, 172), (20, 152), (20, 146), (42, 116), (43, 100), (43, 12), (38, 0))
     jug = Revolution(body, painted(p.WHITE, label), shine=0.3)
-    return Solid("bottle-milk", (jug, Tube(handle(36, 122, 56, 28, 5, 180), p.WHITE)))
+    grip = (Tube(handle(36, 122, 56, 28, 5, 180), p.WHITE),) if with_handle else ()
+    return Solid(name, (jug, *grip))
 
 
 def _tin() -> Solid:
@@ -173,11 +174,11 @@ def _book(name: str, size: tuple[float, float, float], cloth: Colour, cover: Bru
     )
 
 
-def _globe(s: Sheet) -> None:
+def _globe(s: Sheet, title: str = "ATLAS") -> None:
     s.disc(0.5, 0.6, 0.27, p.BLUE)
     for u, v, r in ((0.4, 0.52, 0.1), (0.62, 0.6, 0.09), (0.45, 0.72, 0.08), (0.6, 0.45, 0.05)):
         s.star(u, v, r, p.GREEN, points=7, waist=0.7)
-    s.text("ATLAS", 0.5, 0.17, 0.1, p.YELLOW, width=0.8)
+    s.text(title, 0.5, 0.17, 0.1, p.YELLOW, width=0.8)
 
 
 def _moon(s: Sheet) -> None:
@@ -222,7 +223,7 @@ def _recycled(s: Sheet) -> None:
     s.star(0.5, 0.8, 0.1, p.WHITE, points=3, waist=0.5)
 
 
-def _tissues() -> Solid:
+def _tissues(name: str, *back: Brush) -> Solid:
     def wall(s: Sheet) -> None:
         for i in range(5):
             s.disc(i / 4, 0.2 + 0.15 * (i % 2), 0.17, p.PINK)
@@ -236,9 +237,12 @@ def _tissues() -> Solid:
         painted(p.TEAL, wall),
         painted(p.TEAL, wall, lambda s: s.text("SOFT", 0.5, 0.5, 0.25, p.WHITE, width=0.7)),
     )
+    plain = painted(p.TEAL, wall, *back)
     tissue = Revolution(smooth((0, 108), (6, 107), (7, 96), (22, 84), (28, 80)), painted(p.WHITE), layer=1)
     return Solid(
-        "box-tissues", (box((150, 82, 80), (long, short, long, short), top=painted(p.TEAL, top)), tissue), 180.0
+        name,
+        (box((150, 82, 80), (long, short, plain, short), top=painted(p.TEAL, top)), tissue),
+        360.0 if back else 180.0,
     )
 
 
@@ -250,8 +254,8 @@ def packs() -> tuple[Solid, ...]:
         _can("can-tomato", p.RED, "TOMATO", (40, 50, 230)),
         _can("can-tomato-offer", p.RED, "TOMATO", (40, 50, 230), lambda s: s.around(90, _offer)),
         _can("can-peach", p.TEAL, "PEACH", (90, 170, 250)),
-        _honey(),
-        _milk(),
+        _honey("jar-honey", p.YELLOW),
+        _milk("bottle-milk", with_handle=True),
         _tin(),
         _pencil_pot(),
         _cereal("cereal-plain"),
@@ -259,5 +263,15 @@ def packs() -> tuple[Solid, ...]:
         _book("book-atlas", (118, 34, 152), p.NAVY, _globe, "ATLAS", p.YELLOW),
         _book("book-night", (96, 22, 140), p.PURPLE, _moon, "Night", p.CREAM),
         _juice(),
-        _tissues(),
+        _tissues("box-tissues"),
+    )
+
+
+def more_twins() -> tuple[Solid, ...]:
+    """Return twins that differ in a printed letter, the colour of a lid, a missing handle, and a sticker."""
+    return (
+        _book("book-atlan", (118, 34, 152), p.NAVY, lambda s: _globe(s, "ATLAN"), "ATLAS", p.YELLOW),
+        _honey("jar-honey-amber", (40, 180, 240)),
+        _milk("bottle-milk-plain", with_handle=False),
+        _tissues("box-tissues-sale", lambda s: s.disc(0.8, 0.25, 0.11, p.RED)),
     )

@@ -16,7 +16,7 @@ from sim.objects.polyhedron import box, lying_cylinder
 from sim.objects.pottery import pottery
 from sim.objects.projection import CENTRE_PX, COS, PX_PER_MM, SIN, Image, Visible
 from sim.objects.revolution import Revolution
-from sim.objects.shelf import CONFUSABLE, shelf
+from sim.objects.shelf import CONFUSABLE, MORE_CONFUSABLE, shelf, twins
 from sim.objects.solid import Part, Solid, empty_platter
 from sim.objects.tube import Tube
 
@@ -176,6 +176,12 @@ def test_confusable_objects_differ_from_some_sides_only(one: str, other: str) ->
     apart = np.array([difference(render(a, o), render(b, o)) for o in np.arange(0.0, 360.0, 20.0)])
     assert 0.25 <= (apart < 0.02).mean() <= 0.9
     assert apart.max() > 0.3
+
+
+@pytest.mark.parametrize(("one", "other"), MORE_CONFUSABLE)
+def test_more_twins_differ_little_but_visibly(one: str, other: str) -> None:
+    apart = [difference(render(twins()[one], o), render(twins()[other], o)) for o in (0.0, 90.0, 180.0, 270.0)]
+    assert 0.02 < max(apart) < 4
 
 
 def test_other_objects_differ() -> None:

@@ -12,6 +12,7 @@ from hbr import StopDecision
 from rig.catalog import Catalog
 from rig.core.errors import ViewRejected
 from rig.devices.camera import CameraLocks
+from rig.events.compared import Compared, ComparedView
 from rig.events.events import (
     SCHEMA,
     Candidate,
@@ -45,6 +46,7 @@ TEXT = (Path(__file__).parents[3] / "docs" / "events.md").read_text(encoding="ut
 PLAIN = {"string": str, "integer": int, "number": (int, float), "boolean": bool, "object": dict}
 PARTS = {
     "candidate": Candidate,
+    "compared_view": ComparedView,
     "similar_object": SimilarObject,
     "weighed": Weighed,
     "note": Note,
@@ -141,6 +143,9 @@ def test_every_event_that_the_plans_emit_is_as_documented(simulated, tmp_path):
     seen.add(check_event(Warned(3, Note(NoteCode.EMPTY_TABLE_CHANGED, {"problem": {"code": "missing"}}))))
     seen.add(check_event(FrameUsed(3, 30.0, 1.0, 0, "dice", 0.5, hbr.Outcome.CONTINUE)))
     seen.add(check_event(ScanStarted(90.0, SpeedLimit.SMEAR, 10.0, 0.0, 360.0)))
+    sides = ((0.0,), (10.0, 20.0))
+    shown = (ComparedView(2, 0.9, 5000.0),)
+    seen.add(check_event(Compared(3, ("a", "b"), "a", 0.9, (1.0, -1.0), 0.01, 0.01, 0.1, 0.2, 1.5, shown, sides)))
     seen.add(check_event(Unwinding(0, 330.0, 0.0, 1, (-400.0, 400.0))))
     assert seen == {event_kind(kind) for kind in get_args(Event)}
 

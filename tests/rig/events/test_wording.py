@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from hbr import Outcome, StopDecision, StopReason
 from hbr.dense.stopping import Limitation, LimitationCode
+from rig.events.compared import Compared, ComparedView
 from rig.events.events import (
     Candidate,
     Decided,
@@ -22,9 +23,11 @@ from rig.events.events import (
     WaitReason,
     Weighed,
 )
+from rig.events.lines import line
 from rig.events.phrases import distinct, percent_words, signed
 from rig.events.wording import (
     answer_words,
+    comparison_words,
     decision_words,
     limitation_words,
     move_words,
@@ -154,6 +157,7 @@ def test_end_of_a_search_has_a_reason() -> None:
         (NoteCode.STOPPING_RULE_UNREADABLE, {"reason": "no JSON"}, "(no JSON); to renew it: rig catalog calibrate"),
         (NoteCode.STOPPING_RULE_OUTDATED, {"made": "2026-01-02", "added": 1, "removed": 2}, "1 object added, 2 obj"),
         (NoteCode.STOPPING_RULE_OUTDATED, {"made": "2026-01-02", "added": 0, "removed": 0}, "(other views, or"),
+        (NoteCode.NOT_COMPARED, {"what": "no image"}, "are not compared pixel by pixel: no image"),
         (NoteCode.EARLIER_VERSION, {"text": "as it was"}, "as it was"),
     ],
 )
@@ -169,6 +173,15 @@ def test_warnings_have_a_next_step() -> None:
         assert next_step_words(Note(code)).endswith("rig empty-table")
     assert next_step_words(Note(NoteCode.EARLIER_VERSION, {"next_step": "Wait."})) == "Wait."
     assert wait_words(WaitReason.NEXT_OBJECT) != wait_words(WaitReason.FIRST_OBJECT)
+
+
+def test_comparisons() -> None:
+    views = (ComparedView(3, -0.9, 5000.0),)
+    found = Compared(4, ("a", "b"), "b", -0.9, (0.9, -0.9), 0.004, 0.01, 0.1, 0.2, 1.5, views, ((0.0,), (10.0,)))
+    assert comparison_words(found).endswith("it is b, with an error rate of at most 0.4 % (score −0.90)")
+    assert "does not tell" in comparison_words(replace(found, winner=None))
+    assert "show no difference" in comparison_words(replace(found, winner=None, views=()))
+    assert line(found).startswith("  Compared with a and b")
 
 
 NUMBERS = {"rate": 0.01, "searches": 24, "needed": 100, "min_confidence": 0.98, "wrong": 1, "ended": 20}

@@ -13,6 +13,7 @@ import pytest
 
 from hbr import Outcome
 from rig.core.errors import UsageError
+from rig.events.compared import Compared, ComparedView
 from rig.events.events import Accepted
 from rig.report import EnrollmentRecord, IdentificationRecord, Meta, Truth, render_report, write_report
 from rig.report.contact_sheet import CAPTION_PX, GAP_PX
@@ -305,3 +306,20 @@ def test_dense_search_shows_its_decisions(pair: bool) -> None:
     assert "Each decision, seen from above" in text
     assert ("mug-white or mug-star" in text) == pair
     assert ["mug-white", "60.0 %", "0.900"] in [row for table in page.tables for row in table]
+
+
+def test_comparison_of_two_candidates_is_shown_with_its_picture() -> None:
+    views = (ComparedView(1, 0.9, 5000.0),)
+    picture = np.full((160, 640, 3), 90, np.uint8)
+    names, azimuths_deg = (NAMES[0], NAMES[1]), ((0.0,), (10.0,))
+    compared = Compared(2, names, NAMES[0], 0.9, (0.9, -0.9), 0.004, 0.01, 0.1, 0.2, 1.5, views, azimuths_deg, picture)
+    for event, pictures in ((compared, 1), (replace(compared, picture_bgr=None, views=(), winner=None), 0)):
+        record = IdentificationRecord()
+        for one in (*searching_densely(), event):
+            record.add(one)
+        page = Page(render_report("t", "s", [], [record], meta=META))
+        alt = "Views in which the two candidates differ"
+        assert [attrs["alt"] for tag, attrs in page.tags if tag == "img"].count(alt) == pictures
+        text = " ".join(page.texts)
+        assert f"Compared with {NAMES[0]} and {NAMES[1]} pixel by pixel" in text
+        assert ("differs here" in text) == bool(pictures)

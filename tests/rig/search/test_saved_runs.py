@@ -18,6 +18,7 @@ from rig.catalog import Catalog
 from rig.cli.main import app
 from rig.config import load_config
 from rig.core.errors import UsageError
+from rig.events.compared import Compared
 from rig.events.events import (
     Accepted,
     Decided,
@@ -136,13 +137,22 @@ def test_dense_search_is_computed_again_from_its_folder(saved, tmp_path):
     assert all(e.segmentation["agreement"] > 0.9 for e in events if isinstance(e, Accepted))
     again = list(run.events())
     assert [event_dict(event) for event in again] == [event_dict(event) for event in events]
-    for missing, words in (("empty_table.png", "segmentation.agreement"), ("search_rules.json", None)):
-        other = tmp_path / missing
+    (compared,) = (event for event in events if isinstance(event, Compared))
+    (read,) = (event for event in again if isinstance(event, Compared))
+    assert set(compared.names) == {"mug-white", "mug-star"}
+    assert [len(own) for own in read.leaders] == [len(own) for own in compared.azimuths_deg]
+    assert (read.leaders[1][0] == compared.leaders[1][0]).all()
+    for missing, words in (
+        ("empty_table.png", "segmentation.agreement"),
+        ("search_rules.json", None),
+        ("leaders/1-000.png", None),
+    ):
+        other = tmp_path / missing.replace("/", "-")
         shutil.copytree(folder, other)
         (other / missing).unlink()
         if words is None:
             with pytest.raises(UsageError, match="cannot be read"):
-                load_run(other)
+                check(load_run(other))
         else:
             assert words in {difference.what for difference in check(load_run(other)).differences}
 
@@ -151,7 +161,8 @@ def test_another_stopping_rule_is_noticed(saved, tmp_path):
     folder = tmp_path / "run"
     shutil.copytree(saved["dense"][0], folder)
     rule = json.loads((folder / "search_rules.json").read_text())
-    threshold = 0.0 if saved["dense"][1][-1].outcome is hbr.Outcome.UNKNOWN else 2.0
+    last = [event.decision for event in saved["dense"][1] if isinstance(event, Ranked)][-1]
+    threshold = 0.0 if last.outcome is hbr.Outcome.UNKNOWN else 2.0
     changed = {"open_set_thresholds": [threshold] * len(rule["open_set_thresholds"])}
     (folder / "search_rules.json").write_text(json.dumps(rule | changed))
     assert "decision.outcome" in {difference.what for difference in check(load_run(folder)).differences}

@@ -1,0 +1,389 @@
+"""Comparison of two objects pixel by pixel where their enrolled views differ: the last step before "ambiguous".
+
+Near twins differ in one sticker, letter or handle, which a descriptor of the whole object hardly shows. For each view
+of a search, the enrolled views of both objects at the estimated pose are registered to it. Where the enrolled views of
+the two differ by more than neighbouring views of one object do, the view is compared with both:
+
+    score = Σ w · (difference from the second − difference from the first) / Σ w · (difference between both)
+
+summed over the pixels of all views: 1 for the first object, −1 for the second one. Then enrolled views take the place
+of the views of the search, and are left out of what they are compared with. Their scores say whether the objects can be
+told apart from these sides, and by how much a score scatters: the error rate is bounded by Cantelli's inequality.
+
+Decision: docs/decisions/0058.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Final, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from hbr.core.angles import wrap180, wrap360
+from hbr.core.arrays import ImageArray
+from hbr.dense.filter import Belief
+from hbr.dense.index import BIN_DEG
+from hbr.dense.pose import SHARPNESS
+
+#: Side of the compared images.
+SIDE_PX: Final = 128
+#: Enrolled views that a view is compared with, at most; one more is needed where one is left out.
+NEAREST: Final = 2
+#: Views of a search that are compared, at most, and how far apart they are at least.
+MOST_VIEWS: Final = 8
+APART_DEG: Final = 20.0
+#: Score above which the difference decides.
+MIN_SCORE: Final = 0.5
+#: Sum of the weights, grey levels times pixels: about a spot of 6 x 6 pixels in another colour.
+MIN_WEIGHT: Final = 2000.0
+#: What the object that was found leaves unexplained, as a share of the weights, and in grey levels of a pixel.
+MAX_UNEXPLAINED: Final = 0.5
+MAX_MISFIT: Final = 2.0
+#: Two objects whose enrolled views differ by less, in grey levels of a pixel, are near twins.
+TWINS_APART: Final = 20.0
+#: By so much a detail may be displaced after the registration: parallax, and views between two enrolled ones.
+_REACH_PX: Final = 3
+#: Differences of grey levels that noise and sharpness explain.
+_FLOOR: Final = 10.0
+#: A view with less weight than this does not show a difference.
+_LEAST_WEIGHT: Final = 300.0
+_ITERATIONS: Final = 25
+#: Poses of an object that are tried: those of at least this probability, relative to the likeliest one.
+_MOST_POSES: Final = 3
+_LEAST_POSE: Final = 0.02
+_POSES_APART_DEG: Final = 25.0
+
+Mask = NDArray[np.uint8]
+Map = NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class LocalView:
+    """A view for the comparison.
+
+    Attributes
+    ----------
+    crop : uint8 array (160, 160, 3)
+        As `hbr.Segmentation.crop`.
+    mask : uint8 array (160, 160)
+        As `hbr.Segmentation.mask`.
+    azimuth_deg : float
+        Orientation of the camera around the object; for a view of a search, from any zero that its views share.
+    """
+
+    crop: ImageArray
+    mask: Mask
+    azimuth_deg: float
+
+
+@dataclass(frozen=True, eq=False)
+class ViewDifference:
+    """What one view of a search shows.
+
+    Attributes
+    ----------
+    view : int
+        Its place among the views that were compared.
+    score : float
+        1 for the first object, −1 for the second one.
+    weight : float
+        How much the objects differ from this side: grey levels, summed over pixels.
+    difference : float32 array (128, 128)
+        By how much the enrolled views of both objects differ beyond what neighbouring views do, in grey levels.
+    query, first, second : uint8 arrays (128, 128, 3)
+        The view, and the enrolled views of both objects, registered to it.
+    """
+
+    view: int
+    score: float
+    weight: float
+    difference: Map
+    query: ImageArray
+    first: ImageArray
+    second: ImageArray
+
+
+@dataclass(frozen=True, eq=False)
+class LocalDecision:
+    """Which of two objects the views show.
+
+    Attributes
+    ----------
+    winner : int or None
+        0 for the first object, 1 for the second one, None if the comparison does not tell.
+    score : float
+        1 for the first object, −1 for the second one.
+    expected : (float, float), or None
+        The same of enrolled views of each object in place of the views; None if the views show no difference, or do not
+        fit.
+    error_bound : float
+        Bound of the probability that the other object scores so; 1 if it is not known.
+    unexplained : float, or None
+        Differences of the views from the better object that neighbouring enrolled views do not have, as a share of the
+        weights; None without weights.
+    weight : float
+        Sum of the weights.
+    misfit, apart : float
+        What the better object leaves unexplained, and the weights, per pixel of the object, in grey levels.
+    views : tuple of ViewDifference
+        The views that show a difference, the clearest first.
+    """
+
+    winner: int | None
+    score: float
+    expected: tuple[float, float] | None
+    error_bound: float
+    unexplained: float | None
+    weight: float
+    misfit: float
+    apart: float
+    views: tuple[ViewDifference, ...]
+
+    @property
+    def fits(self) -> bool:
+        """Whether the better object explains the views up to noise."""
+        return self.misfit <= MAX_MISFIT
+
+    @property
+    def twins(self) -> bool:
+        """Whether the two objects look the same apart from a detail."""
+        return self.apart <= TWINS_APART
+
+
+class _Fit(NamedTuple):
+    """An enrolled view that was registered to another one, and its difference from that one."""
+
+    view: LocalView
+    image: ImageArray
+    mask: Mask
+    apart: Map
+
+
+class _Shown(NamedTuple):
+    """What a view shows: score, weight, what each object leaves unexplained, the map, and the two enrolled views."""
+
+    score: float
+    weight: float
+    unexplained: tuple[float, float]
+    pixels: int
+    difference: Map
+    images: tuple[ImageArray, ImageArray, ImageArray]
+
+
+def poses_of(belief: Belief, object_index: int) -> tuple[float, ...]:
+    """Return the likely azimuths of an object at the last view, the likeliest first; symmetric objects have several."""
+    ranking = belief.ranking()
+    best_deg = float(ranking.pose_deg[ranking.object_index == object_index][0])
+    (support,) = belief.support[belief.index.object_index == object_index].astype(np.float64)
+    likely = np.exp(SHARPNESS * (support - support.max()) / np.sqrt(belief.queries))
+    found = [best_deg]
+    for place in np.argsort(-likely, kind="stable").tolist():
+        azimuth_deg = float(wrap360(place * BIN_DEG + belief.rotated_deg))
+        if likely[place] < _LEAST_POSE or len(found) == _MOST_POSES:
+            break
+        if min(abs(wrap180(azimuth_deg - one)) for one in found) >= _POSES_APART_DEG:
+            found.append(azimuth_deg)
+    return tuple(found)
+
+
+def chosen_views(orientations_deg: Sequence[float]) -> list[int]:
+    """Return which views of a search are compared: the last ones that are `APART_DEG` from each other."""
+    chosen: list[int] = []
+    for number in range(len(orientations_deg) - 1, -1, -1):
+        away = [abs(wrap180(orientations_deg[number] - orientations_deg[other])) for other in chosen]
+        if len(chosen) < MOST_VIEWS and min(away, default=360.0) >= APART_DEG:
+            chosen.append(number)
+    return chosen[::-1]
+
+
+def compare_objects(
+    queries: Sequence[LocalView],
+    objects: tuple[Sequence[LocalView], Sequence[LocalView]],
+    rotations_deg: tuple[Sequence[float], Sequence[float]],
+    *,
+    max_error: float = 0.01,
+) -> LocalDecision:
+    """Decide which of two objects the views of a search show.
+
+    Parameters
+    ----------
+    queries
+        Views of the search, at least one.
+    objects
+        Enrolled views of the first and of the second object; those within two views of the poses are enough.
+    rotations_deg
+        For each object, what is added to the azimuth of a query to get that of the enrolled views; several if the pose
+        is not certain. The one that fits the views best counts.
+    max_error
+        Largest `LocalDecision.error_bound` of a decision.
+
+    Raises
+    ------
+    ValueError
+        There are no views of the search, or an object has fewer than two enrolled views.
+    """
+    if not queries or min(map(len, objects)) < NEAREST:
+        raise ValueError("the comparison needs a view of the search and two enrolled views of each object")
+    fits = [_best_pose(queries, views, rotations) for views, rotations in zip(objects, rotations_deg, strict=True)]
+    (first_deg, first), (second_deg, second) = fits
+    shown = [_shown(query, a, b) for query, a, b in zip(queries, first, second, strict=True)]
+    telling = [n for n, one in enumerate(shown) if one.weight >= _LEAST_WEIGHT]
+    weights = np.array([shown[n].weight for n in telling])
+    weight = float(weights.sum())
+    views = tuple(
+        ViewDifference(n, shown[n].score, shown[n].weight, shown[n].difference, *shown[n].images)
+        for n in sorted(telling, key=lambda n: -shown[n].weight)
+    )
+    score = float(weights @ [shown[n].score for n in telling]) / weight if weight else 0.0
+    best = int(score < 0)
+    pixels = max(1, sum(one.pixels for one in shown))
+    left = sum(one.unexplained[best] for one in shown)
+    misfit, apart = left / pixels, weight / pixels
+    unexplained = left / weight if weight else None
+    if unexplained is None or weight < MIN_WEIGHT or misfit > MAX_MISFIT:
+        return LocalDecision(None, score, None, 1.0, unexplained, weight, misfit, apart, views)
+    scores, own = _left_out([queries[n] for n in telling], objects, (first_deg, second_deg))
+    expected = float(scores[0] @ own[0] / own[0].sum()), float(scores[1] @ own[1] / own[1].sum())
+    away = np.concatenate([1 - scores[0], 1 + scores[1]])
+    scatter = float(away**2 @ np.concatenate(own) / np.concatenate(own).sum()) / (weight**2 / float(weights @ weights))
+    bound = scatter / (scatter + (1 + abs(score)) ** 2)
+    decided = (
+        abs(score) >= MIN_SCORE
+        and unexplained <= MAX_UNEXPLAINED
+        and min(expected[0], -expected[1]) >= MIN_SCORE
+        and bound <= max_error
+    )
+    return LocalDecision(best if decided else None, score, expected, bound, unexplained, weight, misfit, apart, views)
+
+
+def _left_out(
+    queries: Sequence[LocalView],
+    objects: tuple[Sequence[LocalView], Sequence[LocalView]],
+    added_deg: tuple[float, float],
+) -> tuple[list[NDArray[np.float64]], list[NDArray[np.float64]]]:
+    """Return scores and weights of the enrolled views of each object that are nearest to these views of a search."""
+    scores, weights = [], []
+    for own in (0, 1):
+        found = []
+        for query in queries:
+            (view,) = _nearest(objects[own], query.azimuth_deg + added_deg[own], 1)
+            rest = [other for other in objects[own] if other is not view]
+            azimuths_deg = [view.azimuth_deg - added_deg[own] + by for by in added_deg]
+            sides = [rest if side == own else objects[side] for side in (0, 1)]
+            a, b = (_fits(view, views, deg) for views, deg in zip(sides, azimuths_deg, strict=True))
+            found.append(_shown(view, a, b))
+        scores.append(np.array([one.score for one in found]))
+        weights.append(np.array([max(one.weight, 1.0) for one in found]))
+    return scores, weights
+
+
+def _best_pose(
+    queries: Sequence[LocalView], views: Sequence[LocalView], rotations_deg: Sequence[float]
+) -> tuple[float, list[list[_Fit]]]:
+    """Return the rotation at which an object fits the views best, with the enrolled views there, the best one first."""
+    found: list[tuple[float, float, list[list[_Fit]]]] = []
+    for rotation_deg in rotations_deg:
+        fits = [_fits(query, views, query.azimuth_deg + rotation_deg) for query in queries]
+        found.append(
+            (sum(_mean(query, fit[0].apart) for query, fit in zip(queries, fits, strict=True)), rotation_deg, fits)
+        )
+    _, rotation_deg, fits = min(found, key=lambda one: one[0])
+    return rotation_deg, fits
+
+
+def _nearest(views: Sequence[LocalView], azimuth_deg: float, count: int) -> list[LocalView]:
+    return sorted(views, key=lambda view: abs(wrap180(view.azimuth_deg - azimuth_deg)))[:count]
+
+
+def _fits(query: LocalView, views: Sequence[LocalView], azimuth_deg: float) -> list[_Fit]:
+    """Return the enrolled views nearest to an azimuth, registered to a view, the one that fits best first."""
+    image, _ = _small(query)
+    found = []
+    for view in _nearest(views, azimuth_deg, NEAREST):
+        moved, mask = _registered(view, query)
+        found.append(_Fit(view, moved, mask, pixel_difference(image, moved)))
+    return sorted(found, key=lambda fit: _mean(query, fit.apart))
+
+
+def _mean(query: LocalView, apart: Map) -> float:
+    return float(cv2.mean(apart, mask=(_small(query)[1] > 127).astype(np.uint8))[0])
+
+
+def _shown(query: LocalView, first: Sequence[_Fit], second: Sequence[_Fit]) -> _Shown:
+    """Compare a view with the enrolled views of both objects, where these differ."""
+    image, mask = _small(query)
+    a, b = first[0], second[0]
+    both = pixel_difference(a.image, b.image)
+    noise = np.full_like(both, _FLOOR)
+    for best, *others in (first, second):
+        for other in others:  # what neighbouring views of one object differ by
+            noise = np.maximum(noise, cv2.dilate(pixel_difference(best.image, other.image), _square(3)))
+    inside = cv2.dilate(np.maximum(np.maximum(a.mask, b.mask), mask), _square(3)) > 127
+    weights = np.where(inside, np.maximum(both - noise, 0), 0).astype(np.float32)
+    total = float((weights * both).sum())
+    score = float((weights * (b.apart - a.apart)).sum()) / total if total > 0 else 0.0
+    own = mask > 127
+    rest = [float(np.maximum(one.apart - noise, 0)[own].sum()) for one in (a, b)]
+    images = image, a.image, b.image
+    return _Shown(score, float(weights.sum()), (rest[0], rest[1]), int(own.sum()), weights, images)
+
+
+def _small(view: LocalView) -> tuple[ImageArray, Mask]:
+    size = (SIDE_PX, SIDE_PX)
+    crop = cv2.resize(view.crop, size, interpolation=cv2.INTER_AREA).astype(np.uint8, copy=False)
+    return crop, cv2.resize(view.mask, size, interpolation=cv2.INTER_AREA).astype(np.uint8, copy=False)
+
+
+def _registered(view: LocalView, to: LocalView) -> tuple[ImageArray, Mask]:
+    """Return a view and its mask, moved, scaled and sheared so that it fits another one, and in that one's light."""
+    image, mask = _small(view)
+    target, target_mask = _small(to)
+    grey, target_grey = (cv2.cvtColor(one, cv2.COLOR_BGR2GRAY) for one in (image, target))
+    move = np.eye(2, 3, dtype=np.float32)
+    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, _ITERATIONS, 1e-4)
+    try:
+        inside = cv2.dilate(target_mask, _square(5))
+        _, found = cv2.findTransformECC(target_grey, grey, move.copy(), cv2.MOTION_AFFINE, criteria, inside, 5)
+        move = np.asarray(found, np.float32)
+    except cv2.error:  # an even surface has nothing to register: the silhouettes have put it there
+        pass
+    size, flags = (SIDE_PX, SIDE_PX), cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    moved = cv2.warpAffine(image, move, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
+    moved_mask = cv2.warpAffine(mask, move, size, flags=flags)
+    both = (moved_mask > 127) & (target_mask > 127)
+    if both.any():
+        levels = [np.median(one[both], axis=0).astype(np.float64) + 8.0 for one in (target, moved)]
+        moved = np.clip(moved * np.clip(levels[0] / levels[1], 0.5, 2.0), 0, 255)
+    return moved.astype(np.uint8, copy=False), moved_mask.astype(np.uint8, copy=False)
+
+
+def pixel_difference(a: ImageArray, b: ImageArray) -> Map:
+    """Return by how much two images, uint8 (h, w, 3), differ at each pixel, float32 (h, w).
+
+    Details may be displaced by `_REACH_PX`. A detail that only one of the images has counts in both directions.
+    """
+    height, width = a.shape[:2]
+    soft = [cv2.GaussianBlur(one, (0, 0), 0.8) for one in (a, b)]
+    found = []
+    for one, other in (soft, soft[::-1]):
+        wide = cv2.copyMakeBorder(other, *(_REACH_PX,) * 4, cv2.BORDER_REPLICATE)
+        least = np.full((height, width), 255, np.uint8)
+        for x, y in _shifts():
+            apart = cv2.absdiff(one, wide[y : y + height, x : x + width])
+            blue, green, red = cv2.split(apart)
+            cv2.min(least, cv2.max(cv2.max(blue, green), red), dst=least)
+        found.append(least)
+    return cv2.max(found[0], found[1]).astype(np.float32)
+
+
+@lru_cache
+def _shifts() -> tuple[tuple[int, int], ...]:
+    reach = range(-_REACH_PX, _REACH_PX + 1)
+    return tuple((x + _REACH_PX, y + _REACH_PX) for x in reach for y in reach if x * x + y * y <= _REACH_PX**2 + 1)
+
+
+def _square(side: int) -> Mask:
+    return np.ones((side, side), np.uint8)

@@ -1,0 +1,52 @@
+"""The enrolled views of an object near some azimuths, cut out as at its enrollment (`hbr.dense.local_difference`)."""
+
+from collections.abc import Sequence
+
+from sqlalchemy import select
+
+from hbr.core.angles import wrap180
+from hbr.dense.local_difference import NEAREST, LocalView
+from rig.catalog.catalog import Catalog
+from rig.catalog.describing import stored_describer
+from rig.catalog.schema import sessions
+from rig.core.errors import CatalogDamaged
+from rig.views.description import BENCH_DESCRIPTOR
+
+
+def local_views(catalog: Catalog, name: str, azimuths_deg: Sequence[float]) -> list[LocalView]:
+    """Return the enrolled views of an object that are nearest to each of these azimuths, by azimuth.
+
+    There is one more than `NEAREST` for each azimuth, because a comparison leaves one out.
+
+    Raises
+    ------
+    ObjectNotFound, CatalogError
+        There is no such object, or an image is missing or is not the stored one.
+    """
+    views = catalog.object(name).views
+    wanted = {
+        view.id: view
+        for azimuth_deg in azimuths_deg
+        for view in sorted(views, key=lambda view: abs(wrap180(view.record.azimuth_deg - azimuth_deg)))[: NEAREST + 1]
+    }
+    with catalog.database.read() as connection:
+        tables = {
+            row.id: (row.empty_table_image, row.empty_table_image_sha256)
+            for row in connection.execute(
+                select(sessions).where(sessions.c.id.in_({v.session.id for v in wanted.values()}))
+            )
+            if row.empty_table_image is not None
+        }
+    found = []
+    for view in wanted.values():
+        describer = stored_describer(
+            catalog.database.images, (BENCH_DESCRIPTOR,), view.record.region, tables.get(view.session.id)
+        )
+        try:
+            cut = describer.segment(catalog.read_image(view), view.record.segmentation)
+        except ValueError as error:
+            raise CatalogDamaged(
+                f"the view {view.id} of {name} cannot be segmented: {error}", next_step="check it: rig catalog verify"
+            ) from error
+        found.append(LocalView(cut.crop, cut.mask, view.record.azimuth_deg))
+    return sorted(found, key=lambda view: view.azimuth_deg)
