@@ -138,6 +138,8 @@ class ShelfOperator:
                 evidence={"objects": list(self.objects)},
             )
         if self.change is not None:
+            assert self.devices is not None
+            self.change.visit(self.devices, self._days)
             self.world.change(light=self.change.light(self._days))
             further_mm = self.change.offset_mm(self._days)
             dx_mm, dy_mm = dx_mm + further_mm[0], dy_mm + further_mm[1]
@@ -149,6 +151,7 @@ class ShelfOperator:
         self.change = change
         self.world.change(light=change.light(self._days))
         change.apply_to(self.devices)
+        change.visit(self.devices, self._days)
 
     def clear(self) -> bool:
         """Clear the table and return whether that is possible: a photograph shows its own table."""

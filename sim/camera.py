@@ -4,7 +4,7 @@ from collections import deque
 from collections.abc import Callable
 from copy import copy
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from math import ceil, cos, radians, sin
 from threading import get_ident
 from typing import Any
@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from hbr.evaluation.changed_bench import Visit
 from rig.devices import v4l2
 from sim.calibration_board import BoardOnPlatter
 from sim.camera_controls import BUFFERS_RANGE, EXPOSURE_RANGE, KELVIN_RANGE, NOMINAL_EXPOSURE, SHARP_AT, Controls
@@ -24,6 +25,7 @@ from sim.objects.solid import empty_platter
 from sim.optics import Optics
 from sim.rolling_shutter import bands, row_weights
 from sim.sensor import Sensor
+from sim.visit import seen_on_visit
 from sim.world import HISTORY_S, Activity, Scene, World
 
 CAMERA_DEVICE = "simulated camera"
@@ -89,6 +91,8 @@ class SimCapture:
         other; None for a steady light.
     backdrop
         Wall, table and platter without an object, uint8 (480, 640, 3).
+    visit
+        A hard change of the bench, through which everything is seen (`sim.change`).
     filters
         Called in order with each fetched frame and its number; each returns a frame.
     """
@@ -103,6 +107,7 @@ class SimCapture:
         self.orbits = False
         self.blur_px = 0.0
         self.lamp: tuple[float, float] | None = None
+        self.visit: Visit | None = None
         self.filters: list[Callable[[Image, int], Image]] = []
         self._world = world
         self._clock = world.clock
@@ -356,12 +361,16 @@ class SimCapture:
         table_deg = -table_deg if self.orbits else table_deg
         image = self.backdrop.copy()
         if scene.object is None:
-            return self._as_mounted(image)
+            return self._as_mounted(image if self.visit is None else seen_on_visit(self.visit, None, table_deg))
         if not isinstance(scene.object, Visible):
             raise TypeError(f"{scene.object!r} is not visible: it has no method draw")
         x, y = scene.offset_mm
         c, s = cos(radians(table_deg)), sin(radians(table_deg))
-        scene.object.draw(image, table_deg + scene.yaw_deg, (c * x - s * y, s * x + c * y))
+        offset_mm = c * x - s * y, s * x + c * y
+        if self.visit is not None and not isinstance(scene.object, BoardOnPlatter):
+            drawn = partial(scene.object.draw, azimuth_deg=table_deg + scene.yaw_deg, offset_mm=offset_mm)
+            return self._as_mounted(seen_on_visit(self.visit, drawn, table_deg))
+        scene.object.draw(image, table_deg + scene.yaw_deg, offset_mm)
         return image if isinstance(scene.object, BoardOnPlatter) else self._as_mounted(image)
 
     def _as_mounted(self, image: Image) -> Image:

@@ -8,6 +8,8 @@ from typing import Self
 import cv2
 import numpy as np
 
+from hbr.evaluation.changed_bench import HARD, Bench, Visit
+from hbr.evaluation.changed_bench import Change as HardChange
 from rig.core.errors import UsageError
 from sim.devices import SimDevices
 from sim.objects.projection import CENTRE_PX, HEIGHT, PX_PER_MM, SIN, WIDTH, Image
@@ -34,6 +36,10 @@ class Change:
     """Distance of objects from the table's axis, along each axis of the platter."""
     background: float = 0.0
     """Weight of another bench's table and wall with patterns: 0 for none, 1 for only these."""
+    hard: float = 0.0
+    """Strength of what `rig eval --bench-change hard` changes (`hbr.evaluation.changed_bench.HARD`): another bench with
+    patterns and clutter, a holder in front, cast shadows, highlights, coloured light with a gradient, gamma, placement,
+    scale, elevation and defocus. The light, the camera and the placement change for each object."""
 
     @classmethod
     def named(cls, names: Iterable[str]) -> Self | None:
@@ -65,6 +71,14 @@ class Change:
         x, y = (self.placement_mm * rng.uniform(-1, 1, 2)).tolist()
         return x, y
 
+    def visit(self, devices: SimDevices, rng: np.random.Generator) -> None:
+        """Draw the hard change for the next object."""
+        if not self.hard:
+            return
+        factors = {f.name: self.hard * getattr(HARD, f.name) for f in fields(HARD)} | {"noise": 0.0}
+        bench = Bench.drawn(devices.world.rng("hard bench"))
+        devices.camera.visit = Visit(bench, HardChange(**factors), rng)  # the sensor adds the noise
+
     def apply_to(self, devices: SimDevices) -> None:
         """Change the camera's settings and the surroundings from now on."""
         rng, camera = devices.world.rng("another day"), devices.camera
@@ -87,9 +101,11 @@ CHANGES: Mapping[str, Change] = MappingProxyType(
         "bench": Change(
             brightness=0.3, colour=0.1, exposure=0.25, white_balance_k=900.0, placement_mm=14.0, background=1.0
         ),
+        "hard": Change(hard=1.0),
     }
 )
-"""By name: light, exposure and white balance; placement; both together with another table and wall."""
+"""By name: light, exposure and white balance; placement; both together with another table and wall; all that
+`rig eval --bench-change hard` changes."""
 
 
 def another_bench(rng: np.random.Generator) -> Image:

@@ -171,11 +171,19 @@ class Visit:
         self._holder = _holder(rng) if rng.random() < change.holder else None
         self._later = rng.random() < 0.5
 
-    def empty(self) -> ImageArray:
+    def empty(self, table_deg: float = 0.0) -> ImageArray:
         """Return the picture of the empty table, in this light; every second holder was put there later."""
-        return self._photographed(self._bench.seen(0.0), self._later)[0]
+        return self._photographed(self._bench.seen(table_deg), self._later)[0]
 
-    def photograph(self, image_bgr: ImageArray, mask: NDArray[np.bool_], table_deg: float) -> Frame:
+    def photograph(
+        self,
+        image_bgr: ImageArray,
+        mask: NDArray[np.bool_],
+        table_deg: float,
+        *,
+        foot_px: tuple[float, float] | None = None,
+        px_per_px: float | None = None,
+    ) -> Frame:
         """Return the frame of an object at a table angle.
 
         Parameters
@@ -184,19 +192,32 @@ class Visit:
             A photograph of the object from this side.
         mask : bool array (H, W)
             Its pixels.
+        foot_px : (float, float), optional
+            Pixel of the photograph on the table's axis; by default the middle of the object's lower edge.
+        px_per_px : float, optional
+            Pixels of the frame per pixel of the photograph; by default the photograph's side becomes `SIDE_PX`.
         """
-        seen, cover = self._placed(image_bgr, mask, table_deg)
+        side = SIDE_PX / max(image_bgr.shape[:2]) if px_per_px is None else px_per_px
+        seen, cover = self._placed(image_bgr, mask, table_deg, side, foot_px)
         ground = self._bench.seen(table_deg) * (1 - self._shadow(cover))[:, :, None]
         picture = ground * (1 - cover[:, :, None]) + seen * cover[:, :, None]
         self._highlights(picture, cover)
         image, hidden = self._photographed(picture, False)
         return Frame(image, (cover > 0.5) & ~hidden)
 
-    def _placed(self, image: ImageArray, mask: NDArray[np.bool_], table_deg: float) -> tuple[Picture, Picture]:
-        side = SIDE_PX / max(image.shape[:2])
+    def _placed(
+        self,
+        image: ImageArray,
+        mask: NDArray[np.bool_],
+        table_deg: float,
+        side: float,
+        foot_px: tuple[float, float] | None,
+    ) -> tuple[Picture, Picture]:
         scale, upright = self._scale * side, self._upright * side
-        rows, columns = np.nonzero(mask)
-        x, y = (columns.min() + columns.max()) / 2, float(rows.max())
+        if foot_px is None:
+            rows, columns = np.nonzero(mask)
+            foot_px = (columns.min() + columns.max()) / 2, float(rows.max())
+        x, y = foot_px
         away_px, from_deg = self._away
         around = np.radians(from_deg - table_deg)
         to_x = FOOT_PX[0] + away_px * np.cos(around)

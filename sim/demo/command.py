@@ -28,7 +28,8 @@ def demo(
             "--change",
             metavar="NAME",
             help="Change the bench between enrollment and search: light (with exposure and white balance), placement, "
-            "or bench (both, with another table and wall). Repeatable.",
+            "bench (both, with another table and wall), or hard (all that rig eval --bench-change hard changes). "
+            "Repeatable.",
         ),
     ] = None,
     strategy: Annotated[

@@ -54,6 +54,25 @@ def test_bench_change_has_another_wall() -> None:
     assert after[:100].std(axis=(0, 1)).max() > 8
 
 
+def test_hard_change_is_that_of_the_evaluation_and_new_for_each_object() -> None:
+    world = World(noise=NoiseModel.none(), seed=3)
+    operator = ShelfOperator(world, shelf(), next_object="toy-house", yaw_deg=0.0)
+    with open_sim_bench(RigConfig(), operator) as bench:
+        operator.place(None)
+        before = _frame(bench)
+        operator.change_bench(CHANGES["hard"])
+        frames = []
+        for _ in range(2):
+            operator.place(None)
+            frames.append(_frame(bench))
+        operator.clear()
+        empty = _frame(bench)
+    assert before[:100].std(axis=(0, 1)).max() < 2
+    assert empty[:100].std(axis=(0, 1)).max() > 8
+    assert np.abs(frames[0].astype(int) - frames[1]).mean() > 2  # another light and placement
+    assert (np.abs(frames[0].astype(int) - empty).max(axis=2) > 40).mean() > 0.05  # the object
+
+
 def test_change_depends_on_the_seed() -> None:
     one, again, other = (_seen(CHANGES["bench"], seed)[1] for seed in (1, 1, 2))
     assert np.array_equal(one, again)
