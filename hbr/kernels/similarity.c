@@ -444,12 +444,13 @@ EXPORT void hbr_nearest(const struct measure *m, const uint8_t *query, const uin
     const struct loops *loops = fastest();
     struct query q;
     begin_new(&q, m, query, loops);
+    const int is_exact = loops->edge_bounds == loops->edges;
     int64_t found = 0; /* a heap: the furthest object first */
     for (int64_t k = 0; k < s->objects; k++) {
         const int64_t object = by_bound[k];
         if (found == kept && bounds[object] < similar[0]) break;
-        double best = -1, of_rows[CHUNK];
-        for (int64_t first = 0; first < s->count[object];) {
+        double best = is_exact ? bounds[object] : -1, of_rows[CHUNK];
+        for (int64_t first = is_exact ? s->count[object] : 0; first < s->count[object];) {
             const int64_t some = bounds_of_rows(&q, loops, rows, stride, squares, s, object, first, of_rows);
             for (int64_t i = 0; i < some; i++) {
                 if (of_rows[i] < best || (found == kept && of_rows[i] < similar[0])) continue;
