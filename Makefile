@@ -99,7 +99,7 @@ $(READY): requirements.lock pyproject.toml
 	@touch $@
 
 # Compiled kernels, if there is a C compiler; NumPy does their work without (docs/decisions/0040).
-$(LIBRARY): $(wildcard hbr/kernels/*.c hbr/kernels/*.h) | $(READY)
+$(LIBRARY): $(wildcard hbr/kernels/*.[ch] hbr/kernels/compile.py) | $(READY)
 	@$(BIN)/python hbr/kernels/compile.py
 
 clean:

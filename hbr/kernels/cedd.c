@@ -6,6 +6,8 @@
 #define BINS 144
 #define RULES 12 /* ten, and two zeros */
 #define HUES 360
+#define COLOURS 8 /* of a texture class, each in three shades */
+#define SHADES 4  /* three, and a zero */
 
 /* The tables of hbr/descriptors/cedd_tables.py. */
 struct cedd_tables {
@@ -20,8 +22,13 @@ struct grid {
     int64_t rows, columns, height, width; /* height and width of a quarter of a block, in pixels */
 };
 
+/* What is known of each block of a row. */
+struct blocks {
+    int32_t *hue, *saturation, *value, *textures;
+};
+
 /* Sum the rows of pixels of one row of quarters: (height, length) -> (length). */
-static inline void add_rows(const uint8_t *image, int64_t stride, int64_t height, int64_t length, uint16_t *sums) {
+PART void add_rows(const uint8_t *image, int64_t stride, int64_t height, int64_t length, uint16_t *sums) {
     for (int64_t i = 0; i < length; i++) sums[i] = image[i];
     for (int64_t k = 1; k < height; k++) {
         image += stride;
@@ -31,7 +38,7 @@ static inline void add_rows(const uint8_t *image, int64_t stride, int64_t height
 
 /* Sum the pixels of each quarter in a row of them: (quarters, width, 3) -> B, G, R and the luminance in thousandths,
    four times (quarters). */
-static inline __attribute__((always_inline)) void add_columns(const uint16_t *sums, int64_t quarters, int64_t width,
+PART void add_columns(const uint16_t *sums, int64_t quarters, int64_t width,
                                                               int32_t *channels) {
     for (int64_t q = 0; q < quarters; q++) {
         int32_t b = 0, g = 0, r = 0;
@@ -48,14 +55,14 @@ static inline __attribute__((always_inline)) void add_columns(const uint16_t *su
 }
 
 /* Mark the bytes of a row of quarters that differ from those a quarter further left: (height, length) -> (length). */
-static inline void mark_changes(const uint8_t *image, int64_t stride, int64_t height, int64_t length, int64_t step,
+PART void mark_changes(const uint8_t *image, int64_t stride, int64_t height, int64_t length, int64_t step,
                                 uint8_t *changes) {
     for (int64_t i = 0; i < length; i++) changes[i] = i < step;
     for (int64_t k = 0; k < height; k++, image += stride)
         for (int64_t i = step; i < length; i++) changes[i] |= image[i] ^ image[i - step];
 }
 
-static inline int any(const uint8_t *bytes, int64_t count) {
+PART int any(const uint8_t *bytes, int64_t count) {
     uint64_t found = 0;
     int64_t i = 0;
     for (; i + 8 <= count; i += 8) {
@@ -72,7 +79,7 @@ static inline int any(const uint8_t *bytes, int64_t count) {
 }
 
 /* Luminance of a quarter with the rounding errors of the reference: pixel by pixel, in raster order. */
-static inline double area_as_rounded(const uint8_t *quarter, int64_t stride, const struct grid *grid,
+PART double area_as_rounded(const uint8_t *quarter, int64_t stride, const struct grid *grid,
                                      const double luminance[3][256]) {
     double total = 0;
     for (int64_t y = 0; y < grid->height; y++, quarter += stride)
@@ -83,22 +90,28 @@ static inline double area_as_rounded(const uint8_t *quarter, int64_t stride, con
     return (double)(int64_t)(total * (4.0 / (double)(4 * grid->height * grid->width)));
 }
 
+/* Where the bytes of 32 pixels differ from the next one; of every three, the third belongs to two pixels. */
+PART void add_differences(const uint8_t *image, uint8_t *differs) {
+    for (int n = 0; n < 96; n++) differs[n] |= image[n] ^ image[n + 1];
+}
+
 /* Whether all pixels of a row of quarters, (height, length), are grey. */
-static inline int is_grey(const uint8_t *image, int64_t stride, int64_t height, int64_t length) {
+PART int is_grey(const uint8_t *image, int64_t stride, int64_t height, int64_t length) {
     uint8_t differs[96] = {0};
+    if (image[0] != image[1] || image[1] != image[2]) return 0;
     for (int64_t k = 0; k < height; k++, image += stride) {
         int64_t i = 0;
-        for (; i + 96 < length; i += 96)
-            for (int n = 0; n < 96; n++) differs[n] |= image[i + n] ^ image[i + n + 1];
+        for (; i + 96 < length; i += 96) add_differences(image + i, differs);
+        if (length >= 99) add_differences(image + length - 99, differs), i = length - 3; /* some of them again */
         for (; i + 1 < length; i++) differs[i % 96] |= image[i] ^ image[i + 1];
     }
     unsigned found = 0;
-    for (int n = 0; n < 96; n += 3) found |= differs[n] | differs[n + 1]; /* the third is between two pixels */
+    for (int n = 0; n < 96; n += 3) found |= differs[n] | differs[n + 1];
     return !found;
 }
 
 /* Luminance of the quarters of a row, 0..255. `greys` are the luminances of grey pixels. */
-static inline void row_areas(const uint8_t *image, int64_t stride, const struct grid *grid, const int32_t *luminances,
+PART void row_areas(const uint8_t *image, int64_t stride, const struct grid *grid, const int32_t *luminances,
                              const double luminance[3][256], const double *greys, int32_t *rest, uint8_t *changes,
                              double *areas) {
     const int64_t quarters = 2 * grid->columns;
@@ -118,7 +131,14 @@ static inline void row_areas(const uint8_t *image, int64_t stride, const struct 
         return;
     }
     if (grid->height == 2 && grid->width == 2 && is_grey(image, stride, 2, 6 * quarters)) {
+        int64_t count_undecided = 0; /* without a branch: about every fourth one is undecided */
         for (int64_t q = 0; q < quarters; q++) {
+            const int is_undecided = rest[q] == 0;
+            rest[count_undecided] = (int32_t)q;
+            count_undecided += is_undecided;
+        }
+        for (int64_t k = 0; k < count_undecided; k++) {
+            const int64_t q = rest[k];
             const uint8_t *upper = image + 6 * q, *lower = upper + stride;
             const double total = ((greys[upper[0]] + greys[upper[3]]) + greys[lower[0]]) + greys[lower[3]];
             areas[q] = (double)(int32_t)(total * 0.25);
@@ -140,14 +160,8 @@ static inline void row_areas(const uint8_t *image, int64_t stride, const struct 
     }
 }
 
-/* Whether a quotient is above a limit. The division is needed only very close to it. */
-static inline unsigned above(double value, double divisor, double limit) {
-    const double apart = value - limit * divisor;
-    return __builtin_fabs(apart) > 1e-9 ? apart > 0 : value / divisor > limit;
-}
-
 /* The texture classes of a block, as bits, by the luminance of its quarters. */
-static inline unsigned textures_of(double a, double b, double c, double d) {
+PART int32_t textures_of(double a, double b, double c, double d) {
     const double root = 1.4142135623730951;
     const double m0 = __builtin_fabs(2 * a - 2 * b - 2 * c + 2 * d), m1 = __builtin_fabs(a + b - c - d),
                  m2 = __builtin_fabs(a - b + c - d), m3 = __builtin_fabs(a * root - d * root),
@@ -156,13 +170,14 @@ static inline unsigned textures_of(double a, double b, double c, double d) {
     strongest = m2 > strongest ? m2 : strongest;
     strongest = m3 > strongest ? m3 : strongest;
     strongest = m4 > strongest ? m4 : strongest;
-    if (strongest < 14.0) return 1;
-    return above(m0, strongest, 0.68) << 1 | above(m1, strongest, 0.98) << 2 | above(m2, strongest, 0.98) << 3 |
-           above(m3, strongest, 0.98) << 4 | above(m4, strongest, 0.98) << 5;
+    const double divisor = strongest < 14.0 ? 14.0 : strongest;
+    const int32_t classes = (m0 / divisor > 0.68) << 1 | (m1 / divisor > 0.98) << 2 | (m2 / divisor > 0.98) << 3 |
+                            (m3 / divisor > 0.98) << 4 | (m4 / divisor > 0.98) << 5;
+    return strongest < 14.0 ? 1 : classes;
 }
 
 /* Hue 0..358, saturation 0..255 and value 0..255 of integer B, G, R. Fractions have denominators of at most 255. */
-static inline void hsv_of(int32_t b, int32_t g, int32_t r, const double *inverse, int32_t *hue, int32_t *saturation,
+PART void hsv_of(int32_t b, int32_t g, int32_t r, const double *inverse, int32_t *hue, int32_t *saturation,
                           int32_t *value) {
     const int32_t most = b > g ? (b > r ? b : r) : (g > r ? g : r), least = b < g ? (b < r ? b : r) : (g < r ? g : r);
     const int32_t delta = most - least;
@@ -173,30 +188,48 @@ static inline void hsv_of(int32_t b, int32_t g, int32_t r, const double *inverse
     *hue = (int32_t)((most == r ? by_red : most == g ? by_green : by_blue) * inverse[delta] + 1e-4);
 }
 
-static inline double lesser(double a, double b) { return a < b ? a : b; }
+/* Describe the blocks of a row. `channels` and `areas` have the two rows of their quarters. */
+PART void describe_blocks(const int32_t *restrict channels, const double *restrict areas, int64_t columns,
+                          double inverse, const double *restrict inverses, struct blocks blocks) {
+    const int64_t quarters = 2 * columns;
+    int32_t *restrict hue = blocks.hue, *restrict saturation = blocks.saturation, *restrict value = blocks.value,
+                      *restrict textures = blocks.textures;
+    for (int64_t j = 0; j < columns; j++) {
+        const double *upper = areas + 2 * j, *lower = upper + quarters;
+        int32_t bgr[3];
+        for (int c = 0; c < 3; c++) {
+            const int32_t *over = channels + c * quarters + 2 * j, *under = over + 4 * quarters;
+            bgr[c] = (int32_t)((over[0] + over[1] + under[0] + under[1] + 0.5) * inverse);
+        }
+        hsv_of(bgr[0], bgr[1], bgr[2], inverses, hue + j, saturation + j, value + j);
+        textures[j] = textures_of(upper[0], upper[1], lower[0], lower[1]);
+    }
+}
 
-/* Add the votes of the two fuzzy systems for a colour to the bins of the texture classes of its block. */
-static inline void vote(const struct cedd_tables *t, int32_t hue, int32_t saturation, int32_t value, unsigned textures,
-                        double *histogram) {
+PART double lesser(double a, double b) { return a < b ? a : b; }
+
+/* Add the votes of the two fuzzy systems for a colour to the bins of the texture classes of its block. A histogram has
+   four places for the three shades of each colour: a sum that is stored as a whole is at hand for the next block. */
+PART void vote(const struct cedd_tables *t, int32_t hue, int32_t saturation, int32_t value, unsigned textures,
+               double *histogram) {
     const double *s = t->saturation + RULES * saturation, *v = t->value + RULES * value;
     const double one = t->hue_weight[hue], two = t->hue_weight[HUES + hue];
-    double rules[RULES], first[8], second[8], outputs[3], one_shades[3], two_shades[3];
+    double rules[RULES], first[8], second[8], one_shades[SHADES], two_shades[SHADES];
     for (int k = 0; k < RULES; k++) rules[k] = lesser(s[k], v[k]);
     for (int k = 0; k < 8; k++) first[k] = lesser(one, rules[k]);
     for (int k = 0; k < 8; k++) second[k] = lesser(two, rules[k]);
-    const double shades[3] = {rules[6], rules[7], rules[8] + rules[9]};
-    outputs[0] = first[0] + second[0];
-    outputs[1] = first[1] + second[1];
-    outputs[2] = ((first[2] + first[3]) + second[2]) + second[3];
-    for (int k = 0; k < 3; k++) one_shades[k] = (first[4] + first[5]) * shades[k];
-    for (int k = 0; k < 3; k++) two_shades[k] = (second[4] + second[5]) * shades[k];
+    const double shades[SHADES] = {rules[6], rules[7], rules[8] + rules[9], 0};
+    const double outputs[SHADES] = {first[0] + second[0], first[1] + second[1],
+                                    ((first[2] + first[3]) + second[2]) + second[3], 0};
+    for (int k = 0; k < SHADES; k++) one_shades[k] = (first[4] + first[5]) * shades[k];
+    for (int k = 0; k < SHADES; k++) two_shades[k] = (second[4] + second[5]) * shades[k];
     for (; textures; textures &= textures - 1) {
-        double *bins = histogram + 24 * __builtin_ctz(textures);
-        double *of_one = bins + t->hue_bin[hue], *of_two = bins + t->hue_bin[HUES + hue];
-        for (int k = 0; k < 3; k++) bins[k] += outputs[k];
-        for (int k = 0; k < 3; k++) of_one[k] += one_shades[k];
+        double *bins = histogram + COLOURS * SHADES * __builtin_ctz(textures);
+        double *of_one = bins + t->hue_bin[hue] / 3 * SHADES, *of_two = bins + t->hue_bin[HUES + hue] / 3 * SHADES;
+        for (int k = 0; k < SHADES; k++) bins[k] += outputs[k];
+        for (int k = 0; k < SHADES; k++) of_one[k] += one_shades[k];
         if (two > 0)
-            for (int k = 0; k < 3; k++) of_two[k] += two_shades[k];
+            for (int k = 0; k < SHADES; k++) of_two[k] += two_shades[k];
     }
 }
 
@@ -212,7 +245,7 @@ EXPORT void hbr_cedd(const uint8_t *image, int64_t stride, int64_t rows, int64_t
     double *areas = scratch;
     int32_t *channels = (int32_t *)(areas + 2 * quarters), *rest = channels + 8 * quarters;
     uint16_t *sums = (uint16_t *)(rest + quarters);
-    double luminance[3][256], greys[256], inverses[256], histogram[BINS] = {0};
+    double luminance[3][256], greys[256], inverses[256], histogram[BINS] = {0}, votes[BINS / 3 * SHADES] = {0};
     for (int i = 0; i < 256; i++) {
         luminance[0][i] = 0.114 * i;
         luminance[1][i] = 0.587 * i;
@@ -234,17 +267,14 @@ EXPORT void hbr_cedd(const uint8_t *image, int64_t stride, int64_t rows, int64_t
             row_areas(strip, stride, &grid, own + 3 * quarters, luminance, greys, rest, (uint8_t *)sums,
                       areas + quarters * half);
         }
-        for (int64_t j = 0; j < columns; j++) {
-            const double *upper = areas + 2 * j, *lower = upper + quarters;
-            int32_t bgr[3], hue, saturation, value;
-            for (int c = 0; c < 3; c++) {
-                const int32_t *over = channels + c * quarters + 2 * j, *under = over + 4 * quarters;
-                bgr[c] = (int32_t)((over[0] + over[1] + under[0] + under[1] + 0.5) * inverse);
-            }
-            hsv_of(bgr[0], bgr[1], bgr[2], inverses, &hue, &saturation, &value);
-            vote(tables, hue, saturation, value, textures_of(upper[0], upper[1], lower[0], lower[1]), histogram);
-        }
+        /* in the place of the luminances, which are used up */
+        int32_t *const upper = channels + 3 * quarters, *const lower = channels + 7 * quarters;
+        const struct blocks blocks = {upper, upper + columns, lower, lower + columns};
+        describe_blocks(channels, areas, columns, inverse, inverses, blocks);
+        for (int64_t j = 0; j < columns; j++)
+            vote(tables, blocks.hue[j], blocks.saturation[j], blocks.value[j], (unsigned)blocks.textures[j], votes);
     }
+    for (int k = 0; k < BINS; k++) histogram[k] = votes[k / 3 * SHADES + k % 3];
     double total = 0;
     for (int k = 0; k < BINS; k++) total += histogram[k];
     for (int k = 0; k < BINS; k++) {

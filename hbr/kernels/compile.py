@@ -13,7 +13,10 @@ from typing import Final
 FOLDER: Final = Path(__file__).resolve().parent
 LIBRARY: Final = FOLDER / "_kernels.so"
 #: No contraction of a product and a sum: the results have the same bits as those of NumPy.
-FLAGS: Final = "-std=gnu11 -O3 -fPIC -shared -s -fvisibility=hidden -ffp-contract=off -fno-math-errno -Wall -Wextra"
+FLAGS: Final = (
+    "-std=gnu11 -O3 -fPIC -shared -s -fvisibility=hidden -ffp-contract=off -fno-math-errno -fno-trapping-math "
+    "-Wall -Wextra"
+)
 
 
 def sources(folder: Path = FOLDER) -> list[Path]:

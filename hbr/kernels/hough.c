@@ -4,7 +4,7 @@
 #define LONGEST 4096
 
 /* The distance of two directions in revolutions, as hbr/core/angles.py has it: rounded to even by a large summand. */
-static inline double revolutions(double difference_deg) {
+PART double revolutions(double difference_deg) {
     const double large = 6755399441055744.0, turns = difference_deg / 360.0;
     return __builtin_fabs(difference_deg - 360.0 * ((turns + large) - large)) / 360.0;
 }
@@ -28,7 +28,7 @@ EXPORT void hbr_rotated(const int64_t *anchors, const double *rotation_deg, int6
     }
 }
 
-static inline int is_before(const int64_t *object_index, int64_t a, int64_t b) {
+PART int is_before(const int64_t *object_index, int64_t a, int64_t b) {
     return object_index[a] < object_index[b] || (object_index[a] == object_index[b] && a < b);
 }
 
@@ -57,7 +57,7 @@ static int64_t sorted(const int64_t *object_index, int64_t *rows, int64_t count)
     return left;
 }
 
-static inline int32_t dot(const int16_t *query, const uint8_t *row, int64_t length) {
+PART int32_t dot(const int16_t *query, const uint8_t *row, int64_t length) {
     int32_t sum = 0;
     for (int64_t i = 0; i < length; i++) sum += query[i] * (int16_t)row[i];
     return sum;

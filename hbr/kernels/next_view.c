@@ -5,7 +5,7 @@
 #define LANES 8
 
 /* Add up a row in the order in which NumPy does. */
-static inline __attribute__((always_inline)) double sum_of_row(const double *row) {
+PART double sum_of_row(const double *row) {
     double part[LANES];
     for (int i = 0; i < LANES; i++) part[i] = row[i];
     for (int b = LANES; b < BINS; b += LANES)
@@ -47,16 +47,16 @@ EXPORT void hbr_strongest(const double *posterior, int64_t objects, int64_t kept
 }
 
 /* The nearest whole number, the even one of two, below 2^51. */
-static inline double nearest_whole(double value) { return (value + 6755399441055744.0) - 6755399441055744.0; }
+PART double nearest_whole(double value) { return (value + 6755399441055744.0) - 6755399441055744.0; }
 
 /* The size of a difference of directions, 0..180. */
-static inline double size_deg(double difference) {
+PART double size_deg(double difference) {
     const double size = difference - 360.0 * nearest_whole(difference / 360.0);
     return size < 0 ? -size : size;
 }
 
 /* The remainder, in [0, 360), of an angle below 10^9: the product and the differences are exact. */
-static inline double wrap360(double deg) {
+PART double wrap360(double deg) {
     double rest = deg - 360.0 * (double)(int64_t)(deg / 360.0);
     if (rest >= 360.0) rest -= 360.0;
     if (rest < 0) rest += 360.0;

@@ -4,7 +4,7 @@
 #define BINS 72
 #define FAR_DEG 2000.0
 
-static inline float larger(float a, float b) { return a > b ? a : b; }
+PART float larger(float a, float b) { return a > b ? a : b; }
 
 /* Store what one query adds to every azimuth of each object, (objects, 72).
 

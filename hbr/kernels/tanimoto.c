@@ -4,18 +4,18 @@
 #define LONGEST 4096
 
 /* The product of two rows; 4096 products of bytes are below 2^31. */
-static inline int32_t dot(const int16_t *query, const uint8_t *row, int64_t length) {
+PART int32_t dot(const int16_t *query, const uint8_t *row, int64_t length) {
     int32_t sum = 0;
     for (int64_t i = 0; i < length; i++) sum += query[i] * (int16_t)row[i];
     return sum;
 }
 
-static inline int32_t expanded(const uint8_t *row, int64_t length, int16_t *values) {
+PART int32_t expanded(const uint8_t *row, int64_t length, int16_t *values) {
     for (int64_t i = 0; i < length; i++) values[i] = row[i];
     return dot(values, row, length);
 }
 
-static inline double coefficient(int32_t product, int32_t square_a, int32_t square_b) {
+PART double coefficient(int32_t product, int32_t square_a, int32_t square_b) {
     const double either = (double)square_a + (double)square_b - (double)product;
     return either > 0 ? (double)product / either : 0;
 }
