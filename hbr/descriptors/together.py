@@ -1,7 +1,7 @@
 """Description of views that belong together: those of one search, or of one enrollment.
 
-They share a background, which is learned while the table turns (`hbr.segmentation.learned`). So every new view also
-improves the segmentation of the earlier ones.
+They share a background, which is learned while the table turns (`hbr.segmentation.learned`). So the second view also
+improves the segmentation of the first one. Further views hardly improve those that were segmented by rotation.
 """
 
 from functools import partial
@@ -16,10 +16,23 @@ from hbr.segmentation import Background, Method, Segmentation, hypotheses
 from hbr.segmentation.learned import LearnedBackground
 from hbr.segmentation.segment import MOST_HYPOTHESES, without_background
 
-#: Segmentations that other views do not improve.
-_FINAL: Final = (Method.PLAIN_BACKGROUND, Method.EMPTY_TABLE)
+#: Segmentations as good as those of enrolled views.
+_EXACT: Final = (Method.PLAIN_BACKGROUND, Method.EMPTY_TABLE)
 #: Segmentations by a known background.
-RELIABLE: Final = (*_FINAL, Method.ROTATION)
+RELIABLE: Final = (*_EXACT, Method.ROTATION)
+
+
+def like_enrollment(method: str, same_bench: bool | None) -> bool | None:
+    """Return whether a view is described as at the enrollment; None: not known.
+
+    Parameters
+    ----------
+    method : str
+        A `Method`. A segmentation by rotation changes a description as much as another bench does.
+    same_bench : bool or None
+        Whether the bench is that of the enrollment; None: not known.
+    """
+    return None if same_bench and method not in _EXACT else same_bench
 
 
 class ViewsTogether:
@@ -62,14 +75,13 @@ class ViewsTogether:
         self._several = several
         self._images: list[ImageArray] = []
         self._learned = LearnedBackground()
-        self._alone: dict[int, tuple[Segmentation, ...]] = {}
         self.segmentations: list[tuple[Segmentation, ...]] = []
         self.levels: list[LevelArray] = []
 
     def add(self, image_bgr: ImageArray, *, revise: bool = True) -> tuple[Segmentation, ...]:
-        """Add a view, and segment the earlier ones again if asked for; return the segmentations of the new view.
+        """Add a view, and revise the earlier ones if asked for; return the segmentations of the new view.
 
-        The object is also guessed in each view, except in those of many that are not segmented again.
+        Among many views that are not revised, the object is guessed in the first one alone.
 
         Raises
         ------
@@ -96,9 +108,9 @@ class ViewsTogether:
         return self.segmentations[-1][0].method in RELIABLE
 
     def revise(self) -> None:
-        """Segment all views again that other views can improve."""
+        """Segment the views whose background was not known, by that which the other views show."""
         for view, found in enumerate(self.segmentations):
-            if not found or found[0].method not in _FINAL:
+            if not found or found[0].method not in RELIABLE:
                 self._describe(view, guess=self._several)
 
     def _describe(self, view: int, *, guess: bool = False) -> None:
@@ -109,14 +121,10 @@ class ViewsTogether:
             alone=partial(self._without_background, view) if guess else None,
             most=MOST_HYPOTHESES if self._several else 1,
         )
-        described = {id(one): row for one, row in zip(self.segmentations[view], self.levels[view], strict=True)}
-        rows = [described[id(one)] if id(one) in described else self._descriptor.describe(one) for one in found]
-        self.segmentations[view], self.levels[view] = found, np.stack(rows)
+        self.segmentations[view] = found
+        self.levels[view] = np.stack([self._descriptor.describe(one) for one in found])
 
     def _without_background(self, view: int) -> tuple[Segmentation, ...]:
-        """Return the segmentations of a view that no other view changes; they are computed once."""
-        if view not in self._alone:
-            known = self.segmentations[view]
-            is_first = bool(known) and known[0].method is Method.GUESS
-            self._alone[view] = known if is_first else without_background(self._images[view])
-        return self._alone[view]
+        """Return the segmentations of a view that no other view changes."""
+        known = self.segmentations[view]
+        return known if known and known[0].method is Method.GUESS else without_background(self._images[view])

@@ -4,7 +4,7 @@ Objects are enrolled on one drawn bench. Each search is a visit to the same benc
 other benches (hard change), with four views, 90° apart. Some objects are never enrolled.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Final, Literal
 
@@ -16,8 +16,8 @@ from hbr.core.angles import wrap180
 from hbr.core.arrays import ImageArray, LevelArray
 from hbr.dense.index import DenseIndex
 from hbr.dense.session import DenseSession
-from hbr.dense.stopping import Outcome, StoppingRule
-from hbr.descriptors.together import ViewsTogether
+from hbr.dense.stopping import Outcome, StopDecision, StoppingRule
+from hbr.descriptors.together import ViewsTogether, like_enrollment
 from hbr.evaluation.changed_bench import ENROLLMENT, HARD, MILD, Bench, Visit
 from hbr.evaluation.condition import object_mask
 from hbr.evaluation.datasets import Dataset, PhotographedObject, read_photograph
@@ -80,12 +80,15 @@ class SearchResult:
         The leading object then.
     views : int
         Views until then.
+    left_out : Outcome, optional
+        How the same search ends if the object is not enrolled; None if it never was.
     """
 
     leaders: tuple[str, ...]
     outcome: Outcome
     decided: str
     views: int
+    left_out: Outcome | None = None
 
 
 def enroll_changed(item: PhotographedObject, changes: Changes) -> tuple[LevelArray, NDArray[np.float64]]:
@@ -116,7 +119,8 @@ def search_changed(
     """Search for an object, once for each trial.
 
     As on the rig, the first frame is compared with the enrollment's picture, or without one with a view of an enrolled
-    object, the ``example``.
+    object, the ``example``. An enrolled object is also searched for as if it were not enrolled. The rule stays: it is
+    fitted to the searches of all enrolled objects, of which this one is a small part.
 
     Raises
     ------
@@ -125,33 +129,67 @@ def search_changed(
     """
     results = []
     before = _bench_image(None if changes.picture else example)
+    left_out = _without(index, item.name)
     for trial in range(changes.trials):
         rng = generator(changes.seed, item.name, "trial", trial)
         hard = changes.kind == "hard"
         bench = _benches()[int(rng.integers(_BENCHES))] if hard else _enrollment_bench()
         visit = Visit(bench, HARD if hard else MILD, rng)
         first_deg = rng.uniform(0, 360)
-        empty_table = visit.empty() if changes.picture else None
+        views = ViewsTogether(DESCRIPTOR, empty_table=visit.empty() if changes.picture else None)
+        search = _Search(index, rule)
+        without = None if left_out is None else _Search(left_out, rule)
         same_bench: bool | None = None
-        views = ViewsTogether(DESCRIPTOR, empty_table=empty_table)
-        session = DenseSession(index, rule, max_views=_MAX_VIEWS)
-        leaders: list[str] = []
-        ended: SearchResult | None = None
-        for n, place in enumerate(_places(item, first_deg + _STEP_DEG * np.arange(VIEWS, dtype=np.float64))):
+        for place in _places(item, first_deg + _STEP_DEG * np.arange(VIEWS, dtype=np.float64)):
             azimuth_deg = item.photographs[place].azimuth_deg
             frame = visit.photograph(*_cut_out(item, place), azimuth_deg).image
             if same_bench is None:
                 same_bench = before.shows_same_bench(frame)
             views.add(frame)
-            *earlier, levels = views.levels
-            decision = session.add(levels, azimuth_deg, earlier=earlier, reliable=views.reliable, same_bench=same_bench)
-            names = index.views.object_names
-            leaders.append(names[int(session.belief.ranking().object_index[0])])
-            if ended is None and decision.outcome is not Outcome.CONTINUE:
-                ended = SearchResult((), decision.outcome, names[decision.object_index], n + 1)
-        ended = ended or SearchResult((), Outcome.CONTINUE, leaders[-1], VIEWS)
-        results.append(SearchResult(tuple(leaders), ended.outcome, ended.decided, ended.views))
+            search.add(views, azimuth_deg, same_bench)
+            if without is not None:
+                without.add(views, azimuth_deg, same_bench)
+        result = search.result()
+        results.append(result if without is None else replace(result, left_out=without.result().outcome))
     return results
+
+
+class _Search:
+    """A search that continues after its end, to see which object leads."""
+
+    def __init__(self, index: DenseIndex, rule: StoppingRule) -> None:
+        self._session = DenseSession(index, rule, max_views=_MAX_VIEWS)
+        self._names = index.views.object_names
+        self._leaders: list[str] = []
+        self._end: StopDecision | None = None
+        self._views = VIEWS
+
+    def add(self, views: ViewsTogether, azimuth_deg: float, same_bench: bool) -> None:
+        *earlier, levels = views.levels
+        decision = self._session.add(
+            levels,
+            azimuth_deg,
+            earlier=earlier,
+            reliable=views.reliable,
+            same_bench=like_enrollment(views.segmentations[-1][0].method, same_bench),
+        )
+        self._leaders.append(self._names[int(self._session.belief.ranking().object_index[0])])
+        if self._end is None and decision.outcome is not Outcome.CONTINUE:
+            self._end, self._views = decision, len(self._leaders)
+
+    def result(self) -> SearchResult:
+        outcome, decided = Outcome.CONTINUE, self._leaders[-1]
+        if self._end is not None:
+            outcome, decided = self._end.outcome, self._names[self._end.object_index]
+        return SearchResult(tuple(self._leaders), outcome, decided, self._views)
+
+
+def _without(index: DenseIndex, name: str) -> DenseIndex | None:
+    """Return the index as if an object were not enrolled; None if it is not."""
+    if name not in index.views.object_names:
+        return None
+    # a new index: the whitening of this one contains the object's views
+    return DenseIndex(index.views.select(index.views.object_index != index.views.object_names.index(name)))
 
 
 def summary(known: dict[str, list[SearchResult]], unknown: dict[str, list[SearchResult]]) -> dict[str, float | int]:
@@ -160,6 +198,7 @@ def summary(known: dict[str, list[SearchResult]], unknown: dict[str, list[Search
     others = [one for results in unknown.values() for one in results]
     count, unknown_count = max(1, len(searches)), max(1, len(others))
     found = [(name, one) for name, one in searches if one.outcome is Outcome.FOUND]
+    left_out = [one.left_out for _, one in searches if one.left_out is not None]
     return {
         "searches": len(searches),
         **{f"hit_rate_{n}": sum(one.leaders[n - 1] == name for name, one in searches) / count for n in (1, 2, VIEWS)},
@@ -170,6 +209,8 @@ def summary(known: dict[str, list[SearchResult]], unknown: dict[str, list[Search
         "unknown_searches": len(others),
         "unknown_accepted": sum(one.outcome is Outcome.FOUND for one in others) / unknown_count,
         "unknown_called_unknown": sum(one.outcome is Outcome.UNKNOWN for one in others) / unknown_count,
+        "left_out_searches": len(left_out),
+        "left_out_accepted": left_out.count(Outcome.FOUND) / max(1, len(left_out)),
     }
 
 

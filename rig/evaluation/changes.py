@@ -1,6 +1,6 @@
 """Searches after a change of the bench, in several processes; results as JSON and as a table."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import asdict
 from functools import partial
 from importlib.metadata import version
@@ -28,11 +28,17 @@ from rig.core.processes import Jobs, map_in_processes
 from rig.evaluation.report import Rows
 
 
-def run_changes(dataset: Dataset, changes: Changes, jobs: Jobs, advance: Callable[[str], None]) -> dict[str, Any]:
+def run_changes(
+    dataset: Dataset,
+    changes: Changes,
+    jobs: Jobs,
+    advance: Callable[[str], None],
+    reported: Collection[str] | None = None,
+) -> dict[str, Any]:
     """Enroll objects on one bench, search for all on changed ones, and return the shares as JSON values.
 
-    Equal settings give equal values. `advance` is called with each object's name after its enrollment, and again after
-    its searches.
+    The shares of the objects ``reported``, searched for among all, are given once more. Equal settings give equal
+    values. `advance` is called with each object's name after its enrollment, and again after its searches.
 
     Raises
     ------
@@ -55,31 +61,41 @@ def run_changes(dataset: Dataset, changes: Changes, jobs: Jobs, advance: Callabl
     for j, results in map_in_processes(work, range(len(dataset.objects)), jobs):
         searched[dataset.objects[j].name] = results
         advance(dataset.objects[j].name)
+
+    def shares(of: Collection[str]) -> dict[str, float | int]:
+        some = {name: results for name, results in searched.items() if name in of}
+        known = {name: results for name, results in some.items() if name in names}
+        return summary(known, {name: results for name, results in some.items() if name not in known})
+
     return {
         "settings": {"version": version("hbr-rig"), "dataset": dataset.name, "objects": len(names), **asdict(changes)},
-        "changed_bench": summary(
-            {name: results for name, results in searched.items() if name in names},
-            {name: results for name, results in searched.items() if name not in names},
-        ),
+        "changed_bench": shares(searched),
+        **({} if reported is None else {"reported": shares(reported)}),
         "calibrated": [asdict(one) for one in rule.rates],
+        "searches": {item.name: [asdict(one) for one in searched[item.name]] for item in dataset.objects},
     }
 
 
 def change_rows(results: dict[str, Any]) -> Rows:
-    """Return a table of the shares, in percent."""
-    found, settings = results["changed_bench"], results["settings"]
+    """Return a table of the shares, in percent: of all objects, and of those that are reported alone."""
+    heads = ["change, %", "ranking, N = 1 / 2 / 4", "decided right", "wrong", "called unknown", "unknown accepted"]
+    rows = [_row(results["settings"], results["changed_bench"])]
+    if "reported" in results:
+        rows.append(_row(results["settings"], results["reported"]))
+    return Rows([*heads, "left out in turn: accepted"], rows)
+
+
+def _row(settings: dict[str, Any], found: dict[str, Any]) -> list[str]:
     ranking = " / ".join(f"{100 * found[f'hit_rate_{n}']:.1f}" for n in (1, 2, 4))
-    row = [
-        f"{settings['kind']}, {'picture of the empty table' if settings['picture'] else 'no picture'}",
-        ranking,
+    return [
+        f"{settings['kind']}, {'picture' if settings['picture'] else 'no picture'}",
+        f"{ranking} of {found['searches']}",
         f"{100 * found['decided_right']:.1f} in {found['mean_views']:.2f} views",
         f"{100 * found['decided_wrong']:.1f}",
         f"{100 * found['called_unknown']:.1f}",
         f"{100 * found['unknown_accepted']:.1f} of {found['unknown_searches']}",
+        f"{100 * found['left_out_accepted']:.1f} of {found['left_out_searches']}",
     ]
-    return Rows(
-        ["change, %", "ranking, N = 1 / 2 / 4", "decided right", "wrong", "called unknown", "unknown accepted"], [row]
-    )
 
 
 def _enroll(dataset: Dataset, changes: Changes, names: list[str], j: int) -> tuple[LevelArray, NDArray[np.float64]]:

@@ -148,6 +148,7 @@ def identify(
                 earlier=described.earlier,
                 reliable=described.reliable,
                 same_bench=described.same_bench,
+                segmentation=described.segmentation,
             )
             yield ranked
             if isinstance(step, Finish):

@@ -115,6 +115,7 @@ class _Passing:
             table_deg=motion.angle_deg,
             reliable=described.reliable,
             same_bench=described.same_bench,
+            segmentation=described.segmentation,
         )
         seconds = seconds_between(self.started_ns, self.bench.clock.now_ns())
         used = self.search.frame_used(self.number, azimuth_deg, seconds, self.rejected)
@@ -185,6 +186,7 @@ def search_in_motion(
                 table_deg=table.rest_deg,
                 reliable=described.reliable,
                 same_bench=described.same_bench,
+                segmentation=described.segmentation,
             )
             ended_ns = bench.clock.now_ns()
             if search.is_new_decision:

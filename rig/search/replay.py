@@ -102,6 +102,7 @@ def check(run: SavedRun, *, by: AnyStrategy | None = None) -> Check:
                     earlier=view.earlier,
                     reliable=view.reliable,
                     same_bench=event.same_bench,
+                    segmentation=event.segmentation,
                 )
                 found.views += 1
                 if event.segmentation is not None:

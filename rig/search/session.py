@@ -1,7 +1,7 @@
 """A search without its hardware: views in, ranking and decision out. The bench runs it, and a replay runs it again."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from math import isfinite
@@ -14,6 +14,7 @@ import hbr
 from hbr.core.angles import wrap360
 from hbr.dense.arc import ArcRule, ArcSession, calibrate_arc_rule
 from hbr.dense.pose import pose
+from hbr.descriptors.together import like_enrollment
 from hbr.model.symmetry import symmetry
 from rig.config import RigConfig
 from rig.core.errors import CatalogError, UsageError
@@ -67,6 +68,7 @@ class Search(ABC):
         earlier: Sequence[NDArray[np.uint8]] | None = None,
         reliable: bool = True,
         same_bench: bool | None = None,
+        segmentation: Mapping[str, Any] | None = None,
     ) -> tuple[Ranked, Rotate | Finish]:
         """Add the next view; return the candidates, and the strategy's decision.
 
@@ -83,7 +85,11 @@ class Search(ABC):
         reliable, same_bench
             Whether the view was segmented reliably, and whether the bench is that of the enrollment, as for
             `hbr.DenseSession.add`.
+        segmentation
+            `hbr.Segmentation.evidence` of the view.
         """
+        if segmentation is not None:
+            same_bench = like_enrollment(segmentation.get("method", ""), same_bench)
         self._orientations.append(azimuth_deg)
         self._earlier, self._reliable, self._same_bench = earlier, reliable, same_bench
         ranked = self._rank(levels)

@@ -110,7 +110,7 @@ def evaluate(
         typer.Option(
             metavar="mild|hard",
             help="Search by edges+colours after a change of a whole drawn bench; every ninth object is not enrolled. "
-            "Uses --enrolled (36), --objects, --reference none.",
+            "Uses --enrolled (36), --objects, --report, --reference none.",
         ),
     ] = None,
     objects: Annotated[
@@ -155,7 +155,7 @@ def evaluate(
     try:
         if bench_change is not None:
             dataset = _dataset(settings, folder, objects)
-            _bench_change(settings, dataset, bench_change, reference != "none", enrolled or 36, workers, out)
+            _bench_change(settings, dataset, bench_change, reference != "none", enrolled or 36, report, workers, out)
             return
         plan = Plan.of(
             _dataset(settings, folder, objects),
@@ -239,7 +239,14 @@ def evaluate(
 
 
 def _bench_change(
-    settings: Settings, dataset: "Dataset", kind: str, picture: bool, enrolled: int, jobs: "Jobs", out: Path
+    settings: Settings,
+    dataset: "Dataset",
+    kind: str,
+    picture: bool,
+    enrolled: int,
+    report: str | None,
+    jobs: "Jobs",
+    out: Path,
 ) -> None:
     from hbr.evaluation.changes import Changes
     from rig.cli.ui.present import Progress, console
@@ -249,13 +256,14 @@ def _bench_change(
     if kind not in ("mild", "hard"):
         raise ValueError(f"bench change {kind!r} is unknown; use mild or hard")
     changes = Changes(kind, picture, enrolled, seed=settings.seed or 0)  # type: ignore[arg-type]
+    reported = None if report is None else [item.name for item in dataset.subset(*_range(report)).objects]
     with Progress("enrolling, searching") as progress:
         progress.start(2 * len(dataset.objects))
 
         def advance(_name: str) -> None:
             progress.advance()
 
-        results = run_changes(dataset, changes, jobs, advance)
+        results = run_changes(dataset, changes, jobs, advance, reported)
     write_json(results, out / "bench_change.json")
     if settings.json:
         settings.print_json({"event": "finished", **results})

@@ -9,6 +9,7 @@ import hbr
 from hbr.dense.shifted_searches import can_shift
 from hbr.dense.whitening import Whitening
 from hbr.descriptors.shift import Shift
+from hbr.descriptors.together import like_enrollment
 from hbr.evaluation.changed_bench import HARD, Bench, Visit
 from hbr.segmentation import Method
 
@@ -150,3 +151,20 @@ def test_whitening_without_an_object_is_that_of_the_other_views() -> None:
     own = left_out.unit(index.whitening.white(levels[:6]))
     gain = own @ found.T - with_it @ index.whitening.unit(levels[6:]).T
     assert np.abs(gain).max() > 0.003  # an unknown object is compared differently
+
+
+@pytest.mark.parametrize(
+    ("method", "same_bench", "expected"),
+    [
+        (Method.EMPTY_TABLE, True, True),
+        (Method.PLAIN_BACKGROUND, True, True),
+        (Method.ROTATION, True, None),
+        (Method.GUESS, True, None),
+        (Method.ROTATION, False, False),
+        (Method.EMPTY_TABLE, None, None),
+    ],
+)
+def test_a_segmentation_by_rotation_is_not_like_the_enrollment(
+    method: Method, same_bench: bool | None, expected: bool | None
+) -> None:
+    assert like_enrollment(method, same_bench) is expected

@@ -276,3 +276,19 @@ def test_left_out_objects_are_searched_for(photographs: Path, tmp_path: Path) ->
     by_trials = [row for row in rows if not row["calibrated"]]
     assert all(row["false_rejects"] == 0 and row["false_accepts"] == 30 for row in by_trials)
     assert run(photographs, *options[:4], "--leave-out", "3", "--out", out).exit_code == 2
+
+
+@pytest.mark.nightly
+def test_bench_change_searches_for_each_object_also_as_if_it_were_not_enrolled(
+    photographs: Path, tmp_path: Path
+) -> None:
+    asked = ("--bench-change", "mild", "--objects", "1-3", "--report", "2-3", "--enrolled", "6", "--jobs", "1")
+    done = run(photographs, *asked, "--out", tmp_path)
+    assert done.exit_code == 0, done.output
+    found = json.loads((tmp_path / "bench_change.json").read_text())
+    assert (found["changed_bench"]["searches"], found["reported"]["searches"]) == (12, 8)
+    assert found["changed_bench"]["left_out_searches"] == 12
+    assert list(found["searches"]) == ["obj1", "obj2", "obj3"]
+    for name, searches in found["searches"].items():
+        assert len(searches) == 4
+        assert {len(one["leaders"]) for one in searches} == {4}, name

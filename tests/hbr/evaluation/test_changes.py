@@ -1,0 +1,32 @@
+"""The shares of searches after a change of the bench."""
+
+import hbr
+from hbr.evaluation.changes import Changes, SearchResult, summary
+
+
+def result(leader: str, outcome: hbr.Outcome, views: int = 1, left_out: hbr.Outcome | None = None) -> SearchResult:
+    return SearchResult((leader,) * 4, outcome, leader, views, left_out)
+
+
+def test_shares_of_enrolled_objects_and_of_others() -> None:
+    known = {
+        "a": [
+            result("a", hbr.Outcome.FOUND, 1, hbr.Outcome.UNKNOWN),
+            result("b", hbr.Outcome.FOUND, 3, hbr.Outcome.FOUND),
+        ],
+        "b": [
+            result("b", hbr.Outcome.UNKNOWN, 4, hbr.Outcome.CONTINUE),
+            result("b", hbr.Outcome.CONTINUE, 4, hbr.Outcome.AMBIGUOUS),
+        ],
+    }
+    unknown = {"c": [result("a", hbr.Outcome.FOUND, 2), result("a", hbr.Outcome.UNKNOWN, 4)]}
+    found = summary(known, unknown)
+    assert (found["searches"], found["unknown_searches"], found["left_out_searches"]) == (4, 2, 4)
+    assert (found["hit_rate_1"], found["hit_rate_4"]) == (0.75, 0.75)
+    assert (found["decided_right"], found["decided_wrong"], found["called_unknown"]) == (0.25, 0.25, 0.25)
+    assert (found["mean_views"], found["unknown_accepted"], found["left_out_accepted"]) == (2.0, 0.5, 0.25)
+
+
+def test_every_so_many_th_object_is_never_enrolled() -> None:
+    changes = Changes(every=3)
+    assert [changes.is_enrolled(place) for place in range(6)] == [True, True, False, True, True, False]
