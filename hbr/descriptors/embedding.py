@@ -49,22 +49,11 @@ class Embedding(Descriptor):
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        try:
-            if path.exists() and not path.is_file():  # reading a pipe waits, and a device can have no end
-                raise ValueError(f"the model {path} is not a regular file; check the path")
-            with path.open("rb") as file:
-                content = file.read(MAX_MODEL_BYTES + 1)
-        except OSError as error:
-            raise ValueError(f"the model {path} cannot be read: {error.strerror}; check the path") from error
-        if len(content) > MAX_MODEL_BYTES:
-            raise ValueError(f"the model {path} is larger than {MAX_MODEL_BYTES} bytes; use a smaller one")
+        content = read_model(path)
         self._digest = sha256(content).hexdigest()
         self._checksum = zlib.crc32(content)
-        try:
-            self._net = cv2.dnn.readNetFromONNX(np.frombuffer(content, np.uint8))
-            self._length = self._run(np.zeros((8, 8, 3), np.uint8)).size
-        except cv2.error as error:
-            raise ValueError(f"{path} is no model that OpenCV can run: {error.err}; export it again as ONNX") from error
+        self._net = opened(path, content)
+        self._length = output(self._net, np.zeros((8, 8, 3), np.uint8)).size
         if self._length < 2:
             raise ValueError(f"{path} returns {self._length} number; an embedding has more, export the layer before")
 
@@ -86,24 +75,67 @@ class Embedding(Descriptor):
         return self._length
 
     def describe(self, view: ImageArray | Segmentation, /) -> LevelArray:
-        vector = self._run((view if isinstance(view, Segmentation) else segment(view)).alone)
-        length = float(np.sqrt((vector * vector).sum()))
-        entries = vector * (_STEPS * np.sqrt(self.length) / length) if length > 0 else vector
-        levels: NDArray[np.float32] = np.clip(np.rint(entries) + 128, 0, 255)
-        return levels.astype(np.uint8)
+        return to_levels(output(self._net, (view if isinstance(view, Segmentation) else segment(view)).alone).ravel())
 
     def prepared(self, rows: LevelArray, /) -> Cosine:
         self.check_rows(rows)
-        return Cosine.of(rows, _unit)
-
-    def _run(self, image: ImageArray) -> NDArray[np.float32]:
-        blob = cv2.dnn.blobFromImage(image, 1 / 255, (_SIDE_PX, _SIDE_PX), _MEAN, swapRB=True)
-        self._net.setInput(np.asarray(blob, np.float32) / _DEVIATION)
-        return np.asarray(self._net.forward(), np.float32).ravel()
+        return Cosine.of(rows, unit)
 
 
-def _unit(levels: LevelArray) -> NDArray[np.float32]:
+def read_model(path: Path) -> bytes:
+    """Return the content of a model file.
+
+    Raises
+    ------
+    ValueError
+        The file is missing, is not a regular one or is too large.
+    """
+    try:
+        if path.exists() and not path.is_file():  # reading a pipe waits, and a device can have no end
+            raise ValueError(f"the model {path} is not a regular file; check the path")
+        with path.open("rb") as file:
+            content = file.read(MAX_MODEL_BYTES + 1)
+    except OSError as error:
+        raise ValueError(f"the model {path} cannot be read: {error.strerror}; check the path") from error
+    if len(content) > MAX_MODEL_BYTES:
+        raise ValueError(f"the model {path} is larger than {MAX_MODEL_BYTES} bytes; use a smaller one")
+    return content
+
+
+def opened(path: Path, content: bytes) -> cv2.dnn.Net:
+    """Return the network of an ONNX file, which was run once.
+
+    Raises
+    ------
+    ValueError
+        OpenCV cannot run it.
+    """
+    try:
+        net = cv2.dnn.readNetFromONNX(np.frombuffer(content, np.uint8))
+        output(net, np.zeros((8, 8, 3), np.uint8))
+    except cv2.error as error:
+        raise ValueError(f"{path} is no model that OpenCV can run: {error.err}; export it again as ONNX") from error
+    return net
+
+
+def output(net: cv2.dnn.Net, image: ImageArray) -> NDArray[np.float32]:
+    """Return what a network returns for an image, uint8 (H, W, 3)."""
+    blob = cv2.dnn.blobFromImage(image, 1 / 255, (_SIDE_PX, _SIDE_PX), _MEAN, swapRB=True)
+    net.setInput(np.asarray(blob, np.float32) / _DEVIATION)
+    return np.asarray(net.forward(), np.float32)
+
+
+def to_levels(vector: NDArray[np.float32]) -> LevelArray:
+    """Return the levels of a vector, whatever its length; 128 is 0."""
+    length = float(np.sqrt((vector * vector).sum()))
+    entries = vector * (_STEPS * np.sqrt(vector.size) / length) if length > 0 else vector
+    levels: NDArray[np.float32] = np.clip(np.rint(entries) + 128, 0, 255)
+    return levels.astype(np.uint8)
+
+
+def unit(levels: LevelArray) -> NDArray[np.float32]:
+    """Return levels as vectors of unit length."""
     rows: NDArray[np.float32] = levels.astype(np.float32) - 128
     length = np.sqrt(np.einsum("ij,ij->i", rows, rows, dtype=np.float64))[:, None]
-    unit: NDArray[np.float32] = np.divide(rows, length, out=np.zeros_like(rows), where=length > 0)
-    return unit
+    scaled: NDArray[np.float32] = np.divide(rows, length, out=np.zeros_like(rows), where=length > 0)
+    return scaled

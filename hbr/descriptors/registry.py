@@ -9,8 +9,9 @@ from typing import Final
 from hbr.descriptors.base import Descriptor
 from hbr.descriptors.colours import Colours
 from hbr.descriptors.edges import Edges
-from hbr.descriptors.embedding import MODEL_NAME, PREFIX, Embedding
+from hbr.descriptors.embedding import MODEL_NAME, PREFIX, Embedding, read_model
 from hbr.descriptors.joined import Joined
+from hbr.descriptors.layer_embedding import MAGIC, LayerEmbedding, load_layer
 from hbr.descriptors.plain_cedd import Cedd
 
 GROUP: Final = "hbr.descriptors"
@@ -31,7 +32,8 @@ _KNOWN: Final[dict[str, Descriptor]] = {
     )
 }
 
-_MODELS: Final[dict[str, Embedding]] = {}
+Model = Embedding | LayerEmbedding
+_MODELS: Final[dict[str, Model]] = {}
 
 
 def descriptor(name: str) -> Descriptor:
@@ -88,19 +90,21 @@ def load_descriptor(given: str) -> Descriptor:
     return descriptor(given)
 
 
-def load_model(path: Path) -> Embedding:
-    """Load a model file; from now on `descriptor` knows it by its digest.
+def load_model(path: Path) -> Model:
+    """Load a model file, or a file of `hbr.descriptors.layer_embedding.fit_layer`; `descriptor` knows it by its digest.
 
     Raises
     ------
     ValueError
         The model file cannot be used.
     """
-    model = Embedding(path)
+    content = read_model(path)
+    is_layer = content.startswith(MAGIC)
+    model = load_layer(path, content, _KNOWN["edges+colours"]) if is_layer else Embedding(path)
     return _MODELS.setdefault(model.name, model)
 
 
-def loaded_models() -> tuple[Embedding, ...]:
+def loaded_models() -> tuple[Model, ...]:
     """Return the models that were loaded."""
     return tuple(_MODELS.values())
 

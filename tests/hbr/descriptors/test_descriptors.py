@@ -8,6 +8,7 @@ import pytest
 from hbr import DenseIndex, ViewIndex, Views, update_belief
 from hbr.descriptors import Descriptor, descriptor, load_descriptor, load_model, loaded_models, names
 from hbr.descriptors.embedding import MAX_MODEL_BYTES
+from tests.networks import means_network
 
 
 @pytest.fixture(params=names())
@@ -51,39 +52,12 @@ def test_similarity_is_1_to_itself_symmetric_and_between_0_and_1(one: Descriptor
     np.testing.assert_allclose(one.similarity(rows[:2], rows), similar[:2], atol=1e-6)
 
 
-def varint(number: int) -> bytes:
-    low, rest = number & 127, number >> 7
-    return bytes([low | 128]) + varint(rest) if rest else bytes([low])
-
-
-def field(number: int, value: int | bytes) -> bytes:
-    """Return a field of a protocol buffer."""
-    if isinstance(value, int):
-        return varint(number << 3) + varint(value)
-    return varint(number << 3 | 2) + varint(len(value)) + value
-
-
-def model() -> bytes:
-    """Return an ONNX model of two nodes that computes the means of the three channels."""
-
-    def tensor(name: bytes, *sides: int) -> bytes:
-        shape = b"".join(field(1, field(1, side)) for side in sides)
-        return field(1, name) + field(2, field(1, field(1, 1) + field(2, shape)))
-
-    def node(source: bytes, target: bytes, kind: bytes) -> bytes:
-        return field(1, source) + field(2, target) + field(3, target) + field(4, kind)
-
-    graph = field(1, node(b"x", b"p", b"GlobalAveragePool")) + field(1, node(b"p", b"y", b"Flatten")) + field(2, b"g")
-    graph += field(11, tensor(b"x", 1, 3, 224, 224)) + field(12, tensor(b"y", 1, 3))
-    return field(1, 8) + field(7, graph) + field(8, field(1, b"") + field(2, 13))
-
-
 def test_embedding_of_a_neural_network_is_a_descriptor(tmp_path: Path) -> None:
     file = tmp_path / "means.onnx"
-    file.write_bytes(model())
+    file.write_bytes(means_network())
     own = load_descriptor(f"onnx:{file}")
     assert (own.length, own.size_bytes) == (3, 3)
-    assert own.name == f"onnx:{sha256(model()).hexdigest()}"
+    assert own.name == f"onnx:{sha256(means_network()).hexdigest()}"
     assert descriptor(own.name) is load_descriptor(own.name) is load_model(file) is own
     assert own in loaded_models()
     red, blue = (np.full((60, 60, 3), colour, np.uint8) for colour in ((20, 20, 220), (220, 20, 20)))
@@ -116,7 +90,7 @@ def test_unusable_model_is_rejected_with_the_reason(tmp_path: Path) -> None:
 
 def test_name_of_a_descriptor_is_checked_and_opens_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file = tmp_path / "means.onnx"
-    file.write_bytes(model())
+    file.write_bytes(means_network())
     monkeypatch.setattr(Path, "open", None)
     for name in (f"onnx:{file}", "onnx:", f"onnx:{'0' * 64}"):
         with pytest.raises(ValueError, match="is not loaded"):

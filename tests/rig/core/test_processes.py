@@ -9,7 +9,7 @@ import pytest
 from hbr.descriptors import descriptor, load_model
 from rig.core.errors import RigError
 from rig.core.processes import map_in_processes
-from tests.hbr.descriptors.test_descriptors import model
+from tests.networks import means_network
 
 
 def work(item: int) -> int:
@@ -35,7 +35,7 @@ def length(item: tuple[str, int]) -> int:
 def test_processes_have_the_loaded_models_and_nothing_of_the_working_directory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (tmp_path / "means.onnx").write_bytes(model())
+    (tmp_path / "means.onnx").write_bytes(means_network())
     name = load_model(tmp_path / "means.onnx").name
     for module in ("multiprocessing", "runpy", "selectors"):
         (tmp_path / f"{module}.py").write_text("open('imported', 'w')")
