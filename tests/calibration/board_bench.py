@@ -16,6 +16,12 @@ Picture = np.ndarray
 
 
 @cache
+def noise() -> Picture:
+    """Return the noise of every frame: drawing it anew takes longer than drawing the board."""
+    return 2 * np.random.default_rng(1).standard_normal(empty_platter().shape, dtype=np.float32)
+
+
+@cache
 def seen(
     optics: Optics,
     stands: tuple[str, ...],
@@ -34,8 +40,7 @@ def seen(
         for angle_deg in angles_deg:
             picture = empty_platter()
             thing.draw(picture, angle_deg)
-            noise = 2 * rng.standard_normal(picture.shape, dtype=np.float32)
-            noisy = np.clip(spoil(picture) + noise, 0, 255).astype(np.uint8)
+            noisy = np.clip(spoil(picture) + noise(), 0, 255).astype(np.uint8)
             found = detect_board(board or thing.board, noisy)
             if found.ids.size >= MIN_CORNERS:
                 encoder_deg = ratio * angle_deg + float(rng.normal(0, 0.03))

@@ -106,7 +106,9 @@ def test_slow_bias_drift_cancels_and_strong_drift_is_rejected():
     assert RejectionCode.DIRECTIONS_DIFFER in codes(strong)
 
 
-@pytest.mark.parametrize(("slip_deg", "leg"), [(0.6, 1), (-0.6, 2), (6.0, 3)])
+@pytest.mark.parametrize(
+    ("slip_deg", "leg"), [(-0.6, 2), *(pytest.param(*one, marks=pytest.mark.nightly) for one in ((0.6, 1), (6.0, 3)))]
+)
 def test_slipping_platter_is_rejected(simulated, slip_deg, leg):
     s = simulated(seed=3)
     result = run(s, during={leg: lambda: s.world.slip(slip_deg, 0.2)})

@@ -67,6 +67,7 @@ def test_views_have_the_time_of_their_bench(rig):
     assert captured[-1] < enrollment["finished_utc"]
 
 
+@pytest.mark.nightly
 def test_catalog_depends_on_nothing_but_the_seed(rig):
     def enrolled(seed: str, folder: str) -> tuple[list[bytes], bytes]:
         assert rig("enroll", "dice", "--views", "4", "--seed", seed, "--set", f"catalog.path={folder}").exit_code == 0

@@ -186,7 +186,7 @@ def test_silent_computer_switches_outputs_off(opened):
     assert opened.head.relay_closed
 
 
-@pytest.mark.parametrize("deadman_s", [0.05, 0.25, 2.0])
+@pytest.mark.parametrize("deadman_s", [0.25, *(pytest.param(one, marks=pytest.mark.nightly) for one in (0.05, 2.0))])
 def test_deadman_has_the_configured_duration(deadman_s):
     with opened_head(noise=NoiseModel.none(), deadman_s=deadman_s) as h:
         h.imu.set_power(True)
@@ -427,6 +427,7 @@ def test_sensor_is_set_up_again_after_a_brown_out(opened):
     assert opened.imu.counters().restarts == 1
 
 
+@AVR_NIGHTLY
 @pytest.mark.parametrize("clocks", [1, 4, 9])
 def test_stuck_bus_is_freed_without_losing_samples(opened, clocks):
     opened.clock.sleep(0.2)

@@ -181,8 +181,17 @@ def test_calibration_of_the_gyro_ignores_slip():
     assert "imu.sign" in caught.value.next_step
 
 
-@pytest.mark.parametrize("velocity", [5.0, 90.0, 180.0])
-@pytest.mark.parametrize("target", [0.5, 40.0])
+@pytest.mark.parametrize(
+    ("velocity", "target"),
+    [
+        (5.0, 0.5),
+        (180.0, 40.0),
+        *(
+            pytest.param(*one, marks=pytest.mark.nightly)
+            for one in ((90.0, 0.5), (180.0, 0.5), (5.0, 40.0), (90.0, 40.0))
+        ),
+    ],
+)
 def test_normal_motion_is_never_stopped(velocity, target):
     fast = (f"table.velocity_dps={velocity}", "table.acceleration_dps2=900")
     with motion_bench(*fast) as (bench, _), Turntable(bench) as table:

@@ -12,7 +12,7 @@ from sim.motion import to_position
 from sim.noise import NoiseModel
 from tests.contract.heads import opened_head
 
-KINDS = ["memory", "avr"]
+KINDS = ["memory", pytest.param("avr", marks=pytest.mark.nightly)]
 
 
 @dataclass
