@@ -1,9 +1,10 @@
 """The catalog of enrolled objects: an SQLite file, and the images as files beside it."""
 
 from rig.catalog.audit import Action, AuditEntry
-from rig.catalog.catalog import Catalog, ModelSet
+from rig.catalog.catalog import Catalog
 from rig.catalog.enrollment import Enrollment
 from rig.catalog.migrate import Migration, migrate
+from rig.catalog.queries import ModelSet
 from rig.catalog.records import (
     EnrollmentStatus,
     EnrollmentSummary,

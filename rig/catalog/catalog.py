@@ -5,13 +5,12 @@ from contextlib import AbstractContextManager
 from datetime import datetime
 from os import PathLike
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import Connection, Row, func, select, update
+from sqlalchemy import Connection, func, select, update
 
-import hbr
 from rig.catalog import audit
 from rig.catalog.audit import AuditEntry
 from rig.catalog.database import Database, insert_row
@@ -19,13 +18,18 @@ from rig.catalog.describing import known_descriptor
 from rig.catalog.enrollment import Enrollment
 from rig.catalog.opening import open_database
 from rig.catalog.queries import (
+    ModelSet,
+    check_not_enrolled,
     enrollment_summaries,
     find,
     in_use,
     model_set,
     object_summaries,
+    of_views,
+    retrieved,
     searched_version,
     stored_views,
+    unfinished,
 )
 from rig.catalog.records import (
     EnrollmentStatus,
@@ -36,7 +40,7 @@ from rig.catalog.records import (
     Session,
     StoredView,
     check_azimuth,
-    check_text,
+    checked_texts,
     clean_name,
 )
 from rig.catalog.rows import abandon_unfinished, insert_session, of_status, unfinished_and_complete
@@ -44,15 +48,8 @@ from rig.catalog.schema import enrollments, objects, views
 from rig.catalog.seal import changing_enrollments, changing_object, damage_of, seal_enrollments, seal_objects
 from rig.config.catalog_place import CatalogPlace
 from rig.core.clock import Clock
-from rig.core.errors import CatalogDamaged, CatalogError, ObjectExists, UsageError
+from rig.core.errors import CatalogDamaged, CatalogError, UsageError
 from rig.views.description import PAPER_DESCRIPTOR
-
-
-class ModelSet(NamedTuple):
-    """The views that searches use, and the id of each view, int64 (n,), for `Catalog.view`."""
-
-    views: hbr.Views
-    view_ids: NDArray[np.int64]
 
 
 class Catalog(AbstractContextManager["Catalog"]):
@@ -154,9 +151,9 @@ class Catalog(AbstractContextManager["Catalog"]):
         checked_texts(label, note)
         with self.database.read() as connection:
             if resume:
-                _unfinished(connection, *find(connection, name))
+                unfinished(connection, *find(connection, name))
             elif not replace and (object_id := connection.scalar(select(objects.c.id).where(in_use(name)))) is not None:
-                _check_not_enrolled(connection, object_id, name)
+                check_not_enrolled(connection, object_id, name)
 
     def _check_elsewhere(self, name: str, *, replace: bool) -> None:
         """Check nothing: only the names of a journal are also those of another catalog."""
@@ -215,7 +212,7 @@ class Catalog(AbstractContextManager["Catalog"]):
                 seal_objects(connection, [object_id])
             else:
                 if not replace:
-                    _check_not_enrolled(connection, object_id, name)
+                    check_not_enrolled(connection, object_id, name)
                 with changing_enrollments(connection, unfinished_and_complete(connection, object_id)):
                     abandon_unfinished(connection, object_id, now)
                 if texts:
@@ -244,8 +241,8 @@ class Catalog(AbstractContextManager["Catalog"]):
         """
         with self.database.read() as connection:
             object_id, _ = find(connection, name)
-            unfinished = of_status(object_id, EnrollmentStatus.IN_PROGRESS)
-            return next(iter(enrollment_summaries(connection, unfinished)), None)
+            in_progress = of_status(object_id, EnrollmentStatus.IN_PROGRESS)
+            return next(iter(enrollment_summaries(connection, in_progress)), None)
 
     def resume(self, name: str, *, provenance: Provenance) -> Enrollment:
         """Continue the unfinished enrollment of an object, on the same bench or on another one.
@@ -261,10 +258,10 @@ class Catalog(AbstractContextManager["Catalog"]):
         """
         with self.database.write() as connection:
             object_id, name = find(connection, name)
-            unfinished = _unfinished(connection, object_id, name)
-            plan = tuple(unfinished.planned_azimuth_deg)
-            audit.append(connection, self.clock, audit.Action.ENROLLMENT_RESUMED, name, enrollment_id=unfinished.id)
-            return self._start_session(connection, unfinished.id, object_id, name, plan, provenance)
+            found = unfinished(connection, object_id, name)
+            plan = tuple(found.planned_azimuth_deg)
+            audit.append(connection, self.clock, audit.Action.ENROLLMENT_RESUMED, name, enrollment_id=found.id)
+            return self._start_session(connection, found.id, object_id, name, plan, provenance)
 
     def objects(self) -> list[ObjectSummary]:
         """Return the objects in use, in the order in which they were added."""
@@ -279,11 +276,7 @@ class Catalog(AbstractContextManager["Catalog"]):
         """Return the id of one view of each object in use, to show the object by."""
         with self.database.read() as connection:
             rows = connection.execute(
-                select(objects.c.name, func.min(views.c.id).label("id"))
-                .join(enrollments, enrollments.c.object_id == objects.c.id)
-                .join(views, views.c.enrollment_id == enrollments.c.id)
-                .where(objects.c.deleted_utc.is_(None), enrollments.c.status == EnrollmentStatus.COMPLETE)
-                .group_by(objects.c.name)
+                of_views(objects.c.name, func.min(views.c.id).label("id")).where(retrieved()).group_by(objects.c.name)
             )
             return {row.name: row.id for row in rows}
 
@@ -342,7 +335,7 @@ class Catalog(AbstractContextManager["Catalog"]):
         """
         kind = known_descriptor(descriptor)
         with self.database.read() as connection:
-            return ModelSet(*model_set(connection, kind))
+            return model_set(connection, kind)
 
     def note(self, action: audit.Action, object_name: str | None = None, **details: Any) -> None:
         """Add an action to the audit log; details are JSON values."""
@@ -403,34 +396,3 @@ class Catalog(AbstractContextManager["Catalog"]):
         enrollment = Enrollment(self.database, self.clock, enrollment_id, object_id, object_name, session, plan)
         self.database.images.make_folder(enrollment.folder.as_posix())
         return enrollment
-
-
-def checked_texts(label: str | None, note: str | None) -> dict[str, str]:
-    """Return the texts of an object that are not None; a `UsageError` if one cannot be stored."""
-    given = {key: text for key, text in (("label", label), ("note", note)) if text is not None}
-    for key, text in given.items():
-        check_text(text, key)
-    return given
-
-
-def _unfinished(connection: Connection, object_id: int, name: str) -> Row[Any]:
-    found = connection.execute(select(enrollments).where(of_status(object_id, EnrollmentStatus.IN_PROGRESS))).first()
-    if found is None:
-        raise CatalogError(f"{name!r} has no unfinished enrollment", next_step="enroll it without --resume")
-    return found
-
-
-def _check_not_enrolled(connection: Connection, object_id: int, name: str) -> None:
-    for enrollment in enrollment_summaries(connection, enrollments.c.object_id == object_id):
-        if enrollment.status == EnrollmentStatus.IN_PROGRESS:
-            raise CatalogError(
-                f"the enrollment of {name!r} is unfinished, with {len(enrollment.present)} of "
-                f"{len(enrollment.planned_azimuth_deg)} views",
-                next_step="continue it (--resume), or start again (--replace)",
-            )
-        if enrollment.status == EnrollmentStatus.COMPLETE:
-            raise ObjectExists(
-                f"{name!r} is enrolled already, with {len(enrollment.present)} views",
-                next_step="choose another name, or enroll it again (--replace); "
-                "the old views stay in use until the new ones are complete",
-            )

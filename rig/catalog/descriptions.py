@@ -11,7 +11,7 @@ from rig.calibrations.store import CALIBRATIONS
 from rig.catalog.catalog import Catalog
 from rig.catalog.columns import parse_mapping
 from rig.catalog.describing import EmptyTable, region_of
-from rig.catalog.queries import described_by, in_use, retrieved
+from rig.catalog.queries import described_by, in_use, of_views, retrieved
 from rig.catalog.records import EnrollmentStatus, Region
 from rig.catalog.schema import descriptors, enrollments, objects, sessions, views
 from rig.catalog.together import needs_segmentation
@@ -69,13 +69,7 @@ def unfinished_camera_settings(catalog: Catalog, name: str) -> list[dict[str, An
 def _camera_settings(catalog: Catalog, condition: ColumnElement[bool]) -> list[dict[str, Any]]:
     settings: list[dict[str, Any]] = []
     with catalog.database.read() as connection:
-        for evidence in connection.scalars(
-            select(views.c.evidence)
-            .select_from(objects)
-            .join(enrollments)
-            .join(views, views.c.enrollment_id == enrollments.c.id)
-            .where(condition)
-        ):
+        for evidence in connection.scalars(of_views(views.c.evidence).where(condition)):
             locks = evidence.get("locks")
             if isinstance(locks, dict) and locks not in settings:
                 settings.append(locks)
@@ -86,10 +80,7 @@ def guessed_objects(catalog: Catalog) -> tuple[str, ...]:
     """Return the names of the objects in use whose first view was segmented by a guess from this view alone."""
     with catalog.database.read() as connection:
         rows = connection.execute(
-            select(objects.c.name, views.c.segmentation)
-            .select_from(objects)
-            .join(enrollments)
-            .join(views, views.c.enrollment_id == enrollments.c.id)
+            of_views(objects.c.name, views.c.segmentation)
             .where(retrieved(), views.c.view_index == 0, views.c.segmentation.is_not(None))
             .order_by(objects.c.name)
         )
@@ -100,10 +91,7 @@ def newest_view(catalog: Catalog) -> EmptyTable | None:
     """Return path and SHA-256 of the first view of the newest enrollment in use; None if there is none."""
     with catalog.database.read() as connection:
         row = connection.execute(
-            select(views.c.image, views.c.image_sha256)
-            .select_from(objects)
-            .join(enrollments)
-            .join(views, views.c.enrollment_id == enrollments.c.id)
+            of_views(views.c.image, views.c.image_sha256)
             .where(retrieved(), views.c.view_index == 0)
             .order_by(views.c.id.desc())
             .limit(1)

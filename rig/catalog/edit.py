@@ -3,9 +3,9 @@
 from sqlalchemy import Connection, update
 
 from rig.catalog import audit
-from rig.catalog.catalog import Catalog, checked_texts
+from rig.catalog.catalog import Catalog
 from rig.catalog.queries import check_free, find, object_summaries
-from rig.catalog.records import ObjectSummary, clean_name
+from rig.catalog.records import ObjectSummary, checked_texts, clean_name
 from rig.catalog.schema import objects
 from rig.catalog.seal import changing_object
 

@@ -97,7 +97,7 @@ class Attempts:
         """Open a catalog, for reading only unless it is created if there is none; errors as `Catalog.open`."""
         begun_ns = self._clock.now_ns()
         if self._error is not None and begun_ns < self._not_before_ns:
-            raise self._error
+            raise self._error.with_traceback(None)  # a traceback grows each time that an error is raised
         try:
             return Catalog.open(place, clock=self._clock, create=create, read_only=not create)
         except CatalogUnavailable as error:

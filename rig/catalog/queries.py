@@ -4,11 +4,11 @@ from collections import defaultdict
 from collections.abc import Collection, Sequence
 from difflib import get_close_matches
 from hashlib import sha256
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import ColumnElement, Connection, Row, Table, and_, func, select
+from sqlalchemy import ColumnElement, Connection, Row, Select, Table, and_, func, select
 
 import hbr
 from hbr.descriptors import Descriptor
@@ -26,11 +26,18 @@ from rig.catalog.records import (
     ViewRecord,
     clean_name,
 )
-from rig.catalog.rows import measured
+from rig.catalog.rows import measured, of_status
 from rig.catalog.schema import descriptors, enrollments, objects, sessions, views
 from rig.catalog.seal import check_loaded
-from rig.core.errors import DescriptorOutdated, ObjectExists, ObjectNotFound
+from rig.core.errors import CatalogError, DescriptorOutdated, ObjectExists, ObjectNotFound
 from rig.views.description import PAPER_DESCRIPTOR
+
+
+class ModelSet(NamedTuple):
+    """The views that searches use, and the id of each view, int64 (n,), for `Catalog.view`."""
+
+    views: hbr.Views
+    view_ids: NDArray[np.int64]
 
 
 def in_use(name: str) -> ColumnElement[bool]:
@@ -137,6 +144,31 @@ def enrollment_summaries(connection: Connection, where: ColumnElement[bool]) -> 
     ]
 
 
+def unfinished(connection: Connection, object_id: int, name: str) -> Row[Any]:
+    """Return the unfinished enrollment of an object; a `CatalogError` if there is none."""
+    found = connection.execute(select(enrollments).where(of_status(object_id, EnrollmentStatus.IN_PROGRESS))).first()
+    if found is None:
+        raise CatalogError(f"{name!r} has no unfinished enrollment", next_step="enroll it without --resume")
+    return found
+
+
+def check_not_enrolled(connection: Connection, object_id: int, name: str) -> None:
+    """Raise an error if an object is enrolled, or its enrollment has begun."""
+    for enrollment in enrollment_summaries(connection, enrollments.c.object_id == object_id):
+        if enrollment.status == EnrollmentStatus.IN_PROGRESS:
+            raise CatalogError(
+                f"the enrollment of {name!r} is unfinished, with {len(enrollment.present)} of "
+                f"{len(enrollment.planned_azimuth_deg)} views",
+                next_step="continue it (--resume), or start again (--replace)",
+            )
+        if enrollment.status == EnrollmentStatus.COMPLETE:
+            raise ObjectExists(
+                f"{name!r} is enrolled already, with {len(enrollment.present)} views",
+                next_step="choose another name, or enroll it again (--replace); "
+                "the old views stay in use until the new ones are complete",
+            )
+
+
 def stored_views(connection: Connection, where: ColumnElement[bool]) -> list[StoredView]:
     """Return views, by enrollment and index, with the descriptors that this program computes."""
     rows = connection.execute(
@@ -211,9 +243,13 @@ def retrieved() -> ColumnElement[bool]:
     return and_(enrollments.c.status == EnrollmentStatus.COMPLETE, objects.c.deleted_utc.is_(None))
 
 
-def model_set(
-    connection: Connection, kind: Descriptor, object_ids: Collection[int] | None = None
-) -> tuple[hbr.Views, NDArray[np.int64]]:
+def of_views(*columns: Any) -> Select[Any]:
+    """Return a query of columns of views and of their enrollments and objects."""
+    in_enrollment = views.c.enrollment_id == enrollments.c.id
+    return select(*columns).select_from(objects).join(enrollments).join(views, in_enrollment)
+
+
+def model_set(connection: Connection, kind: Descriptor, object_ids: Collection[int] | None = None) -> ModelSet:
     """Return the views of all complete enrollments, or of those of some objects, by object and index, and their ids.
 
     Raises
@@ -224,16 +260,13 @@ def model_set(
         An object or a view is not as it was stored.
     """
     rows = connection.execute(
-        select(objects.c.id, objects.c.name, views.c.id, views.c.azimuth_deg, descriptors.c.packed, enrollments.c.id)
-        .select_from(objects)
-        .join(enrollments)
-        .join(views, views.c.enrollment_id == enrollments.c.id)
+        of_views(objects.c.id, objects.c.name, views.c.id, views.c.azimuth_deg, descriptors.c.packed, enrollments.c.id)
         .outerjoin(descriptors, described_by(kind))
         .where(retrieved() if object_ids is None else and_(retrieved(), objects.c.id.in_(object_ids)))
         .order_by(objects.c.id, views.c.view_index)
     ).all()
     if not rows:
-        return hbr.Views.empty(kind.name), np.empty(0, np.int64)
+        return ModelSet(hbr.Views.empty(kind.name), np.empty(0, np.int64))
     found_ids, names, view_ids, azimuths_deg, packed, enrollment_ids = zip(*rows, strict=True)
     if None in packed:
         raise _outdated(connection, kind, names, [levels is None for levels in packed])
@@ -248,7 +281,7 @@ def model_set(
         object_names=tuple(names[i] for i in first),
         descriptor=kind.name,
     )
-    return loaded, np.array(view_ids, np.int64)
+    return ModelSet(loaded, np.array(view_ids, np.int64))
 
 
 def searched_version(connection: Connection) -> str:

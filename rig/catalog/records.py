@@ -285,6 +285,14 @@ def check_text(text: str, what: str) -> None:
         )
 
 
+def checked_texts(label: str | None, note: str | None) -> dict[str, str]:
+    """Return the texts of an object that are not None; a `UsageError` if one cannot be stored."""
+    given = {key: text for key, text in (("label", label), ("note", note)) if text is not None}
+    for key, text in given.items():
+        check_text(text, key)
+    return given
+
+
 def check_azimuth(azimuth_deg: float) -> None:
     """Raise `UsageError` for an azimuth outside [0, 360)."""
     if not 0 <= azimuth_deg < 360:

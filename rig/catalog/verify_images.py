@@ -15,7 +15,7 @@ from hbr.descriptors import descriptor
 from rig.catalog.catalog import Catalog
 from rig.catalog.describing import EmptyTable, is_current, matches, region_of, stored_describer
 from rig.catalog.image_store import ImageStore
-from rig.catalog.queries import packed_descriptors
+from rig.catalog.queries import of_views, packed_descriptors
 from rig.catalog.schema import enrollments, objects, results, sessions, views
 from rig.core.errors import CatalogError, UsageError
 from rig.views import image_files as images
@@ -118,7 +118,7 @@ def stored_images(catalog: Catalog) -> tuple[list[Item], int]:
         empty_table = (sessions.c.empty_table_image, sessions.c.empty_table_image_sha256)
         owner = (objects.c.name, enrollments.c.id)
         rows = connection.execute(
-            select(
+            of_views(
                 views.c.id,
                 null(),
                 *owner,
@@ -128,9 +128,6 @@ def stored_images(catalog: Catalog) -> tuple[list[Item], int]:
                 *empty_table,
                 views.c.segmentation,
             )
-            .select_from(objects)
-            .join(enrollments)
-            .join(views, views.c.enrollment_id == enrollments.c.id)
             .join(sessions, views.c.session_id == sessions.c.id)
             .order_by(views.c.id)
         ).all()

@@ -6,7 +6,8 @@ from functools import partial
 from hbr.core.arrays import LevelArray
 from hbr.dense.stopping import StoppingRule
 from hbr.evaluation.descriptors import enrolled_levels, query_levels
-from hbr.evaluation.protocol import Runs, rule_of_trial, run_object
+from hbr.evaluation.protocol import Runs
+from hbr.evaluation.trials import rule_of_trial, run_object
 from hbr.model.views import Views
 from rig.core.clock import SystemClock
 from rig.core.processes import Jobs, map_in_processes

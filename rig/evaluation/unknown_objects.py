@@ -13,8 +13,9 @@ from hbr.dense.leave_one_out import LeaveOneOut
 from hbr.dense.stopping import StoppingRule
 from hbr.evaluation.descriptors import query_levels
 from hbr.evaluation.methods import METHODS
-from hbr.evaluation.protocol import Protocol, Runs, run_object, views_of_trial
+from hbr.evaluation.protocol import Protocol, Runs, views_of_trial
 from hbr.evaluation.statistics import wilson
+from hbr.evaluation.trials import run_object
 from hbr.evaluation.unknown_objects import left_out, unknown_objects
 from hbr.model.views import Views
 from rig.core.processes import Jobs, map_in_processes

@@ -65,11 +65,6 @@ class Hub:
         self._closed = True
         self.publish("close", {})  # wakes them
 
-    @property
-    def last_id(self) -> str:
-        """The id of the newest message."""
-        return f"{self._epoch}-{self._last}"
-
     def since(self, number: int) -> tuple[list[Message], bool]:
         """Return the messages after ``number``, and whether older ones are missing."""
         with self._lock:

@@ -17,7 +17,7 @@ Picture = np.ndarray
 
 @cache
 def noise() -> Picture:
-    """Return the noise of every frame: drawing it anew takes longer than drawing the board."""
+    """Return the noise of every frame: to compute it for each one takes longer than to draw the board."""
     return 2 * np.random.default_rng(1).standard_normal(empty_platter().shape, dtype=np.float32)
 
 

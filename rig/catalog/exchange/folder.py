@@ -14,16 +14,15 @@ from rig.catalog.exchange.batch import (
     ExportedObject,
     ImportBatch,
     ImportProblem,
-    Photograph,
     Reason,
     RejectedFile,
-    assemble,
     parse_region,
     region_of_view,
     region_text,
 )
 from rig.catalog.exchange.bundle import read_stored
 from rig.catalog.exchange.new_folder import new_folder
+from rig.catalog.exchange.photographs import Photograph, assemble
 from rig.catalog.records import EnrollmentStatus, this_software
 from rig.core.errors import ExportFailed, ImportRejected, UsageError
 

@@ -16,11 +16,9 @@ from rig.catalog.exchange.batch import (
     ImportBatch,
     ImportProblem,
     Object,
-    Photograph,
     Reason,
     RejectedFile,
     View,
-    assemble,
     in_utc,
     parse_region,
     region_of_view,
@@ -28,6 +26,7 @@ from rig.catalog.exchange.batch import (
 )
 from rig.catalog.exchange.bundle import new_file, read_stored
 from rig.catalog.exchange.new_folder import new_folder
+from rig.catalog.exchange.photographs import Photograph, assemble
 from rig.catalog.records import EnrollmentStatus, this_software
 from rig.core.errors import ExportFailed, ImportRejected
 from rig.views.description import PAPER_DESCRIPTOR

@@ -8,8 +8,9 @@ import pytest
 from hbr import DenseIndex, Outcome, next_best_view, update_belief
 from hbr.core.angles import wrap180
 from hbr.evaluation.methods import METHODS, choose_methods
-from hbr.evaluation.protocol import OUTCOMES, Protocol, Runs, _Trials, rule_of_trial, run_object
+from hbr.evaluation.protocol import OUTCOMES, Protocol, Runs
 from hbr.evaluation.results import contests, method_results
+from hbr.evaluation.trials import _Trials, rule_of_trial, run_object
 from tests.hbr.dense.searches import belief_after
 from tests.hbr.evaluation.test_protocol import QUERIES, STEP, VIEWS
 

@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 import hbr
 from hbr import ViewIndex, Views
 from hbr.evaluation.methods import METHODS, Method, choose_methods
-from hbr.evaluation.protocol import Protocol, Removal, Runs, _Trials, run_object
+from hbr.evaluation.protocol import Protocol, Removal, Runs
+from hbr.evaluation.trials import _Trials, run_object
 from tests.fuzzing import examples
 
 STEP = 15

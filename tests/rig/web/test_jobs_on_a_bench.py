@@ -1,5 +1,6 @@
 """Jobs on the simulated bench through the REST API."""
 
+import asyncio
 import json
 import threading
 
@@ -171,9 +172,13 @@ def test_job_of_a_killed_server_is_interrupted_and_its_views_are_found_again(ser
         assert [one.views for one in catalog.objects()] == [6]
 
 
+async def first_event(stream):
+    return await anext(stream)
+
+
 def test_events_continue_after_the_last_one_that_was_received(serve):
     served = serve()
-    start = served.server.hub.last_id
+    start = asyncio.run(first_event(served.server.hub.stream())).split()[1]
     served.run(kind="enroll", name="lamp", views=4)
     number, lost = served.server.hub.position(start)
     messages, missing = served.server.hub.since(number)

@@ -142,7 +142,7 @@ class TestRoundTrips:
     ) -> None:
         catalog = open_catalog("earlier")
         with monkeypatch.context() as patch:
-            patch.setattr("rig.catalog.catalog.check_text", lambda *_: None)  # earlier programs stored any text
+            patch.setattr("rig.catalog.records.check_text", lambda *_: None)  # earlier programs stored any text
             fill(catalog, "mug", 2, label="\x1b[2J")
         assert catalog.objects()[0].label == "\x1b[2J"
         with pytest.raises(UsageError, match="control characters") as error:

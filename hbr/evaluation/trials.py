@@ -1,0 +1,335 @@
+"""The trials of an evaluation: searches for an object without the enrolled views near the queries.
+
+All random values (first views, sensor errors, coins) are drawn once for each object and trial, so that they are equal
+for all methods.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hbr.core.angles import wrap180
+from hbr.core.arrays import FloatArray, IndexArray, LevelArray
+from hbr.dense.calibration import calibrate_stopping_rule
+from hbr.dense.filter import Belief, update_belief
+from hbr.dense.index import DenseIndex
+from hbr.dense.next_view import most_informative_rotation
+from hbr.dense.session import DenseSession
+from hbr.dense.stopping import StoppingRule
+from hbr.descriptors import descriptor
+from hbr.evaluation.draws import generator
+from hbr.evaluation.methods import Method
+from hbr.evaluation.protocol import OUTCOMES, Protocol, Runs, views_of_trial
+from hbr.model.symmetry import symmetry
+from hbr.model.views import Views
+from hbr.paper.hough import Ranking, retrieve
+from hbr.paper.index import ViewIndex, largest
+from hbr.paper.next_view import Side, next_view
+
+_STEP_DEG: Final = {"sweep-45": 45.0, "sweep-90": 90.0, "ahbr-90": 90.0}
+
+
+@dataclass(frozen=True)
+class _Draws:
+    """The random values of one trial."""
+
+    order: IndexArray
+    error_deg: FloatArray
+    coins: NDArray[np.bool_]
+
+
+class _Model(NamedTuple):
+    """The views that a search looks among: some of all views."""
+
+    views: Views
+    mask: NDArray[np.bool_]
+    """Which of all views they are."""
+    place: IndexArray
+    """Where each of them is among them."""
+
+
+def run_object(
+    object_index: int,
+    queries: LevelArray,
+    views: Views,
+    methods: Sequence[Method],
+    protocol: Protocol,
+    *,
+    rule: StoppingRule | None = None,
+    now_ns: Callable[[], int] = lambda: 0,
+) -> Runs:
+    """Search for one object with all methods, in all trials, and return the runs of this object.
+
+    Parameters
+    ----------
+    object_index : int
+        The object.
+    queries : uint8 array (n, 144)
+        Descriptors of its photographs as queries, one for each of its views, in the order of `views.of`.
+    views : Views
+        The complete model set.
+    methods : sequence of Method
+        The methods of the search.
+    protocol : Protocol
+        The settings of the trials.
+    rule : StoppingRule, optional
+        The rule for methods of the dense filter; default: `rule_of_trial`.
+    now_ns : callable
+        Monotonic time, for `Runs.step_ns`.
+
+    Raises
+    ------
+    ValueError
+        The object has too few views, or the number of queries is another one.
+    """
+    if rule is None and any(method.dense for method in methods):
+        rule = rule_of_trial(views, protocol)
+    trial = _Trials(object_index, queries, views, protocol, rule, now_ns)
+    runs = Runs.blank(len(methods), 1, protocol.trials, protocol.max_views)
+    for t in range(protocol.trials):
+        draws = trial.draw(t)
+        models: dict[bytes, _Model] = {}
+        for m, method in enumerate(methods):
+            trial.run(method, draws, models, runs, (m, 0, t))
+    return runs
+
+
+class _Trials:
+    def __init__(
+        self,
+        object_index: int,
+        queries: LevelArray,
+        views: Views,
+        protocol: Protocol,
+        rule: StoppingRule | None,
+        now_ns: Callable[[], int],
+    ) -> None:
+        self._object, self._queries, self._views = object_index, queries, views
+        self._protocol, self._rule, self._now_ns = protocol, rule, now_ns
+        self._rows = views.of(object_index)
+        self._azimuth_deg = views.azimuth_deg[self._rows]
+        name = views.object_names[object_index]
+        self._enrolled = views_of_trial(views, protocol)
+        self._is_unknown = name in protocol.absent
+        self._free = np.flatnonzero(~self._enrolled[self._rows]) if protocol.enrolled else np.arange(len(self._rows))
+        self._index: DenseIndex | None = None
+        if len(queries) != len(self._rows):
+            raise ValueError(f"{len(queries)} queries for the {len(self._rows)} views of {name}; one each is needed")
+        if len(self._free) <= protocol.max_views:
+            raise ValueError(
+                f"{name} has {len(self._free)} views; for {protocol.max_views} queries it needs more that are free"
+            )
+        self._ring = np.argsort(self._azimuth_deg, kind="stable")
+        own = views.descriptors[self._rows]
+        compared = descriptor(views.descriptor)
+        self._alike = _similar_views(compared.similarity(own, own), self._ring)
+        symmetric = symmetry(views, object_index, similarity=compared.similarity)
+        self._period_deg = np.nan if symmetric is None else symmetric.period_deg
+        similar = compared.similarity(queries, views.descriptors)
+        similar[:, ~self._enrolled] = -np.inf
+        self._similar = similar
+        self._nearest_views: dict[tuple[int, int], IndexArray] = {}
+        self._own_similar = similar[:, self._rows]
+        objects = range(len(views.object_names))
+        self._reach = np.stack([similar[:, views.of(j)].max(axis=1, initial=-np.inf) for j in objects])
+
+    def draw(self, trial: int) -> _Draws:
+        rng = generator(self._protocol.seed, self._views.object_names[self._object], "trial", trial)
+        count = self._protocol.max_views
+        return _Draws(
+            order=rng.permutation(self._free)[:count],
+            error_deg=rng.normal(0, self._protocol.sigma_deg, count) + self._protocol.drift_deg * np.arange(count),
+            coins=rng.random(count) < 0.5,
+        )
+
+    def run(
+        self, method: Method, draws: _Draws, models: dict[bytes, _Model], runs: Runs, at: tuple[int, int, int]
+    ) -> None:
+        """Store the results of one trial with one method in `runs`."""
+        if method.dense:
+            self._run_dense(method, draws, runs, at)
+            return
+        if self._protocol.absent:
+            raise ValueError(f"{method.label} cannot search for unknown objects; use methods of the dense filter")
+        seen = [int(draws.order[0])]
+        travelled_deg = 0.0
+        last = min(self._protocol.max_views, method.views or self._protocol.max_views)
+        for n in range(last):
+            keep = self._keep(np.array(seen))
+            key = keep.tobytes()
+            if key not in models:
+                models[key] = self._model(keep)
+            # a new index for each method: lists of another method would shorten the measured time
+            model = models[key]
+            index = ViewIndex(model.views)
+            is_measured = at[2] == 0
+            if not is_measured:
+                self._share_lists(index, model, seen, method.list_length)
+            measured_deg = self._azimuth_deg[seen] + draws.error_deg[: n + 1]
+            start_ns = self._now_ns()
+            ranking = retrieve(
+                self._queries[seen],
+                measured_deg,
+                index,
+                omega=method.omega,
+                list_length=method.list_length,
+                extension=method.extension,
+            )
+            following = self._next(method, draws, seen, ranking) if n + 1 < last else seen[-1]
+            runs.step_ns[*at, n] = self._now_ns() - start_ns if is_measured else 0
+            self._record(ranking.object_index, ranking.pose_deg, seen, runs, (*at, n))
+            self._record_margin(ranking, seen, keep, runs, (*at, n))
+            runs.travelled_deg[*at, n] = travelled_deg
+            travelled_deg += abs(float(wrap180(self._azimuth_deg[following] - self._azimuth_deg[seen[-1]])))
+            seen.append(following)
+
+    def _share_lists(self, index: ViewIndex, model: _Model, seen: list[int], list_length: int) -> None:
+        """Let an index know the retrieval lists, from the similarities to all views that are computed once."""
+        for i in seen:
+            if (i, list_length) not in self._nearest_views:
+                longest = list_length + len(self._rows)  # at most the object's own views are missing
+                self._nearest_views[i, list_length] = largest(self._similar[i], longest)[0]
+            nearest = self._nearest_views[i, list_length]
+            rows = nearest[model.mask[nearest]][:list_length]
+            index.remember(self._queries[i], model.place[rows], self._similar[i, rows])
+
+    def _run_dense(self, method: Method, draws: _Draws, runs: Runs, at: tuple[int, int, int]) -> None:
+        assert self._rule is not None
+        if self._index is None or self._index.omega != method.omega:
+            self._index = DenseIndex(self._views.select(self._enrolled), omega=method.omega)
+        seen = [int(draws.order[0])]
+        travelled_deg = 0.0
+        last = min(self._protocol.max_views, method.views or self._protocol.max_views)
+        session = DenseSession(self._index, self._rule, max_views=last)
+        for n in range(last):
+            # Views near the newest query leave the model for the earlier queries, too.
+            gone = self._rows[~self._keep(np.array(seen)) & self._enrolled[self._rows]]
+            measured_deg = (self._azimuth_deg[seen] + draws.error_deg[: n + 1]).tolist()
+            if len(gone):
+                fewer = self._index.without(np.cumsum(self._enrolled)[gone] - 1)
+                session = DenseSession(fewer, self._rule, max_views=last)
+                for i, angle_deg in zip(seen[:-1], measured_deg, strict=False):
+                    session.add(self._queries[i], angle_deg)
+            start_ns = self._now_ns()
+            decision = session.add(self._queries[seen[-1]], measured_deg[-1])
+            following = self._next_dense(method, draws, seen, session) if n + 1 < last else seen[-1]
+            runs.step_ns[*at, n] = self._now_ns() - start_ns
+            ranking = session.belief.ranking()
+            self._record(ranking.object_index, ranking.pose_deg, seen, runs, (*at, n))
+            runs.score[*at, n] = ranking.scores[0]
+            runs.margin[*at, n] = ranking.scores[0] - (ranking.scores[1] if len(ranking.scores) > 1 else 0.0)
+            runs.outcome[*at, n] = OUTCOMES.index(decision.outcome)
+            runs.travelled_deg[*at, n] = travelled_deg
+            travelled_deg += abs(float(wrap180(self._azimuth_deg[following] - self._azimuth_deg[seen[-1]])))
+            seen.append(following)
+
+    def _next_dense(self, method: Method, draws: _Draws, seen: list[int], session: DenseSession) -> int:
+        match method.strategy:
+            case "next-best-view":
+                return self._nearest(seen, session.next_best_view().rotation_deg)
+            case "next-best-view-coin":
+                rotation_deg = abs(session.next_best_view().rotation_deg)
+                return self._nearest(seen, rotation_deg if draws.coins[len(seen)] else -rotation_deg)
+            case "mutual":
+                return self._nearest(seen, most_informative_rotation(session.belief))
+            case "oracle":
+                return self._oracle(seen, session.belief)
+            case _:
+                if method.strategy in _STEP_DEG:
+                    return self._nearest(seen, _STEP_DEG[method.strategy])
+                return int(draws.order[len(seen)])
+
+    def _oracle(self, seen: list[int], belief: Belief) -> int:
+        """Return the photograph with the largest lead of the true object, of every third photograph."""
+        left = np.setdiff1d(self._free, seen)[::3]
+        margins = []
+        for i in left.tolist():
+            scores = update_belief(self._queries[i], float(self._azimuth_deg[i]), belief).scores()
+            own = belief.index.object_index == self._object
+            margins.append(scores[own].max(initial=-np.inf) - scores[~own].max(initial=-np.inf))
+        return int(left[int(np.argmax(margins))])
+
+    def _keep(self, seen: IndexArray) -> NDArray[np.bool_]:
+        """Return which of the object's views stay enrolled after these queries, bool (n,)."""
+        keep = self._enrolled[self._rows].copy()
+        keep[seen] = False
+        match self._protocol.removal:
+            case "near":
+                away_deg = np.abs(wrap180(self._azimuth_deg[:, None] - self._azimuth_deg[seen]))
+                keep &= (away_deg >= self._protocol.near_deg).all(axis=1)
+            case "paper79":
+                place = np.argsort(self._ring)
+                keep[self._ring[(place[seen] + 1) % len(self._ring)]] = False
+            case "queries":
+                pass
+        if not keep.any() and not self._is_unknown:
+            name = self._views.object_names[self._object]
+            raise ValueError(
+                f"after {len(seen)} queries no view of {name} is left; use fewer views or removal 'queries'"
+            )
+        return keep
+
+    def _model(self, keep: NDArray[np.bool_]) -> _Model:
+        """Return the enrolled views, of the searched object only those to keep."""
+        mask = self._enrolled.copy()
+        mask[self._rows] = keep
+        return _Model(self._views.select(mask), mask, np.cumsum(mask) - 1)
+
+    def _next(self, method: Method, draws: _Draws, seen: list[int], ranking: Ranking) -> int:
+        """Return the next query: a photograph that was not a query yet."""
+        if method.active and len(seen) > 1:
+            coin: Side = "left" if draws.coins[len(seen)] else "right"
+            rotation_deg = next_view(ranking, side=coin if method.strategy == "coin" else None).rotation_deg
+        elif method.strategy in _STEP_DEG:
+            rotation_deg = _STEP_DEG[method.strategy]
+        else:
+            return int(draws.order[len(seen)])
+        return self._nearest(seen, rotation_deg)
+
+    def _nearest(self, seen: list[int], rotation_deg: float) -> int:
+        """Return the possible query that is nearest to a rotation from the last one."""
+        away_deg = np.full(len(self._rows), np.inf)
+        wanted_deg = self._azimuth_deg[seen[-1]] + rotation_deg
+        away_deg[self._free] = np.abs(wrap180(self._azimuth_deg[self._free] - wanted_deg))
+        away_deg[seen] = np.inf
+        return int(away_deg.argmin())
+
+    def _record(
+        self, objects: IndexArray, pose_deg: FloatArray, seen: list[int], runs: Runs, at: tuple[int, int, int, int]
+    ) -> None:
+        place = np.flatnonzero(objects == self._object)
+        runs.rank[at] = place[0] + 1 if len(place) else 0
+        runs.best[at] = objects[0]
+        runs.period_deg[at] = self._period_deg
+        if len(place):
+            away_deg = np.abs(wrap180(pose_deg[place[0]] - self._azimuth_deg))
+            runs.pose_error_deg[at] = away_deg[seen[-1]]
+            runs.alike_error_deg[at] = away_deg[self._alike[seen[-1]]].min()
+
+    def _record_margin(
+        self, ranking: Ranking, seen: list[int], keep: NDArray[np.bool_], runs: Runs, at: tuple[int, int, int, int]
+    ) -> None:
+        runs.score[at] = ranking.scores[0] / len(seen)
+        # hbr.score_margin, from similarities that are computed once for all trials
+        reach = self._reach[:, seen].sum(axis=1)
+        reach[self._object] = self._own_similar[seen][:, keep].max(axis=1).sum()
+        reach[ranking.object_index[0]] = -np.inf
+        runs.margin[at] = (ranking.scores[0] - reach.max()) / len(seen)
+
+
+def rule_of_trial(views: Views, protocol: Protocol) -> StoppingRule:
+    """Return the stopping rule, calibrated on the views that are enrolled in all trials, as on a bench."""
+    return calibrate_stopping_rule(DenseIndex(views.select(views_of_trial(views, protocol)))).rule
+
+
+def _similar_views(similar: FloatArray, ring: IndexArray) -> NDArray[np.bool_]:
+    """Return for each view which views are at least as similar to it as one of its two neighbours, bool (n, n)."""
+    before, after = np.empty_like(ring), np.empty_like(ring)
+    before[ring], after[ring] = np.roll(ring, 1), np.roll(ring, -1)
+    rows = np.arange(len(ring))
+    alike: NDArray[np.bool_] = similar >= np.minimum(similar[rows, before], similar[rows, after])[:, None]
+    alike[rows, rows] = True  # also for a view without texture and colour
+    return alike
