@@ -7,16 +7,22 @@ from sim.objects.projection import HEIGHT
 
 
 def row_weights(exposure: int, readout: int, steps: int) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-    """Divide the time of a frame into steps: return their middles (n,), and the share of each in each row, (n, HEIGHT).
+    """Choose times at which a frame is drawn: return them (n,), and the share of each image in each row, (n, HEIGHT).
 
-    A step counts as far as it lies within the row's exposure; times in ns from the beginning of the first row.
+    A row is the mean of images that are interpolated linearly between those of the times. So its mean time is exactly
+    the middle of its exposure. Times in ns from the beginning of the first row; at least two.
     """
-    middles = (np.arange(steps) + 0.5) / steps * (exposure + readout)
+    times = np.linspace(0, exposure + readout, steps)
     begins = (np.arange(HEIGHT) + 0.5) / HEIGHT * readout
-    half = (exposure + readout) / steps / 2
-    ends = np.minimum(middles[:, None] + half, begins + exposure)
-    weights = np.clip(ends - np.maximum(middles[:, None] - half, begins), 0, None)
-    return middles, (weights / weights.sum(axis=0)).astype(np.float32)
+    weights = _below(begins + exposure, times) - _below(begins, times)
+    return times, (weights / weights.sum(axis=0)).astype(np.float32)
+
+
+def _below(until: NDArray[np.float64], times: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the integrals up to ``until`` (m,) of functions that are 1 at one of ``times`` and 0 at its neighbours."""
+    away = np.clip((until - times[:, None]) / (times[1] - times[0]), -1, 1)
+    below: NDArray[np.float64] = np.where(away < 0, np.square(1 + away) / 2, 1 - np.square(1 - away) / 2)
+    return below
 
 
 def bands(hz: float, depth: float, start: int, exposure: int, readout: int) -> NDArray[np.float32]:

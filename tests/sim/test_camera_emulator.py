@@ -15,6 +15,7 @@ from sim.motion import to_velocity
 from sim.noise import NoiseModel
 from sim.objects.projection import CENTRE_PX, PX_PER_MM, Image
 from sim.objects.shelf import shelf
+from sim.rolling_shutter import row_weights
 from sim.sensor import white_balance
 from sim.world import World
 from tests.fuzzing import examples
@@ -446,3 +447,11 @@ def test_views_at_rest_do_not_depend_on_the_errors_of_camera_time() -> None:
         world.put(shelf()["mug-star"])
         images.append(frame(camera(world)))
     assert np.array_equal(*images)
+
+
+def test_mean_time_of_each_row_is_the_middle_of_its_exposure() -> None:
+    for steps in (2, 3, 8):
+        times, weights = row_weights(10_000_000, 18_000_000, steps)
+        middles = (np.arange(480) + 0.5) / 480 * 18e6 + 5e6
+        assert weights.min() >= 0
+        assert np.abs(times @ weights - middles).max() < 100
