@@ -73,15 +73,16 @@ class ViewsTogether:
         self._descriptor = descriptor_of(descriptor) if isinstance(descriptor, str) else descriptor
         self._table = Background(empty_table) if isinstance(empty_table, np.ndarray) else empty_table
         self._several = several
-        self._images: list[ImageArray] = []
+        self._images: list[ImageArray | None] = []
         self._learned = LearnedBackground()
         self.segmentations: list[tuple[Segmentation, ...]] = []
         self.levels: list[LevelArray] = []
 
-    def add(self, image_bgr: ImageArray, *, revise: bool = True) -> tuple[Segmentation, ...]:
+    def add(self, image_bgr: ImageArray, *, revise: bool = True, keep: bool = True) -> tuple[Segmentation, ...]:
         """Add a view, and revise the earlier ones if asked for; return the segmentations of the new view.
 
-        Among many views that are not revised, the object is guessed in the first one alone.
+        Among many views that are not revised, the object is guessed in the first one alone. If the image is not kept,
+        `revise` leaves the view's segmentations as they are: a long search needs less memory.
 
         Raises
         ------
@@ -93,6 +94,8 @@ class ViewsTogether:
             self.revise()
         else:
             self._describe(len(self._images) - 1)
+        if not keep:
+            self._images[-1] = None
         return self.segmentations[-1]
 
     def learn(self, image_bgr: ImageArray) -> None:
@@ -110,21 +113,23 @@ class ViewsTogether:
     def revise(self) -> None:
         """Segment the views whose background was not known, by that which the other views show."""
         for view, found in enumerate(self.segmentations):
-            if not found or found[0].method not in RELIABLE:
+            if self._images[view] is not None and (not found or found[0].method not in RELIABLE):
                 self._describe(view, guess=self._several)
 
     def _describe(self, view: int, *, guess: bool = False) -> None:
+        image = self._images[view]
+        assert image is not None
         found = hypotheses(
-            self._images[view],
+            image,
             empty_table=self._table,
             learned=self._learned.of(view),
-            alone=partial(self._without_background, view) if guess else None,
+            alone=partial(self._without_background, view, image) if guess else None,
             most=MOST_HYPOTHESES if self._several else 1,
         )
         self.segmentations[view] = found
         self.levels[view] = np.stack([self._descriptor.describe(one) for one in found])
 
-    def _without_background(self, view: int) -> tuple[Segmentation, ...]:
+    def _without_background(self, view: int, image: ImageArray) -> tuple[Segmentation, ...]:
         """Return the segmentations of a view that no other view changes."""
         known = self.segmentations[view]
-        return known if known and known[0].method is Method.GUESS else without_background(self._images[view])
+        return known if known and known[0].method is Method.GUESS else without_background(image)

@@ -248,7 +248,7 @@ class SearchDescriber(ViewDescriber):
             self._views = hbr.ViewsTogether(self._name, empty_table=background)
             if self._bench_image is not None and self._bench_image.shape == image_bgr.shape:
                 self._same_bench = hbr.Background(within(self._bench_image, self.region)).shows_same_bench(part)
-        found = self._views.add(part, revise=self._revise)[0]
+        found = self._views.add(part, revise=self._revise, keep=self._revise)[0]
         found = replace(found, issues=(*issues, *found.issues))
         *earlier, levels = self._views.levels
         problem = self._table_problem(found.agreement)
