@@ -1,7 +1,8 @@
 """Judges frames that were taken while the table rotated, as `rig.views.capture` does for frames at rest."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +12,7 @@ from rig.devices.camera import CameraLocks
 from rig.motion.scan_speed import smear_px, time_sigma_ms
 from rig.motion.trajectory import Trajectory
 from rig.views.capture import Attempt, ImageQuality, MotionEvidence, RejectReason, ViewEvidence
-from rig.views.stream import StreamFrame, irregular_stamps, middle_ns
+from rig.views.stream import StreamFrame, after_middle_row_ns, irregular_stamps, middle_ns
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,3 +84,18 @@ class FlightJudge:
             ),
             tuple(reasons),
         )
+
+    def at_the_object(
+        self, attempt: Attempt, segmentation: Mapping[str, Any] | None, trajectory: Trajectory
+    ) -> Attempt:
+        """Return an attempt with time and angle of the object's middle row instead of the frame's (rolling shutter).
+
+        ``segmentation`` is that of the attempt's image; without a box of the object nothing changes.
+        """
+        motion, box = attempt.evidence.motion, (segmentation or {}).get("box_px")
+        if motion is None or box is None:
+            return attempt
+        middle_ns = motion.middle_ns + after_middle_row_ns(self.config, box)
+        angle_deg = float(trajectory.at([middle_ns]).angle_deg[0])
+        motion = replace(motion, middle_ns=middle_ns, angle_deg=angle_deg)
+        return replace(attempt, evidence=replace(attempt.evidence, motion=motion))

@@ -26,7 +26,7 @@ from rig.motion.trajectory import TrajectoryRecorder
 from rig.motion.turntable import Flight, Turntable
 from rig.plans.capture import announced, capture, moved, warn_of_table
 from rig.views.capture import Attempt, Viewer
-from rig.views.description import ViewDescriber
+from rig.views.description import DescribedView, ViewDescriber
 from rig.views.stream import FrameStream, StreamFrame, middle_ns
 
 NEAR_SHARE = 0.6
@@ -149,17 +149,18 @@ def fly_views(
         if not attempt.accepted:
             yield Rejected(index, attempt.number, attempt.reasons, attempt.evidence)
             continue
-        yield from _store(bench, enrollment, index, angle_deg, attempt, describe)
+        described = describe(attempt.image_bgr)
+        attempt = judge.at_the_object(attempt, described.segmentation, trajectory)
+        yield from _store(bench, enrollment, index, angle_deg, attempt, described)
         stored.add(index)
     return stored, start_deg, before.image_bgr, after.image_bgr
 
 
 def _store(
-    bench: Bench, enrollment: Enrollment, index: int, angle_deg: float, attempt: Attempt, describe: ViewDescriber
+    bench: Bench, enrollment: Enrollment, index: int, angle_deg: float, attempt: Attempt, described: DescribedView
 ) -> Generator[Event, None, None]:
     motion = attempt.evidence.motion
     assert motion is not None
-    described = describe(attempt.image_bgr)
     record = ViewRecord(
         index=index,
         commanded_deg=angle_deg,

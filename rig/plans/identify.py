@@ -14,10 +14,10 @@ from rig.bench import Bench
 from rig.config import RigConfig
 from rig.core.clock import seconds_between
 from rig.core.errors import CatalogError, RigError
-from rig.events.events import Accepted, Event, FrameUsed, Identified, Note, NoteCode, Started, Warned
+from rig.events.events import Event, FrameUsed, Identified, Note, NoteCode, Started, Warned
 from rig.motion.scan_speed import can_fly, require_camera_time
 from rig.motion.turntable import Turntable
-from rig.plans.capture import announced, capture, check_camera, moved, unwind, warn_of_table
+from rig.plans.capture import accepted, add_view, announced, capture, check_camera, moved, unwind, warn_of_table
 from rig.plans.identify_moving import decided as decided_event
 from rig.plans.identify_moving import search_in_motion
 from rig.search.local_step import compare_leaders
@@ -130,26 +130,10 @@ def identify(
             captured = yield from capture(number, viewer, table, move.settled_ns)
             azimuth_deg = float(wrap360(orientation_deg))
             described = describe(captured.image_bgr)
-            yield Accepted(
-                number,
-                azimuth_deg,
-                captured.evidence,
-                captured.image_bgr,
-                described.segmentation,
-                described.same_bench,
-            )
+            yield accepted(number, azimuth_deg, captured, described)
             yield from warn_of_table(bench, number, described)
             # Decide: rank the candidates, then rotate or finish.
-            levels = described.levels[search.descriptor]
-            ranked, step = search.add(
-                levels,
-                azimuth_deg,
-                table_deg=table.rest_deg,
-                earlier=described.earlier,
-                reliable=described.reliable,
-                same_bench=described.same_bench,
-                segmentation=described.segmentation,
-            )
+            ranked, step = add_view(search, described, azimuth_deg, table.rest_deg)
             yield ranked
             if isinstance(step, Finish):
                 break

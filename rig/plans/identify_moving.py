@@ -16,12 +16,12 @@ from hbr.core.angles import wrap360
 from rig.bench import Bench
 from rig.core.clock import seconds_between
 from rig.core.errors import RigError
-from rig.events.events import Accepted, Decided, Event, FrameUsed, Ranked, Rejected
+from rig.events.events import Decided, Event, FrameUsed, Ranked, Rejected
 from rig.motion.flight_views import FlightJudge
 from rig.motion.scan_speed import scan_speed
 from rig.motion.trajectory import TrajectoryRecorder
 from rig.motion.turntable import Flight, Turntable
-from rig.plans.capture import capture, moved, unwind, warn_of_table
+from rig.plans.capture import accepted, add_view, capture, moved, unwind, warn_of_table
 from rig.search.session import ArcSearch
 from rig.search.strategies import Finish, Rotate
 from rig.views.capture import Viewer
@@ -86,8 +86,6 @@ class _Passing:
             return None
         irregular = bool(self.judge.irregular(self.stamps_ns)[-1])
         attempt = self.judge.judge(frame, trajectory, irregular=irregular)
-        motion = attempt.evidence.motion
-        assert motion is not None
         if not attempt.accepted:
             self.rejected += 1
             self.rejected_in_a_row += 1
@@ -95,28 +93,14 @@ class _Passing:
             return self._stop() if self.rejected_in_a_row >= MOST_REJECTED else None
         self.rejected_in_a_row = 0
         self.number += 1
+        described = self.describe(attempt.image_bgr)
+        attempt = self.judge.at_the_object(attempt, described.segmentation, trajectory)
+        motion = attempt.evidence.motion
+        assert motion is not None
         sign = self.bench.config.table.orientation_sign
         azimuth_deg = float(wrap360(sign * motion.angle_deg))
-        described = self.describe(attempt.image_bgr)
-        self.events.append(
-            Accepted(
-                self.number,
-                azimuth_deg,
-                attempt.evidence,
-                attempt.image_bgr,
-                described.segmentation,
-                described.same_bench,
-            )
-        )
-        levels = described.levels[self.search.descriptor]
-        self.ranked, self.step = self.search.add(
-            levels,
-            azimuth_deg,
-            table_deg=motion.angle_deg,
-            reliable=described.reliable,
-            same_bench=described.same_bench,
-            segmentation=described.segmentation,
-        )
+        self.events.append(accepted(self.number, azimuth_deg, attempt, described))
+        self.ranked, self.step = add_view(self.search, described, azimuth_deg, motion.angle_deg)
         seconds = seconds_between(self.started_ns, self.bench.clock.now_ns())
         used = self.search.frame_used(self.number, azimuth_deg, seconds, self.rejected)
         self.live(used)
@@ -171,23 +155,9 @@ def search_in_motion(
             captured = yield from capture(number, viewer, table, settled_ns)
             azimuth_deg = float(wrap360(sign * table.rest_deg))
             described = describe(captured.image_bgr)
-            yield Accepted(
-                number,
-                azimuth_deg,
-                captured.evidence,
-                captured.image_bgr,
-                described.segmentation,
-                described.same_bench,
-            )
+            yield accepted(number, azimuth_deg, captured, described)
             yield from warn_of_table(bench, number, described)
-            ranked, step = search.add(
-                described.levels[search.descriptor],
-                azimuth_deg,
-                table_deg=table.rest_deg,
-                reliable=described.reliable,
-                same_bench=described.same_bench,
-                segmentation=described.segmentation,
-            )
+            ranked, step = add_view(search, described, azimuth_deg, table.rest_deg)
             ended_ns = bench.clock.now_ns()
             if search.is_new_decision:
                 yield ranked

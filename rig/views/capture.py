@@ -46,7 +46,8 @@ class RejectReason(StrEnum):
 class MotionEvidence:
     """How the table moved while a view was exposed.
 
-    ``middle_ns`` is the middle of the exposure on the bench's clock, ``angle_deg`` the table's angle then with its
+    ``middle_ns`` is the middle of the exposure of the object's middle row, or of the frame's if no object was found, on
+    the bench's clock, ``angle_deg`` the table's angle then with its
     standard uncertainty, ``speed_dps`` its speed, and ``smear_px`` the motion during the exposure at the edge of the
     region. ``residual_deg`` is the largest difference between encoder and gyro during the motion.
     """

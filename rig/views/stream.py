@@ -122,6 +122,13 @@ def middle_ns(stamp_ns: int, config: CameraTimeConfig) -> int:
     return stamp_ns + round(config.offset_ms * 1e6)
 
 
+def after_middle_row_ns(config: RigConfig, box_px: Sequence[int]) -> int:
+    """Return how long after the frame's middle row the middle row of a box is exposed (x, y, width, height)."""
+    top_px = 0 if config.view.roi is None else config.view.roi[1]
+    share = (top_px + box_px[1] + box_px[3] / 2) / config.camera.height - 0.5
+    return round(share * config.camera_time.readout_ms * 1e6)
+
+
 def exposed_before_stamp_ns(config: RigConfig) -> int:
     """Return how long before its time stamp the exposure of a frame may begin: 0 if the camera's time is not known.
 

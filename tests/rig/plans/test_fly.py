@@ -10,12 +10,14 @@ import pytest
 
 from rig import Catalog, enroll
 from rig.bench import Bench
+from rig.config import load_config
 from rig.core.errors import DeviceSilent, LimitExceeded, ObjectMoved, RigError, RotationDisagreement, UsageError
 from rig.events.events import Accepted, Enrolled, Event, ScanStarted
 from rig.events.lines import line
 from rig.motion.scan_speed import SpeedLimit
 from rig.plans.estimate import dry_run
 from rig.plans.tray import TrayItem, enroll_tray
+from rig.views.stream import after_middle_row_ns
 from sim.bench import ShelfOperator, open_sim_bench
 from sim.faults import Fault
 from sim.noise import NoiseModel
@@ -84,6 +86,12 @@ def test_one_turn_enrolls_all_views_at_their_true_angles(tmp_path: Path) -> None
         assert "allows" in line(started)
         assert abs(bench.servo.read_state().velocity_dps) < 1
         assert not bench.servo.read_condition().torque
+
+
+def test_rolling_shutter_exposes_the_rows_of_the_object_later() -> None:
+    config = load_config(None, (*SMALL, "view.roi=[40, 30, 240, 200]", "camera_time.readout_ms=12"))
+    assert after_middle_row_ns(config, (10, 90, 20, 60)) == 1_500_000  # row 150 of 240
+    assert after_middle_row_ns(config, (10, 60, 20, 60)) == 0
 
 
 @pytest.mark.parametrize(
