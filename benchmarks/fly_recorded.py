@@ -14,7 +14,6 @@ Each of four catalogs leaves out four objects that are unknown then; one search 
 import argparse
 import json
 import pickle
-from collections.abc import Iterator
 from math import copysign, sqrt
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,7 @@ from typing import Any
 import numpy as np
 
 import hbr
-from benchmarks.fly_enrollment import NOISE
+from benchmarks.fly_enrollment import NOISE, value_of
 from benchmarks.fly_search import summary
 from hbr.core.angles import size_deg
 from hbr.descriptors.shift import Shift
@@ -98,15 +97,6 @@ def revolution(bench: Bench, table: Turntable, describe: ViewDescriber) -> Seen:
     motion = trajectory.at([at for at, _ in frames])
     steady = np.abs(motion.rate_dps) > 0.9 * speed
     return [(float(motion.angle_deg[k]), frames[k][1]) for k in np.flatnonzero(steady)]
-
-
-def value_of(events: Iterator[Any]) -> Any:
-    """Return what a generator returns."""
-    while True:
-        try:
-            next(events)
-        except StopIteration as end:
-            return end.value
 
 
 def nearest(seen: Seen, angle_deg: float) -> tuple[float, Any]:
