@@ -32,7 +32,7 @@ SMALL = (
 
 
 @pytest.fixture(scope="module")
-def enrolled(tmp_path_factory):
+def original(tmp_path_factory):
     """Return a folder with two enrolled objects, the report of one, and a saved run."""
     folder = tmp_path_factory.mktemp("day")
     (folder / "rig.toml").write_text(SMALL, encoding="utf-8")
@@ -58,6 +58,13 @@ def enrolled(tmp_path_factory):
             assert done.exit_code == 0, done.output
             outputs[name] = done
     return folder, outputs
+
+
+@pytest.fixture
+def enrolled(original, tmp_path):
+    """Return a copy of the folder, so that no test finds what another one has changed."""
+    folder, outputs = original
+    return Path(shutil.copytree(folder, tmp_path / "day")), outputs
 
 
 @pytest.fixture
