@@ -63,7 +63,7 @@ def cases(descriptor: str) -> Iterator[tuple[str, TableCondition]]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path, help="Photographs, named like those of COIL-100.")
+    parser.add_argument("folder", type=Path, nargs="?", default=Path("../shared/data/coil-100"), help="Photographs.")
     parser.add_argument("--objects", default="1-50", metavar="FIRST-LAST")
     parser.add_argument("--trials", type=int, default=6)
     parser.add_argument("--descriptor", default="edges+colours")
