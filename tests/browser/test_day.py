@@ -197,3 +197,18 @@ def test_pages_pass_axe(page, serve_process):
             if result.violations_count:
                 found[scheme, name] = [(one["id"], one["nodes"][0]["html"]) for one in result.response["violations"]]
     assert found == {}
+
+
+def test_search_in_motion_shows_its_frames_and_stop_ends_it_in_the_turn(page, serve_process):
+    known = ("camera_time.offset_ms=8", "camera_time.uncertainty_ms=0.3", "camera_time.jitter_ms=0.3")
+    server = serve_process("bench.sim.speed=1", 'bench.sim.object="bottle-harvest"', *known)
+    for name in ("bottle-green", "bottle-harvest"):  # twins: one view does not tell them apart
+        enroll(page, server, name, 6)
+        job_done(page, f"Enroll {name}")
+    page.goto(f"{server.url}identify")
+    page.click("#start button:has-text('Identify')")
+    page.wait_for_selector("#answer:has-text('Looking …')", timeout=WAIT_MS)
+    page.click("#stop")
+    page.wait_for_selector("#messages:has-text('Stopped')", timeout=WAIT_MS)
+    job_done(page, "Identify", "cancelled")
+    assert page.locator("#answer.found").count() == 0
