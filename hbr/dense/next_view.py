@@ -157,29 +157,30 @@ def most_informative_rotation(belief: Belief, *, beta: float = BETA, rotations_d
 
 
 def strongest(posterior: FloatArray) -> tuple[FloatArray, IndexArray, IndexArray]:
-    """Return probability, object (its place) and bin of the strongest hypotheses: of equal ones, the first come first.
+    """Return probability, object (its place) and bin of the strongest hypotheses, the strongest first.
 
     A hypothesis is a peak of its object. It stands for the slopes beside it.
     """
-    best, weight = _strongest(posterior, min(_STRONGEST, posterior.size))
+    weight = _peak_weights(posterior).ravel()
+    count = min(_STRONGEST, len(weight))
+    best = np.argpartition(-weight, count - 1)[:count]  # of all: of equal weights, saved runs chose the same ones
+    best = best[np.argsort(-weight[best], kind="stable")]
+    weight = weight[best]
     place, bin_of = np.divmod(best, posterior.shape[1])
     second = int((place != place[0]).argmax())  # a decision is between two objects, however unlikely the second
     enough = max(1 + int(np.searchsorted(np.cumsum(weight), 1 - _NEGLIGIBLE)), second + 1)
     return weight[:enough], place[:enough], bin_of[:enough]
 
 
-def _strongest(posterior: FloatArray, count: int) -> tuple[IndexArray, FloatArray]:
-    compiled = calls.strongest(posterior, count)
+def _peak_weights(posterior: FloatArray) -> FloatArray:
+    compiled = calls.peak_weights(posterior)
     if compiled is not None:
         return compiled
     around = np.concatenate([posterior[:, -1:], posterior, posterior[:, :1]], axis=1)
     peaks = posterior * ((posterior >= around[:, :-2]) & (posterior >= around[:, 2:]))
     mass, total = posterior.sum(axis=1), peaks.sum(axis=1)
-    share = np.divide(mass, total, out=np.zeros_like(mass), where=total > 0)
-    weight = (peaks * share[:, None]).ravel()
-    candidates = np.flatnonzero(weight >= np.partition(weight, -count)[-count])
-    best = candidates[np.argsort(-weight[candidates], kind="stable")[:count]]
-    return best, weight[best]
+    share: FloatArray = np.divide(mass, total, out=np.zeros_like(mass), where=total > 0)
+    return peaks * share[:, None]
 
 
 def expected_similarity(

@@ -289,15 +289,15 @@ def support(
     return added
 
 
-def strongest(posterior: FloatArray, kept: int) -> tuple[IndexArray, FloatArray] | None:
-    """Return the strongest hypotheses of a posterior, (k, 72), as flat indices; and their weights; see next_view.py."""
+def peak_weights(posterior: FloatArray) -> FloatArray | None:
+    """Return the weight of each hypothesis of a posterior, (k, 72); see `hbr.dense.next_view.strongest`."""
     found = library()
     if found is None:
         return None
     posterior = np.ascontiguousarray(posterior)
-    best, weight = np.empty(kept, np.int64), np.empty(kept)
-    found.hbr_strongest(address(posterior), len(posterior), kept, address(best), address(weight))
-    return best, weight
+    weights = np.empty(posterior.shape)
+    found.hbr_peak_weights(address(posterior), len(posterior), address(weights))
+    return weights
 
 
 def nearest_view(

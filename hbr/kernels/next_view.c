@@ -13,13 +13,12 @@ PART double sum_of_row(const double *row) {
     return ((part[0] + part[1]) + (part[2] + part[3])) + ((part[4] + part[5]) + (part[6] + part[7]));
 }
 
-/* Store the `kept` strongest hypotheses of a posterior, (objects, 72), and their weights, the strongest first; of equal
-   ones, the first. A hypothesis is a peak of its object, and stands for the slopes beside it. */
+/* Store the weight of each hypothesis of a posterior, (objects, 72). A hypothesis that is a peak of its object stands for
+   the slopes beside it; the others have none. */
 FOR_EVERY_PROCESSOR
-EXPORT void hbr_strongest(const double *posterior, int64_t objects, int64_t kept, int64_t *best, double *weight) {
-    int64_t found = 0;
-    for (int64_t j = 0; j < objects; j++, posterior += BINS) {
-        double around[BINS + 2], peaks[BINS], most[LANES] = {0}, largest = 0;
+EXPORT void hbr_peak_weights(const double *posterior, int64_t objects, double *weights) {
+    for (int64_t j = 0; j < objects; j++, posterior += BINS, weights += BINS) {
+        double around[BINS + 2], peaks[BINS];
         around[0] = posterior[BINS - 1];
         for (int b = 0; b < BINS; b++) around[b + 1] = posterior[b];
         around[BINS + 1] = posterior[0];
@@ -27,22 +26,8 @@ EXPORT void hbr_strongest(const double *posterior, int64_t objects, int64_t kept
             const double here = around[b + 1];
             peaks[b] = here >= around[b] && here >= around[b + 2] ? here : 0.0;
         }
-        for (int b = 0; b < BINS; b += LANES)
-            for (int i = 0; i < LANES; i++) most[i] = peaks[b + i] > most[i] ? peaks[b + i] : most[i];
-        for (int i = 0; i < LANES; i++) largest = most[i] > largest ? most[i] : largest;
         const double total = sum_of_row(peaks), share = total > 0 ? sum_of_row(posterior) / total : 0.0;
-        if (found == kept && largest * share <= weight[kept - 1]) continue;
-        for (int b = 0; b < BINS; b++) {
-            const double own = peaks[b] * share;
-            if (found == kept && own <= weight[kept - 1]) continue;
-            int64_t at = found < kept ? found++ : kept - 1;
-            for (; at && weight[at - 1] < own; at--) {
-                weight[at] = weight[at - 1];
-                best[at] = best[at - 1];
-            }
-            weight[at] = own;
-            best[at] = j * BINS + b;
-        }
+        for (int b = 0; b < BINS; b++) weights[b] = peaks[b] * share;
     }
 }
 

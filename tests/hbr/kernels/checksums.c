@@ -17,7 +17,7 @@ void hbr_support(const int64_t *, const int64_t *, const int64_t *, int64_t, con
                  double, int64_t, double *, int64_t, float *);
 void hbr_pairs(const struct measure *, const uint8_t *, int64_t, const double *, const int64_t *, int64_t, int64_t,
                const int64_t *, const int64_t *, int64_t, double *);
-void hbr_strongest(const double *, int64_t, int64_t, int64_t *, double *);
+void hbr_peak_weights(const double *, int64_t, double *);
 void hbr_nearest_view(const int64_t *, const int64_t *, const int64_t *, const double *, const int64_t *, int64_t,
                       const double *, int64_t, int64_t *, double *);
 void hbr_rotated(const int64_t *, const double *, int64_t, const int64_t *, const int64_t *, const int64_t *,
@@ -73,8 +73,8 @@ static void support(void) {
 }
 
 static void next_view(void) {
-    static double posterior[10 * 72], weight[16], azimuth_deg[300], at_deg[60], away_deg[60];
-    static int64_t best[16], order[300], begin[10], count[10], places[6], rows[60];
+    static double posterior[10 * 72], weights[10 * 72], azimuth_deg[300], at_deg[60], away_deg[60];
+    static int64_t order[300], begin[10], count[10], places[6], rows[60];
     for (int i = 0; i < 10 * 72; i++) posterior[i] = (double)(random_bits() % 50) * .013;
     for (int i = 0; i < 300; i++) {
         order[i] = i;
@@ -90,10 +90,9 @@ static void next_view(void) {
     static const int64_t second[5] = {1, 3, 2, 0, 3};
     hbr_pairs(&measure, packed, 160, squares, groups[0], 2, 4, first, second, 5, similar);
     add(similar, 10 * sizeof *similar);
-    hbr_strongest(posterior, 10, 16, best, weight);
+    hbr_peak_weights(posterior, 10, weights);
     hbr_nearest_view(order, begin, count, azimuth_deg, places, 6, at_deg, 10, rows, away_deg);
-    add(best, sizeof best);
-    add(weight, sizeof weight);
+    add(weights, sizeof weights);
     add(rows, sizeof rows);
     add(away_deg, sizeof away_deg);
 }
