@@ -100,7 +100,7 @@ def test_redescribe_works_without_an_empty_table_image(open_catalog: Callable[[s
     finished(redescribe(catalog, BENCH_DESCRIPTOR, jobs=1))
     together = hbr.ViewsTogether(BENCH_DESCRIPTOR, several=False)
     for index in range(VIEWS):
-        together.add(view(index)[:, 8:72], revise=False)
+        together.learn(view(index)[:, 8:72])
     together.revise()
     expected = [levels[0] for levels in together.levels]
     assert np.array_equal(catalog.views(BENCH_DESCRIPTOR).views.descriptors, expected)
