@@ -1,7 +1,10 @@
 """Opens cameras, video files and streams through OpenCV."""
 
 import os
+import select
+import stat
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -35,13 +38,7 @@ class V4l2Capture:
         self.grab = capture.grab
         self.retrieve = capture.retrieve
         self.release = capture.release
-
-    def wait(self, seconds: float) -> bool:
-        """Wait for a frame at most so long; return whether `grab` then returns at once: it has a frame, or fails."""
-        try:
-            return bool(cv2.VideoCapture.waitAny([self._capture], max(round(seconds * 1e9), 1))[0])
-        except cv2.error:
-            return True
+        self.wait = waiter_for(path)
 
     def get(self, propId: int, /) -> float:
         """Return a property or a control; -1 if the camera lacks it."""
@@ -67,9 +64,35 @@ def modes_of(capture: Capture) -> tuple[v4l2.VideoMode, ...]:
 
 
 def waiter_of(capture: Capture) -> Callable[[float], bool] | None:
-    """Return the function that waits for a frame of a source at most so many seconds; None if it has none."""
+    """Return the function that waits for a frame of a source at most so many seconds; None if it has none.
+
+    It returns whether `grab` then returns at once: with a frame, or because it fails.
+    """
     wait: Callable[[float], bool] | None = getattr(capture, "wait", None)
     return wait
+
+
+def waiter_for(path: str | Path) -> Callable[[float], bool] | None:
+    """Return the function of `waiter_of` for a device file that this process has opened once; else None.
+
+    OpenCV's own `waitAny` takes the frame, and `grab` then returns the same frame until it is decoded.
+    """
+    found = []
+    try:
+        device = Path(path).stat().st_rdev
+        for entry in Path("/proc/self/fd").iterdir():
+            number = int(entry.name)
+            with suppress(OSError):  # the descriptor that listed them
+                status = os.fstat(number)
+                if stat.S_ISCHR(status.st_mode) and status.st_rdev == device:
+                    found.append(number)
+    except OSError:
+        return None
+    if len(found) != 1:
+        return None
+    poll = select.poll()
+    poll.register(found[0], select.POLLIN)
+    return lambda seconds: bool(poll.poll(seconds * 1e3))
 
 
 def open_capture(source: int | str | Path) -> Capture:
