@@ -8,6 +8,7 @@ import ctypes
 import json
 import socket
 import socketserver
+import threading
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -16,7 +17,7 @@ from typing import Any, Final
 import cv2
 import smbus2.smbus2 as smbus
 
-from rig.core.clock import SystemClock
+from rig.core.clock import SystemClock, seconds_between
 from rig.core.files import json_values
 from sim.camera import SELECT_S
 from sim.devices import SimDevices
@@ -30,6 +31,8 @@ MAX_MESSAGES, MAX_MESSAGE_BYTES = 42, 8192
 MAX_CONNECTIONS: Final = 64
 _POLL_S: Final = 0.05
 """How often a program that waits for a frame looks whether the camera was unplugged."""
+_LAST_ANSWERS_S: Final = 2.0
+"""How long the end of the bench waits for programs that do not read their answer."""
 
 Answer = tuple[dict[str, Any], bytes]
 
@@ -128,7 +131,7 @@ class Session:
                 wait_ns = camera.wait_ns()
             if not wait_ns:
                 return True
-            if (left_ns := deadline_ns - self._time.now_ns()) <= 0:
+            if self._time.over or (left_ns := deadline_ns - self._time.now_ns()) <= 0:
                 return False
             SystemClock().sleep(min(wait_ns * 1e-9, left_ns * 1e-9, _POLL_S))
 
@@ -213,15 +216,13 @@ class Server(socketserver.ThreadingMixIn, socketserver.UnixStreamServer):
         The world to serve.
     """
 
-    daemon_threads = True
-    block_on_close = False
     request_queue_size = MAX_CONNECTIONS
 
     def __init__(self, folder: Path, devices: SimDevices, time: RealTime, commands: Commands) -> None:
         self.devices, self.time, self.commands = devices, time, commands
         self.camera_user: Session | None = None
         self._path = folder / SOCKET
-        self._connections: set[socket.socket] = set()
+        self._connections: dict[socket.socket, threading.Thread] = {}
         self._path.unlink(missing_ok=True)
         with short_path(folder) as path:
             super().__init__(f"{path}/{SOCKET}", _Handler)
@@ -230,12 +231,18 @@ class Server(socketserver.ThreadingMixIn, socketserver.UnixStreamServer):
         """Return whether there is room for one more connection."""
         return len(self._connections) < MAX_CONNECTIONS
 
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Answer a connection in a thread."""
+        thread = threading.Thread(target=self.process_request_thread, args=(request, client_address), daemon=True)
+        self._connections[request] = thread
+        thread.start()
+
     def process_request_thread(self, request: Any, client_address: Any) -> None:
-        self._connections.add(request)
+        """End the connection after its last answer."""
         try:
             super().process_request_thread(request, client_address)
         finally:
-            self._connections.discard(request)
+            del self._connections[request]
 
     def accept(self) -> bool:
         """Accept the connection that waits."""
@@ -243,8 +250,19 @@ class Server(socketserver.ThreadingMixIn, socketserver.UnixStreamServer):
         return True
 
     def server_close(self) -> None:
+        """Answer what was asked, then end the connections."""
         super().server_close()
-        for connection in tuple(self._connections):
-            with suppress(OSError):
-                connection.shutdown(socket.SHUT_RDWR)
+        connections = dict(self._connections)
+        for connection in connections:
+            _shut(connection, socket.SHUT_RD)  # no more requests; an answer that is under way arrives
+        clock = SystemClock()
+        begun_ns = clock.now_ns()
+        for connection, thread in connections.items():
+            thread.join(max(0.0, _LAST_ANSWERS_S - seconds_between(begun_ns, clock.now_ns())))
+            _shut(connection, socket.SHUT_RDWR)
         self._path.unlink(missing_ok=True)
+
+
+def _shut(connection: socket.socket, how: int) -> None:
+    with suppress(OSError):  # it has ended
+        connection.shutdown(how)

@@ -324,6 +324,22 @@ def test_any_request_is_answered_or_rejected(session, request_):
     assert isinstance(answer, dict)
 
 
+def test_bench_that_ends_answers_what_was_asked(session, tmp_path):
+    server = Server(tmp_path, session._devices, session._time, session._bench.commands)
+    client = connected(tmp_path)
+    client.sendall(b'{"ask": "do", "words": ["status"]}\n')
+    server.accept()
+    with session._time.present():  # the answer has to wait
+        end = threading.Thread(target=server.server_close)
+        end.start()
+        with pytest.raises(BrokenPipeError):
+            until(lambda: not client.send(b" "))  # no more requests
+    with client, client.makefile("rb") as answers_:
+        assert "world" in json_values(answers_.readline())
+    end.join()
+    assert not server._connections
+
+
 # -- the trainee's commands -------------------------------------------------------------------------------------------
 
 
