@@ -7,7 +7,6 @@ known from the empty-table image, or was learned while the table turned. Its wei
 Decision: docs/decisions/0048.
 """
 
-import threading
 from functools import cache
 from importlib.resources import files
 from typing import Any, Final, NamedTuple
@@ -28,8 +27,8 @@ EVENLY: Final = 1.0
 COLOURED: Final = 0.7
 #: Trust in a background that was learned from other views; 1 for an empty-table image.
 LEARNED: Final = 0.5
-#: A network of OpenCV runs in one thread at a time.
-_LOCK: Final = threading.Lock()
+#: A network of OpenCV runs in one thread at a time, so there are as many as threads that needed one at the same time.
+_IDLE: Final[list[cv2.dnn.Net]] = []
 
 Floats = NDArray[np.float32]
 
@@ -63,10 +62,7 @@ def shares(small: ImageArray, difference: Difference | None = None, *, learned: 
         planes[0, 5] = np.clip(_sized(difference.evenly) * np.float32(1 / EVENLY), -1, 1)
         planes[0, 6] = np.clip(_sized(difference.coloured) * np.float32(1 / COLOURED), 0, 1)
         planes[0, 7] = LEARNED if learned else 1.0
-    with _LOCK:
-        net = _network()
-        net.setInput(planes)
-        logits = np.asarray(net.forward(), np.float32)[0]
+    logits = _logits(planes)
     found = [1 / (1 + cv2.exp(-plane)) for plane in logits]
     if (height, width) != (HEIGHT, WIDTH):
         found = [cv2.resize(share, (width, height), interpolation=cv2.INTER_LINEAR) for share in found]
@@ -86,7 +82,18 @@ def _places() -> Floats:
     return np.stack([x, y]).astype(np.float32)
 
 
+def _logits(planes: Floats) -> Floats:
+    """Return the network's answer to its input, float32 (2, HEIGHT, WIDTH)."""
+    try:
+        net = _IDLE.pop()
+    except IndexError:  # all others are at work in other threads
+        net = cv2.dnn.readNetFromONNX(np.frombuffer(_weights(), np.uint8))
+    net.setInput(planes)
+    logits: Floats = np.array(net.forward(), np.float32)[0]
+    _IDLE.append(net)
+    return logits
+
+
 @cache
-def _network() -> cv2.dnn.Net:
-    weights = files("hbr.segmentation").joinpath(WEIGHTS).read_bytes()
-    return cv2.dnn.readNetFromONNX(np.frombuffer(weights, np.uint8))
+def _weights() -> bytes:
+    return files("hbr.segmentation").joinpath(WEIGHTS).read_bytes()

@@ -1,5 +1,6 @@
 """An enrollment in progress: add views, then finish or abandon it."""
 
+from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from datetime import timedelta
 from pathlib import Path
@@ -15,7 +16,14 @@ from rig.catalog.records import EnrollmentStatus, ImageFile, Session, StoredView
 from rig.catalog.rows import NewView, empty_table_columns, insert_views, measured, supersede, unfinished_and_complete
 from rig.catalog.schema import enrollments, objects, sessions, views
 from rig.catalog.seal import changing_enrollments
-from rig.catalog.together import HeldImages, describe_together, object_descriptors, stored_images, write_described
+from rig.catalog.together import (
+    THREADS,
+    HeldImages,
+    describe_together,
+    object_descriptors,
+    stored_images,
+    write_described,
+)
 from rig.core.clock import Clock
 from rig.core.errors import CatalogError, UsageError
 from rig.views import image_files as images
@@ -59,8 +67,10 @@ class Enrollment:
         with self._database.read() as connection:
             return self._missing(connection)
 
-    def add(self, record: ViewRecord, image_bgr: NDArray[np.uint8]) -> StoredView:
+    def add(self, record: ViewRecord, image_bgr: NDArray[np.uint8], encoded: Future[bytes] | None = None) -> StoredView:
         """Store a view and its image, uint8 (H, W, 3) BGR. Both are durable when this returns.
+
+        ``encoded`` is the image as PNG, if `rig.views.image_files.encode_meanwhile` was called before.
 
         The image is complete under its name before its row is committed. A crash in between leaves an image without a
         row, which is harmless, and never a row without its image.
@@ -87,7 +97,7 @@ class Enrollment:
                 f"view {index} is not described by {PAPER_DESCRIPTOR}", next_step="describe it: hbr.describe"
             )
         packed = pack(record.descriptors, record.region)
-        png = images.encode(image_bgr)
+        png = images.encode(image_bgr) if encoded is None else encoded.result()
         captured_utc = None
         if record.captured_ns is not None:
             age_ns = self._clock.now_ns() - record.captured_ns
@@ -152,7 +162,7 @@ class Enrollment:
             images = stored_images(connection, self.id)
         if not names:
             return 0
-        found = describe_together(self._held, names, images)
+        found = describe_together(self._held, names, images, threads=THREADS)
         for one in found:
             if one.reason:
                 raise CatalogError(

@@ -3,8 +3,12 @@
 Decision: docs/decisions/0054.
 """
 
-from collections.abc import Iterable, Sequence
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from itertools import groupby
+from threading import Lock
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -28,6 +32,9 @@ FEWEST_VIEWS: Final = 4
 
 MOST_HELD_BYTES: Final = 256_000_000
 """Pixels of one enrollment that are held in memory: 277 views of 640x480."""
+
+THREADS: Final = min(os.cpu_count() or 1, 4)
+"""Threads that describe the views of one enrollment: more wait for the interpreter."""
 
 
 class StoredImage(NamedTuple):
@@ -64,6 +71,7 @@ class HeldImages:
         self._store = store
         self._pixels: dict[str, NDArray[np.uint8]] = {}
         self._bytes = 0
+        self._lock = Lock()
 
     def hold(self, image: str, pixels: NDArray[np.uint8]) -> None:
         """Hold the pixels of an image, uint8 (H, W, 3) BGR, if there is room. The caller does not change them."""
@@ -72,16 +80,19 @@ class HeldImages:
             self._bytes += pixels.nbytes
 
     def pixels(self, image: str, sha256: str) -> NDArray[np.uint8]:
-        """Return the pixels of an image; errors as `ImageStore.pixels`."""
-        if image not in self._pixels:
-            pixels = self._store.pixels(image, sha256)
-            self.hold(image, pixels)
-            return pixels
-        return self._pixels[image]
+        """Return the pixels of an image; errors as `ImageStore.pixels`. Any thread may ask, one at a time is served."""
+        with self._lock:
+            if image not in self._pixels:
+                pixels = self._store.pixels(image, sha256)
+                self.hold(image, pixels)
+                return pixels
+            return self._pixels[image]
 
 
-def describe_together(held: HeldImages, names: tuple[str, ...], items: Sequence[StoredImage]) -> list[Described]:
-    """Describe the views of one enrollment by these descriptors, in their order."""
+def describe_together(
+    held: HeldImages, names: tuple[str, ...], items: Sequence[StoredImage], *, threads: int = 1
+) -> list[Described]:
+    """Describe the views of one enrollment by these descriptors, in their order, in so many threads."""
     found: dict[int, Described] = {}
     for _, group in groupby(sorted(items, key=_session), _session):
         own = list(group)
@@ -99,17 +110,25 @@ def describe_together(held: HeldImages, names: tuple[str, ...], items: Sequence[
                 numbers[one.view_id] = describer.learn(held.pixels(one.image, one.sha256))
             except (CatalogError, UsageError, ValueError) as error:
                 found.setdefault(one.view_id, Described(one.view_id, reason=_reason(error)))
-        for one in own:
-            if one.view_id not in numbers:
-                continue
-            try:
-                described = describer.describe(numbers[one.view_id], held.pixels(one.image, one.sha256))
-            except (CatalogError, UsageError, ValueError) as error:
-                found[one.view_id] = Described(one.view_id, reason=_reason(error))
-                continue
-            packed = tuple(pack(described.levels, region))
-            found[one.view_id] = Described(one.view_id, packed, described.segmentation)
+        known = [one for one in own if one.view_id in numbers]
+        describe = partial(_described, held, describer, numbers)
+        if threads == 1:
+            found |= {one.view_id: describe(one) for one in known}
+        else:
+            with ThreadPoolExecutor(threads, "describer") as pool:
+                found |= {one.view_id: one for one in pool.map(describe, known)}
     return [found[one.view_id] for one in items]
+
+
+def _described(
+    held: HeldImages, describer: EnrollmentDescriber, numbers: Mapping[int, int], item: StoredImage
+) -> Described:
+    """Return the description of a view that the describer has learned as the view of this number."""
+    try:
+        described = describer.describe(numbers[item.view_id], held.pixels(item.image, item.sha256))
+    except (CatalogError, UsageError, ValueError) as error:
+        return Described(item.view_id, reason=_reason(error))
+    return Described(item.view_id, tuple(pack(described.levels, item.region)), described.segmentation)
 
 
 def object_descriptors(connection: Connection, enrollment_id: int) -> tuple[str, ...]:

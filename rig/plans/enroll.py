@@ -27,6 +27,7 @@ from rig.plans.fly import fly_views, park
 from rig.views.capture import Viewer, image_similarity
 from rig.views.description import DESCRIPTORS, ViewDescriber
 from rig.views.empty_table import empty_table_status
+from rig.views.image_files import encode_meanwhile
 
 SAME_SIMILARITY = 0.97
 """Two images of an object at one angle are more similar; after a shift by a centimetre they are less similar."""
@@ -200,6 +201,7 @@ def _step_views(
         imu.add(move)
         attempt = yield from capture(index, viewer, table, move.settled_ns)
         retakes += attempt.number - 1
+        encoded = encode_meanwhile(attempt.image_bgr)
         described = describe(attempt.image_bgr)
         record = ViewRecord(
             index=index,
@@ -214,7 +216,7 @@ def _step_views(
             region=bench.config.view.roi,
             segmentation=described.segmentation,
         )
-        enrollment.add(record, attempt.image_bgr)
+        enrollment.add(record, attempt.image_bgr, encoded)
         yield Accepted(index, record.azimuth_deg, attempt.evidence, attempt.image_bgr, described.segmentation)
         yield from warn_of_table(bench, index, described)
         first = first or (index, angle_deg, attempt.image_bgr)

@@ -8,6 +8,7 @@ Decision: docs/decisions/0047.
 """
 
 from collections.abc import Generator, Mapping
+from concurrent.futures import Future
 from dataclasses import dataclass, field
 from math import inf
 
@@ -27,6 +28,7 @@ from rig.motion.turntable import Flight, Turntable
 from rig.plans.capture import announced, capture, moved, warn_of_table
 from rig.views.capture import Attempt, Viewer
 from rig.views.description import DescribedView, ViewDescriber
+from rig.views.image_files import encode_meanwhile
 from rig.views.stream import FrameStream, StreamFrame, middle_ns
 
 NEAR_SHARE = 0.6
@@ -149,15 +151,22 @@ def fly_views(
         if not attempt.accepted:
             yield Rejected(index, attempt.number, attempt.reasons, attempt.evidence)
             continue
+        encoded = encode_meanwhile(attempt.image_bgr)
         described = describe(attempt.image_bgr)
         attempt = judge.at_the_object(attempt, described.segmentation, trajectory)
-        yield from _store(bench, enrollment, index, angle_deg, attempt, described)
+        yield from _store(bench, enrollment, index, angle_deg, attempt, described, encoded)
         stored.add(index)
     return stored, start_deg, before.image_bgr, after.image_bgr
 
 
 def _store(
-    bench: Bench, enrollment: Enrollment, index: int, angle_deg: float, attempt: Attempt, described: DescribedView
+    bench: Bench,
+    enrollment: Enrollment,
+    index: int,
+    angle_deg: float,
+    attempt: Attempt,
+    described: DescribedView,
+    encoded: Future[bytes],
 ) -> Generator[Event, None, None]:
     motion = attempt.evidence.motion
     assert motion is not None
@@ -172,7 +181,7 @@ def _store(
         region=bench.config.view.roi,
         segmentation=described.segmentation,
     )
-    enrollment.add(record, attempt.image_bgr)
+    enrollment.add(record, attempt.image_bgr, encoded)
     yield Accepted(index, record.azimuth_deg, attempt.evidence, attempt.image_bgr, described.segmentation)
     yield from warn_of_table(bench, index, described)
 

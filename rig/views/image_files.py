@@ -7,6 +7,7 @@ import hashlib
 import re
 import unicodedata
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Final
 
@@ -59,6 +60,17 @@ def encode(image_bgr: NDArray[np.uint8]) -> bytes:
             f"an image of shape {image_bgr.shape} cannot be encoded as PNG", next_step="store a smaller image"
         )
     return png.tobytes()
+
+
+def encode_meanwhile(image_bgr: NDArray[np.uint8]) -> Future[bytes]:
+    """Begin to encode an image, which must not change, in a thread of its own; the result is that of `encode`.
+
+    The encoder leaves the interpreter to the other threads while it works. Its thread ends with the image.
+    """
+    thread = ThreadPoolExecutor(1, "encoder")
+    encoded = thread.submit(encode, image_bgr)
+    thread.shutdown(wait=False)
+    return encoded
 
 
 def read_file(path: Path) -> bytes:

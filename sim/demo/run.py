@@ -61,6 +61,9 @@ UNKNOWN_OBJECTS = ("radio", "clock")  # objects that are put on the table but no
 
 COUNT_OF_FOLDER = 20  # default number of objects of a folder to enroll
 
+VIEWS = 36
+"""Views of each object, unless they are configured. Decision: docs/decisions/0061."""
+
 GOOD_SHARE = 0.8
 """Share of right answers below which the demo fails; of two very similar objects, an answer can be wrong."""
 
@@ -114,12 +117,14 @@ def run_demo(
     objects: Path | None,
     count: int | None,
     out: Path,
+    views: int | None = None,
     strategy: str | None = None,
     change: Change | None = None,
     faults: Sequence[Fault] = (),
 ) -> DemoResult:
     """Enroll a shelf, identify each object and two unknown ones, print the events, and write ``out/report.html``.
 
+    Each object is enrolled with ``views`` views, by default ``enroll.views`` if the configuration has it, or `VIEWS`.
     The search uses ``strategy``, by default ``identify.strategy``. The bench is changed (``change``) after the
     enrollments. The ``faults`` and those of the configuration are injected meanwhile.
 
@@ -152,7 +157,8 @@ def run_demo(
     ):
         _photograph(bench, operator)
         with Catalog.open(folder, clock=bench.clock) as catalog:
-            enrollments = _enroll_all(bench, catalog, list(enrolled), say=not settings.json)
+            each = views or (config.enroll.views if "views" in config.enroll.model_fields_set else VIEWS)
+            enrollments = _enroll_all(bench, catalog, list(enrolled), each, say=not settings.json)
             model = load_model(catalog, descriptor=None if chosen is None else descriptor_for(chosen))
         if change is not None:
             operator.change_bench(change)
@@ -230,13 +236,15 @@ def _photograph(bench: Bench, operator: ShelfOperator) -> None:
             pass
 
 
-def _enroll_all(bench: Bench, catalog: Catalog, names: Sequence[str], *, say: bool) -> list[EnrollmentRecord]:
+def _enroll_all(
+    bench: Bench, catalog: Catalog, names: Sequence[str], views: int, *, say: bool
+) -> list[EnrollmentRecord]:
     records = []
     with Progress("enrolling") as progress:
-        progress.start(len(names) * bench.config.enroll.views)
+        progress.start(len(names) * views)
         for name in names:
             record = EnrollmentRecord(region=bench.config.view.roi)
-            for event in enroll(bench, catalog, name):
+            for event in enroll(bench, catalog, name, views=views):
                 record.add(event)
                 if isinstance(event, Accepted):
                     progress.advance()

@@ -24,6 +24,7 @@ from rig.catalog.exchange import (
 from rig.catalog.redescribe import redescribe
 from rig.catalog.schema import descriptors, views
 from rig.catalog.seal import changing_enrollments
+from rig.catalog.together import HeldImages, describe_together, stored_images
 from rig.catalog.verify import verify
 from rig.catalog.verify_images import Problem
 from rig.config import ViewConfig
@@ -232,3 +233,17 @@ def test_search_compares_the_bench_with_the_newest_enrollment(open_catalog: Call
     assert np.array_equal(model.bench_image, view(0))
     (catalog.path / first.image).unlink()
     assert load_model(catalog).bench_image is None
+
+
+def test_views_are_described_the_same_in_several_threads(open_catalog):
+    catalog = open_catalog("catalog")
+    enrolled(catalog, "box")
+    with catalog.database.read() as connection:
+        images = stored_images(connection, 1)
+    one, several = (
+        describe_together(HeldImages(catalog.database.images), (BENCH_DESCRIPTOR,), images, threads=threads)
+        for threads in (1, 3)
+    )
+    assert len(one) == VIEWS
+    assert all(found.packed for found in one)
+    assert one == several

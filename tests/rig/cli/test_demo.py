@@ -42,10 +42,11 @@ def in_json(tmp_path_factory):
 
 
 def test_demo_searches_on_a_changed_bench_with_other_camera_settings(tmp_path):
-    few = ("--set", "enroll.views=4", "--set", "identify.max_views=2")
+    few = ("--views", "4", "--set", "identify.max_views=2")  # wins over enroll.views
     done = demo(*SMALL, *few, "--change", "bench", "--json", "--out", str(tmp_path))
     assert done.exit_code in (0, 6), done.output  # with so few views an answer can be wrong
-    assert len(json.loads(done.stdout)["trials"]) == 4
+    result = json.loads(done.stdout)
+    assert (len(result["trials"]), result["views_enrolled"]) == (4, 8)
 
 
 def test_demo_enrolls_and_finds_objects_and_recognizes_unknown_ones(small):
@@ -130,4 +131,5 @@ def test_photographs_are_enrolled_and_found(tmp_path):
 def test_default_demo_finds_all_objects_and_recognizes_both_unknown_ones(tmp_path):
     done = demo("--json", "--out", str(tmp_path))
     totals = json.loads(done.stdout.splitlines()[-1])
+    assert totals["views_enrolled"] == 16 * 36
     assert (totals["found"], totals["unknown_recognised"]) == (totals["of"], totals["of_unknown"]) == (16, 2)
