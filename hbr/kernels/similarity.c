@@ -25,8 +25,8 @@ struct query {
     uint64_t at_level[3][EDGE_LEVELS / 64] __attribute__((aligned(64))); /* where the levels are 1, 2, 3, a bit each */
     int64_t base;                                                        /* product with a row whose levels are all 0 */
     int16_t edges[EDGE_LEVELS] __attribute__((aligned(32))); /* values, in the order in which a row is read */
-    int16_t colours[COLOUR_BYTES] __attribute__((aligned(32)));
-    int16_t weights[COLOUR_BYTES] __attribute__((aligned(32)));
+    int16_t colours[COLOUR_BYTES] __attribute__((aligned(64)));
+    int16_t weights[COLOUR_BYTES] __attribute__((aligned(64)));
     int8_t coarse[EDGE_LEVELS] __attribute__((aligned(32))); /* values in units of COARSE, rounded up */
     double square;
 };
@@ -209,6 +209,8 @@ AVX2 static void colours_avx2(const struct query *q, const uint8_t *const *rows,
 static const struct loops WITH_AVX2 = {prepare_avx2, coarsen_avx2, edges_avx2, edge_bounds_avx2, colours_avx2};
 
 #define AVX512 __attribute__((target("avx512f,avx512bw,avx512vpopcntdq,avx512ifma")))
+#define EVEN_LANES _MM_SHUFFLE(2, 0, 2, 0) /* of two vectors, for _mm512_shuffle_i64x2 */
+#define ODD_LANES _MM_SHUFFLE(3, 1, 3, 1)
 
 /* The low and the high bit of all levels of a row, a bit each, in the same order for every row. */
 AVX512 static inline void bits_of_levels(const uint8_t *edges, __m512i *low, __m512i *high) {
@@ -233,40 +235,95 @@ AVX512 static void prepare_avx512(struct query *q, const uint8_t *edges) {
     q->base *= v[0];
 }
 
+/* Add up eight vectors of 64-bit numbers each: the sum of vector i stands at place i. */
+AVX512 static inline __m512i sums_of_eight(const __m512i v[8]) {
+    __m512i two[4], four[2]; /* lanes of 128 bits with parts of the sums of two vectors; of two times two vectors */
+#pragma GCC unroll 4
+    for (int i = 0; i < 4; i++)
+        two[i] = _mm512_add_epi64(_mm512_unpacklo_epi64(v[2 * i], v[2 * i + 1]),
+                                  _mm512_unpackhi_epi64(v[2 * i], v[2 * i + 1]));
+#pragma GCC unroll 2
+    for (int i = 0; i < 2; i++)
+        four[i] = _mm512_add_epi64(_mm512_shuffle_i64x2(two[2 * i], two[2 * i + 1], EVEN_LANES),
+                                   _mm512_shuffle_i64x2(two[2 * i], two[2 * i + 1], ODD_LANES));
+    return _mm512_add_epi64(_mm512_shuffle_i64x2(four[0], four[1], EVEN_LANES),
+                            _mm512_shuffle_i64x2(four[0], four[1], ODD_LANES));
+}
+
 /* The levels are counted that are i in the query and j in the row, for i and j from 1 to 3, and those that are j in the
    row. Each count times its weight makes the product larger than that with a row whose levels are all 0. */
 AVX512 static void edges_avx512(const struct query *q, const uint8_t *const *rows, int64_t count, double *dots) {
     const int32_t *v = q->measure->edge_values;
     const __m512i one = _mm512_load_si512(q->at_level[0]), two = _mm512_load_si512(q->at_level[1]),
-                  three = _mm512_load_si512(q->at_level[2]);
+                  three = _mm512_load_si512(q->at_level[2]), base = _mm512_set1_epi64(q->base);
     __m512i weights[3][4];
     for (int j = 1; j < 4; j++) {
         weights[j - 1][0] = _mm512_set1_epi64((int64_t)v[0] * (v[j] - v[0]));
         for (int i = 1; i < 4; i++) weights[j - 1][i] = _mm512_set1_epi64((int64_t)(v[i] - v[0]) * (v[j] - v[0]));
     }
-    for (int64_t k = 0; k < count; k++) {
-        const uint8_t *row = rows[k] + q->measure->edges_at;
-        for (int line = 0; line < 3; line++) /* rows mostly follow each other */
-            _mm_prefetch((const char *)row + 2560 + 64 * line, _MM_HINT_T0);
-        __m512i low, high;
-        bits_of_levels(row, &low, &high);
-        const __m512i at_level[3] = {_mm512_andnot_si512(high, low), _mm512_andnot_si512(low, high),
-                                     _mm512_and_si512(low, high)};
-        __m512i sums[3];
+    for (int64_t k = 0; k < count; k += 8) { /* eight rows at once: their sums are added up together */
+        const int64_t left = count - k;
+        __m512i of_rows[8];
+#pragma GCC unroll 1
+        for (int i = 0; i < 8; i++) {
+            const uint8_t *row = rows[i < left ? k + i : count - 1] + q->measure->edges_at;
+            for (int line = 0; line < 3; line++) /* rows mostly follow each other */
+                _mm_prefetch((const char *)row + 2560 + 64 * line, _MM_HINT_T0);
+            __m512i low, high;
+            bits_of_levels(row, &low, &high);
+            const __m512i at_level[3] = {_mm512_andnot_si512(high, low), _mm512_andnot_si512(low, high),
+                                         _mm512_and_si512(low, high)};
+            __m512i sums[3];
 #pragma GCC unroll 3
-        for (int j = 0; j < 3; j++) { /* modulo 2^52: weights can be negative, the product is not */
-            const __m512i *w = weights[j], here = at_level[j], zero = _mm512_setzero_si512();
-            sums[j] = _mm512_madd52lo_epu64(zero, _mm512_popcnt_epi64(here), w[0]);
-            sums[j] = _mm512_madd52lo_epu64(sums[j], _mm512_popcnt_epi64(_mm512_and_si512(one, here)), w[1]);
-            sums[j] = _mm512_madd52lo_epu64(sums[j], _mm512_popcnt_epi64(_mm512_and_si512(two, here)), w[2]);
-            sums[j] = _mm512_madd52lo_epu64(sums[j], _mm512_popcnt_epi64(_mm512_and_si512(three, here)), w[3]);
+            for (int j = 0; j < 3; j++) { /* modulo 2^52: weights can be negative, the product is not */
+                const __m512i *w = weights[j], here = at_level[j], zero = _mm512_setzero_si512();
+                sums[j] = _mm512_madd52lo_epu64(zero, _mm512_popcnt_epi64(here), w[0]);
+                sums[j] = _mm512_madd52lo_epu64(sums[j], _mm512_popcnt_epi64(_mm512_and_si512(one, here)), w[1]);
+                sums[j] = _mm512_madd52lo_epu64(sums[j], _mm512_popcnt_epi64(_mm512_and_si512(two, here)), w[2]);
+                sums[j] = _mm512_madd52lo_epu64(sums[j], _mm512_popcnt_epi64(_mm512_and_si512(three, here)), w[3]);
+            }
+            of_rows[i] = _mm512_add_epi64(_mm512_add_epi64(sums[0], sums[1]), sums[2]);
         }
-        const __m512i total = _mm512_add_epi64(_mm512_add_epi64(sums[0], sums[1]), sums[2]);
-        dots[k] = (double)((q->base + _mm512_reduce_add_epi64(total)) & ((INT64_C(1) << 52) - 1));
+        const __m512i total = _mm512_and_si512(_mm512_add_epi64(base, sums_of_eight(of_rows)),
+                                               _mm512_set1_epi64((INT64_C(1) << 52) - 1));
+        /* below 2^52, a number is the fraction of a double from 2^52 on */
+        const __m512d power = _mm512_set1_pd(4503599627370496.0);
+        const __m512d dot = _mm512_sub_pd(_mm512_castsi512_pd(_mm512_or_si512(total, _mm512_castpd_si512(power))), power);
+        _mm512_mask_storeu_pd(dots + k, left < 8 ? (__mmask8)((1 << left) - 1) : (__mmask8)255, dot);
     }
 }
 
-static const struct loops WITH_AVX512 = {prepare_avx512, 0, edges_avx512, edges_avx512, colours_avx2};
+AVX512 static void colours_avx512(const struct query *q, const uint8_t *const *rows, int64_t count, int32_t *distances) {
+    const __m512i own = _mm512_load_si512(q->colours), weights = _mm512_load_si512(q->weights);
+    for (int64_t k = 0; k < count; k += 16) { /* sixteen rows at once: their sums are added up together */
+        const int64_t left = count - k;
+        __m512i of_rows[16], pairs[8];
+#pragma GCC unroll 1
+        for (int i = 0; i < 16; i++) {
+            const uint8_t *row = rows[i < left ? k + i : count - 1] + q->measure->colours_at;
+            const __m512i apart = _mm512_sub_epi16(own, _mm512_cvtepu8_epi16(_mm256_loadu_si256((const __m256i *)row)));
+            of_rows[i] = _mm512_madd_epi16(apart, _mm512_mullo_epi16(apart, weights));
+        }
+#pragma GCC unroll 8
+        for (int i = 0; i < 8; i++)
+            pairs[i] = _mm512_add_epi32(_mm512_unpacklo_epi32(of_rows[2 * i], of_rows[2 * i + 1]),
+                                        _mm512_unpackhi_epi32(of_rows[2 * i], of_rows[2 * i + 1]));
+        __m512i two[4], four[2];
+#pragma GCC unroll 4
+        for (int i = 0; i < 4; i++)
+            two[i] = _mm512_add_epi32(_mm512_unpacklo_epi64(pairs[2 * i], pairs[2 * i + 1]),
+                                      _mm512_unpackhi_epi64(pairs[2 * i], pairs[2 * i + 1]));
+#pragma GCC unroll 2
+        for (int i = 0; i < 2; i++)
+            four[i] = _mm512_add_epi32(_mm512_shuffle_i64x2(two[2 * i], two[2 * i + 1], EVEN_LANES),
+                                       _mm512_shuffle_i64x2(two[2 * i], two[2 * i + 1], ODD_LANES));
+        const __m512i sums = _mm512_add_epi32(_mm512_shuffle_i64x2(four[0], four[1], EVEN_LANES),
+                                              _mm512_shuffle_i64x2(four[0], four[1], ODD_LANES));
+        _mm512_mask_storeu_epi32(distances + k, left < 16 ? (__mmask16)((1 << left) - 1) : (__mmask16)65535, sums);
+    }
+}
+
+static const struct loops WITH_AVX512 = {prepare_avx512, 0, edges_avx512, edges_avx512, colours_avx512};
 #endif
 
 static const struct loops *fastest(void) {
