@@ -111,9 +111,11 @@ class Belief:
         """
         if beta not in self._posteriors:  # the stopping rule and the next view ask for the same one
             root = np.sqrt(self.queries) if self.weights is None else 1.0
-            exponent = self.support.astype(np.float64) * (beta / root)
-            weights = np.exp(exponent - exponent.max())
-            probability: FloatArray = weights / weights.sum()
+            probability: FloatArray = self.support.astype(np.float64)
+            probability *= beta / root
+            probability -= probability.max()
+            np.exp(probability, out=probability)
+            probability /= probability.sum()
             probability.flags.writeable = False
             self._posteriors[beta] = probability
         return self._posteriors[beta]

@@ -4,6 +4,7 @@ Decision: docs/decisions/0032.
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Final
 
 import numpy as np
@@ -109,7 +110,7 @@ def next_best_view(
     novelty = 1 - np.exp(-0.5 * (apart_deg / _NEAR_DEG) ** 2)
     probability, place, bin_of = strongest(belief.posterior(beta))
     cost = second_costs * times_s
-    first, second = np.nonzero(np.triu(place[:, None] != place))  # pairs of different objects
+    first, second = _pairs(place)
     if len(first):
         similar, known = expected_similarity(belief, place, bin_of, angles_deg, first, second)
         tells = novelty[:, None] * np.sqrt(known[:, first] * known[:, second])
@@ -129,6 +130,18 @@ def next_best_view(
         similarity = similar[:, most]
     rotation_deg = float(angles_deg[chosen])
     return NextBestView(rotation_deg, wrap360(here_deg + rotation_deg), pair, angles_deg, confusion, cost, similarity)
+
+
+def _pairs(place: IndexArray) -> tuple[IndexArray, IndexArray]:
+    """Return the pairs of hypotheses of different objects; pairs with the same first one follow each other."""
+    first, second = _all_pairs(len(place))
+    different = place[first] != place[second]
+    return first[different], second[different]
+
+
+@lru_cache(maxsize=_STRONGEST)
+def _all_pairs(count: int) -> tuple[IndexArray, IndexArray]:
+    return np.triu_indices(count, 1)
 
 
 def most_informative_rotation(belief: Belief, *, beta: float = BETA, rotations_deg: ArrayLike | None = None) -> float:
