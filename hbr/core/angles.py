@@ -13,10 +13,12 @@ def wrap360(angle_deg: float) -> float: ...
 def wrap360(angle_deg: FloatArray) -> FloatArray: ...
 def wrap360(angle_deg: float | FloatArray) -> float | FloatArray:
     """Return the same direction in [0, 360)."""
-    wrapped = np.mod(angle_deg, 360.0)
     # the remainder of a tiny negative angle is rounded to 360.0
-    wrapped = np.where(wrapped == 360.0, 0.0, wrapped)
-    return wrapped if isinstance(angle_deg, np.ndarray) else float(wrapped)
+    if not isinstance(angle_deg, np.ndarray):  # a hundred times faster than an array of one number
+        remainder = float(angle_deg) % 360.0
+        return 0.0 if remainder == 360.0 else remainder
+    wrapped = np.mod(angle_deg, 360.0)
+    return np.where(wrapped == 360.0, 0.0, wrapped)
 
 
 @overload

@@ -47,8 +47,13 @@ class _Model(NamedTuple):
     views: Views
     mask: NDArray[np.bool_]
     """Which of all views they are."""
-    place: IndexArray
-    """Where each of them is among them."""
+    gone: IndexArray
+    """The other ones, ascending."""
+
+    def place(self, rows: IndexArray) -> IndexArray:
+        """Return where these of all views are among them."""
+        place: IndexArray = rows - np.searchsorted(self.gone, rows)
+        return place
 
 
 def run_object(
@@ -194,7 +199,7 @@ class _Trials:
                 self._nearest_views[i, list_length] = largest(self._similar[i], longest)[0]
             nearest = self._nearest_views[i, list_length]
             rows = nearest[model.mask[nearest]][:list_length]
-            index.remember(self._queries[i], model.place[rows], self._similar[i, rows])
+            index.remember(self._queries[i], model.place(rows), self._similar[i, rows])
 
     def _run_dense(self, method: Method, draws: _Draws, runs: Runs, at: tuple[int, int, int]) -> None:
         assert self._rule is not None
@@ -276,7 +281,7 @@ class _Trials:
         """Return the enrolled views, of the searched object only those to keep."""
         mask = self._enrolled.copy()
         mask[self._rows] = keep
-        return _Model(self._views.select(mask), mask, np.cumsum(mask) - 1)
+        return _Model(self._views.select(mask), mask, np.flatnonzero(~mask))
 
     def _next(self, method: Method, draws: _Draws, seen: list[int], ranking: Ranking) -> int:
         """Return the next query: a photograph that was not a query yet."""

@@ -181,7 +181,8 @@ def _extend_orient(lists: _Columns, orientations: FloatArray, views: Views) -> _
     backward = [(i, i + 1) for i in reversed(range(len(lists) - 1))]
     for here, neighbour in forward + backward:
         objects = views.object_index[columns[neighbour]]
-        anchors = columns[neighbour][~np.isin(objects, views.object_index[columns[here]])]
+        is_here = (objects[:, None] == views.object_index[columns[here]]).any(axis=1)
+        anchors = columns[neighbour][~is_here]
         rotation_deg = np.full(len(anchors), orientations[here] - orientations[neighbour])
         columns[here] = np.concatenate([columns[here], _rotated(anchors, rotation_deg, views)])
     return columns
