@@ -1,9 +1,9 @@
 """Parts that the long jobs of a catalog share: progress, and portions of images for processes."""
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import groupby
+from itertools import groupby, islice
 from typing import Final, TypeVar
 
 from rig.core.cluster import Cluster
@@ -23,10 +23,11 @@ class JobProgress:
     total: int
 
 
-def portions(items: Sequence[_T]) -> Iterator[tuple[_T, ...]]:
+def portions(items: Iterable[_T]) -> Iterator[tuple[_T, ...]]:
     """Yield the items in portions."""
-    for start in range(0, len(items), PORTION):
-        yield tuple(items[start : start + PORTION])
+    waiting = iter(items)
+    while portion := tuple(islice(waiting, PORTION)):
+        yield portion
 
 
 def portions_of_groups(items: Sequence[_T], group: Callable[[_T], object]) -> Iterator[tuple[_T, ...]]:

@@ -15,7 +15,16 @@ from rig.catalog.jobs import JobProgress, portions, processes
 from rig.catalog.schema import audit as audit_log
 from rig.catalog.schema import corrections, descriptors, enrollments, objects, results, sessions, views
 from rig.catalog.seal import appended_digests, changing_enrollments, enrollment_digests, object_digests
-from rig.catalog.verify_images import Checked, Finding, Item, Problem, Repair, check_portion, stored_images
+from rig.catalog.verify_images import (
+    Checked,
+    Finding,
+    Item,
+    Problem,
+    Repair,
+    check_portion,
+    stored_images,
+    with_descriptions,
+)
 from rig.core.errors import CatalogDamaged
 from rig.core.processes import Jobs, map_in_processes
 from rig.views import image_files as images
@@ -80,8 +89,9 @@ def verify(
     yield JobProgress(0, len(items))
     checked: dict[Item, Checked] = {}
     work = partial(check_portion, catalog.database.images, quick)
-    for portion, found in map_in_processes(work, portions(items), processes(jobs, len(items))):
-        checked.update(zip(portion, found, strict=True))
+    described = portions(with_descriptions(catalog, items))
+    for portion, found in map_in_processes(work, described, processes(jobs, len(items))):
+        checked.update(zip((item for item, _ in portion), found, strict=True))
         yield JobProgress(len(checked), len(items))
     checked = {item: checked[item] for item in items}  # in the order of the catalog, whichever process was faster
 
@@ -220,7 +230,7 @@ def _report_descriptors(state: _State, checked: Mapping[Item, Checked]) -> None:
                     )
                 repair = Repair.DESCRIBED
             state.findings.append(item.finding(Problem.DESCRIPTOR_DIFFERS, repair, descriptor=name))
-        if item.view_id is not None and not item.described:
+        if item.view_id is not None and not found.is_described:
             state.findings.append(item.finding(Problem.NOT_DESCRIBED))
 
 

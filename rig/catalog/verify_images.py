@@ -1,15 +1,15 @@
 """The images that a catalog must have, and the check of each: its file, its pixels, what was described in it."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import null, select, true
+from sqlalchemy import null, select
 
 from hbr.descriptors import descriptor
 from rig.catalog.catalog import Catalog
@@ -19,6 +19,9 @@ from rig.catalog.queries import of_views, packed_descriptors
 from rig.catalog.schema import enrollments, objects, results, sessions, views
 from rig.core.errors import CatalogError, UsageError
 from rig.views import image_files as images
+
+_READ_AT_ONCE: Final = 1024
+"""Views whose descriptions are read from the catalog at once."""
 
 
 class Problem(StrEnum):
@@ -75,9 +78,7 @@ class Finding:
 
 
 class Item(NamedTuple):
-    """An image that must exist. ``described`` holds name, version, settings as JSON, and packed levels.
-
-    ``segmentation`` is the stored evidence as JSON.
+    """An image that must exist.
 
     That of a result has no object, and the negative number of the result instead of an enrollment.
     """
@@ -90,17 +91,26 @@ class Item(NamedTuple):
     sha256: str
     file_bytes: int
     empty_table: EmptyTable | None = None
-    described: tuple[tuple[str, int, str, bytes], ...] = ()
-    segmentation: str = "null"
 
     def finding(self, problem: Problem, repair: Repair | None = None, **details: Any) -> Finding:
         return Finding(problem, self.object_name, self.view_id, self.image, details, repair)
 
 
+class StoredDescription(NamedTuple):
+    """What is stored of a view's content: name, version, settings as JSON, and packed levels of each descriptor.
+
+    ``segmentation`` is the stored evidence as JSON.
+    """
+
+    descriptors: tuple[tuple[str, int, str, bytes], ...] = ()
+    segmentation: str = "null"
+
+
 class Checked(NamedTuple):
     """What was found for an item: SHA-256 and size of its file, and width and height of the image.
 
-    ``different`` holds name and version of each descriptor with wrong levels, and the right levels if known.
+    ``is_described`` is false for a view without descriptors. ``different`` holds name and version of each descriptor
+    with wrong levels, and the right levels if known.
     """
 
     sha256: str | None
@@ -108,13 +118,13 @@ class Checked(NamedTuple):
     size_px: tuple[int, int] | None = None
     reason: str = ""
     different: tuple[tuple[str, int, bytes | None], ...] = ()
+    is_described: bool = True
 
 
 def stored_images(catalog: Catalog) -> tuple[list[Item], int]:
     """Return an item for each view and each empty-table image, and the number of objects."""
     with catalog.database.read() as connection:
         count = len(connection.execute(select(objects.c.id)).all())
-        described = packed_descriptors(connection, true())
         empty_table = (sessions.c.empty_table_image, sessions.c.empty_table_image_sha256)
         owner = (objects.c.name, enrollments.c.id)
         rows = connection.execute(
@@ -126,22 +136,11 @@ def stored_images(catalog: Catalog) -> tuple[list[Item], int]:
                 views.c.image_sha256,
                 views.c.image_bytes,
                 *empty_table,
-                views.c.segmentation,
             )
             .join(sessions, views.c.session_id == sessions.c.id)
             .order_by(views.c.id)
         ).all()
-        items = [
-            Item(*row[:7])._replace(
-                empty_table=None if row[7] is None else (row[7], row[8]),
-                described=tuple(
-                    (one.name, one.version, json.dumps(one.settings, sort_keys=True), one.packed)
-                    for one in described.get(row.id, ())
-                ),
-                segmentation=json.dumps(row.segmentation),
-            )
-            for row in rows
-        ]
+        items = [Item(*row[:7])._replace(empty_table=None if row[7] is None else (row[7], row[8])) for row in rows]
         items += [
             Item(*row)
             for row in connection.execute(
@@ -159,11 +158,40 @@ def stored_images(catalog: Catalog) -> tuple[list[Item], int]:
     return items, count
 
 
-def check_portion(store: ImageStore, quick: bool, portion: tuple[Item, ...]) -> list[Checked]:
-    return [_check(store, item, quick) for item in portion]
+def with_descriptions(catalog: Catalog, items: Sequence[Item]) -> Iterator[tuple[Item, StoredDescription | None]]:
+    """Yield each item with what is stored of its content; None if it is not the image of a view, or the view is gone.
+
+    The descriptions of a large catalog need gigabytes: they are read some views at a time.
+    """
+    for start in range(0, len(items), _READ_AT_ONCE):
+        some = items[start : start + _READ_AT_ONCE]
+        is_one = views.c.id.in_([item.view_id for item in some if item.view_id is not None])
+        with catalog.database.read() as connection:
+            described = packed_descriptors(connection, is_one)
+            evidence = dict(connection.execute(select(views.c.id, views.c.segmentation).where(is_one)).all())
+        for item in some:
+            if item.view_id is None or item.view_id not in evidence:
+                yield item, None
+                continue
+            packed = (
+                (one.name, one.version, json.dumps(one.settings, sort_keys=True), one.packed)
+                for one in described.get(item.view_id, ())
+            )
+            yield item, StoredDescription(tuple(packed), json.dumps(evidence[item.view_id]))
 
 
-def _check(store: ImageStore, item: Item, quick: bool) -> Checked:
+def check_portion(
+    store: ImageStore, quick: bool, portion: tuple[tuple[Item, StoredDescription | None], ...]
+) -> list[Checked]:
+    return [
+        _check(store, item, StoredDescription() if stored is None else stored, quick)._replace(
+            is_described=stored is None or bool(stored.descriptors)
+        )
+        for item, stored in portion
+    ]
+
+
+def _check(store: ImageStore, item: Item, stored: StoredDescription, quick: bool) -> Checked:
     try:
         content = store.read(item.image)
     except OSError as error:
@@ -176,7 +204,7 @@ def _check(store: ImageStore, item: Item, quick: bool) -> Checked:
     except images.BadImage as error:
         return Checked(sha256, len(content), reason=str(error))
     different: list[tuple[str, int, bytes | None]] = []
-    for name, version, settings, packed in item.described:
+    for name, version, settings, packed in stored.descriptors:
         if not is_current(name, version):
             continue
         kind = descriptor(name)
@@ -191,7 +219,7 @@ def _check(store: ImageStore, item: Item, quick: bool) -> Checked:
             continue  # the empty-table image is damaged: it is another item
         levels: NDArray[np.uint8] | None = None
         with suppress(UsageError, KeyError, ValueError):
-            levels = describe(image, json.loads(item.segmentation)).levels[name]
+            levels = describe(image, json.loads(stored.segmentation)).levels[name]
         if levels is None or not matches(kind, packed, levels):
             different.append((name, version, None if levels is None else kind.pack(levels)))
     return Checked(sha256, len(content), (image.shape[1], image.shape[0]), different=tuple(different))

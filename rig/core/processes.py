@@ -2,11 +2,11 @@
 
 import os
 import signal
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from itertools import chain, islice
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, Final, TypeVar
@@ -33,15 +33,16 @@ def map_in_processes(work: Callable[[_Item], _T], items: Iterable[_Item], jobs: 
     work
         A function that can be pickled, or a partial of one; it is sent to each process once.
     items
-        Items that can be hashed and pickled.
+        Items that can be hashed and pickled. They are read as they are needed.
     jobs
         Largest number of processes; with 1 the work is done in this process. Or a cluster.
     """
     if isinstance(jobs, Cluster):
         yield from map_on_cluster(work, items, jobs)
         return
-    waiting = deque(items)
-    jobs = min(jobs, len(waiting))
+    waiting = iter(items)
+    first = tuple(islice(waiting, jobs))
+    jobs, waiting = min(jobs, len(first)), chain(first, waiting)
     if jobs <= 1:
         for item in waiting:
             yield item, work(item)
@@ -56,11 +57,12 @@ def map_in_processes(work: Callable[[_Item], _T], items: Iterable[_Item], jobs: 
     pool = ProcessPoolExecutor(jobs, get_context("spawn"), _start_worker, (work, models))
     futures: dict[Future[_T], _Item] = {}
     try:
-        while waiting or futures:
-            while waiting and len(futures) < jobs * _AHEAD:
-                item = waiting.popleft()
+        while True:
+            for item in islice(waiting, jobs * _AHEAD - len(futures)):  # read when there is room for them
                 with _ignoring_interrupts():  # a submission may start a process
                     futures[pool.submit(_call, item)] = item  # type: ignore[arg-type]
+            if not futures:
+                break
             for future in wait(futures, return_when=FIRST_COMPLETED).done:
                 yield futures.pop(future), future.result()
     except BrokenProcessPool as error:

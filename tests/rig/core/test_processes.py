@@ -32,6 +32,15 @@ def length(item: tuple[str, int]) -> int:
     return descriptor(item[0]).length
 
 
+@pytest.mark.parametrize(("jobs", "most"), [(1, 1), (2, 8)])
+def test_items_are_read_as_they_are_needed(jobs: int, most: int) -> None:
+    numbers = iter(range(100, 200))
+    results = map_in_processes(work, numbers, jobs)
+    assert next(results) in [(n, n * n) for n in range(100, 100 + most)]
+    assert next(numbers) <= 100 + most
+    results.close()
+
+
 def test_processes_have_the_loaded_models_and_nothing_of_the_working_directory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
