@@ -39,8 +39,8 @@ from tests.contract.heads import needs
 from tests.fuzzing import fuzz_settings
 
 CLOCK = SystemClock()
-PATIENT = ("table.watchdog_s=2.5", "head.deadman_s=2.0")
-"""Settings with which a busy computer may pause a program."""
+PATIENT = ("table.watchdog_s=2.5", "head.deadman_s=2.0", "servo.retries=20")
+"""Settings with which a busy computer may pause this program and the bench."""
 LEFT = {"lock", "rig.toml"}
 """What an ended bench leaves that no program has moved."""
 
