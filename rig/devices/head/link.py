@@ -120,8 +120,13 @@ class HeadLink:
             self.sent_ns = self._clock.now_ns()
             self._guarded(lambda: self._connection.write(frame))
             deadline_ns = self.sent_ns + round(REPLY_S * 1e9)
-            while self._clock.now_ns() < deadline_ns:
-                self._take(self._guarded(lambda: self._read(reply_bytes)))
+            is_late = False
+            while not is_late:
+                is_late = self._clock.now_ns() >= deadline_ns
+                if is_late:
+                    self.poll()  # the reply may have arrived while this computer was busy
+                else:
+                    self._take(self._guarded(lambda: self._read(reply_bytes)))
                 answer = self._answer(message)
                 if isinstance(answer, expected):
                     return answer

@@ -336,6 +336,21 @@ def test_repeated_request_is_carried_out_once(opened):
     assert opened.imu.health()["retries"] == 1
 
 
+@AVR_NIGHTLY
+def test_reply_that_arrived_while_the_computer_was_busy_is_accepted(opened, monkeypatch):
+    opened.imu._cancel()  # no heartbeat in the pause
+    wire = opened.imu._link._connection
+    write = wire.write
+
+    def write_and_pause(data: bytes) -> int:
+        written = write(data)
+        opened.clock.sleep(0.2)
+        return written
+
+    monkeypatch.setattr(wire, "write", write_and_pause)
+    assert opened.imu._link.request(Trigger(500), Triggered, attempts=1).width_us == 500
+
+
 def test_unknown_message_is_rejected(opened):
     class Future(Light):
         ID = 0x55

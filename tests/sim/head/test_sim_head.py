@@ -28,7 +28,7 @@ def answering(connect, clock):
 
 
 @pytest.mark.parametrize("kind", ["memory", "avr"])
-def test_program_with_pyserial_finds_a_head(kind, tmp_path):
+def test_program_with_pyserial_finds_a_head(kind, tmp_path, monkeypatch):
     needs(kind)
     arguments = ("--json", "--kind", kind, "--spin", "30", "--seconds", "600", "--link", "head")
     program = Program("sim-head", *arguments, folder=tmp_path)
@@ -39,6 +39,7 @@ def test_program_with_pyserial_finds_a_head(kind, tmp_path):
         clock = SystemClock()
         wire = open_serial(str(tmp_path / "head"), BAUD, "head")
         head = answering(lambda: RigHead(wire, clock, mpu6050(), deadman_s=2.0), clock)
+        monkeypatch.setattr("rig.devices.head.link.REPLY_S", 2.0)  # the other process may have to wait
         clock.sleep(0.3)
         head.read_samples()
         clock.sleep(0.5)

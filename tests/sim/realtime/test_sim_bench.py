@@ -194,8 +194,9 @@ def test_garbage_does_not_end_the_bench(start):
     assert ping(folder) == 1
 
 
-def test_servo_and_rig_head_are_parts_of_one_world(start):
+def test_servo_and_rig_head_are_parts_of_one_world(start, monkeypatch):
     needs("memory")
+    monkeypatch.setattr("rig.devices.head.link.REPLY_S", 10.0)  # the bench may have to wait for a processor
     folder = start("bench", "imu.connection=head", "head.power=true", "head.light=0.5", *PATIENT)
     config = load_config(folder / "rig.toml")
     assert not tell(folder, "status")["world"]["light"][0]
