@@ -2,14 +2,14 @@
 
 import json
 from collections import defaultdict
-from collections.abc import Generator
+from collections.abc import Generator, Iterable, Iterator
 from dataclasses import dataclass
 from enum import Enum
 from functools import partial
 from itertools import groupby
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
-from sqlalchemy import select
+from sqlalchemy import Connection, select
 
 from hbr.descriptors import Descriptor
 from hbr.descriptors import descriptor as descriptor_named
@@ -33,6 +33,9 @@ from rig.core.errors import CatalogError, UsageError
 from rig.core.processes import Jobs, map_in_processes
 from rig.views.description import PAPER_DESCRIPTOR
 
+_READ_AT_ONCE: Final = 1024
+"""Rows that are read from the catalog at once."""
+
 
 class Stored(Enum):
     """Marks that each view keeps the region that it is described within."""
@@ -52,14 +55,13 @@ class Redescribed:
 
 
 class _Item(NamedTuple):
-    """A view to be described; ``evidence`` is that of its segmentation, as JSON text.
+    """A view to be described.
 
     ``together`` says that the views of its enrollment are segmented again, and ``names`` which descriptors follow.
     """
 
     view: StoredImage
     enrollment_id: int
-    evidence: str
     together: bool
     names: tuple[str, ...]
 
@@ -103,10 +105,11 @@ def redescribe(
     done = 0
     yield JobProgress(0, len(items))
     work = partial(_describe, catalog.database.images)
-    for portion, found in map_in_processes(work, portions_of_groups(items, _group), processes(jobs, len(items))):
-        failed += [(item.view.image, one.reason) for item, one in zip(portion, found, strict=True) if one.reason]
+    portions = _with_evidence(catalog, portions_of_groups(items, _group))
+    for portion, found in map_in_processes(work, portions, processes(jobs, len(items))):
+        failed += [(item.view.image, one.reason) for (item, _), one in zip(portion, found, strict=True) if one.reason]
         with catalog.database.write() as connection:
-            ids = [item.view.view_id for item in portion]
+            ids = [item.view.view_id for item, _ in portion]
             owners = connection.scalars(select(views.c.enrollment_id).where(views.c.id.in_(ids)).distinct())
             with changing_enrollments(connection, owners):
                 write_described(connection, found)
@@ -120,8 +123,18 @@ def redescribe(
     return Redescribed(kind.name, kind.version, done - len(failed), unchanged, tuple(failed))
 
 
+class _Known(NamedTuple):
+    """By the id of each view: settings of its descriptors, those of the wanted one, and the current descriptors."""
+
+    settings: dict[int, JsonObject]
+    present: dict[int, JsonObject]
+    current: dict[int, set[str]]
+
+
 def _items(catalog: Catalog, kind: Descriptor, region: Region | Stored | None, again: bool) -> tuple[list[_Item], int]:
+    items, unchanged = [], 0
     with catalog.database.read() as connection:
+        known = _known(connection, kind)
         wanted = connection.execute(
             select(
                 views.c.id,
@@ -142,37 +155,56 @@ def _items(catalog: Catalog, kind: Descriptor, region: Region | Stored | None, a
                 objects.c.deleted_utc.is_(None),
                 enrollments.c.status.in_([EnrollmentStatus.COMPLETE, EnrollmentStatus.IN_PROGRESS]),
             )
-            .order_by(views.c.enrollment_id, views.c.id)
-        ).all()
-        known: dict[int, dict[str, Any]] = {}
-        present: dict[int, dict[str, Any]] = {}
-        others: dict[int, set[str]] = defaultdict(set)
-        for view_id, other, its_version, settings in connection.execute(
-            select(descriptors.c.view_id, descriptors.c.name, descriptors.c.version, descriptors.c.settings)
-        ):
-            # of several regions, that of the descriptor itself or of the paper's counts
-            if view_id not in known or other in (PAPER_DESCRIPTOR, kind.name):
-                known[view_id] = settings
-            if (other, its_version) == (kind.name, kind.version):
-                present[view_id] = settings
-            if is_current(other, its_version) and not descriptor_named(other).whole_image:
-                others[view_id].add(other)
-    items, unchanged = [], 0
-    for enrollment_id, group in groupby(wanted, lambda row: row.enrollment_id):
-        own = list(group)
-        regions = {row.id: _region(row, known.get(row.id), region) for row in own}
-        described = {row.id for row in own if not again and present.get(row.id) == settings_of(regions[row.id])}
-        together = not kind.whole_image and (again or any(needs_segmentation(row.segmentation) for row in own))
-        names = {kind.name}.union(*(others[row.id] for row in own)) if together else {kind.name}
-        for row in own:
-            if row.id in described and not together:
-                unchanged += 1
-                continue
-            table = row.empty_table_image
-            empty_table = None if table is None else (table, row.empty_table_image_sha256)
-            image = StoredImage(row.id, row.image, row.image_sha256, row.session_id, regions[row.id], empty_table)
-            items.append(_Item(image, enrollment_id, json.dumps(row.segmentation), together, tuple(sorted(names))))
+            .order_by(views.c.enrollment_id, views.c.id),
+            execution_options={"yield_per": _READ_AT_ONCE},
+        )
+        for enrollment_id, group in groupby(wanted, lambda row: row.enrollment_id):
+            own = list(group)
+            regions = {row.id: _region(row, known.settings.get(row.id), region) for row in own}
+            described = {
+                row.id for row in own if not again and known.present.get(row.id) == settings_of(regions[row.id])
+            }
+            together = not kind.whole_image and (again or any(needs_segmentation(row.segmentation) for row in own))
+            names = {kind.name}.union(*(known.current[row.id] for row in own)) if together else {kind.name}
+            in_order = tuple(sorted(names))
+            for row in own:
+                if row.id in described and not together:
+                    unchanged += 1
+                    continue
+                table = row.empty_table_image
+                empty_table = None if table is None else (table, row.empty_table_image_sha256)
+                image = StoredImage(row.id, row.image, row.image_sha256, row.session_id, regions[row.id], empty_table)
+                items.append(_Item(image, enrollment_id, together, in_order))
     return items, unchanged
+
+
+def _known(connection: Connection, kind: Descriptor) -> _Known:
+    known = _Known({}, {}, defaultdict(set))
+    distinct: dict[str, JsonObject] = {}  # few, of many views
+    for view_id, name, version, settings in connection.execute(
+        select(descriptors.c.view_id, descriptors.c.name, descriptors.c.version, descriptors.c.settings),
+        execution_options={"yield_per": _READ_AT_ONCE},
+    ):
+        settings = distinct.setdefault(repr(settings), settings)
+        # of several regions, that of the descriptor itself or of the paper's counts
+        if view_id not in known.settings or name in (PAPER_DESCRIPTOR, kind.name):
+            known.settings[view_id] = settings
+        if (name, version) == (kind.name, kind.version):
+            known.present[view_id] = settings
+        if is_current(name, version) and not descriptor_named(name).whole_image:
+            known.current[view_id].add(name)
+    return known
+
+
+def _with_evidence(catalog: Catalog, portions: Iterable[tuple[_Item, ...]]) -> Iterator[tuple[tuple[_Item, str], ...]]:
+    """Yield portions with the evidence of each view's segmentation, as JSON text; that of all views needs gigabytes."""
+    for portion in portions:
+        ids = [item.view.view_id for item in portion if not item.together]
+        is_one = views.c.id.in_(ids)
+        with catalog.database.read() as connection:
+            found = connection.execute(select(views.c.id, views.c.segmentation).where(is_one)).all() if ids else ()
+        evidence = {view_id: json.dumps(segmentation) for view_id, segmentation in found}
+        yield tuple((item, evidence.get(item.view.view_id, "null")) for item in portion)
 
 
 def _region(row: Any, settings: JsonObject | None, region: Region | Stored | None) -> Region | None:
@@ -194,24 +226,24 @@ def _group(item: _Item) -> tuple[bool, int]:
     return item.together, item.enrollment_id if item.together else item.view.view_id
 
 
-def _describe(store: ImageStore, portion: tuple[_Item, ...]) -> list[Described]:
+def _describe(store: ImageStore, portion: tuple[tuple[_Item, str], ...]) -> list[Described]:
     found: list[Described] = []
-    for (together, _), group in groupby(portion, _group):
+    for (together, _), group in groupby(portion, lambda pair: _group(pair[0])):
         own = list(group)
         if together:
-            found += describe_together(HeldImages(store), own[0].names, [item.view for item in own])
+            found += describe_together(HeldImages(store), own[0][0].names, [item.view for item, _ in own])
         else:
-            found += [_describe_one(store, item) for item in own]
+            found += [_describe_one(store, item, evidence) for item, evidence in own]
     return found
 
 
-def _describe_one(store: ImageStore, item: _Item) -> Described:
+def _describe_one(store: ImageStore, item: _Item, evidence: str) -> Described:
     """Describe a view by its stored segmentation."""
     view = item.view
     try:
         image = store.pixels(view.image, view.sha256)
         describe = stored_describer(store, item.names, view.region, view.empty_table)
-        levels = describe(image, json.loads(item.evidence)).levels
+        levels = describe(image, json.loads(evidence)).levels
         return Described(view.view_id, tuple(pack(levels, view.region)))
     except (CatalogError, UsageError) as error:
         return Described(view.view_id, reason=error.what)
