@@ -41,6 +41,8 @@ _SAME: Final = 0.25
 #: Views of a leave-one-out search, if most objects have enough; searches in a calibration.
 CALIBRATED_VIEWS: Final = 4
 MOST_SEARCHES: Final = 400
+#: Objects that are searched for in a calibration, among all: the share of 1 % is then known to a third of its value.
+MOST_OBJECTS: Final = 1000
 
 
 def conformal_threshold(scores: ArrayLike, false_reject: float) -> float:
@@ -227,6 +229,8 @@ class CalibratedRule:
         Searches for left-out objects that did not; None if there are too few objects to measure that.
     confused : tuple of (str, str)
         Left-out objects and the objects they were taken for, the most frequent pairs first.
+    searched : int
+        Objects that were searched for.
     """
 
     rule: StoppingRule
@@ -237,6 +241,7 @@ class CalibratedRule:
     rejected: int = 0
     accepted: int | None = None
     confused: tuple[tuple[str, str], ...] = ()
+    searched: int = 0
 
 
 def calibrate_stopping_rule(
@@ -259,7 +264,8 @@ def calibrate_stopping_rule(
     error_rate, false_reject
         As for `fit_stopping_rule`.
     most_searches
-        Searches in all, from different first views; each object is searched for at least once.
+        Searches in all, from different first views; each object is searched for at least once, but at most
+        `MOST_OBJECTS` of them.
     most_shifted_searches
         Searches under changes of the bench, from which the open-set score is fitted (`fit_open_set`).
     sample
@@ -310,6 +316,7 @@ def _calibrated(
         rejected=rejected,
         accepted=accepted,
         confused=confused,
+        searched=len(np.unique(searches.searched)),
     )
 
 
@@ -332,6 +339,7 @@ def calibration_searches(
         index.only(places),
         views=min(CALIBRATED_VIEWS, usual_views),
         searches=max(1, min(most_searches // len(index), int(index.rows.shape[1]))),
+        most_objects=MOST_OBJECTS,
         progress=progress,
         tasks=tasks,
     )

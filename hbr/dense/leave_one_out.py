@@ -129,6 +129,7 @@ def leave_one_out(
     views: int = 4,
     seen: LevelArray | None = None,
     searches: int = 4,
+    most_objects: int | None = None,
     step_deg: float = _STEP_DEG,
     weight: float | None = None,
     progress: Callable[[int, int], object] | None = None,
@@ -153,6 +154,8 @@ def leave_one_out(
         and blur. The enrolled views themselves by default.
     searches : int
         Searches for each object; their first views are spread around it.
+    most_objects : int, optional
+        Largest number of objects that are searched for, evenly spread, among all objects.
     step_deg : float
         Distance between the views of a search.
     weight : float, optional
@@ -173,11 +176,12 @@ def leave_one_out(
     shape = len(index.views), index.length
     if seen is not None and seen.shape != shape:
         raise ValueError(f"seen has shape {seen.shape}; the catalog's views have {shape}")
+    counts = np.bincount(index.views.object_index)[index.object_index]
+    places = np.flatnonzero(counts >= (max(views, 2) if weight is None else 2))
+    if most_objects is not None and len(places) > most_objects:
+        places = places[np.linspace(0, len(places) - 1, most_objects).astype(int)]
     todo, aside = [], 0.0
-    for place, object_index in enumerate(index.object_index.tolist()):
-        count = len(index.views.of(object_index))
-        if count < (max(views, 2) if weight is None else 2):
-            continue
+    for place, count in zip(places.tolist(), counts[places].tolist(), strict=True):
         todo.append((place, aside))
         drawn = views if weight is None else 1  # shares of a step that each search draws
         for _ in range(drawn * len(np.unique(np.arange(searches) * count // searches))):

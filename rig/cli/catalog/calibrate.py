@@ -31,8 +31,9 @@ def calibrate(
     """Calibrate the stopping rule, which decides when rig identify ends a search.
 
     Search for each enrolled object with its own views, as if the camera had stood beside them, and again with the whole
-    object left out, as an unknown object. The command reports what the rule cannot guarantee, and how much more data
-    that needs. Repeat it when the catalog has changed; rig identify reports that.
+    object left out, as an unknown object. Of more than 1000 objects, 1000 are searched for, among all. The command
+    reports what the rule cannot guarantee, and how much more data that needs. Repeat it when the catalog has changed;
+    rig identify reports that.
 
     Example: rig catalog calibrate --bench sim --error-rate 0.005
     """
@@ -91,9 +92,9 @@ def _lines(found: "CalibratedRule", objects: int, seconds: float) -> list[str]:
     from rig.events.wording import limitation_words
 
     rule = found.rule
+    searched = (f"{found.searched} of " if 0 < found.searched < objects else "") + counted(objects, "object")
     lines = [
-        f"{rule.searches} leave-one-out searches of {counted(found.views, 'view')} for {counted(objects, 'object')} "
-        f"in {seconds:.1f} s"
+        f"{rule.searches} leave-one-out searches of {counted(found.views, 'view')} for {searched} in {seconds:.1f} s"
     ]
     if found.ended:
         lines.append(

@@ -178,6 +178,15 @@ def test_one_object_is_compared_with_its_own_views() -> None:
     assert DenseSession(index, rule).add(views.descriptors[0], 0.0).outcome is Outcome.FOUND
 
 
+def test_leave_one_out_searches_for_some_of_many_objects_among_all_of_them() -> None:
+    index = DenseIndex(catalog(7))
+    found = leave_one_out(index, beta=BETA, views=2, searches=1, most_objects=3)
+    assert found.searched.tolist() == [0, 3, 6]
+    alone = leave_one_out(index.only(np.array([0, 3, 6])), beta=BETA, views=2, searches=1)
+    assert (found.known.score == alone.known.score).all()  # found in both
+    assert (found.unknown.margin < alone.unknown.margin).any()  # among more others
+
+
 def test_leave_one_out_rejects_catalogs_without_enough_views() -> None:
     with pytest.raises(ValueError, match="at least two"):
         leave_one_out(DenseIndex(catalog(1)), beta=BETA)
