@@ -1,10 +1,12 @@
 """Searches for objects of which the catalog holds a near twin, on the simulated bench.
 
-`python -m benchmarks.twins [--searches 200] [--views 36] [--modes dense,arc] [--alone] [--seed 0] [--json FILE]`
+`python -m benchmarks.twins [--searches 200] [--views 36] [--modes dense,arc] [--alone] [--seed 0] [--json FILE]
+[--catalog FOLDER]`
 
 Ten pairs of objects differ in one sticker, marking, handle, lid or letter. Both objects of each pair are enrolled. Each
 search puts one of them on the table in a random orientation. With ``--alone`` only the first of each pair is enrolled,
-and half of the searches are for its twin, which is not enrolled.
+and half of the searches are for its twin, which is not enrolled. ``--catalog`` keeps the catalog in a new folder, for
+`rig eval`.
 """
 
 import argparse
@@ -38,6 +40,7 @@ def main() -> None:
     options.add_argument("--alone", action="store_true")
     options.add_argument("--seed", type=int, default=0)
     options.add_argument("--json", type=Path)
+    options.add_argument("--catalog", type=Path)
     given = options.parse_args()
     rows = searches(given)
     print(json.dumps(summary(rows), indent=2))
@@ -57,7 +60,7 @@ def searches(given: argparse.Namespace) -> list[dict[str, Any]]:
     with (
         TemporaryDirectory() as folder,
         open_sim_bench(config, operator) as bench,
-        Catalog.open(Path(folder), clock=bench.clock) as catalog,
+        Catalog.open(given.catalog or Path(folder), clock=bench.clock) as catalog,
     ):
         for name in known:
             for _ in enroll(bench, catalog, name, views=given.views):

@@ -4,6 +4,7 @@ Objects are enrolled on one drawn bench. Each search is a visit to the same benc
 other benches (hard change), with four views, 90° apart. Some objects are never enrolled.
 """
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Final, Literal
@@ -15,6 +16,8 @@ from numpy.typing import NDArray
 from hbr.core.angles import wrap180
 from hbr.core.arrays import ImageArray, LevelArray
 from hbr.dense.index import DenseIndex
+from hbr.dense.leaders import compare_leaders, near
+from hbr.dense.local_difference import LocalView
 from hbr.dense.session import DenseSession
 from hbr.dense.stopping import Outcome, StopDecision, StoppingRule
 from hbr.descriptors.together import ViewsTogether, like_enrollment
@@ -25,11 +28,9 @@ from hbr.evaluation.draws import generator
 from hbr.segmentation import Background
 
 Kind = Literal["mild", "hard"]
-#: Views of a search, and the step between them.
+#: Views of a search, at most, and the step between them.
 VIEWS: Final = 4
 _STEP_DEG: Final = 90.0
-#: Views after which a search would end in any case.
-_MAX_VIEWS: Final = 8
 _BENCHES: Final = 12
 DESCRIPTOR: Final = "edges+colours"
 
@@ -75,11 +76,15 @@ class SearchResult:
     leaders : tuple of str
         After 1, 2, 3 and 4 views.
     outcome : Outcome
-        With which the stopping rule ended the search; `Outcome.CONTINUE` if it did not within four views.
+        With which the search ended within four views.
     decided : str
-        The leading object then.
+        The leading object then, or the one that the comparison of the two leaders named.
     views : int
         Views until then.
+    compared : bool
+        Whether its two leaders were compared pixel by pixel (`hbr.dense.leaders`).
+    by_comparison : bool
+        Whether that comparison changed the outcome.
     left_out : Outcome, optional
         How the same search ends if the object is not enrolled; None if it never was.
     """
@@ -88,11 +93,29 @@ class SearchResult:
     outcome: Outcome
     decided: str
     views: int
+    compared: bool = False
+    by_comparison: bool = False
     left_out: Outcome | None = None
 
 
-def enroll_changed(item: PhotographedObject, changes: Changes) -> tuple[LevelArray, NDArray[np.float64]]:
-    """Return the levels of an object's enrolled views, and their azimuths.
+@dataclass(frozen=True, eq=False)
+class EnrolledViews:
+    """The enrolled views of an object.
+
+    Attributes
+    ----------
+    levels : uint8 array (n, length)
+    azimuth_deg : float64 array (n,)
+    cut_outs : tuple of LocalView
+    """
+
+    levels: LevelArray
+    azimuth_deg: NDArray[np.float64]
+    cut_outs: tuple[LocalView, ...]
+
+
+def enroll_changed(item: PhotographedObject, changes: Changes) -> EnrolledViews:
+    """Return an object's enrolled views.
 
     Raises
     ------
@@ -106,7 +129,13 @@ def enroll_changed(item: PhotographedObject, changes: Changes) -> tuple[LevelArr
         azimuth_deg = item.photographs[place].azimuth_deg
         views.learn(visit.photograph(*_cut_out(item, place), azimuth_deg).image)
     views.revise()
-    return np.stack([levels[0] for levels in views.levels]), item.azimuth_deg[places]
+    azimuths_deg = item.azimuth_deg[places]
+    cuts = zip(views.segmentations, azimuths_deg.tolist(), strict=True)
+    return EnrolledViews(
+        np.stack([levels[0] for levels in views.levels]),
+        azimuths_deg,
+        tuple(LocalView(cut.crop, cut.mask, deg) for (cut, *_), deg in cuts),
+    )
 
 
 def search_changed(
@@ -115,12 +144,14 @@ def search_changed(
     index: DenseIndex,
     rule: StoppingRule,
     example: PhotographedObject,
+    enrolled: Callable[[str], EnrolledViews],
 ) -> list[SearchResult]:
     """Search for an object, once for each trial.
 
     As on the rig, the first frame is compared with the enrollment's picture, or without one with a view of an enrolled
     object, the ``example``. An enrolled object is also searched for as if it were not enrolled. The rule stays: it is
-    fitted to the searches of all enrolled objects, of which this one is a small part.
+    fitted to the searches of all enrolled objects, of which this one is a small part. ``enrolled`` returns the enrolled
+    views of an object, for the comparison of two leaders.
 
     Raises
     ------
@@ -137,8 +168,8 @@ def search_changed(
         visit = Visit(bench, HARD if hard else MILD, rng)
         first_deg = rng.uniform(0, 360)
         views = ViewsTogether(DESCRIPTOR, empty_table=visit.empty() if changes.picture else None)
-        search = _Search(index, rule)
-        without = None if left_out is None else _Search(left_out, rule)
+        search = _Search(index, rule, enrolled)
+        without = None if left_out is None else _Search(left_out, rule, enrolled)
         same_bench: bool | None = None
         for place in _places(item, first_deg + _STEP_DEG * np.arange(VIEWS, dtype=np.float64)):
             azimuth_deg = item.photographs[place].azimuth_deg
@@ -157,12 +188,13 @@ def search_changed(
 class _Search:
     """A search that continues after its end, to see which object leads."""
 
-    def __init__(self, index: DenseIndex, rule: StoppingRule) -> None:
-        self._session = DenseSession(index, rule, max_views=_MAX_VIEWS)
+    def __init__(self, index: DenseIndex, rule: StoppingRule, enrolled: Callable[[str], EnrolledViews]) -> None:
+        self._session = DenseSession(index, rule, max_views=VIEWS)
         self._names = index.views.object_names
+        self._enrolled = enrolled
         self._leaders: list[str] = []
-        self._end: StopDecision | None = None
-        self._views = VIEWS
+        self._orientations_deg: list[float] = []
+        self._result: SearchResult | None = None
 
     def add(self, views: ViewsTogether, azimuth_deg: float, same_bench: bool) -> None:
         *earlier, levels = views.levels
@@ -173,15 +205,49 @@ class _Search:
             reliable=views.reliable,
             same_bench=like_enrollment(views.segmentations[-1][0].method, same_bench),
         )
+        self._orientations_deg.append(azimuth_deg)
         self._leaders.append(self._names[int(self._session.belief.ranking().object_index[0])])
-        if self._end is None and decision.outcome is not Outcome.CONTINUE:
-            self._end, self._views = decision, len(self._leaders)
+        if self._result is None and decision.outcome is not Outcome.CONTINUE:
+            self._result = self._ended(decision, views)
+
+    def _ended(self, decision: StopDecision, views: ViewsTogether) -> SearchResult:
+        """Return the result of a search that ends with this decision; the last step compares its two leaders."""
+        scores = np.sort(self._session.belief.scores())
+        compared = compare_leaders(
+            self._session.belief,
+            decision.outcome,
+            float(scores[-1] - scores[-2]) if len(scores) > 1 else 0.0,
+            self._orientations_deg,
+            lambda n: _local_view(views, n, self._orientations_deg[n]),
+            self._near,
+            beta=self._session.rule.beta,
+            max_error=self._session.rule.error_rate,
+        )
+        outcome, decided = decision.outcome, decision.object_index
+        if compared is not None:
+            outcome = compared.outcome
+            decided = decided if compared.winner is None else compared.winner
+        return SearchResult(
+            (),
+            outcome,
+            self._names[decided],
+            len(self._leaders),
+            compared is not None,
+            outcome is not decision.outcome,
+        )
+
+    def _near(self, leader: int, azimuths_deg: Sequence[float]) -> list[LocalView]:
+        enrolled = self._enrolled(self._names[leader])
+        return [enrolled.cut_outs[place] for place in near(enrolled.azimuth_deg, azimuths_deg)]
 
     def result(self) -> SearchResult:
-        outcome, decided = Outcome.CONTINUE, self._leaders[-1]
-        if self._end is not None:
-            outcome, decided = self._end.outcome, self._names[self._end.object_index]
-        return SearchResult(tuple(self._leaders), outcome, decided, self._views)
+        assert self._result is not None  # after the last view
+        return replace(self._result, leaders=tuple(self._leaders))
+
+
+def _local_view(views: ViewsTogether, view: int, orientation_deg: float) -> LocalView:
+    likeliest = views.segmentations[view][0]
+    return LocalView(likeliest.crop, likeliest.mask, orientation_deg)
 
 
 def _without(index: DenseIndex, name: str) -> DenseIndex | None:
@@ -205,6 +271,10 @@ def summary(known: dict[str, list[SearchResult]], unknown: dict[str, list[Search
         "decided_right": sum(one.decided == name for name, one in found) / count,
         "decided_wrong": sum(one.decided != name for name, one in found) / count,
         "called_unknown": sum(one.outcome is Outcome.UNKNOWN for _, one in searches) / count,
+        "ambiguous": sum(one.outcome is Outcome.AMBIGUOUS for _, one in searches) / count,
+        "compared": sum(one.compared for _, one in searches) / count,
+        "right_by_comparison": sum(one.by_comparison and one.decided == name for name, one in found) / count,
+        "wrong_by_comparison": sum(one.by_comparison and one.decided != name for name, one in found) / count,
         "mean_views": sum(one.views for _, one in found) / max(1, len(found)),
         "unknown_searches": len(others),
         "unknown_accepted": sum(one.outcome is Outcome.FOUND for one in others) / unknown_count,

@@ -36,9 +36,14 @@ def _levels(images: Iterable[EvaluationImage], condition: Condition) -> LevelArr
 
 
 def _images(dataset: Dataset, j: int, size: tuple[int, int]) -> Iterator[ImageArray]:
-    for photograph in dataset.objects[j].photographs:
-        image = read_photograph(photograph.path, size)
-        if dataset.region is not None:
-            x, y, width, height = dataset.region
-            image = image[y : y + height, x : x + width]
-        yield image
+    for i in range(len(dataset.objects[j].photographs)):
+        yield photograph(dataset, j, i, size)
+
+
+def photograph(dataset: Dataset, j: int, i: int, size: tuple[int, int]) -> ImageArray:
+    """Return the described part of photograph `i` of object `j`; errors as for `enrolled_levels`."""
+    image = read_photograph(dataset.objects[j].photographs[i].path, size)
+    if dataset.region is not None:
+        x, y, width, height = dataset.region
+        image = image[y : y + height, x : x + width]
+    return image

@@ -15,6 +15,8 @@ from hbr.model.views import Views
 Removal = Literal["near", "paper79", "queries"]
 #: Codes of `Runs.outcome`.
 OUTCOMES: Final = (Outcome.CONTINUE, Outcome.FOUND, Outcome.UNKNOWN, Outcome.AMBIGUOUS)
+#: Codes of `Runs.compared`: what a comparison of the two leaders names.
+COMPARED: Final = ("none", "right", "wrong", "ambiguous")
 
 
 @dataclass(frozen=True)
@@ -94,6 +96,9 @@ class Runs:
         Its score per view.
     outcome : int8
         Decision of the stopping rule with the dense filter, as an index of `OUTCOMES`; -1 with the paper's voting.
+    compared : int8
+        Where a search of the dense filter ends, and its two leaders were compared pixel by pixel: an element of
+        `COMPARED`; else -1.
     travelled_deg : float64
         Sum of the rotations since the first view, without signs.
     step_ns : int64
@@ -109,13 +114,20 @@ class Runs:
     best: NDArray[np.int32]
     score: FloatArray
     outcome: NDArray[np.int8]
+    compared: NDArray[np.int8]
     travelled_deg: FloatArray
     step_ns: NDArray[np.int64]
 
     @classmethod
     def blank(cls, methods: int, objects: int, trials: int, views: int) -> "Runs":
         """Return runs without any result."""
-        filled = {"rank": (-1, np.int32), "best": (-1, np.int32), "outcome": (-1, np.int8), "step_ns": (0, np.int64)}
+        filled = {
+            "rank": (-1, np.int32),
+            "best": (-1, np.int32),
+            "outcome": (-1, np.int8),
+            "compared": (-1, np.int8),
+            "step_ns": (0, np.int64),
+        }
         shape = (methods, objects, trials, views)
         return cls(*(np.full(shape, *filled.get(item.name, (np.nan, np.float64))) for item in fields(cls)))
 

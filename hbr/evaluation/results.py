@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from hbr.core.arrays import FloatArray
 from hbr.dense.stopping import Outcome
 from hbr.evaluation.methods import Method
-from hbr.evaluation.protocol import OUTCOMES, Runs
+from hbr.evaluation.protocol import COMPARED, OUTCOMES, Runs
 from hbr.evaluation.statistics import bootstrap_difference, mcnemar_exact, wilson
 
 _BEST: int = 10
@@ -46,9 +46,10 @@ class Stopping:
     """Results of searches with an end: by a decision, or after all views.
 
     The paper's methods end when the margin per view reaches ``margin``; the dense filter ends by the stopping rule that
-    was calibrated on the enrolled views. A hit is a search that found the right object. ``unknown_rate`` and
-    ``ambiguous_rate`` are the shares of searches with these outcomes, ``ended_early`` the share that ended before the
-    last view.
+    was calibrated on the enrolled views. A hit is a search that found the right object. ``unknown_rate``,
+    ``ambiguous_rate`` and ``wrong_rate`` are the shares of searches with these outcomes, ``compared_rate`` the share
+    whose two leaders were compared pixel by pixel, ``compared_right_rate`` the share in which that named the right
+    object, ``ended_early`` the share that ended before the last view.
     """
 
     margin: float
@@ -59,6 +60,9 @@ class Stopping:
     hit_rate_high: float
     unknown_rate: float
     ambiguous_rate: float
+    wrong_rate: float
+    compared_rate: float
+    compared_right_rate: float
     travelled_mean_deg: float
     ended_early: float
 
@@ -217,16 +221,24 @@ def _point(runs: Runs, method: int, n: int) -> Point:
 
 def _stopping(runs: Runs, method: int, least_margin: float, min_views: int) -> Stopping:
     seen = _steps(runs, method)
-    margin, outcome, rank, travelled_deg = (
+    margin, outcome, compared, rank, travelled_deg = (
         part[method][..., seen].reshape(-1, len(seen))
-        for part in (runs.margin, runs.outcome, runs.rank, runs.travelled_deg)
+        for part in (runs.margin, runs.outcome, runs.compared, runs.rank, runs.travelled_deg)
     )
     dense = bool((outcome >= 0).all())
     ends = outcome != OUTCOMES.index(Outcome.CONTINUE) if dense else (margin >= least_margin) & (seen + 1 >= min_views)
     end = np.where(ends.any(axis=1), ends.argmax(axis=1), len(seen) - 1)
     trial = np.arange(len(end))
-    unknown, ambiguous = (outcome[trial, end] == OUTCOMES.index(one) for one in (Outcome.UNKNOWN, Outcome.AMBIGUOUS))
-    hits = int(((rank[trial, end] == 1) & ~unknown & ~ambiguous).sum())
+    step = compared[trial, end]
+    is_right, is_wrong, is_twin = (step == COMPARED.index(one) for one in ("right", "wrong", "ambiguous"))
+    changed = is_right | is_wrong | is_twin
+    unknown, ambiguous = (
+        (outcome[trial, end] == OUTCOMES.index(one)) & ~changed for one in (Outcome.UNKNOWN, Outcome.AMBIGUOUS)
+    )
+    ambiguous |= is_twin
+    named = ~unknown & ~ambiguous
+    right = np.where(changed, is_right, rank[trial, end] == 1) & named
+    hits = int(right.sum())
     return Stopping(
         least_margin,
         float(end.mean()) + 1,
@@ -235,6 +247,9 @@ def _stopping(runs: Runs, method: int, least_margin: float, min_views: int) -> S
         *wilson(hits, len(trial)),
         float(unknown.mean()),
         float(ambiguous.mean()),
+        float((named & ~right).mean()),
+        float((step >= 0).mean()),
+        float(is_right.mean()),
         float(travelled_deg[trial, end].mean()),
         float(ends[:, :-1].any(axis=1).mean()),
     )

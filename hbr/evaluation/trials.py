@@ -16,13 +16,16 @@ from hbr.core.arrays import FloatArray, IndexArray, LevelArray
 from hbr.dense.calibration import calibrate_stopping_rule
 from hbr.dense.filter import Belief, update_belief
 from hbr.dense.index import DenseIndex
+from hbr.dense.leaders import compare_leaders
+from hbr.dense.local_difference import LocalView
 from hbr.dense.next_view import most_informative_rotation
 from hbr.dense.session import DenseSession
-from hbr.dense.stopping import StoppingRule
+from hbr.dense.stopping import Outcome, StoppingRule
 from hbr.descriptors import descriptor
 from hbr.evaluation.draws import generator
 from hbr.evaluation.methods import Method
-from hbr.evaluation.protocol import OUTCOMES, Protocol, Runs, views_of_trial
+from hbr.evaluation.near_twins import LocalPhotographs
+from hbr.evaluation.protocol import COMPARED, OUTCOMES, Protocol, Runs, views_of_trial
 from hbr.model.symmetry import symmetry
 from hbr.model.views import Views
 from hbr.paper.hough import Ranking, retrieve
@@ -64,6 +67,7 @@ def run_object(
     protocol: Protocol,
     *,
     rule: StoppingRule | None = None,
+    photographs: LocalPhotographs | None = None,
     now_ns: Callable[[], int] = lambda: 0,
 ) -> Runs:
     """Search for one object with all methods, in all trials, and return the runs of this object.
@@ -82,6 +86,9 @@ def run_object(
         The settings of the trials.
     rule : StoppingRule, optional
         The rule for methods of the dense filter; default: `rule_of_trial`.
+    photographs : LocalPhotographs, optional
+        The images, with which a search of the dense filter compares its two leaders as on the bench. Without them it
+        keeps its answer.
     now_ns : callable
         Monotonic time, for `Runs.step_ns`.
 
@@ -92,7 +99,7 @@ def run_object(
     """
     if rule is None and any(method.dense for method in methods):
         rule = rule_of_trial(views, protocol)
-    trial = _Trials(object_index, queries, views, protocol, rule, now_ns)
+    trial = _Trials(object_index, queries, views, protocol, rule, now_ns, photographs)
     runs = Runs.blank(len(methods), 1, protocol.trials, protocol.max_views)
     for t in range(protocol.trials):
         draws = trial.draw(t)
@@ -111,7 +118,9 @@ class _Trials:
         protocol: Protocol,
         rule: StoppingRule | None,
         now_ns: Callable[[], int],
+        photographs: LocalPhotographs | None = None,
     ) -> None:
+        self._photographs = photographs
         self._object, self._queries, self._views = object_index, queries, views
         self._protocol, self._rule, self._now_ns = protocol, rule, now_ns
         self._rows = views.of(object_index)
@@ -209,6 +218,7 @@ class _Trials:
         travelled_deg = 0.0
         last = min(self._protocol.max_views, method.views or self._protocol.max_views)
         session = DenseSession(self._index, self._rule, max_views=last)
+        ended = False
         for n in range(last):
             # Views near the newest query leave the model for the earlier queries, too.
             gone = self._rows[~self._keep(np.array(seen)) & self._enrolled[self._rows]]
@@ -227,9 +237,40 @@ class _Trials:
             runs.score[*at, n] = ranking.scores[0]
             runs.margin[*at, n] = ranking.scores[0] - (ranking.scores[1] if len(ranking.scores) > 1 else 0.0)
             runs.outcome[*at, n] = OUTCOMES.index(decision.outcome)
+            if not ended and decision.outcome is not Outcome.CONTINUE:
+                ended = True
+                runs.compared[*at, n] = self._compared(session, seen, measured_deg)
             runs.travelled_deg[*at, n] = travelled_deg
             travelled_deg += abs(float(wrap180(self._azimuth_deg[following] - self._azimuth_deg[seen[-1]])))
             seen.append(following)
+
+    def _compared(self, session: DenseSession, seen: list[int], measured_deg: list[float]) -> int:
+        """Compare the two leaders as on the bench; return what is found, as `Runs.compared`."""
+        photographs, belief, outcome = self._photographs, session.belief, session.decision.outcome
+        if photographs is None:
+            return -1
+        scores = np.sort(belief.scores())
+        keep = self._keep(np.array(seen))
+
+        def enrolled(leader: int, azimuths_deg: Sequence[float]) -> list[LocalView]:
+            own = keep if leader == self._object else self._enrolled[self._views.of(leader)]
+            return photographs.enrolled(leader, np.flatnonzero(own), azimuths_deg)
+
+        compared = compare_leaders(
+            belief,
+            outcome,
+            float(scores[-1] - scores[-2]) if len(scores) > 1 else 0.0,
+            measured_deg,
+            lambda n: photographs.query(self._object, seen[n], measured_deg[n]),
+            enrolled,
+            beta=session.rule.beta,
+            max_error=session.rule.error_rate,
+        )
+        if compared is None:
+            return -1
+        if compared.winner is not None:
+            return COMPARED.index("right" if compared.winner == self._object else "wrong")
+        return COMPARED.index("none" if compared.outcome is outcome else "ambiguous")
 
     def _next_dense(self, method: Method, draws: _Draws, seen: list[int], session: DenseSession) -> int:
         match method.strategy:

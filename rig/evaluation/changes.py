@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Collection
 from dataclasses import asdict
-from functools import partial
+from functools import cache, partial
 from importlib.metadata import version
 from typing import Any
 
@@ -16,6 +16,7 @@ from hbr.dense.stopping import StoppingRule
 from hbr.evaluation.changes import (
     DESCRIPTOR,
     Changes,
+    EnrolledViews,
     SearchResult,
     enroll_changed,
     enrolled_names,
@@ -78,7 +79,8 @@ def run_changes(
 
 def change_rows(results: dict[str, Any]) -> Rows:
     """Return a table of the shares, in percent: of all objects, and of those that are reported alone."""
-    heads = ["change, %", "ranking, N = 1 / 2 / 4", "decided right", "wrong", "called unknown", "unknown accepted"]
+    heads = ["change, %", "ranking, N = 1 / 2 / 4", "decided right", "wrong", "ambiguous", "called unknown"]
+    heads += ["leaders compared", "so right / wrong", "unknown accepted"]
     rows = [_row(results["settings"], results["changed_bench"])]
     if "reported" in results:
         rows.append(_row(results["settings"], results["reported"]))
@@ -92,17 +94,25 @@ def _row(settings: dict[str, Any], found: dict[str, Any]) -> list[str]:
         f"{ranking} of {found['searches']}",
         f"{100 * found['decided_right']:.1f} in {found['mean_views']:.2f} views",
         f"{100 * found['decided_wrong']:.1f}",
+        f"{100 * found['ambiguous']:.1f}",
         f"{100 * found['called_unknown']:.1f}",
+        f"{100 * found['compared']:.1f}",
+        f"{100 * found['right_by_comparison']:.1f} / {100 * found['wrong_by_comparison']:.1f}",
         f"{100 * found['unknown_accepted']:.1f} of {found['unknown_searches']}",
         f"{100 * found['left_out_accepted']:.1f} of {found['left_out_searches']}",
     ]
 
 
 def _enroll(dataset: Dataset, changes: Changes, names: list[str], j: int) -> tuple[LevelArray, NDArray[np.float64]]:
-    item = next(item for item in dataset.objects if item.name == names[j])
-    return enroll_changed(item, changes)
+    found = _enrolled(dataset, changes, names[j])
+    return found.levels, found.azimuth_deg
+
+
+def _enrolled(dataset: Dataset, changes: Changes, name: str) -> EnrolledViews:
+    return enroll_changed(next(item for item in dataset.objects if item.name == name), changes)
 
 
 def _search(dataset: Dataset, changes: Changes, views: Views, rule: StoppingRule, j: int) -> list[SearchResult]:
     example = next(item for item in dataset.objects if item.name == views.object_names[0])
-    return search_changed(dataset.objects[j], changes, DenseIndex(views), rule, example)
+    again = cache(partial(_enrolled, dataset, changes))  # a few objects lead the searches for one
+    return search_changed(dataset.objects[j], changes, DenseIndex(views), rule, example, again)

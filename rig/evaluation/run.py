@@ -6,6 +6,7 @@ from functools import partial
 from hbr.core.arrays import LevelArray
 from hbr.dense.stopping import StoppingRule
 from hbr.evaluation.descriptors import enrolled_levels, query_levels
+from hbr.evaluation.near_twins import LocalPhotographs
 from hbr.evaluation.protocol import Runs
 from hbr.evaluation.trials import rule_of_trial, run_object
 from hbr.model.views import Views
@@ -69,4 +70,14 @@ def _enroll(plan: Plan, j: int) -> LevelArray:
 
 def _search(plan: Plan, views: Views, rule: StoppingRule | None, j: int) -> Runs:
     queries = query_levels(plan.dataset, j, plan.condition, plan.size, plan.protocol.seed)
-    return run_object(j, queries, views, plan.methods, plan.protocol, rule=rule, now_ns=SystemClock().now_ns)
+    photographs = LocalPhotographs(plan.dataset, plan.condition, plan.size, plan.protocol.seed)
+    return run_object(
+        j,
+        queries,
+        views,
+        plan.methods,
+        plan.protocol,
+        rule=rule,
+        photographs=photographs if photographs.possible else None,
+        now_ns=SystemClock().now_ns,
+    )

@@ -13,24 +13,12 @@ from numpy.typing import NDArray
 
 import hbr
 from hbr import Outcome, StopReason
-from hbr.core.angles import wrap360
-from hbr.dense.local_difference import (
-    NEAREST,
-    LocalDecision,
-    LocalView,
-    ViewDifference,
-    chosen_views,
-    compare_objects,
-    poses_of,
-)
+from hbr.dense import leaders
+from hbr.dense.local_difference import LocalView, ViewDifference
 from rig.events.compared import Compared, ComparedView
 from rig.events.events import Identified
 from rig.search.session import DenseSearch, Search
 
-LEADERS: Final = 0.9
-"""Share of the probability that the two leaders have together."""
-TWIN_MARGIN: Final = 0.02
-"""Near twins score nearly the same: with a larger margin, an unknown object is not compared with the two leaders."""
 SHOWN_VIEWS: Final = 3
 TILE_PX: Final = 160
 
@@ -53,10 +41,7 @@ class Comparison:
 def compare_leaders(
     search: Search, answer: Identified, segmentations: Sequence[hbr.Segmentation], leader_views: LeaderViews
 ) -> Comparison | None:
-    """Compare the two leaders of a search that is ambiguous, or that calls near twins unknown; None if it has no two.
-
-    An enrolled twin takes away the lead that the open-set score measures. So an object that fits one of two near twins
-    up to noise is not unknown.
+    """Compare the two leaders of a search (`hbr.dense.leaders`); None if it has no two that are to be compared.
 
     Parameters
     ----------
@@ -74,39 +59,27 @@ def compare_leaders(
     CatalogError
         From ``leader_views``.
     """
-    if not isinstance(search, DenseSearch) or answer.outcome is Outcome.FOUND:
+    if not isinstance(search, DenseSearch):
         return None
-    if answer.outcome is Outcome.UNKNOWN and answer.margin > TWIN_MARGIN:
-        return None
-    belief, names = search.belief, search.belief.index.views.object_names
-    probability = belief.posterior(search.beta).sum(axis=1)
-    order = np.argsort(-probability, kind="stable")[:2]
-    if len(order) < 2 or float(probability[order].sum()) < LEADERS:
-        return None
-    leaders = [int(belief.index.object_index[place]) for place in order]
-    orientations_deg = search.orientations_deg
-    chosen = chosen_views(orientations_deg)
-    queries = [LocalView(segmentations[n].crop, segmentations[n].mask, orientations_deg[n]) for n in chosen]
-    rotations_deg = [tuple(deg - orientations_deg[-1] for deg in poses_of(belief, leader)) for leader in leaders]
-    views = [
-        leader_views(
-            names[leader],
-            [float(wrap360(query.azimuth_deg + added_deg)) for added_deg in rotations for query in queries],
-        )
-        for leader, rotations in zip(leaders, rotations_deg, strict=True)
-    ]
-    if min(map(len, views)) <= NEAREST:
-        return None
-    found = compare_objects(
-        queries,
-        (views[0], views[1]),
-        (rotations_deg[0], rotations_deg[1]),
+    names, orientations_deg = search.belief.index.views.object_names, search.orientations_deg
+    compared = leaders.compare_leaders(
+        search.belief,
+        answer.outcome,
+        answer.margin,
+        orientations_deg,
+        lambda n: LocalView(segmentations[n].crop, segmentations[n].mask, orientations_deg[n]),
+        lambda leader, azimuths_deg: leader_views(names[leader], azimuths_deg),
+        beta=search.beta,
         max_error=search.error_rate,
     )
+    if compared is None:
+        return None
+    found = compared.found
+    first, second = compared.leaders
     event = Compared(
         index=len(orientations_deg) - 1,
-        names=(names[leaders[0]], names[leaders[1]]),
-        winner=None if found.winner is None else names[leaders[found.winner]],
+        names=(names[first], names[second]),
+        winner=None if found.winner is None else names[compared.leaders[found.winner]],
         score=found.score,
         expected=found.expected,
         error_bound=found.error_bound,
@@ -114,35 +87,32 @@ def compare_leaders(
         unexplained=found.unexplained,
         misfit=found.misfit,
         apart=found.apart,
-        views=tuple(ComparedView(chosen[one.view], one.score, one.weight) for one in found.views),
-        azimuths_deg=(_azimuths(views[0]), _azimuths(views[1])),
+        views=tuple(ComparedView(compared.compared[one.view], one.score, one.weight) for one in found.views),
+        azimuths_deg=(_azimuths(compared.views[0]), _azimuths(compared.views[1])),
         picture_bgr=_picture(found.views),
-        leaders=(_pixels(views[0]), _pixels(views[1])),
+        leaders=(_pixels(compared.views[0]), _pixels(compared.views[1])),
     )
-    return Comparison(event, _changes(search, answer.outcome, found, (leaders[0], leaders[1])))
+    return Comparison(event, _changes(search, answer.outcome, compared))
 
 
-def _changes(search: DenseSearch, outcome: Outcome, found: LocalDecision, leaders: tuple[int, int]) -> dict[str, Any]:
+def _changes(search: DenseSearch, outcome: Outcome, compared: leaders.LeaderComparison) -> dict[str, Any]:
     """Return the fields of the answer that the comparison changes."""
     names = search.belief.index.views.object_names
-    if outcome is Outcome.UNKNOWN and not (found.fits and found.twins):
-        return {}
-    if found.winner is not None:
-        winner = leaders[found.winner]
+    if compared.winner is not None:
         return {
-            "name": names[winner],
+            "name": names[compared.winner],
             "outcome": Outcome.FOUND,
-            "possible": (names[winner],),
+            "possible": (names[compared.winner],),
             "reason": StopReason.LOCAL_DIFFERENCE,
-            "confidence": 1.0 - found.error_bound,
+            "confidence": 1.0 - compared.found.error_bound,
             "min_confidence": 1.0 - search.error_rate,
-            **search.pose_fields(winner),
+            **search.pose_fields(compared.winner),
         }
-    if outcome is Outcome.UNKNOWN:
+    if compared.outcome is not outcome:
         return {
-            "name": names[leaders[0]],
-            "outcome": Outcome.AMBIGUOUS,
-            "possible": tuple(names[leader] for leader in leaders),
+            "name": names[compared.leaders[0]],
+            "outcome": compared.outcome,
+            "possible": tuple(names[leader] for leader in compared.leaders),
             "reason": StopReason.LOCAL_DIFFERENCE,
         }
     return {}

@@ -8,7 +8,7 @@ import pytest
 from hbr import DenseIndex, Outcome, next_best_view, update_belief
 from hbr.core.angles import wrap180
 from hbr.evaluation.methods import METHODS, choose_methods
-from hbr.evaluation.protocol import OUTCOMES, Protocol, Runs
+from hbr.evaluation.protocol import COMPARED, OUTCOMES, Protocol, Runs
 from hbr.evaluation.results import contests, method_results
 from hbr.evaluation.trials import _Trials, rule_of_trial, run_object
 from tests.hbr.dense.searches import belief_after
@@ -106,6 +106,13 @@ def test_dense_searches_end_by_the_stopping_rule_and_methods_are_compared() -> N
     assert (stopping.views_mean, stopping.ended_early) == (3, 1.0)
     assert (stopping.hit_rate, stopping.unknown_rate) == (pytest.approx(4 / 6), pytest.approx(1 / 6))
     assert stopping.ambiguous_rate == pytest.approx(1 / 6)
+    assert (stopping.wrong_rate, stopping.compared_rate) == (0, 0)
+    runs.compared[0, 0, :, 2] = COMPARED.index("ambiguous")
+    runs.compared[0, 1, :, 2] = [COMPARED.index(one) for one in ("right", "wrong", "none")]
+    stopping = method_results(runs, methods, margin=10.0)[0].stopping
+    assert (stopping.unknown_rate, stopping.ambiguous_rate) == (0, pytest.approx(4 / 18))
+    assert (stopping.hit_rate, stopping.wrong_rate) == (pytest.approx(13 / 18), pytest.approx(1 / 18))
+    assert (stopping.compared_rate, stopping.compared_right_rate) == (pytest.approx(1 / 3), pytest.approx(1 / 18))
     assert method_results(runs, methods, margin=10.0)[3].stopping.views_mean == 4
     asked = {(c.first, c.first_views, c.second) for c in contests(runs, methods, np.random.default_rng(0))}
     assert {("dense", 3, "dense-90"), ("dense", 2, "dense-mutual")} <= asked

@@ -47,7 +47,7 @@ def test_a_missing_image_leaves_the_answer_as_it_is(tmp_path: Path) -> None:
 @pytest.mark.nightly
 @pytest.mark.timeout(3600)
 def test_near_twins_are_never_confused_in_200_searches() -> None:
-    rows = searches(Namespace(searches=200, views=36, modes="dense", alone=False, seed=0))
+    rows = searches(Namespace(searches=200, views=36, modes="dense", alone=False, seed=0, catalog=None))
     kinds = Counter(kind_of(row) for row in rows)
     assert kinds.keys() <= {"found", "ambiguous"}
     assert kinds["found"] > 120
