@@ -33,6 +33,7 @@ _SIGNATURES: Final[dict[str, tuple[Any, ...]]] = {
     "hbr_support": (
         *[_POINTER] * 3, _INTEGER, _POINTER, _POINTER, _REAL, _REAL, _INTEGER, _POINTER, _INTEGER, _POINTER,
     ),
+    "hbr_png": (_POINTER, *[_INTEGER] * 4, *[_POINTER] * 3),
     "hbr_peak_weights": (_POINTER, _INTEGER, _POINTER),
     "hbr_nearest_view": (*[_POINTER] * 5, _INTEGER, _POINTER, _INTEGER, _POINTER, _POINTER),
     "hbr_rotated": (_POINTER, _POINTER, _INTEGER, *[_POINTER] * 5),
