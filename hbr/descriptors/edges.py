@@ -14,8 +14,11 @@ from hbr.core.arrays import FloatArray, ImageArray, LevelArray
 from hbr.descriptors.base import CompiledDescriptor
 from hbr.descriptors.cosine import WholeCosine
 from hbr.descriptors.shift import Shift
+from hbr.kernels import parts
 from hbr.kernels.calls import Measure
 from hbr.segmentation import CROP_PX, Segmentation, segment
+
+Floats = NDArray[np.float32]
 
 _CELLS: Final = 8
 _DIRECTIONS: Final = 8
@@ -101,18 +104,36 @@ def _histogram(image: ImageArray) -> NDArray[np.float32]:
     small = cv2.resize(image, (_PIXELS, _PIXELS), interpolation=cv2.INTER_AREA)
     levels = cv2.GaussianBlur(np.sqrt(small, dtype=np.float32), (0, 0), _BLUR)
     x, y = cv2.Sobel(levels, cv2.CV_32F, 1, 0), cv2.Sobel(levels, cv2.CV_32F, 0, 1)
+    magnitude, angle = cv2.cartToPolar(*_strongest(x, y))
+    votes = _votes(magnitude, angle)
+    return _normalised((_SHARES @ votes @ _SHARES.T).astype(np.float32, copy=False))
+
+
+def _strongest(x: cv2.typing.MatLike, y: cv2.typing.MatLike) -> tuple[Floats, Floats]:
+    """Return at every pixel the gradient of the channel with the strongest edge."""
+    found = parts.strongest(x, y)
+    if found is not None:
+        return found
     strength = x * x + y * y
-    # at every pixel, use the channel with the strongest edge
     channel = strength.argmax(axis=2)[:, :, None]
-    x, y = (np.take_along_axis(part, channel, axis=2)[:, :, 0] for part in (x, y))
-    magnitude, angle = cv2.cartToPolar(x, y)
-    place = angle * np.float32(_DIRECTIONS / np.pi)
+    own = [np.take_along_axis(part, channel, axis=2)[:, :, 0] for part in (x, y)]
+    return own[0].astype(np.float32, copy=False), own[1].astype(np.float32, copy=False)
+
+
+def _votes(magnitude: cv2.typing.MatLike, angle: cv2.typing.MatLike) -> Floats:
+    """Return the votes of the pixels for the eight directions, float32 (8, h, w)."""
+    scale = np.float32(_DIRECTIONS / np.pi)
+    found = parts.votes(magnitude, angle, scale)
+    if found is not None:
+        return found
+    place = angle * scale
     away = np.abs(place - np.arange(2 * _DIRECTIONS + 1, dtype=np.float32)[:, None, None])
     votes = np.maximum(1 - away, 0, out=away)
     votes = votes[:_DIRECTIONS] + votes[_DIRECTIONS : 2 * _DIRECTIONS]
     votes[0] += np.maximum(place - (2 * _DIRECTIONS - 1), 0)
     votes *= magnitude
-    return _normalised(_SHARES @ votes @ _SHARES.T)
+    shared: Floats = votes
+    return shared
 
 
 def _normalised(cells: NDArray[np.float32]) -> NDArray[np.float32]:

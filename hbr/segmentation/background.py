@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 
 from hbr.core.arrays import FloatArray, ImageArray
 from hbr.core.validation import check_frame
+from hbr.kernels import view
+from hbr.kernels.calls import Addresses
 from hbr.segmentation.evidence import IssueCode
 
 Mask = NDArray[np.bool_]
@@ -31,6 +33,7 @@ _FLOOR: Final = 6.0
 _LOG: Final = np.log(np.arange(256) + _FLOOR).astype(np.float32)
 #: Noise of the logarithm of each grey level.
 _NOISE: Final = (0.35 * 8.0 / (np.arange(256) + _FLOOR)).astype(np.float32)
+_TABLES: Final = Addresses(_LOG, _NOISE)
 #: A pixel agrees if the residual is smaller than this, in logarithms: about 15 % more or less light.
 _AGREES: Final = 0.15
 #: Cells of a 4 x 4 grid at the frame's border; the object is in the middle.
@@ -68,12 +71,15 @@ class Illumination:
 
     def over(self, height: int, width: int) -> Floats:
         """Return the logarithms of the factors for every pixel, float32 (H, W, 3)."""
-        x = ((np.arange(width) + 0.5) / width - 0.5)[None, :, None]
-        y = ((np.arange(height) + 0.5) / height - 0.5)[:, None, None]
-        along, down = (self.slopes[0] + x * self.slopes[1]).astype(np.float32), (y * self.slopes[2]).astype(np.float32)
+        along, down = self.sides(height, width)
         # in long rows: NumPy adds up short ones slowly
-        planes: Floats = along.reshape(1, -1) + np.tile(down.reshape(height, 3), (1, width))
+        planes: Floats = along.reshape(1, -1) + np.tile(down, (1, width))
         return planes.reshape(height, width, 3)
+
+    def sides(self, height: int, width: int) -> tuple[Floats, Floats]:
+        """Return two parts of `over`, whose sum it is: of each column, float32 (W, 3), and of each row, (H, 3)."""
+        x, y = _places(width), _places(height)
+        return (self.slopes[0] + x * self.slopes[1]).astype(np.float32), (y * self.slopes[2]).astype(np.float32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,19 +167,11 @@ class Background:
 
     def difference(self, small: ImageArray) -> Difference:
         """Compare a small frame, as `shrunk` returns it, with the empty-table image."""
-        ratio = _logarithm(small) - self._log
-        slopes = _fit(ratio, self._useful & _useful(small))
-        residual = cv2.split(ratio - Illumination(slopes).over(*ratio.shape[:2]))
-        evenly = (residual[0] + residual[1] + residual[2]) * np.float32(1 / 3)
-        coloured = _largest([cv2.absdiff(part, evenly) for part in residual])
-        # one grey level of noise is a larger share of a dark pixel
-        noise = cv2.LUT(_smallest(cv2.split(cv2.min(small, self._grey_levels))), _NOISE)
-        certain = (coloured > 0.08 + noise) | (evenly > 0.10 + noise) | (evenly < -1.1)
-        possible = (evenly < -0.12) & ~certain
+        slopes = _fit(small, self._log, self._useful & _useful(small))
+        evenly, coloured, certain, possible, agrees = self._planes(small, Illumination(slopes))
         # a shadow is smooth: a fine texture that the table does not have belongs to an object
         grain = (np.abs(cv2.Laplacian(evenly, cv2.CV_32F, ksize=3)) > 0.5).astype(np.float32)
         certain |= possible & (cv2.blur(grain, (5, 5)) > 0.15)
-        agrees = _largest([np.abs(part) for part in residual]) < _AGREES
         shares = np.array([cell.mean() for cell in border_cells(agrees)])
         agreement = float((shares > _CELL_SHARE).mean())
         return Difference(
@@ -182,7 +180,29 @@ class Background:
             possible & ~certain,
             Illumination(-slopes),
             evenly,
-            np.asarray(coloured, np.float32),
+            coloured,
+        )
+
+    def _planes(self, small: ImageArray, illumination: Illumination) -> tuple[Floats, Floats, Mask, Mask, Mask]:
+        """Return the planes of a `Difference`, without the grain, and where the frame agrees with this image."""
+        found = view.compare(
+            small, self._grey_levels, self._log, *illumination.sides(*small.shape[:2]), _TABLES, _AGREES
+        )
+        if found is not None:
+            evenly, coloured, certain, possible, agrees = found
+            return evenly, coloured, certain.view(np.bool_), possible.view(np.bool_), agrees.view(np.bool_)
+        residual = cv2.split(_logarithm(small) - self._log - illumination.over(*small.shape[:2]))
+        evenly = (residual[0] + residual[1] + residual[2]) * np.float32(1 / 3)
+        coloured = np.asarray(_largest([cv2.absdiff(part, evenly) for part in residual]), np.float32)
+        # one grey level of noise is a larger share of a dark pixel
+        noise = cv2.LUT(_smallest(cv2.split(cv2.min(small, self._grey_levels))), _NOISE)
+        sure = (coloured > 0.08 + noise) | (evenly > 0.10 + noise) | (evenly < -1.1)
+        return (
+            evenly,
+            coloured,
+            sure,
+            (evenly < -0.12) & ~sure,
+            _largest([np.abs(part) for part in residual]) < _AGREES,
         )
 
     def shows_same_bench(self, image_bgr: ImageArray) -> bool:
@@ -229,7 +249,10 @@ def shrunk(image_bgr: ImageArray) -> ImageArray:
     scale = SIDE_PX / max(image_bgr.shape[:2])
     if scale < 1:
         size = max(1, round(image_bgr.shape[1] * scale)), max(1, round(image_bgr.shape[0] * scale))
-        image_bgr = cv2.resize(image_bgr, size, interpolation=cv2.INTER_AREA).astype(np.uint8, copy=False)
+        by_kernel = view.shrink(image_bgr, size)
+        if by_kernel is None:
+            by_kernel = cv2.resize(image_bgr, size, interpolation=cv2.INTER_AREA).astype(np.uint8, copy=False)
+        image_bgr = by_kernel
     return cv2.GaussianBlur(image_bgr, (5, 5), 0.8).astype(np.uint8, copy=False)
 
 
@@ -237,6 +260,13 @@ def border_cells(image: NDArray[np.generic]) -> list[NDArray[np.generic]]:
     """Return the 12 cells of a 4 x 4 grid that lie at the border."""
     rows, columns = map(_quarters, image.shape[:2])
     return [image[rows[y] : rows[y + 1], columns[x] : columns[x + 1]] for y, x in _BORDER]
+
+
+@lru_cache
+def _places(side: int) -> FloatArray:
+    """Return the middles of pixels as shares of a side, 0 in its middle, (side, 1)."""
+    places: FloatArray = ((np.arange(side) + 0.5) / side - 0.5)[:, None]
+    return places
 
 
 @lru_cache
@@ -264,8 +294,8 @@ def _smallest(channels: Sequence[cv2.typing.MatLike]) -> cv2.typing.MatLike:
     return cv2.min(cv2.min(channels[0], channels[1]), channels[2])
 
 
-def _fit(ratio: Floats, useful: Mask) -> FloatArray:
-    """Fit a plane to each channel by least squares, repeated without the outliers."""
+def _fit(small: ImageArray, table_log: Floats, useful: Mask) -> FloatArray:
+    """Fit a plane to each channel of the difference of logarithms by least squares, repeated without the outliers."""
     height, width = useful.shape
     keep = useful[2::_EVERY, 2::_EVERY]
     rows, columns = np.nonzero(keep)
@@ -273,7 +303,8 @@ def _fit(ratio: Floats, useful: Mask) -> FloatArray:
         return np.zeros((3, 3))
     x, y = (columns * _EVERY + 2.5) / width - 0.5, (rows * _EVERY + 2.5) / height - 0.5
     basis = np.column_stack([np.ones(len(rows)), x, y])
-    values = ratio[2::_EVERY, 2::_EVERY][keep].astype(np.float64)
+    few = np.s_[2::_EVERY, 2::_EVERY]
+    values = (_LOG[small[few]] - table_log[few])[keep].astype(np.float64)
     slopes = np.zeros((3, 3))
     slopes[0] = np.median(np.ascontiguousarray(values.T), axis=1)
     quarter = len(values) // 4

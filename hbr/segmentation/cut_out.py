@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hbr.core.arrays import ImageArray
+from hbr.kernels import view
 from hbr.segmentation.background import Illumination
 from hbr.segmentation.evidence import Issue, Method
 
@@ -159,6 +160,9 @@ def _square(
         part = image[max(0, y) : y + size, max(0, x) : x + size]
         if any(out):
             part = cv2.copyMakeBorder(part, out[1], out[3], out[0], out[2], border).astype(np.uint8, copy=False)
+        by_kernel = view.average(part, CROP_PX) if part.ndim == 3 else None
+        if by_kernel is not None:
+            return by_kernel
         return cv2.resize(part, (CROP_PX, CROP_PX), interpolation=cv2.INTER_AREA).astype(np.uint8, copy=False)
     shift = (scale - 1) / 2
     move = np.array([[scale, 0, shift - scale * left], [0, scale, shift - scale * top]])

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from hbr.kernels import view
 from hbr.segmentation.background import Mask
 
 Binary = NDArray[np.uint8]
@@ -83,8 +84,9 @@ def _main_parts(mask: Binary, *, framed: bool) -> Binary | None:
 
 def _filled(mask: Binary) -> Mask:
     margin = 12  # so that closing does not see the frame's border as background
-    wide = cv2.copyMakeBorder(mask, margin, margin, margin, margin, cv2.BORDER_CONSTANT)
-    wide = cv2.morphologyEx(wide, cv2.MORPH_CLOSE, _disc(8))
+    wide = cv2.copyMakeBorder(mask, margin, margin, margin, margin, cv2.BORDER_CONSTANT).astype(np.uint8, copy=False)
+    closed = view.closed(wide, _reach(8))
+    wide = cv2.morphologyEx(wide, cv2.MORPH_CLOSE, _disc(8)).astype(np.uint8, copy=False) if closed is None else closed
     contours, _ = cv2.findContours(wide, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     cv2.drawContours(wide, contours, -1, (1,), -1)
     filled: Mask = wide[margin:-margin, margin:-margin] > 0
@@ -94,3 +96,10 @@ def _filled(mask: Binary) -> Mask:
 @lru_cache
 def _disc(radius: int) -> Binary:
     return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1)).astype(np.uint8)
+
+
+@lru_cache
+def _reach(radius: int) -> NDArray[np.int64]:
+    """Return how far each row of the disc reaches to both sides."""
+    reach: NDArray[np.int64] = (_disc(radius).sum(axis=1, dtype=np.int64) - 1) // 2
+    return reach
