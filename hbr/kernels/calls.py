@@ -1,7 +1,9 @@
 """The kernels as functions of arrays. Each returns None without the compiled library: the caller has the reference."""
 
 import ctypes
+import os
 import threading
+from itertools import pairwise
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -9,6 +11,11 @@ from numpy.typing import NDArray
 
 from hbr.core.arrays import FloatArray, ImageArray, IndexArray, LevelArray
 from hbr.kernels.library import address, library
+
+THREADS: Final = min(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1, 4)
+"""Threads that compare a query with the views of a large catalog; more would wait for the memory."""
+_ROWS_OF_A_THREAD: Final = 100_000
+"""Fewer rows take less time than a thread is worth."""
 
 
 class Addresses:
@@ -185,16 +192,29 @@ class PackedRows:
     def bounds(self, query: LevelArray, segments: Segments) -> FloatArray:
         """Return what the similarity of each object's rows to a packed query cannot exceed, (k,)."""
         bounds = np.empty(len(segments.lengths))
-        struct = self._segments(segments)
+        threads = max(1, min(THREADS, len(self) // _ROWS_OF_A_THREAD))
+        limits = [len(bounds) * i // threads for i in range(threads + 1)]
+        parts = [(query, segments, bounds, *part) for part in pairwise(limits)]
+        others = [threading.Thread(target=self._store_bounds, args=part) for part in parts[1:]]
+        for thread in others:
+            thread.start()
+        self._store_bounds(*parts[0])
+        for thread in others:
+            thread.join()
+        return bounds
+
+    def _store_bounds(self, query: LevelArray, segments: Segments, bounds: FloatArray, first: int, last: int) -> None:
+        """Store the bounds of the objects from the first to the last; the interpreter is free meanwhile."""
+        some = segments._replace(begin=segments.begin[first:last], lengths=segments.lengths[first:last])
+        struct = self._segments(some)
         self._library.hbr_bounds(
             self._by_address,
             address(query),
             *self._at,
             address(self.squares),
             ctypes.addressof(struct),
-            address(bounds),
+            address(bounds[first:last]),
         )
-        return bounds
 
     def nearest(self, query: LevelArray, segments: Segments, kept: int) -> IndexArray:
         """Return the objects with the most similar views, ascending (kept,); of equal ones, the first."""

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 import hbr
 from hbr.dense.index import DenseIndex
 from hbr.dense.next_view import strongest
+from hbr.kernels import calls, library, without_library
 from hbr.kernels import compile as compiling
-from hbr.kernels import library, without_library
 from hbr.kernels.library import load
 from hbr.paper.hough import Extension
 from tests.fuzzing import examples
@@ -179,7 +179,12 @@ def test_the_nearest_objects_are_those_of_the_reference(counts: list[int], kept:
         reference = DenseIndex(views)
         best, nearest = reference.best(query), reference.nearest(query, min(kept, len(counts)))
     np.testing.assert_array_equal(index.nearest(query, min(kept, len(counts))), nearest)
-    assert (index.bounds(query) >= np.square(np.square(best)).astype(np.float32)).all()
+    bounds = index.bounds(query)
+    assert (bounds >= np.square(np.square(best)).astype(np.float32)).all()
+    with pytest.MonkeyPatch.context() as settings:
+        settings.setattr(calls, "THREADS", 3)
+        settings.setattr(calls, "_ROWS_OF_A_THREAD", 1)
+        np.testing.assert_array_equal(index.bounds(query), bounds)
     shuffled = rng.permutation(len(counts))[: (len(counts) + 1) // 2]
     some = index.only(np.sort(shuffled))
     np.testing.assert_array_equal(some.best(query), best[np.sort(shuffled)])
