@@ -33,7 +33,6 @@ _SIGNATURES: Final[dict[str, tuple[Any, ...]]] = {
     "hbr_support": (
         *[_POINTER] * 3, _INTEGER, _POINTER, _POINTER, _REAL, _REAL, _INTEGER, _POINTER, _INTEGER, _POINTER,
     ),
-    "hbr_png": (_POINTER, *[_INTEGER] * 4, *[_POINTER] * 3),
     "hbr_shrink": (_POINTER, *[_INTEGER] * 4, _POINTER, _POINTER),
     "hbr_average": (_POINTER, *[_INTEGER] * 3, *[_POINTER] * 3, _INTEGER, *[_POINTER] * 4),
     "hbr_difference": (*[_POINTER] * 3, _INTEGER, _INTEGER, *[_POINTER] * 3, ctypes.c_float, *[_POINTER] * 5),

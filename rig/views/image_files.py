@@ -15,7 +15,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hbr.kernels.png import png as kernel_png
 from rig.core import files
 from rig.core.errors import CatalogError, UsageError
 from rig.views import jpeg_files
@@ -31,9 +30,8 @@ MAX_PIXELS: Final = 100_000_000
 _PNG: Final = b"\x89PNG\r\n\x1a\n"
 _JPEG: Final = b"\xff\xd8\xff"
 
-# What the kernel does, for computers without it: the fastest lossless settings for camera frames, with nearly the
-# smallest files, because noise hides the repetitions that the other strategies search for. OpenCV before 4.12 chooses
-# the filter itself.
+# The fastest lossless settings for camera frames, with nearly the smallest files: noise hides the repetitions that the
+# other strategies search for. OpenCV before 4.12 chooses the filter itself.
 PNG_SETTINGS: Final = [
     cv2.IMWRITE_PNG_STRATEGY,
     cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY,
@@ -56,9 +54,6 @@ def encode(image_bgr: NDArray[np.uint8]) -> bytes:
         )
     if max(image_bgr.shape) > MAX_SIDE or image_bgr.shape[0] * image_bgr.shape[1] > MAX_PIXELS:
         raise UsageError(f"an image of shape {image_bgr.shape} cannot be stored", next_step="store a smaller image")
-    by_kernel = kernel_png(image_bgr)
-    if by_kernel is not None:
-        return by_kernel
     encoded, png = cv2.imencode(".png", np.ascontiguousarray(image_bgr), PNG_SETTINGS)
     if not encoded:
         raise UsageError(
