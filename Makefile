@@ -8,7 +8,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 
 LIBRARY := hbr/kernels/_kernels.so
 
-.PHONY: demo web test test-nightly test-kills test-web kernel-test fuzz lint docs wheel bench lock clean test-servers help
+.PHONY: FORCE demo web test test-nightly test-kills test-web kernel-test fuzz lint docs wheel bench lock clean test-servers help
 
 help:
 	@echo "make demo   enroll and find objects on the simulated bench, and write rig-demo/report.html"
@@ -99,8 +99,11 @@ $(READY): requirements.lock pyproject.toml
 	@touch $@
 
 # Compiled kernels, if there is a C compiler; NumPy does their work without (docs/decisions/0040).
-$(LIBRARY): $(wildcard hbr/kernels/*.[ch] hbr/kernels/compile.py) | $(READY)
+# Whether it is current, its digest of the sources says: times do not, if a file was removed.
+$(LIBRARY): FORCE | $(READY)
 	@$(BIN)/python hbr/kernels/compile.py
+
+FORCE:
 
 clean:
 	rm -rf $(LIBRARY) .venv .tools rig-demo site dist .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

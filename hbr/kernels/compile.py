@@ -1,5 +1,7 @@
 """Compile the kernels, if there is a C compiler: ``python hbr/kernels/compile.py``. Only the standard library is used.
 
+A library that was compiled from the present sources stays.
+
 The build of the wheel calls it (`hatch_build.py`), and so does ``make``. Without a compiler NumPy does the work.
 """
 
@@ -25,8 +27,8 @@ def sources(folder: Path = FOLDER) -> list[Path]:
 
 
 def sources_digest(folder: Path = FOLDER) -> str:
-    """Return the SHA-256 of the C files."""
-    found = sha256()
+    """Return the SHA-256 of the C files and the compiler's options."""
+    found = sha256(FLAGS.encode())
     for path in sources(folder):
         found.update(path.name.encode() + b"\0" + path.read_bytes())
     return found.hexdigest()
@@ -64,6 +66,11 @@ def compile_kernels(output: Path = LIBRARY) -> str | None:
         new.unlink(missing_ok=True)
 
 
-if __name__ == "__main__":
+def is_current(library: Path = LIBRARY) -> bool:
+    """Return whether a library was compiled from the present sources beside it."""
+    return library.exists() and sources_digest(library.parent).encode() in library.read_bytes()
+
+
+if __name__ == "__main__" and not is_current():
     machine = compile_kernels()
     print("No C compiler works: NumPy does the work of the kernels." if machine is None else f"Compiled for {machine}.")

@@ -240,8 +240,8 @@ def test_every_processor_computes_the_same_bits(
         ]
 
 
-@pytest.mark.parametrize("state", ["intact", "missing", "damaged", "of other sources"])
-def test_library_is_used_only_if_it_fits(state: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("state", ["intact", "missing", "damaged", "of other sources", "of more sources"])
+def test_library_is_used_and_kept_only_if_it_fits(state: str, tmp_path: Path) -> None:
     path = Path(copytree(compiling.FOLDER, tmp_path / "kernels")) / compiling.LIBRARY.name
     match state:
         case "missing":
@@ -251,7 +251,11 @@ def test_library_is_used_only_if_it_fits(state: str, tmp_path: Path) -> None:
             path.write_bytes(b"\x7fELF" + bytes(1000))
         case "of other sources":
             (path.parent / "cedd.c").write_text("/* changed */")
-    assert (load(path) is not None) == (state == "intact" and load(compiling.LIBRARY) is not None)
+        case "of more sources":
+            (path.parent / "cedd.c").unlink()
+    fits = state == "intact" and load(compiling.LIBRARY) is not None
+    assert (load(path) is not None) == fits
+    assert compiling.is_current(path) == fits
 
 
 def test_environment_switches_the_library_off() -> None:
