@@ -34,114 +34,169 @@ EXPORT FOR_EVERY_PROCESSOR void hbr_shrink(const uint8_t *image, int64_t stride,
 }
 
 /* Average by area from a square of `size` pixels to one of `side`, with the sums of cv2.INTER_AREA: first along each
-   row, then over the rows. A pixel takes `count` pixels from `first` on with `weights` (side, most), the same in both
-   directions. `pixels` holds 4 * size floats, `line` and `sums` 4 * side each. */
+   row, then over the rows. A pixel takes `most` pixels from `first` on with `weights` (side, most), the same in both
+   directions; some weights are 0. `pixels` holds 3 * size + 1 floats, because three channels are read as
+   four; `line` and `sums` hold 4 * side floats each. */
+typedef float float4 __attribute__((vector_size(16)));
+
 EXPORT FOR_EVERY_PROCESSOR void hbr_average(const uint8_t *image, int64_t stride, int64_t size, int64_t side,
-                                            const int64_t *first, const int64_t *count, const float *weights,
-                                            int64_t most, float *pixels, float *line, float *sums, uint8_t *out) {
+                                            const int64_t *first, const float *weights, int64_t most, float *pixels,
+                                            float *line, float *sums, uint8_t *out) {
     int64_t ready = -1; /* the row of which `line` has the averages */
     for (int64_t y = 0; y < side; y++) {
         for (int64_t i = 0; i < 4 * side; i++) sums[i] = 0;
-        for (int64_t k = 0; k < count[y]; k++) {
+        for (int64_t k = 0; k < most; k++) {
             const int64_t row = first[y] + k;
+            const float share = weights[y * most + k];
+            if (share == 0) continue;
             if (row != ready) {
-                const uint8_t *from = image + row * stride;
-                for (int64_t i = 0; i < size; i++)
-                    for (int64_t c = 0; c < 3; c++) pixels[4 * i + c] = from[3 * i + c];
+                for (int64_t i = 0; i < 3 * size; i++) pixels[i] = image[row * stride + i];
                 for (int64_t x = 0; x < side; x++) {
-                    float four[4] = {0, 0, 0, 0};
-                    const float *pixel = pixels + 4 * first[x], *weight = weights + x * most;
-                    for (int64_t j = 0; j < count[x]; j++, pixel += 4)
-                        for (int64_t c = 0; c < 4; c++) four[c] += pixel[c] * weight[j];
-                    for (int64_t c = 0; c < 4; c++) line[4 * x + c] = four[c];
+                    const float *pixel = pixels + 3 * first[x];
+                    const float *weight = weights + x * most;
+                    float4 sum = {0, 0, 0, 0};
+                    for (int64_t j = 0; j < most; j++, pixel += 3) {
+                        float4 four;
+                        __builtin_memcpy(&four, pixel, sizeof four);
+                        sum += four * weight[j];
+                    }
+                    __builtin_memcpy(line + 4 * x, &sum, sizeof sum);
                 }
                 ready = row;
             }
-            const float weight = weights[y * most + k];
-            for (int64_t i = 0; i < 4 * side; i++) sums[i] += line[i] * weight;
+            for (int64_t i = 0; i < 4 * side; i++) sums[i] += line[i] * share;
         }
         for (int64_t x = 0; x < side; x++, out += 3)
             for (int64_t c = 0; c < 3; c++) out[c] = rounded(sums[4 * x + c]);
     }
 }
 
-struct difference_tables {
-    const float *logarithm; /* (256) */
-    const float *noise;     /* (256) */
-};
-
 PART float largest(float a, float b) { return a > b ? a : b; }
 PART float absolute(float a) { return a < 0 ? -a : a; }
 
-/* Compare a small frame with the empty-table image: (height, width, 3) -> `evenly`, `coloured` (height, width), and as
-   0 or 1 the pixels that are certain, possible, and in agreement. `along` (3 width) and `down` (3 height) are the parts
-   of the planes that the illumination adds. */
-EXPORT FOR_EVERY_PROCESSOR void hbr_difference(const uint8_t *small, const uint8_t *table, const float *table_log,
-                                               int64_t height, int64_t width, const float *along, const float *down,
-                                               const struct difference_tables *tables, float agrees_below,
-                                               float *evenly, float *coloured, uint8_t *certain, uint8_t *possible,
-                                               uint8_t *agrees) {
-    for (int64_t y = 0; y < height; y++) {
+/* Compare the logarithms of a small frame with those of the empty-table image: (height, width, 3) -> `evenly`, `coloured`
+   (height, width), and as 0 or 1 the pixels that are certain, possible, and in agreement. `along` (3 width) and `down`
+   (3 height) are the parts of the planes that the illumination adds, `noise` (256) is that of each level. `line` holds 8
+   floats for each column. */
+EXPORT FOR_EVERY_PROCESSOR void hbr_difference(const uint8_t *small, const uint8_t *table, const float *logarithm,
+                                               const float *table_log, int64_t height, int64_t width,
+                                               const float *along, const float *down, const float *noise,
+                                               float agrees_below, float *line, float *evenly, float *coloured,
+                                               uint8_t *certain, uint8_t *possible, uint8_t *agrees) {
+    float *rest = line, *tile = line + 3 * width, *grain = line + 6 * width;
+    uint8_t *darker = (uint8_t *)(line + 7 * width);
+    for (int64_t y = 0; y < height; y++, down += 3) {
+        for (int64_t x = 0; x < width; x++)
+            for (int64_t c = 0; c < 3; c++) tile[3 * x + c] = down[c];
+#pragma GCC ivdep
+        for (int64_t i = 0; i < 3 * width; i++) rest[i] = (logarithm[i] - table_log[i]) - (along[i] + tile[i]);
+#pragma GCC ivdep
+        for (int64_t i = 0; i < 3 * width; i++) darker[i] = small[i] < table[i] ? small[i] : table[i];
         for (int64_t x = 0; x < width; x++) {
-            const int64_t at = y * width + x;
-            float rest[3], low = 0;
-            uint8_t darkest = 255;
-            for (int64_t c = 0; c < 3; c++) {
-                const uint8_t a = small[3 * at + c], b = table[3 * at + c];
-                rest[c] = (tables->logarithm[a] - table_log[3 * at + c]) - (along[3 * x + c] + down[3 * y + c]);
-                low = largest(low, absolute(rest[c]));
-                darkest = a < darkest ? a : darkest;
-                darkest = b < darkest ? b : darkest;
-            }
-            const float mean = ((rest[0] + rest[1]) + rest[2]) * (1.0f / 3.0f);
-            const float away = largest(largest(absolute(rest[0] - mean), absolute(rest[1] - mean)),
-                                       absolute(rest[2] - mean));
-            const float noise = tables->noise[darkest];
-            evenly[at] = mean;
-            coloured[at] = away;
-            certain[at] = (away > 0.08f + noise) | (mean > 0.10f + noise) | (mean < -1.1f);
-            possible[at] = (mean < -0.12f) & !certain[at];
-            agrees[at] = low < agrees_below;
+            const uint8_t b = darker[3 * x], g = darker[3 * x + 1], r = darker[3 * x + 2], bg = b < g ? b : g;
+            grain[x] = noise[bg < r ? bg : r];
+        }
+#pragma GCC ivdep
+        for (int64_t x = 0; x < width; x++) {
+            const float b = rest[3 * x], g = rest[3 * x + 1], r = rest[3 * x + 2];
+            const float mean = ((b + g) + r) * (1.0f / 3.0f);
+            evenly[x] = mean;
+            coloured[x] = largest(largest(absolute(b - mean), absolute(g - mean)), absolute(r - mean));
+            tile[x] = largest(largest(absolute(b), absolute(g)), absolute(r));
+        }
+#pragma GCC ivdep
+        for (int64_t x = 0; x < width; x++) {
+            const int sure = (coloured[x] > 0.08f + grain[x]) | (evenly[x] > 0.10f + grain[x]) | (evenly[x] < -1.1f);
+            certain[x] = (uint8_t)sure;
+            possible[x] = (evenly[x] < -0.12f) & !sure;
+            agrees[x] = tile[x] < agrees_below;
+        }
+        small += 3 * width, table += 3 * width, logarithm += 3 * width, table_log += 3 * width;
+        evenly += width, coloured += width, certain += width, possible += width, agrees += width;
+    }
+}
+
+/* Grow a mask of 0 and 1 by a symmetric disc, whose rows reach `reach[j]` pixels to both sides, j = 0 .. 2 radius. What
+   passes an end of a row comes to the next one: the caller has a margin. `near` and `far` hold a mask each. */
+PART void grow(int64_t height, int64_t width, const int64_t *reach, int64_t radius, uint8_t *near, uint8_t *far,
+               uint8_t *out) {
+    const int64_t n = height * width;
+    for (int64_t i = 0; i < n; i++) out[i] = 0;
+    for (int64_t k = 0; k <= radius; k++) {
+        if (k) { /* one pixel further to both sides */
+            far[0] = near[0] | near[1];
+#pragma GCC ivdep
+            for (int64_t i = 1; i < n - 1; i++) far[i] = near[i - 1] | near[i] | near[i + 1];
+            far[n - 1] = near[n - 2] | near[n - 1];
+            uint8_t *other = near;
+            near = far;
+            far = other;
+        }
+        for (int64_t j = -radius; j <= radius; j++) {
+            if (reach[j + radius] != k) continue;
+            const int64_t shift = j * width, from = shift < 0 ? -shift : 0, to = shift < 0 ? n : n - shift;
+#pragma GCC ivdep
+            for (int64_t i = from; i < to; i++) out[i] |= near[i + shift];
         }
     }
 }
 
-/* The largest (or smallest) value of 0 and 1 within a symmetric disc; pixels outside the image do not count. Rows of the
-   disc reach `reach[k]` pixels to both sides, k = 0 .. 2 radius. `spread` holds radius + 1 rows for each row. */
-PART void morph(const uint8_t *mask, int64_t height, int64_t width, const int64_t *reach, int64_t radius, int grows,
-                uint8_t *spread, uint8_t *out) {
-    const int64_t rows = radius + 1;
-    for (int64_t y = 0; y < height; y++) {
-        uint8_t *wide = spread + y * rows * width;
-        for (int64_t x = 0; x < width; x++) wide[x] = mask[y * width + x] ^ !grows;
-        for (int64_t k = 1; k <= radius; k++) { /* one pixel further to both sides */
-            const uint8_t *before = wide + (k - 1) * width;
-            uint8_t *now = wide + k * width;
-            if (width == 1) {
-                now[0] = before[0];
-                continue;
-            }
-            now[0] = before[0] | before[1];
-            for (int64_t x = 1; x < width - 1; x++) now[x] = before[x - 1] | before[x] | before[x + 1];
-            now[width - 1] = before[width - 2] | before[width - 1];
-        }
-    }
-    for (int64_t y = 0; y < height; y++) {
-        uint8_t *to = out + y * width;
-        for (int64_t x = 0; x < width; x++) to[x] = 0;
-        for (int64_t k = 0; k <= 2 * radius; k++) {
-            const int64_t row = y + k - radius;
-            if (row < 0 || row >= height) continue;
-            const uint8_t *wide = spread + (row * rows + reach[k]) * width;
-            for (int64_t x = 0; x < width; x++) to[x] |= wide[x];
-        }
-        for (int64_t x = 0; x < width; x++) to[x] ^= !grows;
-    }
-}
-
-/* Close a mask of 0 and 1 with a disc: grow it, then shrink it. */
+/* Close a mask of 0 and 1 with a disc: grow it, then grow what is left. The mask has a margin of zeros that is wider than
+   the disc's radius. `work` holds three masks. */
 EXPORT FOR_EVERY_PROCESSOR void hbr_closed(const uint8_t *mask, int64_t height, int64_t width, const int64_t *reach,
-                                           int64_t radius, uint8_t *spread, uint8_t *grown, uint8_t *out) {
-    morph(mask, height, width, reach, radius, 1, spread, grown);
-    morph(grown, height, width, reach, radius, 0, spread, out);
+                                           int64_t radius, uint8_t *work, uint8_t *out) {
+    const int64_t n = height * width;
+    uint8_t *near = work, *far = work + n, *grown = work + 2 * n;
+    for (int64_t i = 0; i < n; i++) near[i] = mask[i];
+    grow(height, width, reach, radius, near, far, grown);
+    for (int64_t i = 0; i < n; i++) near[i] = !grown[i];
+    grow(height, width, reach, radius, near, far, out);
+    for (int64_t i = 0; i < n; i++) out[i] = !out[i];
+}
+
+#define REACH 7 /* pixels that the blur of a mask reaches to each side */
+
+/* Where a row or column is mirrored beyond its ends, without the end itself. */
+PART int64_t mirrored(int64_t at, int64_t side) {
+    at = at < 0 ? -at : at;
+    return at < side ? at : 2 * side - 2 - at;
+}
+
+/* Put an even grey of this level around the object: (side, side, 3) and its mask (side, side) -> (side, side, 3). The mask
+   is blurred by a Gaussian of sigma 2.5 in fixed point. `line` holds side + 14 bytes, `blurred` side * side values. */
+EXPORT FOR_EVERY_PROCESSOR void hbr_surround(const uint8_t *crop, const uint8_t *mask, int64_t side, int64_t level,
+                                             uint8_t *line, uint16_t *blurred, uint8_t *out) {
+    static const uint16_t share[REACH + 1] = {40, 38, 30, 20, 11, 6, 2, 1}; /* of 256, from the middle on */
+    const float ground = (float)level;
+    for (int64_t y = 0; y < side; y++) {
+        for (int64_t x = 0; x < side; x++) line[x + REACH] = mask[y * side + x];
+        for (int64_t k = 1; k <= REACH; k++) {
+            line[REACH - k] = mask[y * side + mirrored(-k, side)];
+            line[side - 1 + REACH + k] = mask[y * side + mirrored(side - 1 + k, side)];
+        }
+        uint16_t *to = blurred + y * side;
+        const uint8_t *middle = line + REACH;
+#pragma GCC ivdep
+        for (int64_t x = 0; x < side; x++) {
+            uint16_t sum = (uint16_t)(share[0] * middle[x]);
+            for (int64_t k = 1; k <= REACH; k++) sum = (uint16_t)(sum + share[k] * (middle[x - k] + middle[x + k]));
+            to[x] = sum;
+        }
+    }
+    for (int64_t y = 0; y < side; y++) {
+        const uint16_t *rows[2 * REACH + 1];
+        for (int64_t k = -REACH; k <= REACH; k++) rows[k + REACH] = blurred + mirrored(y + k, side) * side;
+#pragma GCC ivdep
+        for (int64_t x = 0; x < side; x++) {
+            uint32_t sum = (uint32_t)share[0] * rows[REACH][x];
+            for (int64_t k = 1; k <= REACH; k++)
+                sum += share[k] * ((uint32_t)rows[REACH - k][x] + rows[REACH + k][x]);
+            line[x] = (uint8_t)((sum + (1 << 15)) >> 16);
+        }
+        for (int64_t x = 0; x < side; x++, crop += 3, out += 3) {
+            const float weight = (float)line[x] * (1.0f / 255.0f), rest = 1.0f - weight;
+            const float sum = weight + rest + 1e-5f, even = ground * rest;
+            for (int64_t c = 0; c < 3; c++) out[c] = rounded(((float)crop[c] * weight + even) / sum);
+        }
+    }
 }

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hbr.core.arrays import ImageArray
-from hbr.kernels.calls import Addresses
 from hbr.kernels.library import address, library
 
 Floats = NDArray[np.float32]
@@ -52,12 +51,11 @@ class _Taps:
                 weights.append(min(min(end - last, 1.0), width) / width)
             rows.append((first, weights))
         self.most = max(len(weights) for _, weights in rows)
-        self._first = np.array([first for first, _ in rows], np.int64)
-        self._count = np.array([len(weights) for _, weights in rows], np.int64)
+        self._first = np.array([min(first, size - self.most) for first, _ in rows], np.int64)
         self._weights = np.zeros((side, self.most), np.float32)
-        for row, (_, weights) in zip(self._weights, rows, strict=True):
-            row[: len(weights)] = weights
-        self.addresses = address(self._first), address(self._count), address(self._weights)
+        for row, at, (first, weights) in zip(self._weights, self._first, rows, strict=True):
+            row[first - at : first - at + len(weights)] = weights
+        self.addresses = address(self._first), address(self._weights)
 
 
 _taps = lru_cache(maxsize=512)(_Taps)
@@ -72,22 +70,33 @@ def average(image: ImageArray, side: int) -> ImageArray | None:
     if image.strides[1:] != (3, 1):
         image = np.ascontiguousarray(image)
     taps = _taps(size, side)
-    floats, out = np.zeros(4 * (size + 2 * side), np.float32), np.empty((side, side, 3), np.uint8)
+    floats, out = np.zeros(8 * side + 3 * size + 1, np.float32), np.empty((side, side, 3), np.uint8)
     start = address(floats)
     found.hbr_average(
         address(image), image.strides[0], size, side, *taps.addresses, taps.most,
-        start, start + 16 * size, start + 16 * (size + side), address(out),
+        start + 32 * side, start, start + 16 * side, address(out),
     )  # fmt: skip
+    return out
+
+
+def surround(crop: ImageArray, mask: Bytes, level: int) -> ImageArray | None:
+    """Return a square crop with an even grey of this level around the object, as `Segmentation.alone` is."""
+    found = library()
+    side = len(crop)
+    if found is None or crop.shape != (side, side, 3) or mask.shape != (side, side):
+        return None
+    crop, mask = np.ascontiguousarray(crop), np.ascontiguousarray(mask)
+    blurred, line, out = np.empty(side * side, np.uint16), np.empty(side + 14, np.uint8), np.empty_like(crop)
+    found.hbr_surround(address(crop), address(mask), side, level, address(line), address(blurred), address(out))
     return out
 
 
 def compare(
     small: ImageArray,
     table: ImageArray,
-    table_log: Floats,
-    along: Floats,
-    down: Floats,
-    tables: Addresses,
+    logarithms: tuple[Floats, Floats],
+    sides: tuple[Floats, Floats],
+    noise: Floats,
     agrees_below: float,
 ) -> tuple[Floats, Floats, Bytes, Bytes, Bytes] | None:
     """Compare a small frame with an empty-table image, as `hbr.segmentation.background.Background.difference` does.
@@ -98,28 +107,28 @@ def compare(
     if found is None:
         return None
     height, width = small.shape[:2]
-    small, table = np.ascontiguousarray(small), np.ascontiguousarray(table)
+    arrays = [np.ascontiguousarray(one) for one in (small, table, *logarithms, *sides, noise)]
+    own = [address(one) for one in arrays]
     floats, masks = np.empty((2, height, width), np.float32), np.empty((3, height, width), np.uint8)
+    line = np.empty(8 * width, np.float32)
     plane, start, masked = 4 * height * width, address(floats), address(masks)
     found.hbr_difference(
-        address(small), address(table), address(table_log), height, width, address(along), address(down),
-        tables.address, agrees_below, start, start + plane, *(masked + k * height * width for k in range(3)),
+        *own[:4], height, width, *own[4:], agrees_below, address(line),
+        start, start + plane, *(masked + k * height * width for k in range(3)),
     )  # fmt: skip
     return floats[0], floats[1], masks[0], masks[1], masks[2]
 
 
 def closed(mask: Bytes, reach: NDArray[np.int64]) -> Bytes | None:
-    """Return a mask of 0 and 1 after morphological closing with a disc whose rows reach so far to both sides."""
+    """Return a mask of 0 and 1 after morphological closing with a disc whose rows reach so far to both sides.
+
+    The mask has a margin of zeros that is wider than the disc's radius.
+    """
     found = library()
     if found is None:
         return None
     height, width = mask.shape
-    radius = len(reach) // 2
     mask = np.ascontiguousarray(mask)
-    spread, out = np.empty((height, radius + 1, width), np.uint8), np.empty((2, height, width), np.uint8)
-    start = address(out)
-    found.hbr_closed(
-        address(mask), height, width, address(reach), radius, address(spread), start, start + height * width
-    )
-    closed: Bytes = out[1]
-    return closed
+    work, out = np.empty((3, height, width), np.uint8), np.empty((height, width), np.uint8)
+    found.hbr_closed(address(mask), height, width, address(reach), len(reach) // 2, address(work), address(out))
+    return out

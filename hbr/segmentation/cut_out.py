@@ -87,8 +87,11 @@ class Segmentation:
         """The crop with an even grey instead of the background, half as bright as the object, uint8 (160, 160, 3)."""
         if self.box is None:
             return self.crop
-        share = cv2.GaussianBlur(self.mask, (0, 0), 2.5)
         level = _SURROUND * float(np.mean(cv2.mean(self.crop, mask=(self.mask > 127).astype(np.uint8))[:3]))
+        by_kernel = view.surround(self.crop, self.mask, round(level))
+        if by_kernel is not None:
+            return by_kernel
+        share = cv2.GaussianBlur(self.mask, (0, 0), 2.5)
         ground = np.full_like(self.crop, round(level))
         weight = share.astype(np.float32) * np.float32(1 / 255)
         return cv2.blendLinear(self.crop, ground, weight, 1 - weight).astype(np.uint8, copy=False)

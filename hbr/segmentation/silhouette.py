@@ -79,17 +79,20 @@ def _main_parts(mask: Binary, *, framed: bool) -> Binary | None:
     near = (x < x[largest] + w[largest] + 5) & (x[largest] < x + w + 5)
     near &= (y < y[largest] + h[largest] + 5) & (y[largest] < y + h + 5)
     keep = (inner > _PART * inner[largest]) & (near if framed else True)
-    return np.isin(labels, 1 + np.flatnonzero(keep)).astype(np.uint8)
+    chosen = 1 + np.flatnonzero(keep)
+    return (labels == chosen[0] if len(chosen) == 1 else np.isin(labels, chosen)).view(np.uint8)
 
 
 def _filled(mask: Binary) -> Mask:
     margin = 12  # so that closing does not see the frame's border as background
-    wide = cv2.copyMakeBorder(mask, margin, margin, margin, margin, cv2.BORDER_CONSTANT).astype(np.uint8, copy=False)
-    closed = view.closed(wide, _reach(8))
-    wide = cv2.morphologyEx(wide, cv2.MORPH_CLOSE, _disc(8)).astype(np.uint8, copy=False) if closed is None else closed
-    contours, _ = cv2.findContours(wide, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    cv2.drawContours(wide, contours, -1, (1,), -1)
-    filled: Mask = wide[margin:-margin, margin:-margin] > 0
+    height, width = mask.shape
+    wide = cv2.copyMakeBorder(mask, margin, margin, margin, margin, cv2.BORDER_CONSTANT)
+    closed = view.closed(wide.astype(np.uint8, copy=False), _reach(8))
+    if closed is None:
+        closed = cv2.morphologyEx(wide, cv2.MORPH_CLOSE, _disc(8)).astype(np.uint8, copy=False)
+    contours, _ = cv2.findContours(closed, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    cv2.drawContours(closed, contours, -1, (1,), -1)
+    filled: Mask = closed[margin : margin + height, margin : margin + width] > 0
     return filled
 
 

@@ -1,6 +1,7 @@
 """The kernels of a view's segmentation and description have the bits of OpenCV and NumPy."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -90,3 +91,14 @@ def test_descriptors_of_the_object_have_the_bits_of_their_references(seed: int) 
     found.mask[:] = picture(rng, CROP_PX, CROP_PX)[:, :, 0]
     for name in ("edges", "colours"):
         np.testing.assert_array_equal(*both(lambda name=name: descriptor(name).describe(found)))
+
+
+@compiled
+@examples(10)
+@given(seeds, st.booleans())
+def test_the_grey_around_the_object_has_the_bits_of_opencv(seed: int, sharp: bool) -> None:
+    rng = np.random.default_rng(seed)
+    crop, mask = picture(rng, CROP_PX, CROP_PX), picture(rng, CROP_PX, CROP_PX)[:, :, 0]
+    mask = np.where(mask > 127, 255, 0).astype(np.uint8) if sharp else mask
+    found = replace(segment(picture(rng, 40, 40), box=(5, 5, 20, 20)), crop=crop, mask=mask)
+    np.testing.assert_array_equal(*both(lambda: replace(found).alone))
