@@ -14,7 +14,7 @@ from dynamixel_sdk import PortHandler
 from rig.core.clock import Clock
 from rig.core.errors import DeviceNotFound
 
-READ_SLICE_S = 0.002
+READ_SLICE_S = 0.005
 """How long one read blocks: limits the delay of a timeout, and keeps the CPU idle."""
 
 BABBLE_GRACE_MS = 50.0
