@@ -16,6 +16,8 @@ from subprocess import TimeoutExpired
 from threading import Thread
 from typing import IO
 
+from rig.core.clock import SystemClock
+
 _SERVER = get_context("forkserver")
 _SERVER.set_forkserver_preload(
     ["tests.programs", "rig.catalog", "rig.cli.main", "rig.plans.enroll", "rig.plans.identify", "sim.bench"]
@@ -86,6 +88,12 @@ class Program:
         if self.returncode is None:
             os.kill(self.pid, number)
 
+    def wait_until_stopped(self) -> None:
+        """Wait until the program has stopped itself, as by SIGSTOP."""
+        stat = Path(f"/proc/{self.pid}/stat")
+        while stat.read_text().rpartition(")")[2].split()[0] != "T":
+            SystemClock().sleep(0.005)
+
     def kill(self) -> None:
         self._process.kill()
 
@@ -120,6 +128,28 @@ class Program:
             if stream is not None:
                 with suppress(BrokenPipeError):
                     stream.close()
+
+
+def stopping_after_view(number: int) -> str:
+    """Return the code of `rig ... --json` that stops itself when it has reported its view of a number."""
+    return f"""
+import os, signal
+from rig.cli.main import main
+from rig.cli.ui.settings import Settings
+
+signal.signal(signal.SIGINT, signal.SIG_IGN)  # as a background job of a script begins
+print_json, views = Settings.print_json, []
+
+def print_and_stop(settings, value):
+    print_json(settings, value)
+    if value["event"] == "accepted":
+        views.append(value)
+        if len(views) == {number}:
+            os.kill(os.getpid(), signal.SIGSTOP)
+
+Settings.print_json = print_and_stop
+main()
+"""
 
 
 def _run(

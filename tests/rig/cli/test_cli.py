@@ -12,7 +12,7 @@ import pytest
 
 from rig.catalog import Catalog
 from rig.core.clock import SystemClock
-from tests.programs import Program
+from tests.programs import Program, stopping_after_view
 
 SMALL = (
     'default_bench = "sim"\n[catalog]\npath = "catalog"\n[camera]\nwidth = 320\nheight = 240\n'
@@ -258,23 +258,19 @@ def test_unknown_bench_and_unknown_command_are_rejected(rig):
     [(signal.SIGINT, 130), (signal.SIGTERM, 143), pytest.param(signal.SIGHUP, 129, marks=pytest.mark.nightly)],
 )
 def test_signals_end_an_enrollment_with_their_exit_code_and_resume_continues_it(rig, number, code):
-    options = ["--views", "18", "--note", "the owner's", "--report", "a b.html", "--yes", "--json"]
-    # as a background job of a script begins
-    ignored = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN); from rig.cli.main import main; main()"
-    process = Program("enroll", "dice", *options, code=ignored)
-    stored = 0
-    for line in process.stdout:
-        stored += json.loads(line)["event"] == "accepted"
-        if stored == 3:
-            process.send_signal(number)
-            break
-    rest, errors = process.communicate(timeout=60)
-    stored += sum(json.loads(line).get("event") == "accepted" for line in rest.splitlines())
+    options = ["--views", "6", "--note", "the owner's", "--report", "a b.html", "--yes", "--json"]
+    process = Program("enroll", "dice", *options, code=stopping_after_view(3))
+    process.wait_until_stopped()
+    process.send_signal(number)
+    process.send_signal(signal.SIGCONT)
+    output, errors = process.communicate(timeout=60)
+    stored = sum(json.loads(line).get("event") == "accepted" for line in output.splitlines())
     assert process.returncode == code
+    assert 3 <= stored < 6
     again = shlex.split(next(line for line in errors.splitlines() if line.startswith("  rig enroll")))
     assert again == ["rig", "enroll", "dice", "--resume", *options]
     resumed = rig(*again[1:])
     assert resumed.exit_code == 0, resumed.stderr
     events = lines(resumed.stdout)
-    assert events[0]["views"] == 18 - stored
-    assert events[-1] == {**events[-1], "event": "enrolled", "views": 18}
+    assert events[0]["views"] == 6 - stored
+    assert events[-1] == {**events[-1], "event": "enrolled", "views": 6}

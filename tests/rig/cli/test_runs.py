@@ -23,7 +23,7 @@ from rig.search.replay import Difference
 from rig.views.object_presence import TableWatcher
 from sim.bench import SimBenchKind
 from sim.objects.shelf import shelf
-from tests.programs import Program
+from tests.programs import Program, stopping_after_view
 
 SMALL = (
     'default_bench = "sim"\n[catalog]\npath = "catalog"\n[camera]\nwidth = 320\nheight = 240\n'
@@ -374,12 +374,9 @@ def test_enroll_rejects_wrong_options_with_a_next_step(rig, arguments, words):
 
 def test_report_of_a_resumed_enrollment_has_all_views(rig, enrolled):
     folder, _ = enrolled
-    process = Program("enroll", "candle", "--json", folder=folder)
-    for line in process.stdout:
-        if json.loads(line).get("index") == 4 and "accepted" in line:
-            process.kill()
-            break
-    process.communicate()
+    process = Program("enroll", "candle", "--json", code=stopping_after_view(5), folder=folder)
+    process.wait_until_stopped()
+    process.close()
     done = rig("enroll", "candle", "--resume", "--report", "candle.html")
     assert done.exit_code == 0, done.output
     assert "Contact sheet of candle: 8 views" in Path("candle.html").read_text(encoding="utf-8")

@@ -12,7 +12,7 @@ from rig.core.clock import SystemClock
 from rig.search.replay import check
 from rig.search.saved_run import load_run
 from sim.objects.shelf import CONFUSABLE, shelf
-from tests.programs import Program
+from tests.programs import Program, stopping_after_view
 
 VIEWS = 6
 NAMES = [name for name in shelf() if name not in {twin for _, twin in CONFUSABLE}][:5]
@@ -42,16 +42,14 @@ def folder(tmp_path):
 
 
 def enroll_until(folder: Path, views: int, number: int | None) -> tuple[list[dict[str, Any]], int, str]:
-    """Enroll the tray and send a signal after so many views; return the events before it, the exit code and stderr."""
-    process = Program("enroll", "--list", "tray.csv", "--json", folder=folder)
-    events = []
-    for line in process.stdout:
-        events.append(json.loads(line))
-        if number is not None and sum(e["event"] == "accepted" for e in events) == views:
-            process.send_signal(number)
-            break
-    errors = process.communicate()[1]
-    return events, process.wait(), errors
+    """Enroll the tray and send a signal after so many views; return the events, the exit code and stderr."""
+    process = Program("enroll", "--list", "tray.csv", "--json", code=stopping_after_view(views), folder=folder)
+    if number is not None:
+        process.wait_until_stopped()
+        process.send_signal(number)
+        process.send_signal(signal.SIGCONT)
+    output, errors = process.communicate()
+    return [json.loads(line) for line in output.splitlines()], process.wait(), errors
 
 
 def of_kind(events: list[dict[str, Any]], kind: str) -> list[dict[str, Any]]:
