@@ -3,7 +3,7 @@
 `leave_one_out` searches for every object, `fit_stopping_rule` sets the thresholds from these searches, and
 `fit_open_set` fits the open-set score to changes of the bench (`hbr.dense.shifted_searches`).
 
-Decisions: docs/decisions/0026, docs/decisions/0049.
+Decisions: docs/decisions/0026, docs/decisions/0049, docs/decisions/0062.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -18,7 +18,7 @@ from hbr.core.arrays import FloatArray
 from hbr.dense.filter import BETA, update_belief
 from hbr.dense.index import DenseIndex
 from hbr.dense.leave_one_out import Found, Leaders, LeaveOneOut, Task, leader, leave_one_out, usual_scores
-from hbr.dense.open_set import OpenSetModel
+from hbr.dense.open_set import OpenSetModel, fitted_before
 from hbr.dense.shifted_searches import STRENGTHS, ShiftedSearches, can_shift, shifted_searches
 from hbr.dense.stopping import Limitation, LimitationCode, ShiftRates, StoppingRule
 
@@ -146,8 +146,10 @@ def fit_min_confidence(searches: LeaveOneOut, error_rate: float) -> tuple[float,
     return UNCALIBRATED_MIN_CONFIDENCE, Limitation(code, {**values, "wrong": wrong, "ended": len(ended)})
 
 
-def fit_open_set(rule: StoppingRule, searches: ShiftedSearches) -> StoppingRule:
+def fit_open_set(rule: StoppingRule, searches: ShiftedSearches, model: OpenSetModel | None = None) -> StoppingRule:
     """Return the rule with an open-set score that is fitted to changes of the bench.
+
+    The weights are those of a ``model``, or fitted to these searches.
 
     An object is accepted before the last view from a score on that almost no object reaches that is not enrolled: a
     view more costs little. After the last view it is accepted from the score on with which at most 2 % of the objects
@@ -159,7 +161,7 @@ def fit_open_set(rule: StoppingRule, searches: ShiftedSearches) -> StoppingRule:
     On a bench that is known to have changed, the searches without a change do not count; on one that is known to be
     the same, only those with the smallest changes count.
     """
-    model = OpenSetModel.fitted(searches.known, searches.correct, searches.unknown)
+    model = model or OpenSetModel.fitted(searches.known, searches.correct, searches.unknown)
     known, unknown = model.scores(searches.known), model.scores(searches.unknown)
     found = np.where(searches.correct, known, -np.inf)
     count, views = known.shape
@@ -280,7 +282,8 @@ def calibrate_stopping_rule(
     rule = fit_stopping_rule(searches, error_rate=error_rate, false_reject=false_reject, objects=objects)
     if sample is None and len(index) >= FEWEST_OBJECTS_SHIFTED and can_shift(index):
         views = searches.confidence.shape[1]
-        rule = fit_open_set(rule, shifted_searches(index, views=views, searches=most_shifted_searches))
+        shifted = shifted_searches(index, views=views, searches=most_shifted_searches)
+        rule = fit_open_set(rule, shifted, fitted_before(index.views.descriptor, views))
         rejected = sum(one.rejected for one in rule.rates)  # in searches under changes of the bench
         return _calibrated(rule, searches, rejected=rejected, accepted=sum(one.false_accepts for one in rule.rates))
     known, unknown = (part.open_set_score(rule.usual_scores)[:, -1] for part in (searches.known, searches.unknown))
