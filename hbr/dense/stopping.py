@@ -38,6 +38,7 @@ class StopReason(StrEnum):
     MAX_VIEWS = "max-views"
     NO_ROTATION_LEFT = "no-rotation-left"
     LOCAL_DIFFERENCE = "local-difference"
+    PIXEL_FIT = "pixel-fit"
     CUSTOM = "custom"
     EARLIER_VERSION = "earlier-version"
 

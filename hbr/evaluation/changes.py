@@ -20,6 +20,7 @@ from hbr.dense.leaders import compare_leaders, near
 from hbr.dense.local_difference import LocalView
 from hbr.dense.session import DenseSession
 from hbr.dense.stopping import Outcome, StopDecision, StoppingRule
+from hbr.dense.verification import verified
 from hbr.descriptors.together import ViewsTogether, like_enrollment
 from hbr.evaluation.changed_bench import ENROLLMENT, HARD, MILD, Bench, Visit
 from hbr.evaluation.condition import object_mask
@@ -85,6 +86,8 @@ class SearchResult:
         Whether its two leaders were compared pixel by pixel (`hbr.dense.leaders`).
     by_comparison : bool
         Whether that comparison changed the outcome.
+    verified : bool
+        Whether the leader was doubtful, and compared with the views pixel by pixel (`hbr.dense.verification`).
     left_out : Outcome, optional
         How the same search ends if the object is not enrolled; None if it never was.
     """
@@ -95,6 +98,7 @@ class SearchResult:
     views: int
     compared: bool = False
     by_comparison: bool = False
+    verified: bool = False
     left_out: Outcome | None = None
 
 
@@ -212,18 +216,22 @@ class _Search:
 
     def _ended(self, decision: StopDecision, views: ViewsTogether) -> SearchResult:
         """Return the result of a search that ends with this decision; the last step compares its two leaders."""
-        scores = np.sort(self._session.belief.scores())
+        belief, rule = self._session.belief, self._session.rule
+        end, verification = verified(
+            belief, decision, rule, lambda n: _local_views(views, n, self._orientations_deg[n]), self._near
+        )
+        scores = np.sort(belief.scores())
         compared = compare_leaders(
-            self._session.belief,
-            decision.outcome,
+            belief,
+            end.outcome,
             float(scores[-1] - scores[-2]) if len(scores) > 1 else 0.0,
             self._orientations_deg,
-            lambda n: _local_view(views, n, self._orientations_deg[n]),
+            lambda n: _local_views(views, n, self._orientations_deg[n])[0],
             self._near,
-            beta=self._session.rule.beta,
-            max_error=self._session.rule.error_rate,
+            beta=rule.beta,
+            max_error=rule.error_rate,
         )
-        outcome, decided = decision.outcome, decision.object_index
+        outcome, decided = end.outcome, end.object_index
         if compared is not None:
             outcome = compared.outcome
             decided = decided if compared.winner is None else compared.winner
@@ -233,7 +241,8 @@ class _Search:
             self._names[decided],
             len(self._leaders),
             compared is not None,
-            outcome is not decision.outcome,
+            outcome is not end.outcome,
+            verification is not None,
         )
 
     def _near(self, leader: int, azimuths_deg: Sequence[float]) -> list[LocalView]:
@@ -245,9 +254,8 @@ class _Search:
         return replace(self._result, leaders=tuple(self._leaders))
 
 
-def _local_view(views: ViewsTogether, view: int, orientation_deg: float) -> LocalView:
-    likeliest = views.segmentations[view][0]
-    return LocalView(likeliest.crop, likeliest.mask, orientation_deg)
+def _local_views(views: ViewsTogether, view: int, orientation_deg: float) -> list[LocalView]:
+    return [LocalView(one.crop, one.mask, orientation_deg) for one in views.segmentations[view]]
 
 
 def _without(index: DenseIndex, name: str) -> DenseIndex | None:
@@ -272,6 +280,7 @@ def summary(known: dict[str, list[SearchResult]], unknown: dict[str, list[Search
         "decided_wrong": sum(one.decided != name for name, one in found) / count,
         "called_unknown": sum(one.outcome is Outcome.UNKNOWN for _, one in searches) / count,
         "ambiguous": sum(one.outcome is Outcome.AMBIGUOUS for _, one in searches) / count,
+        "verified": sum(one.verified for _, one in searches) / count,
         "compared": sum(one.compared for _, one in searches) / count,
         "right_by_comparison": sum(one.by_comparison and one.decided == name for name, one in found) / count,
         "wrong_by_comparison": sum(one.by_comparison and one.decided != name for name, one in found) / count,

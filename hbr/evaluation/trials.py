@@ -21,6 +21,7 @@ from hbr.dense.local_difference import LocalView
 from hbr.dense.next_view import most_informative_rotation
 from hbr.dense.session import DenseSession
 from hbr.dense.stopping import Outcome, StoppingRule
+from hbr.dense.verification import verified
 from hbr.descriptors import descriptor
 from hbr.evaluation.draws import generator
 from hbr.evaluation.methods import Method
@@ -239,38 +240,43 @@ class _Trials:
             runs.outcome[*at, n] = OUTCOMES.index(decision.outcome)
             if not ended and decision.outcome is not Outcome.CONTINUE:
                 ended = True
-                runs.compared[*at, n] = self._compared(session, seen, measured_deg)
+                end, runs.compared[*at, n] = self._end(session, seen, measured_deg)
+                runs.outcome[*at, n] = OUTCOMES.index(end)
             runs.travelled_deg[*at, n] = travelled_deg
             travelled_deg += abs(float(wrap180(self._azimuth_deg[following] - self._azimuth_deg[seen[-1]])))
             seen.append(following)
 
-    def _compared(self, session: DenseSession, seen: list[int], measured_deg: list[float]) -> int:
-        """Compare the two leaders as on the bench; return what is found, as `Runs.compared`."""
-        photographs, belief, outcome = self._photographs, session.belief, session.decision.outcome
+    def _end(self, session: DenseSession, seen: list[int], measured_deg: list[float]) -> tuple[Outcome, int]:
+        """Take the last steps of a search as on the bench; return the outcome, and `Runs.compared`."""
+        photographs, belief, decision = self._photographs, session.belief, session.decision
         if photographs is None:
-            return -1
+            return decision.outcome, -1
         scores = np.sort(belief.scores())
         keep = self._keep(np.array(seen))
+
+        def query(n: int) -> LocalView:
+            return photographs.query(self._object, seen[n], measured_deg[n])
 
         def enrolled(leader: int, azimuths_deg: Sequence[float]) -> list[LocalView]:
             own = keep if leader == self._object else self._enrolled[self._views.of(leader)]
             return photographs.enrolled(leader, np.flatnonzero(own), azimuths_deg)
 
+        end, _ = verified(belief, decision, session.rule, lambda n: [query(n)], enrolled)
         compared = compare_leaders(
             belief,
-            outcome,
+            end.outcome,
             float(scores[-1] - scores[-2]) if len(scores) > 1 else 0.0,
             measured_deg,
-            lambda n: photographs.query(self._object, seen[n], measured_deg[n]),
+            query,
             enrolled,
             beta=session.rule.beta,
             max_error=session.rule.error_rate,
         )
         if compared is None:
-            return -1
+            return end.outcome, -1
         if compared.winner is not None:
-            return COMPARED.index("right" if compared.winner == self._object else "wrong")
-        return COMPARED.index("none" if compared.outcome is outcome else "ambiguous")
+            return end.outcome, COMPARED.index("right" if compared.winner == self._object else "wrong")
+        return end.outcome, COMPARED.index("none" if compared.outcome is end.outcome else "ambiguous")
 
     def _next_dense(self, method: Method, draws: _Draws, seen: list[int], session: DenseSession) -> int:
         match method.strategy:

@@ -80,7 +80,7 @@ def run_changes(
 def change_rows(results: dict[str, Any]) -> Rows:
     """Return a table of the shares, in percent: of all objects, and of those that are reported alone."""
     heads = ["change, %", "ranking, N = 1 / 2 / 4", "decided right", "wrong", "ambiguous", "called unknown"]
-    heads += ["leaders compared", "so right / wrong", "unknown accepted"]
+    heads += ["leader verified", "leaders compared", "so right / wrong", "unknown accepted"]
     rows = [_row(results["settings"], results["changed_bench"])]
     if "reported" in results:
         rows.append(_row(results["settings"], results["reported"]))
@@ -96,6 +96,7 @@ def _row(settings: dict[str, Any], found: dict[str, Any]) -> list[str]:
         f"{100 * found['decided_wrong']:.1f}",
         f"{100 * found['ambiguous']:.1f}",
         f"{100 * found['called_unknown']:.1f}",
+        f"{100 * found['verified']:.1f}",
         f"{100 * found['compared']:.1f}",
         f"{100 * found['right_by_comparison']:.1f} / {100 * found['wrong_by_comparison']:.1f}",
         f"{100 * found['unknown_accepted']:.1f} of {found['unknown_searches']}",

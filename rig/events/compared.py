@@ -1,9 +1,30 @@
-"""The event of a comparison of two candidates."""
+"""The events of comparisons pixel by pixel: of the leading candidate with the views, and of two candidates."""
 
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
+
+from hbr.dense.stopping import Outcome
+
+
+@dataclass(frozen=True, slots=True)
+class Verified:
+    """The leading candidate was doubtful, and its enrolled views were compared with the views pixel by pixel.
+
+    ``fit`` is the share of the views' contrast that its enrolled views explain, at most 1, and ``others`` that of the
+    next candidates. ``score`` is the log-odds that follows from them and from the open-set score: from ``found_from``
+    on the object is found, and below ``unknown_below`` it is unknown.
+    """
+
+    index: int
+    name: str
+    fit: float
+    others: float
+    score: float
+    found_from: float
+    unknown_below: float
+    outcome: Outcome
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hbr import Outcome, StopDecision, StopReason
-from rig.events.compared import Compared
+from rig.events.compared import Compared, Verified
 from rig.motion.scan_speed import SpeedLimit
 from rig.views.capture import ViewEvidence
 
@@ -417,6 +417,7 @@ Event = (
     | Accepted
     | Ranked
     | FrameUsed
+    | Verified
     | Compared
     | Decided
     | Enrolled

@@ -3,7 +3,7 @@
 from typing import Final
 
 from hbr import Outcome
-from rig.events.compared import Compared
+from rig.events.compared import Compared, Verified
 from rig.events.events import (
     Accepted,
     Candidate,
@@ -39,6 +39,7 @@ from rig.events.wording import (
     share_words,
     similar_objects_words,
     unwinding_words,
+    verification_words,
     wait_words,
 )
 from rig.views.capture import rejection_text
@@ -81,6 +82,8 @@ def line(event: Event) -> str:
             retakes = f", {counted(event.retakes, 'rejected image')}" if event.retakes else ""
             took = duration_words(event.seconds)
             return f"{event.name}: {counted(event.views, 'view')} enrolled in {took}{retakes}"
+        case Verified():
+            return f"  {sentence(verification_words(event))}"
         case Compared():
             return f"  {sentence(comparison_words(event))}"
         case Identified():

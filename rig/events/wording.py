@@ -5,7 +5,7 @@ from typing import Any, Final
 
 from hbr import Outcome, StopDecision, StopReason
 from hbr.dense.stopping import Limitation, LimitationCode
-from rig.events.compared import Compared
+from rig.events.compared import Compared, Verified
 from rig.events.events import (
     Candidate,
     Decided,
@@ -221,6 +221,18 @@ def stop_words(decision: StopDecision, views: int) -> str:
             return f"the best candidate after {counted(views, 'view')}, with a confidence of {confidence} below {least}"
 
 
+def verification_words(verified: Verified) -> str:
+    """Return what the comparison of the leading candidate with the views found, as a sentence without its full stop."""
+    own, others = percent_words(verified.fit), percent_words(verified.others)
+    results = {
+        Outcome.FOUND: "so it is this object",
+        Outcome.UNKNOWN: "so it is another object",
+        Outcome.AMBIGUOUS: "which does not tell whether it is this object",
+    }
+    shares = f"its enrolled views explain {own} of the contrast, those of other candidates {others}"
+    return f"compared with {verified.name} pixel by pixel: {shares}, {results[verified.outcome]}"
+
+
 def comparison_words(compared: Compared) -> str:
     """Return what the comparison of two candidates found, as a sentence without its full stop."""
     first, second = compared.names
@@ -241,6 +253,8 @@ def reason_words(answer: Identified) -> str:
             return f"the margin {answer.margin:.3f} per view reaches {answer.min_margin:g}"
         case StopReason.NO_ROTATION_LEFT:
             return "the cable allows no other view"
+        case StopReason.PIXEL_FIT:
+            return "the views were compared with the enrolled views of the leading candidate pixel by pixel"
         case StopReason.LOCAL_DIFFERENCE if answer.outcome is Outcome.FOUND:
             return "the leading candidates were compared pixel by pixel where they differ most"
         case StopReason.LOCAL_DIFFERENCE:

@@ -20,7 +20,7 @@ from rig.motion.turntable import Turntable
 from rig.plans.capture import accepted, add_view, announced, capture, check_camera, moved, unwind, warn_of_table
 from rig.plans.identify_moving import decided as decided_event
 from rig.plans.identify_moving import search_in_motion
-from rig.search.local_step import compare_leaders
+from rig.search.local_step import compare_leaders, verify_leader
 from rig.search.model import Model, empty_table_for
 from rig.search.session import SHOWN, ArcSearch, Search, begin_search
 from rig.search.strategies import AnyStrategy, Finish
@@ -150,12 +150,27 @@ def identify(
             yield from unwind(number, table)
         except RigError as error:
             failed = error  # report the answer first
+    yield from _verified(search, describe, model)
     answer = search.answer(ranked, step, travelled_deg=travelled_deg, seconds=seconds)
     answer = yield from _compared(search, answer, describe, model)
     yield answer
     if failed:
         raise failed
     return answer
+
+
+def _verified(search: Search, describe: SearchDescriber, model: Model | hbr.ViewIndex) -> Generator[Event, None, None]:
+    """Compare the views with the enrolled views of a doubtful leader pixel by pixel; the answer depends on it."""
+    if not isinstance(model, Model) or model.leader_views is None:
+        return
+    try:
+        found = verify_leader(search, describe.hypotheses, model.leader_views)
+    except CatalogError as error:  # an image is missing: the search has its answer without it
+        number = len(search.orientations_deg) - 1
+        yield Warned(number, Note(NoteCode.NOT_COMPARED, {"what": error.what, "next_step": error.next_step}))
+        return
+    if found is not None:
+        yield found
 
 
 def _compared(

@@ -31,6 +31,7 @@ from rig.events.wording import (
     outcome_words,
     share_words,
     stop_words,
+    verification_words,
 )
 from rig.report.arc_figure import ArcFigure, arc_figure
 from rig.report.contact_sheet import Image, contact_sheet, thumbnail
@@ -172,6 +173,7 @@ class _Retrieval(NamedTuple):
     notes: list[str]
     decisions: list[Markup]
     differs: str
+    verification: str
     comparison: str
     frames: list[_Frame]
     unfold: bool
@@ -228,6 +230,7 @@ def _retrieval(number: int, record: IdentificationRecord, *, unfold: bool) -> _R
         notes=[sentence(note_words(note)) for note in record.notes],
         decisions=_decisions(record),
         differs="" if compared is None or compared.picture_bgr is None else _data_uri(compared.picture_bgr),
+        verification="" if record.verified is None else sentence(verification_words(record.verified)),
         comparison="" if compared is None else sentence(comparison_words(compared)),
         frames=_frames(record),
         unfold=unfold or record.correct is False,

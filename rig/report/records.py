@@ -11,7 +11,7 @@ from typing import Any, Final
 from hbr.core.angles import wrap180
 from rig.catalog import ViewRecord
 from rig.charts.polar_path import PathStep
-from rig.events.compared import Compared
+from rig.events.compared import Compared, Verified
 from rig.events.events import (
     Accepted,
     Decided,
@@ -167,6 +167,7 @@ class IdentificationRecord:
         self.ranked: list[Ranked] = []
         self.used: list[FrameUsed] = []
         self.decided: list[Decided] = []
+        self.verified: Verified | None = None
         self.compared: Compared | None = None
         self.answer: Identified | None = None
         self._collector = _ViewCollector(FRAME, region)
@@ -186,6 +187,8 @@ class IdentificationRecord:
                 self.ranked.append(event)
             case FrameUsed():
                 self.used.append(event)
+            case Verified():
+                self.verified = event
             case Compared():
                 self.compared = event
             case Decided():

@@ -1,6 +1,6 @@
-"""The last step of a search that does not end with one object: the two leaders, compared pixel by pixel.
+"""The last steps of a doubtful search: the leader is verified, and two leaders are compared, pixel by pixel.
 
-Decision: docs/decisions/0058.
+Decisions: docs/decisions/0058, docs/decisions/0062.
 """
 
 from collections.abc import Callable, Sequence
@@ -15,9 +15,10 @@ import hbr
 from hbr import Outcome, StopReason
 from hbr.dense import leaders
 from hbr.dense.local_difference import LocalView, ViewDifference
-from rig.events.compared import Compared, ComparedView
+from hbr.dense.verification import FOUND_FROM, UNKNOWN_BELOW, Verification, verify
+from rig.events.compared import Compared, ComparedView, Verified
 from rig.events.events import Identified
-from rig.search.session import DenseSearch, Search
+from rig.search.session import ArcSearch, DenseSearch, Search
 
 SHOWN_VIEWS: Final = 3
 TILE_PX: Final = 160
@@ -36,6 +37,55 @@ class Comparison:
     def answer_of(self, answer: Identified) -> Identified:
         """Return the answer of the search after the comparison."""
         return replace(answer, **self.changes)
+
+
+def verify_leader(
+    search: Search, hypotheses: Sequence[Sequence[hbr.Segmentation]], leader_views: LeaderViews
+) -> Verified | None:
+    """Compare the views with a doubtful leader's enrolled views, and let the answer depend on it; None without doubt.
+
+    A search in motion is not verified: its frames are smeared, and mostly not segmented again.
+
+    Parameters
+    ----------
+    search
+        After its last view.
+    hypotheses
+        All segmentations of each view of the search.
+    leader_views
+        Returns enrolled views.
+
+    Raises
+    ------
+    CatalogError
+        From ``leader_views``.
+    """
+    if not isinstance(search, DenseSearch) or isinstance(search, ArcSearch) or not search.is_doubtful:
+        return None
+    names, orientations_deg = search.belief.index.views.object_names, search.orientations_deg
+    found = verify(
+        search.belief,
+        search.decision.object_index,
+        lambda n: [LocalView(one.crop, one.mask, orientations_deg[n]) for one in hypotheses[n]],
+        lambda leader, azimuths_deg: leader_views(names[leader], azimuths_deg),
+    )
+    return with_verification(search, found)
+
+
+def with_verification(search: DenseSearch, found: Verification) -> Verified:
+    """Let the answer of a search depend on a verification of its leader; return the event."""
+    score = found.score(search.decision.open_set_score)
+    search.set_verification(found)
+    return Verified(
+        index=len(search.orientations_deg) - 1,
+        name=search.belief.index.views.object_names[found.object_index],
+        fit=found.fit,
+        others=found.others,
+        score=score,
+        found_from=FOUND_FROM,
+        unknown_below=UNKNOWN_BELOW,
+        outcome=search.decision.outcome,
+    )
 
 
 def compare_leaders(

@@ -5,11 +5,12 @@ from dataclasses import dataclass, field, replace
 from math import isclose
 from typing import Any, Final
 
-from rig.events.compared import Compared
+from hbr.dense.verification import Verification
+from rig.events.compared import Compared, Verified
 from rig.events.events import Accepted, Decided, FrameUsed, Identified, Moved, Ranked, RotationReason, plain
-from rig.search.local_step import Comparison, compare_leaders, saved_leader_views
+from rig.search.local_step import Comparison, compare_leaders, saved_leader_views, with_verification
 from rig.search.saved_run import SavedRun
-from rig.search.session import ArcSearch, Search, begin_search
+from rig.search.session import ArcSearch, DenseSearch, Search, begin_search
 from rig.search.strategies import AnyStrategy, Finish, Rotate
 from rig.views.description import SearchDescriber, ViewDescriber
 
@@ -116,6 +117,10 @@ def check(run: SavedRun, *, by: AnyStrategy | None = None) -> Check:
             case Decided():
                 found.decisions += 1
                 computed = _decided(step, event)
+            case Verified() if isinstance(search, DenseSearch):
+                # the enrolled images are not in the run: what they explain is taken as it was measured
+                leader = search.belief.index.views.object_names.index(event.name)
+                computed = with_verification(search, Verification(leader, event.fit, event.others))
             case Compared() if ranked is not None and search is not None and isinstance(describe, SearchDescriber):
                 end = step if isinstance(step, Finish) else Finish()
                 compared = compare_leaders(

@@ -14,6 +14,7 @@ import hbr
 from hbr.core.angles import wrap360
 from hbr.dense.arc import ArcRule, ArcSession, calibrate_arc_rule
 from hbr.dense.pose import pose
+from hbr.dense.verification import Verification, is_doubtful
 from hbr.descriptors.together import like_enrollment
 from hbr.model.symmetry import symmetry
 from rig.config import RigConfig
@@ -216,6 +217,7 @@ class DenseSearch(Search):
         super().__init__(index.views, config, seed=seed, top=top)
         self._strategy = strategy
         self._session = hbr.DenseSession(index, rule, max_views=config.identify.max_views)
+        self._verification: Verification | None = None
 
     def _rank(self, levels: NDArray[np.uint8]) -> Ranked:
         decision = self._session.add(
@@ -273,6 +275,22 @@ class DenseSearch(Search):
         """The largest share of wrong objects among those named."""
         return self._session.rule.error_rate
 
+    @property
+    def decision(self) -> hbr.StopDecision:
+        """The decision with which the search ends here, after the verification of its leader if there was one."""
+        decision = self._session.end()
+        return decision if self._verification is None else self._verification.decided(decision)
+
+    @property
+    def is_doubtful(self) -> bool:
+        """Whether the leader is to be verified (`hbr.dense.verification.is_doubtful`)."""
+        belief, decision = self.belief, self._session.end()
+        return is_doubtful(self._session.rule, decision, belief.queries, belief.index.views.descriptor)
+
+    def set_verification(self, verification: Verification) -> None:
+        """Let the answer depend on a verification of the leader."""
+        self._verification = verification
+
     def pose_fields(self, object_index: int) -> dict[str, Any]:
         """Return the fields of the answer that say how an object is rotated."""
         found = pose(self._session.belief, object_index)
@@ -286,12 +304,13 @@ class DenseSearch(Search):
 
     def answer(self, ranked: Ranked, end: Finish, *, travelled_deg: float = 0.0, seconds: float = 0.0) -> Identified:
         answer = super().answer(ranked, end, travelled_deg=travelled_deg, seconds=seconds)
-        decision = self._session.end()
+        decision = self.decision
         threshold = decision.open_set_threshold
         return replace(
             answer,
             name=None if decision.outcome is hbr.Outcome.UNKNOWN else answer.name,
             outcome=decision.outcome,
+            reason=answer.reason if self._verification is None else decision.reason,
             possible=self._possible(decision),
             **self.pose_fields(decision.object_index),
             confidence=decision.confidence,

@@ -238,6 +238,11 @@ class SearchDescriber(ViewDescriber):
         """The likeliest segmentation of each view so far; empty if the descriptor needs none."""
         return [] if self._views is None else [several[0] for several in self._views.segmentations]
 
+    @property
+    def hypotheses(self) -> list[tuple[hbr.Segmentation, ...]]:
+        """All segmentations of each view so far, in the order of its levels; empty if the descriptor needs none."""
+        return [] if self._views is None else self._views.segmentations
+
     def __call__(self, image_bgr: NDArray[np.uint8], stored: Mapping[str, Any] | None = None) -> DescribedView:  # noqa: ARG002
         """Describe the next frame of the search; errors as for `ViewDescriber`."""
         if not self._segments:

@@ -1,0 +1,155 @@
+"""Comparison of a doubtful leader's enrolled views with the views of a search, pixel by pixel.
+
+The open-set score compares descriptors of 8 x 8 cells. An object that is not enrolled may resemble an enrolled one so
+coarsely; its details do not fit. For each view, the enrolled views at the estimated pose are registered to it, and the
+fit is the share of the view's contrast that they explain, in colours that light hardly changes. The fit of the leader,
+and its lead over the next candidates, count beside the open-set score.
+
+Decision: docs/decisions/0062.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from hbr.core.angles import size_deg, wrap360
+from hbr.core.arrays import FloatArray
+from hbr.dense.filter import Belief
+from hbr.dense.leaders import LeaderViews
+from hbr.dense.local_difference import LocalView
+from hbr.dense.open_set import fitted_before
+from hbr.dense.pixel_fit import Pixels, fit
+from hbr.dense.stopping import Outcome, StopDecision, StoppingRule, StopReason
+from hbr.descriptors import descriptor
+
+#: Candidates beside the leader, enrolled views of each, and segmentations of each view that are compared.
+_OTHERS: Final = 3
+_NEAREST: Final = 2
+_SEGMENTATIONS: Final = 2
+#: Weights of the open-set score, of the leader's fit, and of its lead over the other candidates; and what is added.
+#: Fitted like `hbr.dense.open_set.fitted_before`: the result is a log-odds.
+_WEIGHTS: Final = (0.714, 9.438, 4.995)
+_OFFSET: Final = -5.416
+#: Log-odds from which an object is found, and below which it is unknown: that of 1 in 100 enrolled objects.
+FOUND_FROM: Final = 0.0
+UNKNOWN_BELOW: Final = -1.3
+#: With a smaller open-set score, no fit makes an object known.
+_HOPELESS: Final = -7.0
+
+
+@dataclass(frozen=True)
+class Verification:
+    """How well the leader's enrolled views fit the views of a search.
+
+    Attributes
+    ----------
+    object_index : int
+        The leader.
+    fit, others : float
+        Mean fit of the leader and of the next candidates over the views, at most 1.
+    """
+
+    object_index: int
+    fit: float
+    others: float
+
+    def score(self, open_set_score: float) -> float:
+        """Return the log-odds that the leader is the object, with the open-set score."""
+        numbers = (open_set_score, self.fit, self.fit - self.others)
+        return sum(weight * number for weight, number in zip(_WEIGHTS, numbers, strict=True)) + _OFFSET
+
+    def decided(self, decision: StopDecision) -> StopDecision:
+        """Return the decision of a search that would end with another one."""
+        score = self.score(decision.open_set_score)
+        outcome = Outcome.UNKNOWN if score < UNKNOWN_BELOW else Outcome.AMBIGUOUS
+        if score >= FOUND_FROM and decision.confidence >= decision.min_confidence:
+            outcome = Outcome.FOUND
+        return replace(decision, outcome=outcome, reason=StopReason.PIXEL_FIT)
+
+
+def verified(
+    belief: Belief,
+    decision: StopDecision,
+    rule: StoppingRule,
+    segmentations: Callable[[int], Sequence[LocalView]],
+    leader_views: LeaderViews,
+) -> tuple[StopDecision, Verification | None]:
+    """Return the decision with which a search ends, and what was compared; the same decision if there is no doubt.
+
+    Parameters are those of `is_doubtful` and `verify`.
+    """
+    if not is_doubtful(rule, decision, belief.queries, belief.index.views.descriptor):
+        return decision, None
+    found = verify(belief, decision.object_index, segmentations, leader_views)
+    return found.decided(decision), found
+
+
+def is_doubtful(rule: StoppingRule, decision: StopDecision, views: int, kind: str) -> bool:
+    """Return whether the end of a search is to be verified.
+
+    The open-set score is then too low for an answer after fewer views. The weights are for the scores that come with
+    the program, and for a catalog of so many objects that the rule has them.
+
+    Parameters
+    ----------
+    rule
+        Of the search.
+    decision
+        With which it would end.
+    views
+        Views so far.
+    kind
+        The descriptor.
+    """
+    calibrated = len(rule.open_set_thresholds)
+    model = None if rule.open_set is None else fitted_before(kind, calibrated)
+    if model is None or rule.open_set is None or not np.array_equal(model.weights, rule.open_set.weights):
+        return False
+    if decision.outcome is Outcome.CONTINUE or views < calibrated:
+        return False
+    return _HOPELESS < decision.open_set_score < max(rule.open_set_thresholds)
+
+
+def verify(
+    belief: Belief, leader: int, segmentations: Callable[[int], Sequence[LocalView]], leader_views: LeaderViews
+) -> Verification:
+    """Compare the views of a search with the enrolled views of its leader and of the next candidates.
+
+    Parameters
+    ----------
+    belief
+        After the last view.
+    leader
+        The leading candidate, as an index of the views' names.
+    segmentations
+        Returns a view of the search by each of its segmentations, in the order of the belief's levels.
+    leader_views
+        Returns the enrolled views of an object near some azimuths.
+    """
+    index, ranking = belief.index, belief.ranking()
+    last_deg = float(belief.orientation_deg[-1])
+    pose_deg = dict(zip(ranking.object_index.tolist(), ranking.pose_deg.tolist(), strict=True))
+    candidates = [leader, *[one for one in ranking.object_index.tolist() if one != leader][:_OTHERS]]
+    queries = [[Pixels.of(one) for one in segmentations(n)] for n in range(belief.queries)]
+    similarity = descriptor(index.views.descriptor).similarity
+    means = []
+    for candidate in candidates:
+        azimuths_deg = [wrap360(pose_deg[candidate] + o - last_deg) for o in belief.orientation_deg.tolist()]
+        views = leader_views(candidate, azimuths_deg)
+        enrolled_deg = np.array([view.azimuth_deg for view in views])
+        rows = index.views.of(candidate)
+        prepared: dict[int, Pixels] = {}
+        fits = []
+        for n, azimuth_deg in enumerate(azimuths_deg):
+            near = np.argsort(size_deg(enrolled_deg - azimuth_deg), kind="stable")[:_NEAREST].tolist()
+            own = rows[np.argsort(size_deg(index.views.azimuth_deg[rows] - azimuth_deg), kind="stable")[:_NEAREST]]
+            alike: FloatArray = similarity(np.atleast_2d(belief.levels[n]), index.views.levels(own)).max(axis=1)
+            for place in near:
+                if place not in prepared:
+                    prepared[place] = Pixels.of(views[place])
+            likeliest = np.argsort(-alike, kind="stable")[:_SEGMENTATIONS].tolist()
+            fits.append(max(fit(queries[n][one], prepared[place]) for one in likeliest for place in near))
+        means.append(float(np.mean(fits)))
+    return Verification(leader, means[0], float(np.mean(means[1:])) if len(means) > 1 else 0.0)
