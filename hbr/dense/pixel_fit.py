@@ -1,7 +1,9 @@
-"""How well an enrolled view explains the pixels of another view, after registration, whatever the light.
+"""How well an enrolled view explains the pixels of another view, after registration, in any light.
 
 Logarithms of the brightness and of two ratios of the colours are compared, less their medians: another exposure or
 another colour of the light only adds to them.
+
+Decision: docs/decisions/0062.
 """
 
 from dataclasses import dataclass
@@ -73,7 +75,7 @@ class Pixels:
 
 
 def fit(view: Pixels, enrolled: Pixels) -> float:
-    """Return the share of contrast that an enrolled view explains, at most 1; 0 where nothing can be compared."""
+    """Return the share of contrast that an enrolled view explains, at most 1; 0 if the two have no common pixels."""
     begin = _begin(view, enrolled)
     found = _registered(view, enrolled, begin)
     return max(_explained(view, enrolled, move) for move in ([begin] if found is None else [begin, found]))

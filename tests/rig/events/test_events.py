@@ -12,7 +12,7 @@ from hbr import StopDecision
 from rig.catalog import Catalog
 from rig.core.errors import ViewRejected
 from rig.devices.camera import CameraLocks
-from rig.events.compared import Compared, ComparedView
+from rig.events.compared import Compared, ComparedView, Verified
 from rig.events.events import (
     SCHEMA,
     Candidate,
@@ -146,6 +146,7 @@ def test_every_event_that_the_plans_emit_is_as_documented(simulated, tmp_path):
     sides = ((0.0,), (10.0, 20.0))
     shown = (ComparedView(2, 0.9, 5000.0),)
     seen.add(check_event(Compared(3, ("a", "b"), "a", 0.9, (1.0, -1.0), 0.01, 0.01, 0.1, 0.2, 1.5, shown, sides)))
+    seen.add(check_event(Verified(3, "dice", 0.7, 0.4, 1.2, 0.0, -1.3, hbr.Outcome.FOUND)))
     seen.add(check_event(Unwinding(0, 330.0, 0.0, 1, (-400.0, 400.0))))
     assert seen == {event_kind(kind) for kind in get_args(Event)}
 
