@@ -2,9 +2,9 @@
 
 from collections.abc import Callable, Collection
 from dataclasses import asdict
-from functools import cache, partial
+from functools import lru_cache, partial
 from importlib.metadata import version
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,9 @@ from hbr.evaluation.datasets import Dataset
 from hbr.model.views import Views
 from rig.core.processes import Jobs, map_in_processes
 from rig.evaluation.report import Rows
+
+#: Objects whose enrolled views each process remembers for the last steps of searches, 4 MB each with 36 views.
+_REMEMBERED: Final = 128
 
 
 def run_changes(
@@ -109,11 +112,12 @@ def _enroll(dataset: Dataset, changes: Changes, names: list[str], j: int) -> tup
     return found.levels, found.azimuth_deg
 
 
+@lru_cache(maxsize=_REMEMBERED)
 def _enrolled(dataset: Dataset, changes: Changes, name: str) -> EnrolledViews:
     return enroll_changed(next(item for item in dataset.objects if item.name == name), changes)
 
 
 def _search(dataset: Dataset, changes: Changes, views: Views, rule: StoppingRule, j: int) -> list[SearchResult]:
     example = next(item for item in dataset.objects if item.name == views.object_names[0])
-    again = cache(partial(_enrolled, dataset, changes))  # a few objects lead the searches for one
-    return search_changed(dataset.objects[j], changes, DenseIndex(views), rule, example, again)
+    enrolled = partial(_enrolled, dataset, changes)
+    return search_changed(dataset.objects[j], changes, DenseIndex(views), rule, example, enrolled)
