@@ -246,6 +246,7 @@ def api_pages() -> Iterator[tuple[str, str]]:
         yield f"reference/api/{room}.md", "\n".join(lines)
 
 
+@cache
 def _has_definitions(source: Path) -> bool:
     body = ast.parse(source.read_text(encoding="utf-8")).body
     kinds = (ast.FunctionDef, ast.ClassDef, ast.Assign, ast.AnnAssign)

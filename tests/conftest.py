@@ -26,6 +26,7 @@ from sim.bench import ShelfOperator, open_sim_bench
 from sim.noise import NoiseModel
 from sim.objects.shelf import shelf
 from sim.world import World
+from tests.small import SMALL
 
 # A deadline measures the machine, not the code; pytest-timeout catches what hangs. A clone passes or fails the same way
 # for everybody; `--hypothesis-profile=nightly` looks for what no run has seen.
@@ -106,13 +107,13 @@ class SimulatedBench:
 
 @pytest.fixture
 def simulated() -> Iterator[Callable[..., SimulatedBench]]:
-    """Return a function that opens a simulated bench: settings as ``KEY=VALUE``, ``noise=``, ``seed=``."""
+    """Return a function that opens a bench with small frames: settings as ``KEY=VALUE``, ``noise=``, ``seed=``."""
     with ExitStack() as benches:
 
         def open_one(*settings: str, noise: NoiseModel | None = None, seed: int = 0) -> SimulatedBench:
             world = World(noise=noise, seed=seed)
             operator = ShelfOperator(world, shelf())
-            bench = benches.enter_context(open_sim_bench(load_config(None, settings), operator))
+            bench = benches.enter_context(open_sim_bench(load_config(None, (*SMALL, *settings)), operator))
             return SimulatedBench(bench, operator, world)
 
         yield open_one

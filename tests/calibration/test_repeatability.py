@@ -13,8 +13,6 @@ from rig.core.errors import UsageError
 from rig.events.events import Accepted
 from tests.calibration.rejected import codes
 
-SMALL = ("camera.width=320", "camera.height=240", "view.roi=[40, 0, 240, 240]")
-
 
 def drawn(rng: np.random.Generator, placements: int, *, flips: int = 4, drift: int = 0) -> list[Placement]:
     """Return placings whose views differ in some levels, more with every placing where the light drifts."""
@@ -71,7 +69,7 @@ def test_drifting_light_and_another_object_are_rejected():
 
 
 def test_simulated_result_is_applied(simulated):
-    s = simulated(*SMALL, seed=1)
+    s = simulated(seed=1)
     *_, result = Repeatability("teapot", placements=3, error_rate=0.05).live(s.bench)
     assert result.passed, result.rejections
     repeat, again, low = (result.estimates[name].value for name in ("repeat", "placed_again", "repeatability"))
@@ -85,7 +83,7 @@ def test_simulated_result_is_applied(simulated):
 
 @pytest.mark.nightly
 def test_light_drifting_during_measurement_is_rejected(simulated):
-    s = simulated(*SMALL, seed=1)
+    s = simulated(seed=1)
     light = 1.0
     for event in Repeatability("teapot", placements=3, error_rate=0.05).live(s.bench):
         if isinstance(event, Accepted):

@@ -29,6 +29,7 @@ from sim.noise import NoiseModel
 from sim.objects.shelf import shelf
 from sim.world import World
 from tests.faults.angle_code import Coded, coded_deg
+from tests.small import SMALL
 
 VIEWS = 72
 SHORT = 5
@@ -39,8 +40,6 @@ NAME = "toy-car"
 KNOWN = (NAME, "cereal-puzzle", "dice")
 NOISE = NoiseModel(full_well_e=0, read_noise_e=0)
 """The bench's noise without that of the pixels, which takes most of the time and changes nothing here."""
-SMALL = ("camera.width=320", "camera.height=240", "view.roi=[40, 0, 240, 240]")
-"""Frames of a quarter of the size take a quarter of the time."""
 STILL_S = 1.0
 """Longer than the servo's watchdog needs to stop the table."""
 

@@ -25,12 +25,10 @@ from rig.devices.head.protocol import (
     SERIAL_UNSET,
     Acknowledge,
     Board,
-    Counters,
     Done,
     HeartbeatReply,
     ImuStatus,
     Light,
-    ReadCounters,
     Rejection,
     Relay,
     Reset,
@@ -247,11 +245,6 @@ class RigHead:
                 raise
             self._restart = None
             self._heartbeat()
-
-    def counters(self) -> Counters:
-        """Return the head's own counters since it started."""
-        with self._lock:
-            return self._link.request(ReadCounters(), Counters)
 
     def report(self) -> dict[str, Any]:
         """Return the head's status in words, for people and records."""

@@ -7,8 +7,10 @@ from typer.testing import CliRunner
 
 from rig.cli.main import app
 from sim.faults import Fault, fault_kinds
+from tests import small
 
-SMALL = ("--count", "2", "--set", "enroll.views=4", "--set", "identify.max_views=2")
+SETTINGS = ("enroll.views=4", "identify.max_views=2", *small.SMALL)
+SMALL = ("--count", "2", *(word for setting in SETTINGS for word in ("--set", setting)))
 
 
 def rig(*arguments: str):

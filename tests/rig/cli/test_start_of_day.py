@@ -17,8 +17,7 @@ from rig.config import load_config
 from rig.events.events import Accepted
 from rig.plans.enroll import enroll
 from rig.views.empty_table import empty_table_status
-
-SMALL = ("camera.width=320", "camera.height=240", "view.roi=[40, 0, 240, 240]")
+from tests.small import SMALL
 
 
 def test_empty_table_image_is_taken_and_shown(rig: Callable[..., Any]) -> None:
@@ -108,7 +107,7 @@ def asked(
     def run(
         answers: Answers | io.StringIO, *, ask: bool = True, as_json: bool = False, stays: bool = False
     ) -> tuple[Any, str]:
-        s = simulated(*SMALL)
+        s = simulated()
         s.operator.place("toy-car")
         s.bench.operator = ObjectAlreadyPlaced()
         if isinstance(answers, Answers) and not stays:

@@ -12,13 +12,12 @@ from rig.motion.turntable import Turntable
 from rig.plans.enroll import enroll
 from rig.plans.identify import identify
 
-SMALL = ("camera.width=320", "camera.height=240", "view.roi=[40, 0, 240, 240]")
 VIEWS = 6
 
 
 @pytest.fixture
 def catalog(tmp_path, simulated):
-    with Catalog.open(tmp_path / "catalog", clock=simulated(*SMALL).bench.clock) as catalog:
+    with Catalog.open(tmp_path / "catalog", clock=simulated().bench.clock) as catalog:
         yield catalog
 
 
@@ -26,7 +25,7 @@ def catalog(tmp_path, simulated):
     "limits", ["[-300, 60]", *(pytest.param(one, marks=pytest.mark.nightly) for one in ("[-400, 400]", "[0, 360]"))]
 )
 def test_enrollment_stays_within_the_budget_and_unwinds_the_cable(simulated, catalog, limits):
-    s = simulated(*SMALL, f"table.limits_deg={limits}")
+    s = simulated(f"table.limits_deg={limits}")
     low, high = s.bench.config.table.limits_deg
     events = list(enroll(s.bench, catalog, "toy-car", views=VIEWS))
     assert isinstance(events[-1], Enrolled)
@@ -53,7 +52,7 @@ def test_enrollment_stays_within_the_budget_and_unwinds_the_cable(simulated, cat
     ],
 )
 def test_search_unwinds_when_necessary_and_reports_it(simulated, catalog, start_deg, step_deg, rotates_to):
-    s = simulated(*SMALL, "identify.max_views=2", f"identify.first_step_deg={step_deg}", seed=3)
+    s = simulated("identify.max_views=2", f"identify.first_step_deg={step_deg}", seed=3)
     list(enroll(s.bench, catalog, "toy-car", views=VIEWS))
     with Turntable(s.bench) as table:
         table.goto(start_deg)
@@ -67,7 +66,7 @@ def test_search_unwinds_when_necessary_and_reports_it(simulated, catalog, start_
 
 
 def test_answer_is_reported_although_the_cable_cannot_be_unwound(simulated, catalog):
-    s = simulated(*SMALL, "identify.max_views=2", seed=3)
+    s = simulated("identify.max_views=2", seed=3)
     list(enroll(s.bench, catalog, "toy-car", views=VIEWS))
     with Turntable(s.bench) as table:
         table.goto(300.0)
@@ -84,7 +83,7 @@ def test_answer_is_reported_although_the_cable_cannot_be_unwound(simulated, cata
 
 
 def test_target_beyond_the_budget_is_rejected_with_limits(simulated):
-    s = simulated(*SMALL)
+    s = simulated()
     with Turntable(s.bench) as table:
         table.goto(20.0)
         with pytest.raises(LimitExceeded, match=r"from 20\.0° to 401\.0°.*-1\.11 to \+1\.11 revolutions"):

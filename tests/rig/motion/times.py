@@ -3,9 +3,10 @@
 from rig.config import RigConfig, load_config
 from sim.frame_times import FrameTimes
 from sim.world import World
+from tests import small
 
-SMALL = ("camera.width=320", "camera.height=240", "view.roi=[40, 0, 240, 240]", "view.max_smear_px=2")
-"""Settings for small frames, which take less computing."""
+SMALL = (*small.SMALL, "view.max_smear_px=2")
+"""Settings for small frames."""
 
 
 def camera_time(world: World, *settings: str) -> RigConfig:

@@ -15,7 +15,6 @@ from rig.motion.motion_model import MotionModel
 from rig.plans.enroll import enroll
 from rig.plans.estimate import TimeLeft, dry_run, even_azimuths, table_angles
 
-SMALL = ("camera.width=320", "camera.height=240", "view.roi=[40, 0, 240, 240]")
 LIMITS = st.floats(-2000, 0).flatmap(
     lambda low: st.tuples(st.just(low), st.floats(max(0.0, low + 360.0), low + 4000.0))
 )
@@ -47,7 +46,7 @@ def test_plan_of_another_bench_is_shifted_by_revolutions_or_rejected():
 
 
 def test_enrollment_with_a_short_cable_takes_all_views_within_its_limits(simulated, tmp_path):
-    s = simulated(*SMALL, "table.limits_deg=[-180, 185]")
+    s = simulated("table.limits_deg=[-180, 185]")
     with Catalog.open(tmp_path, clock=s.bench.clock) as catalog:
         moves = [e for e in enroll(s.bench, catalog, "dice", views=6) if isinstance(e, Moved)]
         assert [m.commanded_deg for m in moves] == [-120.0, -60.0, 0.0, 60.0, 120.0, 180.0]
@@ -58,7 +57,7 @@ def test_enrollment_with_a_short_cable_takes_all_views_within_its_limits(simulat
 
 @pytest.mark.parametrize("views", [8, pytest.param(36, marks=pytest.mark.nightly)])
 def test_motion_model_predicts_the_duration_within_10_percent(simulated, tmp_path, views):
-    s = simulated(*SMALL, seed=3)
+    s = simulated(seed=3)
     with Catalog.open(tmp_path, clock=s.bench.clock) as catalog:
         (before,) = dry_run(s.bench, catalog, {"dice": None}, views=views)
         left = TimeLeft(MotionModel(s.bench.config), before.angles_deg)
@@ -79,7 +78,7 @@ def test_motion_model_predicts_the_duration_within_10_percent(simulated, tmp_pat
 
 
 def test_dry_run_shows_the_actions_and_moves_and_stores_nothing(simulated, tmp_path):
-    s = simulated(*SMALL)
+    s = simulated()
     with Catalog.open(tmp_path, clock=s.bench.clock) as catalog:
         list(enroll(s.bench, catalog, "dice", views=4))
         plan = enroll(s.bench, catalog, "lamp", views=6)

@@ -27,15 +27,9 @@ from rig.search.model import load_model
 from sim.bench import ShelfOperator, open_sim_bench
 from sim.objects.shelf import shelf
 from sim.world import World
+from tests.small import SMALL
 
 VIEWS = 12
-SMALL = ("camera.width=320", "camera.height=240", "view.roi=[40, 0, 240, 240]")
-
-
-@pytest.fixture
-def simulated(simulated):
-    """Return a function that opens a simulated bench with small images, which are computed faster."""
-    return lambda *settings, **options: simulated(*SMALL, *settings, **options)
 
 
 @pytest.fixture

@@ -14,7 +14,6 @@ from rig.events.events import Accepted, Enrolled, Item
 from rig.plans.enroll import enroll
 from rig.plans.tray import OBJECT_ERRORS, TrayDecision, TrayItem, enroll_tray, read_tray
 
-SMALL = ("camera.width=320", "camera.height=240", "view.roi=[40, 0, 240, 240]")
 TEXT = st.text(string.ascii_letters + string.digits + " äöü,;\"'-_", min_size=1, max_size=12).map(str.strip)
 
 
@@ -140,7 +139,7 @@ def interrupted(s, catalog, name, views=4):
 
 
 def test_complete_objects_are_skipped_and_interrupted_ones_resumed(simulated, catalog):
-    s = simulated(*SMALL)
+    s = simulated()
     list(enroll(s.bench, catalog, "dice", views=4))
     interrupted(s, catalog, "lamp")
     operator = Scripted()
@@ -156,7 +155,7 @@ def test_complete_objects_are_skipped_and_interrupted_ones_resumed(simulated, ca
 
 
 def test_interrupted_object_that_was_moved_is_enrolled_again(simulated, catalog):
-    s = simulated(*SMALL)
+    s = simulated()
     interrupted(s, catalog, "lamp")
     events = list(enroll_tray(s.bench, catalog, items("lamp"), views=4, operator=Scripted([TrayDecision.RESTART])))
     assert actions(events) == [("lamp", "replace")]
@@ -165,7 +164,7 @@ def test_interrupted_object_that_was_moved_is_enrolled_again(simulated, catalog)
 
 
 def test_operator_can_skip_objects_or_stop(simulated, catalog):
-    s = simulated(*SMALL)
+    s = simulated()
     operator = Scripted([TrayDecision.SKIP, TrayDecision.PROCEED, TrayDecision.STOP])
     events = list(enroll_tray(s.bench, catalog, items("lamp", "dice", "clock"), views=4, operator=operator))
     assert actions(events) == [("lamp", "skip"), ("dice", "enroll")]
@@ -173,7 +172,7 @@ def test_operator_can_skip_objects_or_stop(simulated, catalog):
 
 
 def test_object_in_the_dark_is_tried_again_with_its_stored_views(simulated, catalog):
-    s = simulated(*SMALL)
+    s = simulated()
 
     class Lights(Scripted):
         def decide_after_error(self, item, error):
@@ -192,7 +191,7 @@ def test_object_in_the_dark_is_tried_again_with_its_stored_views(simulated, cata
 
 
 def test_object_that_fails_is_skipped_or_ends_the_tray(simulated, catalog):
-    s = simulated(*SMALL)
+    s = simulated()
     operator = Scripted(problem=[TrayDecision.SKIP])
     events = list(enroll_tray(s.bench, catalog, items("nonsense", "dice"), views=4, operator=operator))
     assert actions(events) == [("nonsense", "enroll"), ("nonsense", "skip"), ("dice", "enroll")]
@@ -202,7 +201,7 @@ def test_object_that_fails_is_skipped_or_ends_the_tray(simulated, catalog):
 
 
 def test_views_label_and_note_of_the_list_are_used(simulated, catalog):
-    s = simulated(*SMALL)
+    s = simulated()
     tray = [TrayItem(2, "dice", "toys", "loaded", 5), TrayItem(3, "lamp")]
     list(enroll_tray(s.bench, catalog, tray, views=4))
     assert [(o.name, o.label, o.note, o.views) for o in catalog.objects()] == [

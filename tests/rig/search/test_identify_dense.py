@@ -11,8 +11,7 @@ from rig.plans.identify import identify
 from rig.plans.photograph_table import photograph_table
 from rig.plans.watch import watch
 from rig.search.model import load_model
-
-SMALL = ("camera.width=320", "camera.height=240", "view.roi=[40, 0, 240, 240]")
+from tests.small import SMALL
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +44,7 @@ def search(s, model, name, **options):
 
 
 def test_objects_enrolled_without_an_empty_table_image_are_searched_without(simulated, shelf):
-    s = simulated(*SMALL)
+    s = simulated()
     events, answer = search(s, shelf, "dice")
     started = events[0]
     assert isinstance(started, Started)
@@ -59,7 +58,7 @@ def test_objects_enrolled_without_an_empty_table_image_are_searched_without(simu
 
 
 def test_image_of_today_comes_before_the_image_of_the_enrollment(simulated, tmp_path):
-    s = simulated(*SMALL)
+    s = simulated()
     list(photograph_table(s.bench))
     with Catalog.open(tmp_path, clock=s.bench.clock) as catalog:
         for name in ("lamp", "teapot"):
@@ -68,7 +67,7 @@ def test_image_of_today_comes_before_the_image_of_the_enrollment(simulated, tmp_
         events, answer = search(s, model, "lamp")
         assert codes(events[0]) <= {NoteCode.RATES_NOT_GUARANTEED}
         assert answer.name == "lamp"
-        another = simulated(*SMALL, seed=5)
+        another = simulated(seed=5)
         events, answer = search(another, model, "teapot")
         assert NoteCode.EMPTY_TABLE_OF_ENROLLMENT in codes(events[0])
         assert answer.name == "teapot"
@@ -84,7 +83,7 @@ def test_image_of_today_comes_before_the_image_of_the_enrollment(simulated, tmp_
 
 @pytest.mark.parametrize("shape", [(10, 10, 3), (480, 640, 3)])
 def test_image_of_another_size_is_rejected_and_the_search_continues(simulated, shelf, shape):
-    s = simulated(*SMALL)
+    s = simulated()
     events, answer = search(s, shelf, "lamp", empty_table=np.full(shape, 90, np.uint8))
     assert answer.name == "lamp"
     issue = {"code": "empty-table-size", "table_px": [shape[1], shape[0]], "frame_px": [320, 240]}
@@ -92,7 +91,7 @@ def test_image_of_another_size_is_rejected_and_the_search_continues(simulated, s
 
 
 def test_image_of_another_bench_is_reported_once_and_not_used(simulated, shelf):
-    s = simulated(*SMALL, "identify.max_views=5")
+    s = simulated("identify.max_views=5")
     other = np.random.default_rng(0).integers(0, 256, (240, 320, 3), np.uint8)
     events, answer = search(s, shelf, "radio", empty_table=other)
     (warned,) = [e for e in events if isinstance(e, Warned)]
@@ -104,7 +103,7 @@ def test_image_of_another_bench_is_reported_once_and_not_used(simulated, shelf):
 
 
 def test_decisions_name_their_candidates_and_stay_within_the_cable_budget(simulated, shelf):
-    s = simulated(*SMALL, "table.limits_deg=[-180, 185]")
+    s = simulated("table.limits_deg=[-180, 185]")
     events, answer = search(s, shelf, "radio")
     decided = [e for e in events if isinstance(e, Decided)]
     assert answer.name is None
@@ -127,7 +126,7 @@ def test_decisions_name_their_candidates_and_stay_within_the_cable_budget(simula
 
 
 def test_watch_finds_objects_enrolled_meanwhile(simulated, tmp_path):
-    s = simulated(*SMALL)
+    s = simulated()
     with Catalog.open(tmp_path, clock=s.bench.clock) as catalog:
         list(enroll(s.bench, catalog, "lamp", views=4))
         s.operator.next_object = "lamp"
@@ -143,7 +142,7 @@ def test_watch_finds_objects_enrolled_meanwhile(simulated, tmp_path):
 
 
 def test_one_object_is_found_by_similarity_to_its_own_views(simulated, tmp_path):
-    s = simulated(*SMALL, seed=1)
+    s = simulated(seed=1)
     with Catalog.open(tmp_path, clock=s.bench.clock) as catalog:
         list(enroll(s.bench, catalog, "lamp", views=6))
         model = load_model(catalog)
@@ -155,7 +154,7 @@ def test_one_object_is_found_by_similarity_to_its_own_views(simulated, tmp_path)
 
 
 def test_rotation_of_a_round_object_is_not_stated(simulated, shelf):
-    s = simulated(*SMALL)
+    s = simulated()
     s.operator.yaw_deg = 40.0
     answer = search(s, shelf, "lamp")[1]
     assert (answer.name, answer.outcome) == ("lamp", hbr.Outcome.FOUND)

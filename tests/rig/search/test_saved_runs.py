@@ -40,6 +40,7 @@ from rig.search.saved_run import RunWriter, load_run
 from sim.bench import ShelfOperator, open_sim_bench
 from sim.objects.shelf import shelf
 from sim.world import World
+from tests.small import SMALL
 
 DATA = Path(__file__).parent / "data"
 
@@ -50,8 +51,7 @@ def saved(tmp_path_factory):
     home = tmp_path_factory.mktemp("runs")
     operator = ShelfOperator(World(seed=9), shelf())
     runs = {}
-    small = ("camera.width=320", "camera.height=240", "view.roi=[40, 0, 240, 240]")
-    settings = (*small, "identify.max_views=4", "identify.margin=0.9")  # every run takes all its views
+    settings = (*SMALL, "identify.max_views=4", "identify.margin=0.9")  # every run takes all its views
     with (
         open_sim_bench(load_config(None, settings), operator) as bench,
         Catalog.open(home / "catalog", clock=bench.clock) as catalog,

@@ -331,7 +331,7 @@ def sim_catalog_of_both(tmp_path, simulated):
     from rig.catalog.seal import seal_enrollments
     from rig.plans.enroll import enroll
 
-    s = simulated("camera.width=320", "camera.height=240", "view.roi=[40, 0, 240, 240]")
+    s = simulated()
     with Catalog.open(tmp_path / "catalog", clock=s.bench.clock) as catalog:
         for name in ("lamp", "dice"):
             list(enroll(s.bench, catalog, name, views=6))

@@ -31,7 +31,7 @@ def test_good_frame_is_accepted_at_once_with_its_evidence(on_the_table):
     assert attempt.evidence.exposed_ns >= settled_ns
     assert attempt.evidence.locks_hold
     assert attempt.evidence.stillness.still
-    assert attempt.image_bgr.shape == (480, 640, 3)
+    assert attempt.image_bgr.shape == (240, 320, 3)
 
 
 def test_frame_shows_the_table_after_it_came_to_rest(on_the_table):

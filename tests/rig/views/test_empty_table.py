@@ -31,8 +31,7 @@ from sim.bench import ShelfOperator, open_sim_bench
 from sim.change import CHANGES
 from sim.objects.shelf import shelf
 from sim.world import World
-
-SMALL = ("camera.width=320", "camera.height=240", "view.roi=[40, 0, 240, 240]")
+from tests.small import SMALL
 
 Open = Callable[..., Any]
 
@@ -44,7 +43,7 @@ def photographed(bench: Bench, **options: Any) -> EmptyTableImage:
 
 
 def test_table_is_cleared_photographed_and_rotated_back(simulated: Open) -> None:
-    s = simulated(*SMALL)
+    s = simulated()
     s.operator.place("dice")
     assert empty_table_status(s.bench).problems == (TableProblem(TableProblemCode.MISSING),)
     taken = photographed(s.bench)
@@ -59,7 +58,7 @@ def test_table_is_cleared_photographed_and_rotated_back(simulated: Open) -> None
 
 @pytest.mark.parametrize("limits", [(0, 400), (-400, 3)])
 def test_rotation_stays_within_the_cable_limits(simulated: Open, limits: tuple[int, int]) -> None:
-    s = simulated(*SMALL, f"table.limits_deg={list(limits)}")
+    s = simulated(f"table.limits_deg={list(limits)}")
     s.operator.clear = lambda: True  # type: ignore[method-assign]
     s.operator.place("toy-house")
     with pytest.raises(TableNotEmpty, match="Something is on the table") as caught:
@@ -68,7 +67,7 @@ def test_rotation_stays_within_the_cable_limits(simulated: Open, limits: tuple[i
 
 
 def test_forgotten_object_is_rejected_and_the_previous_image_stays(simulated: Open) -> None:
-    s = simulated(*SMALL)
+    s = simulated()
     before = photographed(s.bench)
     s.operator.clear = lambda: True
     for name in ("mug-white", "dice"):
@@ -83,7 +82,7 @@ def test_forgotten_object_is_rejected_and_the_previous_image_stays(simulated: Op
 
 
 def test_round_object_is_noticed_by_the_previous_image(simulated: Open) -> None:
-    s = simulated(*SMALL)
+    s = simulated()
     photographed(s.bench)
     s.operator.clear = lambda: True
     s.operator.place("vase-blue")
@@ -93,7 +92,7 @@ def test_round_object_is_noticed_by_the_previous_image(simulated: Open) -> None:
 
 
 def test_dark_table_is_rejected_like_a_view(simulated: Open) -> None:
-    s = simulated(*SMALL)
+    s = simulated()
     s.world.change(light=(0.0, 0.0, 0.0))
     with pytest.raises(ViewRejected, match="too dark"):
         photographed(s.bench)
@@ -101,13 +100,13 @@ def test_dark_table_is_rejected_like_a_view(simulated: Open) -> None:
 
 
 def test_bench_that_rotates_its_camera_has_no_empty_table_image(simulated: Open) -> None:
-    s = simulated(*SMALL, 'table.carries="camera"')
+    s = simulated('table.carries="camera"')
     with pytest.raises(UsageError, match="moves around"):
         photographed(s.bench)
 
 
 def test_age_and_settings_are_problems_and_another_size_is_not_usable(simulated: Open) -> None:
-    s = simulated(*SMALL)
+    s = simulated()
     photographed(s.bench)
     s.operator.devices.camera.drift(kelvin=6000.0)
     parameters = {"name": "white_balance_k", "before": 5000.0, "now": 6000.0}
@@ -126,7 +125,7 @@ def test_age_and_settings_are_problems_and_another_size_is_not_usable(simulated:
 
 
 def test_damage_on_disk_is_reported_and_fixed_by_a_new_image(simulated: Open, tmp_path: Path) -> None:
-    s = simulated(*SMALL)
+    s = simulated()
     s.bench.state = FileStore(tmp_path)
     photographed(s.bench)
     (png,) = tmp_path.glob("*.png")
@@ -176,14 +175,14 @@ def test_any_file_content_gives_an_image_or_a_problem(metadata: bytes, data: st.
 
 
 def test_date_in_the_future_is_reported(simulated: Open) -> None:
-    s = simulated(*SMALL)
+    s = simulated()
     photographed(s.bench)
     s.world.clock.set_civil(-7200.0)
     assert empty_table_status(s.bench).problems == (TableProblem(TableProblemCode.FUTURE, {"hours": 2.0}),)
 
 
 def test_watching_bench_takes_the_image_before_the_first_object(simulated: Open) -> None:
-    s = simulated(*SMALL)
+    s = simulated()
     s.bench.operator = TableWatcher(s.bench)
     assert photographed(s.bench).turning_share == 0
     s.world.clock.call_at(s.world.clock.now_ns() + 2_000_000_000, lambda: s.world.put(shelf()["toy-car"]))
@@ -193,7 +192,7 @@ def test_watching_bench_takes_the_image_before_the_first_object(simulated: Open)
 
 
 def test_full_disk_is_reported_and_the_previous_image_stays(simulated: Open, tmp_path: Path) -> None:
-    s = simulated(*SMALL)
+    s = simulated()
     s.bench.state = FileStore(tmp_path)
     before = photographed(s.bench)
     kept = sorted(path.name for path in tmp_path.iterdir())
@@ -221,7 +220,7 @@ def test_full_disk_is_reported_and_the_previous_image_stays(simulated: Open, tmp
 
 
 def test_enrolled_views_have_both_descriptors_evidence_and_the_image(simulated: Open, tmp_path: Path) -> None:
-    s = simulated(*SMALL)
+    s = simulated()
     taken = photographed(s.bench)
     with Catalog.open(tmp_path, clock=s.bench.clock) as catalog:
         events = list(enroll(s.bench, catalog, "toy-car", views=4))
@@ -240,7 +239,7 @@ def test_enrolled_views_have_both_descriptors_evidence_and_the_image(simulated: 
 
 
 def test_changed_surroundings_are_reported_once_and_stored(simulated: Open, tmp_path: Path) -> None:
-    s = simulated(*SMALL, seed=2)
+    s = simulated(seed=2)
     photographed(s.bench)
     s.operator.change_bench(CHANGES["bench"])
     with Catalog.open(tmp_path, clock=s.bench.clock) as catalog:
@@ -258,7 +257,7 @@ def test_changed_surroundings_are_reported_once_and_stored(simulated: Open, tmp_
 
 
 def test_images_of_version_1_are_read(simulated: Open) -> None:
-    s = simulated(*SMALL)
+    s = simulated()
     photographed(s.bench)
     stored = json.loads(s.bench.state.read_file("empty-table.json"))
     assert stored.pop("noticed") is None

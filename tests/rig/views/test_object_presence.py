@@ -11,8 +11,6 @@ from rig.plans.watch import watch
 from rig.views.object_presence import TableWatcher
 from sim.objects.shelf import shelf
 
-SMALL = ("camera.width=320", "camera.height=240", "view.roi=[40, 0, 240, 240]")
-
 
 def at(s, seconds, action):
     s.world.clock.call_at(s.world.clock.now_ns() + round(seconds * 1e9), action)
@@ -30,7 +28,7 @@ def seconds(s, watcher):
 
 
 def test_watcher_waits_until_the_object_is_still(simulated):
-    s = simulated(*SMALL)
+    s = simulated()
     watcher = TableWatcher(s.bench)
     at(s, 5.0, put(s, "lamp"))
     at(s, 6.0, put(s, "lamp", 40.0))  # a hand still pushes it
@@ -39,7 +37,7 @@ def test_watcher_waits_until_the_object_is_still(simulated):
 
 
 def test_object_is_new_if_it_is_another_one_or_follows_an_empty_table(simulated):
-    s = simulated(*SMALL)
+    s = simulated()
     watcher = TableWatcher(s.bench)
     at(s, 1.0, put(s, "toy-car"))
     watcher.place(None)
@@ -51,7 +49,7 @@ def test_object_is_new_if_it_is_another_one_or_follows_an_empty_table(simulated)
 
 
 def test_empty_table_and_changing_illumination_are_not_an_object(simulated):
-    s = simulated(*SMALL)
+    s = simulated()
     watcher = TableWatcher(s.bench)
     at(s, 1.0, put(s, "radio"))
     watcher.place(None)
@@ -65,28 +63,28 @@ def test_empty_table_and_changing_illumination_are_not_an_object(simulated):
 
 def test_smallest_objects_are_detected(simulated):
     for name in ("dice", "candle"):
-        s = simulated(*SMALL)
+        s = simulated()
         watcher = TableWatcher(s.bench)
         at(s, 2.0, put(s, name))
         assert seconds(s, watcher) <= 6.0
 
 
 def test_object_to_be_enrolled_is_there_already(simulated):
-    s = simulated(*SMALL)
+    s = simulated()
     start_ns = s.world.clock.now_ns()
     TableWatcher(s.bench).place("lamp")
     assert s.world.clock.now_ns() == start_ns
 
 
 def test_unplugged_camera_ends_the_waiting(simulated):
-    s = simulated(*SMALL)
+    s = simulated()
     at(s, 5.0, s.operator.devices.camera.unplug)
     with pytest.raises(DeviceSilent):
         TableWatcher(s.bench).place(None)
 
 
 def test_watch_identifies_objects_and_continues_after_a_failure(simulated, tmp_path):
-    s = simulated(*SMALL, "identify.max_views=4", seed=7)
+    s = simulated("identify.max_views=4", seed=7)
     with Catalog.open(tmp_path, clock=s.bench.clock) as catalog:
         for name in ("toy-car", "book-night"):
             list(enroll(s.bench, catalog, name, views=12))

@@ -21,6 +21,7 @@ from rig.web.app import create_app
 from rig.web.guard import Guard
 from rig.web.run import Listening, make_server
 from rig.web.server import Server
+from tests.small import SMALL
 
 ENDED = ("done", "failed", "cancelled", "interrupted")
 
@@ -57,8 +58,7 @@ def starting(folder: Path) -> Iterator[Callable[..., Served]]:
 
     def start(*settings: str, needs_login: bool = False) -> Served:
         folders = [f"catalog.path='{folder}/catalog'", f"state_dir='{folder}/state'"]
-        small = ("camera.width=320", "camera.height=240", "view.roi=[40, 0, 240, 240]")  # takes less computing
-        config = load_config(None, [*folders, f"calibration_dir='{folder}/cal'", *small, *settings])
+        config = load_config(None, [*folders, f"calibration_dir='{folder}/cal'", *SMALL, *settings])
         web = config.state_path("sim") / "web"
         listening = Listening("127.0.0.1", 0, (), None, None, needs_login, 2_000_000)
         tokens = Tokens(web, SystemClock())
