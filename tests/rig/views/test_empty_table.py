@@ -116,7 +116,7 @@ def test_age_and_settings_are_problems_and_another_size_is_not_usable(simulated:
     status = empty_table_status(s.bench)
     assert status.table is not None
     assert status.problems[0] == TableProblem(TableProblemCode.OLD, {"hours": 13.0})
-    other = simulated()
+    other = simulated("camera.width=640", "camera.height=480", "view.roi=[80, 0, 480, 480]")
     other.bench.state = s.bench.state
     status = empty_table_status(other.bench)
     assert status.table is None
