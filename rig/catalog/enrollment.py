@@ -97,7 +97,7 @@ class Enrollment:
                 f"view {index} is not described by {PAPER_DESCRIPTOR}", next_step="describe it: hbr.describe"
             )
         packed = pack(record.descriptors, record.region)
-        png = images.encode(image_bgr) if encoded is None else encoded.result()
+        png = images.encode(image_bgr) if encoded is None else b""
         captured_utc = None
         if record.captured_ns is not None:
             age_ns = self._clock.now_ns() - record.captured_ns
@@ -111,7 +111,7 @@ class Enrollment:
                     f"view {index} of {self.object_name!r} is stored already",
                     next_step="continue with the missing views; check that no other process enrolls this object",
                 )
-            image = self._write_image(f"{index:03d}.png", png)
+            image = self._write_image(f"{index:03d}.png", png if encoded is None else encoded.result())
             new = NewView(index, measured(record), self.session.id, captured_utc, image, packed)
             with changing_enrollments(connection, [self.id]):
                 (view_id,) = insert_views(connection, self.id, [new])

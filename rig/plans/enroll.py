@@ -27,7 +27,6 @@ from rig.plans.fly import fly_views, park
 from rig.views.capture import Viewer, image_similarity
 from rig.views.description import DESCRIPTORS, ViewDescriber
 from rig.views.empty_table import empty_table_status
-from rig.views.image_files import encode_meanwhile
 
 SAME_SIMILARITY = 0.97
 """Two images of an object at one angle are more similar; after a shift by a centimetre they are less similar."""
@@ -142,7 +141,7 @@ def _take_views(
     bench: Bench, enrollment: Enrollment, angles_deg: Mapping[int, float], describe: ViewDescriber
 ) -> Generator[Event, None, int]:
     """Take and store the views at these table angles, return to 0, and return the number of repeated images."""
-    viewer = Viewer(bench.camera, bench.config)
+    viewer = Viewer(bench.camera, bench.config, encodes=True)
     with Turntable(bench) as table:
         retakes, first, index = yield from _step_views(bench, enrollment, table, viewer, angles_deg, describe)
         # Return to the first view to check that the object was not moved, then to 0 to free the cable: without its
@@ -201,7 +200,6 @@ def _step_views(
         imu.add(move)
         attempt = yield from capture(index, viewer, table, move.settled_ns)
         retakes += attempt.number - 1
-        encoded = encode_meanwhile(attempt.image_bgr)
         described = describe(attempt.image_bgr)
         record = ViewRecord(
             index=index,
@@ -216,7 +214,7 @@ def _step_views(
             region=bench.config.view.roi,
             segmentation=described.segmentation,
         )
-        enrollment.add(record, attempt.image_bgr, encoded)
+        enrollment.add(record, attempt.image_bgr, attempt.encoded)
         yield Accepted(index, record.azimuth_deg, attempt.evidence, attempt.image_bgr, described.segmentation)
         yield from warn_of_table(bench, index, described)
         first = first or (index, angle_deg, attempt.image_bgr)

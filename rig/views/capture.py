@@ -1,7 +1,8 @@
 """Captures frames for views and checks them: image quality, camera settings, and whether the table stood still."""
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from concurrent.futures import Future
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from math import isfinite
 
@@ -13,6 +14,7 @@ from rig.config import RigConfig, ViewConfig
 from rig.devices.camera import Camera, CameraLocks, Frame
 from rig.safety.gyro_rotation import Stillness
 from rig.views.description import within
+from rig.views.image_files import encode_meanwhile
 from rig.views.stream import exposed_before_stamp_ns
 
 DARK_LEVEL = 8
@@ -85,12 +87,16 @@ class ViewEvidence:
 
 @dataclass(frozen=True, slots=True)
 class Attempt:
-    """One frame, the ``number``-th for this view from 1 on, and the reasons to reject it; none if it is accepted."""
+    """One frame, the ``number``-th for this view from 1 on, and the reasons to reject it; none if it is accepted.
+
+    ``encoded`` is the frame as PNG, if the `Viewer` encodes its frames.
+    """
 
     number: int
     image_bgr: NDArray[np.uint8]
     evidence: ViewEvidence
     reasons: tuple[RejectReason, ...]
+    encoded: Future[bytes] | None = None
 
     @property
     def accepted(self) -> bool:
@@ -161,11 +167,13 @@ class Viewer:
     """Captures views with one camera, whose locked settings must not change after the viewer was made.
 
     A camera that delays its frames inside stamps them after their exposure. With the camera's time from calibration,
-    only frames count whose exposure began after the rest.
+    only frames count whose exposure began after the rest. With ``encodes`` each frame is encoded as PNG, to be stored,
+    while it is checked.
     """
 
-    def __init__(self, camera: Camera, config: RigConfig) -> None:
+    def __init__(self, camera: Camera, config: RigConfig, *, encodes: bool = False) -> None:
         self._camera = camera
+        self._encodes = encodes
         self._config = config.view
         self._early_ns = exposed_before_stamp_ns(config)
         self._locks = camera.read_locks()
@@ -188,7 +196,9 @@ class Viewer:
         after_ns = settled_ns + self._early_ns
         for number in range(1, 2 + self._config.retakes):
             frame = self._camera.capture(after_ns, meanwhile)
+            encoded = encode_meanwhile(frame.image_bgr) if self._encodes else None
             attempt = self._check(number, frame, settled_ns, check_still(after_ns - self._early_ns))
+            attempt = replace(attempt, encoded=encoded)
             self._last = frame.image_bgr
             yield attempt
             if attempt.accepted:
