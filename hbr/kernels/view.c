@@ -39,6 +39,20 @@ EXPORT FOR_EVERY_PROCESSOR void hbr_shrink(const uint8_t *image, int64_t stride,
    four; `line` and `sums` hold 4 * side floats each. */
 typedef float float4 __attribute__((vector_size(16)));
 
+PART void average_row(const float *pixels, int64_t side, const int64_t *first, const float *weights, int64_t most,
+                      float *line) {
+    for (int64_t x = 0; x < side; x++, weights += most) {
+        const float *pixel = pixels + 3 * first[x];
+        float4 sum = {0, 0, 0, 0};
+        for (int64_t j = 0; j < most; j++) {
+            float4 four;
+            __builtin_memcpy(&four, pixel + 3 * j, sizeof four);
+            sum += four * weights[j];
+        }
+        __builtin_memcpy(line + 4 * x, &sum, sizeof sum);
+    }
+}
+
 EXPORT FOR_EVERY_PROCESSOR void hbr_average(const uint8_t *image, int64_t stride, int64_t size, int64_t side,
                                             const int64_t *first, const float *weights, int64_t most, float *pixels,
                                             float *line, float *sums, uint8_t *out) {
@@ -51,17 +65,12 @@ EXPORT FOR_EVERY_PROCESSOR void hbr_average(const uint8_t *image, int64_t stride
             if (share == 0) continue;
             if (row != ready) {
                 for (int64_t i = 0; i < 3 * size; i++) pixels[i] = image[row * stride + i];
-                for (int64_t x = 0; x < side; x++) {
-                    const float *pixel = pixels + 3 * first[x];
-                    const float *weight = weights + x * most;
-                    float4 sum = {0, 0, 0, 0};
-                    for (int64_t j = 0; j < most; j++, pixel += 3) {
-                        float4 four;
-                        __builtin_memcpy(&four, pixel, sizeof four);
-                        sum += four * weight[j];
-                    }
-                    __builtin_memcpy(line + 4 * x, &sum, sizeof sum);
-                }
+                if (most == 3) /* unrolled */
+                    average_row(pixels, side, first, weights, 3, line);
+                else if (most == 4)
+                    average_row(pixels, side, first, weights, 4, line);
+                else
+                    average_row(pixels, side, first, weights, most, line);
                 ready = row;
             }
             for (int64_t i = 0; i < 4 * side; i++) sums[i] += line[i] * share;

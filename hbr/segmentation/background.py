@@ -272,6 +272,14 @@ def _places(side: int) -> FloatArray:
 
 
 @lru_cache
+def _plane(height: int, width: int) -> FloatArray:
+    """Return 1 and the place across and down of the pixels that a plane is fitted to, (h, w, 3)."""
+    y, x = np.mgrid[2:height:_EVERY, 2:width:_EVERY]
+    basis: FloatArray = np.stack([np.ones(x.shape), (x + 0.5) / width - 0.5, (y + 0.5) / height - 0.5], axis=2)
+    return basis
+
+
+@lru_cache
 def _quarters(side: int) -> tuple[int, ...]:
     return tuple(np.linspace(0, side, 5).astype(int).tolist())
 
@@ -305,13 +313,10 @@ def _medians(rows: FloatArray) -> FloatArray:
 
 def _fit(logarithm: Floats, table_log: Floats, useful: Mask) -> FloatArray:
     """Fit a plane to each channel of the difference of logarithms by least squares, repeated without the outliers."""
-    height, width = useful.shape
     keep = useful[2::_EVERY, 2::_EVERY]
-    rows, columns = np.nonzero(keep)
-    if len(rows) < 12:
+    basis = _plane(*useful.shape)[keep]
+    if len(basis) < 12:
         return np.zeros((3, 3))
-    x, y = (columns * _EVERY + 2.5) / width - 0.5, (rows * _EVERY + 2.5) / height - 0.5
-    basis = np.column_stack([np.ones(len(rows)), x, y])
     few = np.s_[2::_EVERY, 2::_EVERY]
     values = (logarithm[few] - table_log[few])[keep].astype(np.float64)
     slopes = np.zeros((3, 3))
@@ -322,5 +327,5 @@ def _fit(logarithm: Floats, table_log: Floats, useful: Mask) -> FloatArray:
         inlier = np.flatnonzero(away <= max(tolerance, float(np.partition(away, quarter)[quarter])))
         own = basis.take(inlier, axis=0)
         gram = own.T @ own + _RIDGE
-        slopes = np.linalg.solve(gram, own.T @ values.take(inlier, axis=0))
+        slopes = np.linalg.solve(gram, own.T @ values.take(inlier, axis=0)).astype(np.float64, copy=False)
     return slopes
