@@ -1,0 +1,69 @@
+"""Evaluated searches take the last step of the bench: two leaders are compared pixel by pixel."""
+
+from dataclasses import replace
+from math import inf
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from hbr import Outcome
+from hbr.evaluation.condition import Condition
+from hbr.evaluation.datasets import load_coil
+from hbr.evaluation.descriptors import enrolled_levels, query_levels
+from hbr.evaluation.methods import METHODS
+from hbr.evaluation.near_twins import LocalPhotographs
+from hbr.evaluation.protocol import COMPARED, OUTCOMES, Protocol
+from hbr.evaluation.trials import rule_of_trial, run_object
+from hbr.model.views import Views
+
+SIZE = (96, 96)
+
+
+def drawn(kind: int, angle_deg: float, *, sticker: bool) -> np.ndarray:
+    """A cylinder with painted spots before a dark background; the sticker is a spot that one twin has alone."""
+    image = np.zeros((*SIZE, 3), np.uint8)
+    cv2.rectangle(image, (20, 12), (76, 84), (90 + 60 * kind, 150, 200 - 50 * kind), -1)
+    rng = np.random.default_rng(kind)
+    spots = [(*rng.uniform((0, 20), (360, 76)), rng.integers(40, 255, 3).tolist(), 6) for _ in range(14)]
+    for around_deg, y, colour, radius in [*spots, *([(100.0, 48.0, [30, 30, 250], 9)] if sticker else [])]:
+        angle = np.radians(around_deg - angle_deg)
+        if np.cos(angle) > 0.2:
+            cv2.circle(image, (round(48 + 24 * np.sin(angle)), round(y)), radius, colour, -1)
+    return image
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("photographs")
+    for number, (kind, sticker) in enumerate([(0, False), (0, True), (1, False)], 1):
+        for angle_deg in range(0, 360, 15):
+            assert cv2.imwrite(str(path / f"obj{number}__{angle_deg}.png"), drawn(kind, angle_deg, sticker=sticker))
+    return path
+
+
+def test_searches_for_near_twins_compare_the_two_leaders(folder: Path) -> None:
+    dataset, condition = load_coil(folder), Condition(descriptor="edges+colours")
+    levels = [enrolled_levels(dataset, j, condition, SIZE) for j in range(3)]
+    views = Views.concatenate(
+        [
+            Views.of_object(item.name, own, item.azimuth_deg, condition.descriptor)
+            for item, own in zip(dataset.objects, levels, strict=True)
+        ]
+    )
+    protocol = Protocol(trials=1, max_views=2, removal="queries", sigma_deg=0.5, enrolled=12)
+    photographs = LocalPhotographs(dataset, condition, SIZE, protocol.seed)
+    assert photographs.possible
+    assert not LocalPhotographs(dataset, Condition(), SIZE, 0).possible  # plain CEDD cuts nothing out
+    queries = query_levels(dataset, 1, condition, SIZE, protocol.seed)
+    # no search is confident, and no object is unknown: each ends as ambiguous
+    rule = replace(rule_of_trial(views, protocol), min_confidence=2.0, open_set_thresholds=(-inf, -inf))
+    without, with_images = (
+        run_object(1, queries, views, [METHODS["dense-90"]], protocol, rule=rule, photographs=images)
+        for images in (None, photographs)
+    )
+    assert (without.outcome[0, 0, :, -1] == OUTCOMES.index(Outcome.AMBIGUOUS)).all()
+    assert (without.compared == -1).all()
+    assert (with_images.compared[..., :-1] == -1).all()
+    assert set(with_images.compared[..., -1].ravel()) <= {COMPARED.index("none"), COMPARED.index("right")}
