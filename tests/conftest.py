@@ -55,8 +55,12 @@ for number, handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIG
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers() -> int:
-    """Return three workers for two cores: for a sixth of the time, tests wait for a clock or for another program."""
-    return max(1, (os.cpu_count() or 1) * 3 // 2)
+    """Return three workers for two cores: for a sixth of the time, tests wait for a clock or for another program.
+
+    Each worker takes half a gigabyte of memory, so that there are at most two more than cores.
+    """
+    cores = os.cpu_count() or 1
+    return cores + min(cores // 2, 2)
 
 
 def pytest_collection_finish() -> None:
