@@ -3,6 +3,7 @@
 import json
 import threading
 from collections.abc import Callable, Iterator
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -127,9 +128,10 @@ def test_journal_is_delivered_in_the_middle_of_a_run(postgres: PostgresServer, p
     finally:
         if not postgres.runs:
             postgres.start()
-    assert [state.waiting for state in states] == [1, 0]
-    assert len(said) == 2
-    assert "is delivered later" in said[0]
-    assert said[1].startswith("Delivered star with 2 views")
+    # a server that starts is another reason than one that is stopped
+    assert [waiting for waiting, _ in groupby(state.waiting for state in states)] == [1, 0]
+    assert len(said) > 1
+    assert all("is delivered later" in words for words in said[:-1])
+    assert said[-1].startswith("Delivered star with 2 views")
     with open_copy(place, CLOCK) as copy:  # it follows the first search after the outage
         assert copy.views().views.object_names == ("mug", "star")
