@@ -290,6 +290,10 @@ class DenseIndex:
 
     def _raised(self, similar: FloatArray) -> Floats:
         """Return the similarities to the power p; for 4 by products, which are the same on every computer."""
-        similar = np.maximum(similar, 0)
-        raised: FloatArray = np.square(np.square(similar)) if self.power == 4 else similar**self.power
+        raised = np.maximum(similar, 0)
+        if self.power == 4:
+            np.square(raised, out=raised)
+            np.square(raised, out=raised)
+        else:
+            raised **= self.power
         return raised.astype(np.float32)
