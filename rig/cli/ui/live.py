@@ -103,7 +103,7 @@ class LiveView(AbstractContextManager["LiveView"]):
                 redirect_stdout=False,  # Rich would interpret terminal escapes in what is printed meanwhile
                 redirect_stderr=False,
             )
-            self._live.start()
+            self._live.start(refresh=True)  # a plan of a few fast views also shows the keys
 
     def _stop(self) -> None:
         """End the live table; it stays on the screen, and new lines appear below it."""
