@@ -266,8 +266,8 @@ def calibrate_stopping_rule(
     error_rate, false_reject
         As for `fit_stopping_rule`.
     most_searches
-        Searches in all, from different first views; each object is searched for at least once, but at most
-        `MOST_OBJECTS` of them.
+        Searches in all, from different first views. Each object is searched for at least once; of more than
+        `MOST_OBJECTS`, so many, evenly spread.
     most_shifted_searches
         Searches under changes of the bench, from which the open-set score is fitted (`fit_open_set`).
     sample

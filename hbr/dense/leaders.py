@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from hbr.core.angles import wrap180, wrap360
-from hbr.core.arrays import IndexArray
+from hbr.core.arrays import FloatArray, IndexArray
 from hbr.dense.filter import Belief
 from hbr.dense.local_difference import NEAREST, LocalDecision, LocalView, chosen_views, compare_objects, poses_of
 from hbr.dense.stopping import Outcome
@@ -70,7 +70,6 @@ class LeaderComparison:
 def compare_leaders(
     belief: Belief,
     outcome: Outcome,
-    margin: float,
     orientations_deg: Sequence[float],
     view: Callable[[int], LocalView],
     leader_views: LeaderViews,
@@ -89,8 +88,6 @@ def compare_leaders(
         After the last view.
     outcome
         With which the search would end.
-    margin
-        By how much the leader's score exceeds the second score.
     orientations_deg
         Orientation of each view of the search.
     view
@@ -102,9 +99,11 @@ def compare_leaders(
     max_error
         Largest error rate of a decision.
     """
-    if outcome is not Outcome.AMBIGUOUS and (outcome is not Outcome.UNKNOWN or margin > TWIN_MARGIN):
+    if outcome not in (Outcome.AMBIGUOUS, Outcome.UNKNOWN):
         return None
     probability = belief.posterior(beta).sum(axis=1)
+    if outcome is Outcome.UNKNOWN and _margin(belief.scores(), probability) > TWIN_MARGIN:
+        return None
     order = np.argsort(-probability, kind="stable")[:2]
     if len(order) < 2 or float(probability[order].sum()) < LEADERS:
         return None
@@ -127,3 +126,9 @@ def compare_leaders(
         else:
             outcome = Outcome.AMBIGUOUS
     return LeaderComparison((first, second), tuple(compared), views, found, outcome, winner)
+
+
+def _margin(scores: FloatArray, probability: FloatArray) -> float:
+    """Return by how much the score of the likeliest object exceeds all others."""
+    best = int(np.lexsort((-scores, -probability))[0])
+    return float(scores[best] - np.delete(scores, best).max(initial=0.0))

@@ -61,29 +61,12 @@ class Verification:
         return sum(weight * number for weight, number in zip(_WEIGHTS, numbers, strict=True)) + _OFFSET
 
     def decided(self, decision: StopDecision) -> StopDecision:
-        """Return the decision of a search that would end with another one."""
+        """Return the decision with which a search ends instead of this one."""
         score = self.score(decision.open_set_score)
         outcome = Outcome.UNKNOWN if score < UNKNOWN_BELOW else Outcome.AMBIGUOUS
         if score >= FOUND_FROM and decision.confidence >= decision.min_confidence:
             outcome = Outcome.FOUND
         return replace(decision, outcome=outcome, reason=StopReason.PIXEL_FIT)
-
-
-def verified(
-    belief: Belief,
-    decision: StopDecision,
-    rule: StoppingRule,
-    segmentations: Callable[[int], Sequence[LocalView]],
-    leader_views: LeaderViews,
-) -> tuple[StopDecision, Verification | None]:
-    """Return the decision with which a search ends, and what was compared; the same decision if there is no doubt.
-
-    Parameters are those of `is_doubtful` and `verify`.
-    """
-    if not is_doubtful(rule, decision, belief.queries, belief.index.views.descriptor):
-        return decision, None
-    found = verify(belief, decision.object_index, segmentations, leader_views)
-    return found.decided(decision), found
 
 
 def is_doubtful(rule: StoppingRule, decision: StopDecision, views: int, kind: str) -> bool:
@@ -104,7 +87,7 @@ def is_doubtful(rule: StoppingRule, decision: StopDecision, views: int, kind: st
         The descriptor.
     """
     calibrated = len(rule.open_set_thresholds)
-    model = None if rule.open_set is None else fitted_before(kind, calibrated)
+    model = fitted_before(kind, calibrated)
     if model is None or rule.open_set is None or not np.array_equal(model.weights, rule.open_set.weights):
         return False
     if decision.outcome is Outcome.CONTINUE or views < calibrated:

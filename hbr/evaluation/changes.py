@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from hbr.core.angles import wrap180
 from hbr.core.arrays import ImageArray, LevelArray
 from hbr.dense.index import DenseIndex
-from hbr.dense.leaders import compare_leaders, near
+from hbr.dense.last_steps import last_steps
+from hbr.dense.leaders import near
 from hbr.dense.local_difference import LocalView
 from hbr.dense.session import DenseSession
 from hbr.dense.stopping import Outcome, StopDecision, StoppingRule
-from hbr.dense.verification import verified
 from hbr.descriptors.together import ViewsTogether, like_enrollment
 from hbr.evaluation.changed_bench import ENROLLMENT, HARD, MILD, Bench, Visit
 from hbr.evaluation.condition import object_mask
@@ -216,29 +216,20 @@ class _Search:
 
     def _ended(self, decision: StopDecision, views: ViewsTogether) -> SearchResult:
         """Return the result of a search that ends with this decision; the last step compares its two leaders."""
-        belief, rule = self._session.belief, self._session.rule
-        end, verification = verified(
-            belief, decision, rule, lambda n: _local_views(views, n, self._orientations_deg[n]), self._near
-        )
-        scores = np.sort(belief.scores())
-        compared = compare_leaders(
-            belief,
-            end.outcome,
-            float(scores[-1] - scores[-2]) if len(scores) > 1 else 0.0,
+        end, verification, compared = last_steps(
+            self._session.belief,
+            decision,
+            self._session.rule,
             self._orientations_deg,
-            lambda n: _local_views(views, n, self._orientations_deg[n])[0],
+            lambda n: _local_views(views, n, self._orientations_deg[n]),
             self._near,
-            beta=rule.beta,
-            max_error=rule.error_rate,
         )
-        outcome, decided = end.outcome, end.object_index
-        if compared is not None:
-            outcome = compared.outcome
-            decided = decided if compared.winner is None else compared.winner
+        outcome = end.outcome if compared is None else compared.outcome
+        winner = None if compared is None else compared.winner
         return SearchResult(
             (),
             outcome,
-            self._names[decided],
+            self._names[end.object_index if winner is None else winner],
             len(self._leaders),
             compared is not None,
             outcome is not end.outcome,

@@ -16,12 +16,11 @@ from hbr.core.arrays import FloatArray, IndexArray, LevelArray
 from hbr.dense.calibration import calibrate_stopping_rule
 from hbr.dense.filter import Belief, update_belief
 from hbr.dense.index import DenseIndex
-from hbr.dense.leaders import compare_leaders
+from hbr.dense.last_steps import last_steps
 from hbr.dense.local_difference import LocalView
 from hbr.dense.next_view import most_informative_rotation
 from hbr.dense.session import DenseSession
 from hbr.dense.stopping import Outcome, StoppingRule
-from hbr.dense.verification import verified
 from hbr.descriptors import descriptor
 from hbr.evaluation.draws import generator
 from hbr.evaluation.methods import Method
@@ -251,7 +250,6 @@ class _Trials:
         photographs, belief, decision = self._photographs, session.belief, session.decision
         if photographs is None:
             return decision.outcome, -1
-        scores = np.sort(belief.scores())
         keep = self._keep(np.array(seen))
 
         def query(n: int) -> LocalView:
@@ -261,17 +259,7 @@ class _Trials:
             own = keep if leader == self._object else self._enrolled[self._views.of(leader)]
             return photographs.enrolled(leader, np.flatnonzero(own), azimuths_deg)
 
-        end, _ = verified(belief, decision, session.rule, lambda n: [query(n)], enrolled)
-        compared = compare_leaders(
-            belief,
-            end.outcome,
-            float(scores[-1] - scores[-2]) if len(scores) > 1 else 0.0,
-            measured_deg,
-            query,
-            enrolled,
-            beta=session.rule.beta,
-            max_error=session.rule.error_rate,
-        )
+        end, _, compared = last_steps(belief, decision, session.rule, measured_deg, lambda n: [query(n)], enrolled)
         if compared is None:
             return end.outcome, -1
         if compared.winner is not None:

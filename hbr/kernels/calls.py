@@ -1,7 +1,6 @@
 """The kernels as functions of arrays. Each returns None without the compiled library: the caller has the reference."""
 
 import ctypes
-import os
 import threading
 from itertools import pairwise
 from typing import Any, Final, NamedTuple
@@ -10,10 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hbr.core.arrays import FloatArray, ImageArray, IndexArray, LevelArray
+from hbr.core.cores import THREADS
 from hbr.kernels.library import address, library
 
-THREADS: Final = min(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1, 4)
-"""Threads that compare a query with the views of a large catalog; more would wait for the memory."""
 _ROWS_OF_A_THREAD: Final = 100_000
 """Fewer rows take less time than a thread is worth."""
 

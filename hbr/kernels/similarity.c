@@ -235,19 +235,29 @@ AVX512 static void prepare_avx512(struct query *q, const uint8_t *edges) {
     q->base *= v[0];
 }
 
-/* Add up eight vectors of 64-bit numbers each: the sum of vector i stands at place i. */
-AVX512 static inline __m512i sums_of_eight(const __m512i v[8]) {
-    __m512i two[4], four[2]; /* lanes of 128 bits with parts of the sums of two vectors; of two times two vectors */
-#pragma GCC unroll 4
-    for (int i = 0; i < 4; i++)
-        two[i] = _mm512_add_epi64(_mm512_unpacklo_epi64(v[2 * i], v[2 * i + 1]),
-                                  _mm512_unpackhi_epi64(v[2 * i], v[2 * i + 1]));
+/* Add up the two halves of each lane of 128 bits: lane by lane, the sum of `a` and that of `b`. Numbers of 32 bits are
+   added as pairs of them: their sums are below 2^32. */
+AVX512 static inline __m512i sums_of_halves(__m512i a, __m512i b) {
+    return _mm512_add_epi64(_mm512_unpacklo_epi64(a, b), _mm512_unpackhi_epi64(a, b));
+}
+
+/* Add up the four lanes of each vector: lane i has the sum of vector i. */
+AVX512 static inline __m512i sums_of_lanes(const __m512i v[4]) {
+    __m512i half[2];
 #pragma GCC unroll 2
     for (int i = 0; i < 2; i++)
-        four[i] = _mm512_add_epi64(_mm512_shuffle_i64x2(two[2 * i], two[2 * i + 1], EVEN_LANES),
-                                   _mm512_shuffle_i64x2(two[2 * i], two[2 * i + 1], ODD_LANES));
-    return _mm512_add_epi64(_mm512_shuffle_i64x2(four[0], four[1], EVEN_LANES),
-                            _mm512_shuffle_i64x2(four[0], four[1], ODD_LANES));
+        half[i] = _mm512_add_epi64(_mm512_shuffle_i64x2(v[2 * i], v[2 * i + 1], EVEN_LANES),
+                                   _mm512_shuffle_i64x2(v[2 * i], v[2 * i + 1], ODD_LANES));
+    return _mm512_add_epi64(_mm512_shuffle_i64x2(half[0], half[1], EVEN_LANES),
+                            _mm512_shuffle_i64x2(half[0], half[1], ODD_LANES));
+}
+
+/* Add up eight vectors: lane i of the result has the sums of vectors 2i and 2i + 1. */
+AVX512 static inline __m512i sums_of_eight(const __m512i v[8]) {
+    __m512i two[4];
+#pragma GCC unroll 4
+    for (int i = 0; i < 4; i++) two[i] = sums_of_halves(v[2 * i], v[2 * i + 1]);
+    return sums_of_lanes(two);
 }
 
 /* The levels are counted that are i in the query and j in the row, for i and j from 1 to 3, and those that are j in the
@@ -308,18 +318,8 @@ AVX512 static void colours_avx512(const struct query *q, const uint8_t *const *r
         for (int i = 0; i < 8; i++)
             pairs[i] = _mm512_add_epi32(_mm512_unpacklo_epi32(of_rows[2 * i], of_rows[2 * i + 1]),
                                         _mm512_unpackhi_epi32(of_rows[2 * i], of_rows[2 * i + 1]));
-        __m512i two[4], four[2];
-#pragma GCC unroll 4
-        for (int i = 0; i < 4; i++)
-            two[i] = _mm512_add_epi32(_mm512_unpacklo_epi64(pairs[2 * i], pairs[2 * i + 1]),
-                                      _mm512_unpackhi_epi64(pairs[2 * i], pairs[2 * i + 1]));
-#pragma GCC unroll 2
-        for (int i = 0; i < 2; i++)
-            four[i] = _mm512_add_epi32(_mm512_shuffle_i64x2(two[2 * i], two[2 * i + 1], EVEN_LANES),
-                                       _mm512_shuffle_i64x2(two[2 * i], two[2 * i + 1], ODD_LANES));
-        const __m512i sums = _mm512_add_epi32(_mm512_shuffle_i64x2(four[0], four[1], EVEN_LANES),
-                                              _mm512_shuffle_i64x2(four[0], four[1], ODD_LANES));
-        _mm512_mask_storeu_epi32(distances + k, left < 16 ? (__mmask16)((1 << left) - 1) : (__mmask16)65535, sums);
+        _mm512_mask_storeu_epi32(distances + k, left < 16 ? (__mmask16)((1 << left) - 1) : (__mmask16)65535,
+                                 sums_of_eight(pairs));
     }
 }
 

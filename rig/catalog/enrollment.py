@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sqlalchemy import Connection, delete, select, update
 
+from hbr.core.cores import THREADS
 from rig.catalog import audit
 from rig.catalog.database import Database
 from rig.catalog.describing import pack
@@ -16,14 +17,7 @@ from rig.catalog.records import EnrollmentStatus, ImageFile, Session, StoredView
 from rig.catalog.rows import NewView, empty_table_columns, insert_views, measured, supersede, unfinished_and_complete
 from rig.catalog.schema import enrollments, objects, sessions, views
 from rig.catalog.seal import changing_enrollments
-from rig.catalog.together import (
-    THREADS,
-    HeldImages,
-    describe_together,
-    object_descriptors,
-    stored_images,
-    write_described,
-)
+from rig.catalog.together import HeldImages, describe_together, object_descriptors, stored_images, write_described
 from rig.core.clock import Clock
 from rig.core.errors import CatalogError, UsageError
 from rig.views import image_files as images
@@ -97,7 +91,7 @@ class Enrollment:
                 f"view {index} is not described by {PAPER_DESCRIPTOR}", next_step="describe it: hbr.describe"
             )
         packed = pack(record.descriptors, record.region)
-        png = images.encode(image_bgr) if encoded is None else b""
+        encoded = images.encode_meanwhile(image_bgr) if encoded is None else encoded
         captured_utc = None
         if record.captured_ns is not None:
             age_ns = self._clock.now_ns() - record.captured_ns
@@ -111,7 +105,7 @@ class Enrollment:
                     f"view {index} of {self.object_name!r} is stored already",
                     next_step="continue with the missing views; check that no other process enrolls this object",
                 )
-            image = self._write_image(f"{index:03d}.png", png if encoded is None else encoded.result())
+            image = self._write_image(f"{index:03d}.png", encoded.result())
             new = NewView(index, measured(record), self.session.id, captured_utc, image, packed)
             with changing_enrollments(connection, [self.id]):
                 (view_id,) = insert_views(connection, self.id, [new])

@@ -3,7 +3,6 @@
 Decision: docs/decisions/0054.
 """
 
-import os
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -32,9 +31,6 @@ FEWEST_VIEWS: Final = 4
 
 MOST_HELD_BYTES: Final = 256_000_000
 """Pixels of one enrollment that are held in memory: 277 views of 640x480."""
-
-THREADS: Final = min(os.cpu_count() or 1, 4)
-"""Threads that describe the views of one enrollment: more wait for the interpreter."""
 
 
 class StoredImage(NamedTuple):

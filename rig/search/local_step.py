@@ -93,21 +93,8 @@ def compare_leaders(
 ) -> Comparison | None:
     """Compare the two leaders of a search (`hbr.dense.leaders`); None if it has no two that are to be compared.
 
-    Parameters
-    ----------
-    search
-        After its last view.
-    answer
-        Its answer.
-    segmentations
-        The views of the search.
-    leader_views
-        Returns enrolled views.
-
-    Raises
-    ------
-    CatalogError
-        From ``leader_views``.
+    ``answer`` is that of the search, and ``segmentations`` has the likeliest one of each view; the rest is as for
+    `verify_leader`.
     """
     if not isinstance(search, DenseSearch):
         return None
@@ -115,7 +102,6 @@ def compare_leaders(
     compared = leaders.compare_leaders(
         search.belief,
         answer.outcome,
-        answer.margin,
         orientations_deg,
         lambda n: LocalView(segmentations[n].crop, segmentations[n].mask, orientations_deg[n]),
         lambda leader, azimuths_deg: leader_views(names[leader], azimuths_deg),

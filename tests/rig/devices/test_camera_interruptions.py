@@ -16,19 +16,9 @@ from rig.plans.enroll import enroll
 from sim.camera import SimCapture
 from sim.computer import ComputerFiles
 from sim.frame_times import FPS
-from sim.noise import NoiseModel
-from sim.objects.shelf import shelf
 from sim.world import World
 
 PERIOD_NS = 1_000_000_000 // FPS
-
-
-@pytest.fixture
-def world() -> World:
-    world = World(noise=NoiseModel.none())
-    world.put(shelf()["teapot"])
-    world.clock.sleep(100.0)
-    return world
 
 
 def test_camera_with_another_number_after_replugging_is_found(tmp_path: Path, world: World) -> None:

@@ -18,7 +18,6 @@ from rig.devices.opencv_camera import CameraSettings, OpenCvCamera, TimeBase
 from rig.devices.opencv_capture import open_capture
 from sim.camera import SimCapture
 from sim.frame_times import FPS
-from sim.noise import NoiseModel
 from sim.objects.shelf import shelf
 from sim.world import World
 
@@ -35,14 +34,6 @@ class ForeignStamps(SimCapture):
     def get(self, prop: int) -> float:
         value = super().get(prop)
         return value * self._factor + self._offset_ms if prop == cv2.CAP_PROP_POS_MSEC else value
-
-
-@pytest.fixture
-def world() -> World:
-    world = World(noise=NoiseModel.none())
-    world.put(shelf()["teapot"])
-    world.clock.sleep(100.0)
-    return world
 
 
 # -- settings ---------------------------------------------------------------------------------------------------------

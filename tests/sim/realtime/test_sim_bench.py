@@ -19,15 +19,7 @@ from rig.bench import open_bench
 from rig.cli.ui.settings import Settings
 from rig.config import load_config
 from rig.core.clock import SystemClock, seconds_between
-from rig.core.errors import (
-    BenchBusy,
-    ConfigError,
-    DeviceFault,
-    DeviceNotFound,
-    DeviceSilent,
-    EmergencyStop,
-    UsageError,
-)
+from rig.core.errors import BenchBusy, ConfigError, DeviceNotFound, EmergencyStop, UsageError
 from rig.core.files import json_values
 from rig.devices.dynamixel.opening import open_servo
 from rig.devices.dynamixel.port import open_serial
@@ -205,19 +197,7 @@ def test_garbage_does_not_end_the_bench(start):
 def test_servo_and_rig_head_are_parts_of_one_world(start, monkeypatch):
     needs("memory")
     monkeypatch.setattr("rig.devices.head.link.REPLY_S", 10.0)  # the bench may have to wait for a processor
-    for attempt in (1, 2, 3):
-        folder = start(f"bench-{attempt}", "imu.connection=head", "head.power=true", "head.light=0.5", *PATIENT)
-        try:
-            check_one_world(folder)
-        except (DeviceFault, DeviceSilent):  # on a very busy computer the world stands still and catches up
-            if attempt == 3:
-                raise
-            tell(folder, "quit")
-        else:
-            return
-
-
-def check_one_world(folder: Path) -> None:
+    folder = start("bench", "imu.connection=head", "head.power=true", "head.light=0.5", *PATIENT)
     config = load_config(folder / "rig.toml")
     assert not tell(folder, "status")["world"]["light"][0]
     with open_bench("sim-bench", config) as bench:

@@ -1,0 +1,62 @@
+"""The steps with which a search at rest ends, as an evaluation takes them.
+
+The bench takes the same two steps one by one, because each of them is an event (`rig.search.local_step`).
+
+Decisions: docs/decisions/0058, docs/decisions/0062.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+from hbr.dense.filter import Belief
+from hbr.dense.leaders import LeaderComparison, LeaderViews, compare_leaders
+from hbr.dense.local_difference import LocalView
+from hbr.dense.stopping import StopDecision, StoppingRule
+from hbr.dense.verification import Verification, is_doubtful, verify
+
+
+class LastSteps(NamedTuple):
+    """The decision after a verification of a doubtful leader, that verification, and the comparison of two leaders."""
+
+    decision: StopDecision
+    verification: Verification | None
+    comparison: LeaderComparison | None
+
+
+def last_steps(
+    belief: Belief,
+    decision: StopDecision,
+    rule: StoppingRule,
+    orientations_deg: Sequence[float],
+    segmentations: Callable[[int], Sequence[LocalView]],
+    leader_views: LeaderViews,
+) -> LastSteps:
+    """Verify a doubtful leader, and compare the two leaders of a search that names no object.
+
+    Parameters
+    ----------
+    belief
+        After the last view.
+    decision, rule
+        With which the search would end, and the stopping rule.
+    orientations_deg
+        Orientation of each view of the search.
+    segmentations
+        Returns a view of the search by each of its segmentations, the likeliest first.
+    leader_views
+        Returns enrolled views.
+    """
+    verification = None
+    if is_doubtful(rule, decision, belief.queries, belief.index.views.descriptor):
+        verification = verify(belief, decision.object_index, segmentations, leader_views)
+        decision = verification.decided(decision)
+    comparison = compare_leaders(
+        belief,
+        decision.outcome,
+        orientations_deg,
+        lambda n: segmentations(n)[0],
+        leader_views,
+        beta=rule.beta,
+        max_error=rule.error_rate,
+    )
+    return LastSteps(decision, verification, comparison)
