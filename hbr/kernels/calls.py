@@ -39,7 +39,7 @@ class _Workspace(threading.local):
         return self
 
 
-_WORKSPACE = _Workspace()
+WORKSPACE = _Workspace()
 
 
 def cedd(image: ImageArray, grid: tuple[int, int, int, int], tables: Addresses) -> LevelArray | None:
@@ -50,7 +50,7 @@ def cedd(image: ImageArray, grid: tuple[int, int, int, int], tables: Addresses) 
         return None
     if image.strides[1:] != (3, 1):
         image = np.ascontiguousarray(image)
-    work = _WORKSPACE.grown(18 + 16 * columns + 2 * columns * width)
+    work = WORKSPACE.grown(18 + 16 * columns + 2 * columns * width)
     found.hbr_cedd(
         address(image), image.strides[0], rows, columns, height, width, tables.address, work.address + 144, work.address
     )

@@ -38,6 +38,7 @@ _SIGNATURES: Final[dict[str, tuple[Any, ...]]] = {
     "hbr_surround": (_POINTER, _POINTER, _INTEGER, _INTEGER, *[_POINTER] * 3),
     "hbr_difference": (*[_POINTER] * 4, _INTEGER, _INTEGER, *[_POINTER] * 3, ctypes.c_float, *[_POINTER] * 6),
     "hbr_closed": (_POINTER, _INTEGER, _INTEGER, _POINTER, _INTEGER, _POINTER, _POINTER),
+    "hbr_grab_cut": (_POINTER, _INTEGER, _INTEGER, *[_POINTER] * 7),
     "hbr_strongest": (_POINTER, _POINTER, _INTEGER, _POINTER, _POINTER),
     "hbr_votes": (_POINTER, _POINTER, _INTEGER, ctypes.c_float, _POINTER),
     "hbr_cell_means": (_POINTER, _POINTER, _INTEGER, _INTEGER, _POINTER),

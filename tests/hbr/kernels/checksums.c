@@ -2,6 +2,7 @@
 #include "kernels.h"
 
 #include <stdio.h>
+#include <stdlib.h>
 
 struct measure {
     int64_t edges_at, colours_at;
@@ -25,6 +26,8 @@ void hbr_rotated(const int64_t *, const double *, int64_t, const int64_t *, cons
 void hbr_paths(const uint8_t *, int64_t, int64_t, int64_t, const uint8_t *, int64_t, const int64_t *, const double *,
                const double *, double, const int64_t *, int64_t *, double *, int64_t *, double *, int64_t *,
                int64_t *);
+void hbr_grab_cut(const uint8_t *, int64_t, int64_t, const int64_t *, const uint8_t *, double (*)(double),
+                  double (*)(double), double *, uint8_t *, int64_t *);
 void hbr_cedd(const uint8_t *, int64_t, int64_t, int64_t, int64_t, int64_t, const void *, double *, uint8_t *);
 
 static uint64_t state = 88172645463325252ULL, sum = 1469598103934665603ULL;
@@ -148,6 +151,28 @@ static void cedd(void) {
     }
 }
 
+/* Instead of exp and log, which differ in their last bits from one C library to another. */
+static double falling(double x) { return 1 / (1 - x + x * x); }
+static double rising(double x) { return (x - 1) / (x + 1); }
+
+static void grab_cut(void) {
+    static uint8_t image[96 * 128 * 3], start[96 * 128], mask[96 * 128];
+    static double work[18 * 96 * 128];
+    static const int64_t inner[4] = {25, 11, 102, 86};
+    int64_t done;
+    for (int mode = 0; mode < 3; mode++) { /* smooth colours, noise, few colours */
+        for (int i = 0; i < 96 * 128 * 3; i++) {
+            const int x = i / 3 % 128, y = i / 384, near = (x - 64) * (x - 64) + (y - 50) * (y - 50) < 900;
+            const int smooth = x + y / 2 + (near ? 70 * (i % 3) : 0) + (int)(random_bits() % 16);
+            image[i] = (uint8_t)(mode == 0 ? (uint64_t)smooth : mode == 1 ? random_bits() >> 9 : (random_bits() % 3) * 90);
+            start[i / 3] = abs(x - 60) < 20 && abs(y - 50) < 20;
+        }
+        hbr_grab_cut(image, 96, 128, inner, start, falling, rising, work, mask, &done);
+        add(mask, sizeof mask);
+        add(&done, sizeof done);
+    }
+}
+
 int main(void) {
     similarity();
     printf("similarity %016llx\n", (unsigned long long)sum);
@@ -159,5 +184,7 @@ int main(void) {
     printf("paths %016llx\n", (unsigned long long)sum);
     next_view();
     printf("next_view %016llx\n", (unsigned long long)sum);
+    grab_cut();
+    printf("grab_cut %016llx\n", (unsigned long long)sum);
     return 0;
 }
