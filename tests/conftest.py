@@ -22,6 +22,7 @@ from typer.testing import CliRunner, Result
 from rig.bench import Bench
 from rig.cli.main import app
 from rig.config import load_config
+from rig.config.values import APP
 from sim.bench import ShelfOperator, open_sim_bench
 from sim.noise import NoiseModel
 from sim.objects.shelf import shelf
@@ -73,10 +74,19 @@ def pytest_collection_finish() -> None:
     gc.set_threshold(20_000, 20, 50)
 
 
+def share_firmware(cache: Path, base: Path) -> None:
+    """Let all workers of a run use the firmware that the first of them builds."""
+    shared = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "firmware"
+    shared.mkdir(exist_ok=True)
+    (cache / APP).mkdir(parents=True)
+    (cache / APP / "head").symlink_to(shared)
+
+
 @pytest.fixture(autouse=True, scope="session")
 def _nobodys_home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Keep the tests apart from the data of whoever runs them, and remove what they leave."""
     home = tmp_path_factory.mktemp("home")
+    share_firmware(home / "cache", tmp_path_factory.getbasetemp())
     get_temp_dir()  # Python removes this one at its own end
     with (
         TemporaryDirectory(prefix="rig-tests-", dir=home.parent, ignore_cleanup_errors=True) as temporary,

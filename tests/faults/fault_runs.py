@@ -156,7 +156,7 @@ def known_views() -> hbr.ViewIndex:
     """Return the views of three objects, enrolled without a fault."""
     with TemporaryDirectory() as folder, new_rig(Path(folder), seed=1) as rig, rig.opened() as (bench, catalog):
         for name in KNOWN:
-            for _ in enroll(bench, catalog, name, views=8):
+            for _ in enroll(bench, catalog, name, views=6):
                 pass
         return hbr.ViewIndex(catalog.views().views)
 

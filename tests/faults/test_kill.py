@@ -11,7 +11,7 @@ from tests.faults.killed_enrollments import VIEWS
 from tests.programs import Program
 
 
-@pytest.mark.parametrize("kills", [8, pytest.param(400, marks=[pytest.mark.nightly, pytest.mark.timeout(1800)])])
+@pytest.mark.parametrize("kills", [5, pytest.param(400, marks=[pytest.mark.nightly, pytest.mark.timeout(1800)])])
 def test_killed_enrollment_keeps_reported_views_and_resumes(tmp_path: Path, kills: int) -> None:
     code = "from tests.faults.killed_enrollments import main; main()"
     process = Program(str(tmp_path), str(kills), "1", code=code)

@@ -14,7 +14,7 @@ from hypothesis import settings
 
 from sim.head import build
 
-NIGHTLY_LINES, LINES = 1_000_000, 20_000
+NIGHTLY_LINES, LINES = 1_000_000, 4_000
 
 PROGRAM = """
 import ctypes, random, sys

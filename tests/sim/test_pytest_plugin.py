@@ -6,18 +6,16 @@ import sys
 from importlib.metadata import entry_points
 from pathlib import Path
 
+from tests.programs import Program
+
 DOCUMENT = Path(__file__).parents[2] / "docs" / "testing.md"
 
 
-def run(folder: Path, *arguments: str, code: str) -> subprocess.CompletedProcess[str]:
+def project(folder: Path, code: str) -> list[str]:
+    """Write the tests of another project; return the arguments of pytest."""
     (folder / "test_theirs.py").write_text(code, encoding="utf-8")
     (folder / "pytest.ini").write_text("[pytest]\naddopts = --strict-markers\n", encoding="utf-8")
-    return subprocess.run(
-        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *arguments, "test_theirs.py"],
-        cwd=folder,
-        capture_output=True,
-        text=True,
-    )
+    return ["-q", "-p", "no:cacheprovider", "test_theirs.py"]
 
 
 def test_documented_tests_pass_in_another_project(tmp_path):
@@ -33,9 +31,11 @@ def test_documented_tests_pass_in_another_project(tmp_path):
         "def test_plain(sim_world):\n"
         "    assert (sim_world.seed, sim_world.noise) == (0, NoiseModel())\n"
     )
-    done = run(tmp_path, code=code)
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert "4 passed" in done.stdout
+    words = project(tmp_path, code)
+    program = Program(*words, code="import pytest; raise SystemExit(pytest.main())", folder=tmp_path)
+    output, errors = program.communicate()
+    assert program.returncode == 0, output + errors
+    assert "4 passed" in output
 
 
 def test_plugin_imports_nothing_heavy_without_its_fixtures(tmp_path):
@@ -46,5 +46,6 @@ def test_plugin_imports_nothing_heavy_without_its_fixtures(tmp_path):
         "    assert not {'numpy', 'cv2', 'sqlalchemy', 'pydantic'} & set(sys.modules)\n"
     )
     others = {one.name for one in entry_points(group="pytest11")} - {"rig-sim"}  # whatever else is installed here
-    done = run(tmp_path, *(word for name in sorted(others) for word in ("-p", f"no:{name}")), code=code)
+    words = project(tmp_path, code) + [word for name in sorted(others) for word in ("-p", f"no:{name}")]
+    done = subprocess.run([sys.executable, "-m", "pytest", *words], cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr

@@ -1,41 +1,30 @@
 """Work over processes ends in words when one of them is lost."""
 
-import os
-import signal
 from pathlib import Path
 
 import pytest
 
-from hbr.descriptors import descriptor, load_model
+from hbr.descriptors import load_model
 from rig.core.errors import RigError
 from rig.core.processes import map_in_processes
 from tests.networks import means_network
-
-
-def work(item: int) -> int:
-    if item == 3:
-        os.kill(os.getpid(), signal.SIGKILL)
-    return item * item
+from tests.rig.core.work import length, square
 
 
 def test_killed_process_raises_an_error_with_a_next_step() -> None:
     with pytest.raises(RigError, match="ended before it was done") as lost:
-        list(map_in_processes(work, range(6), 2))
+        list(map_in_processes(square, range(6), 2))
     assert "--jobs 1" in lost.value.next_step
 
 
 def test_one_job_runs_in_this_process() -> None:
-    assert list(map_in_processes(work, [1, 2], 1)) == [(1, 1), (2, 4)]
-
-
-def length(item: tuple[str, int]) -> int:
-    return descriptor(item[0]).length
+    assert list(map_in_processes(square, [1, 2], 1)) == [(1, 1), (2, 4)]
 
 
 @pytest.mark.parametrize(("jobs", "most"), [(1, 1), (2, 8)])
 def test_items_are_read_as_they_are_needed(jobs: int, most: int) -> None:
     numbers = iter(range(100, 200))
-    results = map_in_processes(work, numbers, jobs)
+    results = map_in_processes(square, numbers, jobs)
     assert next(results) in [(n, n * n) for n in range(100, 100 + most)]
     assert next(numbers) <= 100 + most
     results.close()

@@ -34,7 +34,7 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Model]:
         Catalog.open(tmp_path_factory.mktemp("model"), clock=bench.clock) as catalog,
     ):
         for name in NAMES:
-            list(enroll(bench, catalog, name, views=12))
+            list(enroll(bench, catalog, name, views=8))
         yield load_model(catalog)
 
 

@@ -58,7 +58,7 @@ def saved(tmp_path_factory):
     ):
         list(photograph_table(bench))
         for name in ("mug-white", "mug-star", "lamp"):
-            list(enroll(bench, catalog, name, views=8))
+            list(enroll(bench, catalog, name, views=6))
         index = hbr.ViewIndex(catalog.views().views)
         for number, strategy in enumerate(("ahbr", "hbr", "sweep", "random")):
             operator.next_object, operator.yaw_deg = "mug-star", 40.0 * number

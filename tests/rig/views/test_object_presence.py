@@ -87,7 +87,7 @@ def test_watch_identifies_objects_and_continues_after_a_failure(simulated, tmp_p
     s = simulated("identify.max_views=4", seed=7)
     with Catalog.open(tmp_path, clock=s.bench.clock) as catalog:
         for name in ("toy-car", "book-night"):
-            list(enroll(s.bench, catalog, name, views=12))
+            list(enroll(s.bench, catalog, name, views=6))
         index = hbr.ViewIndex(catalog.views().views)
     s.world.put(None)
     s.bench.operator = TableWatcher(s.bench)
