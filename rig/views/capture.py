@@ -121,13 +121,20 @@ class ImageQuality:
     def of(cls, image_bgr: NDArray[np.uint8], config: ViewConfig) -> "ImageQuality":
         """Measure the region of interest of a frame, uint8 (H, W, 3)."""
         grey = cv2.cvtColor(within(image_bgr, config.roi), cv2.COLOR_BGR2GRAY)
-        sharpness = float(cv2.Laplacian(grey, cv2.CV_16S).var())
+        laplacian = cv2.Laplacian(grey, cv2.CV_16S)
+        pixels = grey.size
+        counts = cv2.calcHist([grey], [0], None, [256], [0, 256]).ravel().astype(np.int64)
+        level = np.arange(256)
+        total = int(counts @ level)
+        variance = _variance(total, int(counts @ level**2), pixels)
+        squares = round(cv2.norm(laplacian, cv2.NORM_L2SQR))  # OpenCV squares a root: whole only after rounding
+        sharpness = _variance(int(cv2.sumElems(laplacian)[0]), squares, pixels)
         return cls(
             sharpness=sharpness,
-            mean_level=float(grey.mean()),
-            dark_share=float(np.count_nonzero(grey < DARK_LEVEL) / grey.size),
-            saturated_share=float(np.count_nonzero(grey == 255) / grey.size),
-            noise_share=sharpness / (NOISE_GAIN * max(float(grey.var()), 1.0)),
+            mean_level=total / pixels,
+            dark_share=int(counts[:DARK_LEVEL].sum()) / pixels,
+            saturated_share=int(counts[255]) / pixels,
+            noise_share=sharpness / (NOISE_GAIN * max(variance, 1.0)),
         )
 
     def reasons(self, config: ViewConfig) -> list[RejectReason]:
@@ -142,6 +149,11 @@ class ImageQuality:
         elif self.noise_share > MAX_NOISE:
             reasons.append(RejectReason.NOISE)
         return reasons
+
+
+def _variance(total: int, squares: int, count: int) -> float:
+    """Return the variance of whole numbers, by their sum and the sum of their squares, rounded only once."""
+    return (count * squares - total * total) / (count * count)
 
 
 def image_similarity(image_bgr: NDArray[np.uint8], other_bgr: NDArray[np.uint8], config: ViewConfig) -> float:

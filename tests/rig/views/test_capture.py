@@ -2,11 +2,24 @@
 
 from dataclasses import replace
 
+import cv2
+import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from rig.config import CameraTimeConfig
+from rig.config import CameraTimeConfig, ViewConfig
 from rig.motion.turntable import Turntable
-from rig.views.capture import Attempt, MotionEvidence, RejectReason, Viewer, rejection_text
+from rig.views.capture import (
+    DARK_LEVEL,
+    NOISE_GAIN,
+    Attempt,
+    ImageQuality,
+    MotionEvidence,
+    RejectReason,
+    Viewer,
+    rejection_text,
+)
 from rig.views.description import ViewDescriber
 
 
@@ -151,3 +164,17 @@ def test_every_reason_has_a_text_and_old_texts_stay(reason, on_the_table):
     evidence = replace(attempts_of(*on_the_table)[0].evidence, motion=in_motion)
     assert rejection_text(reason, evidence) not in ("", str(reason))
     assert rejection_text("blurred (sharpness 2.0 < 3)", evidence) == "blurred (sharpness 2.0 < 3)"
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(2, 24), st.integers(2, 24), st.integers(0, 255), st.integers(0, 255))
+def test_image_quality_is_that_of_its_definition(seed, height, width, low, high):
+    low, high = sorted((low, high))
+    image = np.random.default_rng(seed).integers(low, high + 1, (height, width, 3)).astype(np.uint8)
+    quality = ImageQuality.of(image, ViewConfig(roi=None))
+    grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY).astype(float)
+    sharpness = cv2.Laplacian(grey, cv2.CV_64F).var()
+    assert quality.sharpness == pytest.approx(sharpness, rel=1e-12, abs=1e-9)
+    assert quality.mean_level == pytest.approx(grey.mean(), rel=1e-14)
+    assert quality.dark_share == (grey < DARK_LEVEL).mean()
+    assert quality.saturated_share == (grey == 255).mean()
+    assert quality.noise_share == pytest.approx(sharpness / (NOISE_GAIN * max(grey.var(), 1.0)), rel=1e-12, abs=1e-9)
