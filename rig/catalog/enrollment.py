@@ -10,14 +10,23 @@ from numpy.typing import NDArray
 from sqlalchemy import Connection, delete, select, update
 
 from hbr.core.cores import THREADS
+from hbr.segmentation import Method
 from rig.catalog import audit
 from rig.catalog.database import Database
-from rig.catalog.describing import pack
+from rig.catalog.describing import EmptyTable, pack
 from rig.catalog.records import EnrollmentStatus, ImageFile, Session, StoredView, ViewRecord
 from rig.catalog.rows import NewView, empty_table_columns, insert_views, measured, supersede, unfinished_and_complete
 from rig.catalog.schema import enrollments, objects, sessions, views
 from rig.catalog.seal import changing_enrollments
-from rig.catalog.together import HeldImages, describe_together, object_descriptors, stored_images, write_described
+from rig.catalog.together import (
+    DescribedMeanwhile,
+    HeldImages,
+    describe_together,
+    object_descriptors,
+    objects_alone,
+    stored_images,
+    write_described,
+)
 from rig.core.clock import Clock
 from rig.core.errors import CatalogError, UsageError
 from rig.views import image_files as images
@@ -50,6 +59,8 @@ class Enrollment:
 
     def __post_init__(self) -> None:
         self._held = HeldImages(self._database.images)  # of this session: `revise` does not decode them again
+        self._meanwhile = DescribedMeanwhile(self._held)
+        self._empty_table: EmptyTable | None = None
 
     @property
     def folder(self) -> Path:
@@ -110,6 +121,10 @@ class Enrollment:
             with changing_enrollments(connection, [self.id]):
                 (view_id,) = insert_views(connection, self.id, [new])
         self._held.hold(image.path, image_bgr)
+        if self._empty_table is not None and (record.segmentation or {}).get("method") == Method.EMPTY_TABLE:
+            self._meanwhile.begin(
+                image.path, image_bgr, objects_alone(record.descriptors), record.region, self._empty_table
+            )
         return StoredView(
             id=view_id,
             object_name=self.object_name,
@@ -136,6 +151,7 @@ class Enrollment:
                     update(sessions).where(sessions.c.id == self.session.id).values(empty_table_columns(image))
                 )
         self._held.hold(image.path, image_bgr)
+        self._empty_table = image.path, image.sha256
         self.session = replace(self.session, empty_table_image=image.path)
 
     def revise(self) -> int:
@@ -156,7 +172,7 @@ class Enrollment:
             images = stored_images(connection, self.id)
         if not names:
             return 0
-        found = describe_together(self._held, names, images, threads=THREADS)
+        found = describe_together(self._held, names, images, threads=THREADS, meanwhile=self._meanwhile)
         for one in found:
             if one.reason:
                 raise CatalogError(

@@ -3,8 +3,8 @@
 Decision: docs/decisions/0054.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Hashable, Iterable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from itertools import groupby
 from threading import Lock
@@ -24,7 +24,7 @@ from rig.catalog.records import JsonObject, PackedDescriptor, Region
 from rig.catalog.schema import descriptors, sessions, views
 from rig.config import ViewConfig
 from rig.core.errors import CatalogError, UsageError
-from rig.views.description import EnrollmentDescriber
+from rig.views.description import DescribedAlone, EnrollmentDescriber
 
 FEWEST_VIEWS: Final = 4
 """A session with fewer views, after an interruption, learns its background from all views of the enrollment."""
@@ -85,10 +85,55 @@ class HeldImages:
             return self._pixels[image]
 
 
+class DescribedMeanwhile:
+    """Views of one session that are described in a thread while the table turns to the next one.
+
+    These are the views that the empty-table image segments: no other view changes their segmentation. At the end of an
+    enrollment only the others are left to describe.
+    """
+
+    def __init__(self, held: HeldImages) -> None:
+        self._held = held
+        self._thread = ThreadPoolExecutor(1, "describer")
+        self._describers: dict[Hashable, EnrollmentDescriber] = {}
+        self._found: dict[tuple[str, Hashable], Future[DescribedAlone]] = {}
+
+    def begin(
+        self, image: str, pixels: NDArray[np.uint8], names: tuple[str, ...], region: Region | None, table: EmptyTable
+    ) -> None:
+        """Begin to describe the pixels of an image, uint8 (H, W, 3) BGR, by descriptors of the object."""
+        how = names, region, table
+        self._found[image, how] = self._thread.submit(self._describe, how, pixels)
+
+    def result(self, item: StoredImage, names: tuple[str, ...]) -> DescribedAlone | None:
+        """Return the description of a view by these descriptors, when it is ready; None if it was not begun.
+
+        Raises what `EnrollmentDescriber.describe` does.
+        """
+        found = self._found.get((item.image, (names, item.region, item.empty_table)))
+        return None if found is None else found.result()
+
+    def _describe(
+        self, how: tuple[tuple[str, ...], Region | None, EmptyTable], pixels: NDArray[np.uint8]
+    ) -> DescribedAlone:
+        if how not in self._describers:
+            names, region, table = how
+            self._describers[how] = EnrollmentDescriber(ViewConfig(roi=region), names, self._held.pixels(*table))
+        return self._describers[how].describe_alone(pixels)
+
+
 def describe_together(
-    held: HeldImages, names: tuple[str, ...], items: Sequence[StoredImage], *, threads: int = 1
+    held: HeldImages,
+    names: tuple[str, ...],
+    items: Sequence[StoredImage],
+    *,
+    threads: int = 1,
+    meanwhile: DescribedMeanwhile | None = None,
 ) -> list[Described]:
-    """Describe the views of one enrollment by these descriptors, in their order, in so many threads."""
+    """Describe the views of one enrollment by these descriptors, in their order, in so many threads.
+
+    Views that were described ``meanwhile`` are not described again.
+    """
     found: dict[int, Described] = {}
     for _, group in groupby(sorted(items, key=_session), _session):
         own = list(group)
@@ -107,7 +152,7 @@ def describe_together(
             except (CatalogError, UsageError, ValueError) as error:
                 found.setdefault(one.view_id, Described(one.view_id, reason=_reason(error)))
         known = [one for one in own if one.view_id in numbers]
-        describe = partial(_described, held, describer, numbers)
+        describe = partial(_described, held, describer, numbers, names, meanwhile)
         if threads == 1:
             found |= {one.view_id: describe(one) for one in known}
         else:
@@ -117,11 +162,17 @@ def describe_together(
 
 
 def _described(
-    held: HeldImages, describer: EnrollmentDescriber, numbers: Mapping[int, int], item: StoredImage
+    held: HeldImages,
+    describer: EnrollmentDescriber,
+    numbers: Mapping[int, int],
+    names: tuple[str, ...],
+    meanwhile: DescribedMeanwhile | None,
+    item: StoredImage,
 ) -> Described:
     """Return the description of a view that the describer has learned as the view of this number."""
     try:
-        described = describer.describe(numbers[item.view_id], held.pixels(item.image, item.sha256))
+        alone = None if meanwhile is None else meanwhile.result(item, names)
+        described = describer.describe(numbers[item.view_id], held.pixels(item.image, item.sha256), alone)
     except (CatalogError, UsageError, ValueError) as error:
         return Described(item.view_id, reason=_reason(error))
     return Described(item.view_id, tuple(pack(described.levels, item.region)), described.segmentation)
@@ -136,7 +187,12 @@ def object_descriptors(connection: Connection, enrollment_id: int) -> tuple[str,
         .distinct()
         .order_by(descriptors.c.name)
     )
-    return tuple(name for name, version in rows if is_current(name, version) and not descriptor(name).whole_image)
+    return objects_alone(name for name, version in rows if is_current(name, version))
+
+
+def objects_alone(names: Iterable[str]) -> tuple[str, ...]:
+    """Return the descriptors among these that describe the object alone, in alphabetic order."""
+    return tuple(sorted(name for name in names if not descriptor(name).whole_image))
 
 
 def stored_images(connection: Connection, enrollment_id: int) -> list[StoredImage]:

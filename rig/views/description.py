@@ -5,7 +5,7 @@ Decision: docs/decisions/0029.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 import hbr
 from hbr.segmentation import MIN_AGREEMENT, Issue, IssueCode
 from hbr.segmentation.learned import LearnedBackground
-from hbr.segmentation.stored import evidence_together, stored_segmentation
+from hbr.segmentation.stored import TOGETHER, evidence_together, stored_segmentation
 from rig.config import ViewConfig
 from rig.core.errors import UsageError
 from rig.views.table_problems import TableProblem, TableProblemCode
@@ -54,6 +54,13 @@ class DescribedView:
     earlier: tuple[NDArray[np.uint8], ...] | None = None
     reliable: bool = True
     same_bench: bool | None = None
+
+
+class DescribedAlone(NamedTuple):
+    """The levels of a view by each descriptor, and the evidence of its segmentation, as `DescribedView` has them."""
+
+    levels: dict[str, NDArray[np.uint8]]
+    evidence: dict[str, Any]
 
 
 def within(image_bgr: NDArray[np.uint8], region: tuple[int, int, int, int] | None) -> NDArray[np.uint8]:
@@ -183,15 +190,26 @@ class EnrollmentDescriber(ViewDescriber):
         self._learned.add(within(image_bgr, self.region))
         return len(self._learned) - 1
 
-    def describe(self, view: int, image_bgr: NDArray[np.uint8]) -> DescribedView:
-        """Describe the image that was learned from as the view of this number."""
+    def describe(self, view: int, image_bgr: NDArray[np.uint8], alone: DescribedAlone | None = None) -> DescribedView:
+        """Describe the image that was learned from as the view of this number.
+
+        ``alone`` is what `describe_alone` returned for it, if its segmentation needs no other views.
+        """
+        levels, evidence = alone or self._described(image_bgr, self._learned.of(view))
+        return DescribedView(levels, {**evidence, TOGETHER: len(self._learned)})
+
+    def describe_alone(self, image_bgr: NDArray[np.uint8]) -> DescribedAlone:
+        """Describe a view that the empty-table image segments: the other views do not change its segmentation."""
+        return self._described(image_bgr, None)
+
+    def _described(self, image_bgr: NDArray[np.uint8], learned: hbr.Background | None) -> DescribedAlone:
         part = within(image_bgr, self.region)
         background, issues = self._prepared_table(image_bgr)
-        (found,) = hbr.hypotheses(part, empty_table=background, learned=self._learned.of(view), most=1)
+        (found,) = hbr.hypotheses(part, empty_table=background, learned=learned, most=1)
         if found.box is None:
             found = hbr.segment(part, empty_table=background)
         found = replace(found, issues=(*issues, *found.issues))
-        return DescribedView(self._levels(part, found), evidence_together(found, len(self._learned)))
+        return DescribedAlone(self._levels(part, found), evidence_together(found, len(self._learned)))
 
 
 class SearchDescriber(ViewDescriber):

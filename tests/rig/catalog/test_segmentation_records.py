@@ -21,17 +21,18 @@ from rig.catalog.exchange import (
     read_objects,
     write_bundle,
 )
+from rig.catalog.queries import packed_descriptors
 from rig.catalog.redescribe import redescribe
 from rig.catalog.schema import descriptors, views
 from rig.catalog.seal import changing_enrollments
-from rig.catalog.together import HeldImages, describe_together, stored_images
+from rig.catalog.together import DescribedMeanwhile, HeldImages, describe_together, stored_images
 from rig.catalog.verify import verify
 from rig.catalog.verify_images import Problem
 from rig.config import ViewConfig
 from rig.core.clock import SystemClock
 from rig.core.errors import DescriptorOutdated, UsageError
 from rig.search.model import load_model
-from rig.views.description import BENCH_DESCRIPTOR, DESCRIPTORS, PAPER_DESCRIPTOR, ViewDescriber
+from rig.views.description import BENCH_DESCRIPTOR, DESCRIPTORS, PAPER_DESCRIPTOR, EnrollmentDescriber, ViewDescriber
 from rig.views.segmentation_evidence import SegmentationSummary
 from tests.rig.catalog.catalog_samples import PROVENANCE, finished, plan, record
 
@@ -247,3 +248,36 @@ def test_views_are_described_the_same_in_several_threads(open_catalog):
     assert len(one) == VIEWS
     assert all(found.packed for found in one)
     assert one == several
+
+
+def test_views_described_while_the_table_turns_equal_those_described_afterwards(open_catalog):
+    catalog = open_catalog("catalog")
+    enrolled(catalog, "box")
+    store = catalog.database.images
+    with catalog.database.read() as connection:
+        images = stored_images(connection, 1)
+        stored = packed_descriptors(connection, views.c.enrollment_id == 1)
+    afterwards = describe_together(HeldImages(store), (BENCH_DESCRIPTOR,), images)
+    assert [one.packed[0] for one in afterwards] == [
+        next(packed for packed in stored[one.view_id] if packed.name == BENCH_DESCRIPTOR) for one in afterwards
+    ]
+    assert [one.segmentation for one in afterwards] == [
+        view.record.segmentation for view in catalog.object("box").views
+    ]
+
+
+def test_description_made_meanwhile_counts_only_for_the_same_descriptors_and_region(open_catalog):
+    catalog = open_catalog("catalog")
+    enrolled(catalog, "box")
+    with catalog.database.read() as connection:
+        (item, *_) = stored_images(connection, 1)
+    held = HeldImages(catalog.database.images)
+    meanwhile = DescribedMeanwhile(held)
+    pixels = held.pixels(item.image, item.sha256)
+    meanwhile.begin(item.image, pixels, (BENCH_DESCRIPTOR,), item.region, item.empty_table)
+    expected = EnrollmentDescriber(ViewConfig(roi=REGION), (BENCH_DESCRIPTOR,), table()).describe_alone(pixels)
+    found = meanwhile.result(item, (BENCH_DESCRIPTOR,))
+    assert found.evidence == expected.evidence
+    assert np.array_equal(found.levels[BENCH_DESCRIPTOR], expected.levels[BENCH_DESCRIPTOR])
+    assert meanwhile.result(item, (BENCH_DESCRIPTOR, "edges")) is None
+    assert meanwhile.result(item._replace(region=None), (BENCH_DESCRIPTOR,)) is None
