@@ -11,7 +11,7 @@
 #define NOISE 0.01              /* that is added to it */
 #define CLEAR 1e-6              /* difference of logarithms that rounding does not turn over */
 #define TINY (-600.0)           /* logarithm of a density that is far above the smallest number */
-#define LOST 52.0               /* in logarithms: a density so much smaller does not change a sum */
+#define LOST 40.0               /* in logarithms: a density so much smaller does not change a sum */
 #define ZERO (-746.0)           /* the exponential of less is 0 */
 #define KNOWN 4096              /* differences whose weight is kept */
 #define MOST_PIXELS 65000       /* more sums of colours are not exact in float32 */
@@ -22,10 +22,11 @@ enum { BACKGROUND, OBJECT };
 
 struct mixture {
     int64_t count[COLOURS], sum[COLOURS][3], product[COLOURS][3][3];
-    double share[COLOURS], mean[COLOURS][3], inverse[COLOURS][3][3], factor[COLOURS], log_factor[COLOURS];
+    double share[COLOURS], mean[COLOURS][3], inverse[COLOURS][3][3], factor[COLOURS];
+    double log_factor[COLOURS], log_weight[COLOURS]; /* of the factor, and of its product with the share */
 };
 
-PART void clear(struct mixture *m) {
+PART void start_sums(struct mixture *m) {
     for (int k = 0; k < COLOURS; k++) {
         m->count[k] = 0;
         for (int i = 0; i < 3; i++) {
@@ -52,7 +53,7 @@ PART int learn(struct mixture *m, function logarithm) {
     int64_t total = 0;
     for (int k = 0; k < COLOURS; k++) total += m->count[k];
     for (int k = 0; k < COLOURS; k++) {
-        m->share[k] = 0;
+        m->share[k] = m->log_factor[k] = 0;
         if (!m->count[k]) continue;
         const double each = 1.0 / (double)m->count[k];
         double c[9], *mean = m->mean[k];
@@ -82,6 +83,7 @@ PART int learn(struct mixture *m, function logarithm) {
         inverse[2][2] = (c[0] * c[4] - c[1] * c[3]) * over;
         m->factor[k] = 1.0 / __builtin_sqrt(found);
         m->log_factor[k] = logarithm(m->factor[k]);
+        m->log_weight[k] = m->log_factor[k] + logarithm(m->share[k]);
     }
     return 1;
 }
@@ -90,7 +92,10 @@ PART int learn(struct mixture *m, function logarithm) {
 FOR_EVERY_PROCESSOR static void exponents(const struct mixture *m, const double *colour, int64_t count, int64_t stride,
                                           double *exponent) {
     for (int k = 0; k < COLOURS; k++, exponent += stride) {
-        if (!(m->share[k] > 0)) continue;
+        if (!(m->share[k] > 0)) {
+            for (int64_t i = 0; i < count; i++) exponent[i] = -__builtin_inf();
+            continue;
+        }
         const double *mean = m->mean[k];
         const double(*inverse)[3] = m->inverse[k];
 #pragma GCC ivdep
@@ -104,24 +109,10 @@ FOR_EVERY_PROCESSOR static void exponents(const struct mixture *m, const double 
     }
 }
 
-/* The part of a mixture with the highest density. The exponential decides only where the logarithms are close. */
+/* The part of a mixture with the highest density. */
 PART int likeliest(const struct mixture *m, const double *exponent, int64_t stride, function exponential) {
-    double most = -__builtin_inf(), second = most;
-    int best = 0;
-    for (int k = 0; k < COLOURS; k++) {
-        if (!(m->share[k] > 0)) continue;
-        const double own = m->log_factor[k] + exponent[k * stride];
-        if (own > most) {
-            second = most;
-            most = own;
-            best = k;
-        } else if (own > second) {
-            second = own;
-        }
-    }
-    if (most > TINY && most - second > CLEAR) return best;
     double highest = 0;
-    best = 0;
+    int best = 0;
     for (int k = 0; k < COLOURS; k++) {
         if (!(m->share[k] > 0)) continue;
         const double own = m->factor[k] * exponential(exponent[k * stride]);
@@ -133,13 +124,32 @@ PART int likeliest(const struct mixture *m, const double *exponent, int64_t stri
     return best;
 }
 
+/* The same for each pixel of a row, by the logarithms of the densities: (COLOURS, stride) -> (count). `clear` is 0 where
+   they are too close or too small. */
+FOR_EVERY_PROCESSOR static void compare(const struct mixture *m, const double *exponent, int64_t count, int64_t stride,
+                                        double *part, double *clear) {
+#pragma GCC ivdep
+    for (int64_t i = 0; i < count; i++) {
+        double most = m->log_factor[0] + exponent[i], second = -__builtin_inf(), best = 0;
+#pragma GCC unroll 4
+        for (int k = 1; k < COLOURS; k++) {
+            const double own = m->log_factor[k] + exponent[k * stride + i], lower = own > most ? most : own;
+            best = own > most ? k : best;
+            second = lower > second ? lower : second;
+            most = own > most ? own : most;
+        }
+        part[i] = best;
+        clear[i] = (most > TINY) & (most - second > CLEAR) ? 1.0 : 0.0;
+    }
+}
+
 /* The density of a mixture. Parts that do not change the sum are not computed. */
 PART double density(const struct mixture *m, const double *exponent, int64_t stride, function exponential) {
     double most = -__builtin_inf();
     int part[COLOURS], parts = 0;
     for (int k = 0; k < COLOURS; k++) {
         if (!(m->share[k] > 0) || exponent[k * stride] < ZERO) continue;
-        const double own = m->log_factor[k] + exponent[k * stride];
+        const double own = m->log_weight[k] + exponent[k * stride];
         if (own < most - LOST && most > TINY) continue;
         if (own > most + LOST && own > TINY) parts = 0;
         part[parts++] = k;
@@ -220,7 +230,7 @@ EXPORT void hbr_grab_cut(const uint8_t *image, int64_t height, int64_t width, co
         }
         if (count < COLOURS) return;
         hbr_find_clusters(colours, pixels, count, &random, distance, label);
-        clear(&mixture[side]);
+        start_sums(&mixture[side]);
         count = 0;
         for (int64_t i = 0; i < pixels; i++)
             if (mask[i] == side) add(&mixture[side], label[count++], image + 3 * i);
@@ -229,18 +239,24 @@ EXPORT void hbr_grab_cut(const uint8_t *image, int64_t height, int64_t width, co
 
     /* the mixtures of the iteration */
     double *colour = work, *exponent[2] = {work + 3 * width, work + (3 + COLOURS) * width};
+    double *part[2] = {work + 13 * width, work + 14 * width}, *clear[2] = {work + 15 * width, work + 16 * width};
     struct mixture next[2];
-    clear(&next[BACKGROUND]);
-    clear(&next[OBJECT]);
+    start_sums(&next[BACKGROUND]);
+    start_sums(&next[OBJECT]);
     for (int64_t y = 0; y < height; y++) {
         const uint8_t *row = image + 3 * y * width;
         for (int64_t x = 0; x < width; x++)
             for (int64_t c = 0; c < 3; c++) colour[c * width + x] = row[3 * x + c];
-        for (int side = BACKGROUND; side <= OBJECT; side++)
+        for (int side = BACKGROUND; side <= OBJECT; side++) {
+            if (side == OBJECT && (y < top || y >= bottom)) continue;
             exponents(&mixture[side], colour, width, width, exponent[side]);
+            compare(&mixture[side], exponent[side], width, width, part[side], clear[side]);
+        }
         for (int64_t x = 0; x < width; x++) {
             const int side = mask[y * width + x];
-            add(&next[side], likeliest(&mixture[side], exponent[side] + x, width, exponential), row + 3 * x);
+            const int k = clear[side][x] != 0 ? (int)part[side][x]
+                                              : likeliest(&mixture[side], exponent[side] + x, width, exponential);
+            add(&next[side], k, row + 3 * x);
         }
     }
     if (!learn(&next[BACKGROUND], logarithm) || !learn(&next[OBJECT], logarithm)) return;
