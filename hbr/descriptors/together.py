@@ -13,6 +13,8 @@ from hbr.core.arrays import ImageArray, LevelArray
 from hbr.descriptors.base import Descriptor
 from hbr.descriptors.registry import descriptor as descriptor_of
 from hbr.segmentation import Background, Method, Segmentation, hypotheses
+from hbr.segmentation.cut_out import Found
+from hbr.segmentation.frame import Frame
 from hbr.segmentation.learned import LearnedBackground
 from hbr.segmentation.segment import MOST_HYPOTHESES, without_background
 
@@ -73,7 +75,7 @@ class ViewsTogether:
         self._descriptor = descriptor_of(descriptor) if isinstance(descriptor, str) else descriptor
         self._table = Background(empty_table) if isinstance(empty_table, np.ndarray) else empty_table
         self._several = several
-        self._images: list[ImageArray | None] = []
+        self._frames: list[Frame | None] = []
         self._learned = LearnedBackground()
         self.segmentations: list[tuple[Segmentation, ...]] = []
         self.levels: list[LevelArray] = []
@@ -93,15 +95,16 @@ class ViewsTogether:
         if revise:
             self.revise()
         else:
-            self._describe(len(self._images) - 1)
+            self._describe(len(self._frames) - 1)
         if not keep:
-            self._images[-1] = None
+            self._frames[-1] = None
         return self.segmentations[-1]
 
     def learn(self, image_bgr: ImageArray) -> None:
         """Add a view that `revise` segments and describes together with the others; errors as for `add`."""
-        self._learned.add(image_bgr)
-        self._images.append(image_bgr)
+        frame = Frame(image_bgr)
+        self._learned.add(image_bgr, frame.small)
+        self._frames.append(frame)
         self.segmentations.append(())
         self.levels.append(np.empty((0, self._descriptor.length), np.uint8))
 
@@ -113,23 +116,25 @@ class ViewsTogether:
     def revise(self) -> None:
         """Segment the views whose background was not known, by that which the other views show."""
         for view, found in enumerate(self.segmentations):
-            if self._images[view] is not None and (not found or found[0].method not in RELIABLE):
+            if self._frames[view] is not None and (not found or found[0].method not in RELIABLE):
                 self._describe(view, guess=self._several)
 
     def _describe(self, view: int, *, guess: bool = False) -> None:
-        image = self._images[view]
-        assert image is not None
+        frame = self._frames[view]
+        assert frame is not None
+        known = dict(zip(map(id, self.segmentations[view]), self.levels[view], strict=True))
         found = hypotheses(
-            image,
+            frame,
             empty_table=self._table,
             learned=self._learned.of(view),
-            alone=partial(self._without_background, view, image) if guess else None,
+            alone=partial(self._without_background, view, frame) if guess else None,
             most=MOST_HYPOTHESES if self._several else 1,
         )
+        levels = [known[id(one)] if id(one) in known else self._descriptor.describe(one) for one in found]
         self.segmentations[view] = found
-        self.levels[view] = np.stack([self._descriptor.describe(one) for one in found])
+        self.levels[view] = np.stack(levels)
 
-    def _without_background(self, view: int, image: ImageArray) -> tuple[Segmentation, ...]:
+    def _without_background(self, view: int, frame: Frame) -> tuple[Segmentation | Found, ...]:
         """Return the segmentations of a view that no other view changes."""
         known = self.segmentations[view]
-        return known if known and known[0].method is Method.GUESS else without_background(image)
+        return known if known and known[0].method is Method.GUESS else without_background(frame)

@@ -97,36 +97,52 @@ class Segmentation:
         return cv2.blendLinear(self.crop, ground, weight, 1 - weight).astype(np.uint8, copy=False)
 
 
-def cut_out(
-    image: ImageArray,
-    found: NDArray[np.bool_] | None,
-    box: Box | None,
-    correction: Illumination | None,
-    agreement: float | None,
-    method: Method,
-    issues: tuple[Issue, ...],
-) -> Segmentation:
-    """Return the segmentation of a frame whose silhouette or box was found."""
-    height, width = image.shape[:2]
-    if box is None and found is not None:
-        box = _box_of(found, width, height)
-    if box is None:
-        side = float(min(height, width))
-        left, top = (width - side) / 2, (height - side) / 2
-    else:
-        left, top, side = _square_around(box)
-    crop = _square(image, left, top, side)
-    if correction is not None:
-        crop = _corrected(crop, correction, left, top, side, width, height)
-    if found is not None:
-        ratio = found.shape[1] / width
-        mask = _square(found.astype(np.uint8) * 255, left * ratio, top * ratio, side * ratio, cv2.BORDER_CONSTANT)
-    elif box is not None:
-        mask = _box_mask(box, left, top, side)
-    else:
-        mask = np.full((CROP_PX, CROP_PX), 255, np.uint8)
-    gains = None if correction is None else correction.gains
-    return Segmentation(crop, mask, box, gains, agreement, method, issues, correction, found)
+@dataclass(frozen=True, eq=False)
+class Found:
+    """A silhouette or box that was found in a frame; the object is cut out only if it is needed.
+
+    Attributes as those of `Segmentation`; ``given`` is a box that was not found but given.
+    """
+
+    image: ImageArray
+    silhouette: NDArray[np.bool_] | None
+    given: Box | None
+    correction: Illumination | None
+    agreement: float | None
+    method: Method
+    issues: tuple[Issue, ...]
+
+    @cached_property
+    def box(self) -> Box | None:
+        """The object's x, y, width and height in pixels of the frame; None if no object was found."""
+        height, width = self.image.shape[:2]
+        return (
+            _box_of(self.silhouette, width, height)
+            if self.given is None and self.silhouette is not None
+            else self.given
+        )
+
+    def cut_out(self) -> Segmentation:
+        """Return the segmentation of the frame."""
+        height, width = self.image.shape[:2]
+        box, found, correction = self.box, self.silhouette, self.correction
+        if box is None:
+            side = float(min(height, width))
+            left, top = (width - side) / 2, (height - side) / 2
+        else:
+            left, top, side = _square_around(box)
+        crop = _square(self.image, left, top, side)
+        if correction is not None:
+            crop = _corrected(crop, correction, left, top, side, width, height)
+        if found is not None:
+            ratio = found.shape[1] / width
+            mask = _square(found.astype(np.uint8) * 255, left * ratio, top * ratio, side * ratio, cv2.BORDER_CONSTANT)
+        elif box is not None:
+            mask = _box_mask(box, left, top, side)
+        else:
+            mask = np.full((CROP_PX, CROP_PX), 255, np.uint8)
+        gains = None if correction is None else correction.gains
+        return Segmentation(crop, mask, box, gains, self.agreement, self.method, self.issues, correction, found)
 
 
 def _square_around(box: Box) -> tuple[float, float, float]:

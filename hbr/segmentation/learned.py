@@ -27,8 +27,8 @@ class LearnedBackground:
     def __len__(self) -> int:
         return len(self._small)
 
-    def add(self, image_bgr: ImageArray) -> None:
-        """Add a view, uint8 (H, W, 3).
+    def add(self, image_bgr: ImageArray, small: ImageArray | None = None) -> None:
+        """Add a view, uint8 (H, W, 3); ``small`` is what `shrunk` returns for it, if that is known.
 
         Raises
         ------
@@ -42,7 +42,7 @@ class LearnedBackground:
                 "views of one search need one size"
             )
         self._shape = height, width
-        self._small.append(shrunk(image_bgr))
+        self._small.append(shrunk(image_bgr) if small is None else small)
 
     def of(self, view: int) -> Background | None:
         """Return the background of a view, learned from the others; None with a single view."""

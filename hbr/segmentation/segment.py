@@ -9,13 +9,12 @@ from numpy.typing import NDArray
 
 from hbr.core.arrays import ImageArray
 from hbr.core.deprecation import renamed_keyword
-from hbr.core.validation import check_frame
-from hbr.segmentation.background import Background, Difference, Illumination, Mask, shrunk
-from hbr.segmentation.cut_out import Box, Segmentation, cut_out
+from hbr.segmentation.background import Background, Difference, Illumination, Mask
+from hbr.segmentation.cut_out import Box, Found, Segmentation
 from hbr.segmentation.evidence import Issue, IssueCode, Method
+from hbr.segmentation.frame import Frame
 from hbr.segmentation.guess import guess_object
 from hbr.segmentation.network import shares
-from hbr.segmentation.plain import plain_difference
 from hbr.segmentation.silhouette import silhouette
 
 #: A patch whose grey levels differ by more than this is uneven.
@@ -71,40 +70,36 @@ def segment(
     TypeError, ValueError
         The frame is no such image, the empty-table image has another size, or a box is outside the frame.
     """
-    background, small, difference = compared(image_bgr, empty_table)
+    frame = Frame(image_bgr)
+    background, difference = compared(frame, empty_table)
     height, width = image_bgr.shape[:2]
     for name, part in (("box", box), ("grey_patch", grey_patch)):
         if part is not None:
             _check_box(name, part, width, height)
-    return _segmented(image_bgr, small, background, difference, box, grey_patch)
+    return _found(frame, background, difference, box, grey_patch).cut_out()
 
 
-def compared(
-    image_bgr: ImageArray, empty_table: Background | ImageArray | None
-) -> tuple[Background | None, ImageArray, Difference | None]:
-    """Return the prepared empty-table image, the small frame, and its difference from that image."""
-    check_frame(image_bgr)
-    small = shrunk(image_bgr)
+def compared(frame: Frame, empty_table: Background | ImageArray | None) -> tuple[Background | None, Difference | None]:
+    """Return the prepared empty-table image, and the frame's difference from it."""
     if empty_table is None:
-        return None, small, None
+        return None, None
     background = Background(empty_table) if isinstance(empty_table, np.ndarray) else empty_table
-    height, width = image_bgr.shape[:2]
+    height, width = frame.image.shape[:2]
     if background.shape != (height, width):
         raise ValueError(
             f"the empty-table image has {background.shape[1]} x {background.shape[0]} pixels, the frame "
             f"{width} x {height}; take the image with the present camera settings"
         )
-    return background, small, background.difference(small)
+    return background, background.difference(frame.small)
 
 
-def _segmented(
-    image_bgr: ImageArray,
-    small: ImageArray,
+def _found(
+    frame: Frame,
     background: Background | None,
     difference: Difference | None,
     box: Box | None = None,
     grey_patch: Box | None = None,
-) -> Segmentation:
+) -> Found:
     issues: list[Issue] = []
     correction: Illumination | None = None
     found: Mask | None = None
@@ -118,16 +113,15 @@ def _segmented(
         else:
             issues.append(Issue(IssueCode.TABLE_DIFFERS, {"agreement": round(difference.agreement, 3)}))
     if found is None and box is None:
-        differs = plain_difference(small)
-        if differs is not None:
+        if frame.differs is not None:
             method = Method.PLAIN_BACKGROUND
-            found = silhouette(differs, framed=False)
+            found = silhouette(frame.differs, framed=False)
             if found is None:
                 issues.append(Issue(IssueCode.NO_DIFFERENCE))
         else:
             method = Method.GUESS
             issues.append(Issue(IssueCode.BACKGROUND_NOT_PLAIN))
-            cut = guess_object(small)
+            cut = guess_object(frame.small)
             found = None if cut is None else silhouette(cut, framed=False)
             if found is None:
                 issues.append(Issue(IssueCode.NO_GUESS))
@@ -136,19 +130,19 @@ def _segmented(
     elif found is None:
         method = Method.NONE
     if grey_patch is not None:
-        correction, problem = _patch_correction(image_bgr, grey_patch)
+        correction, problem = _patch_correction(frame.image, grey_patch)
         if problem is not None:
             issues.append(Issue(problem))
     agreement = None if difference is None else difference.agreement
-    return cut_out(image_bgr, found, box, correction, agreement, method, tuple(issues))
+    return Found(frame.image, found, box, correction, agreement, method, tuple(issues))
 
 
 def hypotheses(
-    image_bgr: ImageArray,
+    image_bgr: ImageArray | Frame,
     *,
     empty_table: Background | ImageArray | None = None,
     learned: Background | None = None,
-    alone: Callable[[], Sequence[Segmentation]] | None = None,
+    alone: Callable[[], Sequence[Segmentation | Found]] | None = None,
     most: int = MOST_HYPOTHESES,
 ) -> tuple[Segmentation, ...]:
     """Return several segmentations of a frame, the likeliest first, whose boxes differ.
@@ -159,7 +153,7 @@ def hypotheses(
     Parameters
     ----------
     image_bgr, empty_table
-        As for `segment`.
+        As for `segment`; or a `hbr.segmentation.frame.Frame`, if the frame is segmented more than once.
     learned : Background, optional
         The background that the other views of the search show (`hbr.segmentation.learned.LearnedBackground.of`). The
         object is not guessed then.
@@ -174,66 +168,56 @@ def hypotheses(
     TypeError, ValueError
         As for `segment`.
     """
-    background, small, difference = compared(image_bgr, empty_table)
+    frame = image_bgr if isinstance(image_bgr, Frame) else Frame(image_bgr)
+    background, difference = compared(frame, empty_table)
     by_picture = difference is not None and difference.reliable
-    if learned is None or by_picture or plain_difference(small) is not None:
-        first = _segmented(image_bgr, small, background, difference)
+    found: list[Segmentation | Found]
+    if learned is None or by_picture or frame.differs is not None:
+        first = _found(frame, background, difference)
         if first.method is Method.PLAIN_BACKGROUND or (most == 1 and not by_picture):
-            return (first,)
-        share = shares(small, difference if by_picture else None).object
+            return (first.cut_out(),)
+        share = shares(frame.small, difference if by_picture else None).object
         if by_picture:
-            found = [first, *_by_network(image_bgr, share, Method.EMPTY_TABLE, first)]
+            found = [first, *_by_network(share, Method.EMPTY_TABLE, first)]
             if most == 1 and not _same(first, found[-1]):  # an enrollment: the network's box is right more often
                 found.reverse()
         else:
-            found = [first, *_by_network(image_bgr, share, Method.NETWORK, first)]
+            found = [first, *_by_network(share, Method.NETWORK, first)]
     else:
         issues = [Issue(IssueCode.BACKGROUND_NOT_PLAIN)]
         if difference is not None:
             issues.insert(0, Issue(IssueCode.TABLE_DIFFERS, {"agreement": round(difference.agreement, 3)}))
         agreement = None if difference is None else difference.agreement
-        nothing = cut_out(image_bgr, None, None, None, agreement, Method.NONE, (*issues, Issue(IssueCode.NO_OBJECT)))
-        like = replace(nothing, issues=tuple(issues))
-        share = shares(small, learned.difference(small), learned=True).object
+        like = Found(frame.image, None, None, None, agreement, Method.NONE, tuple(issues))
+        share = shares(frame.small, learned.difference(frame.small), learned=True).object
         levels = _LEVELS if most > 1 else (_ENROLLED_LEVEL,)
-        found = _by_network(image_bgr, share, Method.ROTATION, like, levels=levels)
+        found = [*_by_network(share, Method.ROTATION, like, levels=levels)]
         if most > 1:
             by_itself = None if alone is None else alone()
-            found += by_itself or _by_network(image_bgr, shares(small).object, Method.NETWORK, like)
-        found = found or [nothing]
-    several: list[Segmentation] = []
+            found += by_itself or _by_network(shares(frame.small).object, Method.NETWORK, like)
+        found = found or [replace(like, issues=(*issues, Issue(IssueCode.NO_OBJECT)))]
+    several: list[Segmentation | Found] = []
     for one in found:
         if not any(_same(known, one) for known in several):
             several.append(one)
-    return tuple(several[:most])
+    return tuple(one.cut_out() if isinstance(one, Found) else one for one in several[:most])
 
 
-def without_background(image_bgr: ImageArray) -> tuple[Segmentation, ...]:
-    """Return the guess and the network's segmentation of a frame, if they found an object.
-
-    Raises
-    ------
-    TypeError, ValueError
-        As for `segment`.
-    """
-    _, small, _ = compared(image_bgr, None)
-    guess = _segmented(image_bgr, small, None, None)
+def without_background(frame: Frame) -> tuple[Found, ...]:
+    """Return the guess and the network's silhouette of a frame, if they found an object."""
+    guess = _found(frame, None, None)
     return (
         *([] if guess.box is None else [guess]),
-        *_by_network(image_bgr, shares(small).object, Method.NETWORK, guess),
+        *_by_network(shares(frame.small).object, Method.NETWORK, guess),
     )
 
 
 def _by_network(
-    image: ImageArray,
-    share: NDArray[np.float32],
-    method: Method,
-    like: Segmentation,
-    levels: tuple[float, ...] = _LEVELS[:1],
-) -> list[Segmentation]:
-    """Return the segmentations at these probabilities, with the illumination and the evidence of another one."""
+    share: NDArray[np.float32], method: Method, like: Found, levels: tuple[float, ...] = _LEVELS[:1]
+) -> list[Found]:
+    """Return the silhouettes at these probabilities, with the illumination and the evidence of another one."""
     masks = [mask for level in levels if (mask := _object_in(share, level)) is not None]
-    return [cut_out(image, mask, None, like.correction, like.agreement, method, like.issues) for mask in masks]
+    return [replace(like, silhouette=mask, given=None, method=method) for mask in masks]
 
 
 def _object_in(share: NDArray[np.float32], level: float) -> Mask | None:
@@ -241,7 +225,7 @@ def _object_in(share: NDArray[np.float32], level: float) -> Mask | None:
     return silhouette(share > level, framed=False)
 
 
-def _same(a: Segmentation, b: Segmentation) -> bool:
+def _same(a: Segmentation | Found, b: Segmentation | Found) -> bool:
     """Return whether two segmentations have nearly the same box."""
     return a.box is not None and b.box is not None and _overlap(a.box, b.box) >= _SAME_BOX
 

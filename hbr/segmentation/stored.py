@@ -13,8 +13,9 @@ import numpy as np
 
 from hbr.core.arrays import ImageArray
 from hbr.segmentation.background import Background, Mask
-from hbr.segmentation.cut_out import Segmentation, cut_out
+from hbr.segmentation.cut_out import Found, Segmentation
 from hbr.segmentation.evidence import Issue, IssueCode, Method
+from hbr.segmentation.frame import Frame
 from hbr.segmentation.segment import compared, segment
 
 #: Keys of the evidence: the silhouette, and how many views were segmented together.
@@ -49,14 +50,15 @@ def stored_segmentation(
     """
     if evidence is None or TOGETHER not in evidence:
         return segment(image_bgr, empty_table=empty_table)
-    background, small, difference = compared(image_bgr, empty_table)
+    frame = Frame(image_bgr)
+    background, difference = compared(frame, empty_table)
     correction = None
     if background is not None and difference is not None and difference.reliable:
         correction = background.whole_correction(difference)
-    found = mask_from(evidence[MASK], small.shape[:2]) if MASK in evidence else None
+    found = mask_from(evidence[MASK], frame.small.shape[:2]) if MASK in evidence else None
     issues = tuple(_issue(one) for one in evidence.get("issues", ()))
     agreement = None if difference is None else difference.agreement
-    return cut_out(image_bgr, found, None, correction, agreement, Method(evidence["method"]), issues)
+    return Found(image_bgr, found, None, correction, agreement, Method(evidence["method"]), issues).cut_out()
 
 
 def mask_text(found: Mask) -> str:

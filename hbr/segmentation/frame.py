@@ -1,0 +1,28 @@
+"""A frame with what several segmentations of it share."""
+
+from functools import cached_property
+
+from hbr.core.arrays import ImageArray
+from hbr.core.validation import check_frame
+from hbr.segmentation.background import Mask, shrunk
+from hbr.segmentation.plain import plain_difference
+
+
+class Frame:
+    """A frame, uint8 (H, W, 3), and its small image.
+
+    Raises
+    ------
+    TypeError, ValueError
+        The array is no such image.
+    """
+
+    def __init__(self, image_bgr: ImageArray) -> None:
+        check_frame(image_bgr)
+        self.image = image_bgr
+        self.small = shrunk(image_bgr)
+
+    @cached_property
+    def differs(self) -> Mask | None:
+        """Where the small image differs from a plain background, bool (h, w); None if the background is not plain."""
+        return plain_difference(self.small)
