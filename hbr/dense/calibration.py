@@ -159,7 +159,8 @@ def fit_open_set(rule: StoppingRule, searches: ShiftedSearches, model: OpenSetMo
     between the thresholds they are ambiguous.
 
     On a bench that is known to have changed, the searches without a change do not count; on one that is known to be
-    the same, only those with the smallest changes count.
+    the same, only those with the smallest changes count. There the rule's own thresholds count, too, before the last
+    view.
     """
     model = model or OpenSetModel.fitted(searches.known, searches.correct, searches.unknown)
     known, unknown = model.scores(searches.known), model.scores(searches.unknown)
@@ -189,9 +190,20 @@ def fit_open_set(rule: StoppingRule, searches: ShiftedSearches, model: OpenSetMo
         unknown_thresholds=tuple(unknown_below.tolist()),
         changed_bench_thresholds=tuple(changed.tolist()),
         same_bench_thresholds=tuple(same.tolist()),
+        leave_one_out_thresholds=rule.open_set_thresholds,
         false_accept=float(is_false.mean()),
         rates=tuple(rates),
     )
+
+
+def with_false_accepts(rule: StoppingRule, searches: LeaveOneOut) -> StoppingRule:
+    """Return the rule with a limitation if it accepts too many left-out objects before the last view."""
+    before = searches.unknown.open_set_score(rule.usual_scores)[:, :-1]
+    accepted = int((before >= max(rule.open_set_thresholds)).any(axis=1).sum())
+    if accepted <= FALSE_ACCEPT * len(before):
+        return rule
+    values = {"rate": FALSE_ACCEPT, "accepted": accepted, "searches": len(before)}
+    return replace(rule, limitations=(*rule.limitations, Limitation(LimitationCode.FALSE_ACCEPT_RATE, values)))
 
 
 def _accepted_from(unknown: FloatArray) -> FloatArray:
@@ -283,6 +295,7 @@ def calibrate_stopping_rule(
     if sample is None and len(index) >= FEWEST_OBJECTS_SHIFTED and can_shift(index):
         views = searches.confidence.shape[1]
         shifted = shifted_searches(index, views=views, searches=most_shifted_searches)
+        rule = with_false_accepts(rule, searches)
         rule = fit_open_set(rule, shifted, fitted_before(index.views.descriptor, views))
         rejected = sum(one.rejected for one in rule.rates)  # in searches under changes of the bench
         return _calibrated(rule, searches, rejected=rejected, accepted=sum(one.false_accepts for one in rule.rates))

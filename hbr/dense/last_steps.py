@@ -12,7 +12,7 @@ from hbr.dense.filter import Belief
 from hbr.dense.leaders import LeaderComparison, LeaderViews, compare_leaders
 from hbr.dense.local_difference import LocalView
 from hbr.dense.stopping import StopDecision, StoppingRule
-from hbr.dense.verification import Verification, is_doubtful, verify
+from hbr.dense.verification import Verification, found_from, is_doubtful, verify
 
 
 class LastSteps(NamedTuple):
@@ -30,6 +30,8 @@ def last_steps(
     orientations_deg: Sequence[float],
     segmentations: Callable[[int], Sequence[LocalView]],
     leader_views: LeaderViews,
+    *,
+    same_bench: bool | None = None,
 ) -> LastSteps:
     """Verify a doubtful leader, and compare the two leaders of a search that names no object.
 
@@ -45,11 +47,13 @@ def last_steps(
         Returns a view of the search by each of its segmentations, the likeliest first.
     leader_views
         Returns enrolled views.
+    same_bench
+        Whether the bench is that of the enrollment, however the views were segmented; None: not known.
     """
     verification = None
     if is_doubtful(rule, decision, belief.queries, belief.index.views.descriptor):
         verification = verify(belief, decision.object_index, segmentations, leader_views)
-        decision = verification.decided(decision)
+        decision = verification.decided(decision, found_from(rule, same_bench))
     comparison = compare_leaders(
         belief,
         decision.outcome,

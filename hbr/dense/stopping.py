@@ -75,6 +75,7 @@ class LimitationCode(StrEnum):
     SAMPLED = "sampled"
     FALSE_REJECT_RATE = "false-reject-rate"
     ERROR_RATE = "error-rate"
+    FALSE_ACCEPT_RATE = "false-accept-rate"
     SIMILAR_OBJECTS = "similar-objects"
     UNKNOWN_NOT_MEASURED = "unknown-not-measured"
     ONE_OBJECT = "one-object"
@@ -93,7 +94,8 @@ class Limitation:
     values
         ``sampled``: ``searched`` of ``objects``. ``false-reject-rate``: ``rate`` asked for, ``searches`` done and
         ``needed``, ``reached`` rate. ``error-rate`` and ``similar-objects``: ``rate``, ``searches``, ``needed``,
-        ``min_confidence``, and ``wrong`` of ``ended`` searches. ``earlier-version``: ``text``.
+        ``min_confidence``, and ``wrong`` of ``ended`` searches. ``false-accept-rate``: ``rate``, and ``accepted`` of
+        ``searches`` for left-out objects. ``earlier-version``: ``text``.
     """
 
     code: LimitationCode
@@ -154,6 +156,9 @@ class StoppingRule:
     changed_bench_thresholds, same_bench_thresholds : tuple of float
         With weights: ``open_set_thresholds`` of a search that knows that the bench has changed since the enrollment, or
         that it has not.
+    leave_one_out_thresholds : tuple of float
+        With weights: scores of `hbr.dense.leave_one_out.open_set_score` after 1, 2, ... views, below which few enrolled
+        objects are on an unchanged bench. Rules that were calibrated before have none, and decide as before.
     rates : tuple of ShiftRates
         Measured rates under changes of the bench.
     """
@@ -171,6 +176,7 @@ class StoppingRule:
     unknown_thresholds: tuple[float, ...] = ()
     changed_bench_thresholds: tuple[float, ...] = ()
     same_bench_thresholds: tuple[float, ...] = ()
+    leave_one_out_thresholds: tuple[float, ...] = ()
     rates: tuple[ShiftRates, ...] = ()
 
     def decide(
@@ -190,7 +196,8 @@ class StoppingRule:
         however many views are left: no false-reject rate was measured for those. After ``max_views`` an object that is
         not confident is ambiguous. If the views were not segmented reliably, the search continues in any case until
         ``max_views``: another view costs little, and the background is then known. ``same_bench`` says whether the
-        bench is that of the enrollment; None: the search does not know.
+        bench is that of the enrollment; None: the search does not know. If it is, an object is also found before the
+        last calibrated view if it reaches all leave-one-out thresholds: those were measured on an unchanged bench.
         """
         probability = belief.posterior(self.beta).sum(axis=1)
         best = int(probability.argmax())
@@ -202,6 +209,11 @@ class StoppingRule:
         score = self._open_set_score(belief, n)
         early = decisions < min(calibrated, max_views)
         threshold = max(thresholds) if early else thresholds[n]
+        if early and same_bench and score < threshold and self.leave_one_out_thresholds:
+            leading, alike = self._leave_one_out_score(belief, n)
+            least = max(self.leave_one_out_thresholds)
+            if leading == belief.index.object_index[best] and alike >= least:
+                score, threshold = alike, least
         confidence = float(probability[best])
         unknown_below = min(threshold, self.unknown_thresholds[n]) if self.unknown_thresholds else threshold
         if score < threshold:
@@ -224,8 +236,12 @@ class StoppingRule:
         if self.open_set is not None:
             _, numbers = evidence(belief.index, belief.support, belief.orientation_deg, belief.levels)
             return self.open_set.score(numbers, belief.queries)
+        return self._leave_one_out_score(belief, n)[1]
+
+    def _leave_one_out_score(self, belief: Belief, n: int) -> tuple[int, float]:
+        """Return the object with the highest score, and its open-set score as in the leave-one-out searches."""
         best, score, margin = leader(belief.index.object_index, belief.scores())
-        return open_set_score(score, margin, float(self.usual_scores[best, n]), self._typical_scores[n])
+        return best, open_set_score(score, margin, float(self.usual_scores[best, n]), self._typical_scores[n])
 
     @cached_property
     def _typical_scores(self) -> list[float]:

@@ -34,6 +34,9 @@ _WEIGHTS: Final = (0.714, 9.438, 4.995)
 _OFFSET: Final = -5.416
 #: Log-odds from which an object is found, and below which it is unknown: that of 1 in 100 enrolled objects.
 FOUND_FROM: Final = 0.0
+#: The same on a bench that is known to be that of the enrollment: there an enrolled object fits much better. Half-way
+#: between the enrolled and the left-out objects 1–50 after a mild change.
+FOUND_FROM_SAME_BENCH: Final = 3.0
 UNKNOWN_BELOW: Final = -1.3
 #: With a smaller open-set score, no fit makes an object known.
 _HOPELESS: Final = -7.0
@@ -60,11 +63,11 @@ class Verification:
         numbers = (open_set_score, self.fit, self.fit - self.others)
         return sum(weight * number for weight, number in zip(_WEIGHTS, numbers, strict=True)) + _OFFSET
 
-    def decided(self, decision: StopDecision) -> StopDecision:
-        """Return the decision with which a search ends instead of this one."""
+    def decided(self, decision: StopDecision, least: float = FOUND_FROM) -> StopDecision:
+        """Return the decision with which a search ends instead of this one; an object is found from ``least`` on."""
         score = self.score(decision.open_set_score)
         outcome = Outcome.UNKNOWN if score < UNKNOWN_BELOW else Outcome.AMBIGUOUS
-        if score >= FOUND_FROM and decision.confidence >= decision.min_confidence:
+        if score >= least and decision.confidence >= decision.min_confidence:
             outcome = Outcome.FOUND
         return replace(decision, outcome=outcome, reason=StopReason.PIXEL_FIT)
 
@@ -93,6 +96,11 @@ def is_doubtful(rule: StoppingRule, decision: StopDecision, views: int, kind: st
     if decision.outcome is Outcome.CONTINUE or views < calibrated:
         return False
     return _HOPELESS < decision.open_set_score < max(rule.open_set_thresholds)
+
+
+def found_from(rule: StoppingRule, same_bench: bool | None) -> float:
+    """Return the log-odds from which an object is found; rules that were calibrated before ignore the bench."""
+    return FOUND_FROM_SAME_BENCH if same_bench and rule.leave_one_out_thresholds else FOUND_FROM
 
 
 def verify(

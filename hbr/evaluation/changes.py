@@ -212,9 +212,9 @@ class _Search:
         self._orientations_deg.append(azimuth_deg)
         self._leaders.append(self._names[int(self._session.belief.ranking().object_index[0])])
         if self._result is None and decision.outcome is not Outcome.CONTINUE:
-            self._result = self._ended(decision, views)
+            self._result = self._ended(decision, views, same_bench)
 
-    def _ended(self, decision: StopDecision, views: ViewsTogether) -> SearchResult:
+    def _ended(self, decision: StopDecision, views: ViewsTogether, same_bench: bool) -> SearchResult:
         """Return the result of a search that ends with this decision; the last step compares its two leaders."""
         end, verification, compared = last_steps(
             self._session.belief,
@@ -223,6 +223,7 @@ class _Search:
             self._orientations_deg,
             lambda n: _local_views(views, n, self._orientations_deg[n]),
             self._near,
+            same_bench=same_bench,
         )
         outcome = end.outcome if compared is None else compared.outcome
         winner = None if compared is None else compared.winner

@@ -92,6 +92,11 @@ class Condition:
         """Whether objects stand on a drawn bench."""
         return self.background in ("bench", "other-bench")
 
+    @property
+    def same_bench(self) -> bool | None:
+        """Whether a search knows that its bench is that of the enrollment; None: it is not told."""
+        return True if self.background in ("same", "bench") else None
+
     def enrolled(self, image_bgr: ImageArray, rng: np.random.Generator | None = None) -> EvaluationImage:
         """Return the image of an enrolled view; `rng` draws its noise."""
         image = self._sized(image_bgr)

@@ -1,14 +1,24 @@
 """Descriptors of photographs, as enrolled views and as queries."""
 
 from collections.abc import Iterable, Iterator
+from typing import NamedTuple
 
 import numpy as np
 
 from hbr.core.arrays import ImageArray, LevelArray
+from hbr.descriptors import descriptor
 from hbr.descriptors.describe import describe
 from hbr.evaluation.condition import Condition, EvaluationImage
 from hbr.evaluation.datasets import Dataset, read_photograph
 from hbr.evaluation.draws import generator
+from hbr.segmentation import segment
+
+
+class Queries(NamedTuple):
+    """The views of an object as queries: levels, uint8 (n, length), and how each was segmented ("": it was not)."""
+
+    levels: LevelArray
+    methods: tuple[str, ...]
 
 
 def enrolled_levels(dataset: Dataset, j: int, condition: Condition, size: tuple[int, int]) -> LevelArray:
@@ -29,6 +39,21 @@ def query_levels(dataset: Dataset, j: int, condition: Condition, size: tuple[int
     name = dataset.objects[j].name
     images = enumerate(_images(dataset, j, size))
     return _levels((condition.query(image, generator(seed, name, "photograph", i)) for i, image in images), condition)
+
+
+def segmented_queries(dataset: Dataset, j: int, condition: Condition, size: tuple[int, int], seed: int) -> Queries:
+    """Return the same descriptors as `query_levels`, and the methods of segmentation (`hbr.segmentation.Method`)."""
+    kind = descriptor(condition.descriptor)
+    if kind.whole_image:
+        levels = query_levels(dataset, j, condition, size, seed)
+        return Queries(levels, ("",) * len(levels))
+    name = dataset.objects[j].name
+    shown = (
+        condition.query(image, generator(seed, name, "photograph", i))
+        for i, image in enumerate(_images(dataset, j, size))
+    )
+    found = [segment(image, empty_table=empty) for image, empty in shown]
+    return Queries(np.stack([kind.describe(one) for one in found]), tuple(one.method.value for one in found))
 
 
 def _levels(images: Iterable[EvaluationImage], condition: Condition) -> LevelArray:

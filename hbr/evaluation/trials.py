@@ -22,6 +22,7 @@ from hbr.dense.next_view import most_informative_rotation
 from hbr.dense.session import DenseSession
 from hbr.dense.stopping import Outcome, StoppingRule
 from hbr.descriptors import descriptor
+from hbr.descriptors.together import like_enrollment
 from hbr.evaluation.draws import generator
 from hbr.evaluation.methods import Method
 from hbr.evaluation.near_twins import LocalPhotographs
@@ -68,6 +69,8 @@ def run_object(
     *,
     rule: StoppingRule | None = None,
     photographs: LocalPhotographs | None = None,
+    same_bench: bool | None = None,
+    segmented_by: Sequence[str] = (),
     now_ns: Callable[[], int] = lambda: 0,
 ) -> Runs:
     """Search for one object with all methods, in all trials, and return the runs of this object.
@@ -89,6 +92,10 @@ def run_object(
     photographs : LocalPhotographs, optional
         The images, with which a search of the dense filter compares its two leaders as on the bench. Without them it
         keeps its answer.
+    same_bench : bool, optional
+        Whether a search of the dense filter knows that the bench is that of the enrollment; None: it does not know.
+    segmented_by : sequence of str, optional
+        How each query was segmented (`hbr.evaluation.descriptors.segmented_queries`).
     now_ns : callable
         Monotonic time, for `Runs.step_ns`.
 
@@ -99,7 +106,7 @@ def run_object(
     """
     if rule is None and any(method.dense for method in methods):
         rule = rule_of_trial(views, protocol)
-    trial = _Trials(object_index, queries, views, protocol, rule, now_ns, photographs)
+    trial = _Trials(object_index, queries, views, protocol, rule, now_ns, photographs, same_bench, segmented_by)
     runs = Runs.blank(len(methods), 1, protocol.trials, protocol.max_views)
     for t in range(protocol.trials):
         draws = trial.draw(t)
@@ -119,7 +126,11 @@ class _Trials:
         rule: StoppingRule | None,
         now_ns: Callable[[], int],
         photographs: LocalPhotographs | None = None,
+        same_bench: bool | None = None,
+        segmented_by: Sequence[str] = (),
     ) -> None:
+        self._same_bench = same_bench
+        self._alike_bench = [like_enrollment(method, same_bench) for method in segmented_by or [""] * len(queries)]
         self._photographs = photographs
         self._object, self._queries, self._views = object_index, queries, views
         self._protocol, self._rule, self._now_ns = protocol, rule, now_ns
@@ -229,7 +240,8 @@ class _Trials:
                 for i, angle_deg in zip(seen[:-1], measured_deg, strict=False):
                     session.add(self._queries[i], angle_deg)
             start_ns = self._now_ns()
-            decision = session.add(self._queries[seen[-1]], measured_deg[-1])
+            alike = self._alike_bench[seen[-1]]
+            decision = session.add(self._queries[seen[-1]], measured_deg[-1], same_bench=alike)
             following = self._next_dense(method, draws, seen, session) if n + 1 < last else seen[-1]
             runs.step_ns[*at, n] = self._now_ns() - start_ns
             ranking = session.belief.ranking()
@@ -259,7 +271,15 @@ class _Trials:
             own = keep if leader == self._object else self._enrolled[self._views.of(leader)]
             return photographs.enrolled(leader, np.flatnonzero(own), azimuths_deg)
 
-        end, _, compared = last_steps(belief, decision, session.rule, measured_deg, lambda n: [query(n)], enrolled)
+        end, _, compared = last_steps(
+            belief,
+            decision,
+            session.rule,
+            measured_deg,
+            lambda n: [query(n)],
+            enrolled,
+            same_bench=self._same_bench,
+        )
         if compared is None:
             return end.outcome, -1
         if compared.winner is not None:

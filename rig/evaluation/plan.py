@@ -12,7 +12,7 @@ from hbr.evaluation.protocol import Protocol
 from rig.catalog import Catalog
 
 #: Increased if the same settings give other numbers.
-FORMAT: Final = 5
+FORMAT: Final = 6
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from functools import partial
 
 from hbr.core.arrays import LevelArray
 from hbr.dense.stopping import StoppingRule
-from hbr.evaluation.descriptors import enrolled_levels, query_levels
+from hbr.evaluation.descriptors import enrolled_levels, segmented_queries
 from hbr.evaluation.near_twins import LocalPhotographs
 from hbr.evaluation.protocol import Runs
 from hbr.evaluation.trials import rule_of_trial, run_object
@@ -69,7 +69,7 @@ def _enroll(plan: Plan, j: int) -> LevelArray:
 
 
 def _search(plan: Plan, views: Views, rule: StoppingRule | None, j: int) -> Runs:
-    queries = query_levels(plan.dataset, j, plan.condition, plan.size, plan.protocol.seed)
+    queries, methods = segmented_queries(plan.dataset, j, plan.condition, plan.size, plan.protocol.seed)
     photographs = LocalPhotographs(plan.dataset, plan.condition, plan.size, plan.protocol.seed)
     return run_object(
         j,
@@ -79,5 +79,7 @@ def _search(plan: Plan, views: Views, rule: StoppingRule | None, j: int) -> Runs
         plan.protocol,
         rule=rule,
         photographs=photographs if photographs.possible else None,
+        same_bench=plan.condition.same_bench,
+        segmented_by=methods,
         now_ns=SystemClock().now_ns,
     )

@@ -34,6 +34,7 @@ class NoteCode(StrEnum):
     TABLE_DIFFERS = "table-differs"
     STOPPING_RULE_UNREADABLE = "stopping-rule-unreadable"
     STOPPING_RULE_OUTDATED = "stopping-rule-outdated"
+    STOPPING_RULE_EARLIER = "stopping-rule-earlier"
     RATES_NOT_GUARANTEED = "rates-not-guaranteed"
     NOT_RECORDED = "not-recorded"
     NOT_COMPARED = "not-compared"

@@ -78,11 +78,17 @@ def note_words(note: Note) -> str:
                 f"the stopping rule is from {v['made']}, and the catalog has changed since ({changed}), so it "
                 "guarantees no error rate; to renew it: rig catalog calibrate"
             )
+        case NoteCode.STOPPING_RULE_EARLIER:
+            return (
+                f"the stopping rule is from {v['made']}, and decides as an earlier version of this program did: on an "
+                "unchanged bench it takes more views; to renew it: rig catalog calibrate"
+            )
         case NoteCode.RATES_NOT_GUARANTEED:
+            accepted = f" and {percent(v['false_accept'])} of other objects accepted" if "false_accept" in v else ""
             return (
                 f"{v['searches']} leave-one-out searches cannot guarantee at most {percent(v['error_rate'])} wrong "
-                f"answers and {percent(v['false_reject'])} of the enrolled objects called unknown; for the reasons: "
-                "rig catalog calibrate"
+                f"answers and {percent(v['false_reject'])} of the enrolled objects called unknown{accepted}; for the "
+                "reasons: rig catalog calibrate"
             )
         case NoteCode.NOT_RECORDED:
             return f"the answer is not recorded: {v['what']}"
@@ -138,6 +144,12 @@ def limitation_words(limitation: Limitation) -> str:
             return (
                 f"an error rate of {percent(v['rate'])} {why}: a search ends at a confidence of "
                 f"{percent(v['min_confidence'], 0)}, at which {v['wrong']} of {v['ended']} were wrong"
+            )
+        case LimitationCode.FALSE_ACCEPT_RATE:
+            return (
+                f"on an unchanged bench, more than {percent(v['rate'])} of the objects that are not enrolled may be "
+                f"accepted, because enrolled objects are too similar: {v['accepted']} of {v['searches']} left-out "
+                f"objects were ({percent(v['accepted'] / v['searches'])})"
             )
         case LimitationCode.UNKNOWN_NOT_MEASURED:
             return "unknown objects cannot be measured with fewer than three objects; enroll more"

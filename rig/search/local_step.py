@@ -15,7 +15,7 @@ import hbr
 from hbr import Outcome, StopReason
 from hbr.dense import leaders
 from hbr.dense.local_difference import LocalView, ViewDifference
-from hbr.dense.verification import FOUND_FROM, UNKNOWN_BELOW, Verification, verify
+from hbr.dense.verification import UNKNOWN_BELOW, Verification, verify
 from rig.events.compared import Compared, ComparedView, Verified
 from rig.events.events import Identified
 from rig.search.session import ArcSearch, DenseSearch, Search
@@ -82,7 +82,7 @@ def with_verification(search: DenseSearch, found: Verification) -> Verified:
         fit=found.fit,
         others=found.others,
         score=score,
-        found_from=FOUND_FROM,
+        found_from=search.found_from,
         unknown_below=UNKNOWN_BELOW,
         outcome=search.decision.outcome,
     )

@@ -14,7 +14,7 @@ import hbr
 from hbr.core.angles import wrap360
 from hbr.dense.arc import ArcRule, ArcSession, calibrate_arc_rule
 from hbr.dense.pose import pose
-from hbr.dense.verification import Verification, is_doubtful
+from hbr.dense.verification import Verification, found_from, is_doubtful
 from hbr.descriptors.together import like_enrollment
 from hbr.model.symmetry import symmetry
 from rig.config import RigConfig
@@ -59,6 +59,7 @@ class Search(ABC):
         self._earlier: Sequence[NDArray[np.uint8]] | None = None
         self._reliable = True
         self._same_bench: bool | None = None
+        self._alike: bool | None = None
 
     def add(
         self,
@@ -89,10 +90,11 @@ class Search(ABC):
         segmentation
             `hbr.Segmentation.evidence` of the view.
         """
+        self._same_bench = self._alike = same_bench
         if segmentation is not None:
-            same_bench = like_enrollment(segmentation.get("method", ""), same_bench)
+            self._alike = like_enrollment(segmentation.get("method", ""), same_bench)
         self._orientations.append(azimuth_deg)
-        self._earlier, self._reliable, self._same_bench = earlier, reliable, same_bench
+        self._earlier, self._reliable = earlier, reliable
         ranked = self._rank(levels)
         return ranked, self._decide(ranked, table_deg)
 
@@ -225,7 +227,7 @@ class DenseSearch(Search):
             self._orientations[-1],
             earlier=self._earlier,
             reliable=self._reliable,
-            same_bench=self._same_bench,
+            same_bench=self._alike,
         )
         belief = self._session.belief
         probability = belief.posterior(self._session.rule.beta).sum(axis=1)
@@ -279,7 +281,12 @@ class DenseSearch(Search):
     def decision(self) -> hbr.StopDecision:
         """The decision with which the search ends here, after the verification of its leader if there was one."""
         decision = self._session.end()
-        return decision if self._verification is None else self._verification.decided(decision)
+        return decision if self._verification is None else self._verification.decided(decision, self.found_from)
+
+    @property
+    def found_from(self) -> float:
+        """Log-odds from which a verified leader is found (`hbr.dense.verification.found_from`)."""
+        return found_from(self._session.rule, self._same_bench)
 
     @property
     def is_doubtful(self) -> bool:

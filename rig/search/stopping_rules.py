@@ -137,7 +137,9 @@ def stopping_rule_of(folder: Path, index: hbr.DenseIndex) -> tuple[hbr.StoppingR
         stored = None
         notes.append(Note(NoteCode.STOPPING_RULE_UNREADABLE, {"reason": error.evidence["reason"]}))
     if stored is not None and stored.sha256 == digest(index, packed=stored.version >= 3):
-        return stored.rule, _not_guaranteed(stored.rule)
+        if stored.rule.open_set is not None and not stored.rule.leave_one_out_thresholds:
+            notes.append(Note(NoteCode.STOPPING_RULE_EARLIER, {"made": stored.made_utc[:10]}))
+        return stored.rule, (*notes, *_not_guaranteed(stored.rule))
     if stored is None:
         found = quick_stopping_rule(index)
         return found, (*notes, *_not_guaranteed(found))
@@ -153,7 +155,12 @@ def stopping_rule_of(folder: Path, index: hbr.DenseIndex) -> tuple[hbr.StoppingR
 def _not_guaranteed(rule: hbr.StoppingRule) -> tuple[Note, ...]:
     if not rule.limitations:
         return ()
-    values = {"searches": rule.searches, "error_rate": rule.error_rate, "false_reject": rule.false_reject}
+    values: dict[str, Any] = {
+        "searches": rule.searches, "error_rate": rule.error_rate, "false_reject": rule.false_reject,
+    }  # fmt: skip
+    for one in rule.limitations:
+        if one.code is LimitationCode.FALSE_ACCEPT_RATE:
+            values["false_accept"] = one.values["rate"]
     return (Note(NoteCode.RATES_NOT_GUARANTEED, values),)
 
 
@@ -232,11 +239,14 @@ def read_stopping_rule(folder: Path) -> StoredRule | None:
             unknown_thresholds=tuple(_or(threshold, -inf) for threshold in values.get("unknown_thresholds", ())),
             changed_bench_thresholds=tuple(map(float, values.get("changed_bench_thresholds", ()))),
             same_bench_thresholds=tuple(map(float, values.get("same_bench_thresholds", ()))),
+            leave_one_out_thresholds=tuple(
+                _or(threshold, -inf) for threshold in values.get("leave_one_out_thresholds", ())
+            ),
             rates=tuple(ShiftRates(**one) for one in values.get("rates", ())),
         )
         views = len(rule.open_set_thresholds)
-        more = (rule.unknown_thresholds, rule.changed_bench_thresholds, rule.same_bench_thresholds)
-        if not {len(thresholds) for thresholds in more} <= {0, views}:
+        on_benches = rule.changed_bench_thresholds, rule.same_bench_thresholds, rule.leave_one_out_thresholds
+        if not {len(thresholds) for thresholds in (rule.unknown_thresholds, *on_benches)} <= {0, views}:
             raise ValueError("it does not have one threshold for each number of views")
         scores = rule.usual_scores
         if scores.ndim != 2 or scores.shape[1] != len(rule.open_set_thresholds) or not np.isfinite(scores).all():

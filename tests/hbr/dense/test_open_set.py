@@ -6,10 +6,17 @@ import numpy as np
 import pytest
 
 from hbr import DenseIndex, Outcome, Views
-from hbr.dense.calibration import FALSE_ACCEPT, calibrate_stopping_rule, fit_open_set
+from hbr.dense.calibration import (
+    FALSE_ACCEPT,
+    calibrate_stopping_rule,
+    fit_open_set,
+    fit_stopping_rule,
+    with_false_accepts,
+)
+from hbr.dense.leave_one_out import leave_one_out
 from hbr.dense.open_set import NUMBERS, OpenSetModel
 from hbr.dense.shifted_searches import STRENGTHS, ShiftedSearches
-from hbr.dense.stopping import StoppingRule
+from hbr.dense.stopping import LimitationCode, StoppingRule
 from tests.hbr.dense.searches import belief_after
 from tests.hbr.dense.test_stopping import catalog
 
@@ -61,6 +68,20 @@ def test_threshold_is_lower_on_a_bench_that_is_known_to_have_changed(plain: Stop
     assert sum(one.false_accepts for one in rule.rates) <= 2 * FALSE_ACCEPT * sum(one.searches for one in rule.rates)
 
 
+def by_bench(plain: StoppingRule) -> StoppingRule:
+    """A rule with which each object scores 0, and whose thresholds depend on the bench."""
+    score = np.zeros((VIEWS, len(NUMBERS)))
+    return replace(
+        plain,
+        min_confidence=0.5,
+        open_set=OpenSetModel(score, score + 1, score, np.zeros(VIEWS)),
+        open_set_thresholds=(1.0, 1.0, 1.0, -1.0),
+        changed_bench_thresholds=(-1.0,) * VIEWS,
+        same_bench_thresholds=(1.0,) * VIEWS,
+        unknown_thresholds=(-2.0,) * VIEWS,
+    )
+
+
 @pytest.mark.parametrize(
     ("same_bench", "early", "last"),
     [
@@ -72,19 +93,50 @@ def test_threshold_is_lower_on_a_bench_that_is_known_to_have_changed(plain: Stop
 def test_decision_depends_on_what_is_known_of_the_bench(
     index: DenseIndex, plain: StoppingRule, same_bench: bool | None, early: Outcome, last: Outcome
 ) -> None:
-    views: Views = index.views
+    rule, views = by_bench(plain), index.views
     rows = views.of(2)[[0, 4, 9, 13]]
-    score = np.zeros((VIEWS, len(NUMBERS)))
-    model = OpenSetModel(score, score + 1, score, np.zeros(VIEWS))  # each object scores 0
-    rule = replace(
-        plain,
-        min_confidence=0.5,
-        open_set=model,
-        open_set_thresholds=(1.0, 1.0, 1.0, -1.0),
-        changed_bench_thresholds=(-1.0,) * VIEWS,
-        same_bench_thresholds=(1.0,) * VIEWS,
-        unknown_thresholds=(-2.0,) * VIEWS,
-    )
     for count, outcome in ((2, early), (4, last)):
         belief = belief_after(views.descriptors[rows[:count]], views.azimuth_deg[rows[:count]], index)
         assert rule.decide(belief, max_views=4, same_bench=same_bench).outcome is outcome
+
+
+@pytest.mark.parametrize(
+    ("same_bench", "views", "shift", "outcome"),
+    [
+        (True, 1, 0.0, Outcome.FOUND),
+        (True, 1, 0.1, Outcome.CONTINUE),  # the score is too low
+        (None, 1, 0.0, Outcome.CONTINUE),  # the thresholds are those of an unchanged bench
+        (True, 4, 0.0, Outcome.AMBIGUOUS),  # after the last view, the weights decide
+    ],
+)
+def test_on_an_unchanged_bench_the_leave_one_out_thresholds_end_a_search_early(
+    index: DenseIndex, plain: StoppingRule, same_bench: bool | None, views: int, shift: float, outcome: Outcome
+) -> None:
+    rows = index.views.of(2)[[0, 4, 9, 13]][:views]
+    belief = belief_after(index.views.descriptors[rows], index.views.azimuth_deg[rows], index)
+    before = by_bench(plain)
+    score = plain.decide(belief, max_views=4).open_set_score  # of the leave-one-out searches
+    rule = replace(before, leave_one_out_thresholds=(0.0, score + shift, 0.0, 0.0))
+    decision = rule.decide(belief, max_views=4, same_bench=same_bench)
+    assert decision.outcome is outcome
+    if outcome is Outcome.FOUND:
+        assert (decision.open_set_score, decision.open_set_threshold) == (score, score)
+        assert before.decide(belief, max_views=4, same_bench=True).outcome is Outcome.CONTINUE
+
+
+def test_rule_states_that_twins_are_accepted_more_often_than_promised(plain: StoppingRule) -> None:
+    assert fit_open_set(plain, drawn()).leave_one_out_thresholds == plain.open_set_thresholds
+    apart, twins = catalog(4), Views.concatenate([catalog(4), renamed(catalog(4, noise=0.2))])
+    for views, codes in ((apart, []), (twins, [LimitationCode.FALSE_ACCEPT_RATE])):
+        searches = leave_one_out(DenseIndex(views))
+        rule = replace(fit_stopping_rule(searches), limitations=())
+        found = with_false_accepts(rule, searches)
+        assert [one.code for one in found.limitations] == codes
+        for one in found.limitations:
+            assert one.values["accepted"] > one.values["rate"] * one.values["searches"]
+
+
+def renamed(views: Views) -> Views:
+    """The same objects by other names."""
+    names = tuple(f"twin of {name}" for name in views.object_names)
+    return Views(views.descriptors, views.azimuth_deg, views.object_index, names, views.descriptor)

@@ -13,7 +13,15 @@ from hbr.dense.local_difference import LocalView
 from hbr.dense.open_set import fitted_before
 from hbr.dense.pixel_fit import Pixels, fit
 from hbr.dense.stopping import StoppingRule
-from hbr.dense.verification import FOUND_FROM, UNKNOWN_BELOW, Verification, is_doubtful, verify
+from hbr.dense.verification import (
+    FOUND_FROM,
+    FOUND_FROM_SAME_BENCH,
+    UNKNOWN_BELOW,
+    Verification,
+    found_from,
+    is_doubtful,
+    verify,
+)
 from tests.hbr.dense.test_stopping import catalog
 
 KIND = "edges+colours"
@@ -74,6 +82,18 @@ def test_outcome_follows_from_fit_and_open_set_score(fitted: float, confidence: 
     assert found.score(1.0) > found.score(0.0)
     assert Verification(0, fitted, 0.2).score(0.0) < found.score(0.0)
     assert FOUND_FROM > UNKNOWN_BELOW
+
+
+@pytest.mark.parametrize("fitted", [0.5, 0.8])
+def test_on_an_unchanged_bench_an_object_fits_better_before_it_is_found(rule: StoppingRule, fitted: float) -> None:
+    renewed = replace(rule, leave_one_out_thresholds=(0.9,) * 4)
+    assert found_from(renewed, True) == FOUND_FROM_SAME_BENCH > FOUND_FROM
+    assert found_from(renewed, None) == found_from(renewed, False) == FOUND_FROM
+    assert found_from(rule, True) == FOUND_FROM  # a rule that was calibrated before
+    found = Verification(0, fitted, fitted - 0.2)
+    assert found.decided(decision(0.0)).outcome is Outcome.FOUND
+    strict = found.decided(decision(0.0), FOUND_FROM_SAME_BENCH).outcome
+    assert strict is (Outcome.FOUND if fitted == 0.8 else Outcome.AMBIGUOUS)
 
 
 @pytest.fixture(scope="module")

@@ -7,6 +7,7 @@ import pytest
 
 from hbr import DenseIndex, Outcome, next_best_view, update_belief
 from hbr.core.angles import wrap180
+from hbr.dense.open_set import NUMBERS, OpenSetModel
 from hbr.evaluation.methods import METHODS, choose_methods
 from hbr.evaluation.protocol import COMPARED, OUTCOMES, Protocol, Runs
 from hbr.evaluation.results import contests, method_results
@@ -19,6 +20,28 @@ PROTOCOL = Protocol(trials=3, max_views=4, enrolled=8, removal="queries")
 
 def run(name: str, j: int = 2, protocol: Protocol = PROTOCOL) -> Runs:
     return run_object(j, QUERIES[VIEWS.of(j)], VIEWS, choose_methods(name.split(",")), protocol)
+
+
+def test_searches_know_the_bench_of_views_that_are_cut_out_as_the_enrolled_ones() -> None:
+    numbers = np.zeros((4, len(NUMBERS)))
+    rule = replace(
+        rule_of_trial(VIEWS, PROTOCOL),
+        min_confidence=0.0,
+        open_set=OpenSetModel(numbers, numbers + 1, numbers, numbers[:, 0]),  # each object scores 0
+        open_set_thresholds=(1.0,) * 4,
+        unknown_thresholds=(-1.0,) * 4,
+        same_bench_thresholds=(0.0,) * 4,
+    )
+
+    def outcomes(method: str, *, same_bench: bool | None) -> list[Outcome]:
+        own, segmented_by = QUERIES[VIEWS.of(2)], [method] * len(VIEWS.of(2))
+        dense = choose_methods(["dense-90"])
+        runs = run_object(2, own, VIEWS, dense, PROTOCOL, rule=rule, same_bench=same_bench, segmented_by=segmented_by)
+        return [OUTCOMES[code] for code in np.unique(runs.outcome[0, 0, :, 0])]
+
+    assert outcomes("plain-background", same_bench=True) == [Outcome.FOUND]
+    assert outcomes("guess", same_bench=True) == [Outcome.CONTINUE]
+    assert outcomes("plain-background", same_bench=None) == [Outcome.CONTINUE]
 
 
 @pytest.mark.parametrize("protocol", [PROTOCOL, Protocol(trials=2, max_views=4, near_deg=20)])

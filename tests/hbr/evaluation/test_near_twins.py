@@ -11,7 +11,7 @@ import pytest
 from hbr import Outcome
 from hbr.evaluation.condition import Condition
 from hbr.evaluation.datasets import load_coil
-from hbr.evaluation.descriptors import enrolled_levels, query_levels
+from hbr.evaluation.descriptors import enrolled_levels, query_levels, segmented_queries
 from hbr.evaluation.methods import METHODS
 from hbr.evaluation.near_twins import LocalPhotographs
 from hbr.evaluation.protocol import COMPARED, OUTCOMES, Protocol
@@ -57,6 +57,10 @@ def test_searches_for_near_twins_compare_the_two_leaders(folder: Path) -> None:
     assert photographs.possible
     assert not LocalPhotographs(dataset, Condition(), SIZE, 0).possible  # plain CEDD cuts nothing out
     queries = query_levels(dataset, 1, condition, SIZE, protocol.seed)
+    segmented = segmented_queries(dataset, 1, condition, SIZE, protocol.seed)
+    np.testing.assert_array_equal(segmented.levels, queries)
+    assert set(segmented.methods) == {"plain-background"}
+    assert set(segmented_queries(dataset, 1, Condition(), SIZE, protocol.seed).methods) == {""}
     # no search is confident, and no object is unknown: each ends as ambiguous
     rule = replace(rule_of_trial(views, protocol), min_confidence=2.0, open_set_thresholds=(-inf, -inf))
     without, with_images = (

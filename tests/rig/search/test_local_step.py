@@ -12,6 +12,7 @@ import pytest
 import hbr
 from benchmarks.twins import kind_of, searches
 from hbr.dense.open_set import fitted_before
+from hbr.dense.verification import FOUND_FROM, FOUND_FROM_SAME_BENCH
 from rig.bench import Bench
 from rig.catalog import Catalog
 from rig.config import load_config
@@ -42,7 +43,7 @@ def enrolled(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Bench, 
         yield bench, catalog
 
 
-def doubtful(rule: hbr.StoppingRule, offset: float) -> hbr.StoppingRule:
+def doubtful(rule: hbr.StoppingRule, offset: float, leave_one_out: tuple[float, ...]) -> hbr.StoppingRule:
     """A rule with which each search is doubtful after its first view; the offset is added to the open-set score."""
     model = fitted_before("edges+colours", 1)
     assert model is not None
@@ -55,23 +56,29 @@ def doubtful(rule: hbr.StoppingRule, offset: float) -> hbr.StoppingRule:
         ),
         open_set_thresholds=(1e6,),
         unknown_thresholds=(1e6,),
+        leave_one_out_thresholds=leave_one_out,
     )
 
 
 @pytest.mark.parametrize(
-    ("offset", "outcome", "answered"),
+    ("offset", "leave_one_out", "outcome", "answered"),
     [
-        (2.0, hbr.Outcome.FOUND, hbr.Outcome.FOUND),
-        (-6.0, hbr.Outcome.UNKNOWN, hbr.Outcome.AMBIGUOUS),  # it fits one of two near twins up to noise
+        (2.0, (1e6,), hbr.Outcome.FOUND, hbr.Outcome.FOUND),  # the bench is that of the enrollment
+        (-6.0, (), hbr.Outcome.UNKNOWN, hbr.Outcome.AMBIGUOUS),  # it fits one of two near twins up to noise
     ],
 )
 def test_a_doubtful_leader_is_verified_and_the_run_replays(
-    enrolled: tuple[Bench, Catalog], tmp_path: Path, offset: float, outcome: hbr.Outcome, answered: hbr.Outcome
+    enrolled: tuple[Bench, Catalog],
+    tmp_path: Path,
+    offset: float,
+    leave_one_out: tuple[float, ...],
+    outcome: hbr.Outcome,
+    answered: hbr.Outcome,
 ) -> None:
     bench, catalog = enrolled
     model = load_model(catalog)
     assert model.rule is not None
-    model = replace(model, rule=doubtful(model.rule, offset))
+    model = replace(model, rule=doubtful(model.rule, offset, leave_one_out))
     with RunWriter(tmp_path / "run", bench, model) as writer:
         events = list(identify(bench, model))
         for event in events:
@@ -80,6 +87,7 @@ def test_a_doubtful_leader_is_verified_and_the_run_replays(
     answer = events[-1]
     assert isinstance(answer, Identified)
     assert (found.name, found.outcome) == ("vase-blue", outcome)
+    assert found.found_from == (FOUND_FROM_SAME_BENCH if leave_one_out else FOUND_FROM)
     assert answer.outcome is answered
     assert (answer.reason is hbr.StopReason.PIXEL_FIT) == (outcome is answered)
     assert 0.5 < found.fit <= 1

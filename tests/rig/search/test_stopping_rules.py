@@ -10,6 +10,7 @@ import pytest
 import hbr
 from hbr.dense.calibration import UNCALIBRATED_MIN_CONFIDENCE
 from hbr.dense.leave_one_out import leave_one_out
+from hbr.dense.open_set import NUMBERS, OpenSetModel
 from hbr.dense.stopping import LimitationCode
 from rig.catalog import Catalog
 from rig.config import RigConfig
@@ -165,6 +166,28 @@ def test_stored_rules_are_read_as_they_were_written(tmp_path):
         assert stored is not None
         assert (stored.sha256, stored.made_utc) == (digest(index), NOW)
         assert same(stored.adapted(index.views), rule)
+
+
+def test_rule_without_leave_one_out_thresholds_decides_as_before_with_a_note(tmp_path):
+    index = shelf(18, 18, 18)
+    plain = hbr.calibrate_stopping_rule(index).rule
+    thresholds = plain.open_set_thresholds
+    numbers = np.zeros((len(thresholds), len(NUMBERS)))
+    rule = replace(
+        plain,
+        open_set=OpenSetModel(numbers, numbers + 1, numbers, numbers[:, 0]),
+        leave_one_out_thresholds=thresholds,
+    )
+    write_stopping_rule(tmp_path / FILE, rule, index, made_utc=NOW)
+    found, notes = stopping_rule_of(tmp_path, index)
+    assert found.leave_one_out_thresholds == thresholds
+    assert NoteCode.STOPPING_RULE_EARLIER not in [note.code for note in notes]
+    values = json.loads((tmp_path / FILE).read_text())
+    del values["leave_one_out_thresholds"]
+    (tmp_path / FILE).write_text(json.dumps(values))
+    found, notes = stopping_rule_of(tmp_path, index)
+    assert found.leave_one_out_thresholds == ()
+    assert notes[0].code is NoteCode.STOPPING_RULE_EARLIER
 
 
 def test_rules_of_version_1_are_read(tmp_path):
