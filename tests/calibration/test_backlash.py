@@ -49,8 +49,9 @@ def test_true_values_lie_within_the_stated_uncertainty():
     assert abs(z.mean()) < 0.2
 
 
-def test_simulated_backlash_is_found_to_hundredths_of_a_degree(simulated):
-    for seed, backlash_deg in enumerate([0.0, 0.1, 0.45, 1.2]):
+@pytest.mark.parametrize("backlashes_deg", [(0.0, 0.45), pytest.param((0.1, 1.2), marks=pytest.mark.nightly)])
+def test_simulated_backlash_is_found_to_hundredths_of_a_degree(simulated, backlashes_deg):
+    for seed, backlash_deg in enumerate(backlashes_deg):
         s = simulated("table.limits_deg=[-200, 200]", noise=NoiseModel(backlash_deg=backlash_deg), seed=seed)
         result = run(s)
         assert result.passed, result.rejections

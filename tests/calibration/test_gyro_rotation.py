@@ -4,27 +4,12 @@ import numpy as np
 import pytest
 
 from calibration.gyro_rotation import SPEEDS, GyroRotation, TimedLeg, evaluate
-from calibration.legs import Leg
 from calibration.procedure import Evaluation
 from rig.calibrations import RejectionCode
 from rig.core.errors import LimitExceeded, UsageError
 from sim.noise import NoiseModel
+from tests.calibration.drawn import moves
 from tests.calibration.rejected import codes
-
-
-def moves(
-    seed: int, *, true: float = 1.0, repeats: int = 10, backlash_deg: float = 0.4, invalid: str = ""
-) -> list[TimedLeg]:
-    """Return rotations that scatter by ``true`` times the stated σ, with a backlash and a scale."""
-    rng = np.random.default_rng(seed)
-    made = []
-    for number, speed in enumerate(SPEEDS):
-        for index in range(2 * repeats):
-            way = 1 - 2 * (index % 2)
-            sigma = 0.02 * 3.0**number
-            gyro = way * 60 / 1.03 - way * backlash_deg + true * sigma * float(rng.standard_normal())
-            made.append(TimedLeg(speed, 1.7 * 3.0**number, Leg(way * 60.0, gyro, sigma, invalid)))
-    return made
 
 
 def evaluated(some: list[TimedLeg]) -> Evaluation:
@@ -63,19 +48,20 @@ def test_lost_samples_are_rejected():
 
 def test_simulated_sigma_is_true(simulated):
     s = simulated(seed=3)
+    speed_before = s.bench.config.table.velocity_dps
     *_, result = GyroRotation(repeats=4).live(s.bench)
+    assert s.bench.config.table.velocity_dps == speed_before
     assert result.passed, result.rejections
     by_duration = result.evidence["by_duration"]
     assert [row["stated_deg"] for row in by_duration] == sorted(row["stated_deg"] for row in by_duration)
     assert by_duration[-1]["seconds"] > 5 * by_duration[0]["seconds"]
 
 
+@pytest.mark.nightly
 def test_noisy_encoder_is_rejected(simulated):
     s = simulated(noise=NoiseModel(encoder_noise_deg=0.25), seed=3)
-    speed_before = s.bench.config.table.velocity_dps
     *_, result = GyroRotation(repeats=4).live(s.bench)
     assert RejectionCode.SCATTER_TOO_LARGE in codes(result)
-    assert s.bench.config.table.velocity_dps == speed_before
 
 
 def test_too_few_repeats_and_short_cable_are_rejected_before_moving(simulated):

@@ -54,7 +54,7 @@ def torque(s) -> int:
     return s.bench.servo._read("Torque Enable")
 
 
-@pytest.mark.parametrize("benches", [4, pytest.param(20, marks=pytest.mark.nightly)])
+@pytest.mark.parametrize("benches", [3, pytest.param(20, marks=pytest.mark.nightly)])
 def test_true_scale_lies_within_the_stated_uncertainty(simulated, benches):
     """The simulated servo rests in the middle of its counts, a real one anywhere: the errors may be the smaller."""
     z = []

@@ -5,29 +5,12 @@ from math import degrees
 import numpy as np
 import pytest
 
-from calibration.imu_mounting import GravityReading, ImuMounting, RecordedMove, evaluate
+from calibration.imu_mounting import ImuMounting, evaluate
 from calibration.procedure import Evaluation
 from rig.calibrations import RejectionCode
 from rig.core.errors import LimitExceeded
+from tests.calibration.drawn import AXIS, measured
 from tests.calibration.rejected import codes
-
-AXIS = np.array([0.02, -0.03, 1.0]) / np.linalg.norm([0.02, -0.03, 1.0])
-
-
-def measured(
-    axis=AXIS, *, zero_g=(0.01, -0.02, 0.03), table_axis_deg=(0.0, 0.0)
-) -> tuple[list[RecordedMove], list[GravityReading]]:
-    """Return what a bench without noise measures."""
-    rate = np.linspace(10.0, 90.0, 20)
-    moves = [RecordedMove(45.0, 45.0 * axis, 0.01, 0.002 * rate, rate) for _ in range(8)]
-    levels = []
-    for angle in np.arange(8) * 45.0:
-        c, s = np.cos(np.radians(angle)), np.sin(np.radians(angle))
-        x, y = np.radians(table_axis_deg)
-        levels.append(
-            GravityReading(float(angle), axis + zero_g + np.array([c * x + s * y, -s * x + c * y, 0.0]), 1e-4)
-        )
-    return moves, levels
 
 
 def fit(moves, levels, *, column=2, sign=1) -> Evaluation:

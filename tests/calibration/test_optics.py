@@ -88,7 +88,7 @@ def test_region_of_interest_holds_the_rotating_object():
 
 
 def test_objects_cut_off_by_the_frame_are_rejected():
-    views = seen(optics(0), table_axis.STANDS, table_axis.ANGLES_DEG[::2])
+    views = seen(optics(0), table_axis.STANDS, table_axis.ANGLES_DEG[::3])
     room = ObjectSpace(height_mm=260.0)
     result = table_axis.evaluate(views, Board(), calibrated(0), space=room)
     (rejection,) = result.rejections
@@ -98,7 +98,7 @@ def test_objects_cut_off_by_the_frame_are_rejected():
 
 
 def test_wrong_board_size_is_found_by_the_measured_distance():
-    views = seen(optics(0), table_axis.STANDS, table_axis.ANGLES_DEG[::2])
+    views = seen(optics(0), table_axis.STANDS, table_axis.ANGLES_DEG[::3])
 
     def measured(square_mm: float) -> Evaluation:
         room, board = ObjectSpace(lens_mm=480.0), Board(square_mm=square_mm, marker_mm=square_mm * 11 / 15)
@@ -128,7 +128,7 @@ def test_loose_board_is_rejected():
     views = seen(optics(1), ALL, ANGLES, change=lambda board: replace(board, loose_deg=4.0))
     assert RejectionCode.BOARD_LOOSE in codes(camera(views))
     views = seen(
-        optics(0), table_axis.STANDS, table_axis.ANGLES_DEG[::2], change=lambda board: replace(board, loose_deg=1.0)
+        optics(0), table_axis.STANDS, table_axis.ANGLES_DEG[::3], change=lambda board: replace(board, loose_deg=1.0)
     )
     assert RejectionCode.CIRCLES_OFF in codes(axis(views, calibrated(0)))
 

@@ -40,6 +40,13 @@ RESUMED_VIEWS = 1
 LATE_MOVE = 20
 KINDS_OF_RECOVERY = {(one.step, one.after, one.late, one.torque): name for name, one in reversed(SCENARIOS.items())}
 """The first fault of each way to continue; the default tests continue after these."""
+SEVERAL_AT_ONCE = (
+    ("servo.slow", "crc_flip", "late_reply", "friction", "camera.slow", "stamp_jump", "light_flicker"),
+    ("servo.intermittent", "duplicate_reply", "i2c_nack", "lost_frames", "stamps_backwards", "mains_flicker"),
+    ("babble", "camera.delayed", "camera.intermittent", "stamp_jitter", "clock_jump"),
+    ("echo", "doubled_frame"),
+)
+"""Faults that stop no enrollment, in groups that can happen together."""
 SURVIVED = ("servo.intermittent", "camera.intermittent", "crc_flip", "i2c_nack")
 """Faults that stop nothing, under which the default tests identify an object, too."""
 
@@ -52,7 +59,10 @@ def test_every_fault_has_a_scenario_and_a_documented_row() -> None:
         assert cells[5] == recovery(SCENARIOS[name]), UPDATE
 
 
-@pytest.mark.parametrize("name", SCENARIOS)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=[pytest.mark.nightly] * (one.code is None)) for name, one in SCENARIOS.items()],
+)
 def test_enrollment_completes_or_stops_without_lost_views_or_wrong_angles(tmp_path: Path, name: str) -> None:
     scenario = SCENARIOS[name]
     recovers = name in KINDS_OF_RECOVERY.values()
@@ -61,6 +71,27 @@ def test_enrollment_completes_or_stops_without_lost_views_or_wrong_angles(tmp_pa
     assert masked(cells[4]) == masked(message(outcome)), UPDATE
     if scenario.code is not None:
         assert outcome.found_s <= float(cells[3].removesuffix(" s")) + SLACK_S, UPDATE
+
+
+@pytest.mark.parametrize("names", SEVERAL_AT_ONCE)
+def test_enrollment_completes_under_several_faults_at_once(tmp_path: Path, names: tuple[str, ...]) -> None:
+    """The nightly profile enrolls under each of these faults alone."""
+    with new_rig(tmp_path) as rig:
+        outcome = enrollment(rig, *(SCENARIOS[name].fault for name in names), views=SHORT)
+        assert outcome.error is None
+        assert enrolled(outcome)
+        assert {one.fault.kind.name for one in rig.faults.history} == set(names)
+        assert outcome.stored == set(range(SHORT))
+        check_stands(rig)
+        check_stored(rig, outcome.stored, tolerance_deg=TOLERANCE_DEG, planned=SHORT)
+        assert not rig.torque
+
+
+def test_every_fault_that_stops_no_enrollment_is_among_several_at_once() -> None:
+    survived = {name for name, one in SCENARIOS.items() if one.code is None}
+    assert survived == {name for names in SEVERAL_AT_ONCE for name in names}
+    for name in survived:
+        assert documented()[name][4] == message(Outcome()), UPDATE
 
 
 @pytest.mark.nightly
@@ -163,31 +194,34 @@ def test_identification_names_the_object_or_stops(tmp_path: Path, name: str) -> 
         check_stands(rig)
 
 
-@pytest.mark.parametrize(
-    "fault",
-    [
-        "camera.off@view3+1s",
-        "black_frame@view3+0.7s",
-        "crc_flip:rate=0.3@move3+0.5s",
-        "overheat:celsius=60@move3+1s",
-        *(
-            pytest.param(fault, marks=pytest.mark.nightly)
-            for fault in (
-                "camera.stuck@view3+0.1s",
-                "exposure_jump@view3+0.05s",
-                "babble:period=0.001@move3+2s",
-                "i2c_nack:rate=0.3@move3+0.1s",
-                "light_flicker:depth=0.5@move3+5s",
-                "slip:angle=0.2@move3",
-            )
-        ),
-    ],
+SHORT_FAULTS = (
+    "camera.off@view3+1s",
+    "black_frame@view3+0.7s",
+    "crc_flip:rate=0.3@move3+0.5s",
+    "overheat:celsius=60@move3+1s",
+    "camera.stuck@view3+0.1s",
+    "exposure_jump@view3+0.05s",
+    "babble:period=0.001@move3+2s",
+    "i2c_nack:rate=0.3@move3+0.1s",
+    "light_flicker:depth=0.5@move3+5s",
+    "slip:angle=0.2@move3",
 )
-def test_short_fault_does_not_end_an_enrollment(tmp_path: Path, fault: str) -> None:
+ONE_AFTER_THE_OTHER = (
+    "crc_flip:rate=0.3@move1+0.5s",
+    "camera.off@view1+1s",
+    "overheat:celsius=60@move3+1s",
+    "black_frame@view3+0.7s",
+)
+
+
+@pytest.mark.parametrize(
+    "faults", [ONE_AFTER_THE_OTHER, *(pytest.param((one,), marks=pytest.mark.nightly) for one in SHORT_FAULTS)]
+)
+def test_short_faults_do_not_end_an_enrollment(tmp_path: Path, faults: tuple[str, ...]) -> None:
     """The plan waits, repeats the view or repeats the transaction."""
     with new_rig(tmp_path) as rig:
-        outcome = enrollment(rig, fault, views=SHORT)
+        outcome = enrollment(rig, *faults, views=SHORT)
         assert outcome.error is None
-        assert rig.faults.history, "the fault did not happen"
+        assert len({one.fault.kind.name for one in rig.faults.history}) == len(faults), "a fault did not happen"
         check_stored(rig, set(range(SHORT)), tolerance_deg=TOLERANCE_DEG, planned=SHORT)
         assert not rig.torque

@@ -279,8 +279,18 @@ def test_fault_at_the_start_stops_the_bench_from_opening():
         open_sim_bench(load_config(), ShelfOperator(World(), shelf()), faults=[Fault.parse("wrong_model")])
 
 
-@pytest.mark.parametrize("servo", ["xl430_w250", "xm430_w350", "xl330_m288", "mx_28", "ax_12a"])
-@pytest.mark.parametrize("imu", [("mpu6050", 0x68), ("mpu6500", 0x68), ("bno055", 0x28)])
+SERVOS = ("xl430_w250", "xm430_w350", "xl330_m288", "mx_28", "ax_12a")
+IMUS = (("mpu6050", 0x68), ("mpu6500", 0x68), ("bno055", 0x28))
+
+
+@pytest.mark.parametrize(
+    ("servo", "imu"),
+    [
+        pytest.param(servo, imu, marks=[pytest.mark.nightly] * (i % len(IMUS) != j))  # each device once, and all pairs
+        for i, servo in enumerate(SERVOS)
+        for j, imu in enumerate(IMUS)
+    ],
+)
 def test_every_fault_works_on_every_simulated_device(servo, imu):
     settings = (f"servo.model={servo}", "servo.baud=1000000", f"imu.model={imu[0]}", f"imu.address={imu[1]}")
     for name in fault_kinds():

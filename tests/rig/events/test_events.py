@@ -117,12 +117,12 @@ def test_every_event_that_the_plans_emit_is_as_documented(simulated, tmp_path):
     s = simulated("table.limits_deg=[-180, 185]", "identify.max_views=5", "identify.margin=1", seed=2)
     seen = set()
     with Catalog.open(tmp_path, clock=s.bench.clock) as catalog:
-        for event in enroll(s.bench, catalog, "dice", views=8):
+        for event in enroll(s.bench, catalog, "dice", views=6):
             seen.add(check_event(event))
         for event in photograph_table(s.bench):
             seen.add(check_event(event))
         items = [TrayItem(2, "dice"), TrayItem(3, "lamp", label="light")]
-        for event in enroll_tray(s.bench, catalog, items, views=6):
+        for event in enroll_tray(s.bench, catalog, items, views=4):
             seen.add(check_event(event))
         views = catalog.views().views
         seen |= {check_event(similar_objects(views, name)) for name in ("dice", "lamp")}

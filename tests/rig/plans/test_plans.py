@@ -233,13 +233,13 @@ def test_supply_dip_of_the_servo_ends_the_plan_and_nothing_moves_afterwards(simu
     s = simulated()
     with pytest.raises(RigError) as caught:
         for event in enroll(s.bench, catalog, "lamp", views=8):
-            if moving and isinstance(event, Accepted) and event.index == 5:
+            if moving and isinstance(event, Accepted) and event.index == 2:
                 s.world.clock.call_at(s.world.clock.now_ns() + 400_000_000, servo_of(s).power_cycle)
-            if not moving and isinstance(event, Moved) and event.index == 5:
+            if not moving and isinstance(event, Moved) and event.index == 2:
                 servo_of(s).power_cycle()
                 s.world.clock.sleep(0.5)
     assert caught.value.exit_code in (4, 5, 6)
-    assert set(catalog.resumable("lamp").present) <= {0, 1, 2, 3, 4, 5}
+    assert set(catalog.resumable("lamp").present) <= {0, 1, 2}
     assert torque(s) == 0
     before = s.world.shaft()[0]
     s.world.clock.sleep(2.0)
@@ -294,7 +294,7 @@ def test_events_depend_on_nothing_but_the_seed(simulated, tmp_path):
     def run(seed: int, folder: str) -> list[dict]:
         s = simulated(seed=seed)
         with Catalog.open(tmp_path / folder, clock=s.bench.clock) as catalog:
-            events = [event_dict(e) for e in enroll(s.bench, catalog, "toy-car", views=4)]
+            events = [event_dict(e) for e in enroll(s.bench, catalog, "toy-car", views=3)]
             return events + [event_dict(e) for e in identify(s.bench, hbr.ViewIndex(catalog.views().views))]
 
     events = run(5, "a")

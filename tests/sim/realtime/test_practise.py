@@ -23,7 +23,7 @@ from tests.docs.pages import DOCS
 CLOCK = SystemClock()
 START = "from rig.cli.main import main; main()"
 PATIENCE_S = 60.0
-IN_DEPTH = ("A program is killed", "Enroll and identify")
+IN_DEPTH = ("A cable is unplugged", "A program is killed", "Enroll and identify")
 """Sections that only the nightly test walks through."""
 
 

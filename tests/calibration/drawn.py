@@ -1,0 +1,40 @@
+"""Measurements of benches without a simulator: what procedures evaluate, drawn at random or exact."""
+
+import numpy as np
+
+from calibration.gyro_rotation import SPEEDS, TimedLeg
+from calibration.imu_mounting import GravityReading, RecordedMove
+from calibration.legs import Leg
+
+AXIS = np.array([0.02, -0.03, 1.0]) / np.linalg.norm([0.02, -0.03, 1.0])
+
+
+def measured(
+    axis=AXIS, *, zero_g=(0.01, -0.02, 0.03), table_axis_deg=(0.0, 0.0)
+) -> tuple[list[RecordedMove], list[GravityReading]]:
+    """Return what a bench without noise measures."""
+    rate = np.linspace(10.0, 90.0, 20)
+    moves = [RecordedMove(45.0, 45.0 * axis, 0.01, 0.002 * rate, rate) for _ in range(8)]
+    levels = []
+    for angle in np.arange(8) * 45.0:
+        c, s = np.cos(np.radians(angle)), np.sin(np.radians(angle))
+        x, y = np.radians(table_axis_deg)
+        levels.append(
+            GravityReading(float(angle), axis + zero_g + np.array([c * x + s * y, -s * x + c * y, 0.0]), 1e-4)
+        )
+    return moves, levels
+
+
+def moves(
+    seed: int, *, true: float = 1.0, repeats: int = 10, backlash_deg: float = 0.4, invalid: str = ""
+) -> list[TimedLeg]:
+    """Return rotations that scatter by ``true`` times the stated σ, with a backlash and a scale."""
+    rng = np.random.default_rng(seed)
+    made = []
+    for number, speed in enumerate(SPEEDS):
+        for index in range(2 * repeats):
+            way = 1 - 2 * (index % 2)
+            sigma = 0.02 * 3.0**number
+            gyro = way * 60 / 1.03 - way * backlash_deg + true * sigma * float(rng.standard_normal())
+            made.append(TimedLeg(speed, 1.7 * 3.0**number, Leg(way * 60.0, gyro, sigma, invalid)))
+    return made
