@@ -3,7 +3,6 @@
 import os
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -11,6 +10,7 @@ from dataclasses import dataclass, field
 import pytest
 
 from sim.head import build
+from tests.programs import Program
 
 HOST = """
 import sys, serial
@@ -76,9 +76,8 @@ def terminal() -> Iterator[Terminal]:
         program.communicate()
 
 
-def host(port: str, deadman_s: float, how: str) -> subprocess.Popen:
-    command = [sys.executable, "-c", HOST, port, str(deadman_s), how]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+def host(port: str, deadman_s: float, how: str) -> Program:
+    return Program(port, str(deadman_s), how, code=HOST)
 
 
 def test_stream_runs_in_real_time(terminal):
@@ -101,7 +100,7 @@ def test_killed_program_leaves_the_bench_dark_and_unpowered(terminal, deadman_s)
     terminal.wait_for("light", 128)
     killed = time.monotonic()  # noqa: TID251
     os.kill(program.pid, signal.SIGKILL)
-    program.communicate()
+    program.close()
     opened_s = terminal.wait_for("relay", 0)
     took_s = time.monotonic() - killed  # noqa: TID251
     dark_s = terminal.wait_for("light", 0)
@@ -115,5 +114,4 @@ def test_estop_works_in_real_time(terminal):
     terminal.wait_for("light", 128)
     terminal.say("estop open")
     assert terminal.wait_for("relay", 0) > 0
-    program.kill()
-    program.communicate()
+    program.close()

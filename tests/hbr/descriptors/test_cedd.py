@@ -78,7 +78,10 @@ def test_equals_the_literal_definition(image: Image) -> None:
     assert cedd(image).tolist() == cedd_reference(image)
 
 
-@pytest.mark.parametrize(("height", "width"), [(480, 640), (560, 568), (1080, 200), (100, 3000)])
+@pytest.mark.parametrize(
+    ("height", "width"),
+    [(480, 640), (100, 3000), *(pytest.param(*size, marks=pytest.mark.nightly) for size in ((560, 568), (1080, 200)))],
+)
 def test_equals_the_literal_definition_on_large_images(height: int, width: int) -> None:
     image = noise(height, width)
     image[: height // 2] = image[: height // 2, :, :1] // 128 * 118  # greys where exact means are whole numbers
@@ -134,7 +137,10 @@ def drawing(name: str, height: int, width: int) -> Image:
         *("chequers", "one dot", "same sums, other pixels"),
     ],
 )
-@pytest.mark.parametrize(("height", "width"), [(80, 80), (160, 240), (203, 170), (320, 320)])
+@pytest.mark.parametrize(
+    ("height", "width"),
+    [(160, 240), (203, 170), *(pytest.param(n, n, marks=pytest.mark.nightly) for n in (80, 320))],
+)
 def test_areas_of_drawings_round_like_the_reference(name: str, height: int, width: int) -> None:
     image = drawing(name, height, width)
     y, x = height // 80, width // 80

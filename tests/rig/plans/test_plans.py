@@ -23,7 +23,7 @@ from rig.plans.enroll import enroll
 from rig.plans.identify import identify
 from rig.search.model import load_model
 
-VIEWS = 12
+VIEWS = 8
 
 
 @pytest.fixture

@@ -19,6 +19,7 @@ from rig.core.errors import DeviceNotFound
 from rig.devices.dynamixel.port import open_serial
 from sim.realtime.wire import tell
 from tests.docs.pages import DOCS
+from tests.programs import Program
 
 CLOCK = SystemClock()
 START = "from rig.cli.main import main; main()"
@@ -95,7 +96,7 @@ def test_practice_shows_the_output_of_the_page(in_depth, tmp_path, monkeypatch):
     # a busy computer may pause programs
     (tmp_path / "rig.toml").write_text("[table]\nwatchdog_s = 2.5\n[servo]\nretries = 20\n")
     bench = process(*shlex.split(first.command)[1:], cwd=tmp_path)
-    others: list[tuple[Typed, subprocess.Popen[str]]] = []
+    others: list[tuple[Typed, Program]] = []
     try:
         assert bench.stdout is not None
         first.check("".join(bench.stdout.readline() for _ in range(3)))
@@ -115,12 +116,12 @@ def test_practice_shows_the_output_of_the_page(in_depth, tmp_path, monkeypatch):
                 until(lambda: not tell(folder, "status")["world"]["torque"] and is_free(folder / "servo"))
             elif following and (typed.terminal, following.terminal) == ("second terminal", "third terminal"):
                 start_deg = tell(folder, "status")["world"]["table_deg"]
-                others.append((typed, process(*words, cwd=folder)))
+                others.append((typed, Program(*words, folder=folder, OPENBLAS_NUM_THREADS="1", COLUMNS="500")))
                 until(lambda start_deg=start_deg: abs(tell(folder, "status")["world"]["table_deg"] - start_deg) > 20.0)
             else:
                 typed.check(CliRunner().invoke(app, words).output)
         for typed, other in others:
-            typed.check(other.communicate(timeout=PATIENCE_S)[0])
+            typed.check("".join(reversed(other.communicate(timeout=PATIENCE_S))))
         bench.send_signal(signal.SIGTERM if in_depth else signal.SIGINT)
         said = bench.communicate(timeout=PATIENCE_S)[0]
         assert "Traceback" not in said
@@ -128,6 +129,7 @@ def test_practice_shows_the_output_of_the_page(in_depth, tmp_path, monkeypatch):
         assert bench.returncode == (143 if in_depth else 0)
         assert {path.name for path in folder.iterdir()} <= {"lock", "rig.toml", "state", "catalog", "calibration"}
     finally:
-        for other in (bench, *(other for _, other in others)):
-            other.kill()
-            other.communicate()
+        bench.kill()
+        bench.communicate()
+        for _, other in others:
+            other.close()
