@@ -5,7 +5,7 @@ coarsely; its details do not fit. For each view, the enrolled views at the estim
 fit is the share of the view's contrast that they explain, in colours that light hardly changes. The fit of the leader,
 and its lead over the next candidates, count beside the open-set score.
 
-Decision: docs/decisions/0062.
+Decisions: docs/decisions/0062, docs/decisions/0064.
 """
 
 from collections.abc import Callable, Sequence
@@ -34,8 +34,8 @@ _WEIGHTS: Final = (0.714, 9.438, 4.995)
 _OFFSET: Final = -5.416
 #: Log-odds from which an object is found, and below which it is unknown: that of 1 in 100 enrolled objects.
 FOUND_FROM: Final = 0.0
-#: The same on a bench that is known to be that of the enrollment: there an enrolled object fits much better. Half-way
-#: between the enrolled and the left-out objects 1–50 after a mild change.
+#: The same on a bench that is known to be that of the enrollment: there an enrolled object fits much better. It lies
+#: between the enrolled objects 1–50 after a mild change (from 5.6 on) and the left-out ones (up to 1.1).
 FOUND_FROM_SAME_BENCH: Final = 3.0
 UNKNOWN_BELOW: Final = -1.3
 #: With a smaller open-set score, no fit makes an object known.
