@@ -159,8 +159,7 @@ def fit_open_set(rule: StoppingRule, searches: ShiftedSearches, model: OpenSetMo
     between the thresholds they are ambiguous.
 
     On a bench that is known to have changed, the searches without a change do not count; on one that is known to be
-    the same, only those with the smallest changes count. There the rule's own thresholds count, too, before the last
-    view.
+    the same, only those with the smallest changes count. There the rule's own thresholds count, too.
     """
     model = model or OpenSetModel.fitted(searches.known, searches.correct, searches.unknown)
     known, unknown = model.scores(searches.known), model.scores(searches.unknown)

@@ -5,7 +5,7 @@
 Decisions: docs/decisions/0026, docs/decisions/0064.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from functools import cached_property
 from typing import Any
@@ -39,6 +39,7 @@ class StopReason(StrEnum):
     NO_ROTATION_LEFT = "no-rotation-left"
     LOCAL_DIFFERENCE = "local-difference"
     PIXEL_FIT = "pixel-fit"
+    UNCHANGED_BENCH = "unchanged-bench"
     CUSTOM = "custom"
     EARLIER_VERSION = "earlier-version"
 
@@ -157,8 +158,9 @@ class StoppingRule:
         With weights: ``open_set_thresholds`` of a search that knows that the bench has changed since the enrollment, or
         that it has not.
     leave_one_out_thresholds : tuple of float
-        With weights: scores of `hbr.dense.leave_one_out.open_set_score` after 1, 2, ... views, below which few enrolled
-        objects are on an unchanged bench. Rules that were calibrated before have none, and decide as before.
+        With weights: scores of `hbr.dense.leave_one_out.open_set_score` after 1, 2, ... views. On an unchanged bench,
+        few enrolled objects score less, and one that reaches the highest of them is found. Rules that were calibrated
+        before have none, and decide as before.
     rates : tuple of ShiftRates
         Measured rates under changes of the bench.
     """
@@ -196,8 +198,8 @@ class StoppingRule:
         however many views are left: no false-reject rate was measured for those. After ``max_views`` an object that is
         not confident is ambiguous. If the views were not segmented reliably, the search continues in any case until
         ``max_views``: another view costs little, and the background is then known. ``same_bench`` says whether the
-        bench is that of the enrollment; None: the search does not know. If it is, an object is also found before the
-        last calibrated view if it reaches all leave-one-out thresholds: those were measured on an unchanged bench.
+        bench is that of the enrollment; None: the search does not know. If it is, a confident object is also found if
+        it reaches all leave-one-out thresholds, which are for an unchanged bench.
         """
         probability = belief.posterior(self.beta).sum(axis=1)
         best = int(probability.argmax())
@@ -209,11 +211,6 @@ class StoppingRule:
         score = self._open_set_score(belief, n)
         early = decisions < min(calibrated, max_views)
         threshold = max(thresholds) if early else thresholds[n]
-        if early and same_bench and score < threshold and self.leave_one_out_thresholds:
-            leading, alike = self._leave_one_out_score(belief, n)
-            least = max(self.leave_one_out_thresholds)
-            if leading == belief.index.object_index[best] and alike >= least:
-                score, threshold = alike, least
         confidence = float(probability[best])
         unknown_below = min(threshold, self.unknown_thresholds[n]) if self.unknown_thresholds else threshold
         if score < threshold:
@@ -230,7 +227,26 @@ class StoppingRule:
         if not reliable and outcome is not Outcome.CONTINUE and decisions < max_views:
             outcome, reason = Outcome.CONTINUE, StopReason.BADLY_SEGMENTED
         object_index = int(belief.index.object_index[best])
-        return StopDecision(outcome, reason, object_index, confidence, self.min_confidence, score, threshold)
+        decision = StopDecision(outcome, reason, object_index, confidence, self.min_confidence, score, threshold)
+        if same_bench and reliable and score < threshold and decisions <= calibrated:
+            return self._found_on_same_bench(belief, n, decision)
+        return decision
+
+    def _found_on_same_bench(self, belief: Belief, n: int, decision: StopDecision) -> StopDecision:
+        """Return the decision on an unchanged bench, by the score that was measured on one."""
+        if not self.leave_one_out_thresholds or decision.confidence < self.min_confidence:
+            return decision
+        leading, score = self._leave_one_out_score(belief, n)
+        threshold = max(self.leave_one_out_thresholds)
+        if leading != decision.object_index or score < threshold:
+            return decision
+        return replace(
+            decision,
+            outcome=Outcome.FOUND,
+            reason=StopReason.UNCHANGED_BENCH,
+            open_set_score=score,
+            open_set_threshold=threshold,
+        )
 
     def _open_set_score(self, belief: Belief, n: int) -> float:
         if self.open_set is not None:

@@ -93,7 +93,7 @@ def is_doubtful(rule: StoppingRule, decision: StopDecision, views: int, kind: st
     model = fitted_before(kind, calibrated)
     if model is None or rule.open_set is None or not np.array_equal(model.weights, rule.open_set.weights):
         return False
-    if decision.outcome is Outcome.CONTINUE or views < calibrated:
+    if decision.outcome is Outcome.CONTINUE or views < calibrated or decision.reason is StopReason.UNCHANGED_BENCH:
         return False
     return _HOPELESS < decision.open_set_score < max(rule.open_set_thresholds)
 

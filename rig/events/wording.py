@@ -221,6 +221,9 @@ def stop_words(decision: StopDecision, views: int) -> str:
         case StopReason.CONFIDENT:
             known = f", and the open-set score is {abs(above):.3f} above its threshold"
             return f"the confidence {confidence} reaches {least}{known if isfinite(above) else ''}"
+        case StopReason.UNCHANGED_BENCH:
+            known = f"and the open-set score is {above:.3f} above the threshold of an unchanged bench"
+            return f"the confidence {confidence} reaches {least}, {known}"
         case StopReason.BADLY_SEGMENTED:
             return "the background is not known yet; another view shows it"
         case StopReason.NOT_CONFIDENT:

@@ -16,7 +16,7 @@ from hbr.dense.calibration import (
 from hbr.dense.leave_one_out import leave_one_out
 from hbr.dense.open_set import NUMBERS, OpenSetModel
 from hbr.dense.shifted_searches import STRENGTHS, ShiftedSearches
-from hbr.dense.stopping import LimitationCode, StoppingRule
+from hbr.dense.stopping import LimitationCode, StoppingRule, StopReason
 from tests.hbr.dense.searches import belief_after
 from tests.hbr.dense.test_stopping import catalog
 
@@ -106,10 +106,11 @@ def test_decision_depends_on_what_is_known_of_the_bench(
         (True, 1, 0.0, Outcome.FOUND),
         (True, 1, 0.1, Outcome.CONTINUE),  # the score is too low
         (None, 1, 0.0, Outcome.CONTINUE),  # the thresholds are those of an unchanged bench
-        (True, 4, 0.0, Outcome.AMBIGUOUS),  # after the last view, the weights decide
+        (True, 4, 0.0, Outcome.FOUND),
+        (True, 4, 0.1, Outcome.AMBIGUOUS),
     ],
 )
-def test_on_an_unchanged_bench_the_leave_one_out_thresholds_end_a_search_early(
+def test_on_an_unchanged_bench_an_object_is_found_by_the_leave_one_out_thresholds(
     index: DenseIndex, plain: StoppingRule, same_bench: bool | None, views: int, shift: float, outcome: Outcome
 ) -> None:
     rows = index.views.of(2)[[0, 4, 9, 13]][:views]
@@ -121,7 +122,8 @@ def test_on_an_unchanged_bench_the_leave_one_out_thresholds_end_a_search_early(
     assert decision.outcome is outcome
     if outcome is Outcome.FOUND:
         assert (decision.open_set_score, decision.open_set_threshold) == (score, score)
-        assert before.decide(belief, max_views=4, same_bench=True).outcome is Outcome.CONTINUE
+        assert decision.reason is StopReason.UNCHANGED_BENCH
+        assert before.decide(belief, max_views=4, same_bench=True).outcome is not Outcome.FOUND
 
 
 def test_rule_states_that_twins_are_accepted_more_often_than_promised(plain: StoppingRule) -> None:

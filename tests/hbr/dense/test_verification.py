@@ -124,6 +124,8 @@ def test_ends_between_certain_scores_are_doubtful(
 ) -> None:
     assert is_doubtful(rule, decision(score, outcome=outcome), views, KIND) is doubtful
     assert not is_doubtful(replace(rule, open_set=None), decision(score, outcome=outcome), views, KIND)
+    sure = replace(decision(score, outcome=Outcome.FOUND), reason=StopReason.UNCHANGED_BENCH)
+    assert not is_doubtful(rule, sure, views, KIND)
     other = replace(rule.open_set, weights=rule.open_set.weights + 1)  # type: ignore[type-var, union-attr]
     assert not is_doubtful(replace(rule, open_set=other), decision(score, outcome=outcome), views, KIND)
 

@@ -83,6 +83,7 @@ def test_dense_decisions_name_the_two_candidates() -> None:
             StopReason.CONFIDENT,
             "the confidence 97.0 % reaches 95.0 %, and the open-set score is 0.100",
         ),
+        (Outcome.FOUND, StopReason.UNCHANGED_BENCH, "the confidence 97.0 % reaches 95.0 %, and the open-set score is"),
         (
             Outcome.AMBIGUOUS,
             StopReason.MAX_VIEWS,
