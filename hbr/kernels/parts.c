@@ -38,19 +38,27 @@ EXPORT FOR_EVERY_PROCESSOR void hbr_votes(const float *magnitude, const float *a
         }
 }
 
-/* Average the colours of cells, each pixel by its weight: (cells size, cells size, 3) and (cells size, cells size) ->
-   (cells, cells, 3). The sums of rounded products of a byte and a float32 are exact. */
+/* Average the colours of cells, each pixel by its weight, and the weights: (cells size, cells size, 3) and (cells size,
+   cells size) -> (cells, cells, 3) and (cells, cells). The sums of float32 weights, and of their rounded products with a
+   byte, are exact. */
 EXPORT FOR_EVERY_PROCESSOR void hbr_cell_means(const uint8_t *image, const float *weight, int64_t cells, int64_t size,
-                                               double *means) {
+                                               double *means, double *covered) {
+    const double pixels = (double)(size * size);
     for (int64_t row = 0; row < cells; row++)
-        for (int64_t column = 0; column < cells; column++, means += 3) {
-            double sums[3] = {0, 0, 0};
+        for (int64_t column = 0; column < cells; column++, means += 3, covered++) {
+            double blue = 0, green = 0, red = 0, sum = 0;
             for (int64_t y = row * size; y < (row + 1) * size; y++)
-                for (int64_t x = column * size; x < (column + 1) * size; x++)
-                    for (int64_t c = 0; c < 3; c++) {
-                        const int64_t at = y * cells * size + x;
-                        sums[c] += (double)((float)image[3 * at + c] * weight[at]);
-                    }
-            for (int64_t c = 0; c < 3; c++) means[c] = sums[c] / (double)(size * size);
+                for (int64_t x = column * size; x < (column + 1) * size; x++) {
+                    const int64_t at = y * cells * size + x;
+                    const float own = weight[at];
+                    blue += (double)((float)image[3 * at] * own);
+                    green += (double)((float)image[3 * at + 1] * own);
+                    red += (double)((float)image[3 * at + 2] * own);
+                    sum += (double)own;
+                }
+            means[0] = blue / pixels;
+            means[1] = green / pixels;
+            means[2] = red / pixels;
+            *covered = sum / pixels;
         }
 }

@@ -36,12 +36,13 @@ def votes(magnitude: Array, angle: Array, scale: np.float32) -> Floats | None:
     return shared
 
 
-def cell_means(image: ImageArray, weight: Floats, cells: int) -> FloatArray | None:
-    """Return the mean of each cell's weighted colours: (n, n, 3) and (n, n) -> (cells, cells, 3)."""
+def cell_means(image: ImageArray, weight: Floats, cells: int) -> tuple[FloatArray, FloatArray] | None:
+    """Return the means of each cell's weighted colours and weights: (cells, cells, 3), (cells, cells)."""
     found = library()
     if found is None:
         return None
     image, weight = np.ascontiguousarray(image), np.ascontiguousarray(weight)
-    means = np.empty((cells, cells, 3))
-    found.hbr_cell_means(address(image), address(weight), cells, len(image) // cells, address(means))
-    return means
+    means, covered = np.empty((cells, cells, 3)), np.empty((cells, cells))
+    size = len(image) // cells
+    found.hbr_cell_means(address(image), address(weight), cells, size, address(means), address(covered))
+    return means, covered

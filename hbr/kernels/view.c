@@ -171,11 +171,37 @@ PART int64_t mirrored(int64_t at, int64_t side) {
     return at < side ? at : 2 * side - 2 - at;
 }
 
-/* Put an even grey of this level around the object: (side, side, 3) and its mask (side, side) -> (side, side, 3). The mask
-   is blurred by a Gaussian of sigma 2.5 in fixed point. `line` holds side + 14 bytes, `blurred` side * side values. */
-EXPORT FOR_EVERY_PROCESSOR void hbr_surround(const uint8_t *crop, const uint8_t *mask, int64_t side, int64_t level,
+#define WHOLE 6755399441055744.0 /* 1.5 * 2^52: adding it rounds to a whole number, halves to even */
+
+/* The mean of the colours of the pixels whose mask is above 127, as cv2.mean adds them up. */
+PART double brightness(const uint8_t *crop, const uint8_t *mask, int64_t count) {
+    int64_t blue = 0, green = 0, red = 0, pixels = 0;
+    for (int64_t begin = 0; begin < count; begin += 4096) {
+        const int64_t end = begin + 4096 < count ? begin + 4096 : count;
+        int32_t b = 0, g = 0, r = 0, n = 0;
+        for (int64_t i = begin; i < end; i++) {
+            const int32_t own = -(mask[i] > 127);
+            b += crop[3 * i] & own;
+            g += crop[3 * i + 1] & own;
+            r += crop[3 * i + 2] & own;
+            n -= own;
+        }
+        blue += b;
+        green += g;
+        red += r;
+        pixels += n;
+    }
+    const double each = pixels ? 1.0 / (double)pixels : 0;
+    return ((double)blue * each + (double)green * each + (double)red * each) / 3.0;
+}
+
+/* Put an even grey around the object: (side, side, 3) and its mask (side, side) -> (side, side, 3). It is as bright as this
+   share of the object. The mask is blurred by a Gaussian of sigma 2.5 in fixed point. `line` holds side + 14 bytes,
+   `blurred` side * side values. */
+EXPORT FOR_EVERY_PROCESSOR void hbr_surround(const uint8_t *crop, const uint8_t *mask, int64_t side, double bright,
                                              uint8_t *line, uint16_t *blurred, uint8_t *out) {
     static const uint16_t share[REACH + 1] = {40, 38, 30, 20, 11, 6, 2, 1}; /* of 256, from the middle on */
+    const uint8_t level = (uint8_t)((bright * brightness(crop, mask, side * side) + WHOLE) - WHOLE);
     const float ground = (float)level;
     for (int64_t y = 0; y < side; y++) {
         for (int64_t x = 0; x < side; x++) line[x + REACH] = mask[y * side + x];
@@ -203,6 +229,10 @@ EXPORT FOR_EVERY_PROCESSOR void hbr_surround(const uint8_t *crop, const uint8_t 
             line[x] = (uint8_t)((sum + (1 << 15)) >> 16);
         }
         for (int64_t x = 0; x < side; x++, crop += 3, out += 3) {
+            if (line[x] == 255 || line[x] == 0) { /* the same as by the products below */
+                for (int64_t c = 0; c < 3; c++) out[c] = line[x] ? crop[c] : level;
+                continue;
+            }
             const float weight = (float)line[x] * (1.0f / 255.0f), rest = 1.0f - weight;
             const float sum = weight + rest + 1e-5f, even = ground * rest;
             for (int64_t c = 0; c < 3; c++) out[c] = rounded(((float)crop[c] * weight + even) / sum);

@@ -79,15 +79,15 @@ def average(image: ImageArray, side: int) -> ImageArray | None:
     return out
 
 
-def surround(crop: ImageArray, mask: Bytes, level: int) -> ImageArray | None:
-    """Return a square crop with an even grey of this level around the object, as `Segmentation.alone` is."""
+def surround(crop: ImageArray, mask: Bytes, bright: float) -> ImageArray | None:
+    """Return a square crop with an even grey around the object, this share as bright, as `Segmentation.alone` is."""
     found = library()
     side = len(crop)
     if found is None or crop.shape != (side, side, 3) or mask.shape != (side, side):
         return None
     crop, mask = np.ascontiguousarray(crop), np.ascontiguousarray(mask)
     blurred, line, out = np.empty(side * side, np.uint16), np.empty(side + 14, np.uint8), np.empty_like(crop)
-    found.hbr_surround(address(crop), address(mask), side, level, address(line), address(blurred), address(out))
+    found.hbr_surround(address(crop), address(mask), side, bright, address(line), address(blurred), address(out))
     return out
 
 

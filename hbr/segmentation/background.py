@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from hbr.core.arrays import FloatArray, ImageArray
 from hbr.core.validation import check_frame
-from hbr.kernels import view
+from hbr.kernels import fit, view
 from hbr.segmentation.evidence import IssueCode
 
 Mask = NDArray[np.bool_]
@@ -168,7 +168,7 @@ class Background:
     def difference(self, small: ImageArray) -> Difference:
         """Compare a small frame, as `shrunk` returns it, with the empty-table image."""
         logarithm = _logarithm(small)
-        slopes = _fit(logarithm, self._log, self._useful & _useful(small))
+        slopes = _fit(small, self._useful, logarithm, self._log)
         evenly, coloured, certain, possible, agrees = self._planes(small, logarithm, Illumination(slopes))
         # a shadow is smooth: a fine texture that the table does not have belongs to an object
         grain = (np.abs(cv2.Laplacian(evenly, cv2.CV_32F, ksize=3)) > 0.5).astype(np.float32)
@@ -288,7 +288,7 @@ def _logarithm(image: ImageArray) -> Floats:
     return cv2.LUT(image, _LOG).astype(np.float32, copy=False)
 
 
-def _useful(image: ImageArray) -> Mask:
+def _useful(image: cv2.typing.MatLike) -> Mask:
     """Return which pixels are neither black nor overexposed."""
     brightest = _largest(cv2.split(image))
     useful: Mask = (brightest > _FLOOR) & (brightest < 250)
@@ -311,21 +311,39 @@ def _medians(rows: FloatArray) -> FloatArray:
     return (both[:, 0] + both[:, 1]) / 2 if rows.shape[1] % 2 == 0 else both[:, 1]
 
 
-def _fit(logarithm: Floats, table_log: Floats, useful: Mask) -> FloatArray:
+def _fit(small: ImageArray, useful: Mask, logarithm: Floats, table_log: Floats) -> FloatArray:
     """Fit a plane to each channel of the difference of logarithms by least squares, repeated without the outliers."""
-    keep = useful[2::_EVERY, 2::_EVERY]
-    basis = _plane(*useful.shape)[keep]
+    samples = fit.samples(small, useful, logarithm, table_log, _plane(*useful.shape))
+    basis, values, middle = _samples(small, useful, logarithm, table_log) if samples is None else samples
     if len(basis) < 12:
         return np.zeros((3, 3))
-    few = np.s_[2::_EVERY, 2::_EVERY]
-    values = (logarithm[few] - table_log[few])[keep].astype(np.float64)
     slopes = np.zeros((3, 3))
-    slopes[0] = _medians(np.ascontiguousarray(values.T))
+    slopes[0] = middle
     quarter = len(values) // 4
     for tolerance in (0.35, 0.2, 0.12, 0.12):
-        away = np.maximum.reduce(np.abs(values - basis @ slopes).T)
-        inlier = np.flatnonzero(away <= max(tolerance, float(np.partition(away, quarter)[quarter])))
-        own = basis.take(inlier, axis=0)
+        fitted = basis @ slopes
+        inliers = fit.inliers(values, fitted, basis, tolerance, quarter)
+        own, own_values = _inliers(values, fitted, basis, tolerance, quarter) if inliers is None else inliers
         gram = own.T @ own + _RIDGE
-        slopes = np.linalg.solve(gram, own.T @ values.take(inlier, axis=0)).astype(np.float64, copy=False)
+        slopes = np.linalg.solve(gram, own.T @ own_values).astype(np.float64, copy=False)
     return slopes
+
+
+def _samples(
+    small: ImageArray, useful: Mask, logarithm: Floats, table_log: Floats
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return what `hbr.kernels.fit.samples` returns."""
+    few = np.s_[2::_EVERY, 2::_EVERY]
+    keep = useful[few] & _useful(small[few])
+    basis = _plane(*useful.shape)[keep]
+    values = (logarithm[few] - table_log[few])[keep].astype(np.float64)
+    return basis, values, _medians(np.ascontiguousarray(values.T)) if len(values) else np.zeros(3)
+
+
+def _inliers(
+    values: FloatArray, fitted: FloatArray, basis: FloatArray, tolerance: float, quarter: int
+) -> tuple[FloatArray, FloatArray]:
+    """Return what `hbr.kernels.fit.inliers` returns."""
+    away = np.maximum.reduce(np.abs(values - fitted).T)
+    inlier = np.flatnonzero(away <= max(tolerance, float(np.partition(away, quarter)[quarter])))
+    return basis.take(inlier, axis=0), values.take(inlier, axis=0)

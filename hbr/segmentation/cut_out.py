@@ -87,10 +87,10 @@ class Segmentation:
         """The crop with an even grey instead of the background, half as bright as the object, uint8 (160, 160, 3)."""
         if self.box is None:
             return self.crop
-        level = _SURROUND * float(np.mean(cv2.mean(self.crop, mask=(self.mask > 127).astype(np.uint8))[:3]))
-        by_kernel = view.surround(self.crop, self.mask, round(level))
+        by_kernel = view.surround(self.crop, self.mask, _SURROUND)
         if by_kernel is not None:
             return by_kernel
+        level = _SURROUND * float(np.mean(cv2.mean(self.crop, mask=(self.mask > 127).astype(np.uint8))[:3]))
         share = cv2.GaussianBlur(self.mask, (0, 0), 2.5)
         ground = np.full_like(self.crop, round(level))
         weight = share.astype(np.float32) * np.float32(1 / 255)

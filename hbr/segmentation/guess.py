@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hbr.core.arrays import ImageArray
+from hbr.kernels.components import likely_parts
 from hbr.kernels.grab_cut import grab_cut
 from hbr.segmentation.background import Mask
 
@@ -74,9 +75,20 @@ def _main_part(cut: Binary, prior: NDArray[np.float32]) -> Binary | None:
     """Return the part with the largest weight and the parts close to it, without thin connections to clutter."""
     radius = max(1, round(_BRIDGE * max(cut.shape)))
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(cv2.morphologyEx(cut, cv2.MORPH_OPEN, disc))
-    if count < 2:
+    opened = cv2.morphologyEx(cut, cv2.MORPH_OPEN, disc).astype(np.uint8, copy=False)
+    part = likely_parts(opened, prior, _NEAR_PX, _PART, _PART_WEIGHT)
+    if part is None:
+        part = _parts(opened, prior)
+    if not part.size:
         return None
+    return cv2.dilate(part, np.ones((3, 3), np.uint8)).astype(np.uint8) & cut
+
+
+def _parts(opened: Binary, prior: NDArray[np.float32]) -> Binary:
+    """Return what `hbr.kernels.components.likely_parts` returns."""
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(opened)
+    if count < 2:
+        return np.empty(0, np.uint8)
     weight = np.bincount(labels.ravel(), prior.ravel(), count)[1:]
     x, y, w, h, area = stats[1:].T
     main = int(weight.argmax())
@@ -84,8 +96,7 @@ def _main_part(cut: Binary, prior: NDArray[np.float32]) -> Binary | None:
     near &= (y < y[main] + h[main] + _NEAR_PX) & (y[main] < y + h + _NEAR_PX)
     keep = near & (area > _PART * area[main]) & (weight > _PART_WEIGHT * area)
     keep[main] = True
-    part = np.isin(labels, 1 + np.flatnonzero(keep)).astype(np.uint8)
-    return cv2.dilate(part, np.ones((3, 3), np.uint8)).astype(np.uint8) & cut
+    return np.isin(labels, 1 + np.flatnonzero(keep)).astype(np.uint8)
 
 
 @lru_cache

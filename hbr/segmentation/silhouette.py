@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hbr.kernels import view
+from hbr.kernels.components import largest_parts
 from hbr.segmentation.background import Mask
 
 Binary = NDArray[np.uint8]
@@ -16,6 +17,10 @@ Binary = NDArray[np.uint8]
 _LEAST: Final = 0.004
 #: Another part belongs to the object if it has this share of the largest part's area.
 _PART: Final = 0.08
+#: and, if something may reach into the frame, is so near.
+_NEAR_PX: Final = 5
+#: The object is smaller than a part at the frame's border by at most this.
+_OF_BORDER: Final = 0.6
 #: Radii of the bars that are removed when something reaches into the frame, in pixels of the small image.
 _BARS: Final = (0, 2, 3, 4, 5)
 #: Rows at the foot that are narrower than this share of the median row are the rest of a removed bar.
@@ -66,6 +71,9 @@ def _opened(mask: Binary, radius: int) -> Binary:
 
 def _main_parts(mask: Binary, *, framed: bool) -> Binary | None:
     """Return the largest part and those close to it; None if a part that touches the border is much larger."""
+    by_kernel = largest_parts(mask, framed, _NEAR_PX, _LEAST * mask.size, _OF_BORDER, _PART)
+    if by_kernel is not None:
+        return by_kernel if by_kernel.size else None
     count, labels, stats, _ = cv2.connectedComponentsWithStats(mask)
     if count < 2:
         return None
@@ -74,10 +82,10 @@ def _main_parts(mask: Binary, *, framed: bool) -> Binary | None:
     outside = framed & ((x == 0) | (y == 0) | (x + w == width) | (y + h == height))
     inner, outer = np.where(outside, 0, area), np.where(outside, area, 0)
     largest = int(inner.argmax())
-    if inner[largest] < max(_LEAST * mask.size, 0.6 * outer.max()):
+    if inner[largest] < max(_LEAST * mask.size, _OF_BORDER * outer.max()):
         return None
-    near = (x < x[largest] + w[largest] + 5) & (x[largest] < x + w + 5)
-    near &= (y < y[largest] + h[largest] + 5) & (y[largest] < y + h + 5)
+    near = (x < x[largest] + w[largest] + _NEAR_PX) & (x[largest] < x + w + _NEAR_PX)
+    near &= (y < y[largest] + h[largest] + _NEAR_PX) & (y[largest] < y + h + _NEAR_PX)
     keep = (inner > _PART * inner[largest]) & (near if framed else True)
     chosen = 1 + np.flatnonzero(keep)
     return (labels == chosen[0] if len(chosen) == 1 else np.isin(labels, chosen)).view(np.uint8)

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hbr import Background, descriptor, segment
-from hbr.kernels import library, view, without_library
+from hbr.kernels import components, library, view, without_library
 from hbr.segmentation.background import shrunk
 from hbr.segmentation.cut_out import CROP_PX
 from hbr.segmentation.silhouette import silhouette
@@ -71,15 +71,66 @@ def test_frames_differ_from_the_table_as_by_numpy(seed: int, shape: tuple[int, i
 
 
 @compiled
-@examples(15)
-@given(seeds, st.integers(2, 96), st.integers(2, 128), st.sampled_from([0.05, 0.5, 0.9]))
-def test_silhouettes_are_filled_as_by_opencv(seed: int, height: int, width: int, share: float) -> None:
+@examples(20)
+@given(seeds, st.integers(2, 96), st.integers(2, 128), st.sampled_from([0.05, 0.5, 0.9]), st.booleans())
+def test_silhouettes_are_those_by_opencv(seed: int, height: int, width: int, share: float, framed: bool) -> None:
     certain = np.random.default_rng(seed).random((height, width)) < share
     certain[height // 3 : -(height // 3), width // 3 : -(width // 3)] = True
-    found, reference = both(lambda: silhouette(certain, framed=False))
+    found, reference = both(lambda: silhouette(certain, framed=framed))
     assert (found is None) == (reference is None)
     if found is not None:
         np.testing.assert_array_equal(found, reference)
+
+
+@compiled
+@examples(20)
+@given(seeds, st.integers(1, 40), st.integers(1, 60), st.sampled_from([0.03, 0.15, 0.4, 0.7]), st.booleans())
+def test_parts_of_a_mask_are_those_of_opencv(seed: int, height: int, width: int, share: float, even: bool) -> None:
+    rng = np.random.default_rng(seed)
+    mask = (rng.random((height, width)) < share).astype(np.uint8)
+    prior = np.ones_like(mask, np.float32) if even else rng.random(mask.shape, np.float32)  # even: many equal parts
+    for least, of_border, part in ((1, 0.6, 0.08), (4, 1.5, 0.5)):
+        labels = cv2.connectedComponents(mask)[1]
+        for framed in (False, True):
+            found = components.largest_parts(mask, framed, 5, least, of_border, part)
+            np.testing.assert_array_equal(found, largest(labels, framed, 5, least, of_border, part))
+        found = components.likely_parts(mask, prior, 3, part, 0.35)
+        np.testing.assert_array_equal(found, likely(labels, prior, 3, part, 0.35))
+
+
+def largest(labels: np.ndarray, framed: bool, near: int, least: float, of_border: float, share: float) -> np.ndarray:
+    boxes = [cv2.boundingRect((labels == n).astype(np.uint8)) for n in range(1, labels.max() + 1)]
+    areas = np.bincount(labels.ravel())[1:]
+    height, width = labels.shape
+    outside = [framed and (0 in box[:2] or box[0] + box[2] == width or box[1] + box[3] == height) for box in boxes]
+    inner, outer = np.where(outside, 0, areas), np.where(outside, areas, 0)
+    if not inner.any() or inner.max() < max(least, of_border * outer.max()):
+        return np.empty(0, np.uint8)
+    main = int(inner.argmax())
+    kept = [
+        n
+        for n, box in enumerate(boxes)
+        if inner[n] > share * inner[main] and (not framed or close(box, boxes[main], near))
+    ]
+    return np.isin(labels - 1, kept).astype(np.uint8)
+
+
+def likely(labels: np.ndarray, prior: np.ndarray, near: int, share: float, mean: float) -> np.ndarray:
+    boxes = [cv2.boundingRect((labels == n).astype(np.uint8)) for n in range(1, labels.max() + 1)]
+    if not boxes:
+        return np.empty(0, np.uint8)
+    areas, weights = np.bincount(labels.ravel())[1:], np.bincount(labels.ravel(), prior.ravel())[1:]
+    main = int(weights.argmax())
+    kept = [
+        n
+        for n, box in enumerate(boxes)
+        if areas[n] > share * areas[main] and weights[n] > mean * areas[n] and close(box, boxes[main], near)
+    ]
+    return np.isin(labels - 1, [main, *kept]).astype(np.uint8)
+
+
+def close(a: tuple[int, ...], b: tuple[int, ...], away: int) -> bool:
+    return all(a[k] < b[k] + b[k + 2] + away and b[k] < a[k] + a[k + 2] + away for k in (0, 1))
 
 
 @compiled
