@@ -13,7 +13,7 @@ import serial
 from rig.core.clock import Clock, SystemClock
 from rig.devices.dynamixel.port import SerialConnection
 from rig.devices.head.head import RigHead
-from rig.devices.head.protocol import BAUD
+from rig.devices.head.protocol import BAUD, Counters, ReadCounters
 from rig.devices.head.sensors import HeadSensor, head_sensor
 from sim.head.board import SimHead
 from sim.head.build import missing
@@ -186,3 +186,18 @@ class _PtyWire:
                 return
             SystemClock().sleep(0.0001)
         raise AssertionError("the kernel does not carry what was written")
+
+
+AVR_NIGHTLY = pytest.mark.parametrize(
+    "opened", ["memory", pytest.param("avr", marks=pytest.mark.nightly)], indirect=True
+)
+
+
+def counters(h: Head) -> Counters:
+    """Return the head's own counters since it started."""
+    return h.imu._link.request(ReadCounters(), Counters)
+
+
+def switch_on(h: Head) -> None:
+    h.imu.set_power(True)
+    h.imu.set_light(1.0)

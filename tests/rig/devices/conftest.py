@@ -1,10 +1,15 @@
-"""A world that tests of the camera share."""
+"""A world, an MPU-6050 and a rig head that several files of tests share."""
+
+from collections.abc import Iterator
 
 import pytest
 
+from rig.devices.mpu6050 import Mpu6050
 from sim.noise import NoiseModel
 from sim.objects.shelf import shelf
 from sim.world import World
+from tests.contract.heads import Head, opened_head
+from tests.rig.devices.mpu6050_bench import Bench
 
 
 @pytest.fixture
@@ -14,3 +19,21 @@ def world() -> World:
     world.put(shelf()["teapot"])
     world.clock.sleep(100.0)
     return world
+
+
+@pytest.fixture
+def bench() -> Iterator[Bench]:
+    with Bench() as b:
+        yield b
+
+
+@pytest.fixture
+def imu(bench: Bench) -> Mpu6050:
+    return bench.open()
+
+
+@pytest.fixture(params=["memory", "avr"])
+def opened(request: pytest.FixtureRequest) -> Iterator[Head]:
+    """A driver on the core in memory, and on the AVR binary."""
+    with opened_head(request.param, NoiseModel.none()) as head:
+        yield head

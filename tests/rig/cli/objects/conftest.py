@@ -1,0 +1,79 @@
+"""A day with two enrolled objects and a saved run: enrolled once, and copied for each test."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from rig.bench import ObjectAlreadyPlaced
+from rig.cli.main import app
+from sim.bench import SimBenchKind
+
+SMALL = (
+    'default_bench = "sim"\n[catalog]\npath = "catalog"\n[camera]\nwidth = 320\nheight = 240\n'
+    "[view]\nroi = [40, 0, 240, 240]\n[enroll]\nviews = 6\n"
+)
+
+
+@pytest.fixture(scope="session")
+def original(tmp_path_factory):
+    """Return a folder with two enrolled objects, the report of one, and a saved run."""
+    folder = tmp_path_factory.mktemp("day")
+    (folder / "rig.toml").write_text(SMALL, encoding="utf-8")
+    outputs = {}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        for name, words in {
+            "lamp": ["enroll", "lamp", "--label", "kitchen", "--label", "brass", "--report", "lamp.html"],
+            "dice": ["enroll", "dice", "--json"],
+            "run": [
+                "identify",
+                "--strategy",
+                "ahbr",
+                "--set",
+                "bench.sim.object=dice",
+                "--seed",
+                "4",
+                "--save-run",
+                "runs/1",
+            ],
+        }.items():
+            done = CliRunner().invoke(app, words)
+            assert done.exit_code == 0, done.output
+            outputs[name] = done
+    return folder, outputs
+
+
+@pytest.fixture
+def enrolled(original, tmp_path):
+    """Return a copy of the folder, so that no test finds what another one has changed."""
+    folder, outputs = original
+    return Path(shutil.copytree(folder, tmp_path / "day")), outputs
+
+
+@pytest.fixture
+def rig(enrolled, monkeypatch):
+    folder, _ = enrolled
+    monkeypatch.chdir(folder)
+
+    def run(*arguments: str):
+        return CliRunner().invoke(app, list(arguments))
+
+    return run
+
+
+@pytest.fixture
+def with_operator(monkeypatch):
+    """Open the simulated bench without the operator that places objects; return its world."""
+    opened = []
+    really = SimBenchKind.open
+
+    def open_without(self, config, options, seed):
+        bench = really(self, config, options, seed)
+        opened.append(bench.operator.world)
+        bench.operator = ObjectAlreadyPlaced()
+        return bench
+
+    monkeypatch.setattr(SimBenchKind, "open", open_without)
+    return opened
