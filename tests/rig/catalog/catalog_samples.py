@@ -6,8 +6,10 @@ the image, rename, sync of the folder, commit, then those of the next view.
 
 import os
 import signal
+import sqlite3
 import sys
 from collections.abc import Generator, Sequence
+from contextlib import closing
 from itertools import count
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -148,3 +150,13 @@ def other_program(path: Path, name: str, views: int, die_before: int = 0) -> Pro
     """Start a program that enrolls, or records answers if ``views`` is 0; it dies before that step of storing."""
     code = "from tests.rig.catalog.catalog_samples import main; main()"
     return Program(str(path), name, str(views), str(die_before), code=code)
+
+
+def files(catalog: Catalog) -> set[str]:
+    return {path.relative_to(catalog.path).as_posix() for path in catalog.path.rglob("*.png")}
+
+
+def sql(catalog: Catalog, statement: str) -> None:
+    """Change the database directly."""
+    with closing(sqlite3.connect(catalog.path / "catalog.sqlite", isolation_level=None)) as connection:
+        connection.execute(statement)

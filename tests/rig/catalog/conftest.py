@@ -2,10 +2,13 @@
 
 import os
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
+from rig.catalog import Catalog
 from rig.config.catalog_place import CatalogPlace
+from sim.clock import VirtualClock
 from tests.rig.catalog.catalog_samples import without_waiting
 from tests.servers.postgres import VARIABLE, server, use_postgres
 
@@ -34,3 +37,14 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         for item in items:
             if item.get_closest_marker("sqlite"):
                 item.add_marker(pytest.mark.skip(reason="it is about the SQLite file"))
+
+
+@pytest.fixture
+def clock() -> VirtualClock:
+    return VirtualClock()
+
+
+@pytest.fixture
+def catalog(tmp_path: Path, clock: VirtualClock) -> Iterator[Catalog]:
+    with Catalog.open(tmp_path / "catalog", clock=clock) as catalog:
+        yield catalog

@@ -1,6 +1,5 @@
 """A catalog returns what was stored, and searches use complete enrollments only."""
 
-from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta, timezone
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -29,17 +28,6 @@ EVIDENCE = st.dictionaries(
 )
 DESCRIPTORS = hnp.arrays(np.uint8, 144, elements=st.integers(0, 7))
 IMAGES = hnp.arrays(np.uint8, st.tuples(st.integers(1, 9), st.integers(1, 9), st.just(3)))
-
-
-@pytest.fixture
-def clock() -> VirtualClock:
-    return VirtualClock()
-
-
-@pytest.fixture
-def catalog(tmp_path: Path, clock: VirtualClock) -> Iterator[Catalog]:
-    with Catalog.open(tmp_path / "catalog", clock=clock) as catalog:
-        yield catalog
 
 
 def begin(catalog: Catalog, name: str, views: int = 3, **options: object) -> Enrollment:
