@@ -18,7 +18,7 @@ BEFORE = [80, 0, 480, 480]
 def rig(rig, monkeypatch):
     # Fewer sides: other tests show what the procedures find.
     monkeypatch.setattr(camera_model, "ANGLES_DEG", camera_model.ANGLES_DEG[::3])
-    monkeypatch.setattr(table_axis, "ANGLES_DEG", table_axis.ANGLES_DEG[::3])
+    monkeypatch.setattr(table_axis, "ANGLES_DEG", table_axis.ANGLES_DEG[::4])
     return lambda *words, seed=2: rig(*words, "--seed", seed, "--set", MOVED)
 
 

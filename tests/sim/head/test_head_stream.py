@@ -109,6 +109,6 @@ def test_stream_at_200_hz_loses_nothing_and_is_dated_within_100_us(minutes):
 @pytest.mark.timeout(600)
 def test_binary_dates_its_samples_within_100_us():
     nightly = settings.get_current_profile_name() == "nightly"
-    _, lost, error_ns = stream("avr", MINUTES * 60 if nightly else 8)
+    _, lost, error_ns = stream("avr", MINUTES * 60 if nightly else 5)
     assert lost == 0
     assert error_ns < 100_000
