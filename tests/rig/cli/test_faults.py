@@ -43,13 +43,16 @@ def test_fault_ends_the_demo_with_its_exit_code_and_next_step(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_faults_of_file_command_line_and_configuration_are_injected(tmp_path):
+def test_changed_bench_is_searched_with_the_faults_of_file_command_line_and_configuration(tmp_path):
     (tmp_path / "faults.toml").write_text('faults = ["crc_flip@1s+3s"]')
     done = rig(
         *("demo", *SMALL, "--faults", str(tmp_path / "faults.toml"), "--fault", "camera.slow@2s+1s"),
         *("--set", 'bench.sim.faults=["i2c_nack@3s+1s"]', "--out", str(tmp_path / "out")),
+        *("--views", "5", "--change", "bench"),
     )
-    assert done.exit_code in (0, 6)
+    assert done.exit_code in (0, 6), done.output  # with so few views an answer can be wrong
+    assert "2 objects enrolled with 10 views" in done.stdout  # --views wins over enroll.views
+    assert done.stdout.count("(not enrolled)") == 2
     for name in ("crc_flip", "camera.slow", "i2c_nack"):
         assert f"fault begins: {name}" in done.stderr
         assert f"fault ends: {name}" in done.stderr

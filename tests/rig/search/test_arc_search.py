@@ -111,6 +111,7 @@ def test_guessed_view_does_not_end_the_search(model: Model, monkeypatch: pytest.
     assert reasons == [hbr.StopReason.CONFIDENT, hbr.StopReason.BADLY_SEGMENTED]
 
 
+@pytest.mark.nightly
 def test_unknown_object_is_recognised_within_the_arc(model: Model) -> None:
     with moving(World(seed=3)) as bench:
         bench.operator.next_object = "jar-honey"  # type: ignore[attr-defined]

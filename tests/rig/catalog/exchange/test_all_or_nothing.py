@@ -1,5 +1,6 @@
 """An import happens completely or not at all, whatever interrupts it."""
 
+from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -97,6 +98,7 @@ class TestAllOrNothing:
     ) -> None:
         monkeypatch.setattr("rig.catalog.exchange.importing.processes", lambda wanted, _: wanted)
         monkeypatch.setattr("rig.catalog.jobs.PORTION", 2)
+        monkeypatch.setattr("rig.core.processes.get_context", lambda _: get_context("forkserver"))  # starts sooner
         alone, together = open_catalog("alone"), open_catalog("together")
         run_import(alone, batch)
         finished(import_objects(together, plan_import(together, batch), jobs=2))
