@@ -11,6 +11,7 @@ import sys
 from contextlib import suppress
 from multiprocessing import forkserver, get_context
 from multiprocessing.connection import Connection
+from multiprocessing.context import ForkServerContext
 from pathlib import Path
 from subprocess import TimeoutExpired
 from threading import Thread
@@ -22,6 +23,12 @@ _SERVER = get_context("forkserver")
 _SERVER.set_forkserver_preload(
     ["tests.programs", "rig.catalog", "rig.cli.main", "rig.plans.enroll", "rig.plans.identify", "sim.bench"]
 )
+
+
+def server() -> ForkServerContext:
+    """Return the context of the server, which is running: code that blocks signals must not start it."""
+    forkserver.ensure_running()
+    return _SERVER
 
 
 def start_server(*modules: str) -> None:

@@ -294,16 +294,17 @@ def test_busy_catalog_is_reported_after_the_timeout(two: Rig, monkeypatch: pytes
 
 INTERRUPTED = """
 import os, signal
+from contextlib import closing
 from rig.catalog.exchange import importing
 from rig.cli.main import main
 
 staged = importing.map_in_processes
 
 def interrupted(*arguments):
-    portions = staged(*arguments)
-    yield next(portions)
-    os.killpg(os.getpgrp(), signal.SIGINT)  # as in a terminal, to all processes of the program
-    yield from portions
+    with closing(staged(*arguments)) as portions:  # a loop closes it, too; a variable of the traceback would not
+        yield next(portions)
+        os.killpg(os.getpgrp(), signal.SIGINT)  # as in a terminal, to all processes of the program
+        yield from portions
 
 importing.map_in_processes = interrupted
 main()

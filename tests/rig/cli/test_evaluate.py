@@ -3,7 +3,6 @@
 import csv
 import json
 import shutil
-from multiprocessing import get_context
 from pathlib import Path
 
 import cv2
@@ -16,6 +15,7 @@ from rig.catalog import Catalog, Provenance, ViewRecord
 from rig.cli.objects.evaluate import evaluate
 from rig.cli.ui.settings import Settings
 from rig.core.clock import SystemClock
+from tests.programs import server
 
 app = typer.Typer()
 app.command("eval")(evaluate)
@@ -95,7 +95,8 @@ def test_equal_commands_give_equal_results_with_any_number_of_processes(
 ) -> None:
     command = (photographs, *QUICK, *NOISY)
     # Processes that have imported the program: the tests of `map_in_processes` start others.
-    monkeypatch.setattr("rig.core.processes.get_context", lambda _: get_context("forkserver"))
+    context = server()
+    monkeypatch.setattr("rig.core.processes.get_context", lambda _: context)
     assert run(*command, "--out", tmp_path / "again", "--jobs", "2").exit_code == 0
     assert results(tmp_path / "again") == results(evaluated)
     assert (tmp_path / "again/hit-rate.svg").read_bytes() == (evaluated / "hit-rate.svg").read_bytes()

@@ -1,6 +1,5 @@
 """An import happens completely or not at all, whatever interrupts it."""
 
-from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +18,7 @@ from rig.catalog.places import LOST
 from rig.catalog.verify import verify
 from rig.core.errors import CatalogError, ObjectExists
 from sim.clock import VirtualClock
+from tests.programs import server
 from tests.rig.catalog.catalog_samples import (
     finished,
     true_fill,
@@ -98,7 +98,8 @@ class TestAllOrNothing:
     ) -> None:
         monkeypatch.setattr("rig.catalog.exchange.importing.processes", lambda wanted, _: wanted)
         monkeypatch.setattr("rig.catalog.jobs.PORTION", 2)
-        monkeypatch.setattr("rig.core.processes.get_context", lambda _: get_context("forkserver"))  # starts sooner
+        context = server()
+        monkeypatch.setattr("rig.core.processes.get_context", lambda _: context)  # starts sooner
         alone, together = open_catalog("alone"), open_catalog("together")
         run_import(alone, batch)
         finished(import_objects(together, plan_import(together, batch), jobs=2))
