@@ -93,16 +93,20 @@ def next_best_view(
     ValueError
         There is no rotation to choose from, or not one time for each.
     """
-    angles_deg = _ALL_ROTATIONS_DEG if rotations_deg is None else np.asarray(rotations_deg, np.float64)
-    if angles_deg.ndim != 1 or not len(angles_deg) or not np.isfinite(angles_deg).all():
-        raise ValueError(
-            f"rotations_deg is {angles_deg}; at least one finite rotation is needed, check the cable's limits"
-        )
-    times_s = np.abs(angles_deg) / 90 if seconds is None else np.asarray(seconds, np.float64)
-    if times_s.shape != angles_deg.shape or not np.isfinite(times_s).all():
-        raise ValueError(
-            f"{len(angles_deg)} rotations and times of shape {times_s.shape}; one finite time each is needed"
-        )
+    angles_deg = _ALL_ROTATIONS_DEG
+    if rotations_deg is not None:
+        angles_deg = np.asarray(rotations_deg, np.float64)
+        if angles_deg.ndim != 1 or not len(angles_deg) or not np.isfinite(angles_deg).all():
+            raise ValueError(
+                f"rotations_deg is {angles_deg}; at least one finite rotation is needed, check the cable's limits"
+            )
+    times_s = np.abs(angles_deg) / 90
+    if seconds is not None:
+        times_s = np.asarray(seconds, np.float64)
+        if times_s.shape != angles_deg.shape or not np.isfinite(times_s).all():
+            raise ValueError(
+                f"{len(angles_deg)} rotations and times of shape {times_s.shape}; one finite time each is needed"
+            )
 
     here_deg = float(belief.orientation_deg[-1])
     landing_deg = here_deg + angles_deg
