@@ -115,12 +115,10 @@ class Found:
     @cached_property
     def box(self) -> Box | None:
         """The object's x, y, width and height in pixels of the frame; None if no object was found."""
+        if self.given is not None or self.silhouette is None:
+            return self.given
         height, width = self.image.shape[:2]
-        return (
-            _box_of(self.silhouette, width, height)
-            if self.given is None and self.silhouette is not None
-            else self.given
-        )
+        return _box_of(self.silhouette, width, height)
 
     def cut_out(self) -> Segmentation:
         """Return the segmentation of the frame."""

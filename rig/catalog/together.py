@@ -3,11 +3,11 @@
 Decision: docs/decisions/0054.
 """
 
-from collections.abc import Hashable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from itertools import groupby
-from threading import Lock
+from threading import RLock
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -67,13 +67,14 @@ class HeldImages:
         self._store = store
         self._pixels: dict[str, NDArray[np.uint8]] = {}
         self._bytes = 0
-        self._lock = Lock()
+        self._lock = RLock()
 
     def hold(self, image: str, pixels: NDArray[np.uint8]) -> None:
         """Hold the pixels of an image, uint8 (H, W, 3) BGR, if there is room. The caller does not change them."""
-        if image not in self._pixels and self._bytes + pixels.nbytes <= MOST_HELD_BYTES:
-            self._pixels[image] = pixels
-            self._bytes += pixels.nbytes
+        with self._lock:
+            if image not in self._pixels and self._bytes + pixels.nbytes <= MOST_HELD_BYTES:
+                self._pixels[image] = pixels
+                self._bytes += pixels.nbytes
 
     def pixels(self, image: str, sha256: str) -> NDArray[np.uint8]:
         """Return the pixels of an image; errors as `ImageStore.pixels`. Any thread may ask, one at a time is served."""
@@ -83,6 +84,14 @@ class HeldImages:
                 self.hold(image, pixels)
                 return pixels
             return self._pixels[image]
+
+
+class _How(NamedTuple):
+    """What an image is described with."""
+
+    names: tuple[str, ...]
+    region: Region | None
+    empty_table: EmptyTable | None
 
 
 class DescribedMeanwhile:
@@ -95,30 +104,28 @@ class DescribedMeanwhile:
     def __init__(self, held: HeldImages) -> None:
         self._held = held
         self._thread = ThreadPoolExecutor(1, "describer")
-        self._describers: dict[Hashable, EnrollmentDescriber] = {}
-        self._found: dict[tuple[str, Hashable], Future[DescribedAlone]] = {}
+        self._describers: dict[_How, EnrollmentDescriber] = {}
+        self._found: dict[tuple[str, _How], Future[DescribedAlone]] = {}
 
     def begin(
         self, image: str, pixels: NDArray[np.uint8], names: tuple[str, ...], region: Region | None, table: EmptyTable
     ) -> None:
         """Begin to describe the pixels of an image, uint8 (H, W, 3) BGR, by descriptors of the object."""
-        how = names, region, table
-        self._found[image, how] = self._thread.submit(self._describe, how, pixels)
+        how = _How(names, region, table)
+        self._found[image, how] = self._thread.submit(self._describe, how, table, pixels)
 
     def result(self, item: StoredImage, names: tuple[str, ...]) -> DescribedAlone | None:
         """Return the description of a view by these descriptors, when it is ready; None if it was not begun.
 
         Raises what `EnrollmentDescriber.describe` does.
         """
-        found = self._found.get((item.image, (names, item.region, item.empty_table)))
+        found = self._found.get((item.image, _How(names, item.region, item.empty_table)))
         return None if found is None else found.result()
 
-    def _describe(
-        self, how: tuple[tuple[str, ...], Region | None, EmptyTable], pixels: NDArray[np.uint8]
-    ) -> DescribedAlone:
+    def _describe(self, how: _How, table: EmptyTable, pixels: NDArray[np.uint8]) -> DescribedAlone:
         if how not in self._describers:
-            names, region, table = how
-            self._describers[how] = EnrollmentDescriber(ViewConfig(roi=region), names, self._held.pixels(*table))
+            config = ViewConfig(roi=how.region)
+            self._describers[how] = EnrollmentDescriber(config, how.names, self._held.pixels(*table))
         return self._describers[how].describe_alone(pixels)
 
 
