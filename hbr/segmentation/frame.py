@@ -4,7 +4,7 @@ from functools import cached_property
 
 from hbr.core.arrays import ImageArray
 from hbr.core.validation import check_frame
-from hbr.segmentation.background import Mask, shrunk
+from hbr.segmentation.background import Background, Difference, Mask, shrunk
 from hbr.segmentation.plain import plain_difference
 
 
@@ -21,6 +21,13 @@ class Frame:
         check_frame(image_bgr)
         self.image = image_bgr
         self.small = shrunk(image_bgr)
+        self._compared: tuple[Background, Difference] | None = None
+
+    def difference(self, background: Background) -> Difference:
+        """Return the difference from a background. The last one is kept, for further segmentations of the frame."""
+        if self._compared is None or not self._compared[0].equals(background):
+            self._compared = background, background.difference(self.small)
+        return self._compared[1]
 
     @cached_property
     def differs(self) -> Mask | None:

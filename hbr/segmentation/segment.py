@@ -32,7 +32,7 @@ MOST_HYPOTHESES: Final = 5
 
 @renamed_keyword("reference", "empty_table")
 def segment(
-    image_bgr: ImageArray,
+    image_bgr: ImageArray | Frame,
     *,
     empty_table: Background | ImageArray | None = None,
     box: Box | None = None,
@@ -51,7 +51,7 @@ def segment(
     Parameters
     ----------
     image_bgr : uint8 array (H, W, 3)
-        The frame.
+        The frame; or a `hbr.segmentation.frame.Frame`, if the frame is segmented more than once.
     empty_table : Background, or uint8 array (H, W, 3), optional
         The empty-table image. For many frames, pass a `Background`: it is prepared only once.
     box : (int, int, int, int), optional
@@ -70,9 +70,9 @@ def segment(
     TypeError, ValueError
         The frame is no such image, the empty-table image has another size, or a box is outside the frame.
     """
-    frame = Frame(image_bgr)
+    frame = image_bgr if isinstance(image_bgr, Frame) else Frame(image_bgr)
     background, difference = compared(frame, empty_table)
-    height, width = image_bgr.shape[:2]
+    height, width = frame.image.shape[:2]
     for name, part in (("box", box), ("grey_patch", grey_patch)):
         if part is not None:
             _check_box(name, part, width, height)
@@ -90,7 +90,7 @@ def compared(frame: Frame, empty_table: Background | ImageArray | None) -> tuple
             f"the empty-table image has {background.shape[1]} x {background.shape[0]} pixels, the frame "
             f"{width} x {height}; take the image with the present camera settings"
         )
-    return background, background.difference(frame.small)
+    return background, frame.difference(background)
 
 
 def _found(
@@ -143,6 +143,7 @@ def hypotheses(
     empty_table: Background | ImageArray | None = None,
     learned: Background | None = None,
     alone: Callable[[], Sequence[Segmentation | Found]] | None = None,
+    first: Segmentation | None = None,
     most: int = MOST_HYPOTHESES,
 ) -> tuple[Segmentation, ...]:
     """Return several segmentations of a frame, the likeliest first, whose boxes differ.
@@ -160,6 +161,8 @@ def hypotheses(
     alone : callable, optional
         Returns what `without_background` returns for this frame: segmentations that count besides those with the
         learned background. No other view changes them. By default the network's alone counts.
+    first : Segmentation, optional
+        What `segment` returned for this frame and this empty-table image, if that is known.
     most : int
         Largest number of segmentations.
 
@@ -173,16 +176,17 @@ def hypotheses(
     by_picture = difference is not None and difference.reliable
     found: list[Segmentation | Found]
     if learned is None or by_picture or frame.differs is not None:
-        first = _found(frame, background, difference)
-        if first.method is Method.PLAIN_BACKGROUND or (most == 1 and not by_picture):
-            return (first.cut_out(),)
+        like = _found(frame, background, difference) if first is None else _as_found(frame, first)
+        likeliest = like if first is None else first
+        if like.method is Method.PLAIN_BACKGROUND or (most == 1 and not by_picture):
+            return (_cut_out(likeliest),)
         share = shares(frame.small, difference if by_picture else None).object
         if by_picture:
-            found = [first, *_by_network(share, Method.EMPTY_TABLE, first)]
-            if most == 1 and not _same(first, found[-1]):  # an enrollment: the network's box is right more often
+            found = [likeliest, *_by_network(share, Method.EMPTY_TABLE, like)]
+            if most == 1 and not _same(likeliest, found[-1]):  # an enrollment: the network's box is right more often
                 found.reverse()
         else:
-            found = [first, *_by_network(share, Method.NETWORK, first)]
+            found = [likeliest, *_by_network(share, Method.NETWORK, like)]
     else:
         issues = [Issue(IssueCode.BACKGROUND_NOT_PLAIN)]
         if difference is not None:
@@ -200,7 +204,16 @@ def hypotheses(
     for one in found:
         if not any(_same(known, one) for known in several):
             several.append(one)
-    return tuple(one.cut_out() if isinstance(one, Found) else one for one in several[:most])
+    return tuple(map(_cut_out, several[:most]))
+
+
+def _cut_out(found: Segmentation | Found) -> Segmentation:
+    return found.cut_out() if isinstance(found, Found) else found
+
+
+def _as_found(frame: Frame, one: Segmentation) -> Found:
+    """Return what a segmentation of this frame was cut out from."""
+    return Found(frame.image, one.silhouette, None, one.correction, one.agreement, one.method, one.issues)
 
 
 def without_background(frame: Frame) -> tuple[Found, ...]:

@@ -32,7 +32,10 @@ def evidence_together(found: Segmentation, views: int) -> dict[str, Any]:
 
 
 def stored_segmentation(
-    image_bgr: ImageArray, evidence: Mapping[str, Any] | None, *, empty_table: Background | ImageArray | None = None
+    image_bgr: ImageArray | Frame,
+    evidence: Mapping[str, Any] | None,
+    *,
+    empty_table: Background | ImageArray | None = None,
 ) -> Segmentation:
     """Return the segmentation of a stored view: by its silhouette, or by `hbr.segment` if it was segmented alone.
 
@@ -50,7 +53,7 @@ def stored_segmentation(
     """
     if evidence is None or TOGETHER not in evidence:
         return segment(image_bgr, empty_table=empty_table)
-    frame = Frame(image_bgr)
+    frame = image_bgr if isinstance(image_bgr, Frame) else Frame(image_bgr)
     background, difference = compared(frame, empty_table)
     correction = None
     if background is not None and difference is not None and difference.reliable:
@@ -58,7 +61,7 @@ def stored_segmentation(
     found = mask_from(evidence[MASK], frame.small.shape[:2]) if MASK in evidence else None
     issues = tuple(_issue(one) for one in evidence.get("issues", ()))
     agreement = None if difference is None else difference.agreement
-    return Found(image_bgr, found, None, correction, agreement, Method(evidence["method"]), issues).cut_out()
+    return Found(frame.image, found, None, correction, agreement, Method(evidence["method"]), issues).cut_out()
 
 
 def mask_text(found: Mask) -> str:

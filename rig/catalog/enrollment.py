@@ -30,7 +30,7 @@ from rig.catalog.together import (
 from rig.core.clock import Clock
 from rig.core.errors import CatalogError, UsageError
 from rig.views import image_files as images
-from rig.views.description import PAPER_DESCRIPTOR
+from rig.views.description import PAPER_DESCRIPTOR, Segmented
 
 
 @dataclass(eq=False)
@@ -72,10 +72,17 @@ class Enrollment:
         with self._database.read() as connection:
             return self._missing(connection)
 
-    def add(self, record: ViewRecord, image_bgr: NDArray[np.uint8], encoded: Future[bytes] | None = None) -> StoredView:
+    def add(
+        self,
+        record: ViewRecord,
+        image_bgr: NDArray[np.uint8],
+        encoded: Future[bytes] | None = None,
+        segmented: Segmented | None = None,
+    ) -> StoredView:
         """Store a view and its image, uint8 (H, W, 3) BGR. Both are durable when this returns.
 
-        ``encoded`` is the image as PNG, if `rig.views.image_files.encode_meanwhile` was called before.
+        ``encoded`` is the image as PNG, if `rig.views.image_files.encode_meanwhile` was called before, ``segmented``
+        what the record's descriptors were computed from, if a `rig.views.description.ViewDescriber` did so.
 
         The image is complete under its name before its row is committed. A crash in between leaves an image without a
         row, which is harmless, and never a row without its image.
@@ -121,10 +128,9 @@ class Enrollment:
             with changing_enrollments(connection, [self.id]):
                 (view_id,) = insert_views(connection, self.id, [new])
         self._held.hold(image.path, image_bgr)
-        if self._empty_table is not None and (record.segmentation or {}).get("method") == Method.EMPTY_TABLE:
-            self._meanwhile.begin(
-                image.path, image_bgr, objects_alone(record.descriptors), record.region, self._empty_table
-            )
+        if self._empty_table and segmented is not None and segmented.found.method is Method.EMPTY_TABLE:
+            names = objects_alone(record.descriptors)
+            self._meanwhile.begin(image.path, image_bgr, names, record.region, self._empty_table, segmented)
         return StoredView(
             id=view_id,
             object_name=self.object_name,

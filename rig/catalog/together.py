@@ -24,7 +24,7 @@ from rig.catalog.records import JsonObject, PackedDescriptor, Region
 from rig.catalog.schema import descriptors, sessions, views
 from rig.config import ViewConfig
 from rig.core.errors import CatalogError, UsageError
-from rig.views.description import DescribedAlone, EnrollmentDescriber
+from rig.views.description import DescribedAlone, EnrollmentDescriber, Segmented
 
 FEWEST_VIEWS: Final = 4
 """A session with fewer views, after an interruption, learns its background from all views of the enrollment."""
@@ -106,13 +106,28 @@ class DescribedMeanwhile:
         self._thread = ThreadPoolExecutor(1, "describer")
         self._describers: dict[_How, EnrollmentDescriber] = {}
         self._found: dict[tuple[str, _How], Future[DescribedAlone]] = {}
+        self._small: dict[tuple[str, Region | None], NDArray[np.uint8]] = {}
 
     def begin(
-        self, image: str, pixels: NDArray[np.uint8], names: tuple[str, ...], region: Region | None, table: EmptyTable
+        self,
+        image: str,
+        pixels: NDArray[np.uint8],
+        names: tuple[str, ...],
+        region: Region | None,
+        table: EmptyTable,
+        segmented: Segmented,
     ) -> None:
-        """Begin to describe the pixels of an image, uint8 (H, W, 3) BGR, by descriptors of the object."""
+        """Begin to describe the pixels of an image, uint8 (H, W, 3) BGR, by descriptors of the object.
+
+        ``segmented`` is what the view was described with first, by this table and region.
+        """
         how = _How(names, region, table)
-        self._found[image, how] = self._thread.submit(self._describe, how, table, pixels)
+        self._found[image, how] = self._thread.submit(self._describe, how, table, pixels, segmented)
+        self._small[image, region] = segmented.frame.small
+
+    def small(self, item: StoredImage) -> NDArray[np.uint8] | None:
+        """Return the small image (`hbr.segmentation.background.shrunk`) of a view's region, if it is known."""
+        return self._small.get((item.image, item.region))
 
     def result(self, item: StoredImage, names: tuple[str, ...]) -> DescribedAlone | None:
         """Return the description of a view by these descriptors, when it is ready; None if it was not begun.
@@ -122,11 +137,13 @@ class DescribedMeanwhile:
         found = self._found.get((item.image, _How(names, item.region, item.empty_table)))
         return None if found is None else found.result()
 
-    def _describe(self, how: _How, table: EmptyTable, pixels: NDArray[np.uint8]) -> DescribedAlone:
+    def _describe(
+        self, how: _How, table: EmptyTable, pixels: NDArray[np.uint8], segmented: Segmented
+    ) -> DescribedAlone:
         if how not in self._describers:
             config = ViewConfig(roi=how.region)
             self._describers[how] = EnrollmentDescriber(config, how.names, self._held.pixels(*table))
-        return self._describers[how].describe_alone(pixels)
+        return self._describers[how].describe_alone(pixels, segmented)
 
 
 def describe_together(
@@ -155,7 +172,8 @@ def describe_together(
         numbers: dict[int, int] = {}
         for one in learned_from:
             try:
-                numbers[one.view_id] = describer.learn(held.pixels(one.image, one.sha256))
+                small = None if meanwhile is None else meanwhile.small(one)
+                numbers[one.view_id] = describer.learn(held.pixels(one.image, one.sha256), small)
             except (CatalogError, UsageError, ValueError) as error:
                 found.setdefault(one.view_id, Described(one.view_id, reason=_reason(error)))
         known = [one for one in own if one.view_id in numbers]

@@ -214,7 +214,7 @@ def _step_views(
             region=bench.config.view.roi,
             segmentation=described.segmentation,
         )
-        enrollment.add(record, attempt.image_bgr, attempt.encoded)
+        enrollment.add(record, attempt.image_bgr, attempt.encoded, described.segmented)
         yield Accepted(index, record.azimuth_deg, attempt.evidence, attempt.image_bgr, described.segmentation)
         yield from warn_of_table(bench, index, described)
         first = first or (index, angle_deg, attempt.image_bgr)

@@ -181,7 +181,7 @@ def _store(
         region=bench.config.view.roi,
         segmentation=described.segmentation,
     )
-    enrollment.add(record, attempt.image_bgr, encoded)
+    enrollment.add(record, attempt.image_bgr, encoded, described.segmented)
     yield Accepted(index, record.azimuth_deg, attempt.evidence, attempt.image_bgr, described.segmentation)
     yield from warn_of_table(bench, index, described)
 

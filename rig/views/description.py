@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 import hbr
 from hbr.segmentation import MIN_AGREEMENT, Issue, IssueCode
+from hbr.segmentation.frame import Frame
 from hbr.segmentation.learned import LearnedBackground
 from hbr.segmentation.stored import TOGETHER, evidence_together, stored_segmentation
 from rig.config import ViewConfig
@@ -26,6 +27,14 @@ DESCRIPTORS: Final = (PAPER_DESCRIPTOR, BENCH_DESCRIPTOR)
 """The descriptors of every enrolled view."""
 IN_A_ROW: Final = 3
 """So many frames must differ from the empty-table image: one or two can show an arm that reached into the frame."""
+
+
+class Segmented(NamedTuple):
+    """The segmentation of a frame and its levels, from which a further description of the view starts."""
+
+    frame: Frame
+    found: hbr.Segmentation
+    levels: Mapping[str, NDArray[np.uint8]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,6 +55,8 @@ class DescribedView:
         In a search: whether the view was segmented by a known background (`hbr.ViewsTogether.reliable`).
     same_bench
         In a search: whether the bench is that of the enrollment; None: not known.
+    segmented
+        In an enrollment: what the view was described with, if it was segmented alone.
     """
 
     levels: Mapping[str, NDArray[np.uint8]]
@@ -54,6 +65,7 @@ class DescribedView:
     earlier: tuple[NDArray[np.uint8], ...] | None = None
     reliable: bool = True
     same_bench: bool | None = None
+    segmented: Segmented | None = None
 
 
 class DescribedAlone(NamedTuple):
@@ -126,11 +138,15 @@ class ViewDescriber:
         ValueError
             The region is too small for a segmentation, or the stored evidence is damaged.
         """
-        found = self.segment(image_bgr, stored) if self._segments else None
-        levels = self._levels(within(image_bgr, self.region), found)
-        if found is None:
-            return DescribedView(levels, None)
-        return DescribedView(levels, found.evidence(), self._table_problem(found.agreement))
+        part = within(image_bgr, self.region)
+        if not self._segments:
+            return DescribedView(self._levels(part, None), None)
+        frame = Frame(part)
+        found = self._segment(frame, image_bgr, stored)
+        levels = self._levels(part, found)
+        problem = self._table_problem(found.agreement)
+        segmented = Segmented(frame, found, levels) if stored is None else None
+        return DescribedView(levels, found.evidence(), problem, segmented=segmented)
 
     def _levels(self, part: NDArray[np.uint8], found: hbr.Segmentation | None) -> dict[str, NDArray[np.uint8]]:
         return {
@@ -150,9 +166,13 @@ class ViewDescriber:
 
     def segment(self, image_bgr: NDArray[np.uint8], stored: Mapping[str, Any] | None = None) -> hbr.Segmentation:
         """Return the segmentation of the region of interest in a frame, uint8 (H, W, 3); as for a call."""
-        part = within(image_bgr, self.region)
+        return self._segment(Frame(within(image_bgr, self.region)), image_bgr, stored)
+
+    def _segment(
+        self, frame: Frame, image_bgr: NDArray[np.uint8], stored: Mapping[str, Any] | None
+    ) -> hbr.Segmentation:
         background, issues = self._prepared_table(image_bgr)
-        found = stored_segmentation(part, stored, empty_table=background)
+        found = stored_segmentation(frame, stored, empty_table=background)
         return replace(found, issues=(*issues, *(one for one in found.issues if one not in issues)))
 
     def _prepared_table(self, image_bgr: NDArray[np.uint8]) -> tuple[hbr.Background | None, tuple[Issue, ...]]:
@@ -179,15 +199,17 @@ class EnrollmentDescriber(ViewDescriber):
         super().__init__(config, names, empty_table)
         self._learned = LearnedBackground()
 
-    def learn(self, image_bgr: NDArray[np.uint8]) -> int:
+    def learn(self, image_bgr: NDArray[np.uint8], small: NDArray[np.uint8] | None = None) -> int:
         """Learn the background from the next view, uint8 (H, W, 3); return the number of the view.
+
+        ``small`` is the small image (`hbr.segmentation.background.shrunk`) of the region, if it is known.
 
         Raises
         ------
         UsageError, ValueError
             As for `ViewDescriber`, or the view has another size than the others.
         """
-        self._learned.add(within(image_bgr, self.region))
+        self._learned.add(within(image_bgr, self.region), small)
         return len(self._learned) - 1
 
     def describe(self, view: int, image_bgr: NDArray[np.uint8], alone: DescribedAlone | None = None) -> DescribedView:
@@ -198,18 +220,27 @@ class EnrollmentDescriber(ViewDescriber):
         levels, evidence = alone or self._described(image_bgr, self._learned.of(view))
         return DescribedView(levels, {**evidence, TOGETHER: len(self._learned)})
 
-    def describe_alone(self, image_bgr: NDArray[np.uint8]) -> DescribedAlone:
-        """Describe a view that the empty-table image segments: the other views do not change its segmentation."""
-        return self._described(image_bgr, None)
+    def describe_alone(self, image_bgr: NDArray[np.uint8], segmented: Segmented) -> DescribedAlone:
+        """Describe a view that the empty-table image segments: the other views do not change its segmentation.
+
+        ``segmented`` is what a `ViewDescriber` with the same table, region and descriptors described the frame with.
+        """
+        background, _ = self._prepared_table(image_bgr)
+        (found,) = hbr.hypotheses(segmented.frame, empty_table=background, first=segmented.found, most=1)
+        if found is segmented.found:
+            levels = {one.name: segmented.levels[one.name] for one in self._descriptors}
+        else:
+            levels = self._levels(segmented.frame.image, found)
+        return DescribedAlone(levels, evidence_together(found, len(self._learned)))
 
     def _described(self, image_bgr: NDArray[np.uint8], learned: hbr.Background | None) -> DescribedAlone:
-        part = within(image_bgr, self.region)
+        frame = Frame(within(image_bgr, self.region))
         background, issues = self._prepared_table(image_bgr)
-        (found,) = hbr.hypotheses(part, empty_table=background, learned=learned, most=1)
+        (found,) = hbr.hypotheses(frame, empty_table=background, learned=learned, most=1)
         if found.box is None:
-            found = hbr.segment(part, empty_table=background)
+            found = hbr.segment(frame, empty_table=background)
         found = replace(found, issues=(*issues, *found.issues))
-        return DescribedAlone(self._levels(part, found), evidence_together(found, len(self._learned)))
+        return DescribedAlone(self._levels(frame.image, found), evidence_together(found, len(self._learned)))
 
 
 class SearchDescriber(ViewDescriber):

@@ -274,10 +274,13 @@ def test_description_made_meanwhile_counts_only_for_the_same_descriptors_and_reg
     held = HeldImages(catalog.database.images)
     meanwhile = DescribedMeanwhile(held)
     pixels = held.pixels(item.image, item.sha256)
-    meanwhile.begin(item.image, pixels, (BENCH_DESCRIPTOR,), item.region, item.empty_table)
-    expected = EnrollmentDescriber(ViewConfig(roi=REGION), (BENCH_DESCRIPTOR,), table()).describe_alone(pixels)
+    config = ViewConfig(roi=REGION)
+    segmented = ViewDescriber(config, (BENCH_DESCRIPTOR,), table())(pixels).segmented
+    meanwhile.begin(item.image, pixels, (BENCH_DESCRIPTOR,), item.region, item.empty_table, segmented)
+    describer = EnrollmentDescriber(config, (BENCH_DESCRIPTOR,), table())
+    expected = describer.describe(describer.learn(pixels), pixels)
     found = meanwhile.result(item, (BENCH_DESCRIPTOR,))
-    assert found.evidence == expected.evidence
+    assert found.evidence | {"together": 1} == expected.segmentation
     assert np.array_equal(found.levels[BENCH_DESCRIPTOR], expected.levels[BENCH_DESCRIPTOR])
     assert meanwhile.result(item, (BENCH_DESCRIPTOR, "edges")) is None
     assert meanwhile.result(item._replace(region=None), (BENCH_DESCRIPTOR,)) is None

@@ -8,7 +8,14 @@ from numpy.typing import NDArray
 import hbr
 from rig.config import ViewConfig
 from rig.core.errors import UsageError
-from rig.views.description import BENCH_DESCRIPTOR, DESCRIPTORS, PAPER_DESCRIPTOR, SearchDescriber, ViewDescriber
+from rig.views.description import (
+    BENCH_DESCRIPTOR,
+    DESCRIPTORS,
+    PAPER_DESCRIPTOR,
+    EnrollmentDescriber,
+    SearchDescriber,
+    ViewDescriber,
+)
 
 WHOLE = ViewConfig(roi=None)
 
@@ -111,3 +118,22 @@ def test_first_view_of_a_search_shows_whether_the_bench_is_that_of_the_enrollmen
         describe = SearchDescriber(WHOLE, BENCH_DESCRIPTOR, bench_image=image)
         assert describe(frame).same_bench is expected
         assert describe(_with_object(other)).same_bench is expected  # the first view decides for the whole search
+
+
+@pytest.mark.parametrize("change", ["none", "noise", "arm"])
+def test_enrolled_view_is_described_alike_from_its_first_segmentation(change: str) -> None:
+    table = _table()
+    image = _with_object(table)
+    rng = np.random.default_rng(3)
+    if change == "noise":
+        image = np.clip(image + rng.normal(0, 8, image.shape), 0, 255).astype(np.uint8)
+    elif change == "arm":  # a thin part that differs from the empty table; the network leaves it out
+        image[70:80, 100:135] = (200, 200, 60)
+    describer = EnrollmentDescriber(WHOLE, (BENCH_DESCRIPTOR,), table)
+    expected = describer.describe(describer.learn(image), image)
+    segmented = ViewDescriber(WHOLE, DESCRIPTORS, table)(image).segmented
+    assert segmented is not None
+    assert (expected.segmentation["box_px"] == list(segmented.found.box)) is (change != "arm")
+    found = EnrollmentDescriber(WHOLE, (BENCH_DESCRIPTOR,), table).describe_alone(image, segmented)
+    assert found.evidence | {"together": 1} == expected.segmentation
+    assert np.array_equal(found.levels[BENCH_DESCRIPTOR], expected.levels[BENCH_DESCRIPTOR])
