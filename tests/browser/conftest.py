@@ -9,6 +9,7 @@ import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import pytest
@@ -66,9 +67,11 @@ def chromium() -> Iterator[Any]:
     playwright = pytest.importorskip("playwright.sync_api", reason="Playwright is missing: make test-web installs it")
     if CHROMIUM is None:
         pytest.skip("Chromium is missing: apt-get install chromium")
-    with playwright.sync_playwright() as driver:
+    # The path of a socket has at most 107 characters, and the folder of the tests of one process takes most of them.
+    with playwright.sync_playwright() as driver, TemporaryDirectory(dir="/tmp", ignore_cleanup_errors=True) as short:
         browser = driver.chromium.launch(
             executable_path=CHROMIUM,
+            env={**os.environ, "TMPDIR": short},
             args=["--no-sandbox", "--disable-gpu", "--disable-background-networking", "--disable-component-update"],
         )
         yield browser
