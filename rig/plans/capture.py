@@ -133,6 +133,8 @@ def capture(index: int, viewer: Viewer, table: Turntable, settled_ns: int) -> Ge
         next_step = (
             "Lock the camera: set camera.exposure_us and camera.white_balance_k to numbers, then run rig doctor."
         )
+    elif attempt.reasons == (RejectReason.REPEATED_FRAME,):
+        next_step = "Reconnect the camera. If it happens again, use another USB port, without a hub."
     raise ViewRejected(
         f"View {index + 1} was rejected: {texts}.",
         next_step=next_step,

@@ -23,6 +23,8 @@ NOISE_GAIN = 20
 """Factor by which the Laplacian (-4 and four times 1) increases the variance of independent pixels."""
 MAX_NOISE = 0.3
 """Largest share of such variance in an image. Half a frame of random bytes has more."""
+MOST_REPEATED = 10
+"""Repeated frames of one view that do not count as retakes: a camera on a busy bus sends some frames twice."""
 SIMILARITY_PX = 4
 """Side of the squares that `image_similarity` averages over."""
 
@@ -196,6 +198,8 @@ class Viewer:
     ) -> Iterator[Attempt]:
         """Capture frames until one is accepted or ``retakes`` is used up.
 
+        Up to `MOST_REPEATED` frames that the camera only repeats do not count as retakes.
+
         Parameters
         ----------
         settled_ns
@@ -206,7 +210,9 @@ class Viewer:
             Called several times a second while the program waits for a slow camera.
         """
         after_ns = settled_ns + self._early_ns
-        for number in range(1, 2 + self._config.retakes):
+        number = repeated = 0
+        while number - repeated <= self._config.retakes:
+            number += 1
             frame = self._camera.capture(after_ns, meanwhile)
             encoded = encode_meanwhile(frame.image_bgr) if self._encodes else None
             attempt = self._check(number, frame, settled_ns, check_still(after_ns - self._early_ns))
@@ -215,6 +221,8 @@ class Viewer:
             yield attempt
             if attempt.accepted:
                 return
+            if attempt.reasons == (RejectReason.REPEATED_FRAME,) and repeated < MOST_REPEATED:
+                repeated += 1
             after_ns = frame.exposed_ns + 1
 
     def _check(self, number: int, frame: Frame, settled_ns: int, stillness: Stillness) -> Attempt:

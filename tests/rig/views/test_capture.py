@@ -88,6 +88,29 @@ def test_short_darkness_costs_one_retake(on_the_table):
     assert 1 < len(attempts) <= 4
 
 
+@pytest.mark.parametrize("repeated", [5, 10, 40])
+def test_frames_that_the_camera_repeats_are_not_retakes(on_the_table, repeated):
+    s, table, viewer = on_the_table
+    assert attempts_of(s, table, viewer)[0].accepted
+    sent = []
+
+    def again(image, _frame):
+        sent.append(image)
+        return sent[0] if len(sent) <= repeated + 1 else image
+
+    s.operator.devices.camera.filters.append(again)
+    attempts = attempts_of(s, table, viewer)
+    assert attempts[0].accepted  # it is new
+    attempts = attempts_of(s, table, viewer)
+    assert all(attempt.reasons == (RejectReason.REPEATED_FRAME,) for attempt in attempts[:-1])
+    if repeated <= 10:
+        assert len(attempts) == repeated + 1
+        assert attempts[-1].accepted
+    else:
+        assert len(attempts) == 10 + 1 + s.bench.config.view.retakes
+        assert not attempts[-1].accepted
+
+
 def test_glare_is_rejected(on_the_table):
     s, table, viewer = on_the_table
     s.world.change(light=(30.0, 30.0, 30.0))
