@@ -48,7 +48,7 @@ def wait_for_work(place: CatalogPlace, process: str, before: int) -> None:
         CLOCK.sleep(0.05)
 
 
-@pytest.mark.parametrize("seconds", [8, pytest.param(180, marks=pytest.mark.nightly)])
+@pytest.mark.parametrize("seconds", [8, pytest.param(180, marks=[pytest.mark.nightly, pytest.mark.timeout(600)])])
 def test_nothing_is_lost_or_doubled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seconds: float) -> None:
     seconds = float(os.environ.get("RIG_TEST_SOAK_S", seconds))
     rng = random.Random(1)
