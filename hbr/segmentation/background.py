@@ -165,10 +165,6 @@ class Background:
         """Why the correction is missing or incomplete."""
         return self._backdrop[1]
 
-    def equals(self, other: "Background") -> bool:
-        """Return whether two backgrounds compare frames in the same way."""
-        return self is other or (self.shape == other.shape and np.array_equal(self._grey_levels, other._grey_levels))
-
     def difference(self, small: ImageArray) -> Difference:
         """Compare a small frame, as `shrunk` returns it, with the empty-table image."""
         logarithm = _logarithm(small)

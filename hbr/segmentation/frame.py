@@ -23,9 +23,14 @@ class Frame:
         self.small = shrunk(image_bgr)
         self._compared: tuple[Background, Difference] | None = None
 
+    @classmethod
+    def of(cls, image_bgr: "ImageArray | Frame") -> "Frame":
+        """Return the frame of an image, or the frame itself."""
+        return image_bgr if isinstance(image_bgr, Frame) else cls(image_bgr)
+
     def difference(self, background: Background) -> Difference:
         """Return the difference from a background. The last one is kept, for further segmentations of the frame."""
-        if self._compared is None or not self._compared[0].equals(background):
+        if self._compared is None or self._compared[0] is not background:
             self._compared = background, background.difference(self.small)
         return self._compared[1]
 

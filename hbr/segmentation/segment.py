@@ -70,7 +70,7 @@ def segment(
     TypeError, ValueError
         The frame is no such image, the empty-table image has another size, or a box is outside the frame.
     """
-    frame = image_bgr if isinstance(image_bgr, Frame) else Frame(image_bgr)
+    frame = Frame.of(image_bgr)
     background, difference = compared(frame, empty_table)
     height, width = frame.image.shape[:2]
     for name, part in (("box", box), ("grey_patch", grey_patch)):
@@ -171,7 +171,7 @@ def hypotheses(
     TypeError, ValueError
         As for `segment`.
     """
-    frame = image_bgr if isinstance(image_bgr, Frame) else Frame(image_bgr)
+    frame = Frame.of(image_bgr)
     background, difference = compared(frame, empty_table)
     by_picture = difference is not None and difference.reliable
     found: list[Segmentation | Found]

@@ -53,7 +53,7 @@ def stored_segmentation(
     """
     if evidence is None or TOGETHER not in evidence:
         return segment(image_bgr, empty_table=empty_table)
-    frame = image_bgr if isinstance(image_bgr, Frame) else Frame(image_bgr)
+    frame = Frame.of(image_bgr)
     background, difference = compared(frame, empty_table)
     correction = None
     if background is not None and difference is not None and difference.reliable:

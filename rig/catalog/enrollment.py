@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from sqlalchemy import Connection, delete, select, update
 
 from hbr.core.cores import THREADS
-from hbr.segmentation import Method
 from rig.catalog import audit
 from rig.catalog.database import Database
 from rig.catalog.describing import EmptyTable, pack
@@ -59,7 +58,7 @@ class Enrollment:
 
     def __post_init__(self) -> None:
         self._held = HeldImages(self._database.images)  # of this session: `revise` does not decode them again
-        self._meanwhile = DescribedMeanwhile(self._held)
+        self._meanwhile = DescribedMeanwhile()
         self._empty_table: EmptyTable | None = None
 
     @property
@@ -82,7 +81,7 @@ class Enrollment:
         """Store a view and its image, uint8 (H, W, 3) BGR. Both are durable when this returns.
 
         ``encoded`` is the image as PNG, if `rig.views.image_files.encode_meanwhile` was called before, ``segmented``
-        what the record's descriptors were computed from, if a `rig.views.description.ViewDescriber` did so.
+        that of the `rig.views.description.DescribedView`.
 
         The image is complete under its name before its row is committed. A crash in between leaves an image without a
         row, which is harmless, and never a row without its image.
@@ -128,9 +127,9 @@ class Enrollment:
             with changing_enrollments(connection, [self.id]):
                 (view_id,) = insert_views(connection, self.id, [new])
         self._held.hold(image.path, image_bgr)
-        if self._empty_table and segmented is not None and segmented.found.method is Method.EMPTY_TABLE:
+        if self._empty_table is not None and segmented is not None:
             names = objects_alone(record.descriptors)
-            self._meanwhile.begin(image.path, image_bgr, names, record.region, self._empty_table, segmented)
+            self._meanwhile.begin(image.path, names, record.region, self._empty_table, segmented)
         return StoredView(
             id=view_id,
             object_name=self.object_name,

@@ -3,7 +3,7 @@
 Decision: docs/decisions/0054.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from itertools import groupby
@@ -24,7 +24,7 @@ from rig.catalog.records import JsonObject, PackedDescriptor, Region
 from rig.catalog.schema import descriptors, sessions, views
 from rig.config import ViewConfig
 from rig.core.errors import CatalogError, UsageError
-from rig.views.description import DescribedAlone, EnrollmentDescriber, Segmented
+from rig.views.description import DescribedAlone, EnrollmentDescriber, Segmented, describe_alone
 
 FEWEST_VIEWS: Final = 4
 """A session with fewer views, after an interruption, learns its background from all views of the enrollment."""
@@ -86,14 +86,6 @@ class HeldImages:
             return self._pixels[image]
 
 
-class _How(NamedTuple):
-    """What an image is described with."""
-
-    names: tuple[str, ...]
-    region: Region | None
-    empty_table: EmptyTable | None
-
-
 class DescribedMeanwhile:
     """Views of one session that are described in a thread while the table turns to the next one.
 
@@ -101,28 +93,16 @@ class DescribedMeanwhile:
     enrollment only the others are left to describe.
     """
 
-    def __init__(self, held: HeldImages) -> None:
-        self._held = held
+    def __init__(self) -> None:
         self._thread = ThreadPoolExecutor(1, "describer")
-        self._describers: dict[_How, EnrollmentDescriber] = {}
-        self._found: dict[tuple[str, _How], Future[DescribedAlone]] = {}
-        self._small: dict[tuple[str, Region | None], NDArray[np.uint8]] = {}
+        self._found: dict[Hashable, Future[DescribedAlone]] = {}
+        self._small: dict[Hashable, NDArray[np.uint8]] = {}
 
     def begin(
-        self,
-        image: str,
-        pixels: NDArray[np.uint8],
-        names: tuple[str, ...],
-        region: Region | None,
-        table: EmptyTable,
-        segmented: Segmented,
+        self, image: str, names: tuple[str, ...], region: Region | None, table: EmptyTable, segmented: Segmented
     ) -> None:
-        """Begin to describe the pixels of an image, uint8 (H, W, 3) BGR, by descriptors of the object.
-
-        ``segmented`` is what the view was described with first, by this table and region.
-        """
-        how = _How(names, region, table)
-        self._found[image, how] = self._thread.submit(self._describe, how, table, pixels, segmented)
+        """Begin to describe a view by descriptors of the object. Its first description is by this table and region."""
+        self._found[image, names, region, table] = self._thread.submit(describe_alone, segmented, names)
         self._small[image, region] = segmented.frame.small
 
     def small(self, item: StoredImage) -> NDArray[np.uint8] | None:
@@ -134,16 +114,8 @@ class DescribedMeanwhile:
 
         Raises what `EnrollmentDescriber.describe` does.
         """
-        found = self._found.get((item.image, _How(names, item.region, item.empty_table)))
+        found = self._found.get((item.image, names, item.region, item.empty_table))
         return None if found is None else found.result()
-
-    def _describe(
-        self, how: _How, table: EmptyTable, pixels: NDArray[np.uint8], segmented: Segmented
-    ) -> DescribedAlone:
-        if how not in self._describers:
-            config = ViewConfig(roi=how.region)
-            self._describers[how] = EnrollmentDescriber(config, how.names, self._held.pixels(*table))
-        return self._describers[how].describe_alone(pixels, segmented)
 
 
 def describe_together(

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import hbr
-from hbr.segmentation import MIN_AGREEMENT, Issue, IssueCode
+from hbr.segmentation import MIN_AGREEMENT, Issue, IssueCode, Method
 from hbr.segmentation.frame import Frame
 from hbr.segmentation.learned import LearnedBackground
 from hbr.segmentation.stored import TOGETHER, evidence_together, stored_segmentation
@@ -30,9 +30,10 @@ IN_A_ROW: Final = 3
 
 
 class Segmented(NamedTuple):
-    """The segmentation of a frame and its levels, from which a further description of the view starts."""
+    """The first description of a view that the empty-table image segments; its last one starts from it."""
 
     frame: Frame
+    empty_table: hbr.Background
     found: hbr.Segmentation
     levels: Mapping[str, NDArray[np.uint8]]
 
@@ -56,7 +57,7 @@ class DescribedView:
     same_bench
         In a search: whether the bench is that of the enrollment; None: not known.
     segmented
-        In an enrollment: what the view was described with, if it was segmented alone.
+        Set if the empty-table image segmented the view: what `describe_alone` needs.
     """
 
     levels: Mapping[str, NDArray[np.uint8]]
@@ -73,6 +74,16 @@ class DescribedAlone(NamedTuple):
 
     levels: dict[str, NDArray[np.uint8]]
     evidence: dict[str, Any]
+
+
+def describe_alone(segmented: Segmented, names: tuple[str, ...]) -> DescribedAlone:
+    """Describe a view for the last time, by descriptors of the object: no other view changes its segmentation."""
+    (found,) = hbr.hypotheses(segmented.frame, empty_table=segmented.empty_table, first=segmented.found, most=1)
+    if found is segmented.found:
+        levels = {name: segmented.levels[name] for name in names}
+    else:
+        levels = {name: hbr.descriptor(name).describe(found) for name in names}
+    return DescribedAlone(levels, evidence_together(found, 1))
 
 
 def within(image_bgr: NDArray[np.uint8], region: tuple[int, int, int, int] | None) -> NDArray[np.uint8]:
@@ -145,7 +156,9 @@ class ViewDescriber:
         found = self._segment(frame, image_bgr, stored)
         levels = self._levels(part, found)
         problem = self._table_problem(found.agreement)
-        segmented = Segmented(frame, found, levels) if stored is None else None
+        segmented = None
+        if stored is None and self._background is not None and found.method is Method.EMPTY_TABLE:
+            segmented = Segmented(frame, self._background, found, levels)
         return DescribedView(levels, found.evidence(), problem, segmented=segmented)
 
     def _levels(self, part: NDArray[np.uint8], found: hbr.Segmentation | None) -> dict[str, NDArray[np.uint8]]:
@@ -219,19 +232,6 @@ class EnrollmentDescriber(ViewDescriber):
         """
         levels, evidence = alone or self._described(image_bgr, self._learned.of(view))
         return DescribedView(levels, {**evidence, TOGETHER: len(self._learned)})
-
-    def describe_alone(self, image_bgr: NDArray[np.uint8], segmented: Segmented) -> DescribedAlone:
-        """Describe a view that the empty-table image segments: the other views do not change its segmentation.
-
-        ``segmented`` is what a `ViewDescriber` with the same table, region and descriptors described the frame with.
-        """
-        background, _ = self._prepared_table(image_bgr)
-        (found,) = hbr.hypotheses(segmented.frame, empty_table=background, first=segmented.found, most=1)
-        if found is segmented.found:
-            levels = {one.name: segmented.levels[one.name] for one in self._descriptors}
-        else:
-            levels = self._levels(segmented.frame.image, found)
-        return DescribedAlone(levels, evidence_together(found, len(self._learned)))
 
     def _described(self, image_bgr: NDArray[np.uint8], learned: hbr.Background | None) -> DescribedAlone:
         frame = Frame(within(image_bgr, self.region))

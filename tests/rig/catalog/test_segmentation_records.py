@@ -272,15 +272,15 @@ def test_description_made_meanwhile_counts_only_for_the_same_descriptors_and_reg
     with catalog.database.read() as connection:
         (item, *_) = stored_images(connection, 1)
     held = HeldImages(catalog.database.images)
-    meanwhile = DescribedMeanwhile(held)
+    meanwhile = DescribedMeanwhile()
     pixels = held.pixels(item.image, item.sha256)
     config = ViewConfig(roi=REGION)
     segmented = ViewDescriber(config, (BENCH_DESCRIPTOR,), table())(pixels).segmented
-    meanwhile.begin(item.image, pixels, (BENCH_DESCRIPTOR,), item.region, item.empty_table, segmented)
+    meanwhile.begin(item.image, (BENCH_DESCRIPTOR,), item.region, item.empty_table, segmented)
     describer = EnrollmentDescriber(config, (BENCH_DESCRIPTOR,), table())
     expected = describer.describe(describer.learn(pixels), pixels)
     found = meanwhile.result(item, (BENCH_DESCRIPTOR,))
-    assert found.evidence | {"together": 1} == expected.segmentation
+    assert found.evidence == expected.segmentation
     assert np.array_equal(found.levels[BENCH_DESCRIPTOR], expected.levels[BENCH_DESCRIPTOR])
     assert meanwhile.result(item, (BENCH_DESCRIPTOR, "edges")) is None
     assert meanwhile.result(item._replace(region=None), (BENCH_DESCRIPTOR,)) is None

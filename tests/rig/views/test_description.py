@@ -15,6 +15,7 @@ from rig.views.description import (
     EnrollmentDescriber,
     SearchDescriber,
     ViewDescriber,
+    describe_alone,
 )
 
 WHOLE = ViewConfig(roi=None)
@@ -134,6 +135,6 @@ def test_enrolled_view_is_described_alike_from_its_first_segmentation(change: st
     segmented = ViewDescriber(WHOLE, DESCRIPTORS, table)(image).segmented
     assert segmented is not None
     assert (expected.segmentation["box_px"] == list(segmented.found.box)) is (change != "arm")
-    found = EnrollmentDescriber(WHOLE, (BENCH_DESCRIPTOR,), table).describe_alone(image, segmented)
-    assert found.evidence | {"together": 1} == expected.segmentation
+    found = describe_alone(segmented, (BENCH_DESCRIPTOR,))
+    assert found.evidence == expected.segmentation
     assert np.array_equal(found.levels[BENCH_DESCRIPTOR], expected.levels[BENCH_DESCRIPTOR])
