@@ -342,14 +342,14 @@ class SimCapture:
         At rest this is one image, otherwise a mean of images in steps of a pixel of motion in the present mode.
         """
         readout = self.times.readout_ns
-        angles = self._world.table_motion(start + np.linspace(0, exposure + readout, 9).astype(np.int64))[0]
+        angles = self._world.table_angles(start + np.linspace(0, exposure + readout, 9).astype(np.int64))
         path_px = np.abs(np.diff(angles)).sum() * _EDGE_PX_PER_DEG
         if path_px < _STILL_PX:
             return self._picture(scene, float(angles[0]))
         n = min(1 + max(ceil(path_px / self._binning), 1), _MAX_SUBFRAMES * (1 + readout // max(exposure, 1)))
         steps, weights = row_weights(exposure, readout, n)
         seen = np.zeros((HEIGHT, WIDTH, 3), dtype=np.float32)
-        for angle, weight in zip(self._world.table_motion(start + steps.astype(np.int64))[0], weights, strict=True):
+        for angle, weight in zip(self._world.table_angles(start + steps.astype(np.int64)), weights, strict=True):
             rows = np.flatnonzero(weight)
             if len(rows):
                 part = slice(rows[0], rows[-1] + 1)

@@ -37,11 +37,17 @@ class Trajectory:
 
     def at(self, time_s: ArrayLike) -> tuple[Floats, Floats]:
         """Return position and velocity at ``time_s``; before the first piece, its beginning."""
-        t = np.asarray(time_s, dtype=np.float64)
-        i = np.maximum(self.start_s.searchsorted(t, side="right") - 1, 0)
-        tau = np.maximum(t - self.start_s[i], 0.0)
-        v, a = self.velocity_dps[i], self.acceleration_dps2[i]
-        return self.position_deg[i] + v * tau + 0.5 * a * tau**2, v + a * tau
+        return self.within(*self.pieces(np.asarray(time_s, dtype=np.float64)))
+
+    def pieces(self, time_s: Floats) -> tuple[NDArray[np.intp], Floats]:
+        """Return the number of the piece at each time, and the time since its beginning."""
+        piece = np.maximum(self.start_s.searchsorted(time_s, side="right") - 1, 0)
+        return piece, np.maximum(time_s - self.start_s[piece], 0.0)
+
+    def within(self, piece: NDArray[np.intp], since_s: Floats) -> tuple[Floats, Floats]:
+        """Return position and velocity at times since the beginning of pieces."""
+        v, a = self.velocity_dps[piece], self.acceleration_dps2[piece]
+        return self.position_deg[piece] + v * since_s + 0.5 * a * since_s**2, v + a * since_s
 
     def state_at(self, time_s: float) -> tuple[float, float, float]:
         """Return position, velocity and acceleration at one time: as `at`, which takes ten times as long for it."""
@@ -49,11 +55,6 @@ class Trajectory:
         tau = max(time_s - self.start_s.item(i), 0.0)
         x, v, a = self.position_deg.item(i), self.velocity_dps.item(i), self.acceleration_dps2.item(i)
         return x + v * tau + 0.5 * a * (tau * tau), v + a * tau, a
-
-    def acceleration_at(self, time_s: ArrayLike) -> Floats:
-        """Return the acceleration at ``time_s``."""
-        i = np.maximum(np.searchsorted(self.start_s, np.asarray(time_s, dtype=np.float64), side="right") - 1, 0)
-        return np.asarray(self.acceleration_dps2[i], dtype=np.float64)
 
 
 def _from_pieces(start_s: float, position: float, velocity: float, pieces: list[tuple[float, float]]) -> Trajectory:
@@ -169,46 +170,43 @@ class Ripple:
         self._per_deg = 2 * np.pi / self._PERIOD_DEG
 
     def angle_deg(self, angle_deg: float, speed_dps: float) -> float:
-        """Return what the ripple adds to the angle of a shaft: as `at`, for one time."""
+        """Return what the ripple adds to the angle of a shaft: as `angles_deg`, for one time."""
         fade = min(abs(speed_dps) / self._FADES_DPS, 1.0)
         return self._amplitude_deg * fade * float(np.sin(angle_deg * self._per_deg))
 
-    def at(self, shaft: "Trajectory", time_s: ArrayLike) -> tuple[Floats, Floats]:
-        """Return what the ripple adds to the angle and to the rate (°, °/s)."""
-        t = np.asarray(time_s, dtype=np.float64)
+    def angles_deg(self, angle_deg: Floats, speed_dps: Floats) -> Floats | float:
+        """Return what the ripple adds to the angle of a shaft with these angles and speeds."""
         if not self._amplitude_deg:
-            return np.zeros_like(t), np.zeros_like(t)
-        angle, speed = shaft.at(t)
-        fade = np.minimum(np.abs(speed) / self._FADES_DPS, 1.0)
-        fading = np.where(fade < 1, np.sign(speed) * shaft.acceleration_at(t) / self._FADES_DPS, 0.0)
-        phase = angle * self._per_deg
-        wave, slope = np.sin(phase), np.cos(phase) * self._per_deg * speed
-        return self._amplitude_deg * fade * wave, self._amplitude_deg * (fading * wave + fade * slope)
+            return 0.0
+        fade = np.minimum(np.abs(speed_dps) / self._FADES_DPS, 1.0)
+        return self._amplitude_deg * fade * np.sin(angle_deg * self._per_deg)
 
 
 class Platter:
-    """The platter on the shaft: backlash and a damped structural vibration.
+    """The platter on the shaft: backlash, a damped structural vibration, and the ripple of the shaft's speed.
 
     The backlash operator keeps the platter within ±backlash/2 of the shaft; otherwise friction holds the platter. The
     vibration is x'' + 2ζω x' + ω² x = −a(t), solved exactly for each piece of constant shaft acceleration a.
     """
 
-    def __init__(self, play_deg: float, structure_hz: float, damping: float) -> None:
+    def __init__(self, play_deg: float, structure_hz: float, damping: float, ripple: Ripple | None = None) -> None:
         self._half_play = play_deg / 2
         self._omega = 2 * np.pi * structure_hz
         self._zeta = damping
+        self._ripple = ripple or Ripple(0.0)
         self.shaft = rest(0.0, 0.0)
         self._platter = np.zeros(1)
         self._shake = np.zeros((1, 2))  # deflection and its rate at each knot
 
     def follow(self, path: Trajectory, previous: "Platter | None") -> None:
         """Take ``path`` as the shaft's motion, going on from where ``previous`` leaves the platter at its start."""
-        t0 = path.start_s[0]
         if previous is None:
             platter, shake = float(path.position_deg[0]), (0.0, 0.0)
         else:
-            platter = float(previous._rigid(np.array([t0]))[0][0])
-            shake = tuple(float(s[0]) for s in previous._vibration(np.array([t0])))  # type: ignore[assignment]
+            piece, since_s = previous.shaft.pieces(path.start_s[:1])
+            platter = float(previous._rigid(piece, previous.shaft.within(piece, since_s)[0])[0])
+            deflection, rate = previous._vibration(piece, since_s)
+            shake = float(deflection[0]), float(rate[0])
         self.shaft = path
         self._platter = np.empty(len(path.start_s))
         self._shake = np.empty((len(path.start_s), 2))
@@ -219,32 +217,26 @@ class Platter:
                 shake = self._swing(shake, float(path.acceleration_dps2[k - 1]), path.start_s[k] - path.start_s[k - 1])
             self._shake[k] = shake
 
-    def at(self, time_s: ArrayLike) -> tuple[Floats, Floats]:
-        """Return the platter's angle and rate (°, °/s) at times within this path."""
-        t = np.asarray(time_s, dtype=np.float64)
-        angle, rate = self._rigid(t)
+    def at(self, time_s: ArrayLike) -> Floats:
+        """Return the platter's angle (°) at times within this path."""
+        piece, since_s = self.shaft.pieces(np.asarray(time_s, dtype=np.float64))
+        shaft_deg, speed_dps = self.shaft.within(piece, since_s)
+        angle = self._rigid(piece, shaft_deg)
+        if self._omega:
+            angle = angle + self._vibration(piece, since_s)[0]
+        return angle + self._ripple.angles_deg(shaft_deg, speed_dps)
+
+    def _rigid(self, piece: NDArray[np.intp], shaft_deg: Floats) -> Floats:
+        """Return the angle of a platter that does not vibrate."""
+        held = self._platter[piece]
+        return np.minimum(np.maximum(held, shaft_deg - self._half_play), shaft_deg + self._half_play)
+
+    def _vibration(self, piece: NDArray[np.intp], since_s: Floats) -> tuple[Floats, Floats]:
+        """Return deflection and its rate."""
         if self._omega == 0:
-            return angle, rate
-        deflection, deflection_rate = self._vibration(t)
-        return angle + deflection, rate + deflection_rate
-
-    def _knot(self, t: Floats) -> NDArray[np.intp]:
-        return np.maximum(self.shaft.start_s.searchsorted(t, side="right") - 1, 0)
-
-    def _rigid(self, t: Floats) -> tuple[Floats, Floats]:
-        x, v = self.shaft.at(t)
-        held = self._platter[self._knot(t)]
-        low, high = x - self._half_play, x + self._half_play
-        angle = np.minimum(np.maximum(held, low), high)
-        engaged = ((v > 0) & (angle <= low)) | ((v < 0) & (angle >= high))
-        return angle, np.where(engaged, v, 0.0)
-
-    def _vibration(self, t: Floats) -> tuple[Floats, Floats]:
-        if self._omega == 0:
-            return np.zeros_like(t), np.zeros_like(t)
-        k = self._knot(t)
-        tau = np.maximum(t - self.shaft.start_s[k], 0.0)
-        return self._response(self._shake[k, 0], self._shake[k, 1], self.shaft.acceleration_dps2[k], tau)
+            return np.zeros_like(since_s), np.zeros_like(since_s)
+        shake = self._shake[piece]
+        return self._response(shake[..., 0], shake[..., 1], self.shaft.acceleration_dps2[piece], since_s)
 
     def _swing(self, state: tuple[float, float], acceleration: float, tau: float) -> tuple[float, float]:
         if self._omega == 0:

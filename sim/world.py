@@ -122,32 +122,24 @@ class World:
 
     def table_deg(self, time_ns: int | None = None) -> float:
         """Return the true angle of the platter, now or at a time not longer ago than `HISTORY_S`."""
-        return float(self.table_motion([self.clock.now_ns() if time_ns is None else time_ns])[0][0])
+        return float(self.table_angles([self.clock.now_ns() if time_ns is None else time_ns])[0])
 
-    def table_motion(self, times_ns: ArrayLike) -> tuple[Floats, Floats]:
-        """Return the platter's true angle (°) and rate (°/s) at each of the given times, int64 (n,)."""
+    def table_angles(self, times_ns: ArrayLike) -> Floats:
+        """Return the platter's true angle (°) at each of the given times, int64 (n,)."""
         t: NDArray[np.int64] = np.atleast_1d(np.asarray(times_ns, dtype=np.int64))
         first, last = self._index(int(t.min())), self._index(int(t.max()))
         if first == last:
-            angle, rate = self._moved(self._motions[first][1], t * 1e-9)
+            angle = self._motions[first][1].at(t * 1e-9)
         else:
             starts = np.array([start for start, _ in self._motions])
             which = np.maximum(np.searchsorted(starts, t, side="right") - 1, 0)
-            angle, rate = np.empty(t.shape), np.empty(t.shape)
+            angle = np.empty(t.shape)
             for i in range(first, last + 1):
                 here = which == i
-                angle[here], rate[here] = self._moved(self._motions[i][1], t[here] * 1e-9)
+                angle[here] = self._motions[i][1].at(t[here] * 1e-9)
         for start_s, seconds, slip_deg in self._slips:
-            share = (t * 1e-9 - start_s) / seconds
-            angle += slip_deg * np.clip(share, 0.0, 1.0)
-            rate += np.where((share >= 0) & (share < 1), slip_deg / seconds, 0.0)
-        return angle, rate
-
-    def _moved(self, platter: Platter, time_s: ArrayLike) -> tuple[Floats, Floats]:
-        """Return the platter's angle and rate within one motion, with the ripple of the shaft's speed."""
-        angle, rate = platter.at(time_s)
-        more_deg, more_dps = self._ripple.at(platter.shaft, time_s)
-        return angle + more_deg, rate + more_dps
+            angle += slip_deg * np.clip((t * 1e-9 - start_s) / seconds, 0.0, 1.0)
+        return angle
 
     # -- the object on it -----------------------------------------------------------------------------------------
 
@@ -179,7 +171,8 @@ class World:
             self.change(**{name: getattr(before, name) for name in values})
 
     def _platter(self) -> Platter:
-        return Platter(self.noise.backlash_deg, self.noise.structure_hz, self.noise.structure_damping)
+        noise = self.noise
+        return Platter(noise.backlash_deg, noise.structure_hz, noise.structure_damping, self._ripple)
 
     def _index(self, time_ns: int) -> int:
         for i in range(len(self._motions) - 1, 0, -1):

@@ -84,7 +84,7 @@ class InertialModel:
         bias[0] += self.gyro_bias_dps
         np.cumsum(bias, axis=0, out=bias)
 
-        angle_deg, _ = self._world.table_motion(times_ns)
+        angle_deg = self._world.table_angles(times_ns)
         rate_dps = _steps(self._last_deg, angle_deg) / elapsed_s
 
         felt = np.empty((n, 6))

@@ -114,7 +114,7 @@ def rows_of_spot(noise: NoiseModel, seed: int = 0) -> tuple[NDArray[np.float64],
     lever = PX_PER_MM * 80
     seen_deg = np.degrees(np.arcsin((columns - CENTRE_PX[0]) / lever))
     middle_ns = stamp_ns + 1_000_000 + round(noise.camera_readout_ms * 1e6 / 480) * np.arange(100, 300)
-    return seen_deg - world.table_motion(middle_ns)[0], 0.06
+    return seen_deg - world.table_angles(middle_ns), 0.06
 
 
 def test_rows_are_exposed_one_after_the_other() -> None:

@@ -40,7 +40,7 @@ def test_past_does_not_change(moves_made: list[tuple[float, float]]) -> None:
     world = run(moves_made, NoiseModel(), lambda w: seen.append((w.clock.now_ns(), w.table_deg())))
     kept = [(t, angle) for t, angle in seen if t > world.clock.now_ns() - HISTORY_S * 1e9]
     times = [t for t, _ in kept]
-    assert world.table_motion(times)[0] == pytest.approx([angle for _, angle in kept], abs=1e-9)
+    assert world.table_angles(times) == pytest.approx([angle for _, angle in kept], abs=1e-9)
     assert [world.table_deg(t) for t in times] == pytest.approx([angle for _, angle in kept], abs=1e-9)
 
 
@@ -61,7 +61,7 @@ def test_reading_the_world_changes_nothing(moves_made: list[tuple[float, float]]
 def test_table_stays_within_backlash_and_ringing(moves_made: list[tuple[float, float]]) -> None:
     world = run(moves_made, NoiseModel(structure_hz=0.0, speed_ripple=0.0), lambda _: None)
     t = np.arange(0, world.clock.now_ns(), 1_000_000)
-    table, _ = world.table_motion(t)
+    table = world.table_angles(t)
     shaft = np.array([world.shaft(int(when))[0] for when in t])
     assert np.abs(table - shaft).max() <= world.noise.backlash_deg / 2 + 1e-9
 
@@ -71,8 +71,7 @@ def test_table_stays_within_backlash_and_ringing(moves_made: list[tuple[float, f
 def test_table_follows_the_shaft_without_backlash_and_ringing(moves_made: list[tuple[float, float]]) -> None:
     world = run(moves_made, perfect, lambda _: None)
     for t in np.linspace(0, world.clock.now_ns(), 50).astype(np.int64):
-        angle, rate = world.table_motion([t])
-        assert (angle[0], rate[0]) == pytest.approx(world.shaft(int(t)), abs=1e-9)
+        assert world.table_deg(int(t)) == pytest.approx(world.shaft(int(t))[0], abs=1e-9)
 
 
 def test_interrupted_motion_continues_without_a_jump() -> None:
@@ -95,10 +94,12 @@ def test_slip_rotates_the_platter_and_not_the_shaft() -> None:
     world.slip(-4.0, seconds=0.1)
     assert world.table_deg() == pytest.approx(30.0)
     world.clock.sleep(0.05)
-    assert np.ravel(world.table_motion([world.clock.now_ns()])) == pytest.approx([28.0, -40.0])
+    now_ns = world.clock.now_ns()
+    assert world.table_angles([now_ns - 25_000_000, now_ns]) == pytest.approx([29.0, 28.0])  # at a constant rate
     world.clock.sleep(0.45)
     assert world.shaft()[0] == 30.0
-    assert np.ravel(world.table_motion([world.clock.now_ns()])) == pytest.approx([26.0, 0.0])
+    now_ns = world.clock.now_ns()
+    assert world.table_angles([now_ns - 300_000_000, now_ns]) == pytest.approx([26.0, 26.0])
     assert world.table_deg(slipped_ns) == pytest.approx(30.0)
     world.slip(1.0)
     drive(world, 60.0)
@@ -120,7 +121,8 @@ def test_endless_rotation_needs_no_history() -> None:
     world = World(noise=perfect)
     world.drive(to_velocity(0.0, 0.0, 0.0, 36.0, 1000.0))
     world.clock.sleep(3600.0)
-    assert world.table_motion([world.clock.now_ns()])[1][0] == 36.0
+    now_ns = world.clock.now_ns()
+    assert np.diff(world.table_angles([now_ns - 10**9, now_ns])) == pytest.approx(36.0)
     assert world.table_deg() == pytest.approx(36.0 * 3600 - 36.0**2 / 2000, rel=1e-9)
 
 

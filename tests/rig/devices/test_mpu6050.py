@@ -12,6 +12,7 @@ from rig.devices.mpu6050 import Mpu6050
 from sim.motion import to_position
 from tests.fuzzing import examples
 from tests.rig.devices.mpu6050_bench import AT, Bench
+from tests.sim.truth import table_rates
 
 # -- samples ------------------------------------------------------------------------------------------------------
 
@@ -82,7 +83,7 @@ def test_samples_match_the_motion(bench: Bench) -> None:
     time_ns = np.concatenate([p.time_ns for p in parts])
     rate = np.concatenate([p.gyro_dps[:, 2] for p in parts])
     assert rate.max() == pytest.approx(120, abs=1)
-    np.testing.assert_allclose(rate, bench.world.table_motion(time_ns)[1], atol=400 * 0.006)
+    np.testing.assert_allclose(rate, table_rates(bench.world, time_ns), atol=400 * 0.006)
 
 
 def test_reading_samples_takes_two_transactions(bench: Bench, imu: Mpu6050) -> None:

@@ -12,6 +12,7 @@ from rig.motion.turntable import Flight, Turntable
 from sim.noise import NoiseModel
 from tests.fuzzing import examples
 from tests.rig.bench_parts import motion_bench
+from tests.sim.truth import table_rates
 
 
 def flown(goals: list[float], velocity_dps: float, seed: int, noise: NoiseModel | None = None, lost: float = 0.0):  # type: ignore[no-untyped-def]
@@ -30,7 +31,7 @@ def flown(goals: list[float], velocity_dps: float, seed: int, noise: NoiseModel 
         first_ns = max(trajectory.start_ns, trajectory.end_ns - 11_000_000_000)
         times = np.sort(rng.integers(first_ns, trajectory.end_ns, 300))
         motion = trajectory.at(times)
-        angle, rate = wires.world.table_motion(times)
+        angle, rate = wires.world.table_angles(times), table_rates(wires.world, times)
         return motion.angle_deg - (angle - offset_deg), motion.sigma_deg, motion.rate_dps - rate, trajectory
 
 
@@ -63,7 +64,7 @@ def test_angle_of_a_fast_platter_is_neither_late_nor_early() -> None:
                 trajectory = recorder.fit()
                 assert trajectory is not None
                 times = np.linspace(trajectory.start_ns + 5e6, trajectory.end_ns - 1e7, 400).astype(np.int64)
-                angle, rate = wires.world.table_motion(times)
+                angle, rate = wires.world.table_angles(times), table_rates(wires.world, times)
             error = trajectory.at(times).angle_deg - angle
             fast, resting = np.abs(rate) > 85, np.abs(rate) < 0.5
             late_ms.append((error[resting].mean() - error[fast].mean()) / rate[fast].mean() * 1e3)
