@@ -80,7 +80,7 @@ class Enrollment:
     ) -> StoredView:
         """Store a view and its image, uint8 (H, W, 3) BGR. Both are durable when this returns.
 
-        ``encoded`` is the image as PNG, if `rig.views.image_files.encode_meanwhile` was called before, ``segmented``
+        ``encoded`` is the image as PNG, if `rig.views.image_files.Encoder` began with it before, ``segmented``
         that of the `rig.views.description.DescribedView`.
 
         The image is complete under its name before its row is committed. A crash in between leaves an image without a
@@ -108,7 +108,7 @@ class Enrollment:
                 f"view {index} is not described by {PAPER_DESCRIPTOR}", next_step="describe it: hbr.describe"
             )
         packed = pack(record.descriptors, record.region)
-        encoded = images.encode_meanwhile(image_bgr) if encoded is None else encoded
+        png = images.encode(image_bgr) if encoded is None else encoded.result()
         captured_utc = None
         if record.captured_ns is not None:
             age_ns = self._clock.now_ns() - record.captured_ns
@@ -122,7 +122,7 @@ class Enrollment:
                     f"view {index} of {self.object_name!r} is stored already",
                     next_step="continue with the missing views; check that no other process enrolls this object",
                 )
-            image = self._write_image(f"{index:03d}.png", encoded.result())
+            image = self._write_image(f"{index:03d}.png", png)
             new = NewView(index, measured(record), self.session.id, captured_utc, image, packed)
             with changing_enrollments(connection, [self.id]):
                 (view_id,) = insert_views(connection, self.id, [new])

@@ -28,7 +28,7 @@ from rig.motion.turntable import Flight, Turntable
 from rig.plans.capture import announced, capture, moved, warn_of_table
 from rig.views.capture import Attempt, Viewer
 from rig.views.description import DescribedView, ViewDescriber
-from rig.views.image_files import encode_meanwhile
+from rig.views.image_files import Encoder
 from rig.views.stream import FrameStream, StreamFrame, middle_ns
 
 NEAR_SHARE = 0.6
@@ -140,6 +140,7 @@ def fly_views(
     )
     off = dict(zip(scan.stamps_ns, judge.irregular(scan.stamps_ns).tolist(), strict=True))
     stored: set[int] = set()
+    encoder = Encoder()
     for index, angle_deg in angles_deg.items():
         _, frame = scan.nearest.pop(index, (inf, None))
         if frame is None:
@@ -151,7 +152,7 @@ def fly_views(
         if not attempt.accepted:
             yield Rejected(index, attempt.number, attempt.reasons, attempt.evidence)
             continue
-        encoded = encode_meanwhile(attempt.image_bgr)
+        encoded = encoder.begin(attempt.image_bgr)
         described = describe(attempt.image_bgr)
         attempt = judge.at_the_object(attempt, described.segmentation, trajectory)
         yield from _store(bench, enrollment, index, angle_deg, attempt, described, encoded)

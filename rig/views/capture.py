@@ -14,7 +14,7 @@ from rig.config import RigConfig, ViewConfig
 from rig.devices.camera import Camera, CameraLocks, Frame
 from rig.safety.gyro_rotation import Stillness
 from rig.views.description import within
-from rig.views.image_files import encode_meanwhile
+from rig.views.image_files import Encoder
 from rig.views.stream import exposed_before_stamp_ns
 
 DARK_LEVEL = 8
@@ -187,7 +187,7 @@ class Viewer:
 
     def __init__(self, camera: Camera, config: RigConfig, *, encodes: bool = False) -> None:
         self._camera = camera
-        self._encodes = encodes
+        self._encoder = Encoder() if encodes else None
         self._config = config.view
         self._early_ns = exposed_before_stamp_ns(config)
         self._locks = camera.read_locks()
@@ -214,7 +214,7 @@ class Viewer:
         while number - repeated <= self._config.retakes:
             number += 1
             frame = self._camera.capture(after_ns, meanwhile)
-            encoded = encode_meanwhile(frame.image_bgr) if self._encodes else None
+            encoded = None if self._encoder is None else self._encoder.begin(frame.image_bgr)
             attempt = self._check(number, frame, settled_ns, check_still(after_ns - self._early_ns))
             attempt = replace(attempt, encoded=encoded)
             self._last = frame.image_bgr

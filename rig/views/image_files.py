@@ -62,15 +62,18 @@ def encode(image_bgr: NDArray[np.uint8]) -> bytes:
     return png.tobytes()
 
 
-def encode_meanwhile(image_bgr: NDArray[np.uint8]) -> Future[bytes]:
-    """Begin to encode an image, which must not change, in a thread of its own; the result is that of `encode`.
+class Encoder:
+    """Encodes images in a thread of its own, which leaves the interpreter to the other threads while it works.
 
-    The encoder leaves the interpreter to the other threads while it works. Its thread ends with the image.
+    The thread ends with the last reference to this object.
     """
-    thread = ThreadPoolExecutor(1, "encoder")
-    encoded = thread.submit(encode, image_bgr)
-    thread.shutdown(wait=False)
-    return encoded
+
+    def __init__(self) -> None:
+        self._thread = ThreadPoolExecutor(1, "encoder")
+
+    def begin(self, image_bgr: NDArray[np.uint8]) -> Future[bytes]:
+        """Begin to encode an image, which must not change; the result is that of `encode`."""
+        return self._thread.submit(encode, image_bgr)
 
 
 def read_file(path: Path) -> bytes:

@@ -14,7 +14,7 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, 
 
 from rig.catalog import Catalog, Enrollment, EnrollmentStatus, Provenance, ViewRecord, clean_name
 from rig.core.errors import CatalogError, ObjectExists, ObjectNotFound, UsageError
-from rig.views.image_files import encode_meanwhile
+from rig.views.image_files import Encoder
 from sim.clock import EPOCH, VirtualClock
 from tests.fuzzing import examples
 from tests.rig.catalog.catalog_samples import PROVENANCE, fill, image, plan, record
@@ -265,7 +265,7 @@ def test_add_rejects_invalid_images(catalog: Catalog, bad: np.ndarray) -> None:
     with pytest.raises(UsageError):
         enrollment.add(record(0), bad)
     with pytest.raises(UsageError):
-        enrollment.add(record(0), bad, encode_meanwhile(bad))
+        enrollment.add(record(0), bad, Encoder().begin(bad))
     assert enrollment.missing() == (0, 1, 2)
 
 
