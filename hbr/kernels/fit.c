@@ -30,9 +30,9 @@ static double selected(double *value, int64_t count, int64_t place) {
 }
 
 /* Take every fifth pixel in both directions from the third one on, where both images (height, width) are neither black nor
-   overexposed: `useful` marks these pixels of the one image, `small` (height, width, 3) has the levels of the other. `plane`
-   (rows, columns, 3) is what is fitted there. -> `count` rows of `basis` and `difference` (count, 3), and the medians (3) of
-   the latter. `work` holds 3 * rows * columns numbers. */
+   overexposed: `useful` marks these pixels of the one image, `small` (height, width, 3) has the levels of the other, whose
+   logarithms are in `logarithm` (256). `plane` (rows, columns, 3) is what is fitted there. -> `count` rows of `basis` and
+   `difference` (count, 3), and the medians (3) of the latter. `work` holds 3 * rows * columns numbers. */
 EXPORT void hbr_samples(const uint8_t *small, const uint8_t *useful, const float *logarithm, const float *table_log,
                         int64_t height, int64_t width, const double *plane, double *work, double *basis,
                         double *difference, double *median, int64_t *count) {
@@ -45,7 +45,7 @@ EXPORT void hbr_samples(const uint8_t *small, const uint8_t *useful, const float
             if (!useful[at] || brightest <= 6 || brightest >= 250) continue;
             for (int64_t c = 0; c < 3; c++) {
                 basis[3 * n + c] = plane[c];
-                difference[3 * n + c] = (double)(logarithm[3 * at + c] - table_log[3 * at + c]);
+                difference[3 * n + c] = (double)(logarithm[small[3 * at + c]] - table_log[3 * at + c]);
             }
             n++;
         }

@@ -23,8 +23,10 @@ def samples(
         An image,
     useful : bool array (h, w)
         and which pixels of the other one are useful.
-    logarithm, table_log : float32 arrays (h, w, 3)
-        The logarithms of both.
+    logarithm : float32 array (256,)
+        The logarithm of each level of the one,
+    table_log : float32 array (h, w, 3)
+        and the logarithms of the other one.
     plane : float64 array (rows, columns, 3)
         What is fitted at these pixels.
 

@@ -5,31 +5,49 @@
 
 PART uint8_t rounded(float value) { return (uint8_t)((value + MAGIC) - MAGIC); }
 
+/* Three channels are computed as four numbers, the last of which belongs to the next pixel. */
+typedef float float4 __attribute__((vector_size(16)));
+typedef int32_t int4 __attribute__((vector_size(16)));
+typedef uint16_t short4 __attribute__((vector_size(8)));
+typedef uint8_t byte4 __attribute__((vector_size(4)));
+
+/* Store a pixel, rounded. */
+PART void store(float4 pixel, uint8_t *to) {
+    const byte4 bytes = __builtin_convertvector(__builtin_convertvector((pixel + MAGIC) - MAGIC, int4), byte4);
+    __builtin_memcpy(to, &bytes, 3);
+}
+
+/* Add up `factor` neighbours in a row of sums, and store their averages: 3 width factor + 1 numbers -> 3 width. */
+PART void shrink_row(const uint16_t *sums, int64_t width, int64_t factor, float share, uint8_t *small) {
+    for (int64_t x = 0; x < width; x++, small += 3) {
+        int4 sum = {0, 0, 0, 0};
+        for (int64_t k = 0; k < factor; k++, sums += 3) {
+            short4 pixel;
+            __builtin_memcpy(&pixel, sums, sizeof pixel);
+            sum += __builtin_convertvector(pixel, int4);
+        }
+        store(__builtin_convertvector(sum, float4) * share, small);
+    }
+}
+
 /* Average squares of `factor` x `factor` pixels: (height factor, width factor, 3) -> (height, width, 3). `sums` holds
-   a row of the image, whose sums of up to 257 bytes fit. */
+   a row of the image and one number more; sums of up to 257 bytes fit. */
 EXPORT FOR_EVERY_PROCESSOR void hbr_shrink(const uint8_t *image, int64_t stride, int64_t height, int64_t width,
                                            int64_t factor, uint16_t *sums, uint8_t *small) {
     const int64_t length = 3 * width * factor;
     const float share = 1.0f / (float)(factor * factor);
-    for (int64_t y = 0; y < height; y++) {
+    sums[length] = 0;
+    for (int64_t y = 0; y < height; y++, small += 3 * width) {
         for (int64_t i = 0; i < length; i++) sums[i] = image[i];
         for (int64_t k = 1; k < factor; k++) {
             image += stride;
             for (int64_t i = 0; i < length; i++) sums[i] = (uint16_t)(sums[i] + image[i]);
         }
         image += stride;
-        const uint16_t *from = sums;
-        for (int64_t x = 0; x < width; x++, small += 3) {
-            int32_t b = 0, g = 0, r = 0;
-            for (int64_t k = 0; k < factor; k++, from += 3) {
-                b += from[0];
-                g += from[1];
-                r += from[2];
-            }
-            small[0] = rounded((float)b * share);
-            small[1] = rounded((float)g * share);
-            small[2] = rounded((float)r * share);
-        }
+        if (factor == 5) /* 640 x 480, unrolled */
+            shrink_row(sums, width, 5, share, small);
+        else
+            shrink_row(sums, width, factor, share, small);
     }
 }
 
@@ -37,7 +55,6 @@ EXPORT FOR_EVERY_PROCESSOR void hbr_shrink(const uint8_t *image, int64_t stride,
    row, then over the rows. A pixel takes `most` pixels from `first` on with `weights` (side, most), the same in both
    directions; some weights are 0. `pixels` holds 3 * size + 1 floats, because three channels are read as
    four; `line` and `sums` hold 4 * side floats each. */
-typedef float float4 __attribute__((vector_size(16)));
 
 PART void average_row(const float *pixels, int64_t side, const int64_t *first, const float *weights, int64_t most,
                       float *line) {
@@ -83,8 +100,8 @@ EXPORT FOR_EVERY_PROCESSOR void hbr_average(const uint8_t *image, int64_t stride
 PART float largest(float a, float b) { return a > b ? a : b; }
 PART float absolute(float a) { return a < 0 ? -a : a; }
 
-/* Compare the logarithms of a small frame with those of the empty-table image: (height, width, 3) -> `evenly`, `coloured`
-   (height, width), and as 0 or 1 the pixels that are certain, possible, and in agreement. `along` (3 width) and `down`
+/* Compare the logarithms of a small frame, those of each level in `logarithm` (256), with `table_log`, those of the
+   empty-table image: (height, width, 3) -> `evenly`, `coloured` (height, width), and as 0 or 1 the pixels that are certain, possible, and in agreement. `along` (3 width) and `down`
    (3 height) are the parts of the planes that the illumination adds, `noise` (256) is that of each level. `line` holds 8
    floats for each column. */
 EXPORT FOR_EVERY_PROCESSOR void hbr_difference(const uint8_t *small, const uint8_t *table, const float *logarithm,
@@ -98,7 +115,7 @@ EXPORT FOR_EVERY_PROCESSOR void hbr_difference(const uint8_t *small, const uint8
         for (int64_t x = 0; x < width; x++)
             for (int64_t c = 0; c < 3; c++) tile[3 * x + c] = down[c];
 #pragma GCC ivdep
-        for (int64_t i = 0; i < 3 * width; i++) rest[i] = (logarithm[i] - table_log[i]) - (along[i] + tile[i]);
+        for (int64_t i = 0; i < 3 * width; i++) rest[i] = (logarithm[small[i]] - table_log[i]) - (along[i] + tile[i]);
 #pragma GCC ivdep
         for (int64_t i = 0; i < 3 * width; i++) darker[i] = small[i] < table[i] ? small[i] : table[i];
         for (int64_t x = 0; x < width; x++) {
@@ -120,47 +137,9 @@ EXPORT FOR_EVERY_PROCESSOR void hbr_difference(const uint8_t *small, const uint8
             possible[x] = (evenly[x] < -0.12f) & !sure;
             agrees[x] = tile[x] < agrees_below;
         }
-        small += 3 * width, table += 3 * width, logarithm += 3 * width, table_log += 3 * width;
+        small += 3 * width, table += 3 * width, table_log += 3 * width;
         evenly += width, coloured += width, certain += width, possible += width, agrees += width;
     }
-}
-
-/* Grow a mask of 0 and 1 by a symmetric disc, whose rows reach `reach[j]` pixels to both sides, j = 0 .. 2 radius. What
-   passes an end of a row comes to the next one: the caller has a margin. `near` and `far` hold a mask each. */
-PART void grow(int64_t height, int64_t width, const int64_t *reach, int64_t radius, uint8_t *near, uint8_t *far,
-               uint8_t *out) {
-    const int64_t n = height * width;
-    for (int64_t i = 0; i < n; i++) out[i] = 0;
-    for (int64_t k = 0; k <= radius; k++) {
-        if (k) { /* one pixel further to both sides */
-            far[0] = near[0] | near[1];
-#pragma GCC ivdep
-            for (int64_t i = 1; i < n - 1; i++) far[i] = near[i - 1] | near[i] | near[i + 1];
-            far[n - 1] = near[n - 2] | near[n - 1];
-            uint8_t *other = near;
-            near = far;
-            far = other;
-        }
-        for (int64_t j = -radius; j <= radius; j++) {
-            if (reach[j + radius] != k) continue;
-            const int64_t shift = j * width, from = shift < 0 ? -shift : 0, to = shift < 0 ? n : n - shift;
-#pragma GCC ivdep
-            for (int64_t i = from; i < to; i++) out[i] |= near[i + shift];
-        }
-    }
-}
-
-/* Close a mask of 0 and 1 with a disc: grow it, then grow what is left. The mask has a margin of zeros that is wider than
-   the disc's radius. `work` holds three masks. */
-EXPORT FOR_EVERY_PROCESSOR void hbr_closed(const uint8_t *mask, int64_t height, int64_t width, const int64_t *reach,
-                                           int64_t radius, uint8_t *work, uint8_t *out) {
-    const int64_t n = height * width;
-    uint8_t *near = work, *far = work + n, *grown = work + 2 * n;
-    for (int64_t i = 0; i < n; i++) near[i] = mask[i];
-    grow(height, width, reach, radius, near, far, grown);
-    for (int64_t i = 0; i < n; i++) near[i] = !grown[i];
-    grow(height, width, reach, radius, near, far, out);
-    for (int64_t i = 0; i < n; i++) out[i] = !out[i];
 }
 
 #define REACH 7 /* pixels that the blur of a mask reaches to each side */
@@ -228,14 +207,19 @@ EXPORT FOR_EVERY_PROCESSOR void hbr_surround(const uint8_t *crop, const uint8_t 
                 sum += share[k] * ((uint32_t)rows[REACH - k][x] + rows[REACH + k][x]);
             line[x] = (uint8_t)((sum + (1 << 15)) >> 16);
         }
-        for (int64_t x = 0; x < side; x++, crop += 3, out += 3) {
-            if (line[x] == 255 || line[x] == 0) { /* the same as by the products below */
-                for (int64_t c = 0; c < 3; c++) out[c] = line[x] ? crop[c] : level;
+        for (int64_t x = 0; x < side;) {
+            uint64_t eight = 1;
+            if (x + 8 <= side) __builtin_memcpy(&eight, line + x, sizeof eight);
+            if (eight == 0 || eight == UINT64_MAX) { /* the same as by the products below */
+                for (int64_t i = 0; i < 24; i++) out[i] = eight ? crop[i] : level;
+                x += 8, crop += 24, out += 24;
                 continue;
             }
             const float weight = (float)line[x] * (1.0f / 255.0f), rest = 1.0f - weight;
             const float sum = weight + rest + 1e-5f, even = ground * rest;
-            for (int64_t c = 0; c < 3; c++) out[c] = rounded(((float)crop[c] * weight + even) / sum);
+            const float4 pixel = {crop[0], crop[1], crop[2], 0};
+            store((pixel * weight + even) / sum, out);
+            x++, crop += 3, out += 3;
         }
     }
 }

@@ -26,7 +26,7 @@ def shrink(image: ImageArray, size: tuple[int, int]) -> ImageArray | None:
         return None
     if image.strides[1:] != (3, 1):
         image = np.ascontiguousarray(image)
-    sums, small = np.empty(3 * image.shape[1], np.uint16), np.empty((height, width, 3), np.uint8)
+    sums, small = np.empty(3 * image.shape[1] + 1, np.uint16), np.empty((height, width, 3), np.uint8)
     found.hbr_shrink(address(image), image.strides[0], height, width, factor, address(sums), address(small))
     return small
 
@@ -94,20 +94,22 @@ def surround(crop: ImageArray, mask: Bytes, bright: float) -> ImageArray | None:
 def compare(
     small: ImageArray,
     table: ImageArray,
-    logarithms: tuple[Floats, Floats],
+    logarithm: Floats,
+    table_log: Floats,
     sides: tuple[Floats, Floats],
     noise: Floats,
     agrees_below: float,
 ) -> tuple[Floats, Floats, Bytes, Bytes, Bytes] | None:
     """Compare a small frame with an empty-table image, as `hbr.segmentation.background.Background.difference` does.
 
-    Returns the planes ``evenly`` and ``coloured``, and 0 or 1 for pixels that are certain, possible and in agreement.
+    ``logarithm`` (256,) is that of each level, ``table_log`` (h, w, 3) that of the table. Returns the planes ``evenly``
+    and ``coloured``, and 0 or 1 for pixels that are certain, possible and in agreement.
     """
     found = library()
     if found is None:
         return None
     height, width = small.shape[:2]
-    arrays = [np.ascontiguousarray(one) for one in (small, table, *logarithms, *sides, noise)]
+    arrays = [np.ascontiguousarray(one) for one in (small, table, logarithm, table_log, *sides, noise)]
     own = [address(one) for one in arrays]
     floats, masks = np.empty((2, height, width), np.float32), np.empty((3, height, width), np.uint8)
     line = np.empty(8 * width, np.float32)
@@ -117,18 +119,3 @@ def compare(
         start, start + plane, *(masked + k * height * width for k in range(3)),
     )  # fmt: skip
     return floats[0], floats[1], masks[0], masks[1], masks[2]
-
-
-def closed(mask: Bytes, reach: NDArray[np.int64]) -> Bytes | None:
-    """Return a mask of 0 and 1 after morphological closing with a disc whose rows reach so far to both sides.
-
-    The mask has a margin of zeros that is wider than the disc's radius.
-    """
-    found = library()
-    if found is None:
-        return None
-    height, width = mask.shape
-    mask = np.ascontiguousarray(mask)
-    work, out = np.empty((3, height, width), np.uint8), np.empty((height, width), np.uint8)
-    found.hbr_closed(address(mask), height, width, address(reach), len(reach) // 2, address(work), address(out))
-    return out

@@ -167,9 +167,8 @@ class Background:
 
     def difference(self, small: ImageArray) -> Difference:
         """Compare a small frame, as `shrunk` returns it, with the empty-table image."""
-        logarithm = _logarithm(small)
-        slopes = _fit(small, self._useful, logarithm, self._log)
-        evenly, coloured, certain, possible, agrees = self._planes(small, logarithm, Illumination(slopes))
+        slopes = _fit(small, self._useful, self._log)
+        evenly, coloured, certain, possible, agrees = self._planes(small, Illumination(slopes))
         # a shadow is smooth: a fine texture that the table does not have belongs to an object
         grain = (np.abs(cv2.Laplacian(evenly, cv2.CV_32F, ksize=3)) > 0.5).astype(np.float32)
         certain |= possible & (cv2.blur(grain, (5, 5)) > 0.15)
@@ -184,16 +183,14 @@ class Background:
             coloured,
         )
 
-    def _planes(
-        self, small: ImageArray, logarithm: Floats, illumination: Illumination
-    ) -> tuple[Floats, Floats, Mask, Mask, Mask]:
+    def _planes(self, small: ImageArray, illumination: Illumination) -> tuple[Floats, Floats, Mask, Mask, Mask]:
         """Return the planes of a `Difference`, without the grain, and where the frame agrees with this image."""
         sides = illumination.sides(*small.shape[:2])
-        found = view.compare(small, self._grey_levels, (logarithm, self._log), sides, _NOISE, _AGREES)
+        found = view.compare(small, self._grey_levels, _LOG, self._log, sides, _NOISE, _AGREES)
         if found is not None:
             evenly, coloured, certain, possible, agrees = found
             return evenly, coloured, certain.view(np.bool_), possible.view(np.bool_), agrees.view(np.bool_)
-        residual = cv2.split(logarithm - self._log - illumination.over(*small.shape[:2]))
+        residual = cv2.split(_logarithm(small) - self._log - illumination.over(*small.shape[:2]))
         evenly = (residual[0] + residual[1] + residual[2]) * np.float32(1 / 3)
         coloured = np.asarray(_largest([cv2.absdiff(part, evenly) for part in residual]), np.float32)
         # one grey level of noise is a larger share of a dark pixel
@@ -311,10 +308,10 @@ def _medians(rows: FloatArray) -> FloatArray:
     return (both[:, 0] + both[:, 1]) / 2 if rows.shape[1] % 2 == 0 else both[:, 1]
 
 
-def _fit(small: ImageArray, useful: Mask, logarithm: Floats, table_log: Floats) -> FloatArray:
+def _fit(small: ImageArray, useful: Mask, table_log: Floats) -> FloatArray:
     """Fit a plane to each channel of the difference of logarithms by least squares, repeated without the outliers."""
-    samples = fit.samples(small, useful, logarithm, table_log, _plane(*useful.shape))
-    basis, values, middle = _samples(small, useful, logarithm, table_log) if samples is None else samples
+    samples = fit.samples(small, useful, _LOG, table_log, _plane(*useful.shape))
+    basis, values, middle = _samples(small, useful, table_log) if samples is None else samples
     if len(basis) < 12:
         return np.zeros((3, 3))
     slopes = np.zeros((3, 3))
@@ -329,14 +326,12 @@ def _fit(small: ImageArray, useful: Mask, logarithm: Floats, table_log: Floats) 
     return slopes
 
 
-def _samples(
-    small: ImageArray, useful: Mask, logarithm: Floats, table_log: Floats
-) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _samples(small: ImageArray, useful: Mask, table_log: Floats) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return what `hbr.kernels.fit.samples` returns."""
     few = np.s_[2::_EVERY, 2::_EVERY]
     keep = useful[few] & _useful(small[few])
     basis = _plane(*useful.shape)[keep]
-    values = (logarithm[few] - table_log[few])[keep].astype(np.float64)
+    values = (_logarithm(small[few]) - table_log[few])[keep].astype(np.float64)
     return basis, values, _medians(np.ascontiguousarray(values.T)) if len(values) else np.zeros(3)
 
 

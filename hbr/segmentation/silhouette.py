@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hbr.kernels import view
+from hbr.kernels import masks
 from hbr.kernels.components import largest_parts
 from hbr.segmentation.background import Mask
 
@@ -37,10 +37,7 @@ def silhouette(certain: Mask, possible: Mask | None = None, *, framed: bool) -> 
     framed : bool
         Whether anything that touches the frame's border is not the object: a holder, a hand, a shelf.
     """
-    grown = cv2.morphologyEx(
-        cv2.morphologyEx(certain.astype(np.uint8), cv2.MORPH_OPEN, _disc(1)), cv2.MORPH_CLOSE, _disc(3)
-    )
-    everything = grown.astype(np.uint8)
+    everything = _cleaned(certain.astype(np.uint8))
     for radius in _BARS if framed else _BARS[:1]:
         kept = _main_parts(_opened(everything, radius), framed=framed)
         if kept is None:
@@ -55,6 +52,15 @@ def silhouette(certain: Mask, possible: Mask | None = None, *, framed: bool) -> 
             kept |= hull & possible
         return _filled(kept)
     return None
+
+
+def _cleaned(mask: Binary) -> Binary:
+    """Remove single pixels, and join what is separated by a few."""
+    by_kernel = masks.cleaned(mask, _reach(1), _reach(3))
+    if by_kernel is not None:
+        return by_kernel
+    opened = cv2.morphologyEx(mask, cv2.MORPH_OPEN, _disc(1))
+    return cv2.morphologyEx(opened, cv2.MORPH_CLOSE, _disc(3)).astype(np.uint8, copy=False)
 
 
 def _without_stump(mask: Binary) -> Binary:
@@ -92,12 +98,13 @@ def _main_parts(mask: Binary, *, framed: bool) -> Binary | None:
 
 
 def _filled(mask: Binary) -> Mask:
+    by_kernel = masks.filled(mask, _reach(8))
+    if by_kernel is not None:
+        return by_kernel.view(np.bool_)
     margin = 12  # so that closing does not see the frame's border as background
     height, width = mask.shape
     wide = cv2.copyMakeBorder(mask, margin, margin, margin, margin, cv2.BORDER_CONSTANT)
-    closed = view.closed(wide.astype(np.uint8, copy=False), _reach(8))
-    if closed is None:
-        closed = cv2.morphologyEx(wide, cv2.MORPH_CLOSE, _disc(8)).astype(np.uint8, copy=False)
+    closed = cv2.morphologyEx(wide, cv2.MORPH_CLOSE, _disc(8)).astype(np.uint8, copy=False)
     contours, _ = cv2.findContours(closed, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     cv2.drawContours(closed, contours, -1, (1,), -1)
     filled: Mask = closed[margin : margin + height, margin : margin + width] > 0
@@ -110,7 +117,5 @@ def _disc(radius: int) -> Binary:
 
 
 @lru_cache
-def _reach(radius: int) -> NDArray[np.int64]:
-    """Return how far each row of the disc reaches to both sides."""
-    reach: NDArray[np.int64] = (_disc(radius).sum(axis=1, dtype=np.int64) - 1) // 2
-    return reach
+def _reach(radius: int) -> masks.Disc:
+    return masks.Disc(radius, (_disc(radius).sum(axis=1, dtype=np.int64) - 1) // 2)

@@ -13,6 +13,8 @@ from hbr import Background, descriptor, segment
 from hbr.kernels import components, library, view, without_library
 from hbr.segmentation.background import shrunk
 from hbr.segmentation.cut_out import CROP_PX
+from hbr.segmentation.silhouette import _cleaned as cleaned
+from hbr.segmentation.silhouette import _filled as filled
 from hbr.segmentation.silhouette import silhouette
 from tests.fuzzing import examples
 
@@ -80,6 +82,20 @@ def test_silhouettes_are_those_by_opencv(seed: int, height: int, width: int, sha
     assert (found is None) == (reference is None)
     if found is not None:
         np.testing.assert_array_equal(found, reference)
+
+
+@compiled
+@examples(40)
+@given(seeds, st.integers(1, 100), st.integers(1, 200), st.sampled_from([0.05, 0.3, 0.6, 0.95]), st.booleans())
+def test_masks_are_cleaned_and_filled_as_by_opencv(
+    seed: int, height: int, width: int, share: float, fine: bool
+) -> None:
+    """Noise has many small parts, smooth masks have large ones with holes in holes, which touch the border."""
+    values = np.random.default_rng(seed).random((height, width), np.float32)
+    values = values if fine else cv2.GaussianBlur(values, (0, 0), 3).reshape(height, width)
+    mask = (values <= np.quantile(values, share)).astype(np.uint8)
+    np.testing.assert_array_equal(*both(lambda: cleaned(mask)))
+    np.testing.assert_array_equal(*both(lambda: filled(mask)))
 
 
 @compiled
