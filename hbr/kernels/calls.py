@@ -298,7 +298,7 @@ def support(
     if found is None:
         return None
     room = 2 * int(segments.lengths.max())
-    scratch = np.empty(3 * room + 1)
+    scratch = np.empty(4 * room)
     added = np.empty((len(segments.lengths), 72), np.float32)
     found.hbr_support(
         *map(address, segments[:3]), len(segments.lengths), address(azimuth_deg), address(levels),

@@ -3,22 +3,47 @@
 
 #define BINS 72
 #define FAR_DEG 2000.0
+#define CLEAR_DEG 1e-3 /* more than the rounding of the largest shift */
 
 PART float larger(float a, float b) { return a > b ? a : b; }
+
+/* Find the view on whose arc each azimuth lies: the first of `two` - 1 ends that is not before it, or the view behind them.
+   The azimuths are those of object j among all, as the reference searches. */
+PART void find_arcs(const double *seen_deg, const double *end_deg, int64_t two, int64_t j, int64_t *nearest) {
+    const double shift = 2 * FAR_DEG * (double)j;
+    int64_t at = 0;
+    for (int b = 0; b < BINS; b++) {
+        const double seen = seen_deg[b] + shift;
+        while (at + 1 < two && end_deg[at] + shift < seen) at++;
+        nearest[b] = at;
+    }
+}
+
+/* Whether no azimuth is so near to an end, without being there, that the rounding of another object's shift matters. */
+PART int is_clear(const double *seen_deg, const double *end_deg, int64_t two, const int64_t *nearest) {
+    int clear = 1;
+    for (int b = 0; b < BINS; b++) {
+        const double before = nearest[b] ? seen_deg[b] - end_deg[nearest[b] - 1] : 1;
+        const double behind = nearest[b] + 1 < two ? end_deg[nearest[b]] - seen_deg[b] : 1;
+        clear &= before > CLEAR_DEG && (behind > CLEAR_DEG || behind == 0);
+    }
+    return clear;
+}
 
 /* Store what one query adds to every azimuth of each object, (objects, 72).
 
    Object j has the `count[j]` rows from `rows[begin[j]]` on, by rising azimuth. `levels` are the powers of the
-   similarities of all rows. `scratch` has room for 5 floats and a double for each of twice the largest count. */
+   similarities of all rows. `scratch` has room for 4 floats and 2 doubles for each of twice the largest count. */
 FOR_EVERY_PROCESSOR
 EXPORT void hbr_support(const int64_t *rows, const int64_t *begin, const int64_t *count, int64_t objects,
                         const double *azimuth_deg, const float *levels, double slope, double part_deg, int64_t whole,
                         double *scratch, int64_t room, float *support) {
-    double *ring_deg = scratch;
-    float *own = (float *)(ring_deg + room), *penalty = own + room, *before = penalty + room, *behind = before + room;
+    double *ring_deg = scratch, *end_deg = ring_deg + room;
+    float *own = (float *)(end_deg + room), *penalty = own + room, *before = penalty + room, *behind = before + room;
     const float none = -__builtin_inff();
     double seen_deg[BINS];
     float slope_at[BINS], best[BINS];
+    int64_t nearest[BINS], ready = 0; /* the number of views for which the arcs are known; 0 if they are not */
     for (int b = 0; b < BINS; b++) {
         seen_deg[b] = part_deg + b * 5.0;
         slope_at[b] = (float)(seen_deg[b] * slope);
@@ -26,34 +51,46 @@ EXPORT void hbr_support(const int64_t *rows, const int64_t *begin, const int64_t
     for (int64_t j = 0; j < objects; j++, support += BINS) {
         const int64_t n = count[j], two = 2 * n;
         const int64_t *mine = rows + begin[j];
-        int64_t first = 0; /* two revolutions, from 180° before 0 on */
+
+        /* two revolutions, from 180° before 0 on; usually at the azimuths of the object before */
+        int64_t first = 0, moved = n != ready;
         while (first < n && azimuth_deg[mine[first]] < 180) first++;
         for (int64_t i = 0; i < n; i++) {
             const int64_t k = first + i < n ? first + i : first + i - n, row = mine[k];
             const double deg = azimuth_deg[row] < 180 ? azimuth_deg[row] : azimuth_deg[row] - 360;
+            moved |= deg != ring_deg[i];
             ring_deg[i] = deg;
             ring_deg[n + i] = deg + 360;
             own[i] = own[n + i] = levels[row];
         }
-        const double shift = 2 * FAR_DEG * (double)j; /* as the reference searches all objects at once */
-        for (int64_t i = 0; i + 1 < two; i++) {
-            const double end_deg = (ring_deg[i + 1] + ring_deg[i]) / 2;
-            penalty[i] = (float)(end_deg * slope);
-            ring_deg[i] = end_deg + shift;
+        if (moved) {
+            for (int64_t i = 0; i + 1 < two; i++) {
+                end_deg[i] = (ring_deg[i + 1] + ring_deg[i]) / 2;
+                penalty[i] = (float)(end_deg[i] * slope);
+            }
+            find_arcs(seen_deg, end_deg, two, j, nearest);
+            ready = is_clear(seen_deg, end_deg, two, nearest) ? n : 0;
         }
-        float largest_before = none, largest_behind = none;
+
+        /* the best before and behind each view: first within each revolution, because each waits for its last maximum */
+        float one_before = none, two_before = none, one_behind = none, two_behind = none;
         before[0] = behind[two - 1] = none;
-        for (int64_t i = 0, k = two - 2; i + 1 < two; i++, k--) { /* together: each waits for its last maximum */
-            before[i + 1] = largest_before = larger(largest_before, own[i] + penalty[i]);
-            behind[k] = largest_behind = larger(largest_behind, own[k + 1] - penalty[k]);
+        for (int64_t i = 0; i + 1 < n; i++) {
+            before[i + 1] = one_before = larger(one_before, own[i] + penalty[i]);
+            before[n + i + 1] = two_before = larger(two_before, own[n + i] + penalty[n + i]);
+            behind[n - 2 - i] = one_behind = larger(one_behind, own[n - 1 - i] - penalty[n - 2 - i]);
+            behind[two - 2 - i] = two_behind = larger(two_behind, own[two - 1 - i] - penalty[two - 2 - i]);
         }
-        int64_t nearest = 0;
+        before[n] = one_before = larger(one_before, own[n - 1] + penalty[n - 1]);
+        behind[n - 1] = two_behind = larger(two_behind, own[n] - penalty[n - 1]);
+        for (int64_t i = 1; i < n; i++) before[n + i] = larger(one_before, before[n + i]);
+        for (int64_t i = 0; i + 1 < n; i++) behind[i] = larger(two_behind, behind[i]);
+
         for (int b = 0; b < BINS; b++) {
-            const double seen = seen_deg[b] + shift;
-            while (nearest + 1 < two && ring_deg[nearest] < seen) nearest++;
-            const float beside = larger(before[nearest] - slope_at[b], behind[nearest] + slope_at[b]);
-            best[b] = larger(beside, own[nearest]);
+            const int64_t at = nearest[b];
+            best[b] = larger(larger(before[at] - slope_at[b], behind[at] + slope_at[b]), own[at]);
         }
-        for (int b = 0; b < BINS; b++) support[b] = best[(b + whole) % BINS];
+        for (int64_t b = whole; b < BINS; b++) support[b - whole] = best[b];
+        for (int64_t b = 0; b < whole; b++) support[BINS - whole + b] = best[b];
     }
 }
