@@ -148,24 +148,27 @@ def _hits(profile: Floats, up_mm: Floats, x_mm: Floats, *, entering: bool) -> tu
     sign = 1.0 if entering else -1.0
     g *= sign
     reach = np.maximum.accumulate(g, axis=1)
-    samples = np.arange(len(profile))
-    sample = np.empty((len(up_mm), len(x_mm)))
-    depth = np.empty_like(sample)
-    for i in range(len(up_mm)):
-        square = np.minimum(sign * x_mm**2, reach[i, -1])  # the centre of a partly covered pixel may be outside
-        after = np.searchsorted(reach[i], square)
-        before = np.maximum(after - 1, 0)
-        step = np.where(after > before, g[i, after] - g[i, before], 1.0)
-        sample[i] = before + np.clip((square - g[i, before]) / step, 0.0, 1.0)
-        depth[i] = np.interp(sample[i], samples, y[i])
-    return sample, depth
+    after = np.empty((len(up_mm), len(x_mm)), np.intp)
+    square = np.minimum(sign * x_mm**2, reach[:, -1:])  # the centre of a partly covered pixel may be outside
+    for own, row, wanted in zip(after, reach, square, strict=True):
+        own[:] = row.searchsorted(wanted)
+    before = np.maximum(after - 1, 0)
+    g_before = np.take_along_axis(g, before, axis=1)
+    step = np.where(after > before, np.take_along_axis(g, after, axis=1) - g_before, 1.0)
+    sample = before + np.clip((square - g_before) / step, 0.0, 1.0)
+    whole = sample.astype(np.intp)
+    here = np.take_along_axis(y, whole, axis=1)
+    behind = np.take_along_axis(y, np.minimum(whole + 1, len(profile) - 1), axis=1)
+    return sample, (behind - here) * (sample - whole) + here
 
 
 def _sections(profile: Floats, up_mm: Floats) -> tuple[Floats, Floats]:
     """Return g and y of every profile sample (columns) for every row of pixels."""
     r, h = profile.T
-    y = (up_mm[:, None] - h[None] * COS) / SIN
-    return r**2 - y**2, y
+    y = up_mm[:, None] - h[None] * COS
+    y /= SIN
+    g = y * y
+    return np.subtract(r**2, g, out=g), y
 
 
 def _normals(profile: Floats) -> tuple[Floats, Floats]:
@@ -179,8 +182,8 @@ def _normals(profile: Floats) -> tuple[Floats, Floats]:
 def _cover(outside: Floats, up: Floats, half: int) -> Floats:
     """Return which part of each pixel the body covers: exact across, `_SUBROWS` samples down."""
     offsets = (np.arange(_SUBROWS) + 0.5) / _SUBROWS - 0.5
-    rows = (up[:, None] + offsets).reshape(-1)
-    widest = _sections(outside, rows / PX_PER_MM)[0].max(axis=1)
+    # not at once: the sections of all rows do not fit into the processor's cache
+    widest = np.stack([_sections(outside, (up + down) / PX_PER_MM)[0].max(axis=1) for down in offsets], axis=1).ravel()
     edge = np.sqrt(np.maximum(widest, 0.0)) * PX_PER_MM
     x = np.abs(np.arange(-half, half + 1))
     cover = np.clip(edge[:, None] + 0.5 - x, 0.0, 1.0) * (widest > 0)[:, None]
