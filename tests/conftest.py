@@ -64,6 +64,11 @@ def pytest_xdist_auto_num_workers() -> int:
     return cores + min(cores // 2, 2)
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put the tests that wait for a real clock first: one worker waits while the others compute."""
+    items.sort(key=lambda item: item.get_closest_marker("realtime") is None)
+
+
 def pytest_collection_finish() -> None:
     """Let the garbage collector pass over what lives as long as the process: modules and collected tests.
 

@@ -80,6 +80,7 @@ def host(port: str, deadman_s: float, how: str) -> Program:
     return Program(port, str(deadman_s), how, code=HOST)
 
 
+@pytest.mark.realtime
 def test_stream_runs_in_real_time(terminal):
     terminal.say("spin 20")
     program = host(terminal.port, 2.0, "leave")

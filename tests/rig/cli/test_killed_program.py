@@ -23,6 +23,8 @@ from rig.devices.dynamixel.port import GUARDIAN, open_serial
 from sim.realtime.wire import tell
 from tests.programs import Program
 
+pytestmark = pytest.mark.realtime
+
 CLOCK = SystemClock()
 JSON = {"Content-Type": "application/json"}
 

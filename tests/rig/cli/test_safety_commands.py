@@ -181,6 +181,7 @@ def test_killed_program_leaves_the_bench_free(rig, running):
     assert json.loads(rig("status", "--json").stdout)["state"] == "ready"
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize(("handler", "number"), [("", signal.SIGINT), ("unwinding", signal.SIGTERM)])
 def test_stop_signals_a_program_outside_its_control_loop(tmp_path, handler, number):
     code = f"""

@@ -248,6 +248,7 @@ def stream() -> Iterator[tuple[str, list[float]]]:
     server.server_close()
 
 
+@pytest.mark.realtime
 def test_network_stream_is_current_after_a_pause(stream: tuple[str, list[float]]) -> None:
     url, level = stream
     clock = SystemClock()

@@ -53,6 +53,7 @@ def test_impossible_step_is_rejected(simulated, step_deg):
         next(jog(simulated().bench, [FORWARD], step_deg=step_deg))
 
 
+@pytest.mark.realtime
 def test_arrow_keys_of_a_terminal_rotate_the_table(rig, tmp_path):
     assert rig("jog").exit_code == 2  # no terminal
     ours, theirs = pty.openpty()

@@ -194,6 +194,7 @@ def test_garbage_does_not_end_the_bench(start):
     assert ping(folder) == 1
 
 
+@pytest.mark.realtime
 def test_servo_and_rig_head_are_parts_of_one_world(start, monkeypatch):
     needs("memory")
     monkeypatch.setattr("rig.devices.head.link.REPLY_S", 10.0)  # the bench may have to wait for a processor
