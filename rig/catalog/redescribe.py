@@ -29,6 +29,7 @@ from rig.catalog.together import (
     needs_segmentation,
     write_described,
 )
+from rig.catalog.unfinished import UnfinishedJob
 from rig.core.errors import CatalogError, UsageError
 from rig.core.processes import Jobs, map_in_processes
 from rig.views.description import PAPER_DESCRIPTOR
@@ -73,6 +74,7 @@ def redescribe(
     region: Region | Stored | None = Stored.REGION,
     again: bool = False,
     jobs: Jobs | None = None,
+    unfinished: UnfinishedJob | None = None,
 ) -> Generator[JobProgress, None, Redescribed]:
     """Describe the views of all objects in use that are not described by the present version of a descriptor.
 
@@ -91,6 +93,8 @@ def redescribe(
         Also describe views that are described already, and segment them again.
     jobs
         Number of processes, or a cluster; None for one process per core.
+    unfinished
+        Stores which views were described ``again``. Those that it knows are left out.
 
     Raises
     ------
@@ -101,6 +105,8 @@ def redescribe(
     """
     kind = known_descriptor(descriptor)
     items, unchanged = _items(catalog, kind, region, again)
+    if unfinished is not None:
+        items = [item for item in items if str(item.view.view_id) not in unfinished.found]
     failed: list[tuple[str, str]] = []
     done = 0
     yield JobProgress(0, len(items))
@@ -113,6 +119,8 @@ def redescribe(
             owners = connection.scalars(select(views.c.enrollment_id).where(views.c.id.in_(ids)).distinct())
             with changing_enrollments(connection, owners):
                 write_described(connection, found)
+        if unfinished is not None:
+            unfinished.store({str(item.view.view_id): None for item, _ in portion})
         done += len(portion)
         yield JobProgress(done, len(items))
     if items:

@@ -1,7 +1,7 @@
 """Check whether a catalog is as it was stored: rows, images and descriptors. Repair it on request."""
 
 import json
-from collections.abc import Generator, Iterable, Mapping
+from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -15,12 +15,15 @@ from rig.catalog.jobs import JobProgress, portions, processes
 from rig.catalog.schema import audit as audit_log
 from rig.catalog.schema import corrections, descriptors, enrollments, objects, results, sessions, views
 from rig.catalog.seal import appended_digests, changing_enrollments, enrollment_digests, object_digests
+from rig.catalog.unfinished import UnfinishedJob
 from rig.catalog.verify_images import (
     Checked,
+    Described,
     Finding,
     Item,
     Problem,
     Repair,
+    check_key,
     check_portion,
     stored_images,
     with_descriptions,
@@ -56,7 +59,12 @@ class _State:
 
 
 def verify(
-    catalog: Catalog, *, repair: bool = False, quick: bool = False, jobs: Jobs | None = None
+    catalog: Catalog,
+    *,
+    repair: bool = False,
+    quick: bool = False,
+    jobs: Jobs | None = None,
+    unfinished: UnfinishedJob | None = None,
 ) -> Generator[JobProgress, None, Verification]:
     """Check every row, image and descriptor.
 
@@ -70,6 +78,9 @@ def verify(
         Compare the hashes of the files only; do not describe the images again.
     jobs
         Number of processes, or a cluster; None for one process per core.
+    unfinished
+        Stores which images were right. Those that it knows already are not checked again, unless what the catalog says
+        of them has changed.
 
     Raises
     ------
@@ -89,9 +100,13 @@ def verify(
     yield JobProgress(0, len(items))
     checked: dict[Item, Checked] = {}
     work = partial(check_portion, catalog.database.images, quick)
-    described = portions(with_descriptions(catalog, items))
-    for portion, found in map_in_processes(work, described, processes(jobs, len(items))):
+    remaining = with_descriptions(catalog, items)
+    if unfinished is not None and unfinished.found:
+        remaining = _without_known(remaining, unfinished, quick, checked)
+    for portion, found in map_in_processes(work, portions(remaining), processes(jobs, len(items))):
         checked.update(zip((item for item, _ in portion), found, strict=True))
+        if unfinished is not None:
+            unfinished.store(_right(portion, found, quick))
         yield JobProgress(len(checked), len(items))
     checked = {item: checked[item] for item in items}  # in the order of the catalog, whichever process was faster
 
@@ -113,6 +128,27 @@ def verify(
         sum(item.file_bytes for item in items),
         tuple(state.findings),
     )
+
+
+def _without_known(
+    items: Iterator[Described], unfinished: UnfinishedJob, quick: bool, checked: dict[Item, Checked]
+) -> Iterator[Described]:
+    """Yield the items that are not known to be right, and put the others into ``checked``."""
+    for item, stored in items:
+        size_px = unfinished.found.get(check_key(item, stored, quick), 0)
+        if size_px == 0:
+            yield item, stored
+        else:
+            checked[item] = Checked(item.sha256, item.file_bytes, None if size_px is None else tuple(size_px))
+
+
+def _right(portion: Sequence[Described], found: Sequence[Checked], quick: bool) -> dict[str, Any]:
+    """Return the size of each image of a portion that is right, by its key."""
+    return {
+        check_key(item, stored, quick): one.size_px
+        for (item, stored), one in zip(portion, found, strict=True)
+        if one == Checked(item.sha256, item.file_bytes, one.size_px)
+    }
 
 
 def _check_rows(state: _State) -> bool:

@@ -5,6 +5,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from enum import StrEnum
+from hashlib import sha256
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -106,6 +107,10 @@ class StoredDescription(NamedTuple):
     segmentation: str = "null"
 
 
+Described = tuple[Item, StoredDescription | None]
+"""An item, and what is stored of its content; None if it is not the image of a view, or the view is gone."""
+
+
 class Checked(NamedTuple):
     """What was found for an item: SHA-256 and size of its file, and width and height of the image.
 
@@ -158,8 +163,14 @@ def stored_images(catalog: Catalog) -> tuple[list[Item], int]:
     return items, count
 
 
-def with_descriptions(catalog: Catalog, items: Sequence[Item]) -> Iterator[tuple[Item, StoredDescription | None]]:
-    """Yield each item with what is stored of its content; None if it is not the image of a view, or the view is gone.
+def check_key(item: Item, stored: StoredDescription | None, quick: bool) -> str:
+    """Return a digest of everything that a check of an item compares with its image."""
+    compared = [] if stored is None else [is_current(name, version) for name, version, *_ in stored.descriptors]
+    return sha256(ascii((tuple(item), stored, quick, compared)).encode()).hexdigest()
+
+
+def with_descriptions(catalog: Catalog, items: Sequence[Item]) -> Iterator[Described]:
+    """Yield each item with what is stored of its content.
 
     The descriptions of a large catalog need gigabytes: they are read some views at a time.
     """
@@ -180,9 +191,7 @@ def with_descriptions(catalog: Catalog, items: Sequence[Item]) -> Iterator[tuple
             yield item, StoredDescription(tuple(packed), json.dumps(evidence[item.view_id]))
 
 
-def check_portion(
-    store: ImageStore, quick: bool, portion: tuple[tuple[Item, StoredDescription | None], ...]
-) -> list[Checked]:
+def check_portion(store: ImageStore, quick: bool, portion: tuple[Described, ...]) -> list[Checked]:
     return [
         _check(store, item, StoredDescription() if stored is None else stored, quick)._replace(
             is_described=stored is None or bool(stored.descriptors)

@@ -20,15 +20,22 @@ def read(path: Path, *, max_bytes: int) -> bytes:
     OSError
         The file is missing, cannot be read, is not a regular file, or is larger than ``max_bytes``.
     """
-    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOCTTY)
-    with open(descriptor, "rb") as file:  # noqa: PTH123 - a path cannot be opened without waiting for a pipe
-        mode = os.fstat(descriptor).st_mode
-        if not stat.S_ISREG(mode):
-            raise OSError(None, "it is a folder" if stat.S_ISDIR(mode) else "it is not a regular file", str(path))
+    with open_regular(path) as file:
         content = file.read(max_bytes + 1)
     if len(content) > max_bytes:
         raise OSError(None, f"it is larger than {max_bytes} bytes", str(path))
     return content
+
+
+def open_regular(path: Path) -> BinaryIO:
+    """Open a regular file for reading; a pipe or a device is never waited for. Raises as `read`."""
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOCTTY)
+    file = open(descriptor, "rb")  # noqa: PTH123, SIM115 - a path cannot be opened without waiting for a pipe
+    mode = os.fstat(descriptor).st_mode
+    if not stat.S_ISREG(mode):
+        file.close()
+        raise OSError(None, "it is a folder" if stat.S_ISDIR(mode) else "it is not a regular file", str(path))
+    return file
 
 
 def json_values(content: bytes | str) -> Any:

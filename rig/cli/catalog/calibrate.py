@@ -2,6 +2,7 @@
 
 import os
 import sys
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
@@ -11,7 +12,13 @@ from rig.cli.ui.command import command
 from rig.cli.ui.settings import Settings
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator, Sequence
+
     from hbr import CalibratedRule
+    from hbr.dense.leave_one_out import Found, Task
+    from rig.catalog.unfinished import UnfinishedJob
+
+fromhex = float.fromhex
 
 _SEVERAL_PROCESSES: Final = 20_000
 """Views from which the searches take longer than the start of further processes."""
@@ -40,12 +47,13 @@ def calibrate(
     from hbr import DenseIndex, calibrate_stopping_rule
     from rig.catalog.jobs import JobProgress
     from rig.catalog.prepared import prepared_views
+    from rig.catalog.unfinished import UnfinishedJob
     from rig.cli.ui.jobs import progress_bar
     from rig.core.clock import SystemClock, seconds_between
     from rig.core.errors import CatalogError
     from rig.core.processes import map_in_processes
     from rig.events.events import plain
-    from rig.search.stopping_rules import FILE, stopping_rule_values, write_stopping_rule
+    from rig.search.stopping_rules import FILE, digest, stopping_rule_values, write_stopping_rule
     from rig.views.description import BENCH_DESCRIPTOR
 
     clock = SystemClock()
@@ -58,7 +66,9 @@ def calibrate(
     begun_ns = clock.now_ns()
     print(f"Searching for {len(views.object_names)} objects among each other ...", file=sys.stderr)
     index = DenseIndex(views)
-    with progress_bar("Searching") as progress:
+    unfinished = UnfinishedJob(path.with_name("calibrate.unfinished"), f"calibrate {digest(index)}")
+    unfinished.load()
+    with unfinished, _interruptible(unfinished), progress_bar("Searching") as progress:
 
         def show(done: int, total: int) -> None:
             progress(JobProgress(done, total))
@@ -71,8 +81,11 @@ def calibrate(
             error_rate=error_rate,
             false_reject=false_reject,
             progress=show,
-            tasks=None if where is None else lambda work, tasks: map_in_processes(work, tasks, where),
+            tasks=lambda work, tasks: _continued(
+                unfinished, tasks, lambda left: map_in_processes(work, left, where or 1)
+            ),
         )
+    unfinished.remove()
     made_utc = f"{clock.utc():%Y-%m-%dT%H:%M:%SZ}"
     write_stopping_rule(path, found.rule, index, made_utc=made_utc)
     if settings.json:
@@ -83,6 +96,44 @@ def calibrate(
     for words in _lines(found, len(views.object_names), seconds_between(begun_ns, clock.now_ns())):
         print(words)
     print(f"Stored: {path}")
+
+
+def _continued(
+    unfinished: "UnfinishedJob",
+    tasks: "Sequence[Task]",
+    search: "Callable[[Sequence[Task]], Iterable[tuple[Task, Found]]]",
+) -> "Iterator[tuple[Task, Found]]":
+    """Yield the searches for all objects: first those that are stored, then the others, which are stored, too."""
+    from hbr.dense.leave_one_out import Found
+
+    left = []
+    for task in tasks:
+        stored = unfinished.found.get(repr(task))
+        if stored is None:
+            left.append(task)
+            continue
+        known, unknown = ([(n, fromhex(a), fromhex(b)) for n, a, b in part] for part in stored[:2])
+        yield task, Found(known, unknown, [fromhex(one) for one in stored[2]], stored[3])
+    for task, found in search(left):
+        leaders = [[(int(n), float(a).hex(), float(b).hex()) for n, a, b in part] for part in found[:2]]
+        confidence, correct = [float(one).hex() for one in found.confidence], [bool(one) for one in found.correct]
+        unfinished.store({repr(task): [*leaders, confidence, correct]})
+        yield task, found
+
+
+@contextmanager
+def _interruptible(unfinished: "UnfinishedJob") -> "Iterator[None]":
+    """Say after Ctrl+C how to continue."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        kept = (
+            "the searches so far are stored. The same command continues."
+            if unfinished.is_stored
+            else "nothing changed."
+        )
+        print(f"Interrupted; {kept}", file=sys.stderr)
+        raise
 
 
 def _lines(found: "CalibratedRule", objects: int, seconds: float) -> list[str]:

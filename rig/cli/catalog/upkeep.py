@@ -25,6 +25,9 @@ def verify(
     settings: Settings,
     repair: Annotated[bool, typer.Option("--repair", help="Repair what can be repaired. Nothing is deleted.")] = False,
     quick: Annotated[bool, typer.Option("--quick", help="Only compare the hashes of the files.")] = False,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Continue an interrupted check: do not check again what was right.")
+    ] = False,
     jobs: JobsOption = None,
     cluster: ClusterOption = None,
 ) -> None:
@@ -32,17 +35,37 @@ def verify(
 
     Example: rig catalog verify --repair --bench sim
     """
+    from importlib.metadata import version
+
+    from rig.catalog.unfinished import UnfinishedJob
     from rig.catalog.verify import verify as job
     from rig.cli.catalog.findings import finding_text
     from rig.events.events import plain
     from rig.events.phrases import counted
 
-    with settings.open_catalog(read_only=not repair) as catalog:
+    job_name = f"verify by {version('hbr-rig')}"
+    with (
+        settings.open_catalog(read_only=not repair) as catalog,
+        UnfinishedJob(catalog.path / "verify.unfinished", job_name) as unfinished,
+    ):
+        if not resume:
+            unfinished.remove()
+        else:
+            unfinished.load()
+            known = counted(len(unfinished.found), "image")
+            print(
+                f"The interrupted check found {known} right." if unfinished.found else "No check was interrupted.",
+                file=sys.stderr,
+            )
         found = run_job(
             "verifying",
-            job(catalog, repair=repair, quick=quick, jobs=jobs_of(jobs, cluster)),
-            interrupted="Interrupted; nothing was changed.",
+            job(catalog, repair=repair, quick=quick, jobs=jobs_of(jobs, cluster), unfinished=unfinished),
+            interrupted=lambda: (
+                "Interrupted; nothing was changed."
+                + (" To continue: rig catalog verify --resume" if unfinished.is_stored else "")
+            ),
         )
+        unfinished.remove()
     if settings.json:
         settings.print_json(plain(found))
     else:
@@ -86,17 +109,36 @@ def redescribe(
 
     Example: rig catalog redescribe --descriptor edges+colours --bench sim
     """
+    from importlib.metadata import version
+
     from rig.catalog.redescribe import redescribe as job
+    from rig.catalog.unfinished import UnfinishedJob
     from rig.events.events import plain
     from rig.events.phrases import counted
 
-    part = _region(settings, region)
-    with settings.open_catalog() as catalog:
+    part, name = _region(settings, region), descriptor_name(descriptor)
+    job_name = f"describe again by {name}, {part}, {version('hbr-rig')}"
+    with (
+        settings.open_catalog() as catalog,
+        UnfinishedJob(catalog.path / "redescribe.unfinished", job_name) as unfinished,
+    ):
+        if again:
+            unfinished.load()
+        if unfinished.found:
+            print(f"The interrupted command described {counted(len(unfinished.found), 'view')}.", file=sys.stderr)
         done = run_job(
             "describing",
-            job(catalog, descriptor_name(descriptor), region=part, again=again, jobs=jobs_of(jobs, cluster)),
+            job(
+                catalog,
+                name,
+                region=part,
+                again=again,
+                jobs=jobs_of(jobs, cluster),
+                unfinished=unfinished if again else None,
+            ),
             interrupted="Interrupted; the results so far are stored. The same command continues.",
         )
+        unfinished.remove()
     if settings.json:
         settings.print_json(plain(done))
     else:

@@ -16,8 +16,11 @@ if TYPE_CHECKING:
 _T = TypeVar("_T")
 
 
-def run_job(title: str, job: "Generator[JobProgress, None, _T]", *, interrupted: str) -> _T:
-    """Run a job with a progress bar on stderr and return its result; Ctrl+C prints ``interrupted``."""
+def run_job(title: str, job: "Generator[JobProgress, None, _T]", *, interrupted: str | Callable[[], str]) -> _T:
+    """Run a job with a progress bar on stderr and return its result.
+
+    Ctrl+C prints ``interrupted``, or what it returns.
+    """
     from rig.cli.ui.present import Progress
 
     try:
@@ -32,7 +35,7 @@ def run_job(title: str, job: "Generator[JobProgress, None, _T]", *, interrupted:
                     progress.start(at.total)
                 progress.at(at.done)
     except KeyboardInterrupt:
-        print(interrupted, file=sys.stderr)
+        print(interrupted if isinstance(interrupted, str) else interrupted(), file=sys.stderr)
         raise
     finally:
         job.close()

@@ -11,6 +11,7 @@ from hbr.descriptors.plain_cedd import Cedd
 from rig.catalog import Catalog
 from rig.catalog.redescribe import redescribe
 from rig.catalog.seal import seal_enrollments
+from rig.catalog.unfinished import UnfinishedJob
 from rig.catalog.upkeep import collect_garbage, statistics
 from rig.catalog.verify import Verification, verify
 from rig.catalog.verify_images import Problem
@@ -52,6 +53,30 @@ class TestVerify:
             for view in catalog.object(name).views:
                 assert np.array_equal(catalog.read_image(view), image(seed + view.record.index))
         return problems(found)
+
+    def test_continued_check_leaves_out_what_was_right(self, catalog: Catalog, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr("rig.catalog.jobs.PORTION", 1)
+        first, *_ = self.images(catalog, "mug")
+        content = first.read_bytes()
+        first.write_bytes(b"damaged")  # so this view has to be checked again
+        with UnfinishedJob(catalog.path / "unfinished", "verify") as unfinished:
+            job = verify(catalog, jobs=1, unfinished=unfinished)
+            assert [next(job).done for _ in range(5)] == [0, 1, 2, 3, 4]
+            job.close()
+        first.write_bytes(content)
+
+        def again(**options: bool) -> list[str]:
+            with UnfinishedJob(catalog.path / "unfinished", "verify") as unfinished:
+                unfinished.load()
+                return problems(finished(verify(catalog, jobs=1, unfinished=unfinished, **options)))
+
+        for one in self.images(catalog, "mug")[1:]:
+            one.write_bytes(b"damaged")
+        assert again() == []  # they were right
+        assert Problem.CHANGED_IMAGE in again(quick=True)  # another kind of check
+        sql(catalog, "UPDATE views SET image_sha256 = 'another' WHERE id = 2")
+        assert Problem.CHANGED_IMAGE in again()  # the catalog says something else of it now
+        assert problems(finished(verify(catalog))).count(Problem.CHANGED_IMAGE) == 2
 
     def test_several_processes_report_a_missing_image(self, catalog: Catalog, monkeypatch: pytest.MonkeyPatch) -> None:
         found = finished(verify(catalog))
@@ -199,6 +224,17 @@ class TestRedescribe:
             "the region [0, 0, 100, 10] does not lie within an image of 16x12"
         ] * 2
         assert np.array_equal(catalog.views().views.descriptors[0], hbr.describe(image(0)[:10, :10]))
+
+    def test_redescribe_again_continues_after_an_interruption(self, catalog: Catalog, monkeypatch) -> None:
+        true_fill(catalog, "mug", 6, 0)
+        monkeypatch.setattr("rig.catalog.jobs.PORTION", 2)
+        with UnfinishedJob(catalog.path / "unfinished", "again") as first:
+            job = redescribe(catalog, again=True, jobs=1, unfinished=first)
+            assert [next(job).done for _ in range(3)] == [0, 2, 4]
+            job.close()
+        with UnfinishedJob(catalog.path / "unfinished", "again") as second:
+            second.load()
+            assert finished(redescribe(catalog, again=True, unfinished=second)).described == 2
 
     def test_redescribe_continues_after_an_interruption(self, catalog: Catalog, monkeypatch) -> None:
         true_fill(catalog, "mug", 6, 0)
