@@ -35,6 +35,9 @@ settings.register_profile("rig", deadline=None, derandomize=True, database=None,
 settings.register_profile("nightly", deadline=None, max_examples=1000)
 settings.load_profile("rig")
 
+# What is imported and collected stays: the garbage collector would search it in vain for a sixth of that time.
+gc.disable()
+
 # Typer builds all commands for each invocation, which takes longer than most commands.
 typer.testing._get_command = cache(typer.testing._get_command)
 
@@ -77,6 +80,7 @@ def pytest_collection_finish() -> None:
     gc.collect()
     gc.freeze()
     gc.set_threshold(20_000, 20, 50)
+    gc.enable()
 
 
 def share_firmware(cache: Path, base: Path) -> None:
