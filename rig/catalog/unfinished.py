@@ -48,8 +48,8 @@ class UnfinishedJob:
 
     @property
     def is_stored(self) -> bool:
-        """Whether the results so far are stored."""
-        return self._file is not None
+        """Whether there are results to continue from."""
+        return self._file is not None or bool(self.found)
 
     def store(self, results: dict[str, Any]) -> None:
         """Store further results, JSON values by their keys."""
@@ -61,6 +61,7 @@ class UnfinishedJob:
                 self._file.flush()
         except OSError:
             self._close()
+            self.found.clear()
 
     def _begin(self) -> None:
         """Write what was found before to a new file, which takes the place of the old one."""

@@ -135,11 +135,13 @@ def _without_known(
 ) -> Iterator[Described]:
     """Yield the items that are not known to be right, and put the others into ``checked``."""
     for item, stored in items:
-        size_px = unfinished.found.get(check_key(item, stored, quick), 0)
-        if size_px == 0:
-            yield item, stored
-        else:
-            checked[item] = Checked(item.sha256, item.file_bytes, None if size_px is None else tuple(size_px))
+        match unfinished.found.get(check_key(item, stored, quick), ""):
+            case None if quick:
+                checked[item] = Checked(item.sha256, item.file_bytes)
+            case [int(width), int(height)]:
+                checked[item] = Checked(item.sha256, item.file_bytes, (width, height))
+            case _:
+                yield item, stored
 
 
 def _right(portion: Sequence[Described], found: Sequence[Checked], quick: bool) -> dict[str, Any]:

@@ -108,12 +108,14 @@ def _continued(
 
     left = []
     for task in tasks:
-        stored = unfinished.found.get(repr(task))
-        if stored is None:
+        try:
+            *leaders, confidence, correct = unfinished.found[repr(task)]
+            known, unknown = ([(int(n), fromhex(a), fromhex(b)) for n, a, b in part] for part in leaders)
+            done = Found(known, unknown, [fromhex(one) for one in confidence], [bool(one) for one in correct])
+        except (KeyError, TypeError, ValueError):  # not stored, or changed by hand
             left.append(task)
-            continue
-        known, unknown = ([(n, fromhex(a), fromhex(b)) for n, a, b in part] for part in stored[:2])
-        yield task, Found(known, unknown, [fromhex(one) for one in stored[2]], stored[3])
+        else:
+            yield task, done
     for task, found in search(left):
         leaders = [[(int(n), float(a).hex(), float(b).hex()) for n, a, b in part] for part in found[:2]]
         confidence, correct = [float(one).hex() for one in found.confidence], [bool(one) for one in found.correct]

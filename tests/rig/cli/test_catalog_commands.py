@@ -224,9 +224,19 @@ def test_interrupted_calibration_continues_to_the_same_rule(two: Rig, monkeypatc
     assert stopped.exit_code == 130
     assert "Interrupted; the searches so far are stored. The same command continues." in stopped.stderr
     assert not rule.exists()
+    unfinished = Path("catalog/calibrate.unfinished")
+    kept = unfinished.read_text()
     seen = interrupt(monkeypatch, "rig.core.processes", 99)
     assert two("catalog", "calibrate").exit_code == 0
     assert len(seen) == 1, "the search for the other object"
+    for changed in (
+        kept.replace("0x1", "x"),
+        kept.replace("[[[", "[["),
+        kept.partition("\n")[0] + '\n["(0, 0.0)", 5]\n',
+    ):
+        unfinished.write_text(changed)
+        assert two("catalog", "calibrate").exit_code == 0
+    assert len(seen) == 7, "both searches again"
     assert {**json.loads(rule.read_text()), "made_utc": None} == {**expected, "made_utc": None}
     assert not list(Path("catalog").glob("*.unfinished*"))
 
