@@ -1,4 +1,7 @@
-"""Results of a long job, stored so that the job can continue after an interruption."""
+"""Results of a long job, stored so that the job can continue after an interruption.
+
+Decision: docs/decisions/0065.
+"""
 
 import json
 from contextlib import suppress
