@@ -134,7 +134,10 @@ def place_in(url: str, folder: Path, images: str | None = None) -> CatalogPlace:
 def _make_schema(url: str, schema: str) -> None:
     import psycopg
 
-    with psycopg.connect(url.replace("postgresql+psycopg", "postgresql"), autocommit=True) as connection:
+    with (
+        psycopg.connect(url.replace("postgresql+psycopg", "postgresql"), autocommit=True) as connection,
+        suppress(psycopg.errors.UniqueViolation),  # another process creates it in this moment
+    ):
         connection.execute(f"CREATE SCHEMA IF NOT EXISTS {schema}")
 
 

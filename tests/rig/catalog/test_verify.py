@@ -74,9 +74,17 @@ class TestVerify:
             one.write_bytes(b"damaged")
         assert again() == []  # they were right
         assert Problem.CHANGED_IMAGE in again(quick=True)  # another kind of check
-        sql(catalog, "UPDATE views SET image_sha256 = 'another' WHERE id = 2")
-        assert Problem.CHANGED_IMAGE in again()  # the catalog says something else of it now
         assert problems(finished(verify(catalog))).count(Problem.CHANGED_IMAGE) == 2
+
+    @pytest.mark.sqlite
+    def test_continued_check_looks_at_views_whose_rows_changed(self, catalog: Catalog) -> None:
+        with UnfinishedJob(catalog.path / "unfinished", "verify") as unfinished:
+            assert problems(finished(verify(catalog, unfinished=unfinished))) == []
+        sql(catalog, "UPDATE views SET image_sha256 = 'another' WHERE id = 2")
+        with UnfinishedJob(catalog.path / "unfinished", "verify") as unfinished:
+            unfinished.load()
+            assert len(unfinished.found) == 6
+            assert Problem.CHANGED_IMAGE in problems(finished(verify(catalog, unfinished=unfinished)))
 
     def test_several_processes_report_a_missing_image(self, catalog: Catalog, monkeypatch: pytest.MonkeyPatch) -> None:
         found = finished(verify(catalog))
