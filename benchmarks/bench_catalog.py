@@ -17,6 +17,7 @@ from benchmarks.large_catalog import build
 from hbr import describe, pack
 from rig.catalog import Catalog
 from rig.catalog.exchange import import_objects, plan_import, read_folder
+from rig.cli.ui.exit_codes import EXIT_AMBIGUOUS, EXIT_UNKNOWN
 from rig.core.clock import SystemClock, seconds_between
 
 RIG = [sys.executable, "-c", "from rig.cli.main import main; main()"]
@@ -74,15 +75,28 @@ def answers(folder: Path, objects: int) -> None:
 
 
 def run(home: Path, words: list[str], *, first_ranking: bool) -> tuple[float, float]:
-    """Return wall and CPU seconds of a command; the wall time ends at the first ranking if ``first_ranking``."""
+    """Return wall and CPU seconds of a command; the wall time ends at the first ranking if ``first_ranking``.
+
+    Raises
+    ------
+    RuntimeError
+        The command failed, or a search ended without a ranking.
+    """
     before_s = cpu_s()
     begin_ns = _CLOCK.now_ns()
-    with subprocess.Popen([*RIG, *words], cwd=home, stdout=subprocess.PIPE, text=True) as process:
+    pipe = subprocess.PIPE
+    with subprocess.Popen([*RIG, *words], cwd=home, stdout=pipe, stderr=pipe, text=True) as process:
         assert process.stdout is not None
+        assert process.stderr is not None
         stop_ns = None
         for line in process.stdout:
             if first_ranking and stop_ns is None and json.loads(line).get("event") == "ranked":
                 stop_ns = _CLOCK.now_ns()
+        messages = process.stderr.read()
+    # A search for an object of the simulator, which is not enrolled, ends with one of these codes.
+    expected = (EXIT_UNKNOWN, EXIT_AMBIGUOUS) if first_ranking else (0,)
+    if process.returncode not in expected or first_ranking != (stop_ns is not None):
+        raise RuntimeError(f"rig {shlex.join(words)} failed with exit code {process.returncode}: {messages}")
     return seconds_between(begin_ns, stop_ns or _CLOCK.now_ns()), cpu_s() - before_s
 
 

@@ -46,7 +46,7 @@ _EVIDENCE: dict[str, Any] = {
     "saturated_share": 0.0,
     "repeated": False,
     "locks": {
-        "exposure_us": 8000.0,
+        "exposure_us": 10000.0,
         "gain": None,
         "white_balance_k": 5000.0,
         "auto_exposure": False,
