@@ -221,9 +221,7 @@ class Platter:
         """Return the platter's angle (°) at times within this path."""
         piece, since_s = self.shaft.pieces(np.asarray(time_s, dtype=np.float64))
         shaft_deg, speed_dps = self.shaft.within(piece, since_s)
-        angle = self._rigid(piece, shaft_deg)
-        if self._omega:
-            angle = angle + self._vibration(piece, since_s)[0]
+        angle = self._rigid(piece, shaft_deg) + self._vibration(piece, since_s)[0]
         return angle + self._ripple.angles_deg(shaft_deg, speed_dps)
 
     def _rigid(self, piece: NDArray[np.intp], shaft_deg: Floats) -> Floats:

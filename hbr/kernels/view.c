@@ -101,9 +101,9 @@ PART float largest(float a, float b) { return a > b ? a : b; }
 PART float absolute(float a) { return a < 0 ? -a : a; }
 
 /* Compare the logarithms of a small frame, those of each level in `logarithm` (256), with `table_log`, those of the
-   empty-table image: (height, width, 3) -> `evenly`, `coloured` (height, width), and as 0 or 1 the pixels that are certain, possible, and in agreement. `along` (3 width) and `down`
-   (3 height) are the parts of the planes that the illumination adds, `noise` (256) is that of each level. `line` holds 8
-   floats for each column. */
+   empty-table image: (height, width, 3) -> `evenly`, `coloured` (height, width), and as 0 or 1 the pixels that are
+   certain, possible, and in agreement. `along` (3 width) and `down` (3 height) are the parts of the planes that the
+   illumination adds, `noise` (256) is that of each level. `line` holds 8 floats for each column. */
 EXPORT FOR_EVERY_PROCESSOR void hbr_difference(const uint8_t *small, const uint8_t *table, const float *logarithm,
                                                const float *table_log, int64_t height, int64_t width,
                                                const float *along, const float *down, const float *noise,

@@ -118,4 +118,5 @@ def _disc(radius: int) -> Binary:
 
 @lru_cache
 def _reach(radius: int) -> masks.Disc:
+    """Return the disc as the kernels take it."""
     return masks.Disc(radius, (_disc(radius).sum(axis=1, dtype=np.int64) - 1) // 2)

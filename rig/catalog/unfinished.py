@@ -5,11 +5,11 @@ Decision: docs/decisions/0065.
 
 import json
 from contextlib import suppress
-from io import TextIOWrapper
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final, Self, TextIO
 
-from rig.core.files import json_values, open_new, open_regular
+from rig.core.files import json_values, no_follow, open_regular, write
 
 _LONGEST_LINE: Final = 1_000_000
 
@@ -25,7 +25,7 @@ class UnfinishedJob:
     path
         The file.
     job
-        What the results depend on: those of another job are not used.
+        What the results depend on, besides the version of the program: those of another job are not used.
 
     Attributes
     ----------
@@ -35,7 +35,7 @@ class UnfinishedJob:
 
     def __init__(self, path: Path, job: str) -> None:
         self._path = path
-        self._job = job
+        self._job = f"{job}, by {version('hbr-rig')}"
         self._file: TextIO | None = None
         self._begun = False
         self.found: dict[str, Any] = {}
@@ -69,19 +69,9 @@ class UnfinishedJob:
     def _begin(self) -> None:
         """Write what was found before to a new file, which takes the place of the old one."""
         self._begun = True
-        new = self._path.with_name(f"{self._path.name}.part")
-        file = TextIOWrapper(open_new(new, mode=0o600), encoding="utf-8")
-        try:
-            file.write(f"{json.dumps({'job': self._job})}\n")
-            file.writelines(f"{json.dumps(pair)}\n" for pair in self.found.items())
-            file.flush()
-            new.replace(self._path)
-        except BaseException:
-            file.close()
-            with suppress(OSError):
-                new.unlink()
-            raise
-        self._file = file
+        lines = [json.dumps({"job": self._job}), *map(json.dumps, self.found.items())]
+        write(self._path, "".join(f"{line}\n" for line in lines).encode(), mode=0o600)
+        self._file = open(self._path, "a", encoding="utf-8", opener=no_follow)  # noqa: SIM115 - as in files.py
 
     def __enter__(self) -> Self:
         return self

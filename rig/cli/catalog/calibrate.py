@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from hbr.dense.leave_one_out import Found, Task
     from rig.catalog.unfinished import UnfinishedJob
 
-fromhex = float.fromhex
-
 _SEVERAL_PROCESSES: Final = 20_000
 """Views from which the searches take longer than the start of further processes."""
 
@@ -66,7 +64,7 @@ def calibrate(
     begun_ns = clock.now_ns()
     print(f"Searching for {len(views.object_names)} objects among each other ...", file=sys.stderr)
     index = DenseIndex(views)
-    unfinished = UnfinishedJob(path.with_name("calibrate.unfinished"), f"calibrate {digest(index)}")
+    unfinished = UnfinishedJob(path.with_name("calibrate.unfinished"), digest(index))
     unfinished.load()
     with unfinished, _interruptible(unfinished), progress_bar("Searching") as progress:
 
@@ -110,8 +108,8 @@ def _continued(
     for task in tasks:
         try:
             *leaders, confidence, correct = unfinished.found[repr(task)]
-            known, unknown = ([(int(n), fromhex(a), fromhex(b)) for n, a, b in part] for part in leaders)
-            done = Found(known, unknown, [fromhex(one) for one in confidence], [bool(one) for one in correct])
+            known, unknown = ([(int(n), float.fromhex(a), float.fromhex(b)) for n, a, b in part] for part in leaders)
+            done = Found(known, unknown, [float.fromhex(one) for one in confidence], [bool(one) for one in correct])
         except (KeyError, TypeError, ValueError):  # not stored, or changed by hand
             left.append(task)
         else:

@@ -35,18 +35,15 @@ def verify(
 
     Example: rig catalog verify --repair --bench sim
     """
-    from importlib.metadata import version
-
     from rig.catalog.unfinished import UnfinishedJob
     from rig.catalog.verify import verify as job
     from rig.cli.catalog.findings import finding_text
     from rig.events.events import plain
     from rig.events.phrases import counted
 
-    job_name = f"verify by {version('hbr-rig')}"
     with (
         settings.open_catalog(read_only=not repair) as catalog,
-        UnfinishedJob(catalog.path / "verify.unfinished", job_name) as unfinished,
+        UnfinishedJob(catalog.path / "verify.unfinished", "verify") as unfinished,
     ):
         if not resume:
             unfinished.remove()
@@ -109,18 +106,15 @@ def redescribe(
 
     Example: rig catalog redescribe --descriptor edges+colours --bench sim
     """
-    from importlib.metadata import version
-
     from rig.catalog.redescribe import redescribe as job
     from rig.catalog.unfinished import UnfinishedJob
     from rig.events.events import plain
     from rig.events.phrases import counted
 
     part, name = _region(settings, region), descriptor_name(descriptor)
-    job_name = f"describe again by {name}, {part}, {version('hbr-rig')}"
     with (
         settings.open_catalog() as catalog,
-        UnfinishedJob(catalog.path / "redescribe.unfinished", job_name) as unfinished,
+        UnfinishedJob(catalog.path / "redescribe.unfinished", f"{name}, {part}") as unfinished,
     ):
         if again:
             unfinished.load()
@@ -138,7 +132,8 @@ def redescribe(
             ),
             interrupted="Interrupted; the results so far are stored. The same command continues.",
         )
-        unfinished.remove()
+        if again:
+            unfinished.remove()
     if settings.json:
         settings.print_json(plain(done))
     else:

@@ -7,14 +7,13 @@ import sqlite3
 import subprocess
 import sys
 import zipfile
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable
 from contextlib import closing
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import cv2
-import numpy as np
 import pytest
 from click.testing import Result
 from typer.testing import CliRunner
@@ -24,6 +23,7 @@ from hbr.descriptors.plain_cedd import Cedd
 from rig.catalog import Catalog
 from rig.catalog.exchange import read_folder
 from rig.cli.main import app
+from tests.rig.cli.noise_photographs import photographs
 
 SAMPLE = Path(__file__).parents[1] / "catalog" / "data" / "catalog-v1"
 COIL = Path(os.environ.get("RIG_TEST_DATA", Path(__file__).parents[3] / ".." / "shared" / "data")) / "coil-100"
@@ -34,33 +34,6 @@ Rig = Callable[..., Result]
 def result(done: Result) -> Any:
     assert done.exit_code == 0, done.output
     return json.loads(done.stdout)
-
-
-def photographs(folder: Path, *objects: str, step_deg: int = 90, side: int = 24) -> Path:
-    folder.mkdir()
-    for seed, name in enumerate(objects):
-        for angle in range(0, 360, step_deg):
-            picture = np.random.default_rng([seed, angle]).integers(0, 256, (side, side, 3), np.uint8)
-            cv2.imwrite(str(folder / f"{name}__{angle}.png"), picture)
-    return folder
-
-
-@pytest.fixture(scope="session")
-def two_objects(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with photographs of two objects and their catalog."""
-    folder = tmp_path_factory.mktemp("two")
-    photographs(folder / "photographs", "mug", "tin")
-    catalog = ("--bench", "sim", "--set", f"catalog.path={folder / 'catalog'}")
-    done = CliRunner().invoke(app, ["import", str(folder / "photographs"), "--label", "kitchen", *catalog])
-    assert done.exit_code == 0, done.output
-    return folder
-
-
-@pytest.fixture
-def two(rig: Rig, tmp_path: Path, two_objects: Path) -> Rig:
-    """The same with two objects in the catalog."""
-    shutil.copytree(two_objects, tmp_path, dirs_exist_ok=True)
-    return rig
 
 
 def names(rig: Rig, *options: str) -> list[str]:
@@ -163,82 +136,6 @@ def test_verify_repairs_and_sets_the_exit_code(two: Rig) -> None:
     assert two("catalog", "verify").exit_code == 0
     second.unlink()
     assert two("catalog", "verify", "--repair", "--quick").exit_code == 7
-
-
-def interrupt(monkeypatch: pytest.MonkeyPatch, module: str, after: int) -> list[object]:
-    """Let Ctrl+C interrupt the long job of a module after so many portions or tasks; return what it works on then."""
-    seen: list[object] = []
-
-    def interrupted(work: Callable[[Any], Any], items: Iterable[Any], jobs: object) -> Iterator[tuple[Any, Any]]:
-        for item in items:
-            if len(seen) == after:
-                raise KeyboardInterrupt
-            seen.append(item)
-            yield item, work(item)
-
-    monkeypatch.setattr(f"{module}.map_in_processes", interrupted)
-    return seen
-
-
-def test_interrupted_check_continues_if_asked_to(two: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rig.catalog.jobs.PORTION", 3)
-    with monkeypatch.context() as patch:
-        interrupt(patch, "rig.catalog.verify", 2)
-        stopped = two("catalog", "verify")
-    assert stopped.exit_code == 130
-    assert "Interrupted; nothing was changed. To continue: rig catalog verify --resume" in stopped.stderr
-    seen = interrupt(monkeypatch, "rig.catalog.verify", 99)
-    done = two("catalog", "verify", "--resume")
-    assert done.exit_code == 0, done.output
-    assert "The interrupted check found 6 images right." in done.stderr
-    assert [len(portion) for portion in seen] == [2]
-    assert "2 objects, 8 views" in done.stdout
-    assert "No check was interrupted." in two("catalog", "verify", "--resume").stderr
-    assert len(seen) == 4, "3 portions of all views"
-    assert not list(Path("catalog").glob("*.unfinished*"))
-
-
-def test_interrupted_redescription_continues(two: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rig.catalog.jobs.PORTION", 2)
-    with monkeypatch.context() as patch:
-        interrupt(patch, "rig.catalog.redescribe", 1)
-        stopped = two("catalog", "redescribe", "--again")
-    assert stopped.exit_code == 130
-    assert "The same command continues." in stopped.stderr
-    done = two("catalog", "redescribe", "--again")
-    assert "The interrupted command described" in done.stderr
-    assert "6 views described" in done.stdout
-    assert "8 views described" in two("catalog", "redescribe", "--again").stdout
-    assert not list(Path("catalog").glob("*.unfinished*"))
-
-
-def test_interrupted_calibration_continues_to_the_same_rule(two: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert two("catalog", "redescribe", "--descriptor", "edges+colours").exit_code == 0
-    rule = Path("catalog/search_rules.json")
-    assert two("catalog", "calibrate").exit_code == 0
-    expected = json.loads(rule.read_text())
-    rule.unlink()
-    with monkeypatch.context() as patch:
-        interrupt(patch, "rig.core.processes", 1)
-        stopped = two("catalog", "calibrate")
-    assert stopped.exit_code == 130
-    assert "Interrupted; the searches so far are stored. The same command continues." in stopped.stderr
-    assert not rule.exists()
-    unfinished = Path("catalog/calibrate.unfinished")
-    kept = unfinished.read_text()
-    seen = interrupt(monkeypatch, "rig.core.processes", 99)
-    assert two("catalog", "calibrate").exit_code == 0
-    assert len(seen) == 1, "the search for the other object"
-    for changed in (
-        kept.replace("0x1", "x"),
-        kept.replace("[[[", "[["),
-        kept.partition("\n")[0] + '\n["(0, 0.0)", 5]\n',
-    ):
-        unfinished.write_text(changed)
-        assert two("catalog", "calibrate").exit_code == 0
-    assert len(seen) == 7, "both searches again"
-    assert {**json.loads(rule.read_text()), "made_utc": None} == {**expected, "made_utc": None}
-    assert not list(Path("catalog").glob("*.unfinished*"))
 
 
 def test_identify_names_redescribe_for_a_new_descriptor(two: Rig, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,87 @@
+"""Long jobs of the catalog continue after Ctrl+C."""
+
+import json
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import Result
+
+Rig = Callable[..., Result]
+
+
+def interrupt(monkeypatch: pytest.MonkeyPatch, module: str, after: int) -> list[object]:
+    """Let Ctrl+C interrupt the long job of a module after so many portions or tasks; return what it works on then."""
+    seen: list[object] = []
+
+    def interrupted(work: Callable[[Any], Any], items: Iterable[Any], jobs: object) -> Iterator[tuple[Any, Any]]:
+        for item in items:
+            if len(seen) == after:
+                raise KeyboardInterrupt
+            seen.append(item)
+            yield item, work(item)
+
+    monkeypatch.setattr(f"{module}.map_in_processes", interrupted)
+    return seen
+
+
+def test_interrupted_check_continues_if_asked_to(two: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rig.catalog.jobs.PORTION", 3)
+    with monkeypatch.context() as patch:
+        interrupt(patch, "rig.catalog.verify", 2)
+        stopped = two("catalog", "verify")
+    assert stopped.exit_code == 130
+    assert "Interrupted; nothing was changed. To continue: rig catalog verify --resume" in stopped.stderr
+    seen = interrupt(monkeypatch, "rig.catalog.verify", 99)
+    done = two("catalog", "verify", "--resume")
+    assert done.exit_code == 0, done.output
+    assert "The interrupted check found 6 images right." in done.stderr
+    assert [len(portion) for portion in seen] == [2]
+    assert "2 objects, 8 views" in done.stdout
+    assert "No check was interrupted." in two("catalog", "verify", "--resume").stderr
+    assert len(seen) == 4, "3 portions of all views"
+    assert not list(Path("catalog").glob("*.unfinished*"))
+
+
+def test_interrupted_redescription_continues(two: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rig.catalog.jobs.PORTION", 2)
+    with monkeypatch.context() as patch:
+        interrupt(patch, "rig.catalog.redescribe", 1)
+        stopped = two("catalog", "redescribe", "--again")
+    assert stopped.exit_code == 130
+    assert "The same command continues." in stopped.stderr
+    done = two("catalog", "redescribe", "--again")
+    assert "The interrupted command described" in done.stderr
+    assert "6 views described" in done.stdout
+    assert "8 views described" in two("catalog", "redescribe", "--again").stdout
+    assert not list(Path("catalog").glob("*.unfinished*"))
+
+
+def test_interrupted_calibration_continues_to_the_same_rule(two: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert two("catalog", "redescribe", "--descriptor", "edges+colours").exit_code == 0
+    rule = Path("catalog/search_rules.json")
+    assert two("catalog", "calibrate").exit_code == 0
+    expected = json.loads(rule.read_text())
+    rule.unlink()
+    with monkeypatch.context() as patch:
+        interrupt(patch, "rig.core.processes", 1)
+        stopped = two("catalog", "calibrate")
+    assert stopped.exit_code == 130
+    assert "Interrupted; the searches so far are stored. The same command continues." in stopped.stderr
+    assert not rule.exists()
+    unfinished = Path("catalog/calibrate.unfinished")
+    kept = unfinished.read_text()
+    seen = interrupt(monkeypatch, "rig.core.processes", 99)
+    assert two("catalog", "calibrate").exit_code == 0
+    assert len(seen) == 1, "the search for the other object"
+    for changed in (
+        kept.replace("0x1", "x"),
+        kept.replace("[[[", "[["),
+        kept.partition("\n")[0] + '\n["(0, 0.0)", 5]\n',
+    ):
+        unfinished.write_text(changed)
+        assert two("catalog", "calibrate").exit_code == 0
+    assert len(seen) == 7, "both searches again"
+    assert {**json.loads(rule.read_text()), "made_utc": None} == {**expected, "made_utc": None}
+    assert not list(Path("catalog").glob("*.unfinished*"))
