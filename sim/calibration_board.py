@@ -132,14 +132,14 @@ class GreyCard:
         image[:] = self.level
 
 
-def calibration_targets(optics: Optics, board: Board | None = None) -> dict[str, SimObject]:
+def calibration_targets(optics: Optics) -> dict[str, SimObject]:
     """Return the objects that camera calibrations need, by name: the grey card, and the board on each stand."""
-    return {GreyCard().name: GreyCard(), **boards(optics, board)}
+    return {GreyCard().name: GreyCard(), **boards(optics)}
 
 
-def boards(optics: Optics, board: Board | None = None) -> dict[str, BoardOnPlatter]:
+def boards(optics: Optics) -> dict[str, BoardOnPlatter]:
     """Return the board in each position that calibrations need, by name."""
-    layout = board or Board()
+    layout = Board()
     return {
         "calibration-board upright": BoardOnPlatter(layout, optics, tilt_deg=4.0),
         "calibration-board back": BoardOnPlatter(layout, optics, tilt_deg=31.0, centre_mm=(0.0, 10.0, 70.0)),

@@ -112,9 +112,9 @@ class Optics:
         drawn = np.array([[PX_PER_MM, 0.0, CENTRE_PX[0]], [0.0, -PX_PER_MM * COS, CENTRE_PX[1]], [0.0, 0.0, 1.0]])
         return np.asarray(seen @ np.linalg.inv(drawn))
 
-    def rays(self, factor: int = SUPERSAMPLING) -> NDArray[np.float32]:
+    def rays(self) -> NDArray[np.float32]:
         """Return where the ray of each sub-pixel meets the plane one unit in front of the lens, float32 (n, 2)."""
-        return _rays(self, factor)
+        return _rays(self)
 
 
 def _about_vertical(angle_deg: float) -> Floats:
@@ -123,9 +123,9 @@ def _about_vertical(angle_deg: float) -> Floats:
 
 
 @lru_cache(maxsize=2)
-def _rays(optics: Optics, factor: int) -> NDArray[np.float32]:
-    x = (np.arange(WIDTH * factor) + 0.5) / factor - 0.5
-    y = (np.arange(HEIGHT * factor) + 0.5) / factor - 0.5
+def _rays(optics: Optics) -> NDArray[np.float32]:
+    x = (np.arange(WIDTH * SUPERSAMPLING) + 0.5) / SUPERSAMPLING - 0.5
+    y = (np.arange(HEIGHT * SUPERSAMPLING) + 0.5) / SUPERSAMPLING - 0.5
     grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 1, 2)
     rays = cv2.undistortPoints(grid, optics.matrix, np.array(optics.distortion))
     return np.asarray(rays.reshape(-1, 2), dtype=np.float32)

@@ -229,9 +229,7 @@ class NextArc:
     cost: FloatArray
 
 
-def next_arc(
-    belief: Belief, *, beta: float, rotations_deg: FloatArray, seconds: FloatArray, second_costs: float = 1.0
-) -> NextArc:
+def next_arc(belief: Belief, *, beta: float, rotations_deg: FloatArray, seconds: FloatArray) -> NextArc:
     """Choose the arc with the lowest sum of expected confusion and cost.
 
     All that is seen on the way counts: the exponents of `hbr.dense.next_view.next_best_view` are added up from here to
@@ -242,13 +240,12 @@ def next_arc(
     rotations_deg
         Ends of the possible arcs, multiples of `STEP_DEG` to both sides, float64 (a,); the nearest ones included.
     seconds
-        Time to each.
+        Time to each. It is the cost: one second costs 1.
     """
     here_deg = float(belief.orientation_deg[-1])
     apart_deg = size_deg(here_deg + rotations_deg[:, None] - belief.orientation_deg).min(axis=1)
     new = np.minimum(apart_deg / STEP_DEG, 1.0) * STEP_WEIGHT
     probability, place, bin_of = strongest(belief.posterior(beta))
-    cost = second_costs * seconds
     first, second = np.nonzero(np.triu(place[:, None] != place))  # pairs of different objects
     pairs = probability[first] * probability[second]
     confusion = np.zeros(len(rotations_deg))
@@ -266,10 +263,10 @@ def next_arc(
             confusion[way] = np.log(np.maximum(2 * remaining.sum(axis=1), 1e-300))
         else:  # one object alone: a new side helps to find its azimuth
             confusion[way] = -_SHARPNESS * np.cumsum(new[way])
-    sums = np.where(np.abs(rotations_deg) >= LEAST_ARC_DEG, confusion + cost, np.inf)
-    chosen = int((sums if np.isfinite(sums).any() else confusion + cost).argmin())
+    sums = np.where(np.abs(rotations_deg) >= LEAST_ARC_DEG, confusion + seconds, np.inf)
+    chosen = int((sums if np.isfinite(sums).any() else confusion + seconds).argmin())
     if pairs.any():
         most = int(pairs.argmax())
         objects = belief.index.object_index
         pair = int(objects[place[first[most]]]), int(objects[place[second[most]]])
-    return NextArc(float(rotations_deg[chosen]), pair, rotations_deg, confusion, cost)
+    return NextArc(float(rotations_deg[chosen]), pair, rotations_deg, confusion, seconds)

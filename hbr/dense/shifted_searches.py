@@ -61,9 +61,7 @@ def can_shift(index: DenseIndex) -> bool:
     return not np.array_equal(kind.shifted(row, hard), row)
 
 
-def shifted_searches(
-    index: DenseIndex, *, views: int, searches: int, progress: Callable[[int, int], object] | None = None
-) -> ShiftedSearches:
+def shifted_searches(index: DenseIndex, *, views: int, searches: int) -> ShiftedSearches:
     """Search so many times for the objects of an index in turn, each time with so many views.
 
     Objects with fewer views are left out. Every object is searched for under each strength before one is repeated.
@@ -83,8 +81,6 @@ def shifted_searches(
     white = index.whitening.white(index.views.levels(every)) if len(every) <= _MOST_VIEWS else None
     strength, known, unknown, correct = [], [], [], []
     for n in range(searches):
-        if progress is not None:
-            progress(n, searches)
         place = places[n % len(places)]
         rows = rows_of[place]
         azimuth_deg = index.views.azimuth_deg[rows]

@@ -1,7 +1,8 @@
 """Confidence intervals of hit-rates, and tests of two methods on the same trials."""
 
-from math import comb, isfinite, sqrt
+from math import comb, sqrt
 from statistics import NormalDist
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,16 +11,18 @@ from hbr.core.arrays import FloatArray
 
 Hits = NDArray[np.bool_]
 
+_CONFIDENCE: Final = 0.95
+_RESAMPLES: Final = 2000
+"""Draws of all objects with replacement."""
 
-def wilson(hits: int, trials: int, *, confidence: float = 0.95) -> tuple[float, float]:
-    """Return Wilson's score interval of a proportion.
+
+def wilson(hits: int, trials: int) -> tuple[float, float]:
+    """Return Wilson's 95 % score interval of a proportion.
 
     Parameters
     ----------
     hits, trials : int
         0 <= hits <= trials, trials >= 1.
-    confidence : float
-        Coverage, between 0 and 1.
 
     Returns
     -------
@@ -30,9 +33,7 @@ def wilson(hits: int, trials: int, *, confidence: float = 0.95) -> tuple[float, 
     """
     if trials < 1 or not 0 <= hits <= trials:
         raise ValueError(f"{hits} hits of {trials} trials; at least one trial and no more hits than trials are needed")
-    if not (isfinite(confidence) and 0 < confidence < 1):
-        raise ValueError(f"confidence is {confidence}; a share between 0 and 1 is needed, 0.95 by default")
-    z = NormalDist().inv_cdf((1 + confidence) / 2)
+    z = NormalDist().inv_cdf((1 + _CONFIDENCE) / 2)
     rate = hits / trials
     shrink = 1 + z * z / trials
     centre = (rate + z * z / (2 * trials)) / shrink
@@ -57,10 +58,8 @@ def mcnemar_exact(only_first: int, only_second: int) -> float:
     return min(1.0, p_value)
 
 
-def bootstrap_difference(
-    first: Hits, second: Hits, rng: np.random.Generator, *, confidence: float = 0.95, resamples: int = 2000
-) -> tuple[float, float]:
-    """Return the percentile interval of the difference of two hit-rates, by resampling complete objects.
+def bootstrap_difference(first: Hits, second: Hits, rng: np.random.Generator) -> tuple[float, float]:
+    """Return the 95 % percentile interval of the difference of two hit-rates, by resampling complete objects.
 
     The trials of one object are similar: an interval for independent trials would be too narrow.
 
@@ -70,10 +69,6 @@ def bootstrap_difference(
         Hits on the same trials.
     rng : numpy Generator
         Draws the objects.
-    confidence : float
-        Coverage of the interval.
-    resamples : int
-        Draws of all objects with replacement.
 
     Returns
     -------
@@ -83,6 +78,6 @@ def bootstrap_difference(
     if first.shape != second.shape or first.ndim != 2 or not first.size:
         raise ValueError(f"hits of shapes {first.shape} and {second.shape}; one (objects, trials) for both is needed")
     by_object: FloatArray = first.mean(axis=1) - second.mean(axis=1)
-    drawn = by_object[rng.integers(len(by_object), size=(resamples, len(by_object)))].mean(axis=1)
-    low, high = np.quantile(drawn, [(1 - confidence) / 2, (1 + confidence) / 2])
+    drawn = by_object[rng.integers(len(by_object), size=(_RESAMPLES, len(by_object)))].mean(axis=1)
+    low, high = np.quantile(drawn, [(1 - _CONFIDENCE) / 2, (1 + _CONFIDENCE) / 2])
     return float(low), float(high)

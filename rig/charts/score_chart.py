@@ -14,6 +14,7 @@ _LEFT, _TOP, _RIGHT, _BOTTOM = 44.0, 22.0, 226.0, 244.0
 _NAME_X: Final = _RIGHT + 28
 _LINE_HEIGHT: Final = 16.0
 _NAME_LETTERS: Final = 12
+_CANDIDATES: Final = 5
 _TICK_PX: Final = 18.0
 """Room for the number of a view."""
 _FAR: Final = 3.0
@@ -27,9 +28,10 @@ def score_chart(
     winner: str | None = None,
     truth: str | None = None,
     min_score: float | None = None,
-    top: int = 5,
 ) -> str:
     """Draw the score per view of the leading candidates after each view; names are at the ends of the lines.
+
+    The candidates are the best five of the last round.
 
     Parameters
     ----------
@@ -42,8 +44,6 @@ def score_chart(
     min_score
         An object with a lower score is unknown. The line is dashed, and named beside the plot; without a line if it is
         far from the scores.
-    top
-        Number of candidates to draw: the best of the last round.
 
     Returns
     -------
@@ -56,7 +56,7 @@ def score_chart(
     """
     if not rounds or not all(rounds):
         raise ValueError("a score chart needs at least one round, and a candidate in each")
-    names = sorted(rounds[-1], key=lambda name: -rounds[-1][name])[:top]
+    names = sorted(rounds[-1], key=lambda name: -rounds[-1][name])[:_CANDIDATES]
     shown = [scores[name] for scores in rounds for name in names if name in scores]
     ticks = _ticks(shown, min_score, several=len(names) > 1)
     low, high = ticks[0], ticks[-1]

@@ -103,11 +103,11 @@ def without_echoes(scans: Sequence[BaudScan], preferred: int) -> list[BaudScan]:
     return [next((each for each in scans if each.baud == preferred), scans[0])]
 
 
-def corrupt_reads(bus: DynamixelBus, bus_id: int, reads: int = _STATUS_READS) -> int:
+def corrupt_reads(bus: DynamixelBus, bus_id: int) -> int:
     """Return how many reads of a servo's status came back corrupt; the bus must not retry."""
     corrupt = 0
     address, size = _STATUS if bus.protocol == 2 else (36, 8)
-    for _ in range(reads):
+    for _ in range(_STATUS_READS):
         try:
             bus.read_block(bus_id, address, size)
         except RequestRejected:
@@ -208,9 +208,9 @@ def _servo(bus_id: int, baud: int, protocol: int, number: int, firmware: int) ->
     return FoundServo(bus_id, baud, protocol, model_of(number), number, firmware)
 
 
-def _answers_corrupt(bus: DynamixelBus, bus_id: int, pings: int = 3) -> bool:
-    """Return whether every ping of an id gets a corrupt answer."""
-    for _ in range(pings):
+def _answers_corrupt(bus: DynamixelBus, bus_id: int) -> bool:
+    """Return whether each of three pings of an id gets a corrupt answer."""
+    for _ in range(3):
         corrupt = bus.statistics.corrupt
         try:
             bus.ping(bus_id)

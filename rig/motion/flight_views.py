@@ -39,7 +39,7 @@ class FlightJudge:
         """Return which time stamps of consecutive frames cannot be trusted, bool (n,)."""
         return irregular_stamps(stamps_ns, self.period_s, self.config.camera_time.jitter_ms)
 
-    def judge(self, frame: StreamFrame, trajectory: Trajectory, *, irregular: bool, number: int = 1) -> Attempt:
+    def judge(self, frame: StreamFrame, trajectory: Trajectory, *, irregular: bool) -> Attempt:
         """Return a frame as an attempt at a view: its evidence, and the reasons to reject it."""
         quality = ImageQuality.of(frame.image_bgr, self.config.view)
         middle = middle_ns(frame.stamp_ns, self.config.camera_time)
@@ -67,7 +67,7 @@ class FlightJudge:
             reasons.append(RejectReason.LOCKS_CHANGED)
         reasons += quality.reasons(self.config.view)
         return Attempt(
-            number,
+            1,
             frame.image_bgr,
             ViewEvidence(
                 settled_ns=self.begun_ns,

@@ -206,10 +206,10 @@ class SimHead:
         self._library.board_reset(self._board, cause)
         self._drain()
 
-    def hang(self, hangs: bool = True) -> None:
+    def hang(self) -> None:
         """Stop the firmware's main loop, but not its interrupts."""
         self.catch_up()
-        self._library.board_hang(self._board, hangs)
+        self._library.board_hang(self._board, True)
 
     def pulses(self, pin: str) -> list[tuple[int, float]]:
         """Return the history of ``pin``: times (ns, virtual clock) and values, oldest first."""

@@ -20,10 +20,10 @@ class HeadSerial:
         Another port is open on this head.
     """
 
-    def __init__(self, head: SimHead, baudrate: int = BAUD, timeout: float = 0.002, port: str = "sim-head") -> None:
-        self.port = self.name = port
-        self.baudrate = baudrate
-        self.timeout = timeout
+    def __init__(self, head: SimHead) -> None:
+        self.port = self.name = "sim-head"
+        self.baudrate = BAUD
+        self.timeout = 0.002
         self.is_open = True
         self._head = head
         self._plugged_out = False

@@ -196,11 +196,10 @@ def lying_cylinder(
     end: Paint | Colour,
     at: tuple[float, float, float],
     rotation_deg: float = 0.0,
-    layer: int = 0,
     depth_at: tuple[float, float] | None = None,
-    sides: int = 36,
 ) -> Polyhedron:
     """Return a horizontal cylinder with its printed end to the front and its back end at ``at``."""
+    sides = 36
     ring = [(radius_mm * cos(2 * pi * i / sides), radius_mm * sin(2 * pi * i / sides)) for i in range(sides + 1)]
     y = -length_mm
     walls = [
@@ -211,11 +210,11 @@ def lying_cylinder(
     far = np.array([(x, 0.0, z) for x, z in ring[:-1]])[::-1].copy()
     lid = Face(near, end, (np.array([-r, y, r]), np.array([r, y, r]), np.array([-r, y, -r])))
     cap = Face(far, wall, (far[0], far[1], far[2]))
-    return moved(Polyhedron((*walls, lid, cap), layer, depth_at), at, rotation_deg)
+    return moved(Polyhedron((*walls, lid, cap), 0, depth_at), at, rotation_deg)
 
 
 def roof(
-    size_mm: tuple[float, float, float], *, slope: Paint, gable: Colour, at: tuple[float, float, float], layer: int = 1
+    size_mm: tuple[float, float, float], *, slope: Paint, gable: Colour, at: tuple[float, float, float]
 ) -> Polyhedron:
     """Return a gabled roof (width, depth, height) whose ridge runs from left to right."""
     w, d, h = size_mm[0] / 2, size_mm[1] / 2, size_mm[2]
@@ -227,7 +226,7 @@ def roof(
         quad([right, c, e, left], slope),
         *(Face(t, gable, (t[0], t[1], t[2])) for t in triangles),
     )
-    return moved(Polyhedron(faces, layer), at, 0.0)
+    return moved(Polyhedron(faces, 1), at, 0.0)
 
 
 def moved(solid: Polyhedron, at: tuple[float, float, float], rotation_deg: float) -> Polyhedron:

@@ -16,8 +16,8 @@ _MUG = ((41.0, 98.0), (44.0, 98.0), (44.0, 12.0), (42.0, 4.0), (38.0, 0.0))
 _MUG_INSIDE = ((41.0, 98.0), (41.0, 10.0), (36.0, 6.0), (0.0, 6.0))
 
 
-def _mug(name: str, ground: Colour, *brushes: Brush, lining: Colour = p.WHITE) -> Solid:
-    body = Revolution(_MUG, painted(ground, *brushes), inside=_MUG_INSIDE, lining=lining, shine=0.45)
+def _mug(name: str, ground: Colour, *brushes: Brush) -> Solid:
+    body = Revolution(_MUG, painted(ground, *brushes), inside=_MUG_INSIDE, lining=p.WHITE, shine=0.45)
     return Solid(name, (body, Tube(handle(44, 82, 24, 26, 5.5, 90), ground)))
 
 

@@ -33,7 +33,7 @@ def _house(name: str, *door: Brush) -> Solid:
     body = box((112, 84, 78), (front, gable, painted(p.CREAM, windows), gable), top=p.CREAM)
     return Solid(
         name,
-        (body, roof((128, 102, 54), slope=painted(p.RED, tiles), gable=p.CREAM, at=(0, 0, 78), layer=1), _chimney()),
+        (body, roof((128, 102, 54), slope=painted(p.RED, tiles), gable=p.CREAM, at=(0, 0, 78)), _chimney()),
     )
 
 

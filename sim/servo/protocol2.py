@@ -75,8 +75,9 @@ def _crc_of_byte(byte: int) -> int:
 _CRC_TABLE = tuple(_crc_of_byte(byte) for byte in range(256))
 
 
-def crc16(data: bytes, crc: int = 0) -> int:
-    """Return the CRC-16 of ``data`` (polynomial 0x8005, not reflected), continued from ``crc``."""
+def crc16(data: bytes) -> int:
+    """Return the CRC-16 of ``data`` (polynomial 0x8005, not reflected)."""
+    crc = 0
     for byte in data:
         crc = (crc << 8) & 0xFFFF ^ _CRC_TABLE[crc >> 8 ^ byte]
     return crc

@@ -56,11 +56,11 @@ def bno055() -> HeadSensor:
 
 @contextmanager
 def simulated_head(
-    kind: str = "memory", noise: NoiseModel | None = None, *, clock_error: float = CLOCK_ERROR, seed: int = 1
+    kind: str = "memory", noise: NoiseModel | None = None, *, clock_error: float = CLOCK_ERROR
 ) -> Iterator[tuple[SimHead, World]]:
     """Yield a head with nothing on its bus."""
     needs(kind)
-    world = World(noise=noise, seed=seed)
+    world = World(noise=noise, seed=1)
     head = SimHead(world, kind, clock_error=clock_error)
     try:
         yield head, world

@@ -144,8 +144,8 @@ def enrollment(
     return outcome
 
 
-def identification(rig: Rig, *faults: str, yaw_deg: float = 77.0) -> Outcome:
-    rig.operator.next_object, rig.operator.yaw_deg = NAME, yaw_deg
+def identification(rig: Rig, *faults: str) -> Outcome:
+    rig.operator.next_object, rig.operator.yaw_deg = NAME, 77.0
     with _outcome(rig) as outcome, rig.opened(*faults) as (bench, _):
         outcome.events.extend(identify(bench, known_views()))
     return outcome

@@ -70,9 +70,9 @@ class GuestBench:
             self.machine, self.machine.ask("shell", command=command, folder=folder, variables=VARIABLES)
         )
 
-    def sh(self, command: str, folder: str = str(FOLDER), timeout: float = 60.0) -> str:
+    def sh(self, command: str, folder: str = str(FOLDER)) -> str:
         """Return the output of a command; raises AssertionError if it fails."""
-        result = self.start_sh(command, folder).wait(timeout)
+        result = self.start_sh(command, folder).wait(60.0)
         assert result.code == 0, f"{command}: {result}"
         return result.output.strip()
 

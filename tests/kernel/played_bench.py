@@ -32,11 +32,11 @@ class PlayedBench(AbstractContextManager["PlayedBench"]):
         The USB devices.
     """
 
-    def __init__(self, config: RigConfig | None = None, seed: int = 1) -> None:
+    def __init__(self) -> None:
         # A slow computer waits long for the end of a vibration; the contract of an IMU is for one without errors.
         noise = NoiseModel(structure_hz=0.0, accel_bias_g=0.0, imu_tilt_deg=0.0)
-        world = World(noise=noise, seed=seed)
-        self.devices = SimDevices.connected(config or RigConfig(), world)
+        world = World(noise=noise, seed=1)
+        self.devices = SimDevices.connected(RigConfig(), world)
         assert isinstance(self.devices.i2c, SimI2cBus)
         world.put(shelf()[OBJECT])
         self.servo = FtdiAdapter(self.devices.adapter)

@@ -120,10 +120,10 @@ def reading(number: int, endpoint: int = 1, length: int = 64, setup: bytes = byt
     return Submit(number, endpoint, True, length, setup)
 
 
-def writing(number: int, data: bytes, endpoint: int = 2) -> Submit:
+def writing(number: int, data: bytes) -> Submit:
     """Return a transfer to the device; its number is even."""
     assert not number % 2
-    return Submit(number, endpoint, False, len(data), bytes(8), data)
+    return Submit(number, 2, False, len(data), bytes(8), data)
 
 
 def test_control_transfers_are_answered_cut_to_the_length_or_stalled():

@@ -19,11 +19,11 @@ starts = st.floats(0, 1_000)
 
 
 @st.composite
-def trajectories(draw: st.DrawFn, max_moves: int = 4) -> Trajectory:
+def trajectories(draw: st.DrawFn) -> Trajectory:
     """Draw the last of a few moves, each begun where the one before was interrupted."""
     t, x, v = 0.0, draw(angles), 0.0
     path = rest(t, x)
-    for _ in range(draw(st.integers(1, max_moves))):
+    for _ in range(draw(st.integers(1, 4))):
         if draw(st.booleans()):
             path = to_position(t, x, v, draw(angles), draw(limits), draw(ramps))
         else:

@@ -26,7 +26,6 @@ from rig.core.errors import CatalogDamaged, ExportFailed, ImportRejected, RigErr
 from rig.core.files import no_follow, open_new, sync_file, sync_folder
 from rig.views import image_files as images
 
-SUFFIX: Final = ".rigcat.zip"
 FORMAT: Final = "rigcat"
 VERSION: Final = 2
 MANIFEST: Final = "rigcat.json"

@@ -70,10 +70,10 @@ def read_objects(catalog: Catalog, names: Collection[str] = ()) -> Generator[Exp
             yield Object(**texts, created_utc=row.created_utc, enrollments=tuple(found)), files
 
 
-def read_catalog(catalog: Catalog, names: Collection[str] = ()) -> ImportBatch:
-    """Return objects of a catalog, to be imported into another one."""
+def read_catalog(catalog: Catalog) -> ImportBatch:
+    """Return the objects of a catalog, to be imported into another one."""
     found, sources = [], {}
-    for item, files in read_objects(catalog, names):
+    for item, files in read_objects(catalog):
         found.append(item)
         sources.update({name: ImageSource(str(path)) for name, path in files.items()})
     return ImportBatch(str(catalog.place), tuple(found), sources, strict=True)

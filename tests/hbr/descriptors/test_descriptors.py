@@ -16,12 +16,12 @@ def one(request: pytest.FixtureRequest) -> Descriptor:
     return descriptor(request.param)
 
 
-def photo(seed: int = 0, size: tuple[int, int] = (120, 160)) -> np.ndarray:
+def photo(seed: int = 0) -> np.ndarray:
     """Return an image of a coloured, striped blob before a dark background."""
     rng = np.random.default_rng(seed)
-    image = np.full((*size, 3), 20, np.uint8)
-    y, x = np.indices(size)
-    inside = ((y - size[0] / 2) / 40) ** 2 + ((x - size[1] / 2) / 30) ** 2 < 1
+    image = np.full((120, 160, 3), 20, np.uint8)
+    y, x = np.indices((120, 160))
+    inside = ((y - 60) / 40) ** 2 + ((x - 80) / 30) ** 2 < 1
     image[inside] = rng.integers(60, 255, 3)
     image[inside & (x // 6 % 2 == 0)] = rng.integers(60, 255, 3)
     return image

@@ -44,11 +44,10 @@ def test_bootstrap_resamples_objects_not_trials() -> None:
     [
         lambda: wilson(3, 2),
         lambda: wilson(0, 0),
-        lambda: wilson(1, 2, confidence=1),
         lambda: mcnemar_exact(-1, 2),
         lambda: bootstrap_difference(np.ones((2, 3), bool), np.ones((3, 2), bool), np.random.default_rng()),
     ],
 )
 def test_impossible_counts_are_rejected(call) -> None:
-    with pytest.raises(ValueError, match=r"trials|confidence|hits"):
+    with pytest.raises(ValueError, match=r"trials|hits"):
         call()

@@ -61,9 +61,9 @@ def interface(number: int, kind: tuple[int, int, int], endpoints: int = 0, name:
     return struct.pack("9B", 9, INTERFACE, number, 0, endpoints, *kind, name)
 
 
-def endpoint(address: int, kind: int, packet_bytes: int, interval: int = 0) -> bytes:
+def endpoint(address: int, kind: int, packet_bytes: int) -> bytes:
     """Return the descriptor of an endpoint; bit 7 of ``address`` is set if it sends to the host."""
-    return struct.pack("<BBBBHB", 7, ENDPOINT, address, kind, packet_bytes, interval)
+    return struct.pack("<BBBBHB", 7, ENDPOINT, address, kind, packet_bytes, 0)
 
 
 def configuration(body: Sequence[bytes], interfaces: int = 1, milliamps: int = 100) -> bytes:

@@ -10,8 +10,8 @@ from sim.clock import VirtualClock
 class ScriptedSerial:
     """Answers each write with the next of ``answers``, byte by byte, and then stays silent."""
 
-    def __init__(self, clock: VirtualClock, answers: Iterable[bytes], baudrate: int = 1_000_000) -> None:
-        self.baudrate = baudrate
+    def __init__(self, clock: VirtualClock, answers: Iterable[bytes]) -> None:
+        self.baudrate = 1_000_000
         self.written: list[bytes] = []
         self._clock = clock
         self._answers: Iterator[bytes] = iter(answers)

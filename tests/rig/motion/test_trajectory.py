@@ -9,16 +9,15 @@ from hypothesis import strategies as st
 
 from rig.motion.trajectory import TrajectoryRecorder, backlash_states
 from rig.motion.turntable import Flight, Turntable
-from sim.noise import NoiseModel
 from tests.fuzzing import examples
 from tests.rig.bench_parts import motion_bench
 from tests.sim.truth import table_rates
 
 
-def flown(goals: list[float], velocity_dps: float, seed: int, noise: NoiseModel | None = None, lost: float = 0.0):  # type: ignore[no-untyped-def]
+def flown(goals: list[float], velocity_dps: float, seed: int, lost: float):  # type: ignore[no-untyped-def]
     """Return errors, stated uncertainties and errors of the rate at times of a flight, and its trajectory."""
     rng = np.random.default_rng(seed)
-    with motion_bench(noise=noise, seed=seed) as (bench, wires), Turntable(bench) as table:
+    with motion_bench(seed=seed) as (bench, wires), Turntable(bench) as table:
         table.goto(5.0)
         offset_deg = wires.world.table_deg() - table.rest_deg  # the platter, where the encoder shows its angle
         recorder = table.recorder()
@@ -45,7 +44,7 @@ def flown(goals: list[float], velocity_dps: float, seed: int, noise: NoiseModel 
 def test_angle_and_its_uncertainty_are_true_at_any_time(
     seed: int, goals: list[float], velocity_dps: float, lost: float
 ) -> None:
-    error, sigma, _, trajectory = flown(goals, velocity_dps, seed, lost=lost)
+    error, sigma, _, trajectory = flown(goals, velocity_dps, seed, lost)
     assert np.abs(error).max() < 0.2
     assert np.sqrt(np.mean(np.square(error / sigma))) < 2.0
     assert sigma.max() < 0.2

@@ -17,9 +17,9 @@ from rig.plans.tray import OBJECT_ERRORS, TrayDecision, TrayItem, enroll_tray, r
 TEXT = st.text(string.ascii_letters + string.digits + " äöü,;\"'-_", min_size=1, max_size=12).map(str.strip)
 
 
-def written(tmp_path, text, name="tray.csv", encoding="utf-8"):
-    path = tmp_path / name
-    path.write_bytes(text if isinstance(text, bytes) else text.encode(encoding))
+def written(tmp_path, text):
+    path = tmp_path / "tray.csv"
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
     return path
 
 
