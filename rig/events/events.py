@@ -21,7 +21,7 @@ _OUTSIDE = {"json": False}
 
 
 class NoteCode(StrEnum):
-    """What a note is about; `rig.events.wording.note_words` puts it into words."""
+    """What a note is about; `rig.events.note_wording.note_words` puts it into words."""
 
     PAPER_SEARCH = "paper-search"
     MIXED_EMPTY_TABLE = "mixed-empty-table"

@@ -27,20 +27,18 @@ from rig.events.events import (
     Waiting,
     Warned,
 )
+from rig.events.note_wording import next_step_words, note_words, wait_words
 from rig.events.phrases import angle_words, azimuth_words, counted, duration_words, percent_words, sentence, signed
 from rig.events.wording import (
     answer_lines,
     comparison_words,
     decision_words,
     move_words,
-    next_step_words,
-    note_words,
     scan_words,
     share_words,
     similar_objects_words,
     unwinding_words,
     verification_words,
-    wait_words,
 )
 from rig.views.capture import rejection_text
 

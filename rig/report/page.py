@@ -21,13 +21,13 @@ from rig.charts.score_chart import score_chart
 from rig.core.errors import UsageError, os_errors_as
 from rig.core.files import write
 from rig.events.events import Candidate, Ranked
+from rig.events.note_wording import note_words
 from rig.events.phrases import azimuth_words, counted, listed, sentence, signed
 from rig.events.wording import (
     answer_words,
     comparison_words,
     decision_words,
     move_words,
-    note_words,
     outcome_words,
     share_words,
     stop_words,

@@ -17,7 +17,7 @@ from rig.catalog import Catalog
 from rig.config import RigConfig, load_config
 from rig.core.errors import StateNotStored, TableNotEmpty, UsageError, ViewRejected
 from rig.events.events import EmptyTableImage, NoteCode, Warned
-from rig.events.wording import next_step_words, note_words
+from rig.events.note_wording import next_step_words, note_words
 from rig.plans.enroll import enroll
 from rig.plans.photograph_table import photograph_table
 from rig.safety.saved_state import FileStore, MemoryStore
