@@ -5,7 +5,6 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from calibration.procedures import PROCEDURES
@@ -13,6 +12,7 @@ from rig.calibrations import CalibrationResult, CalibrationStanding, Calibration
 from rig.charts.xy import Chart
 from rig.core.errors import UsageError, os_errors_as
 from rig.core.files import write
+from rig.core.templates import environment
 
 PLOTS = {name: procedure.plots for procedure in PROCEDURES for name in procedure.names}
 
@@ -64,15 +64,8 @@ def write_page(
     """
     shown = [_shown(standing, history) for standing in standings]
     count = {status: sum(standing.status is status for standing in standings) for status in CalibrationStatus}
-    environment = Environment(
-        loader=ChoiceLoader([PackageLoader("calibration", "."), PackageLoader("rig.report", ".")]),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-    )
-    page = environment.get_template("report.html.j2").render(
+    template = environment("calibration", "rig.report").get_template("report.html.j2")
+    page = template.render(
         bench=bench,
         when=f"{now_utc:%Y-%m-%d %H:%M}",
         totals=[

@@ -5,14 +5,14 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from hbr.evaluation.protocol import Runs
 from rig.charts.evaluation_figures import figures
 from rig.charts.xy import Chart
-from rig.core.errors import UsageError
+from rig.core.errors import UsageError, os_errors_as
 from rig.core.files import write
+from rig.core.templates import environment
 from rig.evaluation.plan import Plan
 from rig.evaluation.report import contest_sentences, csv_text, curve_rows, decision_rows, evaluate
 
@@ -37,16 +37,10 @@ def write_json(results: Mapping[str, Any], path: Path) -> None:
     UsageError
         The file cannot be written.
     """
-    try:
+    step = "Name another folder with --out."
+    with os_errors_as(UsageError, f"The results cannot be written to {path}.", next_step=step):
         path.parent.mkdir(parents=True, exist_ok=True)
-        text = json.dumps(results, ensure_ascii=False, allow_nan=False, indent=1)
-        write(path, f"{text}\n".encode())
-    except OSError as error:
-        raise UsageError(
-            f"The results cannot be written to {path}.",
-            next_step="Name another folder with --out.",
-            evidence={"reason": error.strerror or str(error)},
-        ) from error
+        write(path, _json(results))
 
 
 def write_results(
@@ -62,30 +56,24 @@ def write_results(
     results = evaluate(plan, runs, margin, min_views, reported)
     drawn = figures(results)
     files: dict[str, bytes] = {
-        "results.json": json.dumps(results, ensure_ascii=False, allow_nan=False, indent=1).encode() + b"\n",
+        "results.json": _json(results),
         "results.csv": csv_text(results).encode(),
         "report.html": _page(results, drawn).encode(),
     }
     for name, figure in drawn.items():
         files |= {f"{name}.svg": figure.svg().encode(), f"{name}.png": figure.png()}
-    try:
+    step = "Free some disk space, then give the same command with --resume: the runs are stored."
+    with os_errors_as(UsageError, f"The results cannot be written to {folder}.", next_step=step):
         for name, data in files.items():
             write(folder / name, data)
-    except OSError as error:
-        raise UsageError(
-            f"The results cannot be written to {folder}.",
-            next_step="Free some disk space, then give the same command with --resume: the runs are stored.",
-            evidence={"reason": error.strerror or str(error)},
-        ) from error
     return results
 
 
+def _json(results: Mapping[str, Any]) -> bytes:
+    return json.dumps(results, ensure_ascii=False, allow_nan=False, indent=1).encode() + b"\n"
+
+
 def _page(results: dict[str, Any], drawn: Mapping[str, Chart]) -> str:
-    loader = PackageLoader("rig.evaluation", ".")
-    environment = Environment(
-        loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    style = Environment(loader=PackageLoader("rig.report", "."), autoescape=False).get_template("page.css").render()
     settings = results["settings"]
     dataset, protocol = settings["dataset"], settings["protocol"]
     stopping = results["methods"][0]["stopping"]
@@ -97,10 +85,10 @@ def _page(results: dict[str, Any], drawn: Mapping[str, Chart]) -> str:
     if results["reported"]:
         summary += " Reported: objects {} to {}.".format(*results["reported"])
     curves, decisions = curve_rows(results, interval=True), decision_rows(results)
-    return environment.get_template("page.html.j2").render(
+    page = environment("rig.evaluation", "rig.report").get_template("page.html.j2")
+    return page.render(
         title=f"Retrieval on {dataset['name']}",
         summary=summary,
-        style=Markup(style),
         contests=contest_sentences(results),
         figures=[(*_HEADINGS[name], Markup(figure.svg())) for name, figure in drawn.items()],
         tables=[

@@ -11,7 +11,7 @@ from typing import Final, Protocol
 
 from rig.bench import Bench
 from rig.catalog import Catalog, ObjectSummary, clean_name
-from rig.core.errors import ObjectNotFound, RigError, RotationDisagreement, UsageError, ViewRejected
+from rig.core.errors import ObjectNotFound, RigError, RotationDisagreement, UsageError, ViewRejected, os_errors_as
 from rig.core.files import read
 from rig.events.events import Event, Item, SkipReason
 from rig.motion.scan_speed import takes_in_motion
@@ -80,14 +80,11 @@ def read_tray(path: Path) -> tuple[TrayItem, ...]:
     UsageError
         The file cannot be read, or it has mistakes; the evidence lists all of them with their lines.
     """
+    step = "Choose a CSV file with --list."
+    with os_errors_as(UsageError, f"The list {path} cannot be read.", next_step=step):
+        content = read(path, max_bytes=MAX_FILE_BYTES)
     try:
-        text = read(path, max_bytes=MAX_FILE_BYTES).decode("utf-8-sig")
-    except OSError as error:
-        raise UsageError(
-            f"The list {path} cannot be read.",
-            next_step="Choose a CSV file with --list.",
-            evidence={"reason": error.strerror or str(error)},
-        ) from error
+        text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = error.object[: error.start].count(b"\n") + 1
         raise UsageError(

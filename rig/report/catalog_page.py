@@ -8,13 +8,13 @@ from urllib.parse import quote
 
 import cv2
 import numpy as np
-from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from rig.catalog.exchange.batch import Enrollment, ExportedObject, Object, Session, region_of_view
 from rig.catalog.exchange.bundle import new_file, read_stored
 from rig.catalog.exchange.new_folder import new_folder
 from rig.catalog.records import EnrollmentStatus
 from rig.core.errors import ExportFailed
+from rig.core.templates import environment
 from rig.events.phrases import counted
 from rig.report.contact_sheet import Image, contact_sheet, thumbnail
 from rig.report.page import JPEG_QUALITY
@@ -70,15 +70,7 @@ def write_catalog_page(target: Path, objects: Iterable[ExportedObject]) -> int:
 
 
 def _page(shown: list[_Shown]) -> bytes:
-    environment = Environment(
-        loader=PackageLoader("rig.report", "."),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-    )
-    template = environment.get_template("catalog.html.j2")
+    template = environment("rig.report").get_template("catalog.html.j2")
     labels = sorted({one.item.label for one in shown} - {""})
     return template.render(objects=shown, views=sum(one.views for one in shown), labels=labels).encode()
 

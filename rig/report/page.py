@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import cv2
-from jinja2 import Environment, PackageLoader, StrictUndefined, Template
+from jinja2 import Template
 from markupsafe import Markup
 
 from hbr import Outcome
@@ -20,6 +20,7 @@ from rig.charts.polar_path import polar_path
 from rig.charts.score_chart import score_chart
 from rig.core.errors import UsageError, os_errors_as
 from rig.core.files import write
+from rig.core.templates import environment
 from rig.events.events import Candidate, Ranked
 from rig.events.note_wording import note_words
 from rig.events.phrases import azimuth_words, counted, listed, sentence, signed
@@ -130,15 +131,7 @@ def write_report(path: Path, html: str) -> None:
 
 @cache
 def _template() -> Template:
-    environment = Environment(
-        loader=PackageLoader("rig.report", "."),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-    )
-    return environment.get_template("page.html.j2")
+    return environment("rig.report").get_template("page.html.j2")
 
 
 class _Frame(NamedTuple):

@@ -10,7 +10,7 @@ Decision: docs/decisions/0018.
 
 import json
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from math import isfinite
@@ -28,7 +28,7 @@ from hbr.descriptors import MODEL_NAME, PREFIX, Descriptor, descriptor, loaded_m
 from rig.bench import Bench
 from rig.config import RigConfig
 from rig.config.values import validate
-from rig.core.errors import CatalogError, RigError, UsageError
+from rig.core.errors import CatalogError, RigError, UsageError, os_errors_as
 from rig.core.files import json_values, read, write
 from rig.events.compared import Compared
 from rig.events.events import Accepted, Event, Identified, Moved, Ranked, Started, event_dict
@@ -84,7 +84,7 @@ class RunWriter:
         views = model.views
         kind = descriptor(views.descriptor)
         started_utc = bench.clock.utc().isoformat()
-        try:
+        with _writing(folder):
             (folder / "frames").mkdir(parents=True, exist_ok=True)
             if len(list(folder.iterdir())) > 1:
                 raise UsageError(
@@ -111,8 +111,6 @@ class RunWriter:
             }
             write(folder / "run.json", (json.dumps(about, indent=2, default=str) + "\n").encode())
             self._events: TextIO = (folder / "events.jsonl").open("x", encoding="utf-8")
-        except OSError as error:
-            raise _not_writable(folder, error) from error
 
     def __enter__(self) -> Self:
         return self
@@ -135,14 +133,12 @@ class RunWriter:
         UsageError
             The disk is full or fails.
         """
-        try:
+        with _writing(self._folder):
             if isinstance(event, Accepted):
                 write(frame_path(self._folder, event.index), images.encode(event.image_bgr))
             elif isinstance(event, Compared):
                 self._add_compared(event)
             self._line(event_dict(event))
-        except OSError as error:
-            raise _not_writable(self._folder, error) from error
 
     def _add_compared(self, event: Compared) -> None:
         (self._folder / LEADERS).mkdir(exist_ok=True)
@@ -430,9 +426,7 @@ def _damaged(folder: Path, reason: str) -> UsageError:
     )
 
 
-def _not_writable(folder: Path, error: OSError) -> UsageError:
-    return UsageError(
-        f"The run cannot be saved in {folder}.",
-        next_step="Give a new folder, on a disk with space, with --save-run.",
-        evidence={"reason": error.strerror or str(error)},
-    )
+def _writing(folder: Path) -> AbstractContextManager[None]:
+    """Return a context in which an error of the system says that the run cannot be saved."""
+    step = "Give a new folder, on a disk with space, with --save-run."
+    return os_errors_as(UsageError, f"The run cannot be saved in {folder}.", next_step=step)

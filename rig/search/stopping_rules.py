@@ -18,7 +18,7 @@ from hbr.dense.filter import BETA
 from hbr.dense.open_set import NUMBERS, OpenSetModel
 from hbr.dense.stopping import Limitation, LimitationCode, ShiftRates
 from hbr.descriptors import descriptor
-from rig.core.errors import CatalogError
+from rig.core.errors import CatalogError, os_errors_as
 from rig.core.files import json_values, read, write
 from rig.events.events import Note, NoteCode, plain
 
@@ -197,14 +197,9 @@ def write_stopping_rule(path: Path, rule: hbr.StoppingRule, index: hbr.DenseInde
     """
     values = stopping_rule_values(rule, index, made_utc=made_utc)
     text = json.dumps(values, ensure_ascii=False, indent=1, allow_nan=False)
-    try:
+    step = "free space on the disk, or get permission to write to the folder"
+    with os_errors_as(CatalogError, f"the stopping rule cannot be written to {path}", next_step=step):
         write(path, (text + "\n").encode())
-    except OSError as error:
-        raise CatalogError(
-            f"the stopping rule cannot be written to {path}",
-            next_step="free space on the disk, or get permission to write to the folder",
-            evidence={"reason": error.strerror or str(error)},
-        ) from error
 
 
 def read_stopping_rule(folder: Path) -> StoredRule | None:

@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 import hbr
 from hbr import Outcome, StopReason
 from hbr.core.angles import wrap180
-from hbr.dense.arc import ARC_DEG, STEP_DEG, next_arc
+from hbr.dense.arc import ARC_DEG, STEP_DEG, NextArc, next_arc
+from hbr.dense.next_view import NextBestView
 from rig.config import IdentifyConfig, RigConfig
 from rig.core.errors import UsageError
 from rig.events.events import RotationReason, Weighed
@@ -302,18 +303,7 @@ class Dense:
         if not len(state.rotations_deg):
             return Finish(StopReason.NO_ROTATION_LEFT)
         best = state.session.next_best_view(state.rotations_deg, state.seconds)
-        names = state.session.belief.index.views.object_names
-        return Rotate(
-            best.rotation_deg,
-            RotationReason.NEW_SIDE if best.pair is None else RotationReason.SEPARATES_CANDIDATES,
-            candidates=() if best.pair is None else tuple(names[i] for i in best.pair),
-            weighed=Weighed(
-                tuple(best.rotations_deg.tolist()),
-                tuple(best.confusion.tolist()),
-                tuple(best.cost.tolist()),
-                None if best.similarity is None else tuple(best.similarity.tolist()),
-            ),
-        )
+        return _rotate(state, best, best.similarity)
 
 
 class Arc:
@@ -329,15 +319,22 @@ class Arc:
             return Finish(StopReason.NO_ROTATION_LEFT)
         belief, beta = state.session.belief, state.session.rule.beta
         best = next_arc(belief, beta=beta, rotations_deg=state.rotations_deg, seconds=state.seconds)
-        names = belief.index.views.object_names
-        return Rotate(
-            best.rotation_deg,
-            RotationReason.NEW_SIDE if best.pair is None else RotationReason.SEPARATES_CANDIDATES,
-            candidates=() if best.pair is None else tuple(names[i] for i in best.pair),
-            weighed=Weighed(
-                tuple(best.rotations_deg.tolist()), tuple(best.confusion.tolist()), tuple(best.cost.tolist())
-            ),
-        )
+        return _rotate(state, best, None)
+
+
+def _rotate(state: DenseSearchState, best: NextBestView | NextArc, similarity: NDArray[np.float64] | None) -> Rotate:
+    names = state.session.belief.index.views.object_names
+    return Rotate(
+        best.rotation_deg,
+        RotationReason.NEW_SIDE if best.pair is None else RotationReason.SEPARATES_CANDIDATES,
+        candidates=() if best.pair is None else tuple(names[i] for i in best.pair),
+        weighed=Weighed(
+            tuple(best.rotations_deg.tolist()),
+            tuple(best.confusion.tolist()),
+            tuple(best.cost.tolist()),
+            None if similarity is None else tuple(similarity.tolist()),
+        ),
+    )
 
 
 BUILT_IN: Final[dict[str, Callable[[], AnyStrategy]]] = {

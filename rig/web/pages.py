@@ -4,7 +4,8 @@ from typing import TYPE_CHECKING, Final
 
 from fastapi import APIRouter, Request
 from fastapi.responses import HTMLResponse
-from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from rig.core.templates import environment
 
 if TYPE_CHECKING:
     from rig.web.server import Server
@@ -23,17 +24,11 @@ PAGES: Final = {
 
 def pages(server: "Server") -> APIRouter:
     """Return the routes of the pages."""
-    environment = Environment(
-        loader=PackageLoader("rig.web", "templates"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
+    templates = environment("rig.web", folder="templates")
     router = APIRouter(include_in_schema=False)
 
     def page(name: str) -> None:
-        template = environment.get_template(f"{name or 'bench'}.html.j2")
+        template = templates.get_template(f"{name or 'bench'}.html.j2")
 
         @router.get(f"/{name}", response_class=HTMLResponse, name=f"page-{name or 'bench'}")
         def show(request: Request) -> HTMLResponse:  # noqa: ARG001
@@ -45,6 +40,6 @@ def pages(server: "Server") -> APIRouter:
 
     @router.get("/login", response_class=HTMLResponse)
     def login() -> HTMLResponse:
-        return HTMLResponse(environment.get_template("login.html.j2").render(bench=server.bench))
+        return HTMLResponse(templates.get_template("login.html.j2").render(bench=server.bench))
 
     return router

@@ -82,7 +82,7 @@ def ensure_empty_table_image(settings: Settings, bench: "Bench", *, ask: bool, t
 
 
 def _show(settings: Settings, bench: "Bench", path: Path) -> None:
-    from rig.core.errors import UsageError
+    from rig.core.errors import UsageError, os_errors_as
     from rig.core.files import write
     from rig.views import image_files as images
     from rig.views.empty_table import empty_table_status
@@ -90,14 +90,8 @@ def _show(settings: Settings, bench: "Bench", path: Path) -> None:
     status = empty_table_status(bench)
     if status.table is None:
         raise UsageError(f"There is no image to show: {status.text}.", next_step="Take the image with rig empty-table.")
-    try:
+    with os_errors_as(UsageError, f"{path} cannot be written.", next_step="Choose another file with --show."):
         write(path, images.encode(status.table.image_bgr))
-    except OSError as error:
-        raise UsageError(
-            f"{path} cannot be written.",
-            next_step="Choose another file with --show.",
-            evidence={"reason": error.strerror or str(error)},
-        ) from error
     settings.say(f"{path}: {status.text}", {"file": str(path), **status.as_json()})
 
 

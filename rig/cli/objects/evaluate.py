@@ -2,9 +2,10 @@
 
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from hbr.evaluation.datasets import Dataset
     from rig.core.processes import Jobs
     from rig.evaluation.plan import Plan
+    from rig.evaluation.report import Rows
 
 #: Draws of left-out objects.
 _DRAWS = 5
@@ -249,70 +251,56 @@ def _bench_change(
     out: Path,
 ) -> None:
     from hbr.evaluation.changes import Changes
-    from rig.cli.ui.present import Progress, console
     from rig.evaluation.changes import change_rows, run_changes
-    from rig.evaluation.write import write_json
 
     if kind not in ("mild", "hard"):
         raise ValueError(f"bench change {kind!r} is unknown; use mild or hard")
     changes = Changes(kind, picture, enrolled, seed=settings.seed or 0)  # type: ignore[arg-type]
     reported = None if report is None else [item.name for item in dataset.subset(*_range(report)).objects]
-    with Progress("enrolling, searching") as progress:
-        progress.start(2 * len(dataset.objects))
-
-        def advance(_name: str) -> None:
-            progress.advance()
-
+    with _progress(dataset) as advance:
         results = run_changes(dataset, changes, jobs, advance, reported)
-    write_json(results, out / "bench_change.json")
-    if settings.json:
-        settings.print_json({"event": "finished", **results})
-        return
-    console().print(change_rows(results).terminal())
-    print(f"Written: {out / 'bench_change.json'}.", file=sys.stderr)
+    _write(settings, results, change_rows(results), out / "bench_change.json", ".")
 
 
 def _matrix(settings: Settings, plan: "Plan", jobs: "Jobs", out: Path) -> None:
-    from rig.cli.ui.present import Progress, console
     from rig.evaluation.matrix import matrix_rows, run_matrix
-    from rig.evaluation.write import write_json
 
     if plan.protocol.enrolled is None:
         raise ValueError("--matrix needs views that are not enrolled for its queries; give --enrolled 18 or fewer")
-    with Progress("enrolling, searching") as progress:
-        progress.start(2 * len(plan.dataset.objects))
-
-        def advance(_name: str) -> None:
-            progress.advance()
-
+    with _progress(plan.dataset) as advance:
         results = run_matrix(plan, jobs, advance)
-    write_json(results, out / "matrix.json")
-    if settings.json:
-        settings.print_json({"event": "finished", **results})
-        return
-    console().print(matrix_rows(results).terminal())
-    print(f"Written: {out / 'matrix.json'}, with Wilson's intervals.", file=sys.stderr)
+    _write(settings, results, matrix_rows(results), out / "matrix.json", ", with Wilson's intervals.")
 
 
 def _unknown_objects(settings: Settings, plan: "Plan", count: int, jobs: "Jobs", out: Path) -> None:
-    from rig.cli.ui.present import Progress, console
     from rig.evaluation.run import enrolled_views
     from rig.evaluation.unknown_objects import run_unknown_objects, unknown_object_rows
-    from rig.evaluation.write import write_json
+
+    with _progress(plan.dataset) as advance:
+        results = run_unknown_objects(plan, enrolled_views(plan, jobs, advance), count, _DRAWS, jobs, advance)
+    _write(settings, results, unknown_object_rows(results), out / "unknown_objects.json", ", with Wilson's intervals.")
+
+
+@contextmanager
+def _progress(dataset: "Dataset") -> Iterator[Callable[[str], None]]:
+    """Yield what shows that an object is enrolled or searched for."""
+    from rig.cli.ui.present import Progress
 
     with Progress("enrolling, searching") as progress:
-        progress.start(2 * len(plan.dataset.objects))
+        progress.start(2 * len(dataset.objects))
+        yield lambda _name: progress.advance()
 
-        def advance(_name: str) -> None:
-            progress.advance()
 
-        results = run_unknown_objects(plan, enrolled_views(plan, jobs, advance), count, _DRAWS, jobs, advance)
-    write_json(results, out / "unknown_objects.json")
+def _write(settings: Settings, results: dict[str, Any], rows: "Rows", path: Path, note: str) -> None:
+    from rig.cli.ui.present import console
+    from rig.evaluation.write import write_json
+
+    write_json(results, path)
     if settings.json:
         settings.print_json({"event": "finished", **results})
         return
-    console().print(unknown_object_rows(results).terminal())
-    print(f"Written: {out / 'unknown_objects.json'}, with Wilson's intervals.", file=sys.stderr)
+    console().print(rows.terminal())
+    print(f"Written: {path}{note}", file=sys.stderr)
 
 
 def _dataset(settings: Settings, folder: Path | None, objects: str | None) -> "Dataset":
