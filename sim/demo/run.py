@@ -78,6 +78,7 @@ class DemoResult:
     trials: tuple[IdentificationRecord, ...]
     seed: int
     strategy: str
+    change: Change | None
     bench_s: float
     wall_s: float
     report: Path
@@ -95,6 +96,7 @@ class DemoResult:
         return {
             "seed": self.seed,
             "strategy": self.strategy,
+            "change": None if self.change is None else asdict(self.change),
             "enrolled": len(self.enrollments),
             "views_enrolled": sum(len(record.views) for record in self.enrollments),
             "found": sum(bool(trial.correct) for trial in known),
@@ -174,7 +176,8 @@ def run_demo(
         bench_s = bench.clock.now_ns() * 1e-9
         devices = bench.devices()
     wall_s = seconds_between(wall_ns, system.now_ns())
-    result = DemoResult(tuple(enrollments), tuple(trials), seed, searched_by, bench_s, wall_s, out / "report.html")
+    report = out / "report.html"
+    result = DemoResult(tuple(enrollments), tuple(trials), seed, searched_by, change, bench_s, wall_s, report)
     meta = Meta(
         conditions={
             "seed": seed,

@@ -84,6 +84,16 @@ def test_json_is_one_object_with_every_trial(in_json):
     assert result["found"] == sum(t["right"] for t in result["trials"] if t["enrolled"])
 
 
+def test_json_names_the_change_of_the_bench(in_json, tmp_path):
+    unchanged = json.loads(in_json[0].stdout)
+    changed = json.loads(demo(*SMALL, "--seed", "3", "--change", "light", "--json", "--out", str(tmp_path)).stdout)
+    assert unchanged["change"] is None
+    assert changed["change"]["brightness"] > 0
+    assert changed["change"]["placement_mm"] == 0
+    before, after = ([trial["score"] for trial in result["trials"]] for result in (unchanged, changed))
+    assert all(score != other for score, other in zip(before, after, strict=True))
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -93,6 +103,7 @@ def test_json_is_one_object_with_every_trial(in_json):
         (("--out", "/proc/self"), "/proc/self"),
         (("--set", "bench.sim.nois=1"), "bench.sim.nois: unknown key; did you mean noise?"),
         (("--set", "bench.sim.noise.fog=1"), "fog"),
+        (("--change", "fog"), "There is no change 'fog'"),
         (("--bench", "hardware"), "simulated bench"),
     ],
 )
