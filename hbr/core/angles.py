@@ -12,9 +12,9 @@ def wrap360(angle_deg: float) -> float: ...
 @overload
 def wrap360(angle_deg: FloatArray) -> FloatArray: ...
 def wrap360(angle_deg: float | FloatArray) -> float | FloatArray:
-    """Return the same direction in [0, 360)."""
+    """Return an angle in degrees as the same direction in [0, 360)."""
     # the remainder of a tiny negative angle is rounded to 360.0
-    if not isinstance(angle_deg, np.ndarray):  # a hundred times faster than an array of one number
+    if not isinstance(angle_deg, np.ndarray):  # floats are a hundred times faster than arrays of one number
         remainder = float(angle_deg) % 360.0
         return 0.0 if remainder == 360.0 else remainder
     wrapped = np.mod(angle_deg, 360.0)
@@ -26,7 +26,7 @@ def wrap180(angle_deg: float) -> float: ...
 @overload
 def wrap180(angle_deg: FloatArray) -> FloatArray: ...
 def wrap180(angle_deg: float | FloatArray) -> float | FloatArray:
-    """Return the same direction in [-180, 180)."""
+    """Return an angle in degrees as the same direction in [-180, 180)."""
     return wrap360(angle_deg + 180.0) - 180.0
 
 
@@ -43,7 +43,7 @@ def revolutions_between(a_deg: float | FloatArray, b_deg: float | FloatArray) ->
 
 
 def size_deg(difference_deg: FloatArray) -> FloatArray:
-    """Return the sizes of differences of directions, 0..180."""
+    """Return the absolute differences of directions, 0..180, in degrees."""
     # same result as wrap180 in a third of the time: the nearest whole revolution is subtracted without rounding
     size: FloatArray = np.abs(difference_deg - 360.0 * np.rint(difference_deg / 360.0))
     return size

@@ -6,14 +6,14 @@ from hbr.core.arrays import FloatArray, IndexArray
 
 
 def ranges(start: IndexArray, count: IndexArray) -> tuple[IndexArray, IndexArray]:
-    """Return ``start[i] .. start[i] + count[i] - 1`` for all i, one after the other, and where each begins."""
+    """Return ``start[i] .. start[i] + count[i] - 1`` for all i, joined, and the position at which each begins."""
     end = np.cumsum(count)
     begin = end - count
     return np.arange(end[-1] if len(end) else 0) + np.repeat(start - begin, count), begin
 
 
 def lengths(begin: IndexArray, total: int) -> IndexArray:
-    """Return the lengths of the segments that begin there; together they have the length ``total``."""
+    """Return the lengths of the segments that begin at the positions ``begin``; their sum is ``total``."""
     end = np.empty_like(begin)
     end[:-1], end[-1:] = begin[1:], total
     return end - begin

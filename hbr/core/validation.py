@@ -14,7 +14,7 @@ def check_image(image: object) -> None:
     Raises
     ------
     TypeError, ValueError
-        It is not. The message says what it is, and what to do.
+        The image has another type or shape. The message names them, and the next step.
     """
     if not isinstance(image, np.ndarray):
         raise TypeError(

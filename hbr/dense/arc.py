@@ -1,12 +1,12 @@
-"""Searches in motion: frames that pass on the way are evidence, and an arc is chosen instead of a view.
+"""Searches in motion: every frame is evidence, and the search chooses arcs instead of single views.
 
 Frames a few degrees apart show nearly the same. If the correlation of what they show falls off as exp(-d / L) with
 their distance d, a frame adds the share 1 - exp(-2 d / L) of a new one (the part of a Markov process that the frame
 before does not determine). With this weight, the evidence of an arc does not depend on the number of its frames.
 
-The search decides each time the frames have covered another step of the circle. The first view is decided by the rule
-of searches at rest, and so is which object is unknown, from a few frames far apart. The confidence that ends a search
-later comes from leave-one-out searches along such arcs, with as many decisions and the same weights.
+The search decides each time the frames have covered another step of the circle. The rule of searches at rest decides
+after the first view. It also decides which objects are unknown, from a few frames that are far apart. The confidence
+that ends a search later comes from leave-one-out searches along such arcs, with as many decisions and the same weights.
 
 Decisions: docs/decisions/0047, docs/decisions/0056.
 """
@@ -29,46 +29,46 @@ from hbr.dense.session import DenseSession
 from hbr.dense.stopping import Limitation, LimitationCode, Outcome, StopDecision, StoppingRule, StopReason
 
 STEP_DEG: Final = 15.0
-"""The rule decides whenever the frames have covered so much more of the circle."""
+"""The rule decides each time the frames have covered this much more of the circle."""
 ARC_DEG: Final = 210.0
-"""An object that is not found on so long an arc is unknown."""
+"""An object that is not found on an arc of this length is unknown."""
 DECISIONS: Final = round(ARC_DEG / STEP_DEG) + 1
 CORRELATION_DEG: Final = 90.0
-"""L: views of a search at rest are so far apart."""
+"""L: distance between the views of a search at rest."""
 FRAME_DEG: Final = 3.0
 """Usual distance of frames in motion: 30 frames/s at 90 °/s."""
 LEAST_ARC_DEG: Final = 45.0
-"""A goal is so far ahead that the table does not slow down before the next decision."""
+"""Shortest arc to a goal, so that the table does not slow down before the next decision."""
 SIDE_DEG: Final = 60.0
-"""Frames that are so far apart count as views of a search at rest in the open-set score."""
+"""Frames at least this far apart count as views of a search at rest in the open-set score."""
 MOTION_LOSS: Final = 0.007
-"""By how much smear and rolling shutter can lower a similarity: views of COIL-100 in motion compared with a second
-enrollment at rest, 5 % quantiles."""
+"""Largest loss of similarity by smear and rolling shutter: 5 % quantile of views of COIL-100 in motion, compared with a
+second enrollment at rest."""
 MOST_SEARCHES: Final = 160
 _SHARPNESS: Final = 100.0
 
 
 def frame_weight(apart_deg: float) -> float:
-    """Return how much a frame counts whose distance to the nearest earlier one is ``apart_deg``."""
+    """Return the weight of a frame, 0..1, from its distance to the nearest earlier frame in degrees."""
     return 1.0 - exp(-2.0 * max(apart_deg, 0.0) / CORRELATION_DEG)
 
 
 STEP_WEIGHT: Final = STEP_DEG / FRAME_DEG * frame_weight(FRAME_DEG)
-"""What the frames between two decisions count together."""
+"""Sum of the weights of the frames between two decisions."""
 
 
 @dataclass(frozen=True, eq=False)
 class ArcRule:
-    """When a search in motion ends.
+    """The rule that ends a search in motion.
 
     Attributes
     ----------
     rest : StoppingRule
-        The rule of searches at rest. It decides after the first view, and says which objects are unknown.
+        The rule of searches at rest. It decides after the first view, and decides which objects are unknown.
     min_confidence : float
         Confidence that ends a search later.
     limitations : tuple of Limitation
-        What the rule does not guarantee, in addition to those of ``rest``.
+        Rates that the rule does not guarantee, in addition to those of ``rest``.
     """
 
     rest: StoppingRule
@@ -79,9 +79,9 @@ class ArcRule:
 def calibrate_arc_rule(index: DenseIndex, rest: StoppingRule, *, most_searches: int = MOST_SEARCHES) -> ArcRule:
     """Return the rule of searches in motion, from leave-one-out searches along arcs of `ARC_DEG`.
 
-    Searches that end with the first view count, too: ``rest.error_rate`` is that of all named objects. If there are
-    more objects than searches, some of them are searched for among each other. A catalog without candidates or with
-    single views has the confidence of searches at rest.
+    Searches that end with the first view count, too, because ``rest.error_rate`` is the error rate of all named
+    objects. If there are more objects than searches, a sample of the objects is searched for among each other. A
+    catalog without candidates or with single views has the confidence of searches at rest.
     """
     if len(index) < 2 or int(np.median((~index.left_out).sum(axis=1))) < 2:
         return ArcRule(rest, rest.min_confidence)
@@ -105,9 +105,9 @@ def fit_arc_rule(searches: LeaveOneOut, rest: StoppingRule) -> ArcRule:
     """Return the rule that keeps ``rest.error_rate`` in searches along arcs, with a decision every `STEP_DEG`."""
     confidence = searches.confidence.copy()
     confidence[:, 0] = confidence[:, 0] >= rest.min_confidence  # after the first view, the rule at rest decides
-    confidence[:, 1 : round(SIDE_DEG / STEP_DEG)] = 0.0  # no object is found there
+    confidence[:, 1 : round(SIDE_DEG / STEP_DEG)] = 0.0  # no object is found this soon
     found, limitation = fit_min_confidence(replace(searches, confidence=confidence), rest.error_rate)
-    # Where no confidence keeps the rate, a search in motion must not end sooner than one at rest.
+    # If no confidence keeps the rate, a search in motion must not end sooner than one at rest.
     return ArcRule(rest, max(found, rest.min_confidence), () if limitation is None else (limitation,))
 
 
@@ -148,7 +148,7 @@ class ArcSession(DenseSession):
     ) -> StopDecision:
         """Add the next frame and return the rule's last decision; `is_new_decision` says whether it is a new one."""
         if earlier is not None:
-            self._sides = None  # they are of other descriptions
+            self._sides = None  # these belief and views were described differently
         if self._queries:
             self._covered_deg += min(self._apart_deg(orientation_deg), STEP_DEG)
         decisions = 1 + int(self._covered_deg / STEP_DEG + 1e-9)
@@ -200,7 +200,7 @@ class ArcSession(DenseSession):
         )
 
     def _is_doubtful(self, decision: StopDecision) -> bool:
-        """Whether an enrolled object could have missed the threshold because it was in motion.
+        """Return whether an enrolled object could have missed the threshold because it was in motion.
 
         A fitted open-set score has other units; its rule has a doubtful range of its own.
         """
@@ -208,7 +208,7 @@ class ArcSession(DenseSession):
         return self.rule.open_set is None and missing <= MOTION_LOSS
 
     def _frames_apart(self, belief: Belief) -> Belief:
-        """Return the belief from the frames alone that are at least `SIDE_DEG` away from all earlier ones of them."""
+        """Return the belief from the frames that are at least `SIDE_DEG` apart from each other."""
         sides, seen = self._sides if self._sides and self._sides[0].index is belief.index else (None, 0)
         for levels, orientation_deg in zip(belief.levels[seen:], belief.orientation_deg[seen:].tolist(), strict=True):
             if sides is None or size_deg(sides.orientation_deg - orientation_deg).min() >= SIDE_DEG:
@@ -220,7 +220,7 @@ class ArcSession(DenseSession):
 
 @dataclass(frozen=True, eq=False)
 class NextArc:
-    """An arc, and what it was decided on; as `hbr.dense.next_view.NextBestView`."""
+    """An arc and the numbers of the decision for it, as in `hbr.dense.next_view.NextBestView`."""
 
     rotation_deg: float
     pair: tuple[int, int] | None
@@ -232,8 +232,8 @@ class NextArc:
 def next_arc(belief: Belief, *, beta: float, rotations_deg: FloatArray, seconds: FloatArray) -> NextArc:
     """Choose the arc with the lowest sum of expected confusion and cost.
 
-    All that is seen on the way counts: the exponents of `hbr.dense.next_view.next_best_view` are added up from here to
-    the end of the arc, each with the weight of its frames.
+    All frames on the way count: the exponents of `hbr.dense.next_view.next_best_view` are added up from the last view
+    to the end of the arc, each with the weight of its frames.
 
     Parameters
     ----------

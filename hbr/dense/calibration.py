@@ -22,13 +22,13 @@ from hbr.dense.open_set import OpenSetModel, fitted_before
 from hbr.dense.shifted_searches import STRENGTHS, ShiftedSearches, can_shift, shifted_searches
 from hbr.dense.stopping import Limitation, LimitationCode, ShiftRates, StoppingRule
 
-#: No search ends at a smaller confidence, however well the leave-one-out searches went: real views may be less clear.
+#: No search ends at a smaller confidence, even if all leave-one-out searches were right: real views may be less clear.
 SMALLEST_MIN_CONFIDENCE: Final = 0.9
 #: Confidence that ends a search if the catalog has too little data for the error rate that was asked for.
 UNCALIBRATED_MIN_CONFIDENCE: Final = 0.98
-#: With fewer objects, leaving one out leaves no second candidate.
+#: With fewer objects, no second candidate remains when one object is left out.
 FEWEST_OBJECTS: Final = 3
-#: With fewer objects, the open-set score is not fitted to changes of the bench: a share of 2 % needs that many.
+#: With fewer objects, the open-set score is not fitted to changes of the bench: a share of 2 % needs this many objects.
 FEWEST_OBJECTS_SHIFTED: Final = 50
 #: Largest share of objects that are not enrolled, and are accepted under changes of the bench.
 FALSE_ACCEPT: Final = 0.02
@@ -41,12 +41,12 @@ _SAME: Final = 0.25
 #: Views of a leave-one-out search, if most objects have enough; searches in a calibration.
 CALIBRATED_VIEWS: Final = 4
 MOST_SEARCHES: Final = 400
-#: Objects that are searched for in a calibration, among all: the share of 1 % is then known to a third of its value.
+#: Largest number of objects that a calibration searches for: it then measures a rate of 1 % to a third of its value.
 MOST_OBJECTS: Final = 1000
 
 
 def conformal_threshold(scores: ArrayLike, false_reject: float) -> float:
-    """Return the score below which no more than this share of further scores of the same kind fall.
+    """Return the score below which at most the share ``false_reject`` of further scores of the same kind fall.
 
     The ⌊α(n + 1)⌋-th smallest of n scores; -inf if n is too small, that is, below 1/α - 1. The guarantee holds on
     average for scores that are exchangeable with these, for any distribution.
@@ -68,11 +68,11 @@ def conformal_threshold(scores: ArrayLike, false_reject: float) -> float:
 
 
 def min_confidence_for(confidence: FloatArray, correct: NDArray[np.bool_], error_rate: float) -> float:
-    """Return the smallest confidence that ends searches with no more than this share of wrong ones.
+    """Return the smallest confidence at which at most the share ``error_rate`` of the ended searches is wrong.
 
-    A search, a row, ends at the first view whose leading candidate has at least this confidence; searches that never
-    reach it do not count. One more error is counted than there was, so that few searches guarantee little: with fewer
-    than ``1 / error_rate`` searches the result is inf.
+    Each row is a search. It ends at the first view whose leading candidate has at least this confidence; searches that
+    never reach it do not count. One error is added to those that occurred, because few searches guarantee little: with
+    fewer than ``1 / error_rate`` searches the result is inf.
     """
     for least in np.unique(np.concatenate([[0.5], confidence[confidence > 0.5]])).tolist():
         ends = confidence >= least
@@ -98,7 +98,7 @@ def fit_stopping_rule(
     error_rate, false_reject : float
         Share of wrong objects among those named, and of enrolled objects called unknown.
     objects : int, optional
-        How many objects were searched for, if that was only a sample of those in the model set.
+        Number of objects that were searched for, if they were only a sample of those in the model set.
     """
     count, views = searches.confidence.shape
     objects = searches.objects if objects is None else objects
@@ -151,15 +151,15 @@ def fit_open_set(rule: StoppingRule, searches: ShiftedSearches, model: OpenSetMo
 
     The weights are those of a ``model``, or fitted to these searches.
 
-    An object is accepted before the last view from a score on that almost no object reaches that is not enrolled: a
-    view more costs little. After the last view it is accepted from the score on with which at most 2 % of the objects
-    that are not enrolled are accepted in all, over changes of all strengths, none included. If enrolled objects are so
-    similar to each other that more than ``false_reject`` of them would not reach a threshold after a mild change, the
-    threshold is lower. Objects are unknown if their score is below that of nearly all searches for enrolled objects;
-    between the thresholds they are ambiguous.
+    Before the last view, an object is accepted only with a score that almost no unknown object reaches, because another
+    view costs little. After the last view the threshold is lower: at most 2 % of the unknown objects are accepted in
+    all, over changes of all strengths and no change. If enrolled objects are so similar to each other that more than
+    ``false_reject`` of them would not reach a threshold after a mild change, the threshold is lower. Objects are
+    unknown if their score is below that of nearly all searches for enrolled objects; between the thresholds they are
+    ambiguous.
 
-    On a bench that is known to have changed, the searches without a change do not count; on one that is known to be
-    the same, only those with the smallest changes count. There the rule's own thresholds count, too.
+    On a bench that is known to have changed, the searches without a change do not count. On a bench that is known to be
+    the same, only the searches with the smallest changes and the rule's own thresholds count.
     """
     model = model or OpenSetModel.fitted(searches.known, searches.correct, searches.unknown)
     known, unknown = model.scores(searches.known), model.scores(searches.unknown)
@@ -173,7 +173,7 @@ def fit_open_set(rule: StoppingRule, searches: ShiftedSearches, model: OpenSetMo
     share = max(rule.false_reject, 1.001 / (count + 1))
     unknown_below = np.array([conformal_threshold(known[:, n], share) for n in range(views)])
     unknown_below = np.minimum(unknown_below, thresholds)
-    # as a search decides that knows whether the bench has changed
+    # the thresholds of a search that knows whether the bench has changed
     limits = np.where(searches.strength[:, None] > 0, changed, same)
     is_accepted, is_false = (np.any(scores >= limits, axis=1) for scores in (found, unknown))
     is_rejected = (known < limits).all(axis=1) & (known[:, -1] < unknown_below[-1])
@@ -196,7 +196,7 @@ def fit_open_set(rule: StoppingRule, searches: ShiftedSearches, model: OpenSetMo
 
 
 def with_false_accepts(rule: StoppingRule, searches: LeaveOneOut) -> StoppingRule:
-    """Return the rule with a limitation if it accepts too many left-out objects before the last view."""
+    """Return the rule, with a limitation if it accepts too many left-out objects before the last view."""
     before = searches.unknown.open_set_score(rule.usual_scores)[:, :-1]
     accepted = int((before >= max(rule.open_set_thresholds)).any(axis=1).sum())
     if accepted <= FALSE_ACCEPT * len(before):
@@ -224,7 +224,7 @@ def _accepted_from(unknown: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class CalibratedRule:
-    """A stopping rule, and what it does in the leave-one-out searches that it comes from.
+    """A stopping rule with its results in the leave-one-out searches that it was fitted to.
 
     Attributes
     ----------
@@ -239,9 +239,9 @@ class CalibratedRule:
     rejected
         Searches for enrolled objects that ended as unknown after the last view.
     accepted
-        Searches for left-out objects that did not; None if there are too few objects to measure that.
+        Searches for left-out objects that did not end as unknown; None if there are too few objects to measure that.
     confused : tuple of (str, str)
-        Left-out objects and the objects they were taken for, the most frequent pairs first.
+        Left-out objects and the objects that the rule confused them with, the most frequent pairs first.
     searched : int
         Objects that were searched for.
     """
@@ -268,7 +268,7 @@ def calibrate_stopping_rule(
     progress: Callable[[int, int], object] | None = None,
     tasks: Callable[[Callable[[Task], Found], Sequence[Task]], Iterable[tuple[Task, Found]]] | None = None,
 ) -> CalibratedRule:
-    """Search for the enrolled objects among each other, and return the rule that follows.
+    """Search for the enrolled objects among each other, and return the rule that is fitted to these searches.
 
     Parameters
     ----------
@@ -277,12 +277,12 @@ def calibrate_stopping_rule(
     error_rate, false_reject
         As for `fit_stopping_rule`.
     most_searches
-        Searches in all, from different first views. Each object is searched for at least once; of more than
-        `MOST_OBJECTS`, so many, evenly spread.
+        Total number of searches, from different first views. Each object is searched for at least once; if there are
+        more than `MOST_OBJECTS`, this many of them, evenly spread.
     most_shifted_searches
         Searches under changes of the bench, from which the open-set score is fitted (`fit_open_set`).
     sample
-        Search only for so many objects, among each other.
+        Number of objects to search for, among each other; by default all.
     progress, tasks
         As for `leave_one_out`.
     """
@@ -320,7 +320,7 @@ def _calibrated(
     accepted: int | None,
     confused: tuple[tuple[str, str], ...] = (),
 ) -> CalibratedRule:
-    """Return the rule with how its leave-one-out searches end."""
+    """Return the rule with the results of its leave-one-out searches."""
     ended, wrong = _ended(searches, rule.min_confidence)
     return CalibratedRule(
         rule,
@@ -361,10 +361,10 @@ def calibration_searches(
 
 
 def _rule_without_candidates(index: DenseIndex, error_rate: float, false_reject: float) -> StoppingRule:
-    """Return the rule of a catalog in which objects cannot be compared: one object, or single views.
+    """Return the rule of a catalog whose objects cannot be compared: it has one object, or single views.
 
-    One object is found if it scores at least what its own views score when they are left out one by one. With single
-    views no object is called unknown.
+    A single object is found if its score reaches the scores of its own views, which are left out one by one. With
+    single views, no object is called unknown.
     """
     threshold, searches, code = -inf, 0, LimitationCode.SINGLE_VIEWS
     usual = np.zeros((len(index.views.object_names), 1))
@@ -391,7 +391,7 @@ def _rule_without_candidates(index: DenseIndex, error_rate: float, false_reject:
 
 
 def _ended(searches: LeaveOneOut, min_confidence: float) -> tuple[NDArray[np.intp], int]:
-    """Return after which view (from 0) each ended search ends at this confidence, and how many of them are wrong."""
+    """Return the view (from 0) after which each ended search ends at this confidence, and the number of wrong ones."""
     ends = searches.confidence >= min_confidence
     at = np.flatnonzero(ends.any(axis=1))
     view = ends[at].argmax(axis=1)

@@ -1,4 +1,4 @@
-"""The dense Hough filter: the support of all views so far for every object at every azimuth.
+"""The dense Hough filter: it adds up the support of all views so far for every object at every azimuth.
 
 The paper's voting (`hbr.retrieve`) follows the few views on its lists. This filter has a score for every hypothesis
 (j, φ): object j with azimuth φ at the first query, to which each query adds what `hbr.dense.index` says.
@@ -21,12 +21,12 @@ from hbr.dense.index import BIN_DEG, BINS, DenseIndex, Floats
 BETA: Final = 30.0
 #: Number of objects that are considered after the first view.
 KEPT: Final = 500
-#: How fast a bin's weight in the mean azimuth falls with its support.
+#: Rate at which a bin's weight in the mean azimuth falls with its support.
 _POSE_SHARPNESS: Final = 60.0
-#: An azimuth leans to what lies so many degrees aside at most, and where the support falls by so much at least.
+#: Largest correction of an azimuth from the bins beside it, in degrees, and smallest fall of the support for it.
 _FARTHEST_LEAN_DEG: Final = 90.0
 _LEAST_FALL: Final = 1e-6
-#: How much the sum of a float32 can be too small.
+#: Largest error of a sum of float32.
 _ROUNDING: Final = 1e-6
 
 
@@ -39,7 +39,7 @@ class Belief:
     index : DenseIndex
         The enrolled views of the objects that are still considered.
     support : float32 array (k, 72)
-        A, the sum of what each query adds, at most their number; for azimuths 0, 5, ... at the first query.
+        A, the sum of the support that each query adds, at most their number; for azimuths 0, 5, ... at the first query.
     orientation_deg : float64 array (n,)
         Orientations of the camera around the object at the queries, from any zero.
     weights : float64 array (n,), or None
@@ -75,18 +75,18 @@ class Belief:
         return scores
 
     def ranking(self) -> "DenseRanking":
-        """The objects considered, best first."""
+        """Return the objects considered, best first."""
         scores = self.scores()
         order = np.argsort(-scores, kind="stable")
         azimuth_deg = self._azimuth_deg(order) + self.rotated_deg
         return DenseRanking(self.index.object_index[order], scores[order], wrap360(azimuth_deg))
 
     def _azimuth_deg(self, which: IndexArray) -> FloatArray:
-        """Azimuth at the first query of these objects, finer than the bins and than the enrolled views.
+        """Return the azimuth at the first query of these objects, finer than the bins and than the enrolled views.
 
-        In the dead zone around an enrolled view all bins are equal: first their middle, the mean weighted by the
-        support. Then the support a step to either side shows to which of the neighbours it leans, as if it fell off
-        evenly on both sides of the true azimuth.
+        In the dead zone around an enrolled view all bins are equal. The first estimate is their middle, the mean
+        weighted by the support. The second estimate compares the support one step to either side, and assumes that it
+        falls off evenly on both sides of the true azimuth.
         """
         support = self.support[which].astype(np.float64)
         best = support.argmax(axis=1)
@@ -104,12 +104,12 @@ class Belief:
         return azimuth_deg
 
     def posterior(self, beta: float = BETA) -> FloatArray:
-        """Return the probability of every hypothesis, (k, 72), not to be changed: proportional to exp(β A / √n).
+        """Return the probability of every hypothesis, (k, 72), read-only: proportional to exp(β A / √n).
 
-        The root reduces it: views of one object are not independent, and each adds less than the one before. Weights
-        say that already, so that with them there is no root.
+        The root is there because views of one object are not independent: each adds less than the one before. Weights
+        contain that already; with weights there is no root.
         """
-        if beta not in self._posteriors:  # the stopping rule and the next view ask for the same one
+        if beta not in self._posteriors:  # the stopping rule and the next view use the same one
             root = np.sqrt(self.queries) if self.weights is None else 1.0
             probability: FloatArray = self.support.astype(np.float64)
             probability *= beta / root
@@ -157,7 +157,7 @@ def update_belief(
     Parameters
     ----------
     query : uint8 array (length,) or (h, length)
-        The view, described as the enrolled ones are; a row for each of several segmentations, of which the most similar
+        The view, described like the enrolled views; a row for each of several segmentations, of which the most similar
         one counts.
     orientation_deg : float
         Orientation of the camera around the object, counter-clockwise, from any zero that all queries share.
@@ -166,7 +166,7 @@ def update_belief(
     kept : int
         Objects that are considered further after the first query: those with the most similar views.
     weight : float, optional
-        How much the query counts, 0..1, if it is nearly the same evidence as an earlier one (`hbr.dense.arc`).
+        Weight of the query, 0..1, if it is nearly the same evidence as an earlier one (`hbr.dense.arc`).
 
     Raises
     ------
@@ -204,7 +204,7 @@ def update_belief(
 
 
 def completed(belief: Belief, index: DenseIndex, queries: Sequence[LevelArray]) -> Belief:
-    """Return a belief with all objects that can lead it or be second, as if they had been considered from the start.
+    """Return a belief with all objects that can be first or second, as if they had been considered from the start.
 
     The support of an object is at most the sum of the largest similarities of its views. Objects that were left out
     after the first query, and whose sum reaches the support of the second object considered, are added.
@@ -235,7 +235,7 @@ def completed(belief: Belief, index: DenseIndex, queries: Sequence[LevelArray]) 
 
 
 def _between(support: FloatArray, bins: FloatArray) -> FloatArray:
-    """Support of each object, a row, at its place between two bins."""
+    """Return the support of each object, a row, at its place between two bins."""
     rows, low = np.arange(len(support)), np.floor(bins)
     share = bins - low
     at = low.astype(int)

@@ -1,11 +1,11 @@
-"""Enrolled views, prepared for the dense Hough filter: what one query adds to every hypothesis.
+"""Enrolled views, prepared for the dense Hough filter: the support that one query adds to every hypothesis.
 
 A query i, rotated by r_i since the first, adds to the hypothesis (j, φ), object j with azimuth φ at the first query,
 
     s_i(j, φ + r_i) = max_k [T(q_i, c_jk)^p - ω · away(φ + r_i, k) / 360]
 
-where k runs over all views of the object and away is how far the azimuth lies outside the arc of view k, which reaches
-half-way to its neighbours: an azimuth between two views is as good as one on a view, also if a view is missing.
+where k runs over all views of the object, and away is the distance of the azimuth from the arc of view k. This arc
+reaches half-way to the neighbouring views, so an azimuth between two views has no penalty, even if a view is missing.
 The power p gives a query near an enrolled view more weight than one between two views.
 
 Decision: docs/decisions/0025.
@@ -28,7 +28,7 @@ from hbr.model.views import Views
 #: Number of azimuths at the first query.
 BINS: Final = 72
 BIN_DEG: Final = 360 / BINS
-#: Degrees that no azimuth reaches.
+#: An angle in degrees that is larger than every azimuth.
 _FAR_DEG: Final = 2000.0
 
 Floats = NDArray[np.float32]
@@ -99,7 +99,7 @@ class DenseIndex:
         return fewer
 
     def only(self, places: IndexArray) -> "DenseIndex":
-        """Return an index of some objects alone, whose later steps do not look at the others."""
+        """Return an index of some objects alone; a search of it ignores the others."""
         fewer = self._copied()
         own, begin = ranges(self._segments.begin[places], self._segments.lengths[places])
         order = self._segments.order[own]
@@ -115,11 +115,11 @@ class DenseIndex:
         """Set the views of each object: ``count`` of the rows ``order`` from ``begin`` on, by rising azimuth."""
         self._segments = calls.Segments(order, begin, count, bool((np.diff(order, prepend=-1) == 1).all()))
         for name in ("rows", "left_out", "azimuth_deg", "spacing_deg", "_ring"):
-            self.__dict__.pop(name, None)  # those of the index that this one was copied from
+            self.__dict__.pop(name, None)  # cached values of the index that this one was copied from
 
     @cached_property
     def rows(self) -> IndexArray:
-        """Rows of each object's views by rising azimuth, padded by the first of them."""
+        """Rows of each object's views by rising azimuth, padded with the first of them."""
         columns = np.arange(self._segments.lengths.max())
         rows: IndexArray = self._segments.order[
             self._segments.begin[:, None] + np.where(columns < self._segments.lengths[:, None], columns, 0)
@@ -128,7 +128,7 @@ class DenseIndex:
 
     @cached_property
     def left_out(self) -> NDArray[np.bool_]:
-        """Where `rows` is padding."""
+        """Mask of the places at which `rows` has padding."""
         padding: NDArray[np.bool_] = np.arange(self._segments.lengths.max()) >= self._segments.lengths[:, None]
         return padding
 
@@ -141,7 +141,7 @@ class DenseIndex:
     def spacing_deg(self) -> FloatArray:
         """The usual step between neighbouring views of each object; 360 of a single one."""
         spacing_deg = np.empty(len(self))
-        for count in np.unique(self._segments.lengths).tolist():  # of objects with as many views
+        for count in np.unique(self._segments.lengths).tolist():  # objects with the same number of views together
             ring_deg = self.azimuth_deg[self._segments.lengths == count, :count]
             steps_deg = np.diff(ring_deg, axis=1, append=ring_deg[:, :1] + 360)
             spacing_deg[self._segments.lengths == count] = np.median(steps_deg, axis=1)
@@ -180,7 +180,7 @@ class DenseIndex:
         nearest = [self.compared.nearest(row, self._segments, kept) for row in np.atleast_2d(query)]
         if len(nearest) == 1:
             return nearest[0]
-        # an object that is among the best by its largest similarity is so by the row that has it
+        # an object is among the best if the row with its largest similarity is
         places = np.unique(np.concatenate(nearest))
         return places[np.sort(np.argsort(-self.only(places).best(query), kind="stable")[:kept])]
 
@@ -192,7 +192,8 @@ class DenseIndex:
     def nearest_views(self, places: IndexArray, at_deg: FloatArray, count: int) -> IndexArray:
         """Return the rows of the views that are nearest to azimuths, (m, n, count), for objects (m,) and (m, n).
 
-        Of equally near views, the one with the smaller azimuth comes first. Of fewer views, some stand there twice.
+        Of equally near views, the one with the smaller azimuth comes first. If an object has fewer views, some are
+        repeated.
         """
         away_deg = size_deg(self.azimuth_deg[places, None] - at_deg[..., None])
         away_deg[np.broadcast_to(self.left_out[places, None], away_deg.shape)] = np.inf
@@ -206,9 +207,9 @@ class DenseIndex:
         return rows
 
     def nearest_view(self, place: IndexArray, at_deg: FloatArray) -> tuple[IndexArray, FloatArray]:
-        """Return the view of each object, (m,), that is nearest to an azimuth, (a, m), and how far away it is.
+        """Return the view of each object, (m,), that is nearest to an azimuth, (a, m), and its distance in degrees.
 
-        Of equally near views, the one with the smaller azimuth.
+        Of equally near views, the one with the smaller azimuth is returned.
         """
         compiled = calls.nearest_view(self._segments, self.views.azimuth_deg, place, at_deg)
         if compiled is not None:
@@ -232,34 +233,34 @@ class DenseIndex:
 
     @cached_property
     def _ring(self) -> tuple[IndexArray, FloatArray, Floats]:
-        """Two turns of every object's views in rows, where their arcs end, and the penalty there.
+        """Two revolutions of every object's views in rows, the ends of their arcs, and the penalty at these ends.
 
-        From 180° before 0 on: a copy of each view is within 180° of any azimuth.
+        They begin at -180°, so that a copy of each view is within 180° of any azimuth.
         """
         first_deg = np.where(self.azimuth_deg < 180, self.azimuth_deg, self.azimuth_deg - 360)
         first_deg = np.where(self.left_out, np.inf, first_deg)
         unrolled_deg = np.concatenate([first_deg, first_deg + 360], axis=1)
         places = np.argsort(unrolled_deg, axis=1, kind="stable")
         ring_deg = np.take_along_axis(unrolled_deg, places, axis=1)
-        with np.errstate(invalid="ignore"):  # padding stands at infinity, behind all views
+        with np.errstate(invalid="ignore"):  # padding is at infinity, behind all views
             middle_deg = (ring_deg[:, 1:] + ring_deg[:, :-1]) / 2
         own = np.arange(places.shape[1]) < 2 * self._segments.lengths[:, None]
-        # the view at each place of the two turns; behind them one beyond all
+        # the view at each place of the two revolutions; behind them an index beyond all views
         ring = np.where(own, np.take_along_axis(self.rows, places % self.rows.shape[1], axis=1), len(self.views))
-        # where the arc of each view ends and the next one's begins; far away behind the last
+        # the end of each view's arc, where the next one begins; the last one is far away
         ends_deg = np.where(own[:, 1:], middle_deg, _FAR_DEG)
         keys = (ends_deg + 2 * _FAR_DEG * np.arange(len(self))[:, None]).ravel()
         return ring, keys, (ends_deg * (self.omega / 360)).astype(np.float32)
 
     def support(self, similar: FloatArray, rotated_deg: float) -> Floats:
-        """Return what one query adds to every hypothesis.
+        """Return the support that one query adds to every hypothesis.
 
         Parameters
         ----------
         similar : float array (n,)
             Similarity of the query to every view.
         rotated_deg : float
-            Orientation since the first query, counter-clockwise.
+            Orientation since the first query in degrees, counter-clockwise.
 
         Returns
         -------
@@ -280,7 +281,7 @@ class DenseIndex:
         place = np.arange(len(self))[:, None]
         # the view on whose arc the azimuth lies, among all objects' rows
         nearest = np.searchsorted(keys, seen_deg + 2 * _FAR_DEG * place) + place
-        # of the views before and behind a running maximum knows the best: the penalty is a straight line from its arc
+        # running maxima find the best views before and behind: outside of an arc, its penalty is a straight line
         before, behind = np.full((2, *own.shape), -np.inf, np.float32)
         np.maximum.accumulate(own[:, :-1] + penalty, axis=1, out=before[:, 1:])
         np.maximum.accumulate((own[:, 1:] - penalty)[:, ::-1], axis=1, out=behind[:, -2::-1])

@@ -16,7 +16,7 @@ from hbr.dense.verification import Verification, found_from, is_doubtful, verify
 
 
 class LastSteps(NamedTuple):
-    """The decision after a verification of a doubtful leader, that verification, and the comparison of two leaders."""
+    """The verification of a doubtful leader, the decision after it, and the comparison of the two leaders."""
 
     decision: StopDecision
     verification: Verification | None
@@ -40,7 +40,7 @@ def last_steps(
     belief
         After the last view.
     decision, rule
-        With which the search would end, and the stopping rule.
+        The decision with which the search would end, and the stopping rule.
     orientations_deg
         Orientation of each view of the search.
     segmentations
@@ -48,7 +48,7 @@ def last_steps(
     leader_views
         Returns enrolled views.
     same_bench
-        Whether the bench is that of the enrollment, however the views were segmented; None: not known.
+        Whether the bench is that of the enrollment, for any segmentation of the views; None: not known.
     """
     verification = None
     if is_doubtful(rule, decision, belief.queries, belief.index.views.descriptor):

@@ -28,7 +28,7 @@ LeaderViews = Callable[[int, Sequence[float]], Sequence[LocalView]]
 
 
 def near(own_deg: ArrayLike, azimuths_deg: Sequence[float]) -> IndexArray:
-    """Return which views, given by their azimuths (n,), a comparison near some azimuths needs, by azimuth.
+    """Return the indices of the views, at ``own_deg`` (n,), that a comparison near some azimuths needs, by azimuth.
 
     There is one more than `NEAREST` for each azimuth, because the comparison leaves one out.
     """
@@ -54,7 +54,7 @@ class LeaderComparison:
     found : LocalDecision
         What the comparison found.
     outcome : Outcome
-        With which the search ends after it.
+        Outcome of the search after the comparison.
     winner : int or None
         The leader that was found, as an index of the views' names; None if the comparison names none.
     """
@@ -79,15 +79,15 @@ def compare_leaders(
 ) -> LeaderComparison | None:
     """Compare the two leaders of a search that is ambiguous, or that calls near twins unknown; None if it has no two.
 
-    An enrolled twin takes away the lead that the open-set score measures. So an object that fits one of two near twins
-    up to noise is not unknown.
+    If two near twins are enrolled, the leading one has a small margin, and the open-set score is low. Therefore an
+    object that fits one of them up to noise is not unknown.
 
     Parameters
     ----------
     belief
         After the last view.
     outcome
-        With which the search would end.
+        Outcome with which the search would end.
     orientations_deg
         Orientation of each view of the search.
     view
@@ -97,7 +97,7 @@ def compare_leaders(
     beta
         As for `Belief.posterior`.
     max_error
-        Largest error rate of a decision.
+        Largest probability that a decision is wrong.
     """
     if outcome not in (Outcome.AMBIGUOUS, Outcome.UNKNOWN):
         return None

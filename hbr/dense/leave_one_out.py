@@ -15,7 +15,7 @@ from hbr.dense.index import BINS, DenseIndex
 #: Weight of the margin in the open-set score, and of the leader's usual score.
 _MARGIN_WEIGHT: Final = 0.5
 _USUAL_WEIGHT: Final = 1.0
-#: Queries lie beside their enrolled views by shares of a step that are spread over 0..1 as multiples of this.
+#: Distances of queries from their enrolled views, as shares of a step: the multiples of this number, modulo 1.
 _GOLDEN: Final = 0.618034
 #: Distance between the views of a search.
 _STEP_DEG: Final = 90.0
@@ -33,7 +33,7 @@ class Leaders:
     object_index : integer array
         The leading candidate.
     score, margin : float64 array
-        Its score per view, and how far that is above the second score.
+        Its score per view, and that score minus the second one.
     """
 
     object_index: IndexArray
@@ -42,7 +42,7 @@ class Leaders:
 
     @classmethod
     def of(cls, found: list[tuple[int, float, float]], shape: tuple[int, int]) -> "Leaders":
-        """Return what `leader` found after each view of each search."""
+        """Return the leading candidates that `leader` found after each view of each search."""
         object_index, score, margin = zip(*found, strict=True)
         return cls(np.reshape(object_index, shape), np.reshape(score, shape), np.reshape(margin, shape))
 
@@ -62,24 +62,24 @@ class Leaders:
 def open_set_score(score: Scores, margin: Scores, usual: Scores, typical: Scores) -> Scores:
     """Return the open-set score of a leading candidate.
 
-    It is the score plus half of the margin, less what the leader usually scores above other objects. An unknown object
-    resembles several enrolled objects a little; an enrolled object resembles one of them closely. An object that looks
-    the same from all sides usually scores more, so it must match better.
+    It is the score plus half of the margin, minus the amount by which the leader usually scores more than other
+    objects. An unknown object resembles several enrolled objects a little; an enrolled object resembles one of them
+    closely. An object that looks the same from all sides usually scores more, so it must match better.
 
     Parameters
     ----------
     score, margin
         As in `Leaders`.
     usual
-        What the leader usually scores, see `usual_scores`.
+        The usual score of the leader, see `usual_scores`.
     typical
-        The median of all objects.
+        The median of the usual scores of all objects.
     """
     return score + _MARGIN_WEIGHT * margin - _USUAL_WEIGHT * (usual - typical)
 
 
 Task = tuple[int, float]
-"""The place of a searched object in the index, and how far aside the search before it was."""
+"""The place of a searched object in the index, and the distance of the queries in the search before it."""
 
 
 class Found(NamedTuple):
@@ -135,11 +135,11 @@ def leave_one_out(
     progress: Callable[[int, int], object] | None = None,
     tasks: Callable[[Callable[[Task], "Found"], Sequence[Task]], Iterable[tuple[Task, "Found"]]] | None = None,
 ) -> LeaveOneOut:
-    """Search for every object with its own enrolled views, 90° apart, as if the camera had stood beside them.
+    """Search for every object with its own enrolled views, as if the camera had been beside their azimuths.
 
     A query beside an enrolled view, at the share u of a step, is less similar to that view by u times the difference
-    to its neighbour. Real queries are at most half a step away; u is spread over 0..1 to allow for light and noise,
-    which make views differ, too.
+    to its neighbour. Real queries are at most half a step away; u is spread over 0..1 because light and noise make
+    views differ, too.
 
     Parameters
     ----------
@@ -159,12 +159,13 @@ def leave_one_out(
     step_deg : float
         Distance between the views of a search.
     weight : float, optional
-        How much each view after the first counts, if they are nearly the same evidence. All views of a search then lie
-        beside their enrolled views by the same share, because what differs between two sessions differs in all of them.
+        Weight of each view after the first, if the views are nearly the same evidence. All views of a search then have
+        the same distance from their enrolled views, because two sessions differ in all views in the same way.
     progress : callable, optional
         Called before each object with the number of objects done, and of all.
     tasks : callable, optional
-        Yields each of some tasks with the result of a function of it, in any order, for example from other processes.
+        Applies a function to each task, for example in other processes, and yields each task with its result, in any
+        order.
 
     Raises
     ------
@@ -258,14 +259,14 @@ def _searches_for(
 
 
 def leader(object_index: IndexArray, scores: FloatArray) -> tuple[int, float, float]:
-    """Return the leading candidate, its score and its margin; without a second candidate, that is the whole score."""
+    """Return the leading candidate, its score and its margin: the whole score without a second candidate."""
     best = int(scores.argmax())
     margin = scores[best] - np.partition(scores, -2)[-2] if len(scores) > 1 else scores[best]
     return int(object_index[best]), float(scores[best]), float(margin)
 
 
 def usual_scores(leaders: Leaders, correct: NDArray[np.bool_], objects: int) -> FloatArray:
-    """Return each object's median score in the searches that found it, (objects, views); the typical one of others."""
+    """Return each object's median score in the searches that found it, (objects, views); else the median of all."""
     usual = np.full((objects, leaders.score.shape[1]), np.nan)
     for n in range(usual.shape[1]):
         for j in np.unique(leaders.object_index[correct[:, n], n]).tolist():
@@ -278,7 +279,7 @@ def usual_scores(leaders: Leaders, correct: NDArray[np.bool_], objects: int) -> 
 def spread(
     azimuth_deg: FloatArray, start: int, count: int, step_deg: float = _STEP_DEG, *, again: bool = False
 ) -> list[int]:
-    """Return the indices of ``count`` views, a step apart, the first one at ``start``; different ones but ``again``."""
+    """Return the indices of ``count`` views, a step apart, from ``start`` on; all different unless ``again`` is set."""
     chosen = [start]
     for n in range(1, count):
         away = np.abs((azimuth_deg - azimuth_deg[start] - n * step_deg + 180) % 360 - 180)

@@ -1,4 +1,4 @@
-"""Comparison of two objects pixel by pixel where their enrolled views differ: the last step before "ambiguous".
+"""Comparison of two objects, pixel by pixel, at the places where their enrolled views differ.
 
 Near twins differ in one sticker, letter or handle, which a descriptor of the whole object hardly shows. For each view
 of a search, the enrolled views of both objects at the estimated pose are registered to it. Where the enrolled views of
@@ -6,9 +6,10 @@ the two differ by more than neighbouring views of one object do, the view is com
 
     score = Σ w · (difference from the second − difference from the first) / Σ w · (difference between both)
 
-summed over the pixels of all views: 1 for the first object, −1 for the second one. Then enrolled views take the place
-of the views of the search, and are left out of what they are compared with. Their scores say whether the objects can be
-told apart from these sides, and by how much a score scatters: the error rate is bounded by Cantelli's inequality.
+summed over the pixels of all views: 1 for the first object, −1 for the second one. Then the same scores are computed
+for enrolled views in place of the views of the search; each is left out of the views that it is compared with. These
+scores show whether the objects can be distinguished from these sides, and how much a score scatters. Cantelli's
+inequality bounds the error rate.
 
 Decision: docs/decisions/0058.
 """
@@ -37,14 +38,14 @@ MOST_VIEWS: Final = 8
 APART_DEG: Final = 20.0
 #: Score above which the difference decides.
 MIN_SCORE: Final = 0.5
-#: Sum of the weights, grey levels times pixels: about a spot of 6 x 6 pixels in another colour.
+#: Smallest sum of the weights, grey levels times pixels: about a spot of 6 x 6 pixels in another colour.
 MIN_WEIGHT: Final = 2000.0
-#: What the object that was found leaves unexplained, as a share of the weights, and in grey levels of a pixel.
+#: Largest difference that the found object leaves unexplained: as a share of the weights, and in grey levels per pixel.
 MAX_UNEXPLAINED: Final = 0.5
 MAX_MISFIT: Final = 2.0
 #: Two objects whose enrolled views differ by less, in grey levels of a pixel, are near twins.
 TWINS_APART: Final = 20.0
-#: By so much a detail may be displaced after the registration: parallax, and views between two enrolled ones.
+#: Largest displacement of a detail after the registration, by parallax and by views between two enrolled ones.
 _REACH_PX: Final = 3
 #: Differences of grey levels that noise and sharpness explain.
 _FLOOR: Final = 10.0
@@ -81,7 +82,7 @@ class LocalView:
 
 @dataclass(frozen=True, eq=False)
 class ViewDifference:
-    """What one view of a search shows.
+    """The differences that one view of a search shows.
 
     Attributes
     ----------
@@ -92,7 +93,8 @@ class ViewDifference:
     weight : float
         How much the objects differ from this side: grey levels, summed over pixels.
     difference : float32 array (128, 128)
-        By how much the enrolled views of both objects differ beyond what neighbouring views do, in grey levels.
+        Difference of the enrolled views of both objects, minus that of neighbouring views of one object, in grey
+        levels.
     query, first, second : uint8 arrays (128, 128, 3)
         The view, and the enrolled views of both objects, registered to it.
     """
@@ -113,21 +115,21 @@ class LocalDecision:
     Attributes
     ----------
     winner : int or None
-        0 for the first object, 1 for the second one, None if the comparison does not tell.
+        0 for the first object, 1 for the second one, None if the comparison decides for neither.
     score : float
         1 for the first object, −1 for the second one.
     expected : (float, float), or None
-        The same of enrolled views of each object in place of the views; None if the views show no difference, or do not
-        fit.
+        The scores of enrolled views of each object in place of the views; None if the views show no difference, or do
+        not fit.
     error_bound : float
-        Bound of the probability that the other object scores so; 1 if it is not known.
+        Bound of the probability that the other object has this score; 1 if it is not known.
     unexplained : float, or None
         Differences of the views from the better object that neighbouring enrolled views do not have, as a share of the
         weights; None without weights.
     weight : float
         Sum of the weights.
     misfit, apart : float
-        What the better object leaves unexplained, and the weights, per pixel of the object, in grey levels.
+        Differences that the better object leaves unexplained, and the weights, per pixel of the object, in grey levels.
     views : tuple of ViewDifference
         The views that show a difference, the clearest first.
     """
@@ -163,7 +165,7 @@ class _Fit(NamedTuple):
 
 
 class _Shown(NamedTuple):
-    """What a view shows: score, weight, what each object leaves unexplained, the map, and the two enrolled views."""
+    """The result for a view: score, weight, unexplained difference of each object, the map, the enrolled views."""
 
     score: float
     weight: float
@@ -190,7 +192,7 @@ def poses_of(belief: Belief, object_index: int) -> tuple[float, ...]:
 
 
 def chosen_views(orientations_deg: Sequence[float]) -> list[int]:
-    """Return which views of a search are compared: the last ones that are `APART_DEG` from each other."""
+    """Return the places of the views of a search to compare: the last ones that are `APART_DEG` from each other."""
     chosen: list[int] = []
     for number in range(len(orientations_deg) - 1, -1, -1):
         away = [abs(wrap180(orientations_deg[number] - orientations_deg[other])) for other in chosen]
@@ -215,8 +217,8 @@ def compare_objects(
     objects
         Enrolled views of the first and of the second object; those within two views of the poses are enough.
     rotations_deg
-        For each object, what is added to the azimuth of a query to get that of the enrolled views; several if the pose
-        is not certain. The one that fits the views best counts.
+        For each object, the angles that are added to the azimuth of a query to get that of the enrolled views; several
+        if the pose is not certain. The one that fits the views best counts.
     max_error
         Largest `LocalDecision.error_bound` of a decision.
 
@@ -319,7 +321,7 @@ def _shown(query: LocalView, first: Sequence[_Fit], second: Sequence[_Fit]) -> _
     both = pixel_difference(a.image, b.image)
     noise = np.full_like(both, _FLOOR)
     for best, *others in (first, second):
-        for other in others:  # what neighbouring views of one object differ by
+        for other in others:  # the differences of neighbouring views of one object
             noise = np.maximum(noise, cv2.dilate(pixel_difference(best.image, other.image), _square(3)))
     inside = cv2.dilate(np.maximum(np.maximum(a.mask, b.mask), mask), _square(3)) > 127
     weights = np.where(inside, np.maximum(both - noise, 0), 0).astype(np.float32)
@@ -338,7 +340,7 @@ def _small(view: LocalView) -> tuple[ImageArray, Mask]:
 
 
 def _registered(view: LocalView, to: LocalView) -> tuple[ImageArray, Mask]:
-    """Return a view and its mask, moved, scaled and sheared so that it fits another one, and in that one's light."""
+    """Return a view and its mask, moved, scaled and sheared to fit another view, with the light of that view."""
     image, mask = _small(view)
     target, target_mask = _small(to)
     grey, target_grey = (cv2.cvtColor(one, cv2.COLOR_BGR2GRAY) for one in (image, target))
@@ -348,7 +350,7 @@ def _registered(view: LocalView, to: LocalView) -> tuple[ImageArray, Mask]:
         inside = cv2.dilate(target_mask, _square(5))
         _, found = cv2.findTransformECC(target_grey, grey, move.copy(), cv2.MOTION_AFFINE, criteria, inside, 5)
         move = np.asarray(found, np.float32)
-    except cv2.error:  # an even surface has nothing to register: the silhouettes have put it there
+    except cv2.error:  # an even surface shows nothing to register: it stays where the silhouettes have placed it
         pass
     size, flags = (SIDE_PX, SIDE_PX), cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     moved = cv2.warpAffine(image, move, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
@@ -361,7 +363,7 @@ def _registered(view: LocalView, to: LocalView) -> tuple[ImageArray, Mask]:
 
 
 def pixel_difference(a: ImageArray, b: ImageArray) -> Map:
-    """Return by how much two images, uint8 (h, w, 3), differ at each pixel, float32 (h, w).
+    """Return the difference of two images, uint8 (h, w, 3), at each pixel, in grey levels, float32 (h, w).
 
     Details may be displaced by `_REACH_PX`. A detail that only one of the images has counts in both directions.
     """

@@ -1,4 +1,4 @@
-"""The next best view, by the belief: the rotation after which the strongest hypotheses are least similar.
+"""The next best view: the rotation after which the strongest hypotheses of the belief are least similar.
 
 Decision: docs/decisions/0032.
 """
@@ -20,16 +20,16 @@ from hbr.kernels import calls
 #: Largest number of compared hypotheses, and the share of the belief that is not compared.
 _STRONGEST: Final = 16
 _NEGLIGIBLE: Final = 1e-3
-#: A view this near to an earlier one adds little.
+#: Distance in degrees up to which a view near an earlier one adds little.
 _NEAR_DEG: Final = 15.0
-#: Every 5 degrees, the shorter way round.
+#: Rotations in steps of 5 degrees, the shorter way round.
 _ALL_ROTATIONS_DEG: Final = np.delete(np.arange(-BINS // 2 + 1.0, BINS // 2 + 1), BINS // 2 - 1) * (360 / BINS)
 _ALL_ROTATIONS_DEG.flags.writeable = False
 
 
 @dataclass(frozen=True, eq=False)
 class NextBestView:
-    """A rotation, and what it was decided on.
+    """A rotation and the numbers of the decision for it.
 
     Attributes
     ----------
@@ -41,10 +41,10 @@ class NextBestView:
         The two objects that it separates most: index of each in the views' names, the likelier first. None if only
         one object is left.
     rotations_deg, confusion, cost : float64 arrays (a,)
-        All rotations that were weighed; logarithm of the probability of still confusing two objects after each; cost of
-        the motion, in the same unit.
+        All rotations that were weighed; the logarithm of the probability that two objects are still confused after
+        each; the cost of the motion, in the same unit.
     similarity : float64 array (a,), or None
-        How similar the pair looks after each rotation; None if there is no pair.
+        Similarity of the pair's views after each rotation; None if there is no pair.
     """
 
     rotation_deg: float
@@ -70,8 +70,8 @@ def next_best_view(
     For hypotheses p, p' of different objects, a rotation a leaves the confusion
     Σ p p' exp(-λ ν(a) √(κ(a) κ'(a)) (1 - T(view(a), view'(a)))), where ν(a) = 1 - exp(-½ (d / 15°)²) discounts a view
     at the distance d from the nearest earlier one, and κ(a) = exp(-½ (e / 15°)²) one at the distance e from the nearest
-    enrolled view: nothing is known of what lies between. Its logarithm and μ · time(a) are added up; of equal sums, the
-    earlier rotation is chosen.
+    enrolled view, because nothing is known about the views between. The logarithm of the confusion and μ · time(a) are
+    added up; of equal sums, the earlier rotation is chosen.
 
     Parameters
     ----------
@@ -91,7 +91,7 @@ def next_best_view(
     Raises
     ------
     ValueError
-        There is no rotation to choose from, or not one time for each.
+        There is no rotation to choose from, or the number of times is another one.
     """
     angles_deg = _ALL_ROTATIONS_DEG
     if rotations_deg is not None:
@@ -151,8 +151,8 @@ def _all_pairs(count: int) -> tuple[IndexArray, IndexArray]:
 def most_informative_rotation(belief: Belief, *, beta: float = BETA, rotations_deg: ArrayLike | None = None) -> float:
     """Choose the rotation whose view is expected to leave the least entropy: a baseline for `next_best_view`.
 
-    If hypothesis h is true, the view after a rotation is the one that was enrolled there, and hypothesis h' is then as
-    likely as exp(β T(view_h, view_h')^p) says.
+    If hypothesis h is true, the view after a rotation is the one that was enrolled there. The likelihood of hypothesis
+    h' is then exp(β T(view_h, view_h')^p).
 
     Parameters
     ----------
@@ -174,17 +174,17 @@ def most_informative_rotation(belief: Belief, *, beta: float = BETA, rotations_d
 
 
 def strongest(posterior: FloatArray) -> tuple[FloatArray, IndexArray, IndexArray]:
-    """Return probability, object (its place) and bin of the strongest hypotheses, the strongest first.
+    """Return the probability, the place of the object and the bin of the strongest hypotheses, the strongest first.
 
-    A hypothesis is a peak of its object. It stands for the slopes beside it.
+    Each of them is a peak of its object's probability; it represents the slopes beside it.
     """
     weight = _peak_weights(posterior).ravel()
     count = min(_STRONGEST, len(weight))
-    best = np.argpartition(-weight, count - 1)[:count]  # of all: of equal weights, saved runs chose the same ones
+    best = np.argpartition(-weight, count - 1)[:count]  # of equal weights, the ones in saved runs
     best = best[np.argsort(-weight[best], kind="stable")]
     weight = weight[best]
     place, bin_of = np.divmod(best, posterior.shape[1])
-    second = int((place != place[0]).argmax())  # a decision is between two objects, however unlikely the second
+    second = int((place != place[0]).argmax())  # a decision needs two objects, even if the second one is unlikely
     enough = max(1 + int(np.searchsorted(np.cumsum(weight), 1 - _NEGLIGIBLE)), second + 1)
     return weight[:enough], place[:enough], bin_of[:enough]
 
@@ -208,7 +208,7 @@ def expected_similarity(
     first: IndexArray,
     second: IndexArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return what pairs of hypotheses would show after each rotation.
+    """Return how similar pairs of hypotheses would look after each rotation.
 
     Parameters
     ----------
@@ -222,7 +222,7 @@ def expected_similarity(
     similar : float64 array (a, p)
         Similarity of the two.
     known : float64 array (a, m)
-        How well the view of each hypothesis is known.
+        Share, 0..1, to which the view of each hypothesis is known.
     """
     compared = belief.index.compared
     rows, away_deg = expected_views(belief, place, bin_of, angles_deg)
@@ -235,6 +235,6 @@ def expected_similarity(
 def expected_views(
     belief: Belief, place: IndexArray, bin_of: IndexArray, angles_deg: FloatArray
 ) -> tuple[IndexArray, FloatArray]:
-    """Return the enrolled view that each hypothesis expects after each rotation, (a, m), and how far away it is."""
+    """Return the enrolled view that each hypothesis expects after each rotation, (a, m), and its distance."""
     seen_deg = bin_of * (360.0 / BINS) + belief.rotated_deg + angles_deg[:, None]
     return belief.index.nearest_view(place, seen_deg)

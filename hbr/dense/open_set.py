@@ -1,12 +1,12 @@
-"""The open-set score of the dense search: how well the leading candidate fits, against all others, as a log-odds.
+"""The open-set score of the dense search: a log-odds that compares the leading candidate with all others.
 
 An absolute similarity means little after a change of the bench: it falls for an enrolled object, too. Therefore the
 score weighs several numbers (`Evidence`), each of which compares the leading candidate with the other candidates under
-the same conditions. Half of them come from whitened descriptions: what all enrolled views share counts little there,
-what tells them apart counts much. The weights for the rig's own descriptor come from searches on drawn benches
-(`hbr.evaluation.changed_bench`); for other descriptors they are fitted on leave-one-out searches of the catalog, under
-changes of the bench of several strengths (`hbr.descriptors.shift`). The thresholds are those of the catalog in any
-case.
+the same conditions. Half of them come from whitened descriptions: properties that all enrolled views share count little
+there, and properties that distinguish them count much. The weights for the rig's own descriptor come from searches on
+drawn benches (`hbr.evaluation.changed_bench`); for other descriptors they are fitted on leave-one-out searches of the
+catalog, under changes of the bench of several strengths (`hbr.descriptors.shift`). The thresholds always come from the
+catalog.
 
 Sources: B. Hariharan, J. Malik and D. Ramanan, "Discriminative decorrelation for clustering and classification", ECCV
 2012 (whitening); R. Auckenthaler, M. Carey and H. Lloyd-Thomas, "Score normalization for text-independent speaker
@@ -30,7 +30,7 @@ COHORT: Final = 10
 #: Enrolled views next to the estimated pose that are compared.
 _NEXT: Final = 3
 _BIN_DEG: Final = 5.0
-#: How strongly weights are drawn to 0.
+#: Strength of the regularisation, which draws weights to 0.
 _RIDGE: Final = 1e-3
 _STEPS: Final = 60
 
@@ -125,7 +125,7 @@ class OpenSetModel:
     offset: FloatArray
 
     def score(self, numbers: FloatArray, views: int) -> float:
-        """Return the open-set score of the numbers, (7,), after so many views."""
+        """Return the open-set score of the numbers, (7,), after this many views."""
         n = min(views, len(self.offset)) - 1
         reduced = (numbers - self.middle[n]) / self.spread[n]
         return float(reduced @ self.weights[n] + self.offset[n])
@@ -175,7 +175,7 @@ _FITTED: Final = {
 
 
 def fitted_before(descriptor: str, views: int) -> OpenSetModel | None:
-    """Return the weights that come with the program for a descriptor and so many views; None if there are none."""
+    """Return the weights that come with the program for a descriptor and a number of views; None if there are none."""
     if descriptor not in _FITTED:
         return None
     weights, offset = (np.array(part, np.float64)[:views] for part in _FITTED[descriptor])

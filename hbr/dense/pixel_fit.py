@@ -1,7 +1,7 @@
-"""How well an enrolled view explains the pixels of another view, after registration, in any light.
+"""Fit of an enrolled view to the pixels of another view, after registration, in any light.
 
-Logarithms of the brightness and of two ratios of the colours are compared, less their medians: another exposure or
-another colour of the light only adds to them.
+The fit compares logarithms of the brightness and of two ratios of the colours, minus their medians: another exposure or
+another colour of the light only adds a constant to them.
 
 Decision: docs/decisions/0062.
 """
@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 from hbr.core.arrays import ImageArray
 from hbr.dense.local_difference import LocalView
 
-#: Side of the compared images, and how far they are moved at most, to begin with.
+#: Side of the compared images, and their largest movement in the first step.
 SIDE_PX: Final = 64
 _REACH_PX: Final = 10
-#: Scales that are tried, to begin with, and how much width and height may differ.
+#: Scales of the first step, and largest ratio of the scales of width and height.
 _SCALES: Final = (0.88, 1.0, 1.13)
 _MOST_APART: Final = 1.2
-#: Loss of correlation that a change of a scale, and a pixel of the reduced image, must make good.
+#: Smallest gain of correlation that justifies a change of a scale, and a movement by a pixel of the reduced image.
 _SCALE_COST: Final = 0.02
 _PIXEL_COST: Final = 0.002
 _CRITERIA: Final = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 1e-3)
@@ -32,7 +32,7 @@ _AREAS: Final = (0.55, 1.8)
 #: Units of a logarithm, and grey levels that keep it finite.
 _UNITS: Final = 40.0
 _DARK: Final = (9.0, 12.0)
-#: With fewer pixels nothing is compared.
+#: Smallest number of common pixels for a comparison.
 _FEWEST: Final = 60
 
 Map = NDArray[np.float32]
@@ -49,7 +49,7 @@ class Pixels:
     mask : uint8 array (64, 64)
         Share of each pixel that belongs to the object, 0..255.
     alone : float32 array (32, 32)
-        The first of them at half the size, with its mean instead of the background.
+        The logarithm of the brightness at half the size, with its mean instead of the background.
     """
 
     colours: Map

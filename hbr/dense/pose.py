@@ -1,9 +1,9 @@
 """The pose of a found object: its uncertainty, and the poses that its views do not distinguish.
 
 The support of the object's azimuths is turned into a posterior, p(φ) ∝ exp(κ A(φ) / √n). The standard uncertainty is a
-half-width of this posterior around the estimated azimuth; two constants, fitted on objects 1-50 of COIL-100, make 68 %
-and 95 % of the true azimuths lie within one and two of them. A posterior with n equal parts means an object that looks
-the same every 360° / n; one that is spread over most azimuths, an object that looks the same from all sides.
+half-width of this posterior around the estimated azimuth. Two constants are fitted on objects 1-50 of COIL-100, so that
+68 % and 95 % of the true azimuths lie within one and two standard uncertainties. If the posterior has n equal parts,
+the object looks the same every 360° / n. If it is spread over most azimuths, the object looks the same from all sides.
 
 Coverage: docs/results.md; `python -m benchmarks.pose_coverage`.
 """
@@ -18,16 +18,16 @@ from hbr.core.arrays import FloatArray
 from hbr.dense.filter import Belief
 from hbr.dense.index import BINS
 
-#: κ, and the share of the posterior's half-width that is the uncertainty: azimuths are estimated finer than its bins.
+#: κ, and the uncertainty as a share of the posterior's half-width, because azimuths are estimated finer than its bins.
 SHARPNESS: Final = 120.0
 WIDTH: Final = 0.68
 #: A pose with a larger uncertainty is not determined.
 LARGEST_SIGMA_DEG: Final = 30.0
-#: The same in an n-fold symmetry, as a share of the period.
+#: The largest uncertainty with an n-fold symmetry, as a share of the period.
 _LARGEST_SHARE: Final = 1 / 9
 #: Each equivalent pose has at least this share of the probability of an equal one.
 _LEAST_PART: Final = 0.25
-#: An object looks the same from all sides if the likeliest azimuths, 95 % together, are such a share of all.
+#: An object looks the same from all sides if the likeliest azimuths, 95 % together, are at least this share of all.
 _FREE_SHARE: Final = 0.5
 _ORDERS: Final = range(2, 13)
 _ONE_SIGMA, _TWO_SIGMA = 0.683, 0.954
@@ -35,7 +35,7 @@ _ONE_SIGMA, _TWO_SIGMA = 0.683, 0.954
 
 @dataclass(frozen=True, slots=True)
 class Pose:
-    """Orientation of the camera around an object at the last query, as far as the views determine it.
+    """Orientation of the camera around an object at the last query, if the views determine it.
 
     Attributes
     ----------

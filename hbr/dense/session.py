@@ -26,7 +26,7 @@ class DenseSession:
     index : DenseIndex
         The enrolled views.
     rule : StoppingRule
-        When the search ends.
+        Decides when the search ends.
     max_views : int
         Views after which it ends in any case.
 
@@ -44,7 +44,7 @@ class DenseSession:
     def __init__(self, index: DenseIndex, rule: StoppingRule, *, max_views: int = 8) -> None:
         self.rule = rule
         self.max_views = max_views
-        # Taking out a part of the views costs more than it saves if a search ends after one or two views.
+        # If a search ends after one or two views, an index of a part of the views costs more time than it saves.
         self._kept = KEPT if len(index) > _WORTH_REDUCING * KEPT else len(index)
         self._index = index
         self._so_far: DenseIndex | Belief = index
@@ -70,7 +70,7 @@ class DenseSession:
         orientation_deg : float
             Orientation of the camera around the object, from any zero that all views share.
         earlier : sequence of uint8 arrays, optional
-            The earlier views, described again: they were segmented better since.
+            New descriptions of the earlier views, because they were segmented again, and better.
         reliable : bool
             Whether the views were segmented reliably (`hbr.ViewsTogether.reliable`). If not, the search does not end
             while it may take more views.
@@ -117,7 +117,7 @@ class DenseSession:
         return self.decision
 
     def _weight(self, orientation_deg: float) -> float | None:  # noqa: ARG002
-        """Return how much the next view counts; None: fully."""
+        """Return the weight of the next view; None: 1."""
         return None
 
     def _decide(self, belief: Belief, *, last: bool = False) -> StopDecision:
@@ -125,7 +125,7 @@ class DenseSession:
         return self.rule.decide(belief, max_views=most, reliable=self._reliable, same_bench=self._same_bench)
 
     def _complete(self) -> None:
-        """Before an end: decide again if an object that was left out after the first view can be first or second."""
+        """Decide again before an end if an object that was left out after the first view can be first or second."""
         if len(self.belief.index) == len(self._index):
             return
         found = completed(self.belief, self._index, self._queries)

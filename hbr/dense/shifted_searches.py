@@ -2,8 +2,8 @@
 
 The queries are the enrolled views of an object, changed as another bench would change their description
 (`hbr.descriptors.shift`), often by several segmentations. Each search is evaluated twice: among all objects, and as if
-its object were not enrolled. Then its views do not count in the whitening, either: they would make it less similar to
-the others than an unknown object is.
+its object were not enrolled. Then the whitening leaves out its views, too: they would make it less similar to the
+others than an unknown object is.
 """
 
 from collections.abc import Callable
@@ -25,7 +25,7 @@ from hbr.descriptors.shift import Shift
 STRENGTHS: Final = (0.0, 0.25, 0.5, 1.0, 1.3)
 #: Probabilities of one, two and three segmentations of a view, as searches without an empty-table image have them.
 _SEVERAL: Final = (0.45, 0.35, 0.2)
-#: Further segmentations are worse: strength relative to the first one, and at least.
+#: Strength of the change in further segmentations, which are worse: relative to the first one, and the smallest.
 _WORSE: Final = 1.6
 _LEAST_WORSE: Final = 0.7
 #: With more views, the whitened descriptions of all of them would take too much memory.
@@ -44,7 +44,7 @@ class ShiftedSearches:
     known, unknown : float64 arrays (searches, views, 7)
         The numbers of `hbr.dense.open_set.NUMBERS`, with the object enrolled, and without it.
     correct : bool array (searches, views)
-        Whether the object leads, if it is enrolled.
+        Whether the object is the leading candidate, if it is enrolled.
     """
 
     strength: FloatArray
@@ -54,7 +54,7 @@ class ShiftedSearches:
 
 
 def can_shift(index: DenseIndex) -> bool:
-    """Return whether the descriptor says how another bench changes it."""
+    """Return whether the descriptor can compute its levels on another bench."""
     kind = descriptor(index.views.descriptor)
     row = index.views.levels(np.array([0]))[0]
     hard = Shift.drawn(np.random.default_rng(_SEED), 2.0)
@@ -62,7 +62,7 @@ def can_shift(index: DenseIndex) -> bool:
 
 
 def shifted_searches(index: DenseIndex, *, views: int, searches: int) -> ShiftedSearches:
-    """Search so many times for the objects of an index in turn, each time with so many views.
+    """Search for the objects of an index in turn, each time with the same number of views.
 
     Objects with fewer views are left out. Every object is searched for under each strength before one is repeated.
 
@@ -108,7 +108,7 @@ def _segmentations(
 def _beside(
     shifted: Callable[[LevelArray, Shift], LevelArray], pair: LevelArray, strength: float, rng: np.random.Generator
 ) -> LevelArray:
-    """Return a view between two enrolled ones, on a changed bench: each entry is that of one of the two."""
+    """Return a view between two enrolled ones, on a changed bench: each entry comes from one of the two."""
     share = rng.uniform(0, 0.5)
     between = np.where(rng.random(pair.shape[1]) < share, pair[1], pair[0]).astype(np.uint8)
     return shifted(between, Shift.drawn(rng, strength))

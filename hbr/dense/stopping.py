@@ -1,4 +1,4 @@
-"""The stopping rule of the dense search: when a search ends, and when an object is unknown, at measured error rates.
+"""The stopping rule of the dense search: it ends searches and rejects unknown objects at measured error rates.
 
 `hbr.dense.calibration` sets the thresholds, and `StoppingRule.decide` applies them after each view of a search.
 
@@ -19,7 +19,7 @@ from hbr.dense.open_set import OpenSetModel, evidence
 
 
 class Outcome(StrEnum):
-    """What to do after a view: continue, or end with one of three answers."""
+    """What a search does after a view: continue, or end with one of three answers."""
 
     CONTINUE = "continue"
     FOUND = "found"
@@ -28,7 +28,7 @@ class Outcome(StrEnum):
 
 
 class StopReason(StrEnum):
-    """Why a search continues or ends."""
+    """The reason why a search continues or ends."""
 
     CONFIDENT = "confident"
     NOT_CONFIDENT = "not-confident"
@@ -46,7 +46,7 @@ class StopReason(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class StopDecision:
-    """What the stopping rule decided after a view, and the numbers it compared.
+    """The decision of the stopping rule after a view, and the numbers that it compared.
 
     Attributes
     ----------
@@ -55,10 +55,10 @@ class StopDecision:
     object_index : int
         The leading candidate, for every outcome.
     confidence, min_confidence : float
-        Its probability among the enrolled objects, and the one that ends a search.
+        Its probability among the enrolled objects, and the probability that ends a search.
     open_set_score, open_set_threshold : float
-        How closely the views resemble an enrolled object, and below what score an object is unknown; a threshold of
-        -inf calls no object unknown.
+        A number that is high for enrolled objects, and the score below which an object is unknown; with a threshold of
+        -inf no object is unknown.
     """
 
     outcome: Outcome
@@ -71,7 +71,7 @@ class StopDecision:
 
 
 class LimitationCode(StrEnum):
-    """What a stopping rule does not guarantee."""
+    """The kinds of limitations: each names something that a stopping rule does not guarantee."""
 
     SAMPLED = "sampled"
     FALSE_REJECT_RATE = "false-reject-rate"
@@ -86,7 +86,7 @@ class LimitationCode(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Limitation:
-    """A rate that a stopping rule does not guarantee, with the numbers that say why.
+    """A rate that a stopping rule does not guarantee, with the numbers that are the reason.
 
     Attributes
     ----------
@@ -128,7 +128,7 @@ class ShiftRates:
 
 @dataclass(frozen=True, eq=False)
 class StoppingRule:
-    """When a search ends, and which objects are unknown.
+    """A rule that ends a search and decides which objects are unknown.
 
     Attributes
     ----------
@@ -137,10 +137,10 @@ class StoppingRule:
     min_confidence : float
         Confidence that ends a search.
     usual_scores : float64 array (objects, views)
-        What each object scores when it is searched for, after 1, 2, ... views.
+        Usual score of each object when it is searched for, after 1, 2, ... views.
     open_set_thresholds : tuple of float
         Open-set scores after 1, 2, ... views below which an object is unknown; the last one is for all further views.
-        -inf calls no object unknown.
+        With -inf no object is unknown.
     error_rate, false_reject : float
         The rates asked for: wrong objects among those named, and enrolled objects called unknown.
     false_accept : float
@@ -155,12 +155,12 @@ class StoppingRule:
         With weights: open-set scores after 1, 2, ... views below which an object is unknown. Between them and
         ``open_set_thresholds`` it is ambiguous. Without weights both thresholds are one.
     changed_bench_thresholds, same_bench_thresholds : tuple of float
-        With weights: ``open_set_thresholds`` of a search that knows that the bench has changed since the enrollment, or
-        that it has not.
+        With weights: ``open_set_thresholds`` for a bench that is known to have changed since the enrollment, and for
+        one that is known to be the same.
     leave_one_out_thresholds : tuple of float
         With weights: scores of `hbr.dense.leave_one_out.open_set_score` after 1, 2, ... views. On an unchanged bench,
-        few enrolled objects score less, and one that reaches the highest of them is found. Rules that were calibrated
-        before have none, and decide as before.
+        few enrolled objects score less, and an object that reaches the highest of them is found. Rules of earlier
+        versions have none; they ignore the bench.
     rates : tuple of ShiftRates
         Measured rates under changes of the bench.
     """
@@ -190,16 +190,16 @@ class StoppingRule:
         reliable: bool = True,
         same_bench: bool | None = None,
     ) -> StopDecision:
-        """Decide whether a search ends after these views; ``decisions`` counts instead of them in a search in motion.
+        """Decide whether a search ends after these views, or in motion after this number of ``decisions``.
 
-        An object is found if it is confident and reaches the open-set threshold. Before the last calibrated view the
-        highest of all thresholds counts: an unknown object that passes the first threshold gets another view, which
-        costs an enrolled object little. From the last calibrated view on, an object below the threshold is unknown,
-        however many views are left: no false-reject rate was measured for those. After ``max_views`` an object that is
-        not confident is ambiguous. If the views were not segmented reliably, the search continues in any case until
-        ``max_views``: another view costs little, and the background is then known. ``same_bench`` says whether the
-        bench is that of the enrollment; None: the search does not know. If it is, a confident object is also found if
-        it reaches all leave-one-out thresholds, which are for an unchanged bench.
+        An object is found if its confidence and its open-set score reach their thresholds. Before the last calibrated
+        view the highest of all open-set thresholds counts: an unknown object that passes the first threshold gets
+        another view, which costs an enrolled object little. From the last calibrated view on, an object below the
+        threshold is unknown, even if views are left: no false-reject rate was measured for those. After ``max_views``
+        an object with too little confidence is ambiguous. If the views were not segmented reliably, the search
+        continues until ``max_views``: another view costs little, and the background is then known. ``same_bench`` is
+        whether the bench is that of the enrollment; None: not known. On the same bench, an object with enough
+        confidence is also found if it reaches all leave-one-out thresholds, which are for an unchanged bench.
         """
         probability = belief.posterior(self.beta).sum(axis=1)
         best = int(probability.argmax())
@@ -233,7 +233,7 @@ class StoppingRule:
         return decision
 
     def _found_on_same_bench(self, belief: Belief, n: int, decision: StopDecision) -> StopDecision:
-        """Return the decision on an unchanged bench, by the score that was measured on one."""
+        """Return the decision by the leave-one-out score, which is for an unchanged bench."""
         if not self.leave_one_out_thresholds or decision.confidence < self.min_confidence:
             return decision
         leading, score = self._leave_one_out_score(belief, n)

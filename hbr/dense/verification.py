@@ -1,9 +1,9 @@
 """Comparison of a doubtful leader's enrolled views with the views of a search, pixel by pixel.
 
-The open-set score compares descriptors of 8 x 8 cells. An object that is not enrolled may resemble an enrolled one so
-coarsely; its details do not fit. For each view, the enrolled views at the estimated pose are registered to it, and the
-fit is the share of the view's contrast that they explain, in colours that light hardly changes. The fit of the leader,
-and its lead over the next candidates, count beside the open-set score.
+The open-set score compares descriptors of 8 x 8 cells. An unknown object may resemble an enrolled one at this coarse
+scale, although its details do not fit. For each view, the enrolled views at the estimated pose are registered to it.
+The fit is the share of the view's contrast that they explain, in colours that light hardly changes. The fit of the
+leader, and its difference from the fit of the next candidates, are added to the open-set score with weights.
 
 Decisions: docs/decisions/0062, docs/decisions/0064.
 """
@@ -24,27 +24,27 @@ from hbr.dense.pixel_fit import Pixels, fit
 from hbr.dense.stopping import Outcome, StopDecision, StoppingRule, StopReason
 from hbr.descriptors import descriptor
 
-#: Candidates beside the leader, enrolled views of each, and segmentations of each view that are compared.
+#: Numbers of compared candidates beside the leader, of enrolled views of each, and of segmentations of each view.
 _OTHERS: Final = 3
 _NEAREST: Final = 2
 _SEGMENTATIONS: Final = 2
-#: Weights of the open-set score, of the leader's fit, and of its lead over the other candidates; and what is added.
+#: Weights of the open-set score, of the leader's fit, and of its difference from that of other candidates; an offset.
 #: Fitted like `hbr.dense.open_set.fitted_before`: the result is a log-odds.
 _WEIGHTS: Final = (0.714, 9.438, 4.995)
 _OFFSET: Final = -5.416
 #: Log-odds from which an object is found, and below which it is unknown: that of 1 in 100 enrolled objects.
 FOUND_FROM: Final = 0.0
-#: The same on a bench that is known to be that of the enrollment: there an enrolled object fits much better. It lies
-#: between the enrolled objects 1–50 after a mild change (from 5.6 on) and the left-out ones (up to 1.1).
+#: Log-odds from which an object is found on the bench of the enrollment, where an enrolled object fits much better. In
+#: searches for objects 1–50 after a mild change, enrolled objects reach 5.6 or more, left-out objects 1.1 or less.
 FOUND_FROM_SAME_BENCH: Final = 3.0
 UNKNOWN_BELOW: Final = -1.3
-#: With a smaller open-set score, no fit makes an object known.
+#: With a smaller open-set score, an object is unknown at any fit.
 _HOPELESS: Final = -7.0
 
 
 @dataclass(frozen=True)
 class Verification:
-    """How well the leader's enrolled views fit the views of a search.
+    """Fit of the leader's enrolled views to the views of a search.
 
     Attributes
     ----------
@@ -59,12 +59,12 @@ class Verification:
     others: float
 
     def score(self, open_set_score: float) -> float:
-        """Return the log-odds that the leader is the object, with the open-set score."""
+        """Return the log-odds that the leader is the object on the table, from the fits and the open-set score."""
         numbers = (open_set_score, self.fit, self.fit - self.others)
         return sum(weight * number for weight, number in zip(_WEIGHTS, numbers, strict=True)) + _OFFSET
 
     def decided(self, decision: StopDecision, least: float = FOUND_FROM) -> StopDecision:
-        """Return the decision with which a search ends instead of this one; an object is found from ``least`` on."""
+        """Return the decision that replaces the given one; log-odds of at least ``least`` find the object."""
         score = self.score(decision.open_set_score)
         outcome = Outcome.UNKNOWN if score < UNKNOWN_BELOW else Outcome.AMBIGUOUS
         if score >= least and decision.confidence >= decision.min_confidence:
@@ -73,17 +73,17 @@ class Verification:
 
 
 def is_doubtful(rule: StoppingRule, decision: StopDecision, views: int, kind: str) -> bool:
-    """Return whether the end of a search is to be verified.
+    """Return whether a search must verify its leader before it ends.
 
-    The open-set score is then too low for an answer after fewer views. The weights are for the scores that come with
-    the program, and for a catalog of so many objects that the rule has them.
+    This is so if the open-set score is too low for an answer after fewer views. The weights are for the scores that
+    come with the program. The rule has them if the catalog has enough objects.
 
     Parameters
     ----------
     rule
         Of the search.
     decision
-        With which it would end.
+        Decision with which it would end.
     views
         Views so far.
     kind
@@ -99,7 +99,7 @@ def is_doubtful(rule: StoppingRule, decision: StopDecision, views: int, kind: st
 
 
 def found_from(rule: StoppingRule, same_bench: bool | None) -> float:
-    """Return the log-odds from which an object is found; rules that were calibrated before ignore the bench."""
+    """Return the log-odds from which an object is found. Rules of earlier versions ignore the bench."""
     return FOUND_FROM_SAME_BENCH if same_bench and rule.leave_one_out_thresholds else FOUND_FROM
 
 

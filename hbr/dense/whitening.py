@@ -1,4 +1,4 @@
-"""Whitened descriptions: what all enrolled views share counts little, what tells them apart counts much.
+"""Whitened descriptions, in which the properties that distinguish the enrolled views count most.
 
 Source: B. Hariharan, J. Malik and D. Ramanan, "Discriminative decorrelation for clustering and classification", ECCV
 2012.
@@ -60,14 +60,14 @@ class Whitening:
     def unit(self, levels: LevelArray) -> FloatArray:
         """Return whitened descriptions of unit length, (n, d), of levels, uint8 (n, length).
 
-        A search asks for the same few rows after each view: they are computed once.
+        A search needs the same few rows after each view; they are computed once.
         """
         if len(levels) > _MOST_REMEMBERED // 8:
             return unit_rows(self.white(levels))
         keys = [row.tobytes() for row in levels]
         if len(self._known) > _MOST_REMEMBERED:
             self._known = {}
-        known = self._known  # of this call, even if another thread begins a new one
+        known = self._known  # this call uses one cache, even if another thread begins a new one
         missing = {key: i for i, key in enumerate(keys) if key not in known}
         if missing:
             known.update(zip(missing, unit_rows(self.white(levels[list(missing.values())])), strict=True))

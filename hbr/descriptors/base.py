@@ -1,4 +1,4 @@
-"""The interface of descriptors, and what they share."""
+"""The interface of descriptors, and the code that they share."""
 
 from abc import abstractmethod
 from typing import Protocol
@@ -22,7 +22,7 @@ class Comparison(Protocol):
         """Return the comparison with some of the rows, in this order."""
 
     def among(self, rows: IndexArray, /) -> FloatArray:
-        """Return the similarity of rows to each other within groups: indices (g, k) in, float64 (g, k, k) out."""
+        """Return the similarity of rows to each other within groups, indices (g, k), as float64 (g, k, k)."""
 
 
 class Descriptor(Protocol):
@@ -36,7 +36,7 @@ class Descriptor(Protocol):
     name : str
         Name by which the descriptor is chosen, stored with every view.
     version : int
-        Rises if the same image gives other levels. Levels of different versions must not be compared.
+        Increases when the same image gives other levels. Levels of different versions must not be compared.
     size_bytes : int
         Size of a packed view.
     length : int
@@ -79,11 +79,11 @@ class Descriptor(Protocol):
         """
 
     def entries(self, rows: LevelArray) -> FloatArray:
-        """Return what levels, uint8 (n, length), mean as numbers whose differences count alike, float64 (n, d)."""
+        """Return the numbers that levels, uint8 (n, length), stand for: differences count alike, float64 (n, d)."""
         return rows.astype(np.float64)
 
     def shifted(self, levels: LevelArray, shift: Shift) -> LevelArray:  # noqa: ARG002
-        """Return the levels of a view, uint8 (length,), as after a change of the bench; as they are if unknown."""
+        """Return the levels of a view, uint8 (length,), after a change of the bench; unchanged if that is not known."""
         return levels
 
     def prepared(self, rows: LevelArray, /) -> Comparison:
@@ -200,7 +200,7 @@ class Descriptor(Protocol):
         Raises
         ------
         ValueError
-            A level is: often of descriptors that are still packed.
+            A level is above it, often because the descriptors are still packed.
         """
         if rows.size and rows.max() > self.max_level:
             raise ValueError(
@@ -216,11 +216,11 @@ class CompiledDescriptor(Descriptor):
 
     @abstractmethod
     def compared(self, rows: LevelArray, /) -> Comparison:
-        """Prepare rows, uint8 (m, length), for comparison in NumPy; takes several times their memory."""
+        """Prepare rows, uint8 (m, length), for comparison in NumPy; the result takes several times their memory."""
 
     @abstractmethod
     def measure(self) -> Measure | None:
-        """Return how the kernels compare packed rows, with the same result; None if they cannot."""
+        """Return the settings with which the kernels compare packed rows, with the same result; None if they cannot."""
 
     def prepared(self, rows: LevelArray, /) -> Comparison:
         self.check_rows(rows)
@@ -244,7 +244,7 @@ class Packed:
         return self._rows.similarity(self._kind.pack_rows(queries))
 
     def bounds(self, query: LevelArray, segments: Segments) -> FloatArray:
-        """Return what the similarity of each object's views to a query cannot exceed, (k,)."""
+        """Return an upper bound of the similarity of each object's views to a query, (k,)."""
         return self._rows.bounds(self._kind.pack_rows(query[None])[0], segments)
 
     def nearest(self, query: LevelArray, segments: Segments, kept: int) -> IndexArray:

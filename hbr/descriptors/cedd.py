@@ -31,7 +31,7 @@ _LUMINANCE: Final = np.array([114, 587, 299])
 #: Luminance of a grey pixel, rounded like the reference.
 _GREYS: Final = (0.114 * np.arange(256) + 0.587 * np.arange(256)) + 0.299 * np.arange(256)
 _SQRT2: Final = np.sqrt(2.0)
-#: Non-directional, horizontal and vertical edge, of the quarters a, b, c, d.
+#: Weights of the quarters a, b, c, d for a non-directional, a horizontal and a vertical edge.
 _FILTERS: Final = np.array([[2.0, -2.0, -2.0, 2.0], [1.0, 1.0, -1.0, -1.0], [1.0, -1.0, 1.0, -1.0]])
 #: For the kernel: the rules padded to the width of vectors, and the first bins of the two colours of each hue.
 _TABLES: Final = calls.Addresses(
@@ -134,7 +134,7 @@ def _covered_size(width: int, height: int) -> tuple[int, int]:
 
 
 def _resize(image: ImageArray, width: int, height: int) -> ImageArray:
-    """Shrink by area, then enlarge linearly (bit-exact: the same bytes on every machine)."""
+    """Return an image shrunk by area, then enlarged linearly (bit-exact: the same bytes on every machine)."""
     shrunk = (min(width, image.shape[1]), min(height, image.shape[0]))
     for size, method in ((shrunk, cv2.INTER_AREA), ((width, height), cv2.INTER_LINEAR_EXACT)):
         if (image.shape[1], image.shape[0]) != size:

@@ -14,7 +14,7 @@ Trapezoid = tuple[float, float, float, float]
 
 
 def _membership(x: FloatArray, trapezoid: Trapezoid) -> FloatArray:
-    """Return the membership: 1 on [b, c], linear on [a, b) and (c, d], 0 elsewhere."""
+    """Return the fuzzy membership of values: 1 on [b, c], linear on [a, b) and (c, d], 0 elsewhere."""
     a, b, c, d = trapezoid
     with np.errstate(divide="ignore", invalid="ignore"):  # vertical edges (a = b, c = d) are never selected
         rising, falling = (x - a) / (b - a), (x - c) / (c - d) + 1

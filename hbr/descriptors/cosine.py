@@ -12,7 +12,7 @@ Rows = NDArray[np.float32]
 
 #: Products are added up in blocks of this many columns.
 _BLOCK: Final = 64
-#: Into so much and the rest the values of a query are split: 64 products of 4095 and 63 are below 2**24.
+#: Unit into whose multiples and the rest the values of a query are split: 64 products of 4095 and 63 are below 2**24.
 _UNIT: Final = 64.0
 #: Rows that are converted to float at once.
 _CHUNK: Final = 256
@@ -30,7 +30,7 @@ class Cosine:
     Parameters
     ----------
     to_unit : callable
-        Makes rows of unit length, float32 (n, length), of levels.
+        Returns levels as rows of unit length, float32 (n, length).
     blocks : float32 array (blocks, n, 64)
         The rows.
     """
@@ -135,7 +135,7 @@ def _cosine(dots: FloatArray, squares_a: FloatArray, squares_b: FloatArray) -> F
 
 
 def _blocks(rows: LevelArray, to_unit: Callable[[LevelArray], Rows]) -> Rows:
-    """Return what rows become, in blocks of columns; the last one is filled with zeros."""
+    """Return converted rows in blocks of columns; the last block is filled with zeros."""
     length = rows.shape[1]
     blocks = np.zeros((-(-length // _BLOCK), len(rows), _BLOCK), np.float32)
     for start in range(0, len(rows), _CHUNK):

@@ -18,7 +18,7 @@ def describe(
     box: Box | None = None,
     grey_patch: Box | None = None,
 ) -> LevelArray:
-    """Return the levels of an image: by the paper's CEDD, or by another descriptor of the object in the image.
+    """Return the levels of an image by the paper's CEDD, or by another descriptor.
 
     ``describe(image)`` is the paper's descriptor of the whole image, scaled to a size that CEDD's grid covers.
     ``describe(image, descriptor="edges+colours", empty_table=empty)`` is the rig's own: the object is cut out and

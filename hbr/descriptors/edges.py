@@ -23,7 +23,7 @@ Floats = NDArray[np.float32]
 _CELLS: Final = 8
 _DIRECTIONS: Final = 8
 _PIXELS: Final = CROP_PX // 2
-#: Blur before the gradient, in pixels of the small image.
+#: Standard deviation of the blur before the gradient, in pixels of the small image.
 _BLUR: Final = 1.25
 #: Largest share of the whole length that one direction of a cell may have.
 _CLIP: Final = 0.25
@@ -88,7 +88,7 @@ class Edges(CompiledDescriptor):
         hidden = 1 - shift.visible
         mean = float(cells.mean())
         upright = np.zeros((_DIRECTIONS, 1, 1), np.float32)
-        upright[[0, -1]] = 0.5  # gradients of a bar that stands are horizontal
+        upright[[0, -1]] = 0.5  # the gradients of a vertical bar are horizontal
         cells += 3 * mean * hidden * (upright + 0.1)
         false = rng.exponential(1.0, cells.shape) * (rng.random((1, _CELLS, _CELLS)) < 0.3)
         cells = np.maximum(cells, 0) ** shift.exponent

@@ -103,7 +103,7 @@ def read_model(path: Path) -> bytes:
 
 
 def opened(path: Path, content: bytes) -> cv2.dnn.Net:
-    """Return the network of an ONNX file, which was run once.
+    """Return the network of an ONNX file after a first run.
 
     Raises
     ------
@@ -134,7 +134,7 @@ def to_levels(vector: NDArray[np.float32]) -> LevelArray:
 
 
 def unit(levels: LevelArray) -> NDArray[np.float32]:
-    """Return levels as vectors of unit length."""
+    """Return levels, uint8 (n, length), as vectors of unit length, float32 (n, length)."""
     rows: NDArray[np.float32] = levels.astype(np.float32) - 128
     length = np.sqrt(np.einsum("ij,ij->i", rows, rows, dtype=np.float64))[:, None]
     scaled: NDArray[np.float32] = np.divide(rows, length, out=np.zeros_like(rows), where=length > 0)

@@ -1,8 +1,8 @@
 """A middle layer of a neural network as a descriptor: pooled on a grid, whitened, and joined with another descriptor.
 
 The descriptor is a file of its own, made by `fit_layer`: the ONNX file, cut off behind the layer, and the whitening
-that was fitted to enrolled views. So a model set that was described by it can be searched on every computer that has
-this file, and a saved run identifies it by its SHA-256.
+that was fitted to enrolled views. Every computer with this file can search a model set that was described by it. A
+saved run identifies the file by its SHA-256.
 """
 
 import io
@@ -66,13 +66,13 @@ class GridLayer(Descriptor):
 
 @dataclass(frozen=True)
 class LayerEmbedding(Joined):
-    """Another descriptor and a layer side by side, from a file."""
+    """A descriptor from a file: another descriptor and a layer side by side."""
 
     path: Path = Path()
 
 
 def load_layer(path: Path, content: bytes, own: Descriptor) -> LayerEmbedding:
-    """Return the descriptor of a file that `fit_layer` has written; ``own`` is what it joins with the layer.
+    """Return the descriptor of a file that `fit_layer` has written; it joins ``own`` with the layer.
 
     Raises
     ------
@@ -111,7 +111,8 @@ def fit_layer(
     network : Path
         An ONNX file for images as `hbr.descriptors.embedding.Embedding` gives them.
     layer : str
-        Name of a node's output (`hbr.descriptors.onnx_layers.layers`). An early block tells more than the last layer.
+        Name of a node's output (`hbr.descriptors.onnx_layers.layers`). An early block distinguishes objects better than
+        the last layer.
     views : iterable of uint8 arrays (H, W, 3), or Segmentation
         Enrolled views, of as many objects as possible; at least two.
     target : Path

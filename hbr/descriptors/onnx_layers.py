@@ -1,8 +1,8 @@
 """The layers of an ONNX file, and the file cut off behind one of them.
 
 ONNX files are protocol buffers (onnx.proto3). A model's field 7 is its graph; a graph has its nodes in field 1 and its
-outputs in field 12; a node has the names of its inputs in field 1 and of its outputs in field 2. Cutting the file works
-with each version of OpenCV, whose own names of layers differ, and saves the computing of what follows.
+outputs in field 12; a node has the names of its inputs in field 1 and of its outputs in field 2. A file that was cut
+off works with each version of OpenCV, although their own names of layers differ, and needs less computing.
 """
 
 from collections.abc import Iterator

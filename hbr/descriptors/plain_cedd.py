@@ -48,7 +48,7 @@ class Cedd(Descriptor):
 
     def prepared(self, rows: LevelArray, /) -> "_Tanimoto":
         self.check_rows(rows)
-        return _Tanimoto(rows.astype(np.float32))  # which represents products of levels 0..7 exactly
+        return _Tanimoto(rows.astype(np.float32))  # float32 represents products of levels 0..7 exactly
 
     def similarity(self, a: LevelArray, b: LevelArray) -> FloatArray:
         return tanimoto(a, b)

@@ -37,7 +37,7 @@ _MODELS: Final[dict[str, Model]] = {}
 
 
 def descriptor(name: str) -> Descriptor:
-    """Return the descriptor of this name. It opens no file: names come from saved runs and from catalogs of others.
+    """Return the descriptor of this name. Opens no file: names come from saved runs and from other users' catalogs.
 
     Raises
     ------

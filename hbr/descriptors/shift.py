@@ -1,4 +1,4 @@
-"""What a change of the bench does to a description: to test a catalog against changes without any image.
+"""Changes of a description by a change of the bench, to test a catalog against such changes without images.
 
 A box that is a little wrong moves and scales the grid of cells, a holder hides some of them, another light changes the
 colours, and highlights, shadows and defocus change the strength of edges.
@@ -32,14 +32,14 @@ class Shift:
     Attributes
     ----------
     move : float64 array (2, 3)
-        Where a cell's place in the changed grid, from -0.5 to 0.5, lies in the unchanged one.
+        Affine map from places in the changed grid, from -0.5 to 0.5, to the unchanged one.
     visible : float32 array (8, 8)
         Share of each cell that the holder leaves visible.
     exponent, false, light, contrast, stain
         Exponent of the edges' strength; share of false edges; change of the two opponent colours, (2,); factor of the
         contrast; other changes of the colours.
     seed : int
-        Of what is drawn for each cell.
+        Seed of the random values of the cells.
     """
 
     move: NDArray[np.float64]

@@ -9,7 +9,7 @@ from hbr.core.arrays import FloatArray
 from hbr.kernels import library
 from hbr.kernels.calls import ByteRows
 
-#: From so many rows on, a matrix product is as fast as the compiled kernel.
+#: From this number of rows on, a matrix product is as fast as the compiled kernel.
 _MANY: Final = 8
 
 Descriptors = NDArray[np.uint8] | FloatArray

@@ -1,6 +1,6 @@
 """Description of views that belong together: those of one search, or of one enrollment.
 
-They share a background, which is learned while the table turns (`hbr.segmentation.learned`). So the second view also
+They share a background, which is learned while the table rotates (`hbr.segmentation.learned`). So the second view also
 improves the segmentation of the first one. Further views hardly improve those that were segmented by rotation.
 """
 
@@ -18,14 +18,14 @@ from hbr.segmentation.frame import Frame
 from hbr.segmentation.learned import LearnedBackground
 from hbr.segmentation.segment import MOST_HYPOTHESES, without_background
 
-#: Segmentations as good as those of enrolled views.
+#: Methods whose segmentations are as good as those of enrolled views.
 _EXACT: Final = (Method.PLAIN_BACKGROUND, Method.EMPTY_TABLE)
-#: Segmentations by a known background.
+#: Methods that use a known background.
 RELIABLE: Final = (*_EXACT, Method.ROTATION)
 
 
 def like_enrollment(method: str, same_bench: bool | None) -> bool | None:
-    """Return whether a view is described as at the enrollment; None: not known.
+    """Return whether a view is described under the conditions of the enrollment; None: not known.
 
     Parameters
     ----------
@@ -83,8 +83,8 @@ class ViewsTogether:
     def add(self, image_bgr: ImageArray, *, revise: bool = True, keep: bool = True) -> tuple[Segmentation, ...]:
         """Add a view, and revise the earlier ones if asked for; return the segmentations of the new view.
 
-        Among many views that are not revised, the object is guessed in the first one alone. If the image is not kept,
-        `revise` leaves the view's segmentations as they are: a long search needs less memory.
+        If many views are not revised, the object is guessed only in the first one. If the image is not stored, `revise`
+        does not change the view's segmentations, and a long search needs less memory.
 
         Raises
         ------
@@ -110,11 +110,11 @@ class ViewsTogether:
 
     @property
     def reliable(self) -> bool:
-        """Whether the last view was segmented by a known background; without an empty-table image the first is not."""
+        """Whether the last view was segmented by a known background; without an empty-table image the first was not."""
         return self.segmentations[-1][0].method in RELIABLE
 
     def revise(self) -> None:
-        """Segment the views whose background was not known, by that which the other views show."""
+        """Segment the views whose background was not known again, with the background that the other views show."""
         for view, found in enumerate(self.segmentations):
             if self._frames[view] is not None and (not found or found[0].method not in RELIABLE):
                 self._describe(view, guess=self._several)

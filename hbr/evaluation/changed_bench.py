@@ -1,7 +1,7 @@
-"""Drawn benches after a change: another table, wall, light, lens, placement and holder, all at once.
+"""Drawn benches after a change of table, wall, light, lens, placement and holder, all at once.
 
 A `Bench` is a wall, a table, a platter and clutter. A `Visit` is one search on it: light, camera and placement are
-drawn once and hold for all its views. The table turns between the views: the object and the platter's pattern turn
+drawn once and hold for all its views. The table rotates between the views: the object and the platter's pattern rotate
 with it, everything else stands still. Pictures are 320 x 240.
 """
 
@@ -23,7 +23,7 @@ _ELEVATION_DEG: Final = 15.0
 
 
 class Frame(NamedTuple):
-    """A frame with what is known about it: the object's pixels, bool (240, 320), without those that are hidden."""
+    """A frame with the object's visible pixels, bool (240, 320)."""
 
     image: ImageArray
     mask: NDArray[np.bool_]
@@ -86,7 +86,7 @@ class Bench:
     Attributes
     ----------
     still : float32 array (240, 320, 3)
-        All that stands still, with the platter's rim.
+        Everything that stands still, with the platter's rim.
     top : float32 array (192, 192, 3)
         The platter from above.
     """
@@ -96,11 +96,11 @@ class Bench:
 
     @classmethod
     def drawn(cls, rng: np.random.Generator, *, textured: float = 1.0, clutter: int = 6) -> "Bench":
-        """Draw a bench; ``textured`` is the contrast of its patterns, ``clutter`` the most things on it."""
+        """Draw a bench; ``textured`` is the contrast of its patterns, ``clutter`` the largest number of objects."""
         horizon = int(rng.integers(110, 175))
         still = _surface(rng, textured)
         still[horizon:] = _surface(rng, textured)[horizon:]
-        if rng.random() < 0.5:  # seen flat, a table's pattern is compressed
+        if rng.random() < 0.5:  # a low camera sees the table's pattern compressed
             still[horizon:] = cv2.resize(_surface(rng, textured), (WIDTH, 2 * (HEIGHT - horizon)))[::2]
         still = np.asarray(cv2.GaussianBlur(still, (0, 0), rng.uniform(0.5, 1.0)), np.float32)
         if textured:
@@ -114,7 +114,7 @@ class Bench:
         if textured and kind < 0.35:  # rings
             for radius in range(12, 96, int(rng.integers(8, 30))):
                 cv2.circle(top, (96, 96), radius, (colour * rng.uniform(0.7, 1.3)).tolist(), 2)
-        elif textured and kind < 0.6:  # marks that turn
+        elif textured and kind < 0.6:  # marks that rotate
             for _ in range(int(rng.integers(2, 9))):
                 ends = (96 + 96 * rng.uniform(-1, 1, 4)).astype(int).tolist()
                 cv2.line(
@@ -172,7 +172,7 @@ class Visit:
         self._later = rng.random() < 0.5
 
     def empty(self, table_deg: float = 0.0) -> ImageArray:
-        """Return the picture of the empty table, in this light; every second holder was put there later."""
+        """Return the picture of the empty table in this light, with the holder in half of the visits."""
         return self._photographed(self._bench.seen(table_deg), self._later)[0]
 
     def photograph(
@@ -252,7 +252,7 @@ class Visit:
             picture += spot[:, :, None] * np.float32(self._rng.uniform(0.4, 1) * self._change.specular)
 
     def _photographed(self, picture: Picture, without_holder: bool) -> tuple[ImageArray, NDArray[np.bool_]]:
-        """Return the picture through the camera, and the pixels of the holder."""
+        """Return the picture as the camera sees it, and the pixels of the holder."""
         hidden = np.zeros((HEIGHT, WIDTH), np.float32)
         if self._holder is not None and not without_holder:
             foot, tip, thick, colour = self._holder

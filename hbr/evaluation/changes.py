@@ -1,4 +1,4 @@
-"""Searches by image after a change of the bench: how many decisions are right, and how many unknown objects accepted.
+"""Searches by image after a change of the bench: rates of right decisions and of accepted unknown objects.
 
 Objects are enrolled on one drawn bench. Each search is a visit to the same bench (mild change), or to one of twelve
 other benches (hard change), with four views, 90° apart. Some objects are never enrolled.
@@ -29,7 +29,7 @@ from hbr.evaluation.draws import generator
 from hbr.segmentation import Background
 
 Kind = Literal["mild", "hard"]
-#: Views of a search, at most, and the step between them.
+#: Largest number of views of a search, and the step between them.
 VIEWS: Final = 4
 _STEP_DEG: Final = 90.0
 _BENCHES: Final = 12
@@ -38,7 +38,7 @@ DESCRIPTOR: Final = "edges+colours"
 
 @dataclass(frozen=True)
 class Changes:
-    """The settings of such searches.
+    """The settings of searches after a change of the bench.
 
     Attributes
     ----------
@@ -51,9 +51,9 @@ class Changes:
     trials : int
         Searches for each object.
     every : int
-        Every so many-th object is never enrolled.
+        One of this many objects is never enrolled.
     seed : int
-        Of all random values.
+        Seed of all random values.
     """
 
     kind: Kind = "hard"
@@ -77,11 +77,11 @@ class SearchResult:
     leaders : tuple of str
         After 1, 2, 3 and 4 views.
     outcome : Outcome
-        With which the search ended within four views.
+        Outcome of the search within four views.
     decided : str
-        The leading object then, or the one that the comparison of the two leaders named.
+        The leading object at the end, or the one that the comparison of the two leaders named.
     views : int
-        Views until then.
+        Views until the end.
     compared : bool
         Whether its two leaders were compared pixel by pixel (`hbr.dense.leaders`).
     by_comparison : bool
@@ -89,7 +89,7 @@ class SearchResult:
     verified : bool
         Whether the leader was doubtful, and compared with the views pixel by pixel (`hbr.dense.verification`).
     left_out : Outcome, optional
-        How the same search ends if the object is not enrolled; None if it never was.
+        Outcome of the same search if the object is not enrolled; None if it never was.
     """
 
     leaders: tuple[str, ...]
@@ -153,9 +153,9 @@ def search_changed(
     """Search for an object, once for each trial.
 
     As on the rig, the first frame is compared with the enrollment's picture, or without one with a view of an enrolled
-    object, the ``example``. An enrolled object is also searched for as if it were not enrolled. The rule stays: it is
-    fitted to the searches of all enrolled objects, of which this one is a small part. ``enrolled`` returns the enrolled
-    views of an object, for the comparison of two leaders.
+    object, the ``example``. An enrolled object is also searched for as if it were not enrolled. The rule is the same
+    then, because it is fitted to the searches for all enrolled objects. ``enrolled`` returns the enrolled views of an
+    object, for the comparison of two leaders.
 
     Raises
     ------
@@ -190,7 +190,7 @@ def search_changed(
 
 
 class _Search:
-    """A search that continues after its end, to see which object leads."""
+    """A search that continues after its end, to record the leading object after each view."""
 
     def __init__(self, index: DenseIndex, rule: StoppingRule, enrolled: Callable[[str], EnrolledViews]) -> None:
         self._session = DenseSession(index, rule, max_views=VIEWS)
@@ -259,7 +259,7 @@ def _without(index: DenseIndex, name: str) -> DenseIndex | None:
 
 
 def summary(known: dict[str, list[SearchResult]], unknown: dict[str, list[SearchResult]]) -> dict[str, float | int]:
-    """Return the shares that the searches of enrolled objects, and of others, ended with; by names with units."""
+    """Return the rates of each outcome, for enrolled objects and for others, by names with units."""
     searches = [(name, one) for name, results in known.items() for one in results]
     others = [one for results in unknown.values() for one in results]
     count, unknown_count = max(1, len(searches)), max(1, len(others))
@@ -302,7 +302,7 @@ def _places(item: PhotographedObject, azimuth_deg: NDArray[np.float64]) -> list[
 
 
 def _bench_image(example: PhotographedObject | None) -> Background:
-    """Return what a catalog knows of the enrollment's bench: its empty-table image, or a view of an object."""
+    """Return the image that a catalog has of the enrollment's bench: the empty-table image, or a view of an object."""
     visit = _enrollment_visit()
     if example is None:
         return Background(visit.empty())

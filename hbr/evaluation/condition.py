@@ -94,7 +94,7 @@ class Condition:
 
     @property
     def same_bench(self) -> bool | None:
-        """Whether a search knows that its bench is that of the enrollment; None: it is not told."""
+        """Whether a search knows that its bench is that of the enrollment; None: not known."""
         return True if self.background in ("same", "bench") else None
 
     def enrolled(self, image_bgr: ImageArray, rng: np.random.Generator | None = None) -> EvaluationImage:
@@ -147,7 +147,7 @@ class Condition:
 
 
 def object_mask(image_bgr: ImageArray) -> NDArray[np.bool_]:
-    """Return the pixels of the object, (H, W): all but the dark region that is connected with the image's border."""
+    """Return the pixels of the object, (H, W): all except the dark region that is connected with the image's border."""
     dark = (image_bgr.max(axis=2) <= _DARK).astype(np.uint8)
     # a frame of dark pixels joins all regions that touch the border
     labels = cv2.connectedComponents(cv2.copyMakeBorder(dark, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=1))[1]

@@ -101,7 +101,7 @@ class Dataset:
 def load_coil(folder: Path) -> Dataset:
     """Find the views of a folder in the layout of COIL-100: ``obj{number}__{angle}.png`` or ``.jpg``.
 
-    Angles are degrees, with or without a fraction, and are taken for azimuths. If they are table angles, left and right
+    Angles are degrees, with or without a fraction, and are used as azimuths. If they are table angles, left and right
     are exchanged. Objects are sorted by number.
 
     Raises

@@ -1,4 +1,4 @@
-"""The methods that are compared: how views are chosen, and how objects are ranked."""
+"""The methods that are compared: each chooses views and ranks objects in its own way."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass

@@ -20,7 +20,7 @@ class LocalPhotographs:
     ----------
     dataset : Dataset
     condition : Condition
-        What changes the images of queries and of enrolled views.
+        Changes of the images of queries and of enrolled views.
     size : (int, int)
         Width and height of each photograph.
     seed : int

@@ -1,6 +1,6 @@
 """Perturbations of a query: placement, illumination, occlusion and background.
 
-Every perturbation has three strengths. The second one can happen to a careful technician.
+Every perturbation has three strengths. The second one can also occur when a technician works carefully.
 """
 
 from collections.abc import Mapping
@@ -136,7 +136,7 @@ class Perturbations:
             size = width, height
         move = np.array([[scale, 0, to_x - scale * x], [0, upright, to_y - upright * y]])
         edge = mask.astype(np.float32)
-        if on_bench:  # a pixel at the edge shows the dark surroundings by half
+        if on_bench:  # half of a pixel at the edge is dark surroundings
             inner = cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(np.float32)
             edge = np.minimum(cv2.GaussianBlur(edge, (0, 0), 0.7), 0.5 * (inner + edge)).astype(np.float32)
         seen = cv2.warpAffine(image, move, size, borderMode=cv2.BORDER_REPLICATE)
@@ -172,7 +172,7 @@ class Perturbations:
             picture += spot[:, :, None] * np.float32(rng.uniform(0.4, 1) * strength)
 
     def _bar(self, pictures: list[Picture], cover: Picture, rng: np.random.Generator) -> None:
-        """Draw a bar in front of the object, from below; every second one is on the empty-table image, too."""
+        """Draw a bar in front of the object, from below; half of the bars are on the empty-table image, too."""
         size = SIDE_PX if len(pictures) > 1 else cover.shape[1]
         thick = int(rng.uniform(0.5, 1) * self.of("occlusion") * size)
         if not thick:

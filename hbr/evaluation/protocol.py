@@ -30,8 +30,9 @@ class Protocol:
     max_views : int
         Number of queries in a trial; there are results after each query.
     removal : {"near", "paper79", "queries"}
-        Enrolled views of the object that are removed before the search: those closer than `near_deg` to any query so
-        far; the queries and the next view of each (79 % of 72 views stay after 8 queries); the queries.
+        Enrolled views of the object that are removed before the search. ``near``: those closer than `near_deg` to any
+        query so far; ``paper79``: the queries and the next view of each (79 % of 72 views stay after 8 queries);
+        ``queries``: only the queries.
     near_deg : float
         The distance for ``near``.
     sigma_deg : float
@@ -84,7 +85,7 @@ class Runs:
     pose_error_deg : float64
         Distance of the estimated from the true orientation of the true object, 0..180; nan if it is not a candidate.
     alike_error_deg : float64
-        The same for the nearest orientation in which the object looks like in the true one.
+        Distance of the estimated from the nearest orientation in which the object looks as in the true one, 0..180.
     period_deg : float64
         Symmetry of the true object, from all its views (`hbr.model.symmetry.symmetry`): 360 if it is not symmetric;
         nan if it has too few views.
@@ -97,7 +98,7 @@ class Runs:
     outcome : int8
         Decision of the stopping rule with the dense filter, as an index of `OUTCOMES`; -1 with the paper's voting.
     compared : int8
-        Where a search of the dense filter ends, and its two leaders were compared pixel by pixel: an element of
+        Result of the comparison of the two leaders at the end of a search of the dense filter, as an index of
         `COMPARED`; else -1.
     travelled_deg : float64
         Sum of the rotations since the first view, without signs.
@@ -151,7 +152,7 @@ def views_enrolled(azimuth_deg: FloatArray, count: int) -> NDArray[np.bool_]:
 
 
 def views_of_trial(views: Views, protocol: Protocol) -> NDArray[np.bool_]:
-    """Return which views are enrolled in all trials, bool (n,): those of absent objects are not."""
+    """Return which views are enrolled in all trials, bool (n,): all except those of absent objects."""
     mask = ~np.isin(views.object_index, [j for j, name in enumerate(views.object_names) if name in protocol.absent])
     if protocol.enrolled is not None:
         for j in range(len(views.object_names)):

@@ -47,9 +47,9 @@ class Stopping:
 
     The paper's methods end when the margin per view reaches ``margin``; the dense filter ends by the stopping rule that
     was calibrated on the enrolled views. A hit is a search that found the right object. ``unknown_rate``,
-    ``ambiguous_rate`` and ``wrong_rate`` are the shares of searches with these outcomes, ``compared_rate`` the share
-    whose two leaders were compared pixel by pixel, ``compared_right_rate`` the share in which that named the right
-    object, ``ended_early`` the share that ended before the last view.
+    ``ambiguous_rate`` and ``wrong_rate`` are the shares of searches with these outcomes. ``compared_rate`` is the share
+    whose two leaders were compared pixel by pixel, ``compared_right_rate`` the share in which the comparison named the
+    right object, and ``ended_early`` the share that ended before the last view.
     """
 
     margin: float
@@ -145,7 +145,7 @@ def contests(runs: Runs, methods: Sequence[Method], rng: np.random.Generator) ->
     place = {method.name: m for m, method in enumerate(methods)}
     all_views = runs.rank.shape[-1]
     answers = []
-    # a stream for each question: its interval does not depend on the other questions
+    # a random stream for each question, so that its interval does not depend on the other questions
     for (first, first_views, second, second_views), own in zip(QUESTIONS, rng.spawn(len(QUESTIONS)), strict=True):
         a, b = first_views or all_views, second_views or all_views
         if first not in place or second not in place or max(a, b) > all_views:

@@ -46,16 +46,16 @@ class _Draws:
 
 
 class _Model(NamedTuple):
-    """The views that a search looks among: some of all views."""
+    """The enrolled views of a search: a selection of all views."""
 
     views: Views
     mask: NDArray[np.bool_]
-    """Which of all views they are."""
+    """Indices of the selected views among all."""
     gone: IndexArray
-    """The other ones, ascending."""
+    """Indices of the other views, ascending."""
 
     def place(self, rows: IndexArray) -> IndexArray:
-        """Return where these of all views are among them."""
+        """Return the places of these views, indices among all, in the selection."""
         place: IndexArray = rows - np.searchsorted(self.gone, rows)
         return place
 
@@ -212,10 +212,10 @@ class _Trials:
             seen.append(following)
 
     def _share_lists(self, index: ViewIndex, model: _Model, seen: list[int], list_length: int) -> None:
-        """Let an index know the retrieval lists, from the similarities to all views that are computed once."""
+        """Store the retrieval lists in an index, from the similarities to all views, which are computed once."""
         for i in seen:
             if (i, list_length) not in self._nearest_views:
-                longest = list_length + len(self._rows)  # at most the object's own views are missing
+                longest = list_length + len(self._rows)  # only the object's own views can be missing
                 self._nearest_views[i, list_length] = largest(self._similar[i], longest)[0]
             nearest = self._nearest_views[i, list_length]
             rows = nearest[model.mask[nearest]][:list_length]
@@ -333,7 +333,7 @@ class _Trials:
         return keep
 
     def _model(self, keep: NDArray[np.bool_]) -> _Model:
-        """Return the enrolled views, of the searched object only those to keep."""
+        """Return the enrolled views; of the searched object, only those that stay."""
         mask = self._enrolled.copy()
         mask[self._rows] = keep
         return _Model(self._views.select(mask), mask, np.flatnonzero(~mask))
@@ -391,5 +391,5 @@ def _similar_views(similar: FloatArray, ring: IndexArray) -> NDArray[np.bool_]:
     before[ring], after[ring] = np.roll(ring, 1), np.roll(ring, -1)
     rows = np.arange(len(ring))
     alike: NDArray[np.bool_] = similar >= np.minimum(similar[rows, before], similar[rows, after])[:, None]
-    alike[rows, rows] = True  # also for a view without texture and colour
+    alike[rows, rows] = True  # a view without texture and colour has similarity 0 to itself
     return alike

@@ -1,4 +1,4 @@
-"""Error rates for unknown objects: how many are accepted, and how many enrolled objects are rejected."""
+"""Error rates for unknown objects: shares of accepted unknown objects and of rejected enrolled objects."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
