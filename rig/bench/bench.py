@@ -34,10 +34,10 @@ DEVICES = ("imu", "camera")
 
 
 class Operator(Protocol):
-    """Puts objects on the table."""
+    """An operator: puts objects on the table."""
 
     def place(self, name: str | None) -> None:
-        """Return when the object ``name`` (None: the one to identify) is on the table, and the hands are away."""
+        """Wait until the object ``name`` (None: the one to identify) is on the table, and the hands are away."""
 
 
 @runtime_checkable
@@ -62,17 +62,17 @@ class Bench(AbstractContextManager["Bench"]):
     Attributes
     ----------
     conditions
-        The noise model or the calibrations that the bench works under; stored with every enrollment.
+        The noise model or the calibrations in force; stored with every enrollment.
     findings
-        What opening the bench revealed that the operator should know; stored with every enrollment.
+        Notes for the operator from the opening of the bench; stored with every enrollment.
     calibration_findings
         The findings about calibrations that are not in force, or only in part.
     state
-        Stores the table's revolutions and faults beyond the end of the program.
+        Stores the table's revolutions and faults for the next program.
     head
         The rig head that `imu` is connected to; None if `imu` is on the computer's own I2C bus.
     connections
-        What must be closed after the devices.
+        Connections that must be closed after the devices.
     """
 
     name: str
@@ -107,7 +107,7 @@ class Bench(AbstractContextManager["Bench"]):
             error.add_note(f"Closing the bench failed: {failure}")
 
     def close(self) -> None:
-        """Switch the torque off and close all devices, also if one of them fails; a second call does nothing."""
+        """Switch the torque off and close all devices, even if one of them fails; a second call does nothing."""
         if not self._open:
             return
         with uninterrupted():

@@ -62,14 +62,14 @@ class Computer:
         return self._text("/proc/device-tree/model") or self._text("/sys/class/dmi/id/product_name")
 
     def serial_ports(self) -> list[SerialPort]:
-        """Return the ports that hang on hardware; the computer's own come last."""
+        """Return the ports that are connected to hardware; the computer's own come last."""
         ports = []
         for entry in self._entries("sys/class/tty"):
             device = entry / "device"
             if not SERIAL_NAMES.fullmatch(entry.name) or not device.exists():
                 continue
             if entry.name.startswith("ttyS") and device.resolve().parent.name.startswith("serial8250"):
-                continue  # reserved by the kernel, with nothing behind them
+                continue  # reserved by the kernel, without hardware
             latency_file = f"/sys/bus/usb-serial/devices/{entry.name}/latency_timer"
             latency = self._text(latency_file)
             usb = self._usb(device)
@@ -85,7 +85,7 @@ class Computer:
         return sorted(ports, key=lambda port: (not port.usb, _natural(port.path)))
 
     def is_left_to_modem_manager(self, port: SerialPort) -> bool:
-        """Return whether ModemManager runs and will open a port: udev has no property that keeps it away."""
+        """Return whether ModemManager runs and will open a port, because udev has no property that prevents it."""
         if self.running("ModemManager") is None or not port.usb:
             return False
         try:
@@ -165,7 +165,7 @@ class Computer:
         return self._text(f"{_CAMERAS}/{Path(node.path).name}/index") in ("", "0")
 
     def camera_device(self, source: int | str) -> str | None:
-        """Return what identifies the camera of a source: its USB ids and serial number, or else its place.
+        """Return the identity of the camera of a source: its USB ids and serial number, or else its place.
 
         The number of a camera and its path can mean another camera after replugging. None for a file or a stream, and
         if the system does not show more than the path.
@@ -189,7 +189,7 @@ class Computer:
         return f"{kind} at {Path(place).name}" if place else None
 
     def device_node(self, source: int | str) -> tuple[int, ...] | None:
-        """Return what identifies the device file of a camera until it is unplugged; None if there is no file."""
+        """Return the identity of a camera's device file, valid until it is unplugged; None if there is no file."""
         try:
             status = self._at(camera_node(source) or str(source)).stat()
         except OSError:

@@ -1,4 +1,4 @@
-"""What a computer shows of its device files, programs, user and disk."""
+"""Records of the device files, programs, user and disk of a computer."""
 
 import os
 import pwd
@@ -19,7 +19,7 @@ class Process:
 
 @dataclass(frozen=True, slots=True)
 class DeviceFile:
-    """A device file, and what is known about it without opening it.
+    """A device file, and its properties that are known without opening it.
 
     ``stable`` is its name that stays the same after replugging, ``group`` its user group. ``usable`` says whether this
     user may open it. ``holders`` are the programs that have it open, as far as this user may see them.

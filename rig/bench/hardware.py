@@ -85,7 +85,7 @@ class HardwareBench:
 
     @contextmanager
     def open_servo(self, config: RigConfig, options: Any, seed: int | None) -> Iterator[Servo]:
-        """Open only the servo, also if the disk cannot be written: it must be possible to stop it."""
+        """Open only the servo, even if the disk cannot be written, because it must be possible to stop it."""
         clock = SystemClock()
         with ExitStack() as connections:
             with suppress(StateNotStored):
@@ -213,11 +213,11 @@ class CameraPlug:
         return capture
 
     def node(self) -> object:
-        """Return what identifies the camera's device file now; None if there is none."""
+        """Return the identity of the camera's device file now; None if there is none."""
         return self._computer.device_node(self._here)
 
     def _found(self) -> int | str:
-        """Return where the camera is now: the kernel gives it a new number while a program holds its old file."""
+        """Return the camera's present source, because its number changes while a program holds the old file."""
         if self.device is None or self._computer.camera_device(self._source) == self.device:
             return self._source
         paths = (node.path for node in self._computer.cameras())
@@ -228,7 +228,7 @@ _FOCUS_FILE = "camera-focus.json"
 
 
 def camera_settings(config: RigConfig, state: StateStore, device: str | None) -> CameraSettings:
-    """Return the camera's settings: the configured ones, and the focus that an earlier program has settled."""
+    """Return the camera's settings: the configured ones, and the focus that an earlier program has found."""
     settings = CameraSettings(**config.camera.model_dump(exclude={"source"}))
     if settings.focus is not None:
         return settings
@@ -243,7 +243,7 @@ def camera_settings(config: RigConfig, state: StateStore, device: str | None) ->
 def store_focus(state: StateStore, device: str | None, focus: float | None) -> None:
     """Store the focus for the next program, because a camera forgets it without power."""
     text = json.dumps({"device": device, "focus": focus}).encode()
-    with suppress(StateNotStored):  # writes that matter report a full disk themselves
+    with suppress(StateNotStored):  # other writes report a full disk
         if focus is not None and state.read_file(_FOCUS_FILE) != text:
             state.store_file(_FOCUS_FILE, text)
 

@@ -1,6 +1,7 @@
 """Table, camera, IMU and fly scan with the protocols of bluesky (`bluesky.protocols`).
 
-A bench belongs to one thread. All devices of a bench share a thread of their own; a status is done when its work is.
+Only one thread may use a bench. All devices of a bench share a thread of their own; a status is done when its work is
+done.
 """
 
 from collections.abc import Callable, Generator, Iterator
@@ -241,14 +242,14 @@ def view_values(event: Accepted) -> dict[str, Any]:
 
 
 class FlyScan:
-    """The fly scan as a Flyer: it enrolls an object in one turn without a stop (`rig.plans.fly`).
+    """The fly scan as a Flyer: it enrolls an object in one revolution without a stop (`rig.plans.fly`).
 
     Parameters
     ----------
     devices
-        Of the bench, with ``hold=False``: the scan prepares the table itself.
+        The devices of the bench, with ``hold=False``, because the scan prepares the table itself.
     catalog
-        Gets the views.
+        The catalog that stores the views.
     object_name
         The object.
     views
@@ -290,7 +291,7 @@ class FlyScan:
 
 
 class _Started(WorkStatus):
-    """The status of something that has started."""
+    """The status of work that has started, and is done at once."""
 
     def __init__(self) -> None:
         future: Future[None] = Future()

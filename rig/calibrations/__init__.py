@@ -1,4 +1,4 @@
-"""Calibration results of a bench: their files, and how they take effect."""
+"""Calibration results of a bench: their files, and the settings that they apply."""
 
 from rig.calibrations.apply import apply_results
 from rig.calibrations.rejection import Rejection, RejectionCode

@@ -13,7 +13,7 @@ from rig.config import RigConfig
 from rig.config.values import validate
 
 _NOTHING: Final = object()
-"""Instead of a value; None is a value, too."""
+"""Stands for a missing value, because None is a value."""
 
 
 def apply_results(config: RigConfig, results: Iterable[CalibrationResult]) -> tuple[RigConfig, tuple[str, ...]]:

@@ -1,4 +1,4 @@
-"""Why a calibration did not pass: a code with its numbers, and the words for people."""
+"""Reasons why a calibration did not pass: a code with its numbers, and its text for the operator."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from pydantic import BeforeValidator, PlainSerializer
 
 @unique
 class RejectionCode(Enum):
-    """A reason why a calibration does not pass: the name is its code, the value its text with the next step."""
+    """A reason why a calibration does not pass: the name is its code, the value its text and the next step."""
 
     # -- servo --
     TOO_FEW_REVERSALS = "Only {used} reversals can be used, {needed} are needed{reasons}."

@@ -50,21 +50,21 @@ class CalibrationResult:
     Attributes
     ----------
     name
-        What was calibrated: ``imu.scale``, ``camera.intrinsics``.
+        Name of the calibration: ``imu.scale``, ``camera.intrinsics``.
     estimates
         The quantities by name; empty if nothing could be estimated.
     residual, limit
         The worst residual of the fit and its limit, in ``residual_unit``.
     rejections
-        Why the estimates must not be used; empty if the calibration passed.
+        Reasons why the estimates must not be used; empty if the calibration passed.
     settings
         The settings that the result applies, by key of the configuration.
     valid_days
-        How long the result is valid; None: until the device changes.
+        Days for which the result is valid; None: until the device changes.
     when_utc
-        By the bench's clock.
+        Time of the calibration, by the bench's clock.
     device
-        The calibrated devices and their bench (`rig.calibrations.apparatus`): the result is valid for no other.
+        The calibrated devices and their bench (`rig.calibrations.apparatus`). The result is valid only for them.
     evidence
         The measurements, enough to fit them again.
 

@@ -1,4 +1,4 @@
-"""The calibration results of a bench on disk: a folder with one file for each calibration, only ever added to."""
+"""The calibration results of a bench on disk: a folder with one file for each calibration. Files are only added."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -119,7 +119,7 @@ class CalibrationStore:
 def apparatus(
     name: str, devices: Mapping[str, Any], config: RigConfig, conditions: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Return what a result is bound to: the bench, its devices and their mounting, the exposure, and the conditions.
+    """Return everything that a result is valid for: bench, devices, their mounting, exposure, and conditions.
 
     The settings that a calibration itself applies are not part of it.
     """
@@ -136,7 +136,7 @@ def apparatus(
 
 
 def differences(result: CalibrationResult, device: Mapping[str, Any]) -> list[str]:
-    """Return the differences between the calibrated devices and ``device``, as far as both are known."""
+    """Return the known differences between the calibrated devices and ``device``."""
     return list(_differences("", result.device, device))
 
 
@@ -144,7 +144,7 @@ def _differences(path: str, then: Any, now: Any) -> Iterable[str]:
     if isinstance(then, Mapping) and isinstance(now, Mapping):
         known = then.keys() & now.keys()
         if "device" in known and None not in (then["device"], now["device"]):
-            known -= {"name"}  # the configured source, which can change its meaning
+            known -= {"name"}  # the configured source, which can mean another camera later
         elif "name" in known:
             known -= {"device"}
         for key in known:

@@ -1,4 +1,4 @@
-"""Compares the digests of a whole catalog beside longer work.
+"""Comparison of the digests of a whole catalog in the background of longer work.
 
 Searches and exports compare the digests of what they load. Deleted objects, unfinished and earlier enrollments, the
 log and the results are compared here. The images are compared by `rig catalog verify` only.
@@ -28,10 +28,10 @@ _ROWS: Final = 100
 
 
 class BackgroundCheck(AbstractContextManager["BackgroundCheck"]):
-    """Compares the digests of the catalog at ``place`` until all are compared or a ``with`` block ends.
+    """A thread that compares the digests of the catalog at ``place`` until all are compared or a ``with`` block ends.
 
-    It has its own thread and its own connection, for reading only. A portion is one transaction: a change of the
-    catalog in the meantime is no damage. ``report`` gets the first damage; it is called in the thread.
+    It has its own connection, for reading only. A portion is one transaction, so that a change of the catalog in the
+    meantime is no damage. ``report`` gets the first damage; it is called in the thread.
     """
 
     def __init__(self, place: CatalogPlace | Path, clock: Clock, report: Callable[[RigError], None]) -> None:

@@ -62,7 +62,7 @@ class Catalog(AbstractContextManager["Catalog"]):
     Attributes
     ----------
     database
-        For the other modules of this package only.
+        The database; only for the other modules of this package.
     clock
         Gives the civil time of what is stored.
     """

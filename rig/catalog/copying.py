@@ -35,7 +35,7 @@ class Copied(NamedTuple):
 
 
 def copy_catalog(source: Catalog, target: Catalog) -> Generator[JobProgress, None, Copied]:
-    """Copy everything of a catalog into an empty one. The target stays empty if the call does not end.
+    """Copy everything from a catalog into an empty one. The target stays empty if the call does not end.
 
     An interrupted copy can be repeated: an image that is there already, with the right bytes, is not copied again.
 

@@ -1,4 +1,4 @@
-"""What a catalog needs of its database, whichever engine has it: `rig.catalog.sqlite_database`, `rig.catalog.postgres`.
+"""The interface of a catalog's database, with two engines: `rig.catalog.sqlite_database` and `rig.catalog.postgres`.
 
 Decision: docs/decisions/0051.
 """
@@ -26,7 +26,7 @@ class Database(ABC):
     images
         The store of the images.
     version
-        Of the tables. A catalog of `READABLE_VERSION` or later can be read without a migration.
+        Version of the tables. A catalog of `READABLE_VERSION` or later can be read without a migration.
     """
 
     place: CatalogPlace

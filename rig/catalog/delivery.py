@@ -1,7 +1,7 @@
 """Deliver the journal of a bench to the server, each object and each answer exactly once.
 
 The server stores the key of an enrollment in its log, in the transaction of the delivery, so that nothing is delivered
-twice. What cannot be delivered because of its name stays in the journal until a person decides.
+twice. If the name of an object is taken, the object stays in the journal until the operator decides.
 
 Decision: docs/decisions/0052.
 """
@@ -46,7 +46,7 @@ _LOCK: Final = "delivering"
 
 @dataclass(frozen=True, slots=True)
 class Delivery:
-    """What became of an object of the journal: ``conflict`` is None if the server has it now."""
+    """The outcome for an object of the journal: ``conflict`` is None if the server has it now."""
 
     name: str
     views: int
@@ -76,7 +76,7 @@ def deliver(journal: Catalog, server: Catalog, *, replacing: Collection[str] = (
 
 @contextmanager
 def _alone(journal: Catalog) -> Iterator[None]:
-    """Let no other program deliver the journal: two of them would remove from it what the other one reads."""
+    """Prevent a delivery of the journal by another program: each would remove objects that the other one reads."""
     lock = no_follow(str(journal.path / _LOCK), os.O_RDWR | os.O_CREAT, mode=0o600)
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # the system releases it when the process ends
@@ -144,7 +144,7 @@ def _deliver(journal: Catalog, server: Catalog, name: str, *, replaces: bool) ->
     with journal.database.read() as reading:
         packed = _packed(reading, enrollment.id)
         stored = _images(reading, enrollment.id)
-    for image, sha256 in stored.items():  # all before the first is sent
+    for image, sha256 in stored.items():  # check all images before the first is sent
         _checked(journal, image, sha256)
     moved = {image: _send(journal, server, key, image, sha256) for image, sha256 in stored.items()}
     with server.database.write() as connection:
@@ -300,7 +300,7 @@ def _deliver_results(journal: Catalog, server: Catalog) -> None:
         key = f"{bench_id(journal)}-{row.id}"
         image = None
         if row.image is not None:
-            # A damaged image goes with its digest: rig catalog verify reports it there.
+            # A damaged image is delivered with the right digest, so that rig catalog verify reports it there.
             image = _sent_name(f"result-{key}", row.image)
             if (content := _content(journal, row.image)) is not None:
                 with server.database.catalog_errors():

@@ -1,4 +1,4 @@
-"""From a stored image to the descriptors that the catalog stores with it."""
+"""Description of stored images by the descriptors that the catalog stores with them."""
 
 from collections.abc import Iterable, Mapping
 from functools import lru_cache
@@ -104,7 +104,7 @@ def unpack(packed: Iterable[PackedDescriptor]) -> dict[str, NDArray[np.uint8]]:
 
 
 def matches(kind: Descriptor, packed: bytes, levels: NDArray[np.uint8]) -> bool:
-    """Return whether stored levels are those of the image: equal, or for a descriptor that rounds, nearly equal.
+    """Return whether stored levels are those of the image: equal, or nearly equal for a descriptor that rounds.
 
     The arithmetic of another computer may have rounded a level the other way.
     """

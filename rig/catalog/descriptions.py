@@ -1,4 +1,4 @@
-"""Questions about how the enrolled views are described: by which descriptors, within which region, with which table."""
+"""Queries about the descriptions of the enrolled views: their descriptors, regions and empty-table images."""
 
 from typing import Any, NamedTuple
 

@@ -1,4 +1,4 @@
-"""Where the images of a catalog are: a folder, or a store that fsspec knows, such as S3.
+"""Stores of the images of a catalog: a folder, or a store that fsspec supports, such as S3.
 
 Names are paths relative to the catalog, within ``images/``; files that were moved away are within ``lost+found/``. An
 image is complete under its name or is not there. Names that are in use are not written again, except to repair them.
@@ -31,7 +31,7 @@ CACHE: Final = "image-cache"
 class ImageStore(ABC):
     """The images of a catalog. It can be sent to other processes.
 
-    Every method raises an `OSError` that says why it fails, and `CatalogUnavailable` if a store does not answer.
+    Every method raises an `OSError` with the reason if it fails, and `CatalogUnavailable` if a store does not answer.
     """
 
     @abstractmethod
@@ -89,7 +89,7 @@ class ImageStore(ABC):
 
     @abstractmethod
     def free_bytes(self) -> int | None:
-        """Return the free space; None if the store has no limit that it tells."""
+        """Return the free space; None if the store reports no limit."""
 
     @abstractmethod
     def mark(self) -> str | None:
@@ -110,7 +110,7 @@ class ImageStore(ABC):
 
 
 class FolderImages(ImageStore):
-    """The images in a folder of this computer, or one that it shares with others."""
+    """The images in a folder of this computer, or in a shared folder."""
 
     def __init__(self, root: Path, *, moves: bool = True) -> None:
         self.root = root
@@ -201,7 +201,7 @@ class FolderImages(ImageStore):
 
 
 class FsspecImages(ImageStore):
-    """The images in a store that fsspec knows. A store writes an image as a whole."""
+    """The images in a store that fsspec supports. A store writes an image as a whole."""
 
     def __init__(self, url: str, cache: Path) -> None:
         self.url = url.rstrip("/")

@@ -12,7 +12,7 @@ from rig.core.processes import Jobs
 _T = TypeVar("_T")
 
 PORTION: Final = 32
-"""Images per call of a process: many enough that the call costs nothing, few enough that Ctrl+C does not wait."""
+"""Images per call of a process: enough to make the time of the call small, but few, so that Ctrl+C works at once."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +43,7 @@ def portions_of_groups(items: Sequence[_T], group: Callable[[_T], object]) -> It
 
 
 def processes(wanted: Jobs | None, items: int) -> Jobs:
-    """Return how many processes are worth starting for a number of images; a cluster as it is."""
+    """Return the useful number of processes for a number of images; a cluster is returned unchanged."""
     if isinstance(wanted, Cluster):
         return wanted
     return min(wanted or os.cpu_count() or 1, max(1, items // (4 * PORTION)))

@@ -1,7 +1,8 @@
 """The journal of a bench: enrollments go into a catalog of this computer first, and are delivered to the server.
 
-So an enrollment needs no server while it takes its views. A server that answers reserves the name at the start. Each
-enrollment has a key, by which the delivery (`rig.catalog.delivery`) knows what the server has already.
+Therefore an enrollment needs no server while it takes its views. A server that answers reserves the name at the start.
+Each enrollment has a key. With it the delivery (`rig.catalog.delivery`) finds out whether the server has the enrollment
+already.
 
 Decision: docs/decisions/0052.
 """
@@ -48,9 +49,9 @@ class Journal(Catalog):
     Attributes
     ----------
     server
-        Where the catalog is that gets the enrollments.
+        Place of the catalog that gets the enrollments.
     unreachable
-        Why the last name could not be reserved; None if it was.
+        The reason why the last name could not be reserved; None if it was.
     """
 
     server: CatalogPlace
@@ -83,7 +84,7 @@ class Journal(Catalog):
 
     @contextmanager
     def _reached(self) -> Iterator[Catalog]:
-        """Open the catalog of the server, and release what this bench had reserved there and did not begin."""
+        """Open the catalog of the server, and release the names that this bench reserved there and did not use."""
         with Catalog.open(self.server, clock=self.clock) as server:
             release(self, server)
             yield server

@@ -1,4 +1,4 @@
-"""The local copy of a catalog on a server: what searches need of it, in a folder of this computer.
+"""The local copy of a catalog on a server: a folder of this computer with the data that searches need.
 
 It is an SQLite catalog: the rows of the objects in use with their ids and digests, and the newest empty-table image.
 A search reads it when the server does not answer, and says how old it is.
@@ -82,7 +82,7 @@ def open_copy(place: CatalogPlace, clock: Clock) -> Catalog:
 
 
 class Attempts:
-    """Opens catalogs, and spares the operator to wait again and again for a server that does not answer.
+    """Attempts to open catalogs, with pauses, so that the operator does not wait repeatedly for a server that is down.
 
     An attempt that failed after a time t is repeated after 20 t: a host that rejects a connection takes milliseconds,
     a network that drops packets takes seconds. Until then the same error is raised at once.

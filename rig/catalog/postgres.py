@@ -42,7 +42,7 @@ LOST_BENCH_S: Final = 30
 """After this time the server ends a transaction that has locks, of a bench that lost its network or its power."""
 
 LOST_READER_S: Final = 12 * 3600
-"""The same for a transaction without locks: exports and copies read images and rows in turn."""
+"""The same for a transaction without locks: longer, because exports and copies read images and rows in turn."""
 
 _SETTINGS: Final = {
     "lock_timeout": "{busy_ms}",
@@ -144,7 +144,7 @@ class PostgresDatabase(Database):
         self._check_mark()
 
     def _check_mark(self) -> None:
-        """Check that the images are those of this catalog: benches that have each their own folder would lose them."""
+        """Check that the images are those of this catalog: if each bench had its own folder, images would be lost."""
         mark = self.images.mark()
         if mark == self.id:
             return
@@ -186,7 +186,7 @@ class PostgresDatabase(Database):
             )
 
     def may_have_changed(self) -> bool:
-        """Ask the server's notifications; without a connection the answer is yes, so that the next query reports it."""
+        """Return whether the server has sent a notification; True without a connection: the next query reports it."""
         import psycopg
 
         try:

@@ -1,10 +1,10 @@
 """Prepared views: the packed descriptors of a large catalog in a file that searches map into memory.
 
-To read a million views from the database, and to check the digests of their rows, takes minutes. The file beside the
-database has the same values, as they were after such a check. An entry for each object names the digest that its
-enrollment had then, and has a digest of its part of the file. At each start both are compared, with the database and
-with the file: an object that was added or changed since is read from the database and appended; a damaged file is made
-again. The file is never used without both checks.
+Reading a million views from the database and checking the digests of their rows takes minutes. The file beside the
+database contains the values after such a check. It has an entry for each object: the digest of its enrollment at that
+time, and a digest of its part of the file. At each start the program compares the first digest with the database and
+the second one with the file. An object that was added or changed since then is read from the database and appended; a
+damaged file is made again. The file is never used without both checks.
 
 Decision: docs/decisions/0042.
 """
@@ -41,7 +41,7 @@ from rig.views.description import PAPER_DESCRIPTOR
 FORMAT: Final = "hbr-rig prepared views"
 VERSION: Final = 1
 FEWEST_OBJECTS: Final = 50
-"""A smaller catalog is read from its database, all of which is checked then."""
+"""Smallest number of views for the file. A smaller catalog is read from its database, which is checked completely."""
 MAX_ENTRIES_BYTES: Final = 500_000_000
 _AT_ONCE: Final = 250
 """Objects that are read from the database before they are stored: after Ctrl+C the next start continues there."""
@@ -278,7 +278,7 @@ def _append(path: Path, known: _File | None, records: NDArray[np.void], *, mode:
 
 @contextmanager
 def _locked(catalog: Catalog, folder: Path, kind: Descriptor, known: _File | None) -> Iterator[None]:
-    """Let no other process write; a `BlockingIOError` if one does, or has done so since the file was opened."""
+    """Lock the file; a `BlockingIOError` if another process writes it, or has written it since it was opened."""
     make_folder_within(catalog.path, folder)
     descriptor = no_follow(str(folder / "lock"), os.O_RDWR | os.O_CREAT, mode=file_mode(catalog.path))
     try:

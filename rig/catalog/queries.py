@@ -1,4 +1,4 @@
-"""Read a catalog: from rows to records."""
+"""Queries of a catalog, which return its rows as records."""
 
 from collections import defaultdict
 from collections.abc import Collection, Sequence

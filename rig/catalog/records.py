@@ -139,7 +139,7 @@ class ViewRecord:
     imu_deg, imu_sigma_deg
         Table angle measured by the IMU, unwrapped, and its standard uncertainty; both None without an IMU.
     evidence
-        The numbers that the view was accepted by (sharpness, exposure, settling, locks) as JSON values. The keys
+        The numbers for which the view was accepted (sharpness, exposure, settling, locks) as JSON values. The keys
         contain the units.
     region
         The part of the image that is described: x, y, width, height in pixels; None for the whole image.

@@ -58,7 +58,7 @@ class Redescribed:
 class _Item(NamedTuple):
     """A view to be described.
 
-    ``together`` says that the views of its enrollment are segmented again, and ``names`` which descriptors follow.
+    ``together`` is whether the views of its enrollment are segmented again; ``names`` are the descriptors to compute.
     """
 
     view: StoredImage
@@ -188,13 +188,13 @@ def _items(catalog: Catalog, kind: Descriptor, region: Region | Stored | None, a
 
 def _known(connection: Connection, kind: Descriptor) -> _Known:
     known = _Known({}, {}, defaultdict(set))
-    distinct: dict[str, JsonObject] = {}  # few, of many views
+    distinct: dict[str, JsonObject] = {}  # many views share a few distinct ones
     for view_id, name, version, settings in connection.execute(
         select(descriptors.c.view_id, descriptors.c.name, descriptors.c.version, descriptors.c.settings),
         execution_options={"yield_per": _READ_AT_ONCE},
     ):
         settings = distinct.setdefault(repr(settings), settings)
-        # of several regions, that of the descriptor itself or of the paper's counts
+        # if there are several regions, that of the descriptor or of the paper's descriptor counts
         if view_id not in known.settings or name in (PAPER_DESCRIPTOR, kind.name):
             known.settings[view_id] = settings
         if (name, version) == (kind.name, kind.version):
@@ -230,7 +230,7 @@ def _configured_region(conditions: JsonObject) -> Region | None:
 
 
 def _group(item: _Item) -> tuple[bool, int]:
-    """Return what is segmented together: an enrollment, or a view alone."""
+    """Return the key of the views that are segmented together: an enrollment, or one view."""
     return item.together, item.enrollment_id if item.together else item.view.view_id
 
 

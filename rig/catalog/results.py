@@ -1,4 +1,4 @@
-"""Results: what was answered about which sample, when and by whom, and how an operator corrected it later.
+"""Results: the recorded answers about samples, and their later corrections by operators.
 
 Decision: docs/decisions/0036.
 """
@@ -271,12 +271,12 @@ def correct(
     sample: str | None = None,
     operator: str | None = None,
 ) -> Answer:
-    """Correct the object or the sample of a result, and return what counts now. The result itself does not change.
+    """Correct the object or the sample of a result, and return the new answer. The recorded answer does not change.
 
     Parameters
     ----------
     reason
-        Why; stored with the correction and in the log.
+        The reason; stored with the correction and in the log.
     object_name
         The right object, which is in the catalog.
     unknown
@@ -284,7 +284,7 @@ def correct(
     sample
         The right sample.
     operator
-        Who corrects it; None for the user's account.
+        The operator who corrects it; None for the user's account.
 
     Raises
     ------

@@ -200,8 +200,8 @@ results = Table(
     sqlite_autoincrement=True,
 )
 
-# The last correction of a result says what counts; the result itself does not change. A foreign key would let a repair
-# delete rows.
+# The last correction of a result counts; the result itself does not change. With a foreign key, a repair could delete
+# rows.
 corrections = Table(
     "corrections",
     METADATA,

@@ -2,8 +2,8 @@
 
 An enrollment has a digest over its own row and all its sessions, views and descriptors, an object over its own row,
 and a row of an append-only table (audit log, results, corrections) over its own values and the digest before it. A
-change by the program seals a row again only if the digest was right before: damage stays noticed. Digests show
-accidents: an attacker can compute them, too.
+change by the program seals a row again only if the digest was right before, so that damage is not hidden. Digests
+detect accidents, but not an attacker, who can compute them, too.
 
 Decision: docs/decisions/0034.
 """

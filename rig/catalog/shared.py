@@ -25,7 +25,7 @@ from rig.core.clock import Clock
 from rig.core.errors import RigError
 
 CHECK_S: Final = 2.0
-"""Time between two looks at the journal."""
+"""Time between two checks of the journal."""
 RETRY_S: Final = 15.0
 """Time until the next attempt, if the server did not answer or a person has to decide about a name."""
 END_S: Final = 5.0
@@ -52,20 +52,20 @@ def deliver_journal(place: CatalogPlace, clock: Clock, *, replacing: Collection[
 
 
 def delivery_words(one: Delivery, place: CatalogPlace) -> str:
-    """Return what became of an object of the journal, as a sentence."""
+    """Return the outcome for an object of the journal, as a sentence."""
     if one.conflict is not None:
         return f"{one.conflict.what}. Next step: {one.conflict.next_step}"
     return f"Delivered {one.name} with {one.views} views to {place}."
 
 
 def failure_words(error: RigError) -> str:
-    """Return why nothing could be delivered, as sentences."""
+    """Return the reason why nothing could be delivered, as sentences."""
     kept = "What is in the journal of this computer is delivered later"
     return f"{error.what}. {kept}. Next step: {error.next_step}"
 
 
 def journal_words(catalog: Catalog) -> str:
-    """Return that the views of the enrollment that has begun wait for the server; empty if the server has its name."""
+    """Return a sentence if the views of the enrollment must wait for the server; empty if the server has its name."""
     if not isinstance(catalog, Journal) or catalog.unreachable is None:
         return ""
     error = catalog.unreachable
@@ -95,17 +95,17 @@ def comparable_views(
 
 @dataclass(frozen=True, slots=True)
 class JournalState:
-    """How many objects and answers wait for the server, and why: sentences for the operator."""
+    """The numbers of objects and answers that wait for the server, and the reasons: sentences for the operator."""
 
     waiting: int = 0
     reasons: tuple[str, ...] = ()
 
 
 class BackgroundDelivery(AbstractContextManager["BackgroundDelivery"]):
-    """Delivers the journal whenever something is in it and the server answers, beside the work of a ``with`` block.
+    """A thread that delivers the journal, whenever the server answers, during the work of a ``with`` block.
 
-    It has its own thread and its own connections. ``report`` gets a sentence about each object that was delivered, and
-    once about each reason why something was not. ``changed`` gets each new state. Both are called in the thread.
+    It has its own connections. ``report`` gets a sentence about each delivered object, and one about each reason why an
+    object was not delivered. ``changed`` gets each new state. Both are called in the thread.
     """
 
     def __init__(

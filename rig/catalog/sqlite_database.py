@@ -1,4 +1,4 @@
-"""The SQLite file of a catalog: how it is opened, and its transactions.
+"""The SQLite file of a catalog, and its transactions.
 
 Decision: docs/decisions/0014.
 """
@@ -168,7 +168,7 @@ class SqliteDatabase(Database):
 
     def _replace_empty(self, made: Path) -> None:
         with closing(self._connect()) as lock:
-            lock.execute("BEGIN EXCLUSIVE")  # one of the processes that find the same empty file goes first
+            lock.execute("BEGIN EXCLUSIVE")  # only one of the processes that find the same empty file continues
             if not self._file.stat().st_size:
                 made.replace(self._file)
 

@@ -34,7 +34,7 @@ MOST_HELD_BYTES: Final = 256_000_000
 
 
 class StoredImage(NamedTuple):
-    """The image of a view, with its SHA-256, its session, and what it is described with."""
+    """The image of a view, with its SHA-256, its session, its region and its descriptors."""
 
     view_id: int
     image: str
@@ -77,7 +77,7 @@ class HeldImages:
                 self._bytes += pixels.nbytes
 
     def pixels(self, image: str, sha256: str) -> NDArray[np.uint8]:
-        """Return the pixels of an image; errors as `ImageStore.pixels`. Any thread may ask, one at a time is served."""
+        """Return the pixels of an image; errors as `ImageStore.pixels`. Threads that call it wait for each other."""
         with self._lock:
             if image not in self._pixels:
                 pixels = self._store.pixels(image, sha256)
@@ -87,10 +87,10 @@ class HeldImages:
 
 
 class DescribedMeanwhile:
-    """Views of one session that are described in a thread while the table turns to the next one.
+    """Views of one session that are described in a thread while the table rotates to the next one.
 
-    These are the views that the empty-table image segments: no other view changes their segmentation. At the end of an
-    enrollment only the others are left to describe.
+    These are the views that were segmented with the empty-table image, because no other view changes their
+    segmentation. At the end of an enrollment only the other views must be described.
     """
 
     def __init__(self) -> None:
@@ -126,7 +126,7 @@ def describe_together(
     threads: int = 1,
     meanwhile: DescribedMeanwhile | None = None,
 ) -> list[Described]:
-    """Describe the views of one enrollment by these descriptors, in their order, in so many threads.
+    """Describe the views of one enrollment by these descriptors, in their order, in this number of threads.
 
     Views that were described ``meanwhile`` are not described again.
     """

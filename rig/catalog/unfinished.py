@@ -25,7 +25,7 @@ class UnfinishedJob:
     path
         The file.
     job
-        What the results depend on, besides the version of the program: those of another job are not used.
+        All values that the results depend on, besides the version of the program. Results of another job are not used.
 
     Attributes
     ----------

@@ -79,8 +79,8 @@ def verify(
     jobs
         Number of processes, or a cluster; None for one process per core.
     unfinished
-        Stores which images were right. Those that it knows already are not checked again, unless what the catalog says
-        of them has changed.
+        Stores which images were right. Images that it has stored are not checked again, unless their records in the
+        catalog have changed.
 
     Raises
     ------
@@ -165,7 +165,7 @@ def _check_rows(state: _State) -> bool:
     transaction = state.catalog.database.write if state.repair else state.catalog.database.read
     with transaction() as connection:
         connection.exec_driver_sql("PRAGMA defer_foreign_keys = ON")
-        # The deletion of an orphan may make others.
+        # The deletion of an orphan may make other rows orphans.
         while broken := state.catalog.database.orphans(connection):
             for table, rowid, parent in broken:
                 row = _row(connection, table, rowid)

@@ -1,4 +1,4 @@
-"""The images that a catalog must have, and the check of each: its file, its pixels, what was described in it."""
+"""The images that a catalog must have, and the check of each: its file, its pixels, its descriptors."""
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
@@ -46,7 +46,7 @@ class Problem(StrEnum):
     OBJECT_CHANGED = "object changed"
     """Its name, label, note or dates are not those that were stored."""
     ENROLLMENT_CHANGED = "enrollment changed"
-    """Something that ``enrollment_id`` says of its sessions, views or descriptors is not what was stored."""
+    """A value of a session, a view or a descriptor of ``enrollment_id`` is not the stored one."""
     LOG_CHANGED = "log changed"
     """Entry ``entry_id`` of the audit log is not the one that was written, or entries before it are missing."""
     RESULT_CHANGED = "result changed"
@@ -81,7 +81,7 @@ class Finding:
 class Item(NamedTuple):
     """An image that must exist.
 
-    That of a result has no object, and the negative number of the result instead of an enrollment.
+    The image of a result has no object, and the negative number of the result instead of an enrollment.
     """
 
     view_id: int | None
@@ -98,7 +98,7 @@ class Item(NamedTuple):
 
 
 class StoredDescription(NamedTuple):
-    """What is stored of a view's content: name, version, settings as JSON, and packed levels of each descriptor.
+    """The stored description of a view: name, version, settings as JSON, and packed levels of each descriptor.
 
     ``segmentation`` is the stored evidence as JSON.
     """
@@ -108,11 +108,11 @@ class StoredDescription(NamedTuple):
 
 
 Described = tuple[Item, StoredDescription | None]
-"""An item, and what is stored of its content; None if it is not the image of a view, or the view is gone."""
+"""An item and its stored description; None if it is not the image of a view, or the view is gone."""
 
 
 class Checked(NamedTuple):
-    """What was found for an item: SHA-256 and size of its file, and width and height of the image.
+    """The result for an item: SHA-256 and size of its file, and width and height of the image.
 
     ``is_described`` is false for a view without descriptors. ``different`` holds name and version of each descriptor
     with wrong levels, and the right levels if known.
@@ -170,7 +170,7 @@ def check_key(item: Item, stored: StoredDescription | None, quick: bool) -> str:
 
 
 def with_descriptions(catalog: Catalog, items: Sequence[Item]) -> Iterator[Described]:
-    """Yield each item with what is stored of its content.
+    """Yield each item with its stored description.
 
     The descriptions of a large catalog need gigabytes: they are read some views at a time.
     """

@@ -47,8 +47,9 @@ def decision_chart(
 
     Returns
     -------
-    SVG markup. The solid curve is close to the centre where little confusion would remain, the dashed curve where the
-    two candidates are least similar. The length of the bars outside is the motion cost.
+    SVG markup. The solid curve is close to the centre at rotations after which little confusion would remain, the
+    dashed curve at rotations after which the two candidates are least similar. The length of the bars outside is the
+    motion cost.
     """
     azimuth_deg = [here_deg + rotation for rotation in weighed.rotations_deg]
     around = sorted(range(len(azimuth_deg)), key=lambda i: azimuth_deg[i] % 360)
@@ -92,7 +93,7 @@ _Lines = list[tuple[str, str]]
 
 
 def _reasons(weighed: Weighed, chosen: int, candidates: Sequence[str]) -> tuple[_Lines, _Lines]:
-    """Return what the rotation is for, and the numbers behind it."""
+    """Return lines of text with the purpose of the rotation and the numbers for it."""
     cost = [("cost of the motion", "small"), (f"{weighed.cost[chosen]:.2f}, at most {max(weighed.cost):.2f}", "small")]
     if len(candidates) < 2 or weighed.similarity is None:
         return [("only one object is likely:", "small"), ("a new side improves its pose", "small")], cost

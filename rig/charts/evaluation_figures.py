@@ -52,7 +52,7 @@ def figures(results: dict[str, Any]) -> dict[str, Chart]:
 
 
 def hit_rate_figure(results: dict[str, Any]) -> Chart:
-    """Hit-rate against the number of views, with 95 % Wilson intervals, and Best 10 of HBR (Fig. 6 of the paper)."""
+    """Return the hit-rate against the number of views, with 95 % Wilson intervals, and Best 10 of HBR (Fig. 6)."""
     series = []
     for m, method in enumerate(results["methods"]):
         colour, dashed = _style(method["name"], m)
@@ -70,7 +70,7 @@ def hit_rate_figure(results: dict[str, Any]) -> Chart:
 
 
 def travel_figure(results: dict[str, Any]) -> Chart:
-    """Hit-rate against the mean rotation."""
+    """Return the figure of the hit-rate against the mean rotation."""
     series = []
     for m, method in enumerate(results["methods"]):
         if method["name"] in ("single", "hbr-visual", "hbr-0", "hbr-0-orient"):
@@ -85,7 +85,7 @@ def travel_figure(results: dict[str, Any]) -> Chart:
 
 
 def pose_figure(results: dict[str, Any], methods: Sequence[dict[str, Any]]) -> Chart:
-    """RMSE of the estimated orientation of each object after all views (Fig. 5 of the paper), sorted by size.
+    """Return the RMSE of each object's estimated orientation after all views, sorted by size (Fig. 5 of the paper).
 
     Dashed: the plain error. Solid: the error to the nearest orientation from which the object looks the same.
     """
@@ -105,7 +105,7 @@ def pose_figure(results: dict[str, Any], methods: Sequence[dict[str, Any]]) -> C
 
 
 def _sweep_figure(results: dict[str, Any], methods: Sequence[dict[str, Any]], prefix: str, x_label: str) -> Chart:
-    """Hit-rate against a setting, for several numbers of views; the values of the setting have equal distances."""
+    """Return the hit-rate against a setting for several numbers of views; the setting's values have equal distances."""
     values = [method["name"].removeprefix(prefix) for method in methods]
     series = []
     for i, n in enumerate(range(2, len(methods[0]["curve"]) + 1, 2)):

@@ -90,7 +90,7 @@ def _radii(n: int) -> list[float]:
 
 
 def _arc(start: tuple[float, float], end: tuple[float, float]) -> list[Point]:
-    """Points of the spiral between two (radius, azimuth), both included."""
+    """Return the points of the spiral between two (radius, azimuth), both included."""
     (r0, a0), (r1, a1) = start, end
     steps = max(2, ceil(abs(a1 - a0) / _ARC_STEP_DEG))
     return [polar(r0 + (r1 - r0) * i / steps, a0 + (a1 - a0) * i / steps) for i in range(steps + 1)]

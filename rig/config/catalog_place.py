@@ -1,4 +1,4 @@
-"""Where a catalog is: a folder alone, or a folder of this computer with a database server and a store of images."""
+"""The place of a catalog: a folder alone, or a folder of this computer with a database server and a store of images."""
 
 import os
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ class CatalogPlace:
     Attributes
     ----------
     path
-        Folder on this computer. Without ``url`` it holds the whole catalog, else what this computer needs for itself.
+        Folder on this computer. Without ``url`` it holds the whole catalog, else the journal and the local copy.
     url
         URL of a PostgreSQL database, ``postgresql+psycopg://HOST/DATABASE``; None for an SQLite file in ``path``.
     images
@@ -28,7 +28,7 @@ class CatalogPlace:
 
     @classmethod
     def of(cls, place: "str | os.PathLike[str] | CatalogPlace") -> "CatalogPlace":
-        """Return the place of a catalog in a folder; a place as it is."""
+        """Return the place of a catalog in a folder; a place is returned unchanged."""
         found = place if isinstance(place, CatalogPlace) else cls(Path(place))
         return cls(found.path.expanduser().absolute(), found.url, found.images)
 

@@ -23,7 +23,7 @@ class ImuKind:
     key : str
         Value of ``imu.model``.
     name : str
-        Name for people.
+        Name in messages.
     addresses : tuple of int
         Possible I2C addresses, the default first.
     register, identities : int, tuple of int
@@ -35,7 +35,7 @@ class ImuKind:
     settings : tuple of str
         Keys of ``[imu]`` that the driver takes, apart from the address.
     note : str
-        What the operator must know about the sensor; reported when the bench is opened, and by ``rig doctor``.
+        Note on the sensor for the operator; reported when the bench is opened, and by ``rig doctor``.
     """
 
     key: str

@@ -1,8 +1,8 @@
 """Edits single values of `rig.toml`; comments, order and spacing stay.
 
 `tomllib` parses; this module only finds the position of a value in the text. Each edit is parsed again and rejected if
-it changed anything else. tomlkit cannot replace it: it drops the comments inside a value of several lines, does not put
-a new key below its commented default, and reports no line numbers.
+it changed anything else. tomlkit is not used, because it drops the comments inside a value of several lines, does not
+put a new key below its commented default, and reports no line numbers.
 """
 
 import difflib

@@ -1,1 +1,1 @@
-"""What every room uses: clock, errors, files, processes."""
+"""Modules that all other packages of `rig` use: clock, errors, files, processes."""

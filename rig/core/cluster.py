@@ -28,7 +28,7 @@ class Cluster:
     Attributes
     ----------
     address
-        Of its scheduler, ``tcp://HOST:8786``; or ``local`` or ``local:WORKERS`` to start one on this computer.
+        Address of its scheduler, ``tcp://HOST:8786``; or ``local`` or ``local:WORKERS`` to start one on this computer.
     """
 
     address: str
@@ -52,8 +52,8 @@ class Cluster:
 def map_on_cluster(work: Callable[[_Item], _T], items: Iterable[_Item], cluster: Cluster) -> Iterator[tuple[_Item, _T]]:
     """Yield each item with its result, in the order of completion; closing the generator ends the tasks.
 
-    The workers need this program in the same version, and the same files under the same names. A worker that dies costs
-    the items that it worked on: others do them again.
+    The workers need this program in the same version, and the same files under the same names. If a worker dies, other
+    workers repeat its items.
 
     Parameters
     ----------
@@ -90,7 +90,7 @@ def map_on_cluster(work: Callable[[_Item], _T], items: Iterable[_Item], cluster:
         models = tuple(str(model.path) for model in loaded_models())
         content = pickle.dumps(work)
         digest = sha256(content).hexdigest()
-        # A task, and no data that is sent to workers: the scheduler repeats it if the worker that has it dies.
+        # A task instead of data that is sent to workers: the scheduler repeats a task if its worker dies.
         shared = client.submit(bytes, content, key=f"rig-work-{digest}", pure=True)
         futures = {
             client.submit(_call, shared, digest, models, item, pure=False, key=f"rig-{digest[:12]}-{number}"): item

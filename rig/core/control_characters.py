@@ -1,4 +1,4 @@
-"""Characters that control a terminal or change the direction of text: to hide it, or to answer for the operator."""
+"""Characters that control a terminal or change the direction of text. They can hide text, or type answers."""
 
 import re
 from typing import Final

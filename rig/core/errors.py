@@ -21,7 +21,7 @@ class RigError(Exception):
     next_step
         What the operator does now: an imperative.
     evidence
-        The numbers behind the decision, with units in the keys.
+        The numbers that led to the error, with units in the keys.
     """
 
     code: ClassVar[int] = 100
@@ -123,7 +123,7 @@ class DeviceMismatch(RigError, code=401, title="wrong device"):
 
 
 class DeviceSilent(RigError, code=402, title="device silent"):
-    """A device stopped answering, also after all retries."""
+    """A device stopped answering, even after all retries."""
 
 
 class RequestRejected(RigError, code=403, title="request rejected"):

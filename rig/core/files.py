@@ -75,7 +75,7 @@ def write(path: Path, content: bytes, *, mode: int = 0o666) -> None:
 def open_new(path: Path, *, mode: int = 0o666) -> BinaryIO:
     """Open a file of the program's own for writing, empty.
 
-    What was put under its name to write elsewhere (a link, a second name of a file) or to block (a pipe) is removed.
+    If something else has its name, such as a link, a second name of a file, or a pipe, it is removed first.
     """
     with suppress(FileNotFoundError):
         found = path.lstat()
@@ -85,17 +85,17 @@ def open_new(path: Path, *, mode: int = 0o666) -> BinaryIO:
 
 
 def no_follow(path: str, flags: int, *, mode: int = 0o666) -> int:
-    """Open a file, but not through a link: an ``opener`` for `open`."""
+    """Open a file without following links: an ``opener`` for `open`."""
     return os.open(path, flags | os.O_NOFOLLOW | os.O_CLOEXEC, mode)
 
 
 def sync_folder(path: Path) -> None:
-    """Return when the names in a folder are on the disk."""
+    """Wait until the names in a folder are on the disk."""
     sync_file(path)
 
 
 def sync_file(path: Path) -> None:
-    """Return when a file's content is on the disk."""
+    """Wait until a file's content is on the disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -104,7 +104,7 @@ def sync_file(path: Path) -> None:
 
 
 def sync_tree(folder: Path) -> None:
-    """Return when everything in a folder is on the disk."""
+    """Wait until everything in a folder is on the disk."""
     paths = [folder, *folder.rglob("*")]
     if len(paths) > MAX_SINGLE_SYNCS:
         os.sync()  # one by one, thousands of small files take minutes on some disks

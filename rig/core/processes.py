@@ -92,7 +92,7 @@ def _start_worker(work: Callable[[Any], object], models: Sequence[Path]) -> None
 
     from hbr.descriptors import load_model
 
-    for path in models:  # whose descriptors this process knows only by their digests
+    for path in models:  # a new process knows their descriptors only by digests
         load_model(path)
     global _work
     _work = work

@@ -1,4 +1,4 @@
-"""Signals that end the program: they unwind the stack once, and do not interrupt a clean-up that has begun.
+"""Signals that end the program. They unwind the stack once, and do not interrupt a clean-up that has begun.
 
 Decision: docs/decisions/0033.
 """
@@ -47,10 +47,11 @@ def handle_signals() -> None:
     """Have each signal in `ENDING` unwind the stack, so that every open device is closed (torque off).
 
     A shell without job control starts background jobs with SIGINT and SIGQUIT ignored, and their children inherit that.
-    A stop must reach a moving table anyway. Other ignored signals stay ignored: SIGHUP is what `nohup` ignores.
+    These two are handled all the same, because a stop must reach a moving table. Other ignored signals stay ignored,
+    such as SIGHUP, which `nohup` ignores.
     """
     _state.raised_ns = None
-    atexit.register(_ignore_signals)  # registered twice, it runs twice, to the same effect
+    atexit.register(_ignore_signals)  # a second registration has no further effect
     for number in ENDING:
         found = signal.getsignal(number)
         if found is signal.SIG_DFL or (number in _IGNORED_BY_SHELLS and found in (signal.SIG_IGN, _python_default)):

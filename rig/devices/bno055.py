@@ -45,7 +45,7 @@ SLOW_BUS = (
     "dtparam=i2c_arm_baudrate=10000 to /boot/firmware/config.txt) or a software bus (dtoverlay=i2c-gpio,bus=3, and "
     "imu.bus = 3), then restart."
 )
-"""What to do about a controller that corrupts the answers of a sensor that stretches the clock."""
+"""Next step if a controller corrupts the answers of a sensor that stretches the clock."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +84,7 @@ class Bno055:
     Raises
     ------
     DeviceNotFound
-        The bus cannot be opened, or no device acknowledges the address, also a second after power-up.
+        The bus cannot be opened, or no device acknowledges the address, even a second after power-up.
     DeviceMismatch
         Another device answers there.
     DeviceFault
@@ -127,7 +127,7 @@ class Bno055:
         Raises
         ------
         DeviceSilent
-            The sensor does not answer, also after retries.
+            The sensor does not answer, even after retries.
         DeviceFault
             The sensor was reset, its fusion stopped, or its data are impossible.
         """
@@ -252,7 +252,7 @@ class Bno055:
 
 
 def _late_by_one_bit(value: int) -> int:
-    """Return what a controller reads that takes the first bit too early, while SDA is still high."""
+    """Return the value that a controller reads if it samples the first bit too early, while SDA is still high."""
     return 0x80 | value >> 1
 
 

@@ -1,13 +1,13 @@
-"""The settings that a camera is asked for, and those that it did not accept."""
+"""The requested settings of a camera, and those that it did not accept."""
 
 from dataclasses import dataclass
 
 
 @dataclass(frozen=True, slots=True)
 class CameraSettings:
-    """Requested settings; None leaves a setting to the camera, but a focus is pinned where the autofocus settles.
+    """Requested settings; None leaves a setting to the camera, except the focus, which is locked after the autofocus.
 
-    Without ``fourcc``, the pixel format is chosen from what the camera offers (`rig.devices.v4l2.choose_mode`).
+    Without ``fourcc``, the pixel format is chosen from those of the camera (`rig.devices.v4l2.choose_mode`).
     ``gain``, ``focus``, ``sharpness`` and ``backlight_compensation`` are in the camera's own units, as `v4l2-ctl
     --list-ctrls` shows them; ``power_line_frequency`` is the number in its menu.
     """

@@ -1,4 +1,4 @@
-"""The interface of an inertial sensor on the platter, and what its drivers share."""
+"""The interface of an inertial sensor on the platter, and the code that its drivers share."""
 
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -13,7 +13,7 @@ from rig.core.errors import DeviceMismatch
 
 @dataclass(frozen=True, slots=True)
 class ImuIdentity:
-    """The sensor that answers on the bus, and its noise by the datasheet."""
+    """The sensor that answers on the bus, with the noise that its datasheet states."""
 
     model: str
     bus_address: int
@@ -68,9 +68,9 @@ class Imu(Protocol):
 class FifoTimes:
     """Dates the samples that a sensor takes by its own clock and stores in its FIFO.
 
-    The newest sample is dated whole periods after the newest of the last reading, corrected to the period before the
-    count was read. The others are evenly spaced between the two. So the times stay in order although the sensor's clock
-    may be a little fast or slow.
+    The newest sample is dated a whole number of periods after the newest one of the last reading, corrected to the
+    period before the count was read. The other samples are evenly spaced between the two. So the times stay in order
+    even if the sensor's clock is a little fast or slow.
     """
 
     def __init__(self, clock: Clock, period_ns: int) -> None:
@@ -87,7 +87,7 @@ class FifoTimes:
         return (now_ns - self._newest_ns) / self.period_ns
 
     def date(self, samples: int, missing: int, before_ns: int, after_ns: int) -> NDArray[np.int64]:
-        """Return the times of so many samples; so many more are missing before them.
+        """Return the times of new samples, before which ``missing`` others were lost.
 
         ``before_ns`` and ``after_ns`` are the times before and after the FIFO's count was read.
         """

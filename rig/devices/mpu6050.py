@@ -35,7 +35,7 @@ _FILTERS = {188: 1, 98: 2, 42: 3, 20: 4, 10: 5, 5: 6}
 """DLPF_CFG by the gyro's bandwidth in Hz; all run at an internal rate of 1 kHz."""
 
 _TESTED_SAMPLES, _TESTED_S = 50, 2.0
-"""How many samples of a clone are tested, and how long at most: 50 samples fit into any of the FIFOs."""
+"""Number of samples of a clone that are tested, and longest time for them: 50 samples fit into any of the FIFOs."""
 _SELF_TEST_DPS = (5.0, 220.0)
 """Smallest and largest response to the self-test; that of an MPU-6050 is 25 to 101 °/s by its factory trim (RM 4.1)."""
 _SELF_TEST_SAMPLES = 4, 20  # at least, and within a second
@@ -122,7 +122,7 @@ class Mpu6050:
         Raises
         ------
         DeviceSilent
-            The sensor does not answer, also after retries.
+            The sensor does not answer, even after retries.
         DeviceFault
             The sensor fell asleep or lost its settings (a brown-out).
         """
@@ -132,7 +132,7 @@ class Mpu6050:
         if count > self.FIFO_BYTES - _FRAME or (
             self._implausible(count, after_ns) and self._implausible(count := self._fifo_count(), after_ns)
         ):
-            return self._start_over()  # an incomplete frame twice: not one that is being written
+            return self._start_over()  # incomplete twice, so it is not a frame that is being written
         samples, missing = count // _FRAME, 0
         due = self._times.due(before_ns)
         if samples < 0.9 * due - 2:  # the sensor's clock is off by at most 5 % (PS 6.6): samples are missing
@@ -250,10 +250,10 @@ class Mpu9250(Mpu6500):
 
 
 class Mpu6050Clone(Mpu6050):
-    """A clone of the MPU-6050 that has no datasheet. Opening it also tests how it behaves at rest.
+    """A clone of the MPU-6050 that has no datasheet. Opening it also tests its samples at rest.
 
-    It counts as the worst of the family: the smallest FIFO and the largest noise. The temperature has the MPU-6050's
-    scale.
+    The driver assumes the worst values of the family: the smallest FIFO and the largest noise. The temperature has the
+    MPU-6050's scale.
 
     Raises
     ------
@@ -296,7 +296,7 @@ class Mpu6050Clone(Mpu6050):
             )
 
     def _self_test(self, at_rest_dps: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return what each axis of the gyro reads more while its self-test moves it, in °/s."""
+        """Return the change of each axis of the gyro during its self-test, (3,), in °/s."""
         self._registers.write(_GYRO_CONFIG, _GYRO_SELF_TEST)
         self._empty_fifo()
         least, most = _SELF_TEST_SAMPLES

@@ -7,7 +7,7 @@ Device = TypeVar("Device")
 
 
 class OnDemand(Generic[Device]):
-    """Behaves like a device, and opens it at the first use; raises what opening it raises.
+    """A device that is opened at its first use; its methods also raise the errors of opening it.
 
     Parameters
     ----------

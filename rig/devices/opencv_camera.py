@@ -39,13 +39,13 @@ _STAMP_ERROR_NS = 2_000_000  # how far a stamp may be ahead of the clock
 _SLICE_S = 0.1  # longest wait for a frame between two calls of ``meanwhile``
 _REPLUG_PAUSE_S = 0.1
 _UNKNOWN_PROPERTY = cv2.CAP_PROP_XI_AEAG  # V4L2 answers -1, other sources 0
-_EXPOSURE_CHANGE_FRAMES = 4  # a sensor applies a new exposure time up to so many frames later
+_EXPOSURE_CHANGE_FRAMES = 4  # a sensor applies a new exposure time up to this number of frames later
 _FOCUS_STILL_S, _FOCUS_LIMIT_S = 1.0, 8.0
 _FOCUS_CHANGE = 0.1  # share of the sharpness that changes while the lens moves
 
 
 class TimeBase(Enum):
-    """How the time of a frame is known."""
+    """The ways in which the time of a frame is known."""
 
     STAMPED = "stamped"
     PACED = "paced"
@@ -246,7 +246,7 @@ class OpenCvCamera:
         return value if value > 0 or zero else None
 
     def _settle_focus(self) -> None:
-        """Let the autofocus find its position, and pin it there: switched off at once, it would stay out of focus."""
+        """Let the autofocus find its position, then lock the focus there."""
         if self._capture.get(cv2.CAP_PROP_AUTOFOCUS) <= 0:
             return
         start_ns = still_ns = self._clock.now_ns()
@@ -287,9 +287,9 @@ class OpenCvCamera:
         return TimeBase.PACED
 
     def _await(self, meanwhile: Callable[[], object]) -> None:
-        """Wait until `grab` returns at once, because it blocks: for ten seconds if a stream of V4L2 hangs.
+        """Wait until `grab` can return at once, because it blocks for ten seconds if a stream of V4L2 hangs.
 
-        If the source cannot tell, wait until shortly before the next frame, estimated from the last ones.
+        If the source does not report this, wait until shortly before the next frame, estimated from the last ones.
 
         Raises
         ------
@@ -390,7 +390,7 @@ class OpenCvCamera:
         )
 
     def _note_arrival(self, asked_ns: int) -> None:
-        """Measure how long the camera takes for a frame, after a wait for one."""
+        """Measure the time that the camera takes for a frame, after a wait for one."""
         now_ns = self._clock.now_ns()
         if seconds_between(asked_ns, now_ns) > self._period_s / 4:
             self._waits_s.append(seconds_between(asked_ns, now_ns))

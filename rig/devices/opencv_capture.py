@@ -64,7 +64,7 @@ def modes_of(capture: Capture) -> tuple[v4l2.VideoMode, ...]:
 
 
 def waiter_of(capture: Capture) -> Callable[[float], bool] | None:
-    """Return the function that waits for a frame of a source at most so many seconds; None if it has none.
+    """Return the function that waits for a frame of a source for a number of seconds; None if it has none.
 
     It returns whether `grab` then returns at once: with a frame, or because it fails.
     """

@@ -39,7 +39,7 @@ def camera_number(source: object) -> int | None:
 
 
 def camera_id(number: int) -> str | None:
-    """Return what identifies a camera: its sensor and its connector; None if there is none, or no picamera2."""
+    """Return the identity of a camera: its sensor and its connector; None without the camera or picamera2."""
     try:
         cameras = _library().Picamera2.global_camera_info()
     except DeviceNotFound:
@@ -64,7 +64,7 @@ class Picamera2Capture:
 
     Units are those of OpenCV's V4L2 backend where there are any: exposure in 100 µs, white balance in kelvin. Gain is
     in decibels (20 log10 of libcamera's AnalogueGain), focus in dioptres (LensPosition), sharpness as libcamera's.
-    `get` returns what the metadata of a frame report, -1 for what the camera lacks.
+    `get` returns the value in the metadata of a frame, -1 for a setting that the camera lacks.
 
     Parameters
     ----------
@@ -99,7 +99,7 @@ class Picamera2Capture:
         self._fps = _NOMINAL_FPS
         self._fixed_rate = False
         self._asked: dict[str, Any] = {}
-        if "AfMode" in self._controls:  # the lens wakes at a fixed distance; `OpenCvCamera` pins what is found
+        if "AfMode" in self._controls:  # the lens starts at a fixed distance; `OpenCvCamera` locks the found focus
             self._asked["AfMode"] = _CONTINUOUS_FOCUS
         self._request: Any = None
         self._metadata: Mapping[str, Any] = {}
@@ -122,14 +122,14 @@ class Picamera2Capture:
         return self._request is not None
 
     def wait(self, seconds: float) -> bool:
-        """Wait for a frame at most so long; return whether `grab` then returns at once."""
+        """Wait for a frame for at most this time; return whether `grab` then returns at once."""
         if self._open and not self._waiting:
             self._take(seconds)
             self._waiting = self._request is not None
         return self._waiting or not self._open
 
     def _take(self, seconds: float) -> None:
-        """Take the next frame in place of the last one; none if none arrives in time."""
+        """Take the next frame in place of the last one; there is no frame if none arrives in time."""
         self._start()
         self._release_request()
         try:

@@ -36,7 +36,7 @@ class ServoState:
     ``time_ns`` is the middle of the transaction on the bench's clock, ``sampled_ns`` the beginning of the answer, when
     the servo read its encoder, to a fraction of a millisecond; None if the driver does not know it. ``hardware_errors``
     are the names of the bits in Hardware Error Status (a status alert). ``moving`` is False when the motion profile has
-    ended and the shaft is slow. ``in_position`` is the servo's own judgement that it is at its goal: friction may hold
+    ended and the shaft is slow. ``in_position`` is whether the servo reports that it is at its goal; friction may hold
     it outside of its window. ``trajectory_deg`` is the present position of the servo's motion profile; None if the
     model does not report it.
     """
@@ -58,8 +58,8 @@ class ServoState:
 class ServoCondition:
     """The servo's condition when it is opened, before anything is written to it.
 
-    ``power_lost`` says that its volatile registers are as after power-up: it lost its supply since the rig last set a
-    profile, and with it the count of its revolutions.
+    ``power_lost`` is whether its volatile registers have the values of power-up. If so, the servo lost its supply, and
+    with it the count of its revolutions, since the rig last set a profile.
     """
 
     torque: bool
@@ -85,7 +85,7 @@ class Servo(Protocol):
         """Notes for the operator about this model."""
 
     def prepare(self, *, write: bool) -> tuple[str, ...]:
-        """Compare the servo's permanent settings with what the rig needs; return what was changed.
+        """Compare the servo's permanent settings with the required ones; return the changes.
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""Questions to a Video4Linux device that OpenCV does not ask (linux/videodev2.h)."""
+"""Queries of a Video4Linux device that OpenCV does not offer (linux/videodev2.h)."""
 
 import os
 import struct

@@ -1,1 +1,1 @@
-"""What is connected, in what state it is, and what to do about it; nothing here moves anything."""
+"""The checks of `rig doctor`: the connected devices, their state, and fixes. No check moves anything."""

@@ -29,7 +29,7 @@ from rig.views.capture import ImageQuality, rejection_text
 QUICK, SPACED, SPACING_S = 5, 6, 0.17
 """Consecutive frames, which show the frame rate, and frames spread over a second, which show flicker."""
 MAX_AGE_S = 0.25
-"""Time from the start of an exposure until the program has the frame; the table waits that long at each view."""
+"""Largest time from the start of an exposure until the program has the frame; the table waits for it at each view."""
 PER_EXPOSURE = 6
 """Images of each exposure time that are compared to find bands that stand still."""
 DARK, BRIGHT = 12, 240

@@ -26,7 +26,8 @@ PORT_GRABBERS = {
 """Programs of a desktop that open every new serial port, and how to stop them."""
 
 RULES_FILES = ("/etc/udev/rules.d/60-hbr-rig.rules", "/etc/udev/rules.d/99-hbr-rig.rules")
-"""The same rules before and after those of other programs: access and ModemManager need the first, brltty the last."""
+"""Two files with the same rules. Access and ModemManager need rules before those of other programs, brltty after
+them."""
 
 
 def bench_state(context: DoctorContext) -> Iterator[Finding]:
@@ -153,7 +154,7 @@ def clock(context: DoctorContext) -> Iterator[Finding]:
 def udev_rules(ports_found: list[SerialPort]) -> str:
     """Return udev rules: a short latency, a permanent name, access for the logged-in user, no ModemManager, no brltty.
 
-    brltty's rule (85-brltty.rules) starts it for many USB adapters by ``SYSTEMD_WANTS``; a later rule takes that back.
+    brltty's rule (85-brltty.rules) starts it for many USB adapters by ``SYSTEMD_WANTS``; a later rule cancels that.
     """
     lines = [
         "# Made by `rig doctor --udev`, for two files:",

@@ -21,7 +21,7 @@ MARKS = {Severity.FINE: "✓", Severity.WARNING: "!", Severity.BAD: "✗"}
 
 @unique
 class FindingCode(Enum):
-    """All findings. The name of a member is its code in JSON, its value the template of its text (`finding_words`)."""
+    """The codes of all findings. The name of a member is its code in JSON, its value the template of its text."""
 
     ERROR = "{what}"
     CHECK_TIMED_OUT = "the check did not end within {deadline_s:g} s"

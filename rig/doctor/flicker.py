@@ -15,7 +15,7 @@ _CYCLES = np.arange(0.0, 8.01, 0.125)
 """Bands in an image: at most 8, for a readout of 67 ms at 120 Hz."""
 _BLOCKS = 48
 _STANDING_CYCLES = _CYCLES[_CYCLES >= 0.75]
-"""Fewer bands look like a change of the scene from its top to its bottom."""
+"""Smallest number of bands; fewer look like a change of the scene from its top to its bottom."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,6 +154,6 @@ def _phases(mains_hz: float, times_ns: NDArray[np.int64]) -> NDArray[np.complex1
 
 
 def _residual(design: NDArray[np.float64], values: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
-    """Return the coefficients of a fit by least squares, and the mean square that it leaves."""
+    """Return the coefficients of a fit by least squares, and the mean square of its residuals."""
     fitted = np.asarray(np.linalg.lstsq(design, values, rcond=None)[0], dtype=np.float64)
     return fitted, float(((values - design @ fitted) ** 2).mean())

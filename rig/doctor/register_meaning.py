@@ -5,7 +5,7 @@ from rig.devices.dynamixel.registers import ControlTable
 
 BAUD_CODES = {9_600: 0, 57_600: 1, 115_200: 2, 1_000_000: 3, 2_000_000: 4, 3_000_000: 5, 4_000_000: 6, 4_500_000: 7}
 """Values of Baud Rate, Protocol 2.0."""
-AX_BAUD = 2_000_000  # protocol 1.0: the value of Baud Rate is this divided by the rate, minus one
+AX_BAUD = 2_000_000  # protocol 1.0: the value of Baud Rate is this number divided by the rate, minus one
 
 _OPERATING_MODES = {
     0: "current",

@@ -78,7 +78,7 @@ def calibrations(context: DoctorContext) -> Iterator[Finding]:
 
 
 def _camera_delay(context: DoctorContext, standings: Iterable[CalibrationStanding]) -> Finding:
-    """Return how long views wait for a delay inside the camera, which its time stamps do not show."""
+    """Return the time that views wait for a delay inside the camera, which its time stamps do not show."""
     in_force = (one.result for one in standings if one.status is CalibrationStatus.IN_FORCE)
     config, _ = apply_results(context.config, in_force)
     if config.camera_time.offset_ms is None:

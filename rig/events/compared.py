@@ -13,8 +13,8 @@ class Verified:
     """The leading candidate was doubtful, and its enrolled views were compared with the views pixel by pixel.
 
     ``fit`` is the share of the views' contrast that its enrolled views explain, at most 1, and ``others`` that of the
-    next candidates. ``score`` is the log-odds that follows from them and from the open-set score: from ``found_from``
-    on the object is found, and below ``unknown_below`` it is unknown.
+    next candidates. ``score`` is the log-odds from these numbers and the open-set score. With at least ``found_from``
+    the object is found, and below ``unknown_below`` it is unknown.
     """
 
     index: int
@@ -31,7 +31,7 @@ class Verified:
 class ComparedView:
     """A view in which two candidates differ: ``score`` is 1 for the first one, −1 for the second one.
 
-    ``weight`` says how much their enrolled views differ there: grey levels, summed over pixels.
+    ``weight`` is the difference of their enrolled views there: grey levels, summed over pixels.
     """
 
     index: int
@@ -43,11 +43,12 @@ class ComparedView:
 class Compared:
     """The two leading candidates were compared pixel by pixel where their enrolled views differ most.
 
-    ``winner`` is the one that the views show; None if they do not tell. ``score`` is 1 for the first one, −1 for the
-    second one. ``expected`` is the same of enrolled views of each, None if they were not compared. ``error_bound`` is
-    the bound of the probability of a wrong winner, at most ``max_error``. ``unexplained`` is what the better one leaves
-    unexplained, as a share of the difference of both; ``misfit`` and ``apart`` are the two in grey levels of a pixel.
-    ``views`` are those that show a difference, the clearest first; ``azimuths_deg`` are the enrolled views of each.
+    ``winner`` is the one that the views show; None if the comparison decides for neither. ``score`` is 1 for the first
+    one, −1 for the second one. ``expected`` are the scores of enrolled views of each, None if they were not compared.
+    ``error_bound`` is the bound of the probability of a wrong winner, at most ``max_error``. ``unexplained`` is the
+    difference that the better one leaves unexplained, as a share of the difference of both; ``misfit`` and ``apart``
+    are these two differences in grey levels of a pixel. ``views`` are those that show a difference, the clearest first;
+    ``azimuths_deg`` are the enrolled views of each.
 
     ``picture_bgr`` has a row for each of the clearest views: the view, both enrolled views, and where these differ.
     ``leaders`` has the crops and masks of the enrolled views, uint8 (160, 320, 3).

@@ -21,7 +21,7 @@ _OUTSIDE = {"json": False}
 
 
 class NoteCode(StrEnum):
-    """What a note is about; `rig.events.note_wording.note_words` puts it into words."""
+    """The subjects of notes; `rig.events.note_wording.note_words` has their sentences."""
 
     PAPER_SEARCH = "paper-search"
     MIXED_EMPTY_TABLE = "mixed-empty-table"
@@ -44,7 +44,7 @@ class NoteCode(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Note:
-    """Something that the operator should know: a code, and the numbers and names that its words need."""
+    """A note for the operator: a code, and the numbers and names for its sentence."""
 
     code: NoteCode
     values: dict[str, Any] = field(default_factory=dict)
@@ -75,9 +75,9 @@ class WaitReason(StrEnum):
 class Started:
     """A plan starts: ``plan`` is "enroll" or "identify", ``views`` the largest number of views.
 
-    ``angles_deg`` are the table angles of an enrollment, whose views are taken in one turn if ``in_motion``. An
+    ``angles_deg`` are the table angles of an enrollment; with ``in_motion`` all views are taken in one revolution. An
     identification has a ``strategy`` with its ``seed``, the ``descriptor`` that views are compared by, and ``notes`` on
-    what its answer is worth.
+    how reliable its answer is.
     """
 
     plan: str
@@ -95,10 +95,10 @@ class Started:
 
 @dataclass(frozen=True, slots=True)
 class Moved:
-    """The table turned and is at rest.
+    """The table has rotated and is at rest.
 
-    Angles of the table in degrees, unwrapped. ``agrees`` says whether encoder and gyro measured the same rotation
-    within ``bound_deg``; when they do not, the gyro on the platter is trusted.
+    Angles of the table in degrees, unwrapped. ``agrees`` is whether encoder and gyro measured the same rotation within
+    ``bound_deg``; if they did not, the gyro on the platter is trusted.
     """
 
     index: int
@@ -114,11 +114,11 @@ class Moved:
 
 @dataclass(frozen=True, slots=True)
 class ScanStarted:
-    """The table begins a turn in which the views are taken while it rotates.
+    """The table begins a rotation during which views are taken.
 
-    Angles of the table in degrees, unwrapped. ``limit`` says what limits the speed, and ``value`` is the number that
-    belongs to it: the exposure in ms, the frames per second, the table's or the gyro's speed in °/s, or the uncertainty
-    of a frame's time in ms.
+    Angles of the table in degrees, unwrapped. ``limit`` names the cause that limits the speed, and ``value`` is its
+    number: the exposure in ms, the frames per second, the table's or the gyro's speed in °/s, or the uncertainty of a
+    frame's time in ms.
     """
 
     speed_dps: float
@@ -144,7 +144,7 @@ class Unwinding:
 
 @dataclass(frozen=True, slots=True)
 class Rejected:
-    """A frame was not taken, and why."""
+    """A frame was rejected, with the reasons."""
 
     index: int
     attempt: int
@@ -157,7 +157,7 @@ class Accepted:
     """A view was taken (and, when enrolling, is durable).
 
     ``segmentation`` is `hbr.Segmentation.evidence` as JSON values; None if no segmentation was made. ``same_bench``
-    says whether a search's first view shows the bench of the enrollment; None: not known.
+    is whether a search's first view shows the bench of the enrollment; None: not known.
     """
 
     index: int
@@ -172,7 +172,7 @@ class Accepted:
 class Candidate:
     """An object with its score per view and its pose: the azimuth at which the camera sees it now.
 
-    ``probability`` is that of being what stands there, among the enrolled objects; None where the search has none.
+    ``probability`` is that of being the object on the table, among the enrolled ones; None if the search computes none.
     """
 
     name: str
@@ -185,8 +185,8 @@ class Candidate:
 class Ranked:
     """The candidates after a view, the best first.
 
-    ``margin`` is how far, in score per view, the first one leads every other enrolled object at least; it may be
-    negative. ``decision`` is the stopping rule's, of the dense search.
+    ``margin`` is the smallest lead of the first one over any other enrolled object, in score per view; it may be
+    negative. ``decision`` is the stopping rule's decision in the dense search.
     """
 
     index: int
@@ -197,11 +197,11 @@ class Ranked:
 
 @dataclass(frozen=True, slots=True)
 class FrameUsed:
-    """A search in motion used a frame: what it knew then.
+    """A search in motion used a frame; the fields are its state after the frame.
 
     ``seconds`` is the time since the search began, ``rejected`` the number of frames that were not used so far.
-    ``name`` is the best candidate with its ``probability``. ``outcome`` is what the stopping rule would decide here; it
-    decides only when the frames have covered another step of the circle.
+    ``name`` is the best candidate with its ``probability``. ``outcome`` is what the stopping rule would decide at this
+    frame; it decides only when the frames have covered another step of the circle.
     """
 
     index: int
@@ -217,9 +217,10 @@ class FrameUsed:
 class Weighed:
     """All rotations that the dense search weighed before it chose one.
 
-    ``rotations_deg`` are the camera's, positive to the left. ``confusion`` is the logarithm of the probability of still
-    confusing two objects after each rotation, ``cost`` what its motion costs, in the same unit: the lowest sum was
-    chosen. ``similarity`` is how similar the two candidates look there; None if no second object is likely.
+    ``rotations_deg`` are the camera's, positive to the left. ``confusion`` is the logarithm of the probability that two
+    objects are still confused after each rotation, ``cost`` the cost of its motion in the same unit. The rotation with
+    the lowest sum was chosen. ``similarity`` is the similarity of the two candidates after each rotation; None if no
+    second object is likely.
     """
 
     rotations_deg: tuple[float, ...]
@@ -233,8 +234,8 @@ class Decided:
     """The rotation to the next view, and the ``reason`` for it.
 
     ``rotation_deg`` is the camera's around the object, positive to the left; the table rotates the other way, to
-    ``target_deg``. ``s_left`` and ``s_right`` are how similar the ``candidates`` look from each side (Eq. 6), if AHBR
-    compared the sides. ``note`` is the explanation of a strategy of your own, or of an earlier version.
+    ``target_deg``. ``s_left`` and ``s_right`` are the similarities of the ``candidates`` from each side (Eq. 6), if
+    AHBR compared the sides. ``note`` is the explanation of a user's own strategy, or of an earlier version.
     """
 
     index: int
@@ -269,7 +270,7 @@ class SkipReason(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Item:
-    """The next object of a tray, ``number`` (from 1) ``of`` so many.
+    """The next object of a tray: ``number``, from 1, ``of`` all.
 
     ``action`` is "enroll", "resume" (take the missing views), "replace" (repeat an interrupted enrollment, because
     the object was moved), or "skip". A skipped object has a ``reason``, and after an error its ``error_code``.
@@ -299,11 +300,10 @@ class SimilarObject:
 
 @dataclass(frozen=True, slots=True)
 class SimilarObjects:
-    """What a new object can be confused with: itself, rotated by ``period_deg``, and other objects.
+    """Confusions of a new object: with itself, rotated by ``period_deg``, and with other objects.
 
     ``period_deg`` is 360 if the object has no symmetry, 0 if it looks the same from everywhere, None if it has too few
-    views to tell. ``neighbour_similarity`` is the mean of neighbouring views, ``period_similarity`` of views a period
-    apart.
+    views. ``neighbour_similarity`` is the mean of neighbouring views, ``period_similarity`` of views a period apart.
     """
 
     name: str
@@ -315,10 +315,10 @@ class SimilarObjects:
 
 @dataclass(frozen=True, slots=True)
 class EmptyTableImage:
-    """The empty table was photographed, and the picture is kept: objects are found by what differs from it.
+    """The empty-table image was taken and stored. Segmentation compares views with it.
 
-    ``turning_share`` is how much of the picture changed as the table turned a little, ``agreement`` how much of its
-    border did not; None where the table could not turn. ``replaced`` has the problems of the previous image.
+    ``turning_share`` is the share of the image that changed while the table rotated a little, ``agreement`` the share
+    of its border that did not; None if the table could not rotate. ``replaced`` has the problems of the previous image.
     """
 
     taken_utc: str
@@ -334,7 +334,7 @@ class EmptyTableImage:
 
 @dataclass(frozen=True, slots=True)
 class Warned:
-    """Something that the operator should attend to while the plan continues; ``index`` is the view it was seen at."""
+    """A warning for the operator while the plan continues; ``index`` is the view at which it was noticed."""
 
     index: int | None
     note: Note
@@ -362,19 +362,19 @@ class Failed:
 class Identified:
     """The answer: an object's name, or None for an unknown object.
 
-    ``outcome`` says whether the object was found, is ambiguous, or is unknown; ``possible`` names the objects that it
-    may be: one, several, or none. The ``name`` of an ambiguous object is the first of them.
+    ``outcome`` is whether the object was found, is ambiguous, or is unknown. ``possible`` names the objects that it may
+    be: one, several, or none. The ``name`` of an ambiguous object is the first of them.
 
-    ``score`` and ``margin`` are per view. ``pose_deg`` is the azimuth the camera sees last, in the catalog's frame, and
-    ``yaw_deg`` how far the object is rotated counter-clockwise against its enrollment, with the standard uncertainty
+    ``score`` and ``margin`` are per view. ``pose_deg`` is the azimuth of the last view, in the catalog's frame.
+    ``yaw_deg`` is the object's rotation relative to its enrollment, counter-clockwise, with the standard uncertainty
     ``yaw_sigma_deg``. It is None if the views do not determine it, or if the object looks the same every
     ``period_deg``; ``yaw_set_deg`` then has all equivalent rotations. ``period_deg`` is 360 without symmetry, 0 if the
     object looks the same from all sides, None if that is not known. The paper's search has no uncertainty.
 
-    ``reason`` says why the search ended; ``note`` is the explanation of a strategy of your own, or of an earlier
-    version. The paper's search compares the score with ``min_score`` and the margin with ``min_margin``; the dense
-    search compares the confidence with ``min_confidence`` and the open-set score with ``open_set_threshold``, None if
-    no object is called unknown.
+    ``reason`` is why the search ended; ``note`` is the explanation of a user's own strategy, or of an earlier version.
+    The paper's search compares the score with ``min_score`` and the margin with ``min_margin``; the dense search
+    compares the confidence with ``min_confidence`` and the open-set score with ``open_set_threshold``, None if no
+    object is called unknown.
     """
 
     name: str | None

@@ -117,7 +117,7 @@ def _leader(one: Candidate, ranked: Ranked) -> str:
 
 
 def _frame_words(used: FrameUsed) -> str:
-    """Return what a frame of a turn showed."""
+    """Return the state of a search in motion after a frame, in words."""
     best = f"{used.name} {percent_words(used.probability)}{_ENOUGH[used.outcome]}"
     where = f"azimuth {azimuth_words(used.azimuth_deg)}°, {used.seconds:.1f} s"
     rejected = f" ({counted(used.rejected, 'frame')} rejected)" if used.rejected else ""

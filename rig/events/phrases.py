@@ -4,7 +4,7 @@ from collections.abc import Iterable, Sequence
 
 
 def percent_words(probability: float) -> str:
-    """Return a probability in percent; below 0.1 % and above 99.9 % only that."""
+    """Return a probability in percent; "below 0.1 %" and "above 99.9 %" at the ends."""
     if probability > 0.999:
         return ">99.9 %"
     return "<0.1 %" if probability < 0.001 else percent(probability)
@@ -51,7 +51,7 @@ def joined(items: Sequence[str], conjunction: str = "and") -> str:
 
 
 def short(words: str, letters: int) -> str:
-    """Return words cut to so many letters, the last of them "…"."""
+    """Return words cut to a number of letters, the last of them "…"."""
     return words if len(words) <= letters else f"{words[: letters - 1]}…"
 
 

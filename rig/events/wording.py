@@ -24,7 +24,7 @@ NAMED = 5
 
 
 def decision_words(decided: Decided) -> str:
-    """Return which way the camera goes, and why: "left 47.3°: the leading candidates look less similar there …."."""
+    """Return the camera's rotation and its reason: "left 47.3°: the leading candidates look less similar there …."."""
     # A rotation of AHBR is at most 90°; a larger one leads past views that were taken before (`hbr.next_view`).
     past = decided.s_left is not None and round(abs(decided.rotation_deg), 1) > 90
     rotation = f"{decided.side} {abs(decided.rotation_deg):.1f}°{', past earlier views' if past else ''}"
@@ -168,13 +168,13 @@ _SPEED_LIMITS: Final = {
 
 
 def scan_words(scan: ScanStarted) -> str:
-    """Return that a scan begins, its speed, and what limits it."""
+    """Return a sentence that a scan begins, with its speed and the cause that limits it."""
     limit = _SPEED_LIMITS[scan.limit].format(value=scan.value, speed=scan.speed_dps)
     return f"one turn from {angle_words(scan.from_deg)} to {angle_words(scan.to_deg)}: {limit}"
 
 
 def unwinding_words(unwinding: Unwinding) -> str:
-    """Return that the table frees its cable by a long rotation, and why."""
+    """Return a sentence that the table frees its cable by a long rotation, with the reason."""
     low, high = (f"{angle:g}°".replace("-", "−") for angle in unwinding.limits_deg)
     return (
         f"Unwinding the cable: the table rotates from {angle_words(unwinding.from_deg)} back to "
@@ -244,7 +244,7 @@ def answer_words(answer: Identified) -> str:
 
 
 def symmetry_words(similar: SimilarObjects) -> str:
-    """Return what an object's views say about its pose; empty if they say nothing."""
+    """Return what an object's views show about its symmetry; empty if they show nothing."""
     if similar.period_deg is None or similar.neighbour_similarity is None or similar.period_similarity is None:
         return ""
     numbers = f"similarity {similar.period_similarity:.3f}, of neighbouring views {similar.neighbour_similarity:.3f}"

@@ -59,7 +59,7 @@ class FlightJudge:
             reasons.append(RejectReason.TIME_UNCERTAIN)
         if evidence.angle_sigma_deg > self.config.view.max_angle_sigma_deg or not trajectory.consistent:
             reasons.append(RejectReason.ANGLE_UNCERTAIN)
-        if evidence.smear_px > 1.1 * self.config.view.max_smear_px:  # the speed ripples about the chosen one
+        if evidence.smear_px > 1.1 * self.config.view.max_smear_px:  # the speed varies about the chosen one
             reasons.append(RejectReason.SMEARED)
         if frame.repeated:
             reasons.append(RejectReason.REPEATED_FRAME)
@@ -88,7 +88,7 @@ class FlightJudge:
     def at_the_object(
         self, attempt: Attempt, segmentation: Mapping[str, Any] | None, trajectory: Trajectory
     ) -> Attempt:
-        """Return an attempt with time and angle of the object's middle row instead of the frame's (rolling shutter).
+        """Return an attempt with the time and angle of the object's middle row, not the frame's (rolling shutter).
 
         ``segmentation`` is that of the attempt's image; without a box of the object nothing changes.
         """

@@ -17,9 +17,9 @@ STILL_S = 0.01
 STALE_S = 0.05
 """Age at which a reading is too old for a goal: the computer paused after it."""
 READINGS = 8
-"""How many readings are taken to find two that agree."""
+"""Number of readings that are taken to find two that agree."""
 AGREEMENTS = 3
-"""How many readings in a row must agree if the table cannot have got there since the last trusted reading."""
+"""Number of successive readings that must agree if the table cannot have reached them since the last trusted one."""
 STOP_ALLOWANCE_S = 0.5
 """Time for a stop in addition to its ramp; then the torque goes off in any case."""
 
@@ -46,7 +46,7 @@ def halt(
 
     The goal is ahead of the table by its stopping distance, but never beyond the path of the motion. With its present
     position as the goal, the table would overshoot and come back. Without two readings that agree, the position is not
-    known: the torque goes off and the table runs out.
+    known; then the torque goes off and the table stops by friction.
     """
     try:
         state = _agreed_reading(servo, clock, path)
@@ -56,7 +56,7 @@ def halt(
                 servo.disarm_watchdog()
             return True
         ramp_deg = copysign(state.velocity_dps**2 / (2 * ramp_dps2), state.velocity_dps)
-        bus_s = 2 * min(seconds_between(state.time_ns, clock.now_ns()), STALE_S)  # for the answer and for the goal
+        bus_s = 2 * min(seconds_between(state.time_ns, clock.now_ns()), STALE_S)  # for the answer and the goal
         low_deg, high_deg = path.ends_deg
         set_goal(min(max(state.position_deg + ramp_deg + state.velocity_dps * bus_s, low_deg), high_deg))
         deadline_ns = clock.now_ns() + round((abs(state.velocity_dps) / ramp_dps2 + STOP_ALLOWANCE_S) * 1e9)
@@ -76,9 +76,9 @@ def halt(
 def _agreed_reading(servo: Servo, clock: Clock, path: MotionPath) -> ServoState | None:
     """Return a fresh reading of a moving table that agrees with the one before it; None if there is none.
 
-    The two agree if the angle between them is the speed times the time between them. If the table cannot have got there
-    (a false reading, or the encoder slipped), more readings must agree. Readings of a table that stands still do not
-    count: if they hang, a goal from them would rotate the table.
+    The two agree if the angle between them is the speed times the time between them. If the table cannot have reached
+    this angle (a false reading, or the encoder slipped), more readings must agree. Readings of a table that stands
+    still do not count: if the readings are stuck, a goal from them would rotate the table.
     """
     low_deg, high_deg = path.ends_deg
     earlier, agreeing = servo.read_state(), 0

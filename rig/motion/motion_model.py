@@ -30,19 +30,19 @@ class MotionModel:
         return seconds
 
     def park_s(self, from_deg: float) -> float:
-        """Return the duration of the way back to 0 after views in motion: the table need not be quiet there."""
+        """Return the duration of the way back to 0 after views in motion, where the table need not be quiet."""
         table = self.config.table
         return motion_seconds(from_deg, MotionProfile(table.velocity_dps, table.acceleration_dps2))
 
     @property
     def view_s(self) -> float:
-        """The duration of a view: the time until a frame arrives."""
+        """Return the duration of a view: the time until a frame arrives."""
         return FRAMES / self.config.camera.fps
 
     def enrollment_s(self, start_deg: float, angles_deg: Sequence[float], *, in_motion: bool = False) -> float:
         """Return the duration of views at these table angles, from ``start_deg`` and back home.
 
-        ``in_motion``: all are taken in one turn at `table.velocity_dps`; a long exposure makes it slower.
+        With ``in_motion`` all are taken in one revolution at `table.velocity_dps`; a long exposure makes it slower.
         """
         if not angles_deg:
             return 0.0

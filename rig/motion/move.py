@@ -30,7 +30,7 @@ class Move:
     def rotation_deg(self) -> float:
         """The best measurement of the rotation.
 
-        The encoder's, unless the gyro on the platter contradicts it, or ``table.orientation`` selects the gyro.
+        It is the encoder's, unless the gyro on the platter contradicts it, or ``table.orientation`` selects the gyro.
         """
         return self.gyro.angle_deg if self.by_gyro or not self.agrees else self.rotation_encoder_deg
 

@@ -1,4 +1,4 @@
-"""The speed of a scan: the fastest at which its views are good enough, and what limits it."""
+"""The speed of a scan: the fastest at which its views are good enough, and the cause that limits it."""
 
 from dataclasses import dataclass
 from enum import StrEnum
@@ -9,15 +9,15 @@ from rig.config import RigConfig
 from rig.core.errors import UsageError
 
 GYRO_SHARE: Final = 0.9
-"""Share of the gyro's range that a scan uses: the table rings, and the scale may be off."""
+"""Share of the gyro's range that a scan uses, because the table vibrates and the scale may be wrong."""
 FRAME_SHARE: Final = 0.9
-"""A frame for each planned angle arrives with a margin, because the frame rate is nominal."""
+"""Margin with which a frame for each planned angle arrives, because the frame rate is nominal."""
 FIT_SIGMA_DEG: Final = 0.05
 """Standard uncertainty of the angle that is left to the trajectory."""
 
 
 class SpeedLimit(StrEnum):
-    """What limits the speed of a scan."""
+    """The causes that limit the speed of a scan."""
 
     SMEAR = "smear"
     FRAME_RATE = "frame-rate"
@@ -28,7 +28,7 @@ class SpeedLimit(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class ScanSpeed:
-    """A speed in °/s, what limits it, and the number of the limit as in `rig.events.events.ScanStarted`."""
+    """A speed in °/s, the cause that limits it, and its number as in `rig.events.events.ScanStarted`."""
 
     dps: float
     limit: SpeedLimit
@@ -66,9 +66,9 @@ def can_fly(config: RigConfig) -> bool:
 
 
 def takes_in_motion(config: RigConfig, fly: bool | None, *, tray: bool = False) -> bool:
-    """Return whether an enrollment takes its views in one turn; ``fly`` overrides ``enroll.mode``.
+    """Return whether an enrollment takes its views in one revolution; ``fly`` overrides ``enroll.mode``.
 
-    "auto" means at rest, but for a tray in motion where that is possible.
+    "auto" means at rest; for a tray it means in motion if that is possible.
     """
     if fly is not None:
         return fly
@@ -88,7 +88,7 @@ def require_camera_time(config: RigConfig) -> None:
 
 
 def scan_speed(config: RigConfig, *, fps: float, gyro_range_dps: float, spacing_deg: float | None) -> ScanSpeed:
-    """Return the fastest speed for views every ``spacing_deg``; None: no view is planned at a certain angle."""
+    """Return the fastest speed for views every ``spacing_deg``; None means that the angles of views are not planned."""
     milliseconds = exposure_s(config) * 1e3
     left_deg = max(config.view.max_angle_sigma_deg**2 - FIT_SIGMA_DEG**2, 1e-6) ** 0.5
     sigma_ms = max(time_sigma_ms(config), 1e-3)

@@ -16,7 +16,7 @@ from rig.safety.saved_state import FileStore, Holder, LatchedFault
 REACTION_S = 2.0
 """How long a program may take to notice the request: many rounds of its control loop, and a long exposure."""
 END_S = 5.0
-"""How long it may take afterwards to close its devices."""
+"""Longest time that the program may then take to close its devices."""
 POLL_S = 0.02
 
 
@@ -36,7 +36,7 @@ class StopReport:
 
 
 def stop(name: str, config: RigConfig, clock: Clock, *, seed: int | None = None) -> StopReport:
-    """Stop the table of the bench ``name`` and switch its torque off, whichever program moves it.
+    """Stop the table of the bench ``name`` and switch its torque off, even if another program moves it.
 
     Raises
     ------

@@ -11,7 +11,7 @@ shaft has run through. The platter is not rigid on its shaft: while it is accele
 c one over the square of its natural frequency. The parameters follow by weighted least squares over all readings of the
 motion. Prior knowledge enters as further readings: the bias that was measured at rest, and the uncertainty of the
 scale. The platter's angle is the same sum without c·α and o. Angles are those that the encoder shows when the platter
-is driven upwards, as in the views of a table that stops from below.
+is driven upwards. Views at rest are taken in this state, because the table approaches each angle from below.
 
 Decision: docs/decisions/0046.
 """
@@ -39,7 +39,7 @@ OUTLIER: Final = 4.0
 """Readings that deviate by more standard uncertainties weigh less."""
 SLIP_DEG: Final = 0.25
 SLIP_READINGS: Final = 5
-"""So many readings in a row that deviate by so much show that the platter slipped, or that a sensor is wrong."""
+"""Number of successive readings with a large deviation that shows a slip of the platter or a wrong sensor."""
 FEWEST_READINGS: Final = 4
 
 
@@ -89,12 +89,12 @@ class Trajectory:
         outside_s = np.maximum(at_s - self._time_s[-1], 0) - np.maximum(self._time_s[0] - at_s, 0)
         design = _design(at_s, t, self._time_s, self._rate_dps, self._integral_deg, self._gaps)
         angle = design @ self._values + rate * outside_s + np.interp(at_s, self._time_s, self._integral_deg)
-        angle -= design[:, 3] * delay_s  # the integral was taken at the delayed time already
+        angle -= design[:, 3] * delay_s  # the integral is already at the delayed time
         nearest = np.searchsorted(self._time_s, at_s).clip(1, len(self._time_s) - 1)
         inside_s = np.minimum(np.abs(self._time_s[nearest] - at_s), np.abs(at_s - self._time_s[nearest - 1]))
         unknown = ACCELERATION_DPS2 / 4 * np.square(np.where(outside_s == 0, inside_s, outside_s))
         variance = np.einsum("ij,jk,ik->i", design, self._covariance, design) + self._drift_deg**2 + unknown**2
-        variance += np.square(rate * READ_TIME_S)  # of all readings together
+        variance += np.square(rate * READ_TIME_S)  # the same error applies to all readings
         return Motion(angle, np.sqrt(variance), rate * (1 + self._values[2]) - self._values[1])
 
 
@@ -166,7 +166,7 @@ class TrajectoryRecorder:
         if used.sum() < FEWEST_READINGS:
             return None
         t, e, o = encoder_t[used], encoder_deg[used], played[used]
-        # What is known before: the mean and the standard uncertainty of each parameter.
+        # Prior knowledge: the mean and the standard uncertainty of each parameter.
         mean = np.concatenate(
             [[0.0, 0.0, 0.0, DELAY_S[0]], np.zeros(len(gaps)), [0.0, -self.backlash_deg / 2, -self.backlash_deg / 4]]
         )
@@ -212,7 +212,7 @@ class TrajectoryRecorder:
 
 
 def backlash_states(encoder_deg: Floats, backlash_deg: float) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Return in which direction the shaft drives the platter at each reading, and which readings can be used.
+    """Return the direction in which the shaft drives the platter at each reading, and which readings can be used.
 
     +1: upwards; −1: downwards; 0: not known yet, because the shaft has not rotated by the backlash since the beginning.
     While the shaft runs through its backlash, the platter is anywhere between, and a reading cannot be used.

@@ -1,4 +1,4 @@
-"""The table: rotates to an angle, always from the same side, detects its rest, and measures how far it rotated.
+"""The table: rotates to an angle, always from the same side, waits for rest, and measures the rotation.
 
 Decision: docs/decisions/0004.
 """
@@ -35,24 +35,24 @@ from rig.safety.motion_checks import MotionMonitor, SlipMonitor
 from rig.safety.supervisor import TableState
 
 FIRST_REST_S = 0.6
-"""How long the gyro is averaged for its first bias."""
+"""Time over which the gyro is averaged for its first bias."""
 SETTLE_ALLOWANCE_S = 2.5
 """Time for ringing to die down and for a slow bus, in addition to the motion."""
 
 
 @dataclass(frozen=True, slots=True)
 class Flight:
-    """How a motion is watched and steered while the table turns.
+    """The observation and the control of a motion while the table rotates.
 
     Attributes
     ----------
     each
         Called in each round of the control loop, instead of a pause: it waits for the next frame, for example. It
-        returns a new goal, or None to go on to the last one.
+        returns a new goal, or None to continue to the last one.
     reach_deg
         Lowest and highest goal that ``each`` may return.
     recorder
-        Gets the readings of the encoder and the samples of the gyro.
+        Receives the readings of the encoder and the samples of the gyro.
     velocity_dps
         Cruise speed.
     quiet
@@ -125,7 +125,7 @@ class Turntable(AbstractContextManager["Turntable"]):
                 self._safety.latch(stays_on)
                 raise
             except RigError:
-                if error is None or isinstance(error, KeyboardInterrupt | SystemExit):  # an error is the important one
+                if error is None or isinstance(error, KeyboardInterrupt | SystemExit):  # the first error is reported
                     raise
 
     @property
@@ -316,7 +316,7 @@ class Turntable(AbstractContextManager["Turntable"]):
             with self._safety.motion((start_deg, *waypoints, *steered_deg), self._stop) as motion:
                 slip = SlipMonitor(self._limits, start_deg) if self._trust_gyro else None
                 for waypoint in waypoints:
-                    # Only the last stop must be a rest; at the others it is enough to arrive.
+                    # The table must rest only at the last stop; at the others it is enough to arrive.
                     last = waypoint is waypoints[-1] and (flight is None or flight.quiet)
                     target_deg = self._approach(waypoint, self._config.quiet_s if last else 0.0, slip, flight)
                 self._servo.disarm_watchdog()
@@ -373,7 +373,7 @@ class Turntable(AbstractContextManager["Turntable"]):
         """Give the moving servo another goal; return the monitor of the motion from here on."""
         self._safety.set_goal(self._safety.angle_reference.to_servo(goal_deg))
         here_deg = self._safety.angle_reference.to_table(state.position_deg)
-        # If the goal lies behind, the table overshoots before it comes back.
+        # If the goal is behind the table, it overshoots before it comes back.
         start_deg = max(here_deg, self.stopping_deg(state), key=lambda angle: abs(angle - goal_deg))
         return self._monitor(start_deg, goal_deg)
 
@@ -433,7 +433,7 @@ class Turntable(AbstractContextManager["Turntable"]):
                 raise explain_unsettled(goal_deg, angle_deg, allowed_s, state, arrived, peak_dps, config.velocity_dps)
 
     def _holds(self) -> bool:
-        """Return whether the servo's torque is on: without it, no profile is ongoing either."""
+        """Return whether the servo's torque is on; without torque there is no motion profile."""
         condition = self._servo.read_condition()
         return condition.torque and not condition.power_lost
 

@@ -46,14 +46,14 @@ def enroll(
 ) -> Generator[Event, None, Enrolled]:
     """Enroll the object ``name`` with views at even steps; yields events and returns the last of them.
 
-    The table rotates upwards from 0, so that its backlash stays taken up. View k has the azimuth −k·360/views, or + if
-    the servo moves the camera around the object. If the cable budget does not allow that, the table starts further
-    back; a table that covers less than a revolution takes the views within its limits. An interrupted enrollment keeps
-    its views: ``resume`` takes the missing ones, provided that the object was not moved. Closing the generator switches
-    the torque off.
+    The table rotates upwards from 0, so that its backlash stays on one side. View k has the azimuth −k·360/views, or
+    +k·360/views if the servo moves the camera around the object. If the cable budget does not allow that, the table
+    starts further back; a table that covers less than a revolution takes the views within its limits. An interrupted
+    enrollment keeps its views: ``resume`` takes the missing ones, provided that the object was not moved. Closing the
+    generator switches the torque off.
 
-    With ``fly`` the views are taken in one turn without a stop (`rig.plans.fly`). Those that fail or are missing are
-    then taken at rest. The default is ``enroll.mode``; "auto" means at rest.
+    With ``fly`` the views are taken in one revolution without a stop (`rig.plans.fly`). Views that fail or are missing
+    are then taken at rest. The default is ``enroll.mode``; "auto" means at rest.
 
     Every view is described by `rig.views.description.DESCRIPTORS`. Segmentation uses the bench's empty-table image, if
     there is one (`rig.plans.photograph_table`); the enrollment stores it. At the end all views are segmented again,
@@ -145,7 +145,7 @@ def _take_views(
     with Turntable(bench) as table:
         retakes, first, index = yield from _step_views(bench, enrollment, table, viewer, angles_deg, describe)
         # Return to the first view to check that the object was not moved, then to 0 to free the cable: without its
-        # supply the servo forgets whole revolutions, and a cable that stays wound up is wound further the next time.
+        # supply the servo loses the count of revolutions, and the next enrollment would wind up the cable further.
         if first and first[0] != index:
             yield from _check_not_moved(bench, enrollment, table, viewer, *first)
         if first is None or first[0] == index or first[1] != 0.0:
@@ -156,7 +156,7 @@ def _take_views(
 def _fly_and_complete(
     bench: Bench, enrollment: Enrollment, angles_deg: Mapping[int, float], describe: ViewDescriber
 ) -> Generator[Event, None, int]:
-    """Take and store the views in one turn, the others at rest, return to 0; return the number of repeated images."""
+    """Take and store views in one revolution, the others at rest, go to 0; return the number of repeated images."""
     viewer = Viewer(bench.camera, bench.config)
     retakes = 0
     with Turntable(bench) as table:

@@ -1,4 +1,4 @@
-"""The course of an enrollment before anything moves: table angles, duration, and whether it is possible."""
+"""The plan of an enrollment before anything moves: table angles, duration, and whether it is possible."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -50,12 +50,12 @@ def even_azimuths(views: int, limits_deg: tuple[float, float], sign: int = -1) -
 def table_angles(azimuth_deg: Sequence[float], limits_deg: tuple[float, float], sign: int = -1) -> tuple[float, ...]:
     """Return the unwrapped table angle for each planned azimuth: always upwards, and within the limits.
 
-    The table always rotates upwards, so that the backlash stays taken up.
+    The table always rotates upwards, so that the backlash stays on one side.
 
     Raises
     ------
     LimitExceeded
-        The cable budget does not allow so many views in one direction.
+        The cable budget does not allow this number of views in one direction.
     """
     if not azimuth_deg:
         return ()
@@ -80,7 +80,7 @@ def table_angles(azimuth_deg: Sequence[float], limits_deg: tuple[float, float], 
 
 
 class Obstacle(StrEnum):
-    """Why an object would not be enrolled."""
+    """The reason why an object would not be enrolled."""
 
     ALREADY_ENROLLED = "already_enrolled"
     INTERRUPTED = "interrupted"
@@ -89,12 +89,12 @@ class Obstacle(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class DryRun:
-    """What an enrollment would do.
+    """The plan of an enrollment that is not carried out.
 
     ``action`` is "enroll", "resume", "replace", "skip" or "reject"; the last two have an ``obstacle``.
     ``enrolled_views`` is the number of views that the object has already. ``angles_deg`` and ``azimuths_deg`` are those
     of the views in their order. ``table_deg`` is the table angle before; ``travel_deg`` is the sum of all rotations,
-    unwinding included. ``in_motion``: the views are taken in one turn.
+    unwinding included. ``in_motion`` is whether the views are taken in one revolution.
     """
 
     name: str
@@ -121,7 +121,7 @@ def dry_run(
     replace: bool = False,
     fly: bool | None = None,
 ) -> tuple[DryRun, ...]:
-    """Return what enrolling these objects would do. Nothing moves and nothing is stored.
+    """Return the plans of enrolling these objects. Nothing moves and nothing is stored.
 
     Parameters
     ----------
@@ -206,7 +206,7 @@ class TimeLeft:
     angles_deg
         Table angles of the coming views, in their order.
     in_motion
-        Whether they are taken in one turn; they are reported after it.
+        Whether they are taken in one revolution; they are reported after it.
     """
 
     def __init__(self, model: MotionModel, angles_deg: Sequence[float], *, in_motion: bool = False) -> None:

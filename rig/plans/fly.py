@@ -1,8 +1,8 @@
 """The part of an enrollment in which the views are taken while the table rotates: a fly scan.
 
-The table turns from rest to rest by one revolution. For each planned angle the frame nearest to it is kept. When the
-turn is over, the trajectory of the platter gives each frame its angle, and each is judged as a view at rest is. Nothing
-is stored before: an interrupted turn leaves no view.
+The table rotates from rest to rest by one revolution. For each planned angle the plan holds the nearest frame in
+memory. After the revolution, the trajectory of the platter gives each frame its angle, and each frame is judged like a
+view at rest. Nothing is stored before that, so an interrupted revolution leaves no view.
 
 Decision: docs/decisions/0047.
 """
@@ -32,14 +32,14 @@ from rig.views.image_files import Encoder
 from rig.views.stream import FrameStream, StreamFrame, middle_ns
 
 NEAR_SHARE = 0.6
-"""A frame stands for a planned angle if it is within this share of the step from it."""
+"""Largest distance of a frame from its planned angle, as a share of the step."""
 READINGS = 8
-"""Readings of the encoder from which the angle of a frame is estimated in the turn."""
+"""Readings of the encoder from which the angle of a frame is estimated during the revolution."""
 
 
 @dataclass
 class Scan:
-    """Frames of a turn: the nearest one to each planned angle, and the stamps of all."""
+    """The frames of a revolution: the nearest one to each planned angle, and the time stamps of all."""
 
     bench: Bench
     table: Turntable
@@ -50,7 +50,7 @@ class Scan:
     stamps_ns: list[int] = field(default_factory=list)
 
     def each(self) -> None:
-        """Wait for the next frame, and keep it if it is the nearest so far to a planned angle."""
+        """Wait for the next frame, and hold it in memory if it is the nearest so far to a planned angle."""
         frame = self.stream.next(self.table.collect_gyro)
         if frame is None:
             return
@@ -62,7 +62,7 @@ class Scan:
                 self.nearest[index] = away_deg, frame
 
     def _about_deg(self, time_ns: int) -> float:
-        """Return the angle at a time, roughly: from the last readings of the encoder."""
+        """Return the approximate angle at a time, from the last readings of the encoder."""
         readings = self.recorder.newest_readings(READINGS)
         if len(readings) < 2:
             return readings[-1][1] if readings else self.table.rest_deg
@@ -75,7 +75,7 @@ class Scan:
 
 
 def start_of_revolution(bench: Bench, angles_deg: Mapping[int, float]) -> float | None:
-    """Return where a revolution upwards that passes all angles begins; None if the cable budget does not allow one."""
+    """Return the start of a revolution upwards that passes all angles; None if the cable budget does not allow one."""
     low_deg, high_deg = bench.config.table.limits_deg
     start_deg = min(min(angles_deg.values()), high_deg - 360.0)
     return start_deg if start_deg >= low_deg and max(angles_deg.values()) <= start_deg + 360.0 else None
@@ -89,10 +89,10 @@ def fly_views(
     angles_deg: Mapping[int, float],
     describe: ViewDescriber,
 ) -> Generator[Event, None, tuple[set[int], float, NDArray[np.uint8], NDArray[np.uint8]]]:
-    """Take the views at these table angles in one turn, and store those that pass their checks.
+    """Take the views at these table angles in one revolution, and store those that pass their checks.
 
-    Returns the indices of the stored views, the start angle, and the frames at rest before and after the turn, which
-    show the same side of the object.
+    Returns the indices of the stored views, the start angle, and the frames at rest before and after the revolution,
+    which show the same side of the object.
 
     Raises
     ------
@@ -101,7 +101,7 @@ def fly_views(
     LimitExceeded
         The cable budget does not allow a revolution.
     RotationDisagreement
-        Encoder and gyro disagree: no view of the turn is stored.
+        Encoder and gyro disagree: no view of the revolution is stored.
     """
     config = bench.config
     require_camera_time(config)

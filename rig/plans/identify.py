@@ -43,10 +43,10 @@ def identify(
     After each view the strategy chooses the next view or ends the search (`rig.search.strategies`). ``dense`` is the
     bench's own: it takes the next best view until the stopping rule, which was calibrated on the catalog, finds an
     object or calls it unknown. ``ahbr`` is the paper's: the first rotation is fixed, and each further one leads to the
-    side on which the candidates look less similar (Eq. 5-7), until an enrolled object leads all others by
-    ``identify.margin`` per view, or after ``identify.max_views``. Its object is unknown if its score per view is below
-    ``identify.min_score``; the default is what the enrolled views score among each other (`hbr.open_set_threshold`).
-    Closing the generator turns the torque off.
+    side on which the candidates look less similar (Eq. 5-7). The search ends when an enrolled object leads all others
+    by ``identify.margin`` per view, or after ``identify.max_views``. The object is unknown if its score per view is
+    below ``identify.min_score``; the default comes from the scores of the enrolled views among each other
+    (`hbr.open_set_threshold`). Closing the generator turns the torque off.
 
     Parameters
     ----------
@@ -55,7 +55,7 @@ def identify(
     model : Model or hbr.ViewIndex
         The enrolled views, from `rig.search.model.load_model`; a ViewIndex is for the paper's strategies.
     strategy
-        Its name, or a strategy of your own. The default is the one that the model is for.
+        Its name, or a `Strategy` object. The default is the one that the model is for.
     seed
         For strategies that draw random numbers.
     top
@@ -93,7 +93,7 @@ def identify(
     moving = isinstance(search, ArcSearch)
     bench_image = model.bench_image if isinstance(model, Model) else None
     if bench.config.table.carries == "camera":
-        bench_image = None  # what the camera sees behind the object changes with each view
+        bench_image = None  # the background of the object changes with each view
     describe = SearchDescriber(
         bench.config.view, search.descriptor, empty_table, revise=not moving, bench_image=bench_image
     )
@@ -118,7 +118,7 @@ def identify(
             raise found.failed
         return answer
     travelled_deg = 0.0
-    sign = bench.config.table.orientation_sign  # the camera goes around the object against the table
+    sign = bench.config.table.orientation_sign  # the camera moves opposite to the table
     number = 0
     failed: RigError | None = None
     with Turntable(bench) as table:
@@ -137,7 +137,7 @@ def identify(
             yield ranked
             if isinstance(step, Finish):
                 break
-            # Rotate: within the cable budget, and count what the table really did.
+            # Rotate: within the cable budget, and use the measured rotation.
             asked_deg = table.rest_deg + sign * step.rotation_deg
             decided = decided_event(number, step, table.within_reach(asked_deg), top)
             yield decided

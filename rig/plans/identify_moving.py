@@ -1,8 +1,8 @@
-"""The part of an identification in which the table rotates: frames that pass on the way are evidence.
+"""The part of an identification in which the table rotates: every frame on the way is evidence.
 
 The first view is taken at rest. Then the table rotates along an arc; each frame is judged, described and added to the
-belief. Each time the frames have covered another step of the circle the search decides: it ends in mid-turn, continues,
-or gives the table another goal without a stop. If the table arrives first, the next view is taken at rest.
+belief. Each time the frames have covered another step of the circle, the search decides: it ends during the rotation,
+continues, or gives the table another goal without a stop. If the table arrives first, the next view is taken at rest.
 
 Decision: docs/decisions/0047.
 """
@@ -29,18 +29,18 @@ from rig.views.description import ViewDescriber
 from rig.views.stream import FrameStream
 
 FIRST_REST_S: Final = 0.15
-"""How long the gyro is averaged before the first view: the fit of the trajectory corrects the bias later."""
+"""Time over which the gyro is averaged before the first view; the fit of the trajectory corrects the bias later."""
 STAMPS: Final = 30
 """Time stamps that are compared with each other: a second of frames."""
 MOST_FLIGHTS: Final = 8
 MOST_REJECTED: Final = 15
-"""After so many rejected frames in a row the table stops, and the next view is taken at rest."""
+"""Number of successive rejected frames after which the table stops and the next view is taken at rest."""
 NEW_GOAL_DEG: Final = 10.0
 
 
 @dataclass
 class Found:
-    """How a search in motion ended."""
+    """The end of a search in motion."""
 
     ranked: Ranked
     end: Finish
@@ -51,7 +51,7 @@ class Found:
 
 @dataclass
 class _Passing:
-    """The frames that pass: what `Flight.each` does in a search."""
+    """The frames of an arc: the function `Flight.each` of a search."""
 
     bench: Bench
     table: Turntable
@@ -74,7 +74,7 @@ class _Passing:
     stamps_ns: list[int] = field(default_factory=list)
 
     def each(self) -> float | None:
-        """Take the next frame as evidence; return a new goal, or where the table stops if the search has ended."""
+        """Take the next frame as evidence; return a new goal, or the stopping angle if the search has ended."""
         frame = self.stream.next(self.table.collect_gyro, newest=True)
         if frame is None:
             return None
@@ -119,7 +119,7 @@ class _Passing:
         return goal_deg
 
     def _stop(self) -> float:
-        """Return where the table stops if it brakes now."""
+        """Return the angle at which the table stops if it brakes now."""
         self.goal_deg = self.table.stopping_deg(self.bench.servo.read_state())
         return self.goal_deg
 
@@ -136,8 +136,8 @@ def search_in_motion(
 ) -> Generator[Event, None, Found]:
     """Search along arcs until the stopping rule ends the search; the frames of an arc become events at its end.
 
-    ``live`` gets its event of each frame in the turn already. It must return at once, because it is called in the
-    control loop. Raises what `rig.plans.identify.identify` raises.
+    ``live`` gets the event of each frame while the table still rotates. It must return at once, because it is called in
+    the control loop. Raises what `rig.plans.identify.identify` raises.
     """
     config = bench.config
     sign = config.table.orientation_sign
@@ -151,7 +151,7 @@ def search_in_motion(
         recorder: TrajectoryRecorder | None = None
         settled_ns = bench.clock.now_ns()
         for _ in range(MOST_FLIGHTS):
-            # A view at rest: the first one, and where an arc has ended without an answer.
+            # A view at rest: the first one, and after each arc that ended without an answer.
             captured = yield from capture(number, viewer, table, settled_ns)
             azimuth_deg = float(wrap360(sign * table.rest_deg))
             described = describe(captured.image_bgr)

@@ -13,7 +13,7 @@ STEPS_DEG = (0.5, 1.0, 5.0, 15.0, 45.0, 90.0)
 
 
 class JogKey(Enum):
-    """What the operator asks for."""
+    """The operator's keys."""
 
     FORWARD = "forward"
     BACK = "back"

@@ -28,8 +28,8 @@ def photograph_table(bench: Bench, *, anyway: bool = False) -> Generator[Event, 
     """Take the empty-table image and store it beside the bench's state. Yields events and returns the last one.
 
     An operator that can clear the table does so; otherwise the table must be empty already. The plan takes two frames
-    and rotates the table a little between them: what changes is on the table. The frames are checked like those of
-    views. Closing the generator switches the torque off.
+    and rotates the table a little between them. If something is on the table, the image changes. The frames are checked
+    like those of views. Closing the generator switches the torque off.
 
     Parameters
     ----------

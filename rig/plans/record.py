@@ -25,11 +25,11 @@ class ResultRecorder:
     Parameters
     ----------
     place
-        Where the catalog is.
+        Place of the catalog.
     bench
         The bench that takes the views.
     clock
-        Gives the civil time of the results.
+        Clock for the civil time of the results.
     catalog_version
         Returns `Catalog.version` of the views that the search has loaded.
     operator
@@ -64,7 +64,7 @@ class ResultRecorder:
         self._azimuths_deg: list[float] = []
 
     def stream(self, events: Generator[Event, None, object]) -> Generator[Event, None, None]:
-        """Yield the events of `identify` or `watch`; after each answer also `Recorded`, or why it is not recorded."""
+        """Yield the events of `identify` or `watch`; after each answer also `Recorded`, or a `Warned` if that fails."""
         try:
             for event in events:
                 yield event

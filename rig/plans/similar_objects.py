@@ -1,4 +1,4 @@
-"""What an enrolled object can be confused with."""
+"""The objects that an enrolled object can be confused with."""
 
 from hbr.model import symmetry
 from hbr.model.views import Views

@@ -38,7 +38,7 @@ class TrayItem:
 
 
 class TrayDecision(StrEnum):
-    """What the operator decides about an object."""
+    """The decisions of the operator about an object."""
 
     PROCEED = "proceed"
     RESTART = "restart"
@@ -47,10 +47,10 @@ class TrayDecision(StrEnum):
 
 
 class TrayOperator(Protocol):
-    """Puts the objects on the table and decides what happens with each."""
+    """An operator: puts the objects on the table and decides whether each is enrolled."""
 
     def request(self, item: TrayItem, number: int, of: int, interrupted: ObjectSummary | None) -> TrayDecision:
-        """Return once the object is on the table.
+        """Wait until the object is on the table, and return the decision about it.
 
         ``interrupted`` is the object's interrupted enrollment, if it has one: PROCEED resumes it, RESTART repeats it
         because the object was moved.
@@ -142,8 +142,8 @@ def enroll_tray(
 ) -> Generator[Event, None, None]:
     """Enroll the objects of a tray one after the other; yields an `Item` before the events of each.
 
-    Complete objects are skipped, and interrupted enrollments are resumed. After an interruption, the same call
-    therefore does what is left.
+    Complete objects are skipped, and interrupted enrollments are resumed. So after an interruption, the same call
+    enrolls the remaining objects.
 
     Parameters
     ----------

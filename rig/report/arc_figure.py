@@ -1,4 +1,4 @@
-"""The figure of a search in motion: the probability along the arc, and when the search could have ended."""
+"""The figure of a search in motion: the probability along the arc, and the time at which the evidence was enough."""
 
 from typing import NamedTuple
 
@@ -13,7 +13,7 @@ from rig.report.records import IdentificationRecord
 
 
 class ArcFigure(NamedTuple):
-    """A chart and its words; both are empty for a search at rest."""
+    """A chart and its text; both are empty for a search at rest."""
 
     chart: Markup = Markup()
     words: str = ""
@@ -47,7 +47,7 @@ def arc_figure(record: IdentificationRecord) -> ArcFigure:
 
 
 def _words(frames: list[FrameUsed], enough: FrameUsed | None, rotated: dict[int, float]) -> str:
-    """Return which frames were used, and when they were enough; empty for runs that do not say it."""
+    """Return which frames were used, and when they were enough; empty for runs that do not contain this."""
     if not frames:
         return ""
     last = frames[-1]

@@ -36,7 +36,7 @@ def thumbnail(
     region
         The part to show: x, y, width, height in pixels; None shows all.
     box
-        What to outline in it: x, y, width, height in pixels of the part.
+        Box to outline in it: x, y, width, height in pixels of the part.
 
     Returns
     -------
@@ -45,7 +45,7 @@ def thumbnail(
     Raises
     ------
     ValueError
-        The image is not uint8 (H, W, 3), or the region holds none of it.
+        The image is not uint8 (H, W, 3), or the region contains no part of it.
     """
     if image_bgr.dtype != np.uint8 or image_bgr.ndim != 3 or image_bgr.shape[2] != 3:
         raise ValueError(f"the image is {image_bgr.dtype} {image_bgr.shape}; give uint8 (H, W, 3) BGR")

@@ -39,7 +39,7 @@ FRAME: Final = (240, 240)
 
 @dataclass(frozen=True, slots=True)
 class ReportView:
-    """An accepted view: its thumbnail, its evidence, the move before it, and why frames before it were rejected."""
+    """An accepted view: thumbnail, evidence, the move before it, and the reasons for rejecting frames before it."""
 
     index: int
     azimuth_deg: float
@@ -137,10 +137,10 @@ class EnrollmentRecord:
 class Truth:
     """The object that is really on the table.
 
-    ``name`` is None for an object that was never enrolled. ``yaw_deg`` is how far it stands turned counter-clockwise
-    against its enrollment, None if it is not known. ``symmetry_deg`` is the smallest turn after which it looks the
-    same: 360 for an object without symmetry, 0 for one that looks the same from everywhere. ``description`` is what
-    people call an object that was never enrolled.
+    ``name`` is None for an object that was never enrolled. ``yaw_deg`` is its rotation relative to its enrollment,
+    counter-clockwise, None if it is not known. ``symmetry_deg`` is the smallest rotation after which it looks the same:
+    360 for an object without symmetry, 0 for one that looks the same from everywhere. ``description`` is the common
+    name of an object that was never enrolled.
     """
 
     name: str | None
@@ -207,13 +207,13 @@ class IdentificationRecord:
 
     @property
     def pose_error_deg(self) -> float | None:
-        """Distance of the answer's yaw from the true one, modulo the object's symmetry; None where it means nothing."""
+        """Distance of the answer's yaw from the true one, modulo the object's symmetry; None if it is not defined."""
         truth, answer = self.truth, self.answer
         if truth is None or answer is None or answer.name is None or not self.correct:
             return None
         if truth.yaw_deg is None or truth.symmetry_deg <= 0 or not answer.yaw_set_deg:
             return None
-        # One period of the symmetry is one turn of the circle.
+        # Angles are compared modulo one period of the symmetry.
         periods = 360.0 / truth.symmetry_deg
         true_deg = truth.yaw_deg
         return min(abs(wrap180((yaw_deg - true_deg) * periods)) / periods for yaw_deg in answer.yaw_set_deg)
@@ -228,8 +228,8 @@ class IdentificationRecord:
     def steps(self) -> list[PathStep]:
         """The camera's rotations between the views, as the table made them; in motion, those between decisions.
 
-        The cable's limits may make the table rotate the long way: the azimuths show where a rotation ended, the encoder
-        how many times around it went.
+        The cable's limits may make the table rotate the long way: the azimuths show the end of a rotation, and the
+        encoder its number of revolutions.
         """
         steps: list[PathStep] = []
         last: Decided | None = None

@@ -1,1 +1,1 @@
-"""What protects the table: the state machine, limits, motion checks, and the state that survives a restart."""
+"""The protection of the table: the state machine, limits, motion checks, and the state that survives a restart."""

@@ -19,7 +19,7 @@ from rig.safety.saved_state import SavedTable
 TOLERANCE_DEG = 2.0
 """How far a shaft may relax when its torque goes off, including the encoder's noise."""
 HAND_DEG = 180.0
-"""Largest rotation by hand that is taken for one; a larger change is probably a servo that lost its count."""
+"""Largest change that counts as a rotation by hand; after a larger one, the servo has probably lost its count."""
 OVERSHOOT_DEG = 5.0
 """How far an interrupted motion may overshoot its path."""
 
@@ -79,9 +79,9 @@ class SavedAngleCheck:
     Attributes
     ----------
     finding
-        What the comparison showed.
+        Result of the comparison.
     shift_deg
-        What must be added to the servo's positions.
+        Angle that must be added to the servo's positions.
     position_deg, saved_position_deg
         The servo's position now and when it was stored.
     firmware, saved_firmware
@@ -103,7 +103,7 @@ class SavedAngleCheck:
 
     @property
     def certain(self) -> bool:
-        """Whether the angle can be trusted; otherwise the operator must look at the cable."""
+        """Whether the angle is certain; otherwise the operator must look at the cable."""
         return self.finding in _CERTAIN
 
     def __str__(self) -> str:
@@ -121,8 +121,9 @@ class AngleReference:
     """Converts between the servo's positions and the table's angles.
 
     The table's angle is ``direction · (position − error + shift − zero)``, degrees, unwrapped. The error is the
-    encoder's error at that position, from calibration. The shift is what the servo lost (whole revolutions) or the
-    operator set (`set_angle`). ``revolution_deg`` is the table's rotation for one revolution of the encoder.
+    encoder's error at that position, from calibration. The shift is the whole revolutions that the servo lost, or the
+    angle that the operator set (`set_angle`). ``revolution_deg`` is the table's rotation for one revolution of the
+    encoder.
     """
 
     def __init__(self, config: TableConfig, shift_deg: float = 0.0, revolution_deg: float = 360.0) -> None:
@@ -168,9 +169,9 @@ def check_saved_angle(
 ) -> SavedAngleCheck:
     """Compare the servo's position after a pause with the stored one.
 
-    As long as the servo has its supply, it counts its revolutions itself, also if the table is rotated by hand. Without
-    supply only the angle within the revolution remains: if it is the stored one, the stored revolutions hold as well.
-    In all other cases the operator must look at the cable. ``revolution_deg`` is the period of the encoder.
+    As long as the servo has its supply, it counts its revolutions, even if the table is rotated by hand. Without supply
+    only the angle within the revolution remains. If it is the stored angle, the stored number of revolutions is also
+    valid. In all other cases the operator must look at the cable. ``revolution_deg`` is the period of the encoder.
     """
     if saved is None:
         return SavedAngleCheck(AngleFinding.NEVER_REFERENCED, 0.0, position_deg)

@@ -1,4 +1,4 @@
-"""The lock that reserves a bench for one program, and who holds it.
+"""The lock that reserves a bench for one program, and the holder of the lock.
 
 Decision: docs/decisions/0009.
 """
@@ -59,7 +59,7 @@ class BenchLock:
             since_utc=clock.utc().isoformat(timespec="seconds"),
             terminates=callable(signal.getsignal(signal.SIGTERM)),
         )
-        with suppress(OSError):  # full disk: the lock works, only the holder's name is missing
+        with suppress(OSError):  # full disk: the lock works without the holder's name
             self._file.truncate(0)
             self._file.write(mine.model_dump_json())
             self._file.flush()
@@ -73,7 +73,8 @@ class BenchLock:
 def holder(path: Path) -> Holder | None:
     """Return the program that uses the bench with the state folder ``path``; None if there is none.
 
-    The name of a killed program does not count, because its lock is gone. A holder whose name is not known has pid 0.
+    The name of a killed program does not count, because its lock is released. A holder whose name is not known has pid
+    0.
     """
     try:
         with open(path / "lock", encoding="utf-8", opener=no_follow) as file:

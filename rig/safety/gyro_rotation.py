@@ -26,9 +26,10 @@ Axis = Literal["x", "y", "z"]
 MEMORY_S = 2.0
 """Longer rests do not improve the bias, because it drifts during them."""
 DRAIN_S, DRAIN_SAMPLES = 0.2, 60
-"""How long, and how many, samples may wait in the sensor's FIFO (170 in the MPU-6050): reading costs bus time."""
+"""Longest time, and largest number, of samples in the sensor's FIFO (170 in the MPU-6050), because reading uses the
+bus."""
 HUNG_S, HUNG_SAMPLES = 0.15, 20
-"""Duration and number of equal samples that mean that the sensor hangs."""
+"""Duration and number of equal samples that show that the sensor hangs."""
 FINE_DPS = 550.0
 """Up to this range, a sensor's steps are small enough to show its noise."""
 REST_PEAK_DPS = 0.5
@@ -48,7 +49,7 @@ class Bias:
 
 
 class GyroIssue(StrEnum):
-    """Why a rotation by the gyro is not valid."""
+    """The reasons why a rotation by the gyro is not valid."""
 
     LOST_SAMPLES = "lost-samples"
     OUT_OF_RANGE = "out-of-range"

@@ -23,13 +23,13 @@ from rig.devices.servo import ServoLimits, ServoState
 from rig.safety.gyro_rotation import Rotation
 
 STANDING_DPS = 3.0
-"""A slower shaft counts as standing still: two units of the servo's velocity reading."""
+"""Speed below which the shaft counts as standing still: two units of the servo's velocity reading."""
 HELD_DEG = 2.0
-"""A table that rests nearer to its goal is held by friction: its servo's position controller is too weak."""
+"""Distance from the goal up to which friction holds the table, because the servo's position controller is too weak."""
 VOLTAGE_S = 0.1
 """How long a bad voltage must last: starting motors make it dip."""
 COOLER_C = 5.0
-"""How much cooler than its limit a servo must be before it may work again."""
+"""Difference between its limit and the temperature at which a servo may work again."""
 
 
 def implausible_readings(state: ServoState) -> list[str]:
@@ -47,7 +47,7 @@ def implausible_readings(state: ServoState) -> list[str]:
 def find_servo_fault(
     state: ServoState, config: SafetyConfig, limits: ServoLimits, *, again: bool = False
 ) -> RigError | None:
-    """Return why a servo must not work, moving or not (hardware error, temperature, supply); None if it may.
+    """Return the error that forbids a servo to work (hardware error, temperature, supply); None if it may work.
 
     Parameters
     ----------
@@ -137,7 +137,7 @@ class MotionMonitor:
         angle_deg
             The table's angle from this reading.
         lag_deg
-            How far the table is behind the servo's profile; None if that is not known.
+            Angle by which the table is behind the servo's profile; None if that is not known.
 
         Raises
         ------
@@ -207,7 +207,7 @@ class MotionMonitor:
             self._lasts("supply", False, state.time_ns, VOLTAGE_S)
 
     def _lasts(self, name: str, holds: bool, time_ns: int, seconds: float) -> bool:
-        """Return whether a condition has been true in all readings for so long."""
+        """Return whether a condition has been true in all readings for this time."""
         if not holds:
             self._since_ns.pop(name, None)
             return False

@@ -1,4 +1,4 @@
-"""State of a bench that survives its program: how far the cable is wound up, a latched fault, who uses the bench.
+"""State of a bench that survives its program: the cable's revolutions, a latched fault, and the program that uses it.
 
 Decision: docs/decisions/0009.
 """
@@ -38,7 +38,7 @@ class SavedTable(_Saved):
 
     ``shift_deg`` must be added to them (revolutions that the servo lost, an angle that the operator set). ``path_deg``
     is the range of a motion that had not ended when this was stored. ``zero_deg``, ``direction`` and ``gear_ratio`` are
-    the settings that turn positions into table angles; None if an earlier version stored this.
+    the settings that convert positions to table angles; None if an earlier version stored this.
     """
 
     model_number: int
@@ -72,7 +72,7 @@ class LatchedFault(_Saved):
 
 
 class BenchState(_Saved):
-    """The whole stored state; ``damage`` (not stored) says why an earlier state could not be read.
+    """The whole stored state; ``damage`` (not stored) is the reason why an earlier state could not be read.
 
     ``checksum`` is set in the file only: SHA-256 of the other values.
     """
@@ -89,7 +89,7 @@ class BenchState(_Saved):
 
 
 class Holder(_Saved):
-    """The program that uses a bench; ``terminates`` says whether it handles SIGTERM and ends in an orderly way."""
+    """The program that uses a bench; ``terminates`` is whether it handles SIGTERM and ends in an orderly way."""
 
     pid: int
     command: str
@@ -98,7 +98,7 @@ class Holder(_Saved):
 
 
 class SessionEnd(StrEnum):
-    """How a program ended its session with the bench."""
+    """The ways in which a program ends its session with the bench."""
 
     FINISHED = "finished"
     FAILED = "failed"
@@ -153,7 +153,7 @@ class StateStore(Protocol):
         """
 
     def latch(self, fault: LatchedFault | None) -> None:
-        """Store the latched fault, also on a full disk if a state was saved before; None removes it.
+        """Store the latched fault, even on a full disk if a state was saved before; None removes it.
 
         Raises
         ------
@@ -253,7 +253,8 @@ class FileStore:
     def load(self) -> BenchState:
         """Return the stored state.
 
-        If a file cannot be read, the state is empty and says why, and a fault is latched: a fault may be lost.
+        If a file cannot be read, the state is empty with the reason in ``damage``, and a fault is latched, because the
+        file may have contained one.
         """
         state, fault, damage = BenchState(), None, ""
         try:
@@ -372,7 +373,7 @@ def _session(store: StateStore) -> SavedSession | None:
 
 
 def _store_session(store: StateStore, session: SavedSession) -> None:
-    with suppress(StateNotStored):  # full disk: only the words about the session are missing
+    with suppress(StateNotStored):  # full disk: only the record of the session is missing
         store.store_file(SESSION, session.model_dump_json().encode())
 
 

@@ -1,8 +1,8 @@
-"""Decides whether the table may move, and what must happen before it may move again.
+"""Supervision of the table: whether it may move, and what must happen before it may move again.
 
 `rig.safety.state_machine` has the states and their transitions. A motion is a `with` block that can only end by
 arriving, by a stop or by a latched fault. A fault outlives the process and an unplugged cable. It ends when its cause
-is gone and the operator acknowledges it.
+is removed and the operator acknowledges it.
 
 Decision: docs/decisions/0008.
 """
@@ -69,13 +69,13 @@ class Safety:
     Parameters
     ----------
     servo
-        Asked for its condition. It is only written to by `acknowledge` with a reboot.
+        The servo. It is only read, except by `acknowledge` with a reboot.
     config
         The bench's configuration.
     clock
-        Dates the faults.
+        Clock for the times of the faults.
     store
-        Where the state survives the process; None keeps it in memory.
+        Store in which the state survives the process; None holds it in memory.
     """
 
     def __init__(self, servo: Servo, config: RigConfig, clock: Clock, store: StateStore | None = None) -> None:
@@ -111,7 +111,7 @@ class Safety:
 
     @property
     def doubt(self) -> SavedAngleCheck | None:
-        """Why the table is `TableState.UNREFERENCED`; None if it is not."""
+        """The reason why the table is `TableState.UNREFERENCED`; None if it is not."""
         return self._record.doubt
 
     @property
@@ -192,7 +192,7 @@ class Safety:
 
     @contextmanager
     def motion(self, ends_deg: tuple[float, ...], stop: Callable[[], bool]) -> Iterator[Motion]:
-        """Be `TableState.MOVING` for the duration of a ``with`` block, on a path between ``ends_deg`` (of the table).
+        """Hold the state `TableState.MOVING` for a ``with`` block, on a path between the table angles ``ends_deg``.
 
         If the block is interrupted, ``stop`` is called. It stops the table and returns whether the servo received the
         stop. The state is then STOPPED or DISCONNECTED, or a FAULT is latched. The path is on the disk before anything
@@ -254,11 +254,11 @@ class Safety:
         self._run_monitors()
 
     def end_session(self, ended: SessionEnd) -> None:
-        """Store how this program ends its session, so that the next one does not take its end for a crash."""
+        """Store how this program ends its session, so that the next one knows that it did not crash."""
         end_session(self._store, ended)
 
     def released(self) -> None:
-        """Store where the table rests now that the torque is off, and clear a request to stop."""
+        """Store the angle at which the table rests without torque, and clear a request to stop."""
         with suppress(DeviceSilent, StateNotStored):  # the state stored before the motion stays valid
             if self._record.check_angle():
                 self._record.save_position()
@@ -336,7 +336,7 @@ class Safety:
         self._apply(StateEvent.REFER)
 
     def set_revolutions(self, revolutions: int) -> None:
-        """Set by how many revolutions the cable is wound up, as the operator sees it; home stays where it was.
+        """Set the number of revolutions by which the cable is wound up, as the operator sees it; home does not change.
 
         Raises
         ------
@@ -366,7 +366,7 @@ class Safety:
                 raise
 
     def _find_monitor_fault(self, symptom: BaseException) -> BaseException:
-        """Return the fault of a device that stopped the bench, else ``symptom``: the servo then only falls silent."""
+        """Return the fault of a device that stopped the bench, else ``symptom``."""
         if isinstance(symptom, RigError) and not symptom.latches:
             for monitor in self.monitors:
                 try:
@@ -388,7 +388,7 @@ class Safety:
             self._apply(StateEvent.REFER if certain else StateEvent.DOUBT)
 
     def _not_ready(self) -> NotReady:
-        """Return the error that says why nothing may move, and what to do."""
+        """Return the error with the reason why nothing may move, and the next step."""
         if self.fault is not None:
             fault = self.fault
             return FaultLatched(

@@ -1,4 +1,4 @@
-"""What is stored about one bench's table: its angle, how its cable is wound up, and the latched fault."""
+"""The stored state of one bench's table: its angle, the revolutions of its cable, and the latched fault."""
 
 from dataclasses import replace
 from math import isclose
@@ -11,7 +11,7 @@ from rig.safety.saved_state import BenchState, LatchedFault, SavedTable, StateSt
 
 
 class TableRecord:
-    """The stored state of a table, compared with its servo and kept up to date.
+    """The stored state of a table: compared with its servo, and updated.
 
     Parameters
     ----------
@@ -20,7 +20,7 @@ class TableRecord:
     config
         Direction, zero and encoder calibration of the table.
     store
-        Where the state survives the process.
+        Store in which the state survives the process.
     """
 
     def __init__(self, servo: Servo, config: TableConfig, store: StateStore) -> None:
@@ -41,7 +41,7 @@ class TableRecord:
 
     @property
     def damage(self) -> str:
-        """Why the stored state could not be read; empty if it could."""
+        """The reason why the stored state could not be read; empty if it could."""
         return self._state.damage
 
     def check_angle(self) -> bool:
@@ -66,7 +66,7 @@ class TableRecord:
         return not low_deg - TOLERANCE_DEG <= table_deg <= high_deg + TOLERANCE_DEG
 
     def _settings_changed(self) -> bool:
-        """Return whether positions meant other table angles when the state was stored."""
+        """Return whether the same positions stood for other table angles when the state was stored."""
         saved = self._state.table
         if saved is None or saved.gear_ratio is None:
             return False
@@ -75,7 +75,7 @@ class TableRecord:
         )
 
     def set_angle(self, table_deg: float) -> None:
-        """Take ``table_deg`` for the table's present angle, and store it."""
+        """Set the table's present angle to ``table_deg``, and store it."""
         position_deg = self._servo.read_state().position_deg
         self.angle_reference.set_angle(position_deg, table_deg)
         self.save_position(position_deg)
@@ -100,7 +100,7 @@ class TableRecord:
         self._save(self._state.model_copy(update={"table": table, "damage": ""}))
 
     def save_fault(self, fault: LatchedFault | None) -> None:
-        """Store the latched fault; it holds in this process even if the disk cannot be written."""
+        """Store the latched fault; it stays latched in this process even if the disk cannot be written."""
         state = self._state.model_copy(update={"fault": fault, "damage": ""})
         latched = False
         try:

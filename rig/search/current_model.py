@@ -16,8 +16,8 @@ class CurrentModel:
     """Loads the enrolled views, and again after a change of the catalog or of its stopping rule.
 
     If the catalog is on a server, it brings the local copy up to date, too. While the server does not answer, the
-    loaded model stays in use, with a note that says how old it is. A local copy is given up when the server is back;
-    use the model in a ``with`` block, which closes what was opened for that.
+    loaded model stays in use, with a note about its age. When the server answers again, the catalog replaces the local
+    copy. Use the model in a ``with`` block, which closes the opened catalogs.
 
     Attributes
     ----------
@@ -54,7 +54,7 @@ class CurrentModel:
                 self._model, self._loaded_state = load_model(self._catalog, descriptor=self._descriptor), state
                 self.version = version
                 if self._catalog.place.url is not None:
-                    with suppress(RigError):  # the copy is for later; the search itself has its model
+                    with suppress(RigError):  # the copy is for later; the search has its model already
                         update_copy(self._catalog)
         except CatalogUnavailable:
             if self._model is None:

@@ -29,7 +29,7 @@ LeaderViews = Callable[[str, Sequence[float]], Sequence[LocalView]]
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """A comparison of the two leaders: its event, and the fields of the answer that follow from it."""
+    """A comparison of the two leaders: its event, and the fields of the answer that it changes."""
 
     event: Compared
     changes: dict[str, Any]
@@ -42,7 +42,7 @@ class Comparison:
 def verify_leader(
     search: Search, hypotheses: Sequence[Sequence[hbr.Segmentation]], leader_views: LeaderViews
 ) -> Verified | None:
-    """Compare the views with a doubtful leader's enrolled views, and let the answer depend on it; None without doubt.
+    """Compare the views with a doubtful leader's enrolled views, and use the result in the answer; None without doubt.
 
     A search in motion is not verified: its frames are smeared, and mostly not segmented again.
 
@@ -58,7 +58,7 @@ def verify_leader(
     Raises
     ------
     CatalogError
-        From ``leader_views``.
+        The enrolled views cannot be read.
     """
     if not isinstance(search, DenseSearch) or isinstance(search, ArcSearch) or not search.is_doubtful:
         return None
@@ -73,7 +73,7 @@ def verify_leader(
 
 
 def with_verification(search: DenseSearch, found: Verification) -> Verified:
-    """Let the answer of a search depend on a verification of its leader; return the event."""
+    """Use a verification of the leader in the answer of a search; return the event."""
     score = found.score(search.decision.open_set_score)
     search.set_verification(found)
     return Verified(
@@ -155,7 +155,7 @@ def _changes(search: DenseSearch, outcome: Outcome, compared: leaders.LeaderComp
 
 
 def saved_leader_views(event: Compared) -> LeaderViews:
-    """Return what returns the enrolled views of a saved comparison."""
+    """Return a function that returns the enrolled views of a saved comparison."""
 
     def views(name: str, _: Sequence[float]) -> list[LocalView]:
         side = event.names.index(name)

@@ -1,4 +1,4 @@
-"""What a search compares views with: the enrolled views by one descriptor, and the stopping rule.
+"""The model of a search: the enrolled views by one descriptor, and the stopping rule.
 
 Decision: docs/decisions/0030.
 """
@@ -41,11 +41,11 @@ class Model:
     Attributes
     ----------
     index : hbr.ViewIndex or hbr.DenseIndex
-        For the paper's searches, or for the dense search.
+        Index for the paper's searches, or for the dense search.
     rule : hbr.StoppingRule, optional
-        When the dense search ends, and which objects are unknown.
+        The rule that ends the dense search and decides which objects are unknown.
     notes
-        What the operator should know about an answer by this model.
+        Notes for the operator about an answer by this model.
     with_empty_table
         Whether most objects were enrolled with an empty-table image; None if that is not known.
     camera
@@ -103,9 +103,9 @@ def load_model(
     catalog
         An open one.
     descriptor
-        Load views by this descriptor and no other.
+        Load views by this descriptor only.
     progress
-        Called while views of a large catalog are read that searches have not used before.
+        Called while the program reads views of a large catalog for the first time.
 
     Raises
     ------
@@ -162,10 +162,10 @@ def _dense(catalog: Catalog, progress: Callable[[JobProgress], None] | None) -> 
 
 
 def empty_table_for(bench: Bench, model: Model) -> tuple[NDArray[np.uint8] | None, tuple[Note, ...]]:
-    """Return the empty-table image that a search uses, and what the operator should know about it.
+    """Return the empty-table image that a search uses, and notes for the operator about it.
 
-    It is the bench's own of today, else the one of the enrollment. None if the objects were enrolled without an image:
-    views are compared with views that were described in the same way.
+    It is the bench's own of today, else the one of the enrollment. It is None if the objects were enrolled without an
+    image, because views are compared only with views that were described in the same way.
     """
     if not isinstance(model.index, hbr.DenseIndex):
         return None, ()

@@ -1,4 +1,4 @@
-"""Compute a saved run again from its frames: the same program must decide the same."""
+"""Computes a saved run again from its frames, and compares the decisions."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
@@ -15,12 +15,12 @@ from rig.search.strategies import AnyStrategy, Finish, Rotate
 from rig.views.description import SearchDescriber, ViewDescriber
 
 TOLERANCE: Final = 1e-9
-"""Numbers that differ less are equal: another machine may sum in another order."""
+"""Largest difference of equal numbers, because another machine may sum in another order."""
 EARLIER_TOLERANCE: Final = 1e-3
 """For runs of formats 1 to 3: similarities had errors of up to 5e-6 then, which exponents in the belief multiply."""
 
 SHOWN_CHARACTERS: Final = 60
-"""Of a value in the summary of a difference."""
+"""Longest text of a value in the summary of a difference."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +63,7 @@ def check(run: SavedRun, *, by: AnyStrategy | None = None) -> Check:
     run
         The run.
     by
-        The strategy, if it has no name that this program knows.
+        The strategy, if its name is not known to this program.
 
     Raises
     ------
@@ -110,7 +110,7 @@ def check(run: SavedRun, *, by: AnyStrategy | None = None) -> Check:
                     saved, again = event.segmentation, plain(view.segmentation)
                     found.differences += _compare(found.views, "segmentation", saved, again, tolerance)
             case Ranked() if ranked is not None:
-                # A run names as many candidates as it was asked for.
+                # The number of candidates is a setting of the run.
                 computed = replace(ranked, candidates=ranked.candidates[: len(event.candidates)])
             case FrameUsed() if isinstance(search, ArcSearch):
                 computed = search.frame_used(event.index, event.azimuth_deg, event.seconds, event.rejected)
@@ -118,7 +118,7 @@ def check(run: SavedRun, *, by: AnyStrategy | None = None) -> Check:
                 found.decisions += 1
                 computed = _decided(step, event)
             case Verified() if isinstance(search, DenseSearch):
-                # the enrolled images are not in the run: what they explain is taken as it was measured
+                # the enrolled images are not in the run, so their measured fit is used
                 leader = search.belief.index.views.object_names.index(event.name)
                 computed = with_verification(search, Verification(leader, event.fit, event.others))
             case Compared() if ranked is not None and search is not None and isinstance(describe, SearchDescriber):
@@ -147,7 +147,7 @@ def check(run: SavedRun, *, by: AnyStrategy | None = None) -> Check:
 
 
 def _describer(run: SavedRun, *, moving: bool) -> ViewDescriber:
-    """Return what describes the views of a run; in runs of earlier formats each view has one segmentation."""
+    """Return the describer of a run's views; in runs of earlier formats each view has one segmentation."""
     if run.format_version < 5:
         return ViewDescriber(run.config.view, (run.views.descriptor,), run.empty_table)
     return SearchDescriber(run.config.view, run.views.descriptor, run.empty_table, revise=not moving)
@@ -170,7 +170,7 @@ def _decided(step: Rotate | Finish | None, saved: Decided) -> Decided | dict[str
 
 
 def _compare(view: int, where: str, saved: Any, computed: Any, tolerance: float) -> Iterator[Difference]:
-    """Yield what differs, field by field."""
+    """Yield the differences, field by field."""
     if isinstance(saved, dict) and isinstance(computed, dict):
         for key in {**saved, **computed}:
             yield from _compare(view, f"{where}.{key}" if where else key, saved.get(key), computed.get(key), tolerance)

@@ -401,7 +401,7 @@ def _bytes(folder: Path, name: str) -> bytes:
 
 
 def _reason(error: Exception) -> str:
-    """Return an error in words; those of Python are only about its own objects, except a ValueError and a TypeError."""
+    """Return an error in words; of Python's own errors, only those of a ValueError or TypeError are useful."""
     match error:
         case KeyError():
             text = f"the value {error.args[0]!r} is missing" if error.args else "a value is missing"

@@ -183,7 +183,7 @@ class HoughSearch(Search):
         if answer.score < self._min_score:
             outcome, possible = hbr.Outcome.UNKNOWN, ()
         elif answer.margin <= 0 and len(self._ranking.names) > 1:
-            # Objects that share the best score; at least the second one, which the margin says is as likely.
+            # Objects that share the best score; at least the second one, which is as likely by the margin.
             outcome, scores = hbr.Outcome.AMBIGUOUS, self._ranking.scores
             possible = self._ranking.names[: max(2, int((scores >= scores[0]).sum()))]
         own = symmetry(self._index.views, int(self._ranking.object_index[0]))
@@ -295,11 +295,11 @@ class DenseSearch(Search):
         return is_doubtful(self._session.rule, decision, belief.queries, belief.index.views.descriptor)
 
     def set_verification(self, verification: Verification) -> None:
-        """Let the answer depend on a verification of the leader."""
+        """Use a verification of the leader in the answer."""
         self._verification = verification
 
     def pose_fields(self, object_index: int) -> dict[str, Any]:
-        """Return the fields of the answer that say how an object is rotated."""
+        """Return the fields of the answer about the rotation of an object."""
         found = pose(self._session.belief, object_index)
         yaws_deg = tuple(float(wrap360(self._orientations[-1] - azimuth_deg)) for azimuth_deg in found.azimuth_deg)
         return {
@@ -327,7 +327,7 @@ class DenseSearch(Search):
         )
 
     def _possible(self, decision: hbr.StopDecision) -> tuple[str, ...]:
-        """Return the objects that it may be: the likeliest, which together reach the confidence that ends a search."""
+        """Return the possible objects: the likeliest, which together reach the confidence that ends a search."""
         if decision.outcome is hbr.Outcome.UNKNOWN:
             return ()
         belief = self._session.belief
@@ -341,7 +341,7 @@ class DenseSearch(Search):
 
 
 class ArcSearch(DenseSearch):
-    """The bench's own search in motion (`hbr.dense.arc`): each frame counts as far as it is new evidence.
+    """The bench's own search in motion (`hbr.dense.arc`): each frame has a weight for its share of new evidence.
 
     `is_new_decision` says whether the last frame led to a decision; between decisions the last one stays.
     """
@@ -400,7 +400,7 @@ def begin_search(
     config
         Of the bench.
     strategy
-        Its name, or a strategy of your own. The default is ``dense`` if the model is for it, else ``ahbr``.
+        Its name, or a strategy object. The default is ``dense`` if the model is for it, else ``ahbr``.
     seed
         For strategies that draw random numbers.
     top

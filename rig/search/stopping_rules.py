@@ -38,7 +38,7 @@ _KNOWN_SHARE: Final = 0.5
 _QUICK_S: Final = 0.4
 _LEAST_QUICK_S: Final = 0.08
 _LOADED_S: Final = 5e-6
-"""Time for a calibration while the operator waits, its minimum, and what each loaded view takes off it."""
+"""Time for a calibration while the operator waits, its minimum, and its reduction by each loaded view."""
 _SEARCH_S, _VIEW_S = 1.4e-3, 1.3e-6
 """Time of a leave-one-out search, and its increase with each enrolled view."""
 _QUICK_SHIFTED: Final = 80
@@ -48,12 +48,12 @@ _QUICK_SHIFTED: Final = 80
 def quick_stopping_rule(
     index: hbr.DenseIndex, *, error_rate: float = ERROR_RATE, false_reject: float = FALSE_REJECT
 ) -> hbr.StoppingRule:
-    """Calibrate on as many objects as about 0.4 s allow."""
+    """Return a stopping rule that is calibrated on as many objects as about 0.4 s allow."""
     budget_s = max(_QUICK_S - _LOADED_S * len(index.views), _LEAST_QUICK_S)
     searches = _affordable(len(index.views), budget_s)
     sample = None
     if searches < len(index):
-        # A sample of the objects: each is searched for once, among the others of the sample.
+        # The calibration searches for each object of a sample once, among the others of the sample.
         each = len(index.views) // len(index)
         sample = next(n for n in range(len(index), 0, -1) if n <= max(1, _affordable(n * each, budget_s)))
     return hbr.calibrate_stopping_rule(
@@ -67,7 +67,7 @@ def quick_stopping_rule(
 
 
 def _affordable(views: int, budget_s: float) -> int:
-    """Return how many searches among so many enrolled views fit into the time."""
+    """Return the number of searches among this number of enrolled views that fit into the time."""
     return int(budget_s / (_SEARCH_S + _VIEW_S * views))
 
 
@@ -82,9 +82,9 @@ class StoredRule:
     objects
         Names of the objects.
     sha256
-        Of the model (`digest`).
+        Digest of the model (`digest`).
     made_utc
-        When, in the format of ISO 8601.
+        Time of the calibration, in the format of ISO 8601.
     version
         Of the file.
     """
@@ -124,7 +124,7 @@ def digest(index: hbr.DenseIndex, *, packed: bool = True) -> str:
 
 
 def stopping_rule_of(folder: Path, index: hbr.DenseIndex) -> tuple[hbr.StoppingRule, tuple[Note, ...]]:
-    """Return the stopping rule for a model, and what the operator should know about it.
+    """Return the stopping rule for a model, and notes for the operator about it.
 
     A stored rule of this model is used as it is. If the catalog has changed since, it is calibrated again if that is
     quick for all objects; otherwise the stored rule is used, and new objects count as typical. If there is no rule, or
@@ -165,7 +165,7 @@ def _not_guaranteed(rule: hbr.StoppingRule) -> tuple[Note, ...]:
 
 
 def stopping_rule_values(rule: hbr.StoppingRule, index: hbr.DenseIndex, *, made_utc: str) -> dict[str, Any]:
-    """Return a stopping rule as JSON values; what is not finite is null."""
+    """Return a stopping rule as JSON values; numbers that are not finite become null."""
     views = index.views
     kind = descriptor(views.descriptor)
     usual = {name: scores.tolist() for name, scores in zip(views.object_names, rule.usual_scores, strict=True)}

@@ -1,9 +1,9 @@
 """Strategies: after each view, rotate to the next view or finish.
 
 `identify` asks one strategy after every view. Five come with the rig; others are passed as an object, or plug in by
-name through the entry-point group `rig.strategies`. The attribute ``descriptor`` of a strategy says which views it is
-shown: without it, the paper's (`Strategy`, `SearchState`); with the bench's own descriptor, those of the dense search
-(`DenseStrategy`, `DenseSearchState`).
+name through the entry-point group `rig.strategies`. The attribute ``descriptor`` of a strategy selects its search:
+without it, the paper's (`Strategy`, `SearchState`); with the bench's own descriptor, the dense search (`DenseStrategy`,
+`DenseSearchState`).
 
 Decision: docs/decisions/0017.
 """
@@ -41,7 +41,7 @@ _DRAWS: Final = 20
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SearchState:
-    """What the paper's search knows after a view.
+    """The state of the paper's search after a view.
 
     Attributes
     ----------
@@ -52,7 +52,7 @@ class SearchState:
     ranking : hbr.Ranking
         The objects by their scores; `ranking.orientation_deg` has the orientation of each view.
     score, margin
-        Of the leading candidate, per view: its Hough score, and its margin (`hbr.score_margin`).
+        Hough score and margin of the leading candidate, per view (`hbr.score_margin`).
     min_score
         Below this score per view the object is unknown.
     table_deg, limits_deg
@@ -82,17 +82,16 @@ class SearchState:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DenseSearchState:
-    """What the dense search knows after a view.
+    """The state of the dense search after a view.
 
     Attributes
     ----------
     session : hbr.DenseSession
-        With its ``belief``, its stopping ``rule`` and its method ``next_best_view``.
+        The search, with its ``belief``, its stopping ``rule`` and its method ``next_best_view``.
     decision : hbr.StopDecision
         The stopping rule's decision.
     rotations_deg, seconds : float64 arrays (a,)
-        Rotations of the camera around the object that the cable allows, every 5°, and how long each takes on this
-        bench.
+        Rotations of the camera around the object that the cable allows, every 5°, and the time of each on this bench.
     table_deg
         The table angle, unwrapped.
     config
@@ -119,8 +118,9 @@ class DenseSearchState:
 class Rotate:
     """Take the next view after a rotation of the camera around the object, positive to the left.
 
-    A strategy of your own explains itself in ``note``. ``s_left`` and ``s_right`` are how similar the ``candidates``
-    (names) look from each side, if the strategy compared the sides; ``weighed`` has all rotations that it weighed.
+    ``note`` is the reason, for a strategy that does not come with the rig. ``s_left`` and ``s_right`` are the
+    similarities of the ``candidates`` (names) from each side, if the strategy compared the sides; ``weighed`` has all
+    rotations that it weighed.
     """
 
     rotation_deg: float
@@ -134,14 +134,14 @@ class Rotate:
 
 @dataclass(frozen=True, slots=True)
 class Finish:
-    """End the search. A strategy of your own explains itself in ``note``."""
+    """End the search. ``note`` is the reason, for a strategy that does not come with the rig."""
 
     reason: StopReason = StopReason.CUSTOM
     note: str = ""
 
 
 class Strategy(Protocol):
-    """Decides after each view of the paper's search."""
+    """A strategy of the paper's search: decides after each view."""
 
     @property
     def name(self) -> str:
@@ -154,7 +154,7 @@ class Strategy(Protocol):
 
 
 class DenseStrategy(Protocol):
-    """Decides after each view of the dense search."""
+    """A strategy of the dense search: decides after each view."""
 
     @property
     def name(self) -> str:
@@ -190,7 +190,7 @@ def strategy_for(descriptor: str) -> AnyStrategy:
 
 
 def reachable_rotations(config: RigConfig, table_deg: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the rotations of the camera that the cable allows, and how long each takes by the bench's motion model.
+    """Return the rotations of the camera that the cable allows, and the time of each by the bench's motion model.
 
     If the short way exceeds the cable budget, the table rotates the long way round, which takes longer.
     """
@@ -208,7 +208,8 @@ def reachable_rotations(config: RigConfig, table_deg: float) -> tuple[NDArray[np
 def reachable_arcs(config: RigConfig, table_deg: float, way: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the ends of the arcs that the cable allows, as rotations of the camera, and the time to each.
 
-    ``way`` is the sign of the present rotation of the camera, 0 at rest: the other way takes the time for a reversal.
+    ``way`` is the sign of the present rotation of the camera, 0 at rest. An arc in the other direction also takes the
+    time for a reversal.
     """
     speed = scan_speed(config, fps=config.camera.fps, gyro_range_dps=config.imu.range_dps, spacing_deg=None).dps
     low_deg, high_deg = config.table.limits_deg
@@ -217,7 +218,7 @@ def reachable_arcs(config: RigConfig, table_deg: float, way: float) -> tuple[NDA
     ends_deg = table_deg + config.table.orientation_sign * arcs_deg
     arcs_deg = arcs_deg[(ends_deg >= low_deg) & (ends_deg <= high_deg)]
     seconds = np.abs(arcs_deg) / speed
-    if not way:  # where the cable ends before the whole arc, the table would have to come back
+    if not way:  # if the cable ends before the whole arc, the table would have to come back
         for side in (-1.0, 1.0):
             room_deg = high_deg - table_deg if side * config.table.orientation_sign > 0 else table_deg - low_deg
             seconds[np.sign(arcs_deg) == side] += max(ARC_DEG - room_deg, 0.0) / speed / 2
@@ -226,7 +227,7 @@ def reachable_arcs(config: RigConfig, table_deg: float, way: float) -> tuple[NDA
 
 
 def end_by_margin(state: SearchState) -> Finish | None:
-    """Return the end that most strategies of the paper's search share, or None.
+    """Return the end by the rule that most strategies of the paper's search share, or None.
 
     A search ends when an enrolled object leads all others by ``identify.margin`` per view, or after
     ``identify.max_views``. A low score ends no search early.
@@ -243,7 +244,7 @@ def end_by_views(state: SearchState) -> Finish | None:
 
 
 class Active:
-    """AHBR: rotate to the side on which the candidates look less similar (Eq. 5-7); the first rotation is fixed."""
+    """AHBR: rotates to the side on which the candidates look less similar (Eq. 5-7); the first rotation is fixed."""
 
     name = "ahbr"
 
@@ -265,7 +266,7 @@ class Active:
 
 
 class Sweep:
-    """All around in even steps, one for each allowed view, until the margin is large enough."""
+    """Rotates in even steps of a revolution, one for each allowed view, until the margin is large enough."""
 
     name = "sweep"
 
@@ -274,7 +275,7 @@ class Sweep:
 
 
 class Random:
-    """Random views that were not taken before, until the margin is large enough."""
+    """Takes random views that were not taken before, until the margin is large enough."""
 
     name = "random"
 
@@ -283,7 +284,7 @@ class Random:
 
 
 class Passive:
-    """HBR as the paper measures it: all allowed views at random, then an answer."""
+    """HBR as the paper measures it: takes all allowed views at random, then answers."""
 
     name = "hbr"
 
@@ -292,7 +293,7 @@ class Passive:
 
 
 class Dense:
-    """The bench's own: rotate to the next best view, motion time included, until the stopping rule ends the search."""
+    """The bench's own: rotates to the next best view, motion time included, until the stopping rule ends the search."""
 
     name = "dense"
     descriptor = BENCH_DESCRIPTOR
@@ -307,7 +308,7 @@ class Dense:
 
 
 class Arc:
-    """The bench's own in motion: rotate along the arc that tells most, and decide again while the table rotates."""
+    """The bench's own in motion: rotates along the most informative arc, and decides again while the table rotates."""
 
     name = "arc"
     descriptor = BENCH_DESCRIPTOR
@@ -377,7 +378,7 @@ def strategy(name: str) -> AnyStrategy:
 
 
 def _draw(state: SearchState) -> float:
-    """Return a random rotation to where no view was taken; the last one drawn if views were taken everywhere."""
+    """Return a random rotation to an azimuth without a view; the last one drawn if there is none."""
     seen_deg = state.ranking.orientation_deg
     for _ in range(_DRAWS):
         rotation_deg = float(state.rng.uniform(-180.0, 180.0))

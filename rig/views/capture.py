@@ -30,7 +30,7 @@ SIMILARITY_PX = 4
 
 
 class RejectReason(StrEnum):
-    """Why a frame is not accepted as a view. `rejection_text` puts it into words."""
+    """The reasons to reject a frame. `rejection_text` has their texts."""
 
     EXPOSED_EARLY = "exposed-early"
     GYRO_INCOMPLETE = "gyro-incomplete"
@@ -48,12 +48,12 @@ class RejectReason(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class MotionEvidence:
-    """How the table moved while a view was exposed.
+    """The motion of the table while a view was exposed.
 
     ``middle_ns`` is the middle of the exposure of the object's middle row, or of the frame's if no object was found, on
-    the bench's clock, ``angle_deg`` the table's angle then with its
-    standard uncertainty, ``speed_dps`` its speed, and ``smear_px`` the motion during the exposure at the edge of the
-    region. ``residual_deg`` is the largest difference between encoder and gyro during the motion.
+    the bench's clock. ``angle_deg`` is the table's angle then, with its standard uncertainty; ``speed_dps`` is its
+    speed, and ``smear_px`` the motion during the exposure at the edge of the region. ``residual_deg`` is the largest
+    difference between encoder and gyro during the motion.
     """
 
     middle_ns: int
@@ -70,8 +70,7 @@ class ViewEvidence:
 
     ``settled_ns`` and ``exposed_ns`` are times on the bench's clock. ``sharpness`` is the variance of the Laplacian of
     the grey region, in squared levels. The shares are shares of the region's pixels. For a view that was taken in
-    motion, ``settled_ns`` is the time at which the motion began, ``motion`` says how the table moved, and ``stillness``
-    is None.
+    motion, ``settled_ns`` is the time at which the motion began, ``motion`` describes it, and ``stillness`` is None.
     """
 
     settled_ns: int
@@ -129,7 +128,7 @@ class ImageQuality:
         level = np.arange(256)
         total = int(counts @ level)
         variance = _variance(total, int(counts @ level**2), pixels)
-        squares = round(cv2.norm(laplacian, cv2.NORM_L2SQR))  # OpenCV squares a root: whole only after rounding
+        squares = round(cv2.norm(laplacian, cv2.NORM_L2SQR))  # whole only after rounding: OpenCV squares a root
         sharpness = _variance(int(cv2.sumElems(laplacian)[0]), squares, pixels)
         return cls(
             sharpness=sharpness,
@@ -180,9 +179,9 @@ def image_similarity(image_bgr: NDArray[np.uint8], other_bgr: NDArray[np.uint8],
 class Viewer:
     """Captures views with one camera, whose locked settings must not change after the viewer was made.
 
-    A camera that delays its frames inside stamps them after their exposure. With the camera's time from calibration,
-    only frames count whose exposure began after the rest. With ``encodes`` each frame is encoded as PNG, to be stored,
-    while it is checked.
+    A camera with an internal delay stamps its frames after their exposure. If the camera's time is calibrated, only
+    frames count whose exposure began after the table came to rest. With ``encodes`` each frame is encoded as PNG, for
+    storing, while it is checked.
     """
 
     def __init__(self, camera: Camera, config: RigConfig, *, encodes: bool = False) -> None:
@@ -273,7 +272,7 @@ _TEXTS: Mapping[str, str] = {
 
 
 def rejection_text(reason: str, evidence: ViewEvidence | ImageQuality) -> str:
-    """Return the text of a `RejectReason`, with the numbers of the evidence; any other text as it is.
+    """Return the text of a `RejectReason`, with the numbers of the evidence; any other text is returned unchanged.
 
     Version 0.1 saved the text itself.
     """

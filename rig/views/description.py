@@ -26,7 +26,7 @@ BENCH_DESCRIPTOR: Final = "edges+colours"
 DESCRIPTORS: Final = (PAPER_DESCRIPTOR, BENCH_DESCRIPTOR)
 """The descriptors of every enrolled view."""
 IN_A_ROW: Final = 3
-"""So many frames must differ from the empty-table image: one or two can show an arm that reached into the frame."""
+"""Number of successive frames that must differ from the empty-table image: one or two can show the operator's arm."""
 
 
 class Segmented(NamedTuple):
@@ -49,7 +49,7 @@ class DescribedView:
     segmentation
         `hbr.Segmentation.evidence` as JSON values; None if no segmentation was made.
     table_problem
-        Set for the view after which it is clear that the bench no longer looks like its empty-table image.
+        Set for the view with which it is certain that the bench no longer looks like its empty-table image.
     earlier : tuple of uint8 arrays (k, length), optional
         In a search: the levels of all earlier views, which were segmented again; a row for each segmentation.
     reliable
@@ -57,7 +57,7 @@ class DescribedView:
     same_bench
         In a search: whether the bench is that of the enrollment; None: not known.
     segmented
-        Set if the empty-table image segmented the view: what `describe_alone` needs.
+        Set if the view was segmented with the empty-table image: the input of `describe_alone`.
     """
 
     levels: Mapping[str, NDArray[np.uint8]]
@@ -77,7 +77,7 @@ class DescribedAlone(NamedTuple):
 
 
 def describe_alone(segmented: Segmented, names: tuple[str, ...]) -> DescribedAlone:
-    """Describe a view for the last time, by descriptors of the object: no other view changes its segmentation."""
+    """Return the last description of a view, whose segmentation no other view changes, by descriptors of the object."""
     (found,) = hbr.hypotheses(segmented.frame, empty_table=segmented.empty_table, first=segmented.found, most=1)
     if found is segmented.found:
         levels = {name: segmented.levels[name] for name in names}
@@ -113,7 +113,7 @@ class ViewDescriber:
     Parameters
     ----------
     config
-        Its region of interest is described.
+        Configuration with the region of interest to describe.
     names
         The descriptors.
     empty_table : uint8 array (H, W, 3), optional
@@ -203,7 +203,8 @@ class ViewDescriber:
 class EnrollmentDescriber(ViewDescriber):
     """Describes the views of one enrollment together, as a search segments its views.
 
-    First all images are learned from, one after the other, then each is described. No image is held in memory.
+    First it learns the background from all images, one after the other, then it describes each image. It holds no image
+    in memory.
     """
 
     def __init__(
@@ -226,7 +227,7 @@ class EnrollmentDescriber(ViewDescriber):
         return len(self._learned) - 1
 
     def describe(self, view: int, image_bgr: NDArray[np.uint8], alone: DescribedAlone | None = None) -> DescribedView:
-        """Describe the image that was learned from as the view of this number.
+        """Describe the image that `learn` got as the view of this number.
 
         ``alone`` is what `describe_alone` returned for it, if its segmentation needs no other views.
         """

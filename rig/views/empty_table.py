@@ -45,7 +45,7 @@ class EmptyTable:
     evidence
         The measurements that the image was accepted with.
     noticed
-        A problem that a search or an enrollment has noticed since.
+        A problem that a search or an enrollment has noticed since then.
     """
 
     image_bgr: NDArray[np.uint8]
@@ -114,7 +114,7 @@ def store_table_problem(bench: Bench, problem: TableProblem) -> None:
     before = _metadata(bench, quiet=True)
     if before is not None:
         changed = before.model_copy(update={"noticed": problem.as_json()})
-        with suppress(StateNotStored):  # the warning was shown; writes that matter report a full disk themselves
+        with suppress(StateNotStored):  # the warning was shown; other writes report a full disk
             bench.state.store_file(_FILE, changed.model_dump_json(indent=1).encode())
 
 
@@ -175,7 +175,7 @@ class _Stored(BaseModel):
         )
 
     def upgraded(self) -> Self:
-        """Return it in the present version."""
+        """Return the content in the present version."""
         if self.version != 1:
             return self
         noticed = None

@@ -30,8 +30,8 @@ MAX_PIXELS: Final = 100_000_000
 _PNG: Final = b"\x89PNG\r\n\x1a\n"
 _JPEG: Final = b"\xff\xd8\xff"
 
-# The fastest lossless settings for camera frames, with nearly the smallest files: noise hides the repetitions that the
-# other strategies search for. OpenCV before 4.12 chooses the filter itself.
+# The fastest lossless settings for camera frames. The files are nearly the smallest, because noise hides the
+# repetitions that the other strategies search for. OpenCV before 4.12 chooses the filter itself.
 PNG_SETTINGS: Final = [
     cv2.IMWRITE_PNG_STRATEGY,
     cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY,

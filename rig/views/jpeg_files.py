@@ -1,6 +1,6 @@
 """JPEG files: their size, and whether all their rows are there (ITU-T T.81).
 
-libjpeg fills what is missing with grey and reports it only as a line on stderr.
+libjpeg fills missing rows with grey and reports them only as a line on stderr.
 """
 
 import os
@@ -39,8 +39,8 @@ def size(content: bytes) -> tuple[int, int] | None:
 def is_complete(content: bytes, image_bgr: NDArray[np.uint8]) -> bool:
     """Return whether a JPEG file that decodes to an image, uint8 (H, W, 3) BGR, contains all of its data.
 
-    The image decodes to the same pixels with more data before its end: so no block lacks any. And the scans
-    contain every coefficient of every component to its last bit.
+    The function checks two properties. First, the image decodes to the same pixels with more data before its end, so no
+    block lacks data. Second, the scans contain every coefficient of every component to its last bit.
     """
     segments = list(_segments(content))
     if not segments or segments[-1].marker != _END or not _has_all_scans(segments):

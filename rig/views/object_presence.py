@@ -19,7 +19,7 @@ GRID: Final = 48
 STEP_LEVELS: Final = 8.0
 """A cell has changed if its level changed by more than this, after the change of the whole image is subtracted."""
 CELLS: Final = 6
-"""So many changed cells of `GRID`² are an object: for example 2 cm in an image of 40 cm."""
+"""Smallest number of changed cells of `GRID`² that are an object: for example 2 cm in an image of 40 cm."""
 
 Cells = NDArray[np.float32]
 
@@ -27,9 +27,9 @@ Cells = NDArray[np.float32]
 class TableWatcher:
     """An operator that waits until the next object is on the table and nothing moves.
 
-    At the first call the table must be empty, because that image is compared with later. An object is new if the image
-    is still, differs from the empty table, and either differs from the image at the start of the wait or follows an
-    empty table. The table must be at the same angle each time.
+    At the first call the table must be empty, because later images are compared with that image. An object is new if
+    the image is still, differs from the empty table, and either differs from the image at the start of the wait or
+    follows an empty table. The table must be at the same angle each time.
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ class TableWatcher:
         self._empty: Cells | None = None
 
     def place(self, name: str | None) -> None:
-        """Return when the next object is on the table. An object to be enrolled (``name``) is there already.
+        """Wait until the next object is on the table. An object to be enrolled (``name``) is there already.
 
         Raises
         ------
@@ -78,7 +78,7 @@ class TableWatcher:
             before = now
 
     def clear(self) -> bool:
-        """Return whether the table is empty: by agreement, until `place` has waited for the first object."""
+        """Return whether the table is empty: it must be until `place` has waited for the first object."""
         return self._empty is None
 
     def _capture(self) -> Cells:

@@ -34,9 +34,9 @@ class SegmentationSummary:
     views
         Number of views with segmentation evidence.
     found, guessed
-        In how many the object was found reliably, and in how many it was guessed.
+        Numbers of views in which the object was found reliably, and in which it was guessed.
     corrected
-        In how many the illumination was corrected.
+        Number of views whose illumination was corrected.
     issues
         Number of views for each `hbr.segmentation.IssueCode`, the most frequent first.
     """
@@ -79,7 +79,7 @@ class SegmentationSummary:
 
 
 def check_evidence(evidence: object) -> None:
-    """Raise TypeError if a JSON value is not segmentation evidence, so that a reader would fail on it."""
+    """Raise TypeError if a JSON value is not segmentation evidence, on which a reader would fail."""
     if not isinstance(evidence, Mapping) or not isinstance(evidence.get("issues", []), list):
         raise TypeError("the evidence of a segmentation that is not one")
     for issue in evidence.get("issues", []):

@@ -1,7 +1,7 @@
 """Frames of a running camera: each with the time at the middle of its exposure, and whether that time can be trusted.
 
 A frame's angle is the platter's at the middle of the exposure of the middle row. `rig calibrate camera-time` measures
-how long after the frame's time stamp that is.
+the time from the frame's time stamp to that moment.
 """
 
 from collections.abc import Callable, Sequence
@@ -17,15 +17,15 @@ from rig.core.clock import Clock
 from rig.devices.camera import Camera
 
 LATEST_S: Final = 1.0
-"""A frame that arrives later after its stamp has no time that can be trusted."""
+"""Largest time from the stamp to the arrival of a frame whose time can be trusted."""
 GRID_MS: Final = 1.5
-"""How far a stamp may be from the camera's regular rhythm, at least."""
+"""Smallest tolerance for the distance of a stamp from the camera's regular rhythm."""
 GRID_SIGMAS: Final = 5.0
 FEWEST_STAMPS: Final = 4
 PATIENCE_S: Final = 0.1
-"""How long the control loop of a moving table waits for a frame: the servo's watchdog needs to be fed meanwhile."""
+"""Longest wait of the control loop of a moving table for a frame, because it must also feed the servo's watchdog."""
 SURE_SIGMAS: Final = 2.0
-"""A difference of the camera's time from that of its stamps counts from so many sigmas on."""
+"""Smallest difference of the camera's time from that of its stamps that counts, in standard uncertainties."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,7 +45,7 @@ class StreamFrame:
 
 
 class _NoFrameYet(Exception):
-    """Ends the wait for a frame."""
+    """An exception that ends the wait for a frame."""
 
 
 class FrameStream:
@@ -145,8 +145,8 @@ def exposed_before_stamp_ns(config: RigConfig) -> int:
 def irregular_stamps(stamps_ns: Sequence[int], period_s: float, jitter_ms: float) -> NDArray[np.bool_]:
     """Return which time stamps do not fit the camera's regular rhythm, bool (n,).
 
-    Lost frames leave whole periods out. The rhythm is that of most frames: stamps that jumped, or that the computer set
-    late, are off. Fewer than `FEWEST_STAMPS` stamps are compared with the period alone.
+    Lost frames leave gaps of whole periods. The rhythm is that of most frames. Stamps that jumped, or that the computer
+    set late, do not fit it. Fewer than `FEWEST_STAMPS` stamps are compared with the period alone.
     """
     times = (np.asarray(stamps_ns, np.int64) - stamps_ns[0]) * 1e-9
     limit_s = max(GRID_MS, GRID_SIGMAS * (jitter_ms if isfinite(jitter_ms) else 0.0)) * 1e-3

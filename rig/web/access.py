@@ -1,4 +1,4 @@
-"""Who may use the server: tokens, logins, and the lease of the one operator.
+"""Access to the server: tokens, logins, and the lease of the one operator.
 
 Decision: docs/decisions/0039.
 """
@@ -25,10 +25,10 @@ TOKENS: Final = "tokens.json"
 PREFIX: Final = "rig_"
 MAX_BYTES: Final = 1_000_000
 SESSION_S: Final = 12 * 3600.0
-"""A login is valid for a working day."""
+"""Time for which a login is valid: a working day."""
 MAX_SESSIONS: Final = 1000
 LEASE_S: Final = 45.0
-"""A lease that is not renewed for this time is free: the operator's browser was closed."""
+"""Time after which a lease that is not renewed is free, because the operator's browser was closed."""
 FREE_ATTEMPTS: Final = 5
 WINDOW_S: Final = 60.0
 """After `FREE_ATTEMPTS` wrong tokens within this time from one address, logins from it are rejected for a while."""
@@ -36,7 +36,7 @@ MAX_ADDRESSES: Final = 10_000
 
 
 class Role(StrEnum):
-    """What a token allows: to watch, or also to operate the bench."""
+    """The rights of a token: to watch, or also to operate the bench."""
 
     WATCH = "watch"
     OPERATE = "operate"
@@ -56,7 +56,7 @@ class StoredToken(BaseModel):
 
 @dataclass(frozen=True, slots=True)
 class Person:
-    """Who sends a request: the name of the token, and what it allows. ``client`` distinguishes browser windows."""
+    """The sender of a request: the name and the rights of the token. ``client`` distinguishes browser windows."""
 
     name: str
     role: Role
@@ -68,7 +68,7 @@ class Person:
 
 
 LOCAL: Final = "local"
-"""Name of everybody on this computer, if the server listens to this computer only."""
+"""Name of all users of this computer, if the server listens to this computer only."""
 
 _STORED: Final = TypeAdapter(list[StoredToken])
 
@@ -154,7 +154,7 @@ class _Session:
 
 @dataclass(slots=True)
 class Sessions:
-    """Logins of browsers, and wrong tokens by address. In memory: after a restart, everybody logs in again."""
+    """Logins of browsers, and wrong tokens by address, in memory: after a restart, all users log in again."""
 
     tokens: Tokens
     clock: Clock
@@ -165,7 +165,7 @@ class Sessions:
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def login(self, token: str, address: str) -> tuple[str, Person]:
-        """Return the secret of a new session and who it belongs to.
+        """Return the secret of a new session and its person.
 
         Raises
         ------
@@ -206,7 +206,7 @@ class Sessions:
         return stored
 
     def find(self, secret: str) -> Person | None:
-        """Return who a session belongs to; None if it has ended or its token was removed."""
+        """Return the person of a session; None if it has ended or its token was removed."""
         with self._lock:
             session = self._sessions.get(secret)
         if session is None or seconds_between(session.since_ns, self.clock.now_ns()) > SESSION_S:
@@ -299,5 +299,5 @@ class Lease:
 
 
 def _hash(token: str) -> str:
-    # The token has 256 random bits: a slow hash would protect nothing more.
+    # The token has 256 random bits, so a slow hash would not protect it better.
     return hashlib.sha256(token.encode(errors="replace")).hexdigest()

@@ -1,4 +1,4 @@
-"""The catalog of a served bench: its local copy, its journal, and what the pages say about them."""
+"""The catalog of a served bench: its local copy, its journal, and their state for the pages."""
 
 from collections.abc import Callable
 from typing import Any
@@ -19,18 +19,18 @@ from rig.core.errors import CatalogBusy, CatalogError
 
 
 class BenchCatalog:
-    """Opens the catalog of a bench for requests and jobs, also while its server does not answer.
+    """The catalog of a bench: opens it for requests and jobs, even while its server does not answer.
 
     Parameters
     ----------
     place
-        Where the catalog is.
+        Place of the catalog.
     clock
         The computer's clock.
     changed
         Called with `state` after each change.
     report
-        Gets a sentence about each object that was delivered beside the jobs, and about each reason why one was not.
+        Gets a sentence about each object that was delivered in the background, and about each reason why one was not.
     """
 
     def __init__(
@@ -56,7 +56,7 @@ class BenchCatalog:
         return catalog
 
     def open_to_change(self) -> Catalog:
-        """Open the catalog to change what is in it; a `CatalogUnavailable` if its server does not answer."""
+        """Open the catalog to change its objects; a `CatalogUnavailable` if its server does not answer."""
         return Catalog.open(self.place, clock=self._clock)
 
     def open_to_enroll(self, clock: Clock) -> Catalog:
@@ -64,7 +64,7 @@ class BenchCatalog:
         return open_for_enrollment(self.place, clock)
 
     def deliver(self) -> list[str]:
-        """Deliver the journal now; return sentences about what was delivered, and why something was not."""
+        """Deliver the journal now; return sentences about delivered objects, and reasons for the others."""
         if self.place.url is None:
             return []
         try:
@@ -73,7 +73,7 @@ class BenchCatalog:
             return [failure_words(error)]
 
     def background_delivery(self) -> BackgroundDelivery:
-        """Return a delivery of the journal beside the work of a ``with`` block."""
+        """Return a delivery of the journal during the work of a ``with`` block."""
         return BackgroundDelivery(self.place, self._clock, self._report, changed=self._show)
 
     def _show(self, state: JournalState) -> None:

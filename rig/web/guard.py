@@ -15,11 +15,11 @@ Send = Callable[[Message], Awaitable[None]]
 App = Callable[[Scope, Receive, Send], Awaitable[None]]
 
 MAX_BODY_BYTES: Final = 1_000_000
-"""Of every request but an upload."""
+"""Largest size of a request, except an upload."""
 CHUNK_TIMEOUT_S: Final = 20.0
-"""A client that sends nothing of its body for this time is disconnected."""
+"""Time after which a client that sends no more of its body is disconnected."""
 HEADER_TIMEOUT_S: Final = 10.0
-"""A client that has not sent a whole request head within this time is disconnected."""
+"""Time after which a client that has not sent a whole request head is disconnected."""
 _CHANGES: Final = {"POST", "PUT", "PATCH", "DELETE"}
 _HEADERS: Final = [
     (
@@ -36,7 +36,7 @@ _HEADERS: Final = [
 
 
 class Guard:
-    """Rejects requests of other sites and requests that are too large, and adds headers to all responses.
+    """A layer before the application: rejects foreign and too large requests, and adds headers to responses.
 
     Parameters
     ----------
@@ -45,7 +45,7 @@ class Guard:
     hosts
         Names and addresses by which browsers may call the server (against DNS rebinding).
     upload_path, max_upload_bytes
-        The path whose requests may be larger, and by how much.
+        The path whose requests may be larger, and their largest size.
     """
 
     def __init__(self, app: App, *, hosts: set[str], upload_path: str, max_upload_bytes: int) -> None:
@@ -73,9 +73,9 @@ class Guard:
         complete = False
 
         async def limited() -> Message:
-            """Receive the body; errors are raised in the application, which answers them as its other errors."""
+            """Receive the body; its errors are raised in the application, which answers them like its other errors."""
             nonlocal received, complete
-            if complete:  # what comes next is the end of the connection
+            if complete:  # the next message is the end of the connection
                 return await receive()
             try:
                 message = await asyncio.wait_for(receive(), CHUNK_TIMEOUT_S)

@@ -1,4 +1,4 @@
-"""The queue of jobs: one runs at a time. It survives the server, and a job that the server left is interrupted."""
+"""The queue of jobs: one runs at a time. The queue survives the server; a job that was running then is interrupted."""
 
 import json
 import secrets
@@ -16,7 +16,7 @@ from rig.web.requests import Choice, EnrollRequest, IdentifyRequest, Job, JobReq
 
 FILE: Final = "jobs.json"
 STORED: Final = 200
-"""Jobs that are remembered."""
+"""Largest number of stored jobs."""
 MAX_QUEUED: Final = 50
 MAX_BYTES: Final = 50_000_000
 
@@ -27,9 +27,9 @@ class JobQueue:
     Parameters
     ----------
     folder
-        Where the jobs are stored.
+        Folder of the stored jobs.
     clock
-        Dates the jobs.
+        Clock for the times of the jobs.
     changed
         Called with each job that has changed.
     rig_arguments
@@ -194,7 +194,7 @@ class JobQueue:
         return job
 
     def _offer_to_continue(self, job: Job) -> None:
-        """Set how to continue the work of a job that ended early."""
+        """Set the request and the command that continue the work of a job that ended early."""
         request = job.request
         if isinstance(request, EnrollRequest):
             started = job.views > 0 or request.resume

@@ -14,7 +14,7 @@ TOLERANCE_PX = 1.0
 
 
 class Outliner:
-    """Finds the object in the views of one job, as their descriptions do."""
+    """The outlines of the object in the views of one job, with the segmentation of their descriptions."""
 
     def __init__(self, bench: Bench) -> None:
         self._region = bench.config.view.roi

@@ -20,7 +20,7 @@ VIEWER_GONE_S: Final = 30.0
 
 
 class LivePicture:
-    """Holds the newest frame; viewers never wait for the camera, and the camera never waits for viewers."""
+    """The newest frame. Viewers never wait for the camera, and the camera never waits for viewers."""
 
     def __init__(self, clock: Clock) -> None:
         self._clock = clock

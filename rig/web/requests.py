@@ -1,4 +1,4 @@
-"""What can be asked of the bench: one model for each kind of job."""
+"""The requests to the bench: one model for each kind of job."""
 
 from enum import StrEnum
 from typing import Annotated, Any, Literal

@@ -42,7 +42,7 @@ RUNS: Final = "runs"
 
 @dataclass(frozen=True, slots=True)
 class Listening:
-    """Where a server listens, and to whom."""
+    """The address at which a server listens, and its allowed clients."""
 
     host: str
     port: int
@@ -71,7 +71,7 @@ def run_server(
     arguments
         Arguments of `rig` that select the same bench.
     listening, tokens
-        Where to listen, and who may log in.
+        The address at which to listen, and the tokens of those who may log in.
     ready
         Called with the address of the page when the server answers.
 
@@ -119,7 +119,7 @@ def run_server(
 
 
 def checked_catalog(server: Server) -> AbstractContextManager[object]:
-    """Return a check of the catalog beside the work of a ``with`` block; damage is on stderr and in the status."""
+    """Return a check of the catalog during the work of a ``with`` block; damage is on stderr and in the status."""
     place = server.config.catalog_place(server.bench)
     if not place.may_exist():
         return nullcontext()
@@ -145,7 +145,7 @@ class _Web(uvicorn.Server):
         self.answers = threading.Event()
 
     def install_signal_handlers(self) -> None:
-        """Install none."""
+        """Install no signal handlers."""
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         await super().startup(sockets)

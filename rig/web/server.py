@@ -1,4 +1,4 @@
-"""What the parts of the web application share: the server, who sends a request, and pages of lists."""
+"""Code that the parts of the web application share: the server, the sender of a request, and pages of lists."""
 
 import hashlib
 import json
@@ -28,16 +28,16 @@ MAX_PAGE: Final = 500
 
 @dataclass(slots=True)
 class Server:
-    """What the application works with.
+    """The objects that the application works with.
 
     Attributes
     ----------
     needs_login
         Whether requests need a token: always, unless the server listens to this computer only.
     catalog
-        Opens the bench's catalog.
+        The bench's catalog.
     damage
-        Of the catalog; None if none is known.
+        Damage of the catalog; None if none is known.
     """
 
     bench: str
@@ -56,7 +56,7 @@ class Server:
     damage: RigError | None = None
 
     def person(self, request: Request) -> Person | None:
-        """Return who sends a request; None if it is not known. Raises `LoginRequired`, `TooManyLogins`."""
+        """Return the sender of a request; None if it is not known. Raises `LoginRequired`, `TooManyLogins`."""
         client = request.headers.get("x-rig-client", "")[:64]
         scheme, _, token = request.headers.get("authorization", "").partition(" ")
         if scheme.lower() == "bearer":
@@ -136,7 +136,7 @@ class Problem(BaseModel):
 
 
 def watcher(request: Request) -> Person:
-    """Return who sends the request. Raises `LoginRequired`."""
+    """Return the sender of the request. Raises `LoginRequired`."""
     server: Server = request.app.state.server
     person = server.person(request)
     if person is None:

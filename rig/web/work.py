@@ -1,4 +1,4 @@
-"""What each kind of job does on the bench."""
+"""The work of each kind of job on the bench."""
 
 from collections.abc import Callable, Generator
 from contextlib import closing
@@ -54,7 +54,7 @@ from rig.web.requests import (
 from rig.web.worker import Context, Work
 
 CALIBRATIONS: Final = "rig.calibrations"
-"""Entry-point group of the calibrations: functions that yield what happens."""
+"""Entry-point group of the calibrations: functions that yield the steps of a calibration."""
 
 _DECISIONS: Final = {
     Choice.CONTINUE: TrayDecision.PROCEED,
@@ -90,7 +90,7 @@ def calibrations() -> dict[str, Calibration]:
 
 @dataclass(slots=True)
 class Works:
-    """Makes the work of a job.
+    """A factory of the work of a job.
 
     Parameters
     ----------
@@ -274,7 +274,7 @@ def _run(context: Context, events: Generator[Event, None, object]) -> None:
     """Report the events of a plan; an operator who cancels closes the plan, and so the torque goes off."""
     with closing(events):
         for event in events:
-            if not isinstance(event, FrameUsed):  # reported in the turn
+            if not isinstance(event, FrameUsed):  # reported during the rotation
                 _report(context, event)
 
 
@@ -388,6 +388,6 @@ def doctor_findings(
     from rig.doctor.examination import run_checks
 
     with open_context(bench, config, seed=seed, options=options) as context:
-        context.holder = None  # this program, which has closed its devices
+        context.holder = None  # the holder is this program, which has closed its devices
         for finding in run_checks(context, CHECKS):
             yield finding.as_dict()

@@ -1,4 +1,4 @@
-"""Owns the bench of a server: runs its jobs one after the other, and watches the bench between them.
+"""The worker of a server: owns the bench, runs its jobs one after the other, and watches the bench between them.
 
 The worker runs in the main thread of the program, because signals interrupt only that thread: SIGTERM or Ctrl+C unwind
 the running job and switch the torque off, as in every other command.
@@ -26,12 +26,12 @@ from rig.web.picture import LivePicture, ObservedCamera, jpeg
 from rig.web.requests import Choice, Job, JobState, Progress, Question
 
 IDLE_S: Final = 0.05
-"""Time between two looks at the queue."""
+"""Time between two checks of the queue."""
 STATUS_S: Final = 0.25
 """Time between two messages about the state of the table."""
 IDLE_STATUS_S: Final = 1.0
 REOPEN_S: Final = 5.0
-"""A bench that could not be opened is tried again after this time."""
+"""Time after which a bench that could not be opened is opened again."""
 INTERVALS: Final = 20_000
 VIEW_PX: Final = 480
 JOBS_WITH_PICTURES: Final = 10
@@ -45,9 +45,9 @@ class JobCancelled(Exception):
 
 @dataclass(slots=True)
 class Context:
-    """What a job works with: the open bench, and the way to report and to ask.
+    """The context of a job: the open bench, and functions to report and to ask.
 
-    ``asked`` returns the operator's choice; it waits for it.
+    ``asked`` waits for the operator's choice and returns it.
     """
 
     bench: Bench
@@ -78,9 +78,9 @@ class BenchWorker:
     open_bench
         Opens the bench.
     queue, hub, picture
-        Where jobs come from, and where their events and frames go.
+        The source of the jobs, and the receivers of their events and frames.
     work
-        Returns what a job does.
+        Returns the work of a job.
     clock
         The computer's clock.
     """
@@ -179,7 +179,7 @@ class BenchWorker:
         except RigError as failure:
             error = failure
             if self._queue.is_cancelled(job):
-                state = JobState.CANCELLED  # the stop of the motion is what the operator asked for
+                state = JobState.CANCELLED  # the operator asked for the stop of the motion
         except BaseException:
             self._queue.end(job, JobState.INTERRUPTED)
             raise
@@ -196,7 +196,7 @@ class BenchWorker:
         self._read_status()
 
     def _report_stop(self) -> None:
-        """Tell the listeners once that no job runs any more after a stop."""
+        """Report to the listeners once that no job runs any more after a stop."""
         if self._stop_asked.is_set():
             self._stop_asked.clear()
             self._hub.publish("stop", {"ended": True})
@@ -288,7 +288,7 @@ class BenchWorker:
     def _close(self) -> None:
         bench, self._held.bench = self._held.bench, None
         if bench is not None:
-            with suppress(RigError):  # the fault is latched, and the next opening finds out
+            with suppress(RigError):  # the fault is latched, and the next opening reports it
                 bench.close()
 
     def _idle(self) -> None:

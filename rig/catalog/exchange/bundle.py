@@ -55,7 +55,7 @@ def write_bundle(path: Path, objects: Iterable[ExportedObject]) -> int:
                 archive.writestr(_member(name), read_stored(files[name], sha256), ZIP_STORED)
             items.append(item)
         text, manifest = index_of(items)
-        compressible = len(text) > MAX_RATIO // 2 * len(zlib.compress(text))  # as a reader would not believe it
+        compressible = len(text) > MAX_RATIO // 2 * len(zlib.compress(text))  # a reader would reject a higher ratio
         archive.writestr(_member(OBJECTS), text, ZIP_STORED if compressible else ZIP_DEFLATED)
         archive.writestr(_member(MANIFEST), manifest, ZIP_STORED)
         archive.close()

@@ -51,7 +51,7 @@ def import_objects(
     Parameters
     ----------
     label
-        For new objects without a label.
+        Label of new objects that have none.
     descriptors
         Descriptors (`hbr.descriptors`) to compute besides CEDD, for views without descriptors.
     strict

@@ -13,7 +13,7 @@ from rig.core.errors import ObjectExists
 
 
 class Conflict(StrEnum):
-    """What to do with an object whose name is in the catalog already."""
+    """What an import does with an object whose name is in the catalog already."""
 
     REJECT = "reject"
     SKIP = "skip"
@@ -26,7 +26,7 @@ class Conflict(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """What an import would do, with the names of the new, the replaced and the skipped objects."""
+    """The plan of an import: the names of the new, the replaced and the skipped objects."""
 
     batch: ImportBatch
     conflict: Conflict

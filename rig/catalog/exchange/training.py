@@ -35,7 +35,7 @@ Intrinsics = Callable[[Session], Mapping[str, float] | None]
 
 
 class Split(StrEnum):
-    """What is divided among the parts: whole objects, or the views of each object."""
+    """The unit that is divided among the parts: whole objects, or the views of each object."""
 
     OBJECT = "object"
     VIEW = "view"
@@ -133,7 +133,7 @@ def write_training(
             for name, sha256 in images_of(item).items():
                 if name not in masks:
                     (made / name).write_bytes(read_stored(files[name], sha256))
-        # Write the annotations, and what an import needs.
+        # Write the annotations, and the files for an import.
         write = _write_coco if form is Annotations.COCO else _write_yolo
         names_of = {part: [name for name in masks if part_of[name] == part] for part in parts}
         write(made, kept, masks, names_of, intrinsics)

@@ -1,4 +1,4 @@
-"""The support bundle of `rig doctor --bundle`: what a person needs who cannot see the bench."""
+"""The support bundle of `rig doctor --bundle`: files for a person who helps without seeing the bench."""
 
 import json
 import platform

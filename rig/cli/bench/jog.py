@@ -31,7 +31,7 @@ _KEYS: Final = {
     b"h": "home",
     b"q": "end",
 }
-"""What a terminal sends for each key; cursor keys have two forms."""
+"""The bytes that a terminal sends for each key; cursor keys have two forms."""
 
 
 @command

@@ -57,7 +57,7 @@ def setup(
         print(_heading(context, settings), file=out)
         dialogue = Dialogue(context, ask_nothing=yes or settings.json, out=out)
         wanted = dialogue.run()
-        if context.computer.simulated:  # what the file says of devices is true of real ones
+        if context.computer.simulated:  # the devices in the file are real ones
             wanted = {key: value for key, value in wanted.items() if not _is_set(stored, key)}
         if stored.default_bench != context.bench:
             wanted[("default_bench",)] = context.bench

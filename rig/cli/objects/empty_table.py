@@ -51,7 +51,7 @@ def empty_table(
 
 
 def ensure_empty_table_image(settings: Settings, bench: "Bench", *, ask: bool, then: str | None = None) -> None:
-    """See to it that the bench has an empty-table image of today before objects are put on the table.
+    """Ensure that the bench has an empty-table image of today before objects are put on the table.
 
     An operator that can clear the table by itself does so. Otherwise the operator is asked at the terminal if ``ask``
     is set; ``then`` names the object to put on the table afterwards. If the operator cannot be asked, a note

@@ -145,7 +145,7 @@ def identify(
                 with saver:
                     for event in events:
                         saver.add(event)
-                        if not isinstance(event, FrameUsed):  # shown in the turn
+                        if not isinstance(event, FrameUsed):  # shown during the revolution
                             show(event)
                         if isinstance(event, Identified):
                             answer = event

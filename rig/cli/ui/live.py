@@ -113,7 +113,7 @@ class LiveView(AbstractContextManager["LiveView"]):
 
     @property
     def _hint(self) -> Text:
-        """What the operator can do now: how to resume a pause, or the keys."""
+        """Return what the operator can do now: how to resume a pause, or the keys."""
         if self._paused:
             return Text(self._paused, style="bold yellow")
         stop = "Ctrl+C: stop"
@@ -258,7 +258,7 @@ class IdentifyView(LiveView):
                     self.note(f"  {move_words(event)}")
             case Accepted():
                 self._taken, self._azimuth_deg = event.index + 1, event.azimuth_deg
-                if plain and event.evidence.motion is None:  # a frame of a turn has its own line
+                if plain and event.evidence.motion is None:  # a frame in motion has its own line
                     self.note(line(event))
             case FrameUsed() if plain:
                 self.note(line(event))

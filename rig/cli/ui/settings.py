@@ -1,4 +1,4 @@
-"""The common options of every command; they open the bench and the catalog.
+"""The common options of every command. They open the bench and the catalog.
 
 This module imports none of numpy, cv2, scipy and sqlalchemy: `rig --help` must start at once.
 """
@@ -70,7 +70,7 @@ class Settings:
         return self.bench or self.load().default_bench
 
     def open_bench(self, *, tell: bool = True, devices: "Collection[str]" = ("imu", "camera")) -> "Bench":
-        """Open the bench and print its notes; with ``tell`` false the command prints those on calibration itself.
+        """Open the bench and print its notes; with ``tell`` false, the caller prints those on calibration.
 
         The servo and ``devices`` are opened now, the others when they are first used.
         """
@@ -127,7 +127,7 @@ class Settings:
             self.deliver()
 
     def deliver(self, *, replacing: "Collection[str]" = (), now: bool = False) -> "list[Delivery]":
-        """Deliver the journal to the server of the catalog; print what was delivered, and why something was not.
+        """Deliver the journal to the server of the catalog; print the delivered objects, and reasons for the others.
 
         If the server cannot be used, print a note: the journal keeps everything. With ``now`` raise the error.
         """
@@ -150,14 +150,14 @@ class Settings:
         return done
 
     def background_delivery(self) -> "BackgroundDelivery":
-        """Return a delivery of the journal beside the work of a ``with`` block; what becomes of it is on stderr."""
+        """Return a delivery of the journal during the work of a ``with`` block; its results are printed on stderr."""
         from rig.catalog.shared import BackgroundDelivery
         from rig.core.clock import SystemClock
 
         return BackgroundDelivery(self.load().catalog_place(self.bench_name), SystemClock(), _report)
 
     def background_check(self) -> "BackgroundCheck":
-        """Return a check of the bench's catalog beside the work of a ``with`` block; damage is printed on stderr."""
+        """Return a check of the bench's catalog during the work of a ``with`` block; damage is printed on stderr."""
         from rig.catalog.background import BackgroundCheck
         from rig.core.clock import SystemClock
 

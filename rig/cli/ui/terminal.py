@@ -1,4 +1,4 @@
-r"""What a command writes to the terminal: text from files and devices cannot control it.
+r"""Guarded output of a command: text from files and devices cannot control the terminal.
 
 Labels, notes, file names and answers of devices can hold terminal escapes. Standard output and standard error replace
 such characters by ``\u001b``. JSON stays JSON, because that is its own notation. Colors come from Rich, which writes to
@@ -55,7 +55,7 @@ class _Output:
 
 
 class _GuardedOutput(_Output):
-    """A text stream that neutralises what it is given; ``unguarded`` is the same stream without that."""
+    """A text stream that neutralises its input; ``unguarded`` is the same stream without that."""
 
     def __init__(self, stream: TextIO) -> None:
         super().__init__(stream)

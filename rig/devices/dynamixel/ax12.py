@@ -11,7 +11,7 @@ from rig.devices.servo import MotionProfile, ServoCondition, ServoState
 RANGE_DEG, MAX_COUNTS = 300.0, 1023
 DPS_PER_UNIT = 0.111 * 6.0
 _DIRECTION = 0x400  # bit 10 of speed and load: clockwise, the position falls
-_STEEPEST_DPS2 = 2000.0  # its fastest acceleration, which no document states: an estimate from its 354 °/s
+_STEEPEST_DPS2 = 2000.0  # its fastest acceleration, estimated from its 354 °/s, because no document states it
 _ARRIVED_COUNTS = 2  # largest distance from the goal at rest: the compliance margin of 1 count, and 1 count of noise
 
 

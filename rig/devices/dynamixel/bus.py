@@ -24,7 +24,7 @@ DOUBT_S = 60.0
 """How long a bus counts as one that repeats replies, after one arrived that belongs to no request."""
 
 CONFIRM_ATTEMPTS = 16
-"""How often a reading is repeated until nothing else arrives beside its reply."""
+"""Largest number of repetitions of a reading until only its reply arrives."""
 
 _BITS = 10  # a byte with its start and stop bit
 _ECHO_SIZE = 2  # in Protocol 1.0, an echoed instruction that reads this number of bytes is a valid reply to itself
@@ -56,26 +56,27 @@ class BusStatistics:
 class DynamixelBus:
     """Reads and writes registers; repeats failed transactions, and never returns a failed read as a value.
 
-    The protocols have no sequence numbers, so a reply after its time-out would be taken for the next one. Here replies
-    are distinguished by their length: reads in a row ask for different numbers of bytes (some more, below the address),
-    and while a reply is still owed, no other read asks for its number. The replies to all writes are equal. So while a
-    reply is owed, and for `DOUBT_S` after a reply that belongs to no request, each write is read back, and each reading
-    is confirmed. In Protocol 1.0 no reading contains its age, so all readings are confirmed.
+    The protocols have no sequence numbers, so a reply after its time-out could be accepted as the next one. Therefore
+    the bus distinguishes replies by their length. Successive reads ask for different numbers of bytes, by some more
+    bytes below the address, and while a reply is missing, no other read asks for its number of bytes. The replies to
+    all writes are equal. So while a reply is missing, and for `DOUBT_S` after a reply that belongs to no request, each
+    write is read back, and each reading is confirmed. In Protocol 1.0 no reading contains its age, so all readings are
+    confirmed.
 
     Parameters
     ----------
     port
         An open port.
     retries
-        How often a transaction is repeated before the device counts as silent. All instructions used here are absolute
-        (a read, or a write of a value), so a repetition is harmless.
+        Largest number of repetitions of a transaction before the device counts as silent. All instructions used here
+        are absolute (a read, or a write of a value), so a repetition is harmless.
     protocol
         2 (X series, and MX series with firmware for it), or 1 (AX-12A).
 
     Attributes
     ----------
     sampled_ns
-        When the device began to send the last block that was read: it had sampled its registers just before.
+        Time at which the device began to send the last block that was read; it had sampled its registers just before.
     """
 
     def __init__(self, port: ClockedPort, retries: int = 3, protocol: int = 2) -> None:
@@ -111,8 +112,8 @@ class DynamixelBus:
     def read_block(self, device_id: int, address: int, size: int, *, dated: bool = False) -> bytes:
         """Return ``size`` bytes from ``address``, read in one transaction; ``dated`` if they show their own age.
 
-        In doubt, a reading is confirmed by a second one. If the reply to the first was an old one, its own reply is
-        there already or arrives before that to the second; then both are discarded.
+        In doubt, a second reading confirms the first one. If the first reply was an old one, the right reply is there
+        already or arrives before the reply to the second reading; then both are discarded.
         """
         data, self.sampled_ns = self._read_once(device_id, address, size)
         if dated or not (self.protocol == 1 or self._repeats_replies()):
@@ -239,7 +240,7 @@ class DynamixelBus:
         """Send an instruction to ``target``; wait for replies with ``size`` parameters, from it or from ``answering``.
 
         A reply of another length does not belong to this request. A rejection has no parameters: while a reply without
-        parameters is owed, it is accepted only if no better one arrives.
+        parameters is missing, a rejection is accepted only if no longer reply arrives.
         """
         answering = (target,) if answering is None else answering
         self._drop_foreign()

@@ -1,4 +1,4 @@
-"""A small process that switches the torque off if the program dies without doing it, for example by `kill -9`.
+"""A small process that switches the torque off if the program dies before it has done so, for example by `kill -9`.
 
 The program holds one end of a pipe. When the program dies, the system closes that end, and the guardian opens the
 servo's port. It has its own session, so Ctrl+C at the terminal does not end it. A simulated servo in the memory of
@@ -43,7 +43,7 @@ class Guardian:
         self._tell(_ON)
 
     def disarm(self) -> None:
-        """The torque is off."""
+        """Report to the guardian that the torque is off."""
         self._tell(_OFF)
 
     def close(self) -> None:

@@ -158,5 +158,5 @@ def _restuff(packet: list[int], body: Sequence[int] | bytes) -> list[int]:
 
 
 def reason(result: int) -> str:
-    """Return the SDK's words for a result."""
+    """Return the SDK's text for a result."""
     return str(Protocol2PacketHandler().getTxRxResult(result)).removeprefix("[TxRxResult] ")

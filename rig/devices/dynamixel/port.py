@@ -15,7 +15,7 @@ from rig.core.clock import Clock
 from rig.core.errors import DeviceNotFound
 
 READ_SLICE_S = 0.005
-"""How long one read blocks: limits the delay of a timeout, and keeps the CPU idle."""
+"""Longest time that one read blocks. It limits the delay of a timeout, and keeps the CPU idle."""
 
 BABBLE_GRACE_MS = 50.0
 """How long a packet may exceed its timeout while bytes keep arriving; the SDK itself has no limit."""
@@ -56,7 +56,7 @@ def open_serial(path: str, baud: int, device: str = "servo", clock: Clock | None
         The next step names the likely reason: no such port, no permission, or another program uses it.
     """
     begun_ns = clock.now_ns() if clock else 0
-    was_guarded = True  # a guardian may close the port between the attempt to open it and the look at its users
+    was_guarded = True  # a guardian may close the port between the attempt to open it and the check of its users
     while True:
         try:
             connection: SerialConnection = serial.Serial(

@@ -16,7 +16,7 @@ BOOT_ALLOWANCE_S = 3.0
 """How long a servo may be silent after a reboot: some tenths of a second; the e-manual states no number."""
 
 TORQUE_OFF_ATTEMPTS = 3
-"""How often the torque is switched off and read back before it counts as on."""
+"""Largest number of attempts to switch the torque off and read it back before it counts as on."""
 
 _HARDWARE_ERRORS = {0: "input voltage", 2: "overheating", 3: "motor encoder", 4: "electrical shock", 5: "overload"}
 

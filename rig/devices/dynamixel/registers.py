@@ -16,7 +16,7 @@ from rig.core.plugins import plugins
 _FOLDER = "control_table"
 _PACKAGE = "dynamixel_easy_sdk"
 
-# The .model files mark the sign of few registers; these are the signed ones of the e-manual's control tables.
+# The signed registers of the e-manual's control tables: the .model files mark the sign of few registers.
 _SIGNED = frozenset(
     {
         "Homing Offset",
@@ -186,7 +186,7 @@ def model_numbers() -> Mapping[int, str]:
 
 
 def servo_plugin(model: str) -> Any:
-    """Return what a package names ``model`` in the group `GROUP`; None for other models.
+    """Return the object that a package names ``model`` in the group `GROUP`; None for other models.
 
     Raises
     ------

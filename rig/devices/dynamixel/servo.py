@@ -72,7 +72,7 @@ class DynamixelServo(RegisterServo):
             torque=bool(values["Torque Enable"]),
             watchdog_armed=0 < watchdog < WATCHDOG_TRIPPED,
             watchdog_tripped=tripped,
-            # The rig's profile is never 0, but 0 after power-up; a watchdog that trips also sets it to 0.
+            # The rig's profile is never 0. The register is 0 after power-up, and after the watchdog has tripped.
             power_lost=not tripped and values["Profile Acceleration"] == 0,
             hardware_errors=hardware_errors(values["Hardware Error Status"]),
         )

@@ -22,7 +22,7 @@ class ServoMode(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class SettingDifference:
-    """A setting that differs from what the rig needs, and why that matters."""
+    """A setting that differs from the required value, and the reason for that value."""
 
     register: str
     found: int

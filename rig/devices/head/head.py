@@ -47,7 +47,7 @@ from rig.devices.imu import ImuSamples
 FIRST_HEARTBEATS = 8
 """Heartbeats that compare the clocks before the first sample is dated."""
 RECOVERY_S = 0.5
-"""How long the head may take to get its sensor back."""
+"""Longest time that the head may take to set its sensor up again."""
 
 
 class RigHead:
@@ -207,7 +207,7 @@ class RigHead:
 
     @property
     def fault(self) -> RigError | None:
-        """Why the head switched its outputs off; None if it did not."""
+        """The reason why the head switched its outputs off; None if it did not."""
         return head_fault(
             self._status,
             port=self._connection.name,
@@ -360,7 +360,7 @@ class RigHead:
             self._clock.sleep(0.005)
 
     def _check_sensor(self) -> None:
-        """Raise the sensor's error, after the head had time to get it back."""
+        """Raise the sensor's error, after the head had time to set it up again."""
         if self._status.imu_status == ImuStatus.WRONG_ID or (
             self._status.imu_status != ImuStatus.RUNNING
             and seconds_between(self._sensor_lost_ns, self._clock.now_ns()) > max(RECOVERY_S, self._sensor.start_s)

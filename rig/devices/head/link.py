@@ -85,14 +85,14 @@ class HeadLink:
         self._connection = connection
 
     def start(self) -> None:
-        """End a frame that an earlier program may have sent in part, and drop what it did not read."""
+        """End a frame that an earlier program may have sent in part, and drop the replies that it did not read."""
         self._guarded(lambda: self._connection.write(b"\0"))
         self._guarded(self._connection.reset_input_buffer)
         self._deframer.reset()
         self._event_sequence = None
 
     def poll(self) -> None:
-        """Process what has arrived, without waiting."""
+        """Process the bytes that have arrived, without waiting."""
         if waiting := self._guarded(lambda: self._connection.in_waiting):
             self._take(self._guarded(lambda: self._connection.read(waiting)))
 
@@ -155,7 +155,7 @@ class HeadLink:
         return answer
 
     def _read(self, frame_bytes: int) -> bytes:
-        """Read what has arrived, or wait for the bytes that the present frame still lacks."""
+        """Read the bytes that have arrived, or wait for those that the present frame still lacks."""
         return self._connection.read(max(self._connection.in_waiting, self._deframer.missing(frame_bytes)))
 
     def _take(self, data: bytes) -> None:

@@ -63,7 +63,7 @@ class HeadStatus:
 def head_fault(
     status: HeadStatus, *, port: str, restart: Reset | None, start: Reset, deadman_ms: int
 ) -> RigError | None:
-    """Return why the head switched its outputs off; None if it did not.
+    """Return the error for the reason why the head switched its outputs off; None if it did not.
 
     Parameters
     ----------
@@ -72,9 +72,9 @@ def head_fault(
     port
         Its port, for the message.
     restart
-        Why it restarted while it was in use; None if it did not.
+        Cause of a restart while the head was in use; None if it did not restart.
     start
-        Why it started before it was opened.
+        Cause of the start before the head was opened.
     deadman_ms
         The deadman in force.
     """

@@ -64,7 +64,7 @@ class HeadClock:
 
     @property
     def drift_ppm(self) -> float:
-        """How much too fast the head's clock runs, in parts per million."""
+        """Relative error of the head's clock rate in parts per million; positive if it is too fast."""
         return float(1 / (1 + self._fit[1]) - 1) * 1e6
 
     @property
