@@ -1,7 +1,8 @@
 """Measure the backlash between servo shaft and platter, and the sense and ratio of the servo, with the platter's gyro.
 
-The table rotates up and down alternately. At each reversal the shaft first crosses the backlash while the platter
-stands still. The gyro therefore measures less than the encoder by the full backlash b, for any length of the leg:
+The table rotates up and down alternately. At each reversal the shaft first rotates through the backlash while the
+platter stands still. Therefore the gyro measures less than the encoder by the full backlash b, for any length of the
+leg:
 
     E = s·G + b·sign(E)
 
@@ -43,7 +44,7 @@ MAX_UNCERTAINTY_DEG = 0.03
 
 
 def plot(result: CalibrationResult) -> Chart | None:
-    """Return the rotation that each reversal lost beyond the fitted ratio: the backlash, for any length of the leg."""
+    """Return a chart of the rotation that each reversal lost beyond the fitted ratio: the backlash."""
     if "backlash" not in result.estimates:
         return None
     backlash, ratio = result.estimates["backlash"], result.estimates["ratio"].value
@@ -66,7 +67,7 @@ def plot(result: CalibrationResult) -> Chart | None:
 
 @dataclass(frozen=True)
 class Backlash(Procedure):
-    """Measure the backlash by ``reversals`` of the table around the angle where it stands."""
+    """A procedure that measures the backlash by ``reversals`` of the table around its present angle."""
 
     names, title, devices, valid_days, plots = (NAME,), "backlash of the gears", ("servo", "imu"), 90, (plot,)
     reversals: int = 24
@@ -74,14 +75,14 @@ class Backlash(Procedure):
     def measure(self, bench: Bench, *_: CalibrationResult) -> Measured:
         require_at_least(MIN_REVERSALS, self.reversals, "reversals")
         legs: list[Leg] = []
-        # Without the usual approach from one side: the backlash is what is measured.
+        # Without the usual approach from one side, because the backlash is measured.
         with table_settings(bench, approach_deg=0.0), Turntable(bench, trust_gyro=False) as table:
             base_deg = lower_end(bench, table.rest_deg, LONG_DEG)
             with returning(table) as goto:
                 yield moved(0, goto(base_deg + LONG_DEG))
                 yield moved(1, goto(base_deg))
                 for index in range(self.reversals):
-                    # Two short legs, then two long ones: a drifting bias of the gyro affects both alike.
+                    # Two short legs, then two long ones, so that a drifting bias of the gyro affects both equally.
                     length_deg = SHORT_DEG if index // 2 % 2 == 0 else LONG_DEG
                     move = goto(base_deg + (length_deg if index % 2 == 0 else 0.0))
                     legs.append(Leg.of(move, bench.config.imu))

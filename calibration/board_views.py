@@ -1,4 +1,4 @@
-"""Views of the calibration board on the table: the table moves the board, the operator only changes its position."""
+"""Views of the calibration board on the table, which rotates the board; the operator only changes its position."""
 
 from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass
@@ -59,7 +59,7 @@ class BoardView:
 def take_views(
     bench: Bench, board: Board, stands: Mapping[str, str], angles_deg: Sequence[float], found: Evaluation
 ) -> Generator[Event | Ask | Progress, None, list[BoardView]]:
-    """Ask for the board in each of the ``stands``, rotate to each of the ``angles_deg``, and return the views.
+    """Ask for the board in each of the positions ``stands``, rotate to each of the ``angles_deg``, return the views.
 
     ``stands`` maps names to descriptions, as in `STANDS`. A wrong board becomes a rejection of ``found``.
 
@@ -165,7 +165,7 @@ def by_stand(views: Sequence[Mapping[str, Any]]) -> list[tuple[str, str, list[Ma
 
 
 def plot_views(result: CalibrationResult, limit_px: float) -> Chart | None:
-    """Return the deviation of the corners of each view from the fit (RMS); the title names the worst views."""
+    """Return a chart of the deviation of each view's corners from the fit (RMS); the title names the worst views."""
     views, rms = result.evidence["views"], result.evidence.get("view_rms_px")
     if not rms:
         return None

@@ -1,4 +1,4 @@
-"""Measure how far the cable lets the table rotate: the operator shows both ends by hand, with the torque off.
+"""Measure the cable budget: the operator rotates the table by hand to both ends, with the torque off.
 
 The servo counts the revolutions itself while its supply is on.
 """
@@ -13,14 +13,14 @@ from rig.calibrations import CalibrationResult, RejectionCode
 NAME = "servo.cable"
 
 MARGIN_DEG = 15.0
-"""Left at either end: a stopped motion overruns, and a hand feels a taut cable late."""
+"""Margin at either end, because a stopped motion overruns, and an operator notices a taut cable late."""
 HAND_DEG = 5.0
 """Standard uncertainty of the angle at which an operator finds the cable taut."""
 
 
 @dataclass(frozen=True)
 class Cable(Procedure):
-    """Ask the operator to show both ends of the cable. The servo moves nothing."""
+    """A procedure in which the operator shows both ends of the cable. The servo moves nothing."""
 
     names, title, devices, valid_days = (NAME,), "ends of the cable", ("servo",), 365
 
@@ -37,7 +37,7 @@ class Cable(Procedure):
 
 
 def evaluate(high_deg: float, low_deg: float, *, pan: bool) -> Evaluation:
-    """Check the two ends of the cable, table angles in degrees; a ``pan`` table needs no whole revolution."""
+    """Evaluate the two ends of the cable, table angles in degrees; a ``pan`` table needs no whole revolution."""
     found = Evaluation(name=NAME, residual_unit="°", evidence={"margin_deg": MARGIN_DEG})
     found.estimate("lowest", low_deg, HAND_DEG, "°")
     found.estimate("highest", high_deg, HAND_DEG, "°")

@@ -36,7 +36,7 @@ MIN_PIXELS = 50
 REGIONS = (3, 4)
 FRAME_GROUPS = 6
 LEVELS = (8.0, 235.0)
-"""Between them a pixel is neither cut off at black nor saturated."""
+"""Grey levels between which a pixel is neither black nor saturated."""
 MIN_SPAN = 80.0
 """Grey levels that the scene must span to separate noise that grows with light from noise that does not."""
 BLOCK = 16
@@ -46,7 +46,7 @@ MAX_FLICKER = 0.02
 MAX_CAST = 0.15
 MAX_LOSS = 0.5
 MIN_SHARPNESS = 20.0
-"""Squared levels: a board in focus has hundreds."""
+"""Smallest sharpness in squared levels; a board in focus has hundreds."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +62,7 @@ class CardFrames:
 
 
 def plot(result: CalibrationResult) -> Chart | None:
-    """Return the data of noise, sharpness, flat field or drift, and the fit."""
+    """Return a chart of the data of noise, sharpness, flat field or drift, and of the fit."""
     evidence = result.evidence
     if not result.estimates:
         return None
@@ -123,7 +123,7 @@ def plot(result: CalibrationResult) -> Chart | None:
 
 @dataclass(frozen=True)
 class CameraNoise(Procedure):
-    """Take frames of the board at rest: sharpness and noise of the camera."""
+    """A procedure that takes frames of the board at rest: sharpness and noise of the camera."""
 
     names, title, devices, valid_days, plots = (SHARPNESS, NOISE), "sharpness and noise", ("camera",), 180, (plot,)
 
@@ -141,7 +141,7 @@ class CameraNoise(Procedure):
 
 @dataclass(frozen=True)
 class CameraCard(Procedure):
-    """Take frames of a plain card for some minutes: flat field of the camera, and stability of the light."""
+    """A procedure that takes frames of a plain card for some minutes: flat field, and stability of the light."""
 
     names, title, devices, valid_days, plots = (FLAT_FIELD, DRIFT), "flat field and light", ("camera",), 180, (plot,)
 
@@ -215,7 +215,7 @@ def photon_transfer(frames: NDArray[np.uint8]) -> Evaluation:
 
 
 def sharpness(values: Sequence[float]) -> Evaluation:
-    """Evaluate the sharpness of frames of the board: the reference that shows later that a lens shifted."""
+    """Evaluate the sharpness of frames of the board, with which a shift of the lens is noticed later."""
     found = Evaluation(name=SHARPNESS, residual_unit="squared levels")
     found.evidence = {"sharpness": [round(float(value), 2) for value in values]}
     mean = float(np.mean(values))

@@ -49,7 +49,7 @@ def matrix_of(result: CalibrationResult) -> tuple["np.ndarray[tuple[int, int], n
 
 
 def plot(result: CalibrationResult) -> Chart | None:
-    """Return the corners in the frame; each position of the board has its colour."""
+    """Return a chart of the corners in the frame; each position of the board has its colour."""
     views = result.evidence["views"]
     if not views:
         return None
@@ -69,7 +69,7 @@ def plot(result: CalibrationResult) -> Chart | None:
 
 
 def plot_residuals(result: CalibrationResult) -> Chart | None:
-    """Return the deviation of each corner from the fit, enlarged; each position of the board has its colour."""
+    """Return a chart of each corner's enlarged deviation from the fit, with a colour for each position of the board."""
     views = result.evidence["views"]
     if not views or not result.estimates:
         return None
@@ -95,13 +95,13 @@ def plot_residuals(result: CalibrationResult) -> Chart | None:
 
 
 def plot_views(result: CalibrationResult) -> Chart | None:
-    """Return the deviation of the corners in each view; see `calibration.board_views.plot_views`."""
+    """Return a chart of the corners' deviation in each view; see `calibration.board_views.plot_views`."""
     return plot_views_of(result, MAX_RMS_PX)
 
 
 @dataclass(frozen=True)
 class CameraModel(Procedure):
-    """Take views of the board in four positions, from nine sides each."""
+    """A procedure that takes views of the board in four positions, from nine sides each."""
 
     names, title, devices, valid_days = (NAME,), "lens of the camera", ("camera",), 365
     plots = (plot, plot_residuals, plot_views)

@@ -1,18 +1,18 @@
 """Measure when a frame is exposed: the time from its time stamp to the middle of its exposure.
 
-The table turns over the same arc in both directions and at several speeds. The image of an object at a table angle is
-the same in each pass, apart from noise. A frame that was exposed τ after its stamp shows the angle of that time, so at
-the speed ω it seems to be ahead by ω·τ of the angle at its stamp: two passes in opposite directions differ by 2·ω·τ.
+The table rotates over the same arc in both directions and at several speeds. The image of an object at a table angle is
+the same in each pass, apart from noise. A frame that was exposed τ after its stamp shows the angle of that time. At the
+speed ω this angle is ahead of the angle at the stamp by ω·τ, so two passes in opposite directions differ by 2·ω·τ.
 
-The angle that a frame shows is where the sum of squared differences to the frames of the slow passes, which lie densely
-over the arc, has its minimum. With the trajectory's angle θ at the stamps,
+The frames of the slow passes lie densely over the arc. The angle that a frame shows is the minimum of the sum of
+squared differences to these frames. With the trajectory's angle θ at the stamps,
 
     shown − θ = τ·ω + constant,
 
-where the constant of each direction is what the trajectory does not know of the backlash. The slow frames are moved by
-their own τ·ω. Bands of rows are compared apart: with a rolling shutter τ grows from the top to the bottom, and one fit
-to all bands gives the offset of the middle row and the read-out time. Bands with much texture weigh more. The scatter
-of fast frames beyond that of slow ones is the jitter, which all bands of a frame share.
+where the constant of each direction is the part of the backlash that the trajectory does not contain. The slow frames
+are corrected by their own τ·ω. Bands of rows are compared separately: with a rolling shutter τ grows from the top to
+the bottom, and one fit to all bands gives the offset of the middle row and the read-out time. Bands with much texture
+have more weight. The scatter of fast frames beyond that of slow ones is the jitter, which all bands of a frame share.
 """
 
 from collections.abc import Sequence
@@ -39,7 +39,7 @@ NAME = "camera.time"
 
 ARC_DEG = 50.0
 RAMP_S = 0.25
-"""Frames within so much time after the table has reached its speed are left out: the platter rings."""
+"""Time after the table has reached its speed in which frames are left out, because the platter vibrates."""
 SPEEDS = (12.0, 45.0, 90.0)
 """Speeds of the passes in °/s; the first is that of the reference frames."""
 SMALL_PX = 6
@@ -51,7 +51,7 @@ MAX_ANGLE_DEG = 0.15
 
 
 def plot(result: CalibrationResult) -> Chart | None:
-    """Return how far frames are ahead of the angle at their stamps, over the speed."""
+    """Return a chart of the angle by which frames are ahead of the angle at their stamps, over the speed."""
     if not result.estimates or "rates_dps" not in result.evidence:
         return None
     rates, ahead = result.evidence["rates_dps"], result.evidence["ahead_deg"]
@@ -70,13 +70,13 @@ def plot(result: CalibrationResult) -> Chart | None:
 
 @dataclass(frozen=True)
 class CameraTime(Procedure):
-    """Measure the camera's time by turning an object with texture at several speeds in both directions."""
+    """A procedure that measures the camera's time by rotating an object at several speeds in both directions."""
 
     names, title, devices, plots = (NAME,), "time of the frames", ("servo", "camera", "exposure"), (plot,)
     valid_days = 90
-    """Time stamps depend on camera, driver and USB port; three months find a changed kernel."""
+    """Three months, because time stamps depend on camera, driver, USB port and kernel."""
     thing: str = BOARD
-    """What the simulated bench puts on the table: the board, or an object with texture."""
+    """The object that the simulated bench puts on the table: the board, or an object with texture."""
     rounds: int = 1
 
     def measure(self, bench: Bench, *_: CalibrationResult) -> Measured:
@@ -122,14 +122,14 @@ class CameraTime(Procedure):
 
 
 def _ramp_deg(speed_dps: float, bench: Bench) -> float:
-    """Return the rotation until the table has its speed and does not ring any more."""
+    """Return the rotation until the table has its speed and no longer vibrates."""
     return speed_dps**2 / (2 * bench.config.table.acceleration_dps2) + speed_dps * RAMP_S
 
 
 def _take_pass(
     table: Turntable, stream: FrameStream, bench: Bench, ends_deg: tuple[float, float], speed_dps: float, way: int
 ) -> tuple[Pass, float, int] | None:
-    """Turn over the arc and return the frames at constant speed, the trajectory's residual, and lost frames.
+    """Rotate over the arc; return the frames at constant speed, the trajectory's residual, and the lost frames.
 
     None if the time stamps cannot be used.
     """
@@ -176,7 +176,7 @@ def _take_pass(
 def small(image_bgr: NDArray[np.uint8], bench: Bench) -> NDArray[np.float32]:
     """Return the region in grey, averaged over squares, with mean 0: smooth enough to interpolate over angles.
 
-    It is not smoothed downwards: with a rolling shutter, rows show other times.
+    It is not smoothed across rows, because with a rolling shutter rows show different times.
     """
     grey = cv2.cvtColor(within(image_bgr, bench.config.view.roi), cv2.COLOR_BGR2GRAY)
     size = max(grey.shape[1] // SMALL_PX, 8), max(grey.shape[0] // SMALL_PX, 8)
@@ -241,4 +241,4 @@ def evaluate(passes: Sequence[Pass], *, exposure_ms: float, fastest_dps: float, 
 
 
 COMMON_S = 0.00025
-"""What all passes have in common: the times of encoder readings, and the trajectory."""
+"""Errors that all passes share: the times of encoder readings, and the trajectory."""

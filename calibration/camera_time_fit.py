@@ -1,4 +1,4 @@
-"""The fit behind `rig calibrate camera-time`: frames of several passes are compared, and times of their rows fitted.
+"""The fit of `rig calibrate camera-time`: compares frames of several passes, and fits the times of their rows.
 
 `calibration.camera_time` describes the method.
 """
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 NEAR_DEG = 2.0
-"""Reference frames within so many degrees are compared with a frame."""
+"""Largest distance, in degrees, of the reference frames that are compared with a frame."""
 FEWEST_FRAMES = 40
 BANDS = 4
 TEXTURE_SHARE = 0.1
@@ -23,7 +23,7 @@ READOUT_S = 0.03
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pass:
-    """Frames of one turn at a constant speed.
+    """The frames of one rotation at a constant speed.
 
     ``angle_deg`` and ``rate_dps`` are those of the trajectory at the stamps, ``images`` the small grey frames
     (n, h, w).
@@ -87,7 +87,7 @@ def bands_of(passes: Sequence[Pass]) -> list[tuple[slice, float]]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fit:
-    """Times of the middle row and of each band, and what frames show, ahead of the angle at their stamps (n,)."""
+    """Times of the middle row and of each band, and the angles of frames minus those at their stamps (n,)."""
 
     middle_s: float
     middle_sigma_s: float
@@ -104,8 +104,8 @@ class Fit:
 def _matches(passes: Sequence[Pass], rows: slice, expected_s: float) -> NDArray[np.float64]:
     """Compare some rows of all frames with the slow passes.
 
-    Returns, for each frame and slow pass, (n, 5): the frame's number, its rate, its rate less that of the slow pass,
-    its direction against it, and the angle that it shows less that at its stamp.
+    Returns, for each frame and slow pass, (n, 5): the frame's number, its rate, its rate minus that of the slow pass,
+    its direction relative to the slow pass, and the angle that it shows minus that at its stamp.
     """
     means = [float(one.rate_dps.mean()) if len(one.rate_dps) else 0.0 for one in passes]
     slow_dps = min((abs(mean) for mean in means if mean), default=0.0)
@@ -138,7 +138,7 @@ def fit(passes: Sequence[Pass], bands: Sequence[tuple[slice, float]]) -> Fit | N
         own = band[:, None] == np.arange(len(bands))
         design = np.column_stack([x, x * centre[band], -down[:, None] * own])
         known = np.zeros(design.shape[1])
-        known[1] = 1 / READOUT_S  # a narrow object does not show it
+        known[1] = 1 / READOUT_S  # a narrow object does not show the read-out time
         known[2:] = 1 / 90.0  # no slow pass in the other direction
         weight = np.ones(len(x))
         for _ in range(5):
@@ -150,12 +150,12 @@ def fit(passes: Sequence[Pass], bands: Sequence[tuple[slice, float]]) -> Fit | N
             spread = np.maximum(spread, 1e-4)[band]
             weight = 1 / (spread * np.maximum(1, np.abs(residual) / (2.5 * spread)))
         times_s = (values[0] + values[1] * centre).tolist()
-    # All comparisons of a frame share its jitter: the scatter counts by frames.
+    # All comparisons of a frame share its jitter, so the scatter is computed over frames.
     number = frame.astype(int)
     scores = np.zeros((number.max() + 1, design.shape[1]))
     np.add.at(scores, number, design * (residual * np.square(weight))[:, None])
     covariance = inverse @ (scores.T @ scores + np.diag(np.square(known))) @ inverse
-    # Each band's own time shows whether the rows follow a line.
+    # The time of each band shows whether the times of the rows lie on a line.
     slopes, sigmas = [], []
     for of in own.T:
         power = float(np.square(x[of] * weight[of]).sum())
@@ -172,7 +172,7 @@ def fit(passes: Sequence[Pass], bands: Sequence[tuple[slice, float]]) -> Fit | N
     rate = np.bincount(number, precise * rates)[seen] / total[seen]
     at = np.bincount(number, precise * centre[band])[seen] / total[seen]
     spread_deg = max(1.4826 * float(np.median(np.abs(mean))), 1e-4)
-    variance = np.square(mean / np.maximum(1, np.abs(mean) / (2.5 * spread_deg)))  # a frame may show nothing
+    variance = np.square(mean / np.maximum(1, np.abs(mean) / (2.5 * spread_deg)))  # a frame may have no usable rows
     line = np.column_stack([np.ones_like(rate), np.square(rate)])
     (rest, growth), *_ = np.linalg.lstsq(line, variance, rcond=None)
     noise = np.linalg.inv(line.T @ line)[1, 1] * 2 * float(np.square(variance).mean() / 3)

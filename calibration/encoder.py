@@ -31,7 +31,7 @@ NAMES = ("cos1", "sin1", "cos2", "sin2")
 STEPS_PER_REVOLUTION = 12
 MIN_REVOLUTIONS = 1
 MAX_ERROR_DEG = 2.0
-"""Encoders of sound servos stay far below: more is a magnet that came off, or a platter off its shaft."""
+"""Far above the error of intact encoders: more means that the magnet or the platter came off the shaft."""
 MAX_UNCERTAINTY_DEG = 0.05
 
 
@@ -45,7 +45,7 @@ class Step:
 
 
 def plot(result: CalibrationResult) -> Chart | None:
-    """Return the encoder's error over its revolution, as fitted and as the steps show it."""
+    """Return a chart of the encoder's error over its revolution: the fit, and the values of the steps."""
     if not result.estimates:
         return None
     revolution_deg = result.evidence["turn_deg"]
@@ -56,7 +56,7 @@ def plot(result: CalibrationResult) -> Chart | None:
     basis = _basis(phi, revolution_deg)
     encoder = np.array([step["leg"]["encoder_deg"] for step in steps])
     gyro = np.array([step["leg"]["gyro_deg"] for step in steps])
-    # Over whole revolutions the encoder's error is zero: what differs is the gyro's scale.
+    # Over whole revolutions the encoder's error is zero, so the difference is the gyro's scale.
     error = np.cumsum(encoder - gyro * encoder.sum() / gyro.sum())
     sense = np.sign(steps[0]["to_deg"] - steps[0]["from_deg"]) * np.sign(encoder[0])
     to = np.array([step["to_deg"] for step in steps])
@@ -77,7 +77,7 @@ def plot(result: CalibrationResult) -> Chart | None:
 
 @dataclass(frozen=True)
 class Encoder(Procedure):
-    """Measure the encoder's error over ``revolutions`` of the table, in even steps upwards."""
+    """A procedure that measures the encoder's error over ``revolutions`` of the table, in even steps upwards."""
 
     names, title, devices, valid_days, plots = (NAME,), "error of the encoder", ("servo", "imu"), 365, (plot,)
     revolutions: int = 2
@@ -104,7 +104,7 @@ class Encoder(Procedure):
                     move = goto(middle + index * step_deg)
                     after = reference.to_servo(table.rest_deg)
                     leg = Leg.of(move, bench.config.imu)
-                    # As the servo itself reads: without the correction in force.
+                    # The servo's own reading, without the correction in force.
                     raw = Leg(config.direction * (after - before), leg.gyro_deg, leg.sigma_deg, leg.invalid)
                     steps.append(Step(before, after, raw))
                     yield moved(len(steps), move)
@@ -118,9 +118,9 @@ def evaluate(steps: Sequence[Step], *, direction: int, revolution_deg: float, re
     Parameters
     ----------
     steps
-        Consecutive ones, over whole revolutions.
+        Consecutive steps, over whole revolutions.
     direction
-        Of the table relative to the servo.
+        Direction of the table relative to the servo.
     revolution_deg
         The table's angle of one revolution of the encoder.
     resolution_deg

@@ -4,10 +4,10 @@ The Allan variance of the rate over the time τ, overlapping, from the integrate
 
     σ²(τ) = Σ (θ(t + 2τ) − 2θ(t + τ) + θ(t))² / (2τ²·n)
 
-White noise of the angle random walk N gives N²/τ, a random walk K of the rate K²·τ/3. Both are fitted together. Where
-they are equal lies the lowest value of the curve, which divided by 0.664 is called the bias instability. Samples of an
-Allan variance over many τ share their data, so the uncertainties come from a parametric bootstrap: the fit is repeated
-on series drawn with the fitted N and K.
+White noise of the angle random walk N gives N²/τ, a random walk K of the rate K²·τ/3. Both are fitted together. The
+curve has its lowest value at the τ where both are equal. This value, divided by 0.664, is called the bias instability.
+Samples of an Allan variance over many τ share their data, so the uncertainties come from a parametric bootstrap: the
+fit is repeated on series drawn with the fitted N and K.
 """
 
 from collections.abc import Generator
@@ -30,9 +30,9 @@ BLOCK_S = 1.0
 MIN_MINUTES = 3.0
 BOOTSTRAPS = 100
 MIN_WARMTH_C = 1.0
-"""A smaller change of temperature does not determine the slope."""
+"""Smallest change of temperature that determines the slope."""
 MAX_ARW_DEG_RTS = 0.02
-"""Six times the sensor's datasheet: beyond it the bench shakes, or the sensor is broken."""
+"""Six times the value in the sensor's datasheet: above it the bench shakes, or the sensor is broken."""
 MAX_STEP_SIGMA = 7.0
 """Largest deviation of one block from its neighbours: of 10⁶ blocks of noise none deviates more."""
 INSTABILITY = sqrt(2 * np.log(2) / np.pi)
@@ -55,7 +55,7 @@ class RestRecord:
 
 
 def plot(result: CalibrationResult) -> Chart | None:
-    """Return the Allan deviation over the averaging time, measured and fitted."""
+    """Return a chart of the Allan deviation over the averaging time, measured and fitted."""
     taus, model = result.evidence["tau_s"], result.evidence["allan_deviation_model_dps"]
     return Chart(
         "Allan deviation of the gyro at rest",
@@ -70,7 +70,7 @@ def plot(result: CalibrationResult) -> Chart | None:
 
 @dataclass(frozen=True)
 class GyroNoise(Procedure):
-    """Record the sensor for some ``minutes`` while the table stands without torque.
+    """A procedure that records the sensor for some ``minutes`` while the table stands without torque.
 
     The slope over temperature can be determined only while the sensor warms up, soon after power-on.
     """
@@ -118,7 +118,8 @@ def evaluate(rest: RestRecord, *, column: int, seed: int = 0) -> Evaluation:
     drawn = np.array(
         [_fit(series, rest.block_s, trend) for series in _bootstrap(fitted, rest.block_s, rate.size, seed)]
     )
-    # Removing the trend also removes some of the random walk. The bootstrap shows how much: correct the fit by it.
+    # Removing the trend also removes a part of the random walk. The bootstrap measures this part, and the fit is
+    # corrected.
     lack = np.divide(fitted, drawn.mean(axis=0), out=np.ones(2), where=fitted > 0)
     arw, walk = (fitted * lack).tolist()
     drawn *= lack**2

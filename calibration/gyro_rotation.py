@@ -1,15 +1,15 @@
 """Verify the uncertainty of every measured rotation, by repeated rotations of several durations.
 
-The table rotates to and fro between the same two rests, at several speeds. Systematic differences between encoder and
-gyro (scale, backlash, error of the encoder over its revolution) are the same in every rotation of a group, which is one
-speed and one direction: they go into the group's mean. What is left is the scatter, which must match the uncertainty
-stated for each rotation,
+The table rotates back and forth between the same two rests, at several speeds. A group is one speed and one direction.
+Systematic differences between encoder and gyro (scale, backlash, error of the encoder over its revolution) are the same
+in every rotation of a group, so they are in the group's mean. The remaining scatter must match the uncertainty stated
+for each rotation,
 
     σ² = N²·t + (σ_bias·t)² + 2·c²/12
 
-with the gyro's angle random walk N over the duration t, the uncertainty of its zero as learned from the rest before,
-and two rests anywhere within an encoder count c. Σ (d − mean)²/σ² then follows χ². The bench states its σ with caution:
-a servo stops at nearly the same place of a count each time, and the bench knows the zero better than it assumes.
+with the gyro's angle random walk N over the duration t, the uncertainty of its zero from the rest before, and two rests
+anywhere within an encoder count c. Σ (d − mean)²/σ² then follows χ². The stated σ of the bench is rather too large: a
+servo stops at nearly the same place of a count each time, and the zero is known better than assumed.
 """
 
 from collections.abc import Sequence
@@ -46,12 +46,12 @@ MIN_REPEATS = 4
 CHANCE = 1e-4
 """Probability that a true σ is rejected, at each duration and in either direction."""
 CAUTION = 2.0
-"""The stated σ may be this many times too large: overstated uncertainty does no harm."""
+"""Largest accepted ratio of the stated σ to the true one, because too large an uncertainty does no harm."""
 
 
 @dataclass(frozen=True, slots=True)
 class TimedLeg:
-    """A leg, how long its gyro was summed up, and its speed (a key of `SPEEDS`)."""
+    """A leg, the time over which its gyro was summed up, and its speed (a key of `SPEEDS`)."""
 
     speed: str
     seconds: float
@@ -59,7 +59,7 @@ class TimedLeg:
 
 
 def plot(result: CalibrationResult) -> Chart | None:
-    """Return the scatter of repeated rotations over their duration, and the stated uncertainty."""
+    """Return a chart of the scatter of repeated rotations over their duration, and of the stated uncertainty."""
     rows = result.evidence["by_duration"]
     if not rows:
         return None
@@ -79,7 +79,7 @@ def plot(result: CalibrationResult) -> Chart | None:
 
 @dataclass(frozen=True)
 class GyroRotation(Procedure):
-    """Rotate to and fro ``repeats`` times at each speed, around the angle where the table stands."""
+    """A procedure that rotates back and forth ``repeats`` times at each speed, around the table's present angle."""
 
     names, title, devices, valid_days, plots = (NAME,), "scatter of rotations", ("servo", "imu"), 180, (plot,)
     repeats: int = 10
@@ -96,7 +96,7 @@ class GyroRotation(Procedure):
                 with returning(table) as goto:
                     for number in range(2 * self.repeats + 1):
                         move = goto(base_deg + (0.0 if number % 2 else DISTANCE_DEG))
-                        if number:  # the first rotation begins where the table happened to stand
+                        if number:  # the first rotation begins at any angle
                             moves.append(TimedLeg(speed, move.gyro.duration_s, Leg.of(move, bench.config.imu)))
                         yield moved(index, move)
                         index += 1
@@ -109,7 +109,7 @@ def evaluate(moves: Sequence[TimedLeg], *, resolution_deg: float) -> Evaluation:
     Parameters
     ----------
     moves
-        To and fro between the same rests.
+        Rotations back and forth between the same rests.
     resolution_deg
         Angle of one encoder count.
     """

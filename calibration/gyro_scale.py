@@ -6,9 +6,9 @@ bias:
 
     s = Σ w·E·G / Σ w·G²,    w = 1/σ²,    σ² = σ_gyro² + σ_encoder²
 
-with the rotations E by the encoder and G by the gyro as it reads, without a scale. The tilt of the sensor against the
-axis (a factor of its cosine) and the error of its sample clock are part of s. A platter that slips by the same share on
-every leg looks like a scale: whole revolutions do not distinguish the two.
+with the rotations E by the encoder and G by the gyro, without a scale. The tilt of the sensor relative to the axis (a
+factor of its cosine) and the error of its sample clock are part of s. Whole revolutions do not distinguish a scale from
+a platter that slips by the same share on every leg.
 """
 
 from collections.abc import Sequence
@@ -31,17 +31,17 @@ from rig.safety.gyro_rotation import DRAIN_S, MEMORY_S
 NAME = "imu.scale"
 
 MIN_LEGS = 2
-"""Legs in each direction: fewer cannot contradict each other."""
+"""Smallest number of legs in each direction, so that they can contradict each other."""
 MAX_LEG_REVOLUTIONS = 2
-"""Longer legs gain nothing: the bias learned at the rest before gets old."""
+"""Longest leg; longer ones do not help, because the bias from the rest before drifts."""
 PLAUSIBLE = (0.9, 1.1)
 """±3 % from part to part, ±2 % over temperature (PS-MPU-6000A, 6.1), a mounting tilted by up to 15°."""
 MAX_UNCERTAINTY = 0.001
-"""Needed to know a rotation by 90° to a tenth of a degree."""
+"""Uncertainty with which a rotation by 90° is known to a tenth of a degree."""
 
 
 def plot(result: CalibrationResult) -> Chart | None:
-    """Return encoder over gyro for each leg, and the scale."""
+    """Return a chart of the ratio of encoder to gyro for each leg, and of the scale."""
     legs = [(i + 1, leg) for i, leg in enumerate(result.evidence["legs"]) if stored_valid(leg) and leg["gyro_deg"]]
     if not legs or not result.estimates:
         return None
@@ -67,11 +67,11 @@ def plot(result: CalibrationResult) -> Chart | None:
 
 @dataclass(frozen=True)
 class GyroScale(Procedure):
-    """Measure the gyro's scale by at least ``revolutions`` whole revolutions."""
+    """A procedure that measures the gyro's scale by at least ``revolutions`` whole revolutions."""
 
     names, title, devices, plots = (NAME,), "scale of the gyro", ("servo", "imu"), (plot,)
     valid_days = 180
-    """The scale ages by mounting and temperature, not by use; half a year finds a sensor that came loose."""
+    """Half a year, to notice a loose sensor; the scale changes by mounting and temperature, not by use."""
     revolutions: int = 8
 
     def measure(self, bench: Bench, *_: CalibrationResult) -> Measured:
@@ -91,7 +91,7 @@ class GyroScale(Procedure):
             for index in range(1 + 2 * each_way):
                 _rest(table, bench)
                 move = goto(ends_deg[index % 2])
-                if index:  # the first rotation takes up the backlash
+                if index:  # the first rotation runs through the backlash
                     legs.append(Leg.of(move, bench.config.imu))
                 yield moved(index, move)
         yield evaluate(legs, resolution_deg=bench.servo.resolution_deg)
@@ -111,8 +111,8 @@ def evaluate(legs: Sequence[Leg], *, resolution_deg: float) -> Evaluation:
     used = [leg for leg in legs if not leg.invalid]
     encoder = np.array([leg.encoder_deg for leg in used])
     gyro = np.array([leg.gyro_deg for leg in used])
-    # A leg has two rests, each uniform within a count: variance 2·count²/12. Neighbouring legs share one with opposite
-    # signs, so that its error counts twice in the ratio: as much again.
+    # A leg has two rests, each uniform within a count: variance 2·count²/12. Neighbouring legs share a rest with
+    # opposite signs, so that its error counts twice in the ratio: the variance is twice as large.
     sigma = np.hypot([leg.sigma_deg for leg in used], resolution_deg / sqrt(3))
     up = encoder > 0
     upwards, downwards = int(up.sum()), int((~up).sum())
@@ -146,14 +146,14 @@ def evaluate(legs: Sequence[Leg], *, resolution_deg: float) -> Evaluation:
 
 
 def _rest(table: Turntable, bench: Bench) -> None:
-    """Let the gyro see as much of a rest as it learns from: the bias is the largest part of its uncertainty."""
+    """Wait at rest as long as the gyro needs for its bias, the largest part of its uncertainty."""
     for _ in range(round(MEMORY_S / DRAIN_S)):
         bench.clock.sleep(DRAIN_S)
         table.check_still()
 
 
 def _ratio(encoder: NDArray[np.float64], gyro: NDArray[np.float64], sigma: NDArray[np.float64]) -> tuple[float, float]:
-    """Return encoder over gyro as a line through the origin, and its standard uncertainty."""
+    """Return the slope of encoder over gyro, a line through the origin, and its standard uncertainty."""
     weight = 1 / sigma**2
     norm = float((weight * gyro**2).sum())
     return float((weight * encoder * gyro).sum()) / norm, 1 / sqrt(norm)

@@ -3,8 +3,8 @@
 While the table rotates, the rate is along its axis: the direction of the integrated rate in the sensor's frame is the
 axis, in any direction of gravity. At rest the accelerometer shows gravity. The part of its mean over a revolution
 that is not along the axis is its own zero error; the part that rotates with the table is the deviation of the table's
-axis from the vertical. During a rotation with the backlash taken up, the encoder is ahead of the gyro by the rate times
-the delay.
+axis from the vertical. During a rotation after the backlash, the encoder is ahead of the gyro by the rate times the
+delay.
 """
 
 from collections.abc import Generator, Mapping, Sequence
@@ -27,21 +27,21 @@ NAME = "imu.mounting"
 STEPS = 8
 READINGS = 60
 SPACING_S = 0.025
-"""Between readings of the accelerometer: the memory of its low-pass filter of about 40 Hz has decayed."""
+"""Time between readings of the accelerometer, in which the memory of its low-pass filter of about 40 Hz decays."""
 MAX_TILT_DEG = 10.0
-"""The cosine of more costs 1.5 % of the rate: more than the gyro's own scale error."""
+"""Largest tilt; the cosine of this angle reduces the rate by 1.5 %, more than the gyro's own scale error."""
 MAX_LEVEL_DEG = 5.0
 AXIS_GAIN_SIGMA = 0.015
 """Difference of the scales of two of the gyro's axes, from part to part."""
 MIN_RATE_DPS = 5.0
-"""Readings during a rotation count from this rate on: the backlash is taken up long before."""
+"""Rate from which readings during a rotation count; the shaft has run through the backlash before."""
 
 REST_IN_BACKLASH_DEG = 0.04
 
 
 @dataclass(frozen=True, slots=True)
 class RecordedMove:
-    """One rotation upwards with the backlash taken up.
+    """One rotation upwards, after the shaft has run through the backlash.
 
     ``rotation_deg`` float64 (3,): the integrated rate about the sensor's axes, without the zero; ``sigma_deg`` of each
     of them; ``encoder_deg`` the table's rotation; ``lead_deg`` and ``rate_dps`` float64 (n,): the lead of the encoder
@@ -65,7 +65,7 @@ class GravityReading:
 
 
 def plot(result: CalibrationResult) -> Chart | None:
-    """Return the accelerometer across the axis over the revolution: a tilt and an offset make it a circle."""
+    """Return a chart of the accelerometer across the axis over the revolution; a tilt and an offset give a circle."""
     levels = result.evidence["levels"]
     if not levels or not result.estimates:
         return None
@@ -82,7 +82,7 @@ def plot(result: CalibrationResult) -> Chart | None:
 
 @dataclass(frozen=True)
 class ImuMounting(Procedure):
-    """Rotate the table once, in eight steps, and read the sensor at each stop."""
+    """A procedure that rotates the table once, in eight steps, and reads the sensor at each stop."""
 
     names, title, devices, valid_days, plots = (NAME,), "mounting of the IMU", ("servo", "imu"), 180, (plot,)
 
@@ -116,7 +116,7 @@ class ImuMounting(Procedure):
 
 
 def evaluate(moves: Sequence[RecordedMove], levels: Sequence[GravityReading], *, column: int, sign: int) -> Evaluation:
-    """Find tilt, levels and delay.
+    """Evaluate the tilt, the levels and the delay.
 
     Parameters
     ----------
@@ -189,13 +189,13 @@ def _delay(moves: Sequence[RecordedMove]) -> Estimate:
         float((move.rate_dps * move.lead_deg).sum() / (move.rate_dps**2).sum()) for move in moves if move.rate_dps.size
     ]
     # Readings of one rotation share the encoder's error at its rest, so the rotations are the independent data. A
-    # platter that rings comes to rest a little inside the backlash, always on the same side.
+    # vibrating platter comes to rest a little inside the backlash, always on the same side.
     scatter = float(np.std(each, ddof=1)) / sqrt(len(each))
     return Estimate(delay, hypot(scatter, REST_IN_BACKLASH_DEG / float(np.median(rate))), "s")
 
 
 def _observe_rest(bench: Bench, table: Turntable) -> None:
-    """Let the gyro see a rest, from which it learns its zero."""
+    """Wait at rest until the gyro's zero is measured."""
     for _ in range(5):
         bench.clock.sleep(0.2)
         table.check_still()
@@ -232,7 +232,8 @@ def _recorded_move(kept: Recording, before_ns: int, column: int, sign: int, dire
     rate_dps = np.interp(state_ns, times, (rates[:, column] - zero[column]) * sign)
     start = np.mean([direction * state.position_deg for state in kept.states if state.time_ns < before_ns])
     rotation = float(position[-1] - start)
-    # Scale of gyro against encoder, from the whole rotation: what remains during it is the delay.
+    # The whole rotation gives the scale of the gyro relative to the encoder. The remaining difference during it is the
+    # delay.
     scale = rotation / float(angle[-1]) if angle[-1] else 1.0
     cruising = np.abs(rate_dps) > MIN_RATE_DPS
     span_s = float(moving.sum()) * step_s

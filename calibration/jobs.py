@@ -40,7 +40,7 @@ class CalibrationJob:
     procedures: Callable[[str | None], Sequence[Procedure]]
 
     def __call__(self, bench: Bench, thing: str | None) -> Generator[CalibrationStep, None, None]:
-        """Calibrate; each result that passed is in force at once. ``thing`` is the object to use, if it needs one."""
+        """Calibrate; each result that passed is in force at once. ``thing`` is the object, if one is needed."""
         store = CalibrationStore(bench.config.calibration_path(bench.name))
         for procedure in self.procedures(thing):
             required = [in_force(bench, name) for name in procedure.requires]

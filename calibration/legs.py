@@ -14,7 +14,7 @@ from rig.config import ImuConfig
 from rig.motion.move import Move
 
 COVERAGE = 4.0
-"""A residual of more standard uncertainties is not chance (1 in 16 000)."""
+"""Largest residual, in standard uncertainties, that is due to chance (1 in 16 000)."""
 
 STATED_WEIGHT = 4.0
 """The stated noise weighs as much as this many degrees of freedom of the legs' scatter."""
@@ -22,10 +22,10 @@ STATED_WEIGHT = 4.0
 
 @dataclass(frozen=True, slots=True)
 class Leg:
-    """A rotation between two rests, in degrees: by the encoder, and by the gyro as it reads (scale 1).
+    """A rotation between two rests, in degrees: by the encoder, and by the gyro with scale 1.
 
-    ``sigma_deg`` is the gyro's standard uncertainty from noise and bias alone; ``invalid`` says why the gyro's rotation
-    is not valid, and is empty if it is.
+    ``sigma_deg`` is the gyro's standard uncertainty from noise and bias alone. ``invalid`` is the reason why the gyro's
+    rotation is not valid; empty if it is valid.
     """
 
     encoder_deg: float
@@ -49,7 +49,7 @@ def stored_valid(leg: Mapping[str, Any]) -> bool:
 
 
 def reasons(legs: Sequence[Leg]) -> list[str]:
-    """Return why legs are not valid, each reason once."""
+    """Return the reasons why legs are not valid, each once."""
     return list(dict.fromkeys(leg.invalid for leg in legs if leg.invalid))
 
 
@@ -107,7 +107,7 @@ def reject_slipped_leg(found: Evaluation, number: int) -> None:
 def scatter(chi_square: float, freedom: int) -> float:
     """Return the factor by which the variance of legs differs from the stated one: the square of the Birge ratio.
 
-    A bench may state its noise too high or too low, and a few legs prove neither. The stated noise weighs as much as
-    `STATED_WEIGHT` legs: the mean of an inverse-gamma posterior about 1.
+    The stated noise of a bench may be too high or too low, and a few legs do not show which. Therefore the stated noise
+    has the weight of `STATED_WEIGHT` legs: the result is the mean of an inverse-gamma posterior about 1.
     """
     return (chi_square + STATED_WEIGHT) / (freedom + STATED_WEIGHT)

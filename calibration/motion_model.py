@@ -1,4 +1,4 @@
-"""Measure how long a rotation takes: pace, wind-up and delay, from rotations over many distances.
+"""Measure the duration of rotations: pace, wind-up and delay, from rotations over many distances.
 
 A rotation by Δ until the table stands still takes, with the cruise speed v, the ramp a and the delay d (the servo's
 answer, the ringing, and the settling time)
@@ -41,7 +41,7 @@ TYPICAL_S = 0.04
 """Scatter of a settling time: the period of the control loop."""
 NOMINAL_TRUST = 0.3
 MAX_RESIDUAL_S = 0.25
-"""A rotation with a larger residual was hindered: six periods of the control loop."""
+"""Largest residual of a rotation that nothing obstructed: six periods of the control loop."""
 PARAMETERS = {"pace": "s/°", "wind_up": "s", "delay": "s"}
 
 
@@ -54,7 +54,7 @@ class TimedMove:
 
 
 def plot(result: CalibrationResult) -> Chart | None:
-    """Return the time of each rotation over its length, and the model."""
+    """Return a chart of the time of each rotation over its length, and of the model."""
     if not result.estimates:
         return None
     moves = result.evidence["moves"]
@@ -74,7 +74,7 @@ def plot(result: CalibrationResult) -> Chart | None:
 
 @dataclass(frozen=True)
 class MotionModel(Procedure):
-    """Time rotations over seven distances in both directions, ``rounds`` times."""
+    """A procedure that measures the time of rotations over seven distances in both directions, ``rounds`` times."""
 
     names, title, devices, valid_days, plots = (NAME,), "duration of rotations", ("servo",), 180, (plot,)
     rounds: int = 3

@@ -37,7 +37,7 @@ def as_json(result: "CalibrationResult") -> dict[str, Any]:
 
 
 def outcome_text(result: "CalibrationResult") -> str:
-    """Return the outcome of a calibration: its values, or why it did not pass and the next step."""
+    """Return the outcome of a calibration: its values, or the reasons why it did not pass and the next step."""
     residual = ""
     if result.residual is not None and result.limit is not None:
         unit = result.residual_unit

@@ -44,7 +44,7 @@ class Ask:
 
 @dataclass(slots=True, kw_only=True)
 class Evaluation:
-    """What a fit found: the part of a `CalibrationResult` that does not depend on date and device."""
+    """The result of a fit: the part of a `CalibrationResult` that does not depend on date and device."""
 
     name: str
     residual_unit: str = ""
@@ -107,15 +107,15 @@ class Procedure(ABC):
     names
         The results that the procedure yields, in order.
     title
-        What it calibrates, for people.
+        The quantity that it calibrates, in words.
     devices
         The devices that its results are bound to.
     valid_days
-        How long its results are valid.
+        Days for which its results are valid.
     requires
         Names of the results that must be in force; `measure` gets them in this order.
     plots
-        Draw a result, the main plot first; None if there is nothing to draw.
+        Functions that draw a result, the main plot first; they return None if there is nothing to draw.
     """
 
     names: ClassVar[tuple[str, ...]]
@@ -200,7 +200,7 @@ def lower_end(bench: Bench, start_deg: float, length_deg: float) -> float:
 
 
 def too_little_room(bench: Bench, needed: str) -> LimitExceeded:
-    """Return the error of a cable budget below what is ``needed``."""
+    """Return the error of a cable budget below the ``needed`` one."""
     low, high = bench.config.table.limits_deg
     return LimitExceeded(
         f"The cable leaves {high - low:.0f}°, the procedure needs {needed}.",

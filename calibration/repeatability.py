@@ -1,12 +1,12 @@
-"""Measure how well the bench repeats a view: the similarity of repeated views, and the settings that follow from it.
+"""Measure the repeatability of views: the similarity of repeated views, and the settings that depend on it.
 
 An object is placed several times at the same mark; each time the table makes two revolutions and takes the same views.
 Two views of the same azimuth differ by the camera's noise and the table's repeatability within one placement, and also
-by the hand and the light between two placements. The latter determine
+by placement and light between two placements. The differences between placements determine
 
 - ``identify.repeatability``: the similarity per view below which a known object falls with the stated error rate α in a
   decision: the conformal quantile ⌊α(n+1)⌋ of the n comparisons, each averaged over the N views of the shortest
-  decision. A single view falls much lower; with its quantile, unknown objects would be taken for known ones.
+  decision. A single view can be much less similar; with its quantile, unknown objects would be found as known ones.
 - ``identify.margin``: the difference by chance of two equally true scores in a decision of N views, z(1−α)·√2·σ/√N,
   with σ the scatter about the mean of the azimuth.
 """
@@ -43,7 +43,7 @@ BOOTSTRAPS = 200
 MAX_DRIFT = 0.02
 """Largest loss of similarity between the first and the last placement, compared with consecutive placements."""
 MIN_SIMILARITY = 0.7
-"""Less similar views of the same azimuth are not of the same object, or not of the same azimuth."""
+"""Smallest similarity of two views of the same object at the same azimuth."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +54,7 @@ class Placement:
 
 
 def plot(result: CalibrationResult) -> Chart | None:
-    """Return the similarity of views over the rotation of the table between them."""
+    """Return a chart of the similarity of views over the rotation of the table between them."""
     rows, threshold = result.evidence["by_step"], result.estimates["repeatability"].value
     steps, limit = [row["step_deg"] for row in rows], f"unknown below {threshold:.3f}"
     return Chart(
@@ -71,7 +71,7 @@ def plot(result: CalibrationResult) -> Chart | None:
 
 @dataclass(frozen=True)
 class Repeatability(Procedure):
-    """Ask for the object ``name`` at its mark several times, and take views from all sides."""
+    """A procedure that asks for the object ``name`` at its mark several times, and takes views from all sides."""
 
     names, title, devices, valid_days, plots = (NAME,), "repeatability of views", ("camera",), 180, (plot,)
     name: str
@@ -128,7 +128,7 @@ def needed_placements(error_rate: float) -> int:
 def evaluate(
     placements: Sequence[Placement], *, error_rate: float, views: int, first_step_deg: float = 90.0, seed: int = 0
 ) -> Evaluation:
-    """Find the similarity of repeated views.
+    """Evaluate the similarity of repeated views.
 
     Parameters
     ----------
@@ -166,7 +166,7 @@ def evaluate(
         some_within, some_between = within[:, chosen], between[:, chosen]
         ordered = np.sort(decided[:, chosen].ravel())
         quantile = float(ordered[max(floor(error_rate * (ordered.size + 1)) - 1, 0)])
-        # Scatter about the mean of its azimuth: the mean itself depends on the object, and is in every score.
+        # Scatter about the mean of each azimuth, because the mean depends on the object and is in every score.
         scatter = float(np.sqrt(some_between.var(axis=0, ddof=min(1, len(between) - 1)).mean()))
         return float(np.median(some_within)), float(np.median(some_between)), quantile, scatter
 

@@ -1,4 +1,4 @@
-"""Measure the table's axis in the camera's frame, and its wobble, with a board that rides on the table.
+"""Measure the table's axis in the camera's frame, and its wobble, with a board on the table.
 
 The board's poses lie on circles about the axis: the axes of the rotations between them give its direction, a linear fit
 to their centres a point on it. Starting from there, one fit uses all corners, with the encoder's angles θ as they are:
@@ -45,7 +45,7 @@ MAX_UNCERTAINTY_PX = 0.3
 MAX_LENS_OFF = 0.06
 """Relative error of a distance from lens to axis that is measured by hand."""
 MAX_CUT = 0.1
-"""Share of the object space's height or width that the frame may cut off on a side: objects seldom fill its corners."""
+"""Largest share of the object space that the frame may cut off on a side, because objects seldom fill its corners."""
 ROBUST_PX = 0.3
 CORNER_PX = 0.1
 """Uncertainty of a corner: it weighs the corners against the known camera parameters."""
@@ -66,7 +66,7 @@ class ObjectSpace:
     Attributes
     ----------
     radius_mm, height_mm
-        Of the cylinder, which stands on the platter.
+        Radius and height of the cylinder, which stands on the platter.
     board_mm
         Height of the board's middle above the platter in the first position.
     lens_mm
@@ -99,7 +99,7 @@ def region_of_interest(estimates: Mapping[str, Estimate], intrinsics: Calibratio
 
 
 def plot(result: CalibrationResult) -> Chart | None:
-    """Return the path of the board's middle about the axis, seen along it, and the fitted circles."""
+    """Return a chart of the path of the board's middle about the axis, seen along it, and of the fitted circles."""
     if not result.estimates:
         return None
     value = {name: estimate.value for name, estimate in result.estimates.items()}
@@ -126,13 +126,13 @@ def plot(result: CalibrationResult) -> Chart | None:
 
 
 def plot_views(result: CalibrationResult) -> Chart | None:
-    """Return the deviation of the corners in each view; see `calibration.board_views.plot_views`."""
+    """Return a chart of the corners' deviation in each view; see `calibration.board_views.plot_views`."""
     return plot_views_of(result, MAX_RMS_PX)
 
 
 @dataclass(frozen=True)
 class TableAxis(Procedure):
-    """Take views of the board in two positions, from thirteen sides each, and find the axis.
+    """A procedure that takes views of the board in two positions, from thirteen sides each, and fits the axis.
 
     Needs the camera's calibration.
     """
@@ -221,13 +221,13 @@ class _Axis:
         camera = [intrinsics.estimates[name] for name, _ in PARAMETERS]
         self._known = np.array([-PIVOT_MM, *(estimate.value for estimate in camera)])
         self._known_sigma = np.array([PIVOT_MM / 2, *(estimate.uncertainty for estimate in camera)])
-        self._known_sigma[1:3] *= sqrt(2)  # both focal lengths err together: they count once
+        self._known_sigma[1:3] *= sqrt(2)  # both focal lengths have the same error, so they count once
         self._points = [points(board, view) for view in views]
         self._corners_px = np.concatenate([view.corners_px for view in views])
         self._middle = board.points_mm().mean(axis=0)
         self._stands = sorted({view.stand for view in views})
         self._up, self._origin = _first_axis(views, poses, self._middle)
-        # Two directions across the axis: the point on it may move, and the axis lean, in these.
+        # Two directions across the axis, in which the point on the axis may move and the axis may lean.
         first = np.cross(self._up, [0.0, 0.0, 1.0])
         first /= np.linalg.norm(first)
         self._across = np.stack([first, np.cross(self._up, first)])
@@ -253,7 +253,7 @@ class _Axis:
 
     def fit(self) -> tuple[dict[str, Estimate], float]:
         """Return the estimates, and the root mean square of the corners' residuals in pixels."""
-        # Starting without a lean, the fit may end at a lean to the wrong side: try three starts, and use the best.
+        # Without a lean at the start, the fit may end at a lean to the wrong side. Try three starts, and use the best.
         starts = [self._start.copy() for _ in range(3)]
         for start, angle in zip(starts, np.radians([0.0, 120.0, 240.0]), strict=True):
             start[4:6] = radians(0.05) * np.array([np.cos(angle), np.sin(angle)])
@@ -385,7 +385,7 @@ def _check(found: Evaluation, board: Board, space: ObjectSpace) -> None:
         wobble_deg=wobble.value,
         limit_deg=MAX_WOBBLE_DEG,
     )
-    # Images alone do not determine lengths: only the measured distance shows a board of another size.
+    # Images alone do not determine lengths. Only the measured distance shows that the board has another size.
     if space.lens_mm is not None:
         lens_mm = _from_lens(found.estimates)
         found.reject_if(
