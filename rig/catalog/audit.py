@@ -71,7 +71,7 @@ def append(
             **author(),
             action=action,
             object_name=object_name,
-            details=as_json(details, "the details of the log entry"),
+            details=as_json(details, "The details of the log entry"),
         )
     )
     seal_appended(connection, audit)

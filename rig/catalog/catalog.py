@@ -198,7 +198,7 @@ class Catalog(AbstractContextManager["Catalog"]):
         name = clean_name(name)
         plan = tuple(float(azimuth_deg) for azimuth_deg in planned_azimuth_deg)
         if not plan:
-            raise UsageError("the enrollment has no planned views", next_step="plan at least one view")
+            raise UsageError("The enrollment has no planned views.", next_step="Plan at least one view.")
         for azimuth_deg in plan:
             check_azimuth(azimuth_deg)
         texts = checked_texts(label, note)
@@ -359,7 +359,7 @@ class Catalog(AbstractContextManager["Catalog"]):
             found = stored_views(connection, views.c.id == int(view_id))
         if not found:
             raise CatalogError(
-                f"there is no view {view_id} in the catalog {self.place}", next_step="load the views again"
+                f"There is no view {view_id} in the catalog {self.place}.", next_step="Load the views again."
             )
         return found[0]
 

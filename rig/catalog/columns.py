@@ -18,14 +18,14 @@ from rig.core.errors import CatalogDamaged
 from rig.views.image_files import IMAGE_FOLDER
 from rig.views.segmentation_evidence import check_evidence
 
-FIX = "use a backup of the catalog; if you received it, ask the sender for an export (rig export) instead"
+FIX = "Use a backup of the catalog; if you received it, ask the sender for an export (rig export) instead."
 
 
 def damaged(what: str, found: object) -> CatalogDamaged:
     """Return the error for a value that this program would not have stored."""
     shown = ascii(found)
     return CatalogDamaged(
-        f"the catalog is damaged: {what} is {shown if len(shown) <= 80 else shown[:79] + '…'}", next_step=FIX
+        f"The catalog is damaged: {what} is {shown if len(shown) <= 80 else shown[:79] + '…'}.", next_step=FIX
     )
 
 

@@ -83,8 +83,8 @@ def copy_catalog(source: Catalog, target: Catalog) -> Generator[JobProgress, Non
 def _check_empty(connection: Connection, target: Catalog) -> None:
     if any(_count(connection, table) for table in _TABLES):
         raise CatalogError(
-            f"the catalog {target.place} is not empty",
-            next_step="give a new place; to add objects to a catalog use rig catalog merge",
+            f"The catalog {target.place} is not empty.",
+            next_step="Give a new place. To add objects to a catalog: rig catalog merge",
         )
 
 
@@ -97,8 +97,8 @@ def _check_appended(connection: Connection, table: Table, source: Catalog) -> No
     for expected, (row_id, sealed, found) in enumerate(rows, 1):
         if sealed != found or row_id != expected:
             raise CatalogDamaged(
-                f"row {expected} of {table.name} in the catalog {source.place} is not the one that was written",
-                next_step="check the catalog: rig catalog verify",
+                f"Row {expected} of {table.name} in the catalog {source.place} is not the one that was written.",
+                next_step="Check the catalog: rig catalog verify",
             )
 
 
@@ -123,8 +123,8 @@ def _copy_image(source: Catalog, target: Catalog, name: str, sha256: str) -> int
         content = source.database.images.read(name)
     if images.digest(content) != sha256:
         raise CatalogDamaged(
-            f"the image {source.database.images.where(name)} is not the one that was stored",
-            next_step="run rig catalog verify --repair to find a copy",
+            f"The image {source.database.images.where(name)} is not the one that was stored.",
+            next_step="Run rig catalog verify --repair to find a copy.",
         )
     with target.database.catalog_errors():
         target.database.images.write(name, content)
@@ -168,5 +168,6 @@ def _compare(reading: Connection, writing: Connection) -> None:
         after += appended_digests(writing, table)
     if before != after or any(sealed != found for _, sealed, found in after):
         raise CatalogError(
-            "the copy is not equal to the catalog; nothing was stored", next_step="report this with rig doctor --json"
+            "The copy is not equal to the catalog. Nothing was stored.",
+            next_step="Report this with the output of `rig doctor --json`.",
         )

@@ -92,14 +92,14 @@ class Database(ABC):
 
     def read_only_error(self) -> CatalogError:
         """Return the error for a change of a catalog that is open for reading."""
-        return CatalogError(f"the catalog {self.place} is open for reading only", next_step="open it for writing")
+        return CatalogError(f"The catalog {self.place} is open for reading only.", next_step="Open it for writing.")
 
     def outdated(self) -> CatalogOutdated:
         """Return the error for a catalog that must be migrated first."""
         return CatalogOutdated(
-            f"the catalog {self.place} was written by an earlier program: its schema has version {self.version}, "
-            f"this program works with {SCHEMA_VERSION}",
-            next_step="migrate it (a backup is made): rig catalog migrate",
+            f"The catalog {self.place} was written by an earlier program: its schema has version {self.version}, "
+            f"this program works with {SCHEMA_VERSION}.",
+            next_step="Migrate it (a backup is made): rig catalog migrate",
             evidence={"found": self.version, "known": SCHEMA_VERSION},
         )
 
@@ -107,9 +107,9 @@ class Database(ABC):
 def newer(place: CatalogPlace, version: int) -> CatalogError:
     """Return the error for a catalog of a version that this program does not know."""
     return CatalogError(
-        f"the catalog {place} was written by a newer program: its schema has version {version}, "
-        f"this program knows {SCHEMA_VERSION}",
-        next_step="update hbr-rig on this computer",
+        f"The catalog {place} was written by a newer program: its schema has version {version}, "
+        f"this program knows {SCHEMA_VERSION}.",
+        next_step="Update hbr-rig on this computer.",
         evidence={"found": version, "known": SCHEMA_VERSION},
     )
 

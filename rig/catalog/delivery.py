@@ -81,7 +81,7 @@ def _alone(journal: Catalog) -> Iterator[None]:
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # the system releases it when the process ends
     except BlockingIOError as error:
-        raise CatalogBusy("another program delivers the journal now", next_step="try again later") from error
+        raise CatalogBusy("Another program delivers the journal now.", next_step="Try again later.") from error
     else:
         yield
     finally:
@@ -200,8 +200,9 @@ def _checked(journal: Catalog, name: str, sha256: str) -> bytes:
     content = _content(journal, name)
     if content is None or images.digest(content) != sha256:
         raise CatalogDamaged(
-            f"the image {journal.database.images.where(name)} of the journal is not the one that was stored",
-            next_step="restore it from a backup; or enroll the object again after rig catalog deliver --discard NAME",
+            f"The image {journal.database.images.where(name)} of the journal is not the one that was stored.",
+            next_step="Restore it from a backup. Or run `rig catalog deliver --discard NAME` and enroll the "
+            "object again.",
         )
     return content
 
@@ -240,8 +241,8 @@ def _check_name(connection: Connection, name: str, key: str, replaces: bool) -> 
     statuses = set(connection.scalars(select(enrollments.c.status).where(enrollments.c.object_id == object_id)))
     if statuses & {EnrollmentStatus.COMPLETE, EnrollmentStatus.IN_PROGRESS}:
         raise ObjectExists(
-            f"the journal has {name!r}, and the catalog has another object of that name; nothing is lost",
-            next_step=f"choose: rig catalog deliver --rename {name} NEW-NAME, --replace {name}, or --discard {name}",
+            f"The journal has {name!r}, and the catalog has another object of that name. Nothing is lost.",
+            next_step=f"Choose: rig catalog deliver --rename {name} NEW-NAME, --replace {name}, or --discard {name}",
         )
     return object_id
 

@@ -44,7 +44,9 @@ def known_descriptor(name: str) -> Descriptor:
     try:
         return descriptor(name)
     except ValueError as error:
-        raise UsageError(f"there is no descriptor {name!r}", next_step=f"choose one of {', '.join(names())}") from error
+        raise UsageError(
+            f"There is no descriptor {name!r}.", next_step=f"Choose one of {', '.join(names())}."
+        ) from error
 
 
 def settings_of(region: Region | None) -> JsonObject:
@@ -66,8 +68,8 @@ def region_of(settings: JsonObject) -> Region | None:
         case {"region": [x, y, width, height], **other} if not other and is_region((x, y, width, height)):
             return x, y, width, height
     raise CatalogError(
-        f"a view is described with settings that this program does not know: {dict(settings)}",
-        next_step="update hbr-rig on this computer, or describe the views again: rig catalog redescribe",
+        f"A view is described with settings that this program does not know: {dict(settings)}.",
+        next_step="Update hbr-rig on this computer, or describe the views again: rig catalog redescribe",
     )
 
 

@@ -100,12 +100,12 @@ class Enrollment:
         index = record.index
         if index >= len(self.planned_azimuth_deg):
             raise UsageError(
-                f"view {index} is not one of the {len(self.planned_azimuth_deg)} planned views of {self.object_name!r}",
-                next_step="start a new enrollment with a larger plan",
+                f"View {index} is not among the {len(self.planned_azimuth_deg)} planned views of {self.object_name!r}.",
+                next_step="Start a new enrollment with a larger plan.",
             )
         if PAPER_DESCRIPTOR not in record.descriptors:
             raise UsageError(
-                f"view {index} is not described by {PAPER_DESCRIPTOR}", next_step="describe it: hbr.describe"
+                f"View {index} is not described by {PAPER_DESCRIPTOR}.", next_step="Describe it: hbr.describe."
             )
         packed = pack(record.descriptors, record.region)
         png = images.encode(image_bgr) if encoded is None else encoded.result()
@@ -119,8 +119,8 @@ class Enrollment:
             self._check_in_progress(connection)
             if index not in self._missing(connection):
                 raise CatalogError(
-                    f"view {index} of {self.object_name!r} is stored already",
-                    next_step="continue with the missing views; check that no other process enrolls this object",
+                    f"View {index} of {self.object_name!r} is stored already.",
+                    next_step="Continue with the missing views; check that no other process enrolls this object.",
                 )
             image = self._write_image(f"{index:03d}.png", png)
             new = NewView(index, measured(record), self.session.id, captured_utc, image, packed)
@@ -181,8 +181,8 @@ class Enrollment:
         for one in found:
             if one.reason:
                 raise CatalogError(
-                    f"a view of {self.object_name!r} cannot be segmented: {one.reason}",
-                    next_step="check the disk, then continue the enrollment with --resume",
+                    f"A view of {self.object_name!r} cannot be segmented: {one.reason}.",
+                    next_step="Check the disk, then continue the enrollment with --resume.",
                 )
         with self._database.write(self.id) as connection:
             self._check_in_progress(connection)
@@ -202,8 +202,8 @@ class Enrollment:
             if missing := self._missing(connection):
                 raise CatalogError(
                     f"{len(missing)} of the {len(self.planned_azimuth_deg)} planned views of {self.object_name!r} "
-                    "are missing",
-                    next_step="resume the enrollment (--resume), or abandon it",
+                    "are missing.",
+                    next_step="Resume the enrollment (--resume), or abandon it.",
                     evidence={"missing_views": list(missing)},
                 )
             with changing_enrollments(connection, unfinished_and_complete(connection, self.object_id)):
@@ -234,8 +234,8 @@ class Enrollment:
             self._check_in_progress(connection)
             if len(self._missing(connection)) < len(self.planned_azimuth_deg):
                 raise CatalogError(
-                    f"the enrollment of {self.object_name!r} has views",
-                    next_step="abandon the enrollment: its views stay in the catalog",
+                    f"The enrollment of {self.object_name!r} has views.",
+                    next_step="Abandon the enrollment: its views stay in the catalog.",
                 )
             connection.execute(delete(sessions).where(sessions.c.enrollment_id == self.id))
             connection.execute(delete(enrollments).where(enrollments.c.id == self.id))
@@ -269,10 +269,10 @@ class Enrollment:
         ).first() or ("gone", None)
         if deleted_utc is not None:
             raise CatalogError(
-                f"{self.object_name!r} was deleted during its enrollment",
-                next_step=f"restore it and continue: rig catalog undelete {self.object_name}",
+                f"{self.object_name!r} was deleted during its enrollment.",
+                next_step=f"Restore it and continue: rig catalog undelete {self.object_name}",
             )
         if status != EnrollmentStatus.IN_PROGRESS:
             raise CatalogError(
-                f"the enrollment of {self.object_name!r} is {status}, not in progress", next_step="start a new one"
+                f"The enrollment of {self.object_name!r} is {status}, not in progress.", next_step="Start a new one."
             )

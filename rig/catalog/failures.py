@@ -56,21 +56,21 @@ def _of_server(error: DBAPIError, place: CatalogPlace, busy_timeout_s: float) ->
     evidence = {"sqlstate": state, "server": str(error.orig)}
     if state == "55P03":
         return CatalogBusy(
-            f"another process has been using the catalog {place} for {busy_timeout_s:g} s; nothing was changed",
-            next_step="wait until it has finished, and try again",
+            f"Another process has been using the catalog {place} for {busy_timeout_s:g} s. Nothing was changed.",
+            next_step="Wait until it has finished, and try again.",
             evidence=evidence,
         )
     if state.startswith("53"):
         return CatalogError(
-            f"the server of the catalog {place} has no space or memory left; this change was not stored, all earlier "
-            "ones are safe",
-            next_step="ask the administrator of the server, then continue",
+            f"The server of the catalog {place} has no space or memory left. This change was not stored. All earlier "
+            "ones are safe.",
+            next_step="Ask the administrator of the server, then continue.",
             evidence=evidence,
         )
     if state.startswith("28") or state in ("42501", "3D000", "25006"):
         return CatalogError(
-            f"the server denies access to the catalog {place}: {error.orig}",
-            next_step="check catalog.url, ~/.pgpass and the rights of the user on the server",
+            f"The server denies access to the catalog {place}: {error.orig}.",
+            next_step="Check catalog.url, ~/.pgpass and the rights of the user on the server.",
             evidence=evidence,
         )
     if (
@@ -93,13 +93,13 @@ def _accepts_connections(place: CatalogPlace) -> bool:
 def _unavailable(place: CatalogPlace, error: object) -> CatalogUnavailable:
     if _accepts_connections(place):
         return CatalogUnavailable(
-            f"the server of the catalog {place} denies the connection",
-            next_step="check catalog.url, the password in ~/.pgpass, and the rights of the user on the server",
+            f"The server of the catalog {place} denies the connection.",
+            next_step="Check catalog.url, the password in ~/.pgpass, and the rights of the user on the server.",
             evidence={"server": str(error).strip()},
         )
     return CatalogUnavailable(
-        f"the server of the catalog {place} does not answer",
-        next_step="check the network and the server, then try again",
+        f"The server of the catalog {place} does not answer.",
+        next_step="Check the network and the server, then try again.",
         evidence={"server": str(error).strip()},
     )
 
@@ -108,9 +108,11 @@ def absent(root: Path) -> CatalogError:
     """Return the error for a folder without a catalog."""
     if root.exists() and not root.is_dir():
         return CatalogError(
-            f"{root} is a file, not the folder of a catalog", next_step="give the folder of the catalog"
+            f"{root} is a file, not the folder of a catalog.", next_step="Give the folder of the catalog."
         )
-    return CatalogError(f"there is no catalog in {root}", next_step="check the path, or enroll an object to create it")
+    return CatalogError(
+        f"There is no catalog in {root}.", next_step="Check the path, or enroll an object to create it."
+    )
 
 
 def _of_sqlite(error: BaseException | None, root: Path, busy_timeout_s: float) -> RigError | None:
@@ -118,13 +120,16 @@ def _of_sqlite(error: BaseException | None, root: Path, busy_timeout_s: float) -
     match getattr(error, "sqlite_errorcode", 0) & 0xFF:
         case sqlite3.SQLITE_BUSY | sqlite3.SQLITE_LOCKED | sqlite3.SQLITE_PROTOCOL:
             return CatalogBusy(
-                f"another process has been writing to the catalog {root} for {busy_timeout_s:g} s; nothing was changed",
-                next_step="wait until it has finished, and try again",
+                f"Another process has been writing to the catalog {root} for {busy_timeout_s:g} s. "
+                "Nothing was changed.",
+                next_step="Wait until it has finished, and try again.",
                 evidence=evidence,
             )
         case sqlite3.SQLITE_NOTADB:
             return CatalogError(
-                f"{root / DATABASE_NAME} is not a catalog", next_step="give the folder of a catalog", evidence=evidence
+                f"{root / DATABASE_NAME} is not a catalog.",
+                next_step="Give the folder of a catalog.",
+                evidence=evidence,
             )
         case sqlite3.SQLITE_CORRUPT:
             return _damaged(root, evidence)
@@ -141,8 +146,8 @@ def _of_sqlite(error: BaseException | None, root: Path, busy_timeout_s: float) -
 
 def _damaged(root: Path, evidence: dict[str, str]) -> CatalogDamaged:
     return CatalogDamaged(
-        f"the catalog {root / DATABASE_NAME} is damaged",
-        next_step="copy the folder, then restore the database from a backup",
+        f"The catalog {root / DATABASE_NAME} is damaged.",
+        next_step="Copy the folder, then restore the database from a backup.",
         evidence=evidence,
     )
 
@@ -151,18 +156,18 @@ def _of_system(error: OSError, root: object) -> CatalogError:
     evidence = {"errno": errno.errorcode.get(error.errno or 0, "unknown"), "system": str(error)}
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         return CatalogError(
-            f"the disk of the catalog {root} is full; this change was not stored, all earlier ones are safe",
-            next_step="free some space, then continue",
+            f"The disk of the catalog {root} is full. This change was not stored. All earlier ones are safe.",
+            next_step="Free some space, then continue.",
             evidence=evidence,
         )
     if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
         return CatalogError(
-            f"no permission to use the catalog {root}",
-            next_step="make the folder and its files writable for this user, or give another folder",
+            f"No permission to use the catalog {root}.",
+            next_step="Make the folder and its files writable for this user, or give another folder.",
             evidence=evidence,
         )
     return CatalogError(
-        f"the catalog {root} cannot be used: {error}",
-        next_step="check the folder and its disk; use a local disk for a catalog",
+        f"The catalog {root} cannot be used: {error}.",
+        next_step="Check the folder and its disk; use a local disk for a catalog.",
         evidence=evidence,
     )

@@ -236,8 +236,8 @@ class FsspecImages(ImageStore):
                 files.pipe_file(f"{root}/{name}", content)
         except FileNotFoundError as error:
             raise CatalogError(
-                f"the store {self.url} does not exist",
-                next_step="create its bucket, or correct catalog.images",
+                f"The store {self.url} does not exist.",
+                next_step="Create its bucket, or correct catalog.images.",
                 evidence={"error": str(error)},
             ) from error
 
@@ -310,8 +310,8 @@ class FsspecImages(ImageStore):
             raise
         except Exception as error:  # each store has its own errors for a connection that fails
             raise CatalogUnavailable(
-                f"the images of the catalog in {self.url} cannot be reached",
-                next_step="check the network and the access to the store, then try again",
+                f"The images of the catalog in {self.url} cannot be reached.",
+                next_step="Check the network and the access to the store, then try again.",
                 evidence={"error": f"{type(error).__name__}: {error}"},
             ) from error
 
@@ -337,8 +337,8 @@ def open_store(place: CatalogPlace) -> ImageStore:
     except (ImportError, ValueError) as error:
         if isinstance(error, ValueError):
             raise ConfigError(
-                f"catalog.images = {place.images!r}: no such kind of store",
-                next_step="give a folder, or a URL such as s3://bucket/folder",
+                f"catalog.images = {place.images!r}: no such kind of store.",
+                next_step="Give a folder, or a URL such as s3://bucket/folder.",
             ) from error
         raise ExtraMissing.of("store", "images in an object store", error) from error
     return FsspecImages(place.images, place.path / CACHE)

@@ -73,8 +73,8 @@ def open_copy(place: CatalogPlace, clock: Clock) -> Catalog:
         copied_utc = datetime.fromisoformat(state["copied_utc"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise CatalogUnavailable(
-            f"this computer has no copy of the catalog {place}",
-            next_step="a copy is made when a search uses the server",
+            f"This computer has no copy of the catalog {place}.",
+            next_step="Search once while the server answers: the search makes the copy.",
         ) from error
     copy = Catalog.open(folder, clock=clock, create=False, read_only=True)
     copy.copied_utc, copy.copy_of = copied_utc, place
@@ -126,8 +126,8 @@ def open_or_copy(
             return open_copy(place, clock)
         except CatalogUnavailable as missing:
             raise CatalogUnavailable(
-                f"{error.what}, and {missing.what}",
-                next_step=f"{error.next_step}; {missing.next_step}",
+                f"{error.what} {missing.what}",
+                next_step=f"{error.next_step} {missing.next_step}",
                 evidence=error.evidence,
             ) from error
 

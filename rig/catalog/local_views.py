@@ -46,7 +46,7 @@ def local_views(catalog: Catalog, name: str, azimuths_deg: Sequence[float]) -> l
             cut = describer.segment(catalog.read_image(view), view.record.segmentation)
         except ValueError as error:
             raise CatalogDamaged(
-                f"the view {view.id} of {name} cannot be segmented: {error}", next_step="check it: rig catalog verify"
+                f"The view {view.id} of {name} cannot be segmented: {error}.", next_step="Check it: rig catalog verify"
             ) from error
         found.append(LocalView(cut.crop, cut.mask, view.record.azimuth_deg))
     return sorted(found, key=lambda view: view.azimuth_deg)

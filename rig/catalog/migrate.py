@@ -85,14 +85,14 @@ def _migrate(connection: Connection, root: Path, file: Path, clock: Clock) -> Mi
         _run_steps(connection, before)
     except (ValueError, TypeError, LookupError, AttributeError, RecursionError) as error:
         raise CatalogDamaged(
-            f"the catalog {root} has a value that no program stored; nothing was changed",
+            f"The catalog {root} has a value that no program stored; nothing was changed.",
             next_step=FIX,
             evidence={"error": str(error)},
         ) from error
     if broken := connection.exec_driver_sql("PRAGMA foreign_key_check").all():
         raise CatalogDamaged(
-            f"{len(broken)} rows of the catalog {root} refer to missing rows; nothing was changed",
-            next_step="restore the catalog from a backup, or ask for help with a copy of it",
+            f"{len(broken)} rows of the catalog {root} refer to missing rows; nothing was changed.",
+            next_step="Restore the catalog from a backup, or ask for help with a copy of it.",
             evidence={"tables": sorted({row[0] for row in broken})},
         )
     connection.exec_driver_sql(f"PRAGMA user_version = {SCHEMA_VERSION}")

@@ -97,5 +97,5 @@ def _inside(root: Path, top: str, name: str) -> Path:
 
 def _leads_out(path: Path) -> CatalogDamaged:
     return CatalogDamaged(
-        f"{os.fspath(path)!r} of the catalog leads to another place; nothing was changed", next_step=FIX
+        f"{os.fspath(path)!r} of the catalog leads to another place; nothing was changed.", next_step=FIX
     )

@@ -136,7 +136,7 @@ class PostgresDatabase(Database):
         with self._writing.begin() as connection:
             found = properties(connection)
         if found.get("application") != APPLICATION:
-            raise CatalogError(f"{self.place} is the database of another program", next_step="check catalog.url")
+            raise CatalogError(f"{self.place} is the database of another program.", next_step="Check catalog.url.")
         self.id = found["id"]
         self.version = _version(found, self.place)
         if self.version < (READABLE_VERSION if self._read_only else SCHEMA_VERSION):
@@ -149,18 +149,18 @@ class PostgresDatabase(Database):
         if mark == self.id:
             return
         where = self.images.where("images")
-        fix = "set catalog.images to the folder or the store that all benches of the catalog use"
+        fix = "Set catalog.images to the folder or the store that all benches of the catalog use."
         if mark is not None:
-            raise CatalogError(f"{where} has the images of another catalog than {self.place}", next_step=fix)
+            raise CatalogError(f"{where} has the images of another catalog than {self.place}.", next_step=fix)
         with self.read() as connection:
             used = connection.scalar(select(func.count()).select_from(METADATA.tables["enrollments"])) or 0
         if used and self.images.is_empty():
             raise CatalogUnavailable(
-                f"the images of the catalog {self.place} are not in {where}, which is empty",
-                next_step=f"mount the network share if it is not mounted; or {fix}",
+                f"The images of the catalog {self.place} are not in {where}, which is empty.",
+                next_step=f"Mount the network share if it is not mounted. Otherwise: {fix}",
             )
         if used:
-            raise CatalogError(f"the images of the catalog {self.place} are not in {where}", next_step=fix)
+            raise CatalogError(f"The images of the catalog {self.place} are not in {where}.", next_step=fix)
         if not self._read_only:
             self.images.set_mark(self.id)
 
@@ -181,8 +181,8 @@ class PostgresDatabase(Database):
         found = _version(properties(connection), self.place)
         if found != self.version:
             raise CatalogError(
-                f"the catalog {self.place} was migrated to version {found} while this program used it",
-                next_step="start the program again; update hbr-rig if it reports a newer version",
+                f"The catalog {self.place} was migrated to version {found} while this program used it.",
+                next_step="Start the program again; update hbr-rig if it reports a newer version.",
             )
 
     def may_have_changed(self) -> bool:
@@ -252,8 +252,8 @@ def migrate_server(
 
 def _absent(place: CatalogPlace) -> CatalogError:
     return CatalogError(
-        f"the database {place} has no catalog",
-        next_step="check catalog.url, or enroll an object to create the catalog",
+        f"The database {place} has no catalog.",
+        next_step="Check catalog.url, or enroll an object to create the catalog.",
     )
 
 
@@ -327,8 +327,8 @@ def _engine(place: CatalogPlace, busy_timeout_s: float) -> Any:
         )
     except ArgumentError as error:
         raise ConfigError(
-            f"catalog.url = {str(place)!r} is not the URL of a PostgreSQL database",
-            next_step="give postgresql+psycopg://USER@HOST/DATABASE; the password belongs in ~/.pgpass",
+            f"catalog.url = {str(place)!r} is not the URL of a PostgreSQL database.",
+            next_step="Give postgresql+psycopg://USER@HOST/DATABASE; the password belongs in ~/.pgpass.",
         ) from error
     except ImportError as error:
         raise ExtraMissing.of("postgres", "catalogs on PostgreSQL", error) from error

@@ -151,7 +151,7 @@ def _read(catalog: Catalog, kind: Descriptor, part: Sequence[_Wanted]) -> tuple[
     counts = np.bincount(views.object_index, minlength=len(views.object_names)).tolist()
     if views.object_names != tuple(one.name for one in part):
         raise CatalogError(
-            "the catalog was changed while it was read", next_step="start the command again", evidence={}
+            "The catalog was changed while it was read.", next_step="Start the command again.", evidence={}
         )
     records = np.empty(len(views), _record(kind))
     records["packed"], records["azimuth_deg"], records["view_id"] = views.packed(), views.azimuth_deg, view_ids

@@ -64,10 +64,10 @@ def find(connection: Connection, name: str, *, deleted: bool = False) -> tuple[i
     near = [by_folded[folded] for folded in get_close_matches(name.casefold(), by_folded)]
     state = "deleted object" if deleted else "object"
     raise ObjectNotFound(
-        f"there is no {state} {name!r} in the catalog",
-        next_step=f"did you mean {' or '.join(map(repr, near))}?"
+        f"There is no {state} {name!r} in the catalog.",
+        next_step=f"Did you mean {' or '.join(map(repr, near))}?"
         if near
-        else f"list the {state}s: rig catalog list{' --deleted' if deleted else ''}",
+        else f"List the {state}s: rig catalog list{' --deleted' if deleted else ''}",
         evidence={"near": near},
     )
 
@@ -76,8 +76,8 @@ def check_free(connection: Connection, name: str) -> None:
     """Raise `ObjectExists` if an object in use has this name."""
     if connection.scalar(select(objects.c.id).where(in_use(name))) is not None:
         raise ObjectExists(
-            f"there is another object {name!r} in the catalog",
-            next_step="choose another name, or rename the other object: rig catalog rename",
+            f"There is another object {name!r} in the catalog.",
+            next_step="Choose another name, or rename the other object: rig catalog rename",
         )
 
 
@@ -148,7 +148,7 @@ def unfinished(connection: Connection, object_id: int, name: str) -> Row[Any]:
     """Return the unfinished enrollment of an object; a `CatalogError` if there is none."""
     found = connection.execute(select(enrollments).where(of_status(object_id, EnrollmentStatus.IN_PROGRESS))).first()
     if found is None:
-        raise CatalogError(f"{name!r} has no unfinished enrollment", next_step="enroll it without --resume")
+        raise CatalogError(f"{name!r} has no unfinished enrollment.", next_step="Enroll it without --resume.")
     return found
 
 
@@ -157,15 +157,15 @@ def check_not_enrolled(connection: Connection, object_id: int, name: str) -> Non
     for enrollment in enrollment_summaries(connection, enrollments.c.object_id == object_id):
         if enrollment.status == EnrollmentStatus.IN_PROGRESS:
             raise CatalogError(
-                f"the enrollment of {name!r} is unfinished, with {len(enrollment.present)} of "
-                f"{len(enrollment.planned_azimuth_deg)} views",
-                next_step="continue it (--resume), or start again (--replace)",
+                f"The enrollment of {name!r} is unfinished, with {len(enrollment.present)} of "
+                f"{len(enrollment.planned_azimuth_deg)} views.",
+                next_step="Continue it (--resume), or start again (--replace).",
             )
         if enrollment.status == EnrollmentStatus.COMPLETE:
             raise ObjectExists(
-                f"{name!r} is enrolled already, with {len(enrollment.present)} views",
-                next_step="choose another name, or enroll it again (--replace); "
-                "the old views stay in use until the new ones are complete",
+                f"{name!r} is enrolled already, with {len(enrollment.present)} views.",
+                next_step="Choose another name, or enroll it again (--replace); "
+                "the old views stay in use until the new ones are complete.",
             )
 
 
@@ -306,7 +306,7 @@ def _outdated(
     return DescriptorOutdated(
         f"{described} of {views} views have the descriptor {kind.name} {kind.version}; it is missing for {shown}."
         f"{also}",
-        next_step=f"describe the stored images again: rig catalog redescribe{option}",
+        next_step=f"Describe the stored images again: rig catalog redescribe{option}",
         evidence={
             "views": views,
             "described": described,

@@ -102,8 +102,8 @@ class Provenance:
     software: str = field(default_factory=this_software)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "devices", as_json(self.devices, "the identities of the devices"))
-        object.__setattr__(self, "conditions", as_json(self.conditions, "the conditions"))
+        object.__setattr__(self, "devices", as_json(self.devices, "The identities of the devices"))
+        object.__setattr__(self, "conditions", as_json(self.conditions, "The conditions"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,23 +173,23 @@ class ViewRecord:
         convert(operator.index, "index", "captured_ns")
         convert(float, "commanded_deg", "encoder_deg", "azimuth_deg", "imu_deg", "imu_sigma_deg")
         if self.index < 0:
-            raise UsageError(f"view index {self.index} is negative", next_step="number the views of a plan from 0")
+            raise UsageError(f"View index {self.index} is negative.", next_step="Number the views of a plan from 0.")
         for name in ("commanded_deg", "encoder_deg", "azimuth_deg", "imu_deg", "imu_sigma_deg"):
             if not math.isfinite(getattr(self, name) or 0.0):
                 raise UsageError(
-                    f"view {self.index} has {name} = {getattr(self, name)}", next_step="store measured angles"
+                    f"View {self.index} has {name} = {getattr(self, name)}.", next_step="Store measured angles."
                 )
         check_azimuth(self.azimuth_deg)
         if (self.imu_deg is None) != (self.imu_sigma_deg is None) or (self.imu_sigma_deg or 0.0) < 0:
             raise UsageError(
-                f"view {self.index} has an IMU angle of {self.imu_deg} with an uncertainty of {self.imu_sigma_deg}",
-                next_step="give both, with an uncertainty of 0 or more, or None for both",
+                f"View {self.index} has an IMU angle of {self.imu_deg} with an uncertainty of {self.imu_sigma_deg}.",
+                next_step="Give both, with an uncertainty of 0 or more, or None for both.",
             )
-        convert(lambda values: as_json(values, f"the evidence of view {self.index}"), "evidence", "segmentation")
+        convert(lambda values: as_json(values, f"The evidence of view {self.index}"), "evidence", "segmentation")
         convert(lambda region: tuple(map(operator.index, region)), "region")
         if self.region is not None and not is_region(self.region):
             raise UsageError(
-                f"view {self.index} has the region {self.region}", next_step="give x, y, width, height in pixels"
+                f"View {self.index} has the region {self.region}.", next_step="Give x, y, width, height in pixels."
             )
 
 
@@ -259,15 +259,15 @@ def clean_name(name: str) -> str:
     """
     cleaned = unicodedata.normalize("NFC", name).strip()
     if not cleaned:
-        raise UsageError("the name of the object is empty", next_step="give a name, such as mug-white")
+        raise UsageError("The name of the object is empty.", next_step="Give a name, such as mug-white.")
     if not cleaned.isprintable():
         raise UsageError(
-            f"the name {cleaned!r} contains characters that cannot be printed", next_step="remove them from the name"
+            f"The name {cleaned!r} contains characters that cannot be printed.", next_step="Remove them from the name."
         )
     if len(cleaned) > MAX_NAME_LENGTH:
         raise UsageError(
-            f"the name has {len(cleaned)} characters; at most {MAX_NAME_LENGTH} are allowed",
-            next_step="shorten the name and put the rest into the note",
+            f"The name has {len(cleaned)} characters; at most {MAX_NAME_LENGTH} are allowed.",
+            next_step="Shorten the name and put the rest into the note.",
         )
     return cleaned
 
@@ -277,11 +277,11 @@ def check_text(text: str, what: str) -> None:
     try:
         text.encode()
     except UnicodeEncodeError as error:
-        raise UsageError(f"the {what} {text!r} is not valid text", next_step="type it in UTF-8") from error
+        raise UsageError(f"The {what} {text!r} is not valid text.", next_step="Type it in UTF-8.") from error
     if has_control_characters(text):
         raise UsageError(
-            f"the {what} {text!r} contains control characters",
-            next_step="remove them; `rig catalog label` changes the label and the note of an object",
+            f"The {what} {text!r} contains control characters.",
+            next_step="Remove them; `rig catalog label` changes the label and the note of an object.",
         )
 
 
@@ -296,7 +296,7 @@ def checked_texts(label: str | None, note: str | None) -> dict[str, str]:
 def check_azimuth(azimuth_deg: float) -> None:
     """Raise `UsageError` for an azimuth outside [0, 360)."""
     if not 0 <= azimuth_deg < 360:
-        raise UsageError(f"the azimuth {azimuth_deg}° is not in [0°, 360°)", next_step="wrap azimuths to [0°, 360°)")
+        raise UsageError(f"The azimuth {azimuth_deg}° is not in [0°, 360°).", next_step="Wrap azimuths to [0°, 360°).")
 
 
 def as_json(values: JsonObject, what: str) -> dict[str, Any]:
@@ -305,8 +305,8 @@ def as_json(values: JsonObject, what: str) -> dict[str, Any]:
         plain: dict[str, Any] = json.loads(json.dumps(dict(values), allow_nan=False, default=_plain_scalar))
     except (TypeError, ValueError) as error:
         raise UsageError(
-            f"{what} cannot be stored as JSON: {error}",
-            next_step="use text, finite numbers, true, false, None, lists and mappings",
+            f"{what} cannot be stored as JSON: {error}.",
+            next_step="Use text, finite numbers, true, false, None, lists and mappings.",
         ) from error
     return plain
 

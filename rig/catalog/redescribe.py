@@ -254,6 +254,6 @@ def _describe_one(store: ImageStore, item: _Item, evidence: str) -> Described:
         levels = describe(image, json.loads(evidence)).levels
         return Described(view.view_id, tuple(pack(levels, view.region)))
     except (CatalogError, UsageError) as error:
-        return Described(view.view_id, reason=error.what)
+        return Described(view.view_id, reason=error.what.rstrip("."))
     except ValueError as error:
         return Described(view.view_id, reason=str(error))

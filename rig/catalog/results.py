@@ -174,7 +174,7 @@ def clean_text(text: str, what: str) -> str:
             if len(cleaned) > MAX_TEXT_LENGTH
             else f"contains characters that cannot be printed: {cleaned[:100]!a}"
         )
-        raise UsageError(f"the {what} {problem}", next_step=f"give the {what} as one line of text")
+        raise UsageError(f"The {what} {problem}.", next_step=f"Give the {what} as one line of text.")
     return cleaned
 
 
@@ -206,7 +206,7 @@ def record(catalog: Catalog, new: NewResult, image_bgr: NDArray[np.uint8] | None
                 time_utc=catalog.clock.utc(),
                 operator=operator,
                 **new.answered._replace(sample=sample)._asdict(),
-                answer=as_json(new.details, "the answer"),
+                answer=as_json(new.details, "The answer"),
                 azimuths_deg=new.azimuths_deg,
                 bench=new.provenance.bench,
                 devices=new.provenance.devices,
@@ -299,7 +299,7 @@ def correct(
     author = audit.author()
     operator = author["user"] if operator is None else clean_text(operator, "operator")
     if unknown and object_name is not None:
-        raise UsageError("an object is named, and it is called unknown", next_step="give --object or --unknown")
+        raise UsageError("--object and --unknown are both given.", next_step="Give one of them.")
     with catalog.database.write() as connection:
         now = before = _find(catalog, connection, result_id).current
         if object_name is not None:
@@ -310,7 +310,8 @@ def correct(
             now = now._replace(sample=clean_text(sample, "sample"))
         if now == before:
             raise UsageError(
-                f"result {result_id} is so already", next_step="give the right --object NAME, --unknown, or --sample ID"
+                f"Result {result_id} has these values already.",
+                next_step="Give the right --object NAME, --unknown, or --sample ID.",
             )
         insert_row(
             connection,
@@ -355,7 +356,7 @@ def _write_image(catalog: Catalog, result_id: int, png: bytes) -> str:
 def _find(catalog: Catalog, connection: Connection, result_id: int) -> Result:
     found = _load(catalog, connection, results.c.id == result_id)
     if not found:
-        raise CatalogError(f"there is no result {result_id} in the catalog", next_step="list them: rig results list")
+        raise CatalogError(f"There is no result {result_id} in the catalog.", next_step="List them: rig results list")
     return found[0]
 
 

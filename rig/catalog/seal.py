@@ -112,8 +112,9 @@ def damage_of(
     shown = _names_of(connection, broken, spoiled)
     return CatalogDamaged(
         f"{', '.join(map(repr, shown[:3]))}{' and others' if len(shown) > 3 else ''} in the catalog changed after they "
-        "were stored",
-        next_step="check the catalog (rig catalog verify); use a backup, or delete these objects and enroll them again",
+        "were stored.",
+        next_step="Check the catalog: `rig catalog verify`. Then use a backup, or delete these objects and enroll them "
+        "again.",
         evidence={"objects": shown[:20]},
     )
 

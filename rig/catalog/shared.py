@@ -54,14 +54,14 @@ def deliver_journal(place: CatalogPlace, clock: Clock, *, replacing: Collection[
 def delivery_words(one: Delivery, place: CatalogPlace) -> str:
     """Return the outcome for an object of the journal, as a sentence."""
     if one.conflict is not None:
-        return f"{one.conflict.what}. Next step: {one.conflict.next_step}"
+        return f"{one.conflict.what} Next step: {one.conflict.next_step}"
     return f"Delivered {one.name} with {one.views} views to {place}."
 
 
 def failure_words(error: RigError) -> str:
     """Return the reason why nothing could be delivered, as sentences."""
     kept = "What is in the journal of this computer is delivered later"
-    return f"{error.what}. {kept}. Next step: {error.next_step}"
+    return f"{error.what} {kept}. Next step: {error.next_step}"
 
 
 def journal_words(catalog: Catalog) -> str:
@@ -69,7 +69,7 @@ def journal_words(catalog: Catalog) -> str:
     if not isinstance(catalog, Journal) or catalog.unreachable is None:
         return ""
     error = catalog.unreachable
-    return f"{error.what}. The views go into the journal of this computer. Next step: {error.next_step}"
+    return f"{error.what} The views go into the journal of this computer. Next step: {error.next_step}"
 
 
 def comparable_views(

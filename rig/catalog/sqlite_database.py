@@ -213,7 +213,7 @@ def version_of(connection: Connection, root: Path) -> int:
     version: int = connection.exec_driver_sql("PRAGMA user_version").scalar_one()
     if application_id != APPLICATION_ID:
         raise CatalogError(
-            f"{root / DATABASE_NAME} is the database of another program", next_step="give the folder of a catalog"
+            f"{root / DATABASE_NAME} is the database of another program.", next_step="Give the folder of a catalog."
         )
     if version > SCHEMA_VERSION:
         raise newer(CatalogPlace(root), version)
@@ -229,8 +229,8 @@ def check_schema(connection: Connection, root: Path, version: int) -> None:
     if schema_digest(database) != expected_schema(version):
         names = sorted({str(name) for (name,) in database.execute("SELECT name FROM sqlite_master")} - KNOWN_NAMES)
         raise CatalogDamaged(
-            f"the database of the catalog {root} has other tables, triggers or views than this program made; "
-            "nothing was changed",
+            f"The database of the catalog {root} has other tables, triggers or views than this program made; "
+            "nothing was changed.",
             next_step=FIX,
             evidence={"version": version, "unknown": names[:20]},
         )

@@ -138,7 +138,7 @@ def describe_together(
         try:
             table = None if empty_table is None else held.pixels(*empty_table)
         except CatalogError as error:
-            found |= {one.view_id: Described(one.view_id, reason=error.what) for one in own}
+            found |= {one.view_id: Described(one.view_id, reason=error.what.rstrip(".")) for one in own}
             continue
         describer = EnrollmentDescriber(ViewConfig(roi=region), names, table)
         numbers: dict[int, int] = {}
@@ -248,4 +248,4 @@ def _session(item: StoredImage) -> tuple[int, str]:
 
 
 def _reason(error: Exception) -> str:
-    return error.what if isinstance(error, CatalogError | UsageError) else str(error)
+    return error.what.rstrip(".") if isinstance(error, CatalogError | UsageError) else str(error)

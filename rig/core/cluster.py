@@ -45,7 +45,7 @@ class Cluster:
         if name != LOCAL:
             return None
         if count and not (count.isdecimal() and int(count) > 0):
-            raise UsageError(f"--cluster {self.address!r}: {count!r} is not a number", next_step="give local:2")
+            raise UsageError(f"--cluster {self.address!r}: {count!r} is not a number.", next_step="Give local:2.")
         return int(count or 0)
 
 
@@ -83,8 +83,8 @@ def map_on_cluster(work: Callable[[_Item], _T], items: Iterable[_Item], cluster:
             client = ends.enter_context(Client(where, timeout=START_S))
         except (OSError, TimeoutError, ValueError) as error:
             raise ClusterFailed(
-                f"the cluster {cluster.address} does not answer",
-                next_step="start its scheduler and workers (dask scheduler, dask worker), or use --cluster local",
+                f"The cluster {cluster.address} does not answer.",
+                next_step="Start its scheduler and workers (dask scheduler, dask worker), or use --cluster local.",
                 evidence={"error": str(error)},
             ) from error
         models = tuple(str(model.path) for model in loaded_models())

@@ -108,8 +108,8 @@ class ExtraMissing(ConfigError, code=301, title="package missing"):
     def of(cls, extra: str, what: str, error: ImportError) -> "ExtraMissing":
         """Return the error that ``what`` needs the packages of an extra."""
         return cls(
-            f"{what} need packages that are not installed",
-            next_step=f"install them: pip install 'hbr-rig[{extra}]'",
+            f"{what} need packages that are not installed.",
+            next_step=f"Install them: pip install 'hbr-rig[{extra}]'",
             evidence={"missing": error.name or str(error)},
         )
 

@@ -41,9 +41,9 @@ _G = 9.80665
 _ATTEMPTS = 4  # readings until one is valid
 _IDENTITY_READS = 8
 SLOW_BUS = (
-    "A Raspberry Pi up to the 4 does not wait for the BNO055, which stretches the clock. Use a slow bus (add "
-    "dtparam=i2c_arm_baudrate=10000 to /boot/firmware/config.txt) or a software bus (dtoverlay=i2c-gpio,bus=3, and "
-    "imu.bus = 3), then restart."
+    "Use a slow bus (add dtparam=i2c_arm_baudrate=10000 to /boot/firmware/config.txt) or a software bus "
+    "(dtoverlay=i2c-gpio,bus=3, and imu.bus = 3), then restart. A Raspberry Pi up to the 4 does not wait for the "
+    "BNO055, which stretches the clock."
 )
 """Next step if a controller corrupts the answers of a sensor that stretches the clock."""
 

@@ -154,8 +154,9 @@ class OpenCvCamera:
             dropped += 1
             if self._clock.now_ns() > deadline_ns:
                 raise DeviceSilent(
-                    f"{self.identity.name} delivered no new frame in {self._timeout_s:g} s",
-                    next_step="check the camera's cable; a long exposure or a busy USB bus needs a longer time-out",
+                    f"{self.identity.name} delivered no new frame in {self._timeout_s:g} s.",
+                    next_step="Check the camera's cable. If the exposure is long or the USB bus is busy, give a longer "
+                    "time-out.",
                     evidence={"dropped_frames": dropped, "time_base": self.time_base.value, "after_ns": after_ns},
                 )
 

@@ -72,9 +72,9 @@ def note_words(note: Note) -> str:
                 "reasons: rig catalog calibrate"
             )
         case NoteCode.NOT_RECORDED:
-            return f"the answer is not recorded: {v['what']}"
+            return f"the answer is not recorded: {v['what'].rstrip('.')}"
         case NoteCode.NOT_COMPARED:
-            return f"the leading candidates are not compared pixel by pixel: {v['what']}"
+            return f"the leading candidates are not compared pixel by pixel: {v['what'].rstrip('.')}"
         case NoteCode.LOCAL_COPY:
             return f"the server of the catalog cannot be used; this uses the copy of {v['copied_utc']}"
         case NoteCode.EARLIER_VERSION:

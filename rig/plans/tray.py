@@ -105,7 +105,7 @@ def read_tray(path: Path) -> tuple[TrayItem, ...]:
                     try:
                         items.append(_item(line, headings, cells))
                     except UsageError as error:
-                        mistakes.append(f"line {line}: {error.what}")
+                        mistakes.append(f"line {line}: {error.what.rstrip('.')}")
     except csv.Error as error:
         mistakes.append(f"this is not CSV: {error}")
     counts = Counter(item.name for item in items)
@@ -231,14 +231,14 @@ def _heading_mistakes(line: int, headings: Sequence[str]) -> list[str]:
 def _item(line: int, headings: Sequence[str], cells: Sequence[str]) -> TrayItem:
     if len(cells) > len(headings):
         raise UsageError(
-            f"{len(cells)} values in {len(headings)} columns", next_step="Put text with a comma in quotes."
+            f"{len(cells)} values in {len(headings)} columns.", next_step="Put text with a comma in quotes."
         )
     values = {heading: cell.strip() for heading, cell in zip(headings, cells, strict=False)}
     views = None
     if values.get("views"):
         if not values["views"].isdecimal() or not MIN_VIEWS <= int(values["views"]) <= MAX_VIEWS:
             raise UsageError(
-                f"views is {values['views']!r}, not a number from {MIN_VIEWS} to {MAX_VIEWS}", next_step="Correct it."
+                f"views is {values['views']!r}, not a number from {MIN_VIEWS} to {MAX_VIEWS}.", next_step="Correct it."
             )
         views = int(values["views"])
     return TrayItem(line, clean_name(values.get("name", "")), values.get("label"), values.get("note"), views)

@@ -102,7 +102,9 @@ def _pictures(enrollment: Enrollment, files: dict[str, Path]) -> Iterator[Image]
 def _write(path: Path, image: Image) -> None:
     encoded, jpeg = cv2.imencode(".jpg", np.ascontiguousarray(image), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
     if not encoded:
-        raise ExportFailed(f"the picture {path.name} cannot be encoded", next_step="export fewer views an object")
+        raise ExportFailed(
+            f"The picture {path.name} cannot be encoded.", next_step="Export an object with fewer views."
+        )
     path.write_bytes(jpeg.tobytes())
 
 

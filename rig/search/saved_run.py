@@ -295,7 +295,7 @@ def load_run(folder: Path) -> SavedRun:
         if failed is not None and not {"code", "error", "what"} <= failed.keys():
             raise ValueError("the last line of events.jsonl is neither an event nor an error")
     except CatalogError as error:
-        raise _damaged(folder, f"{error.what}: {error.evidence['reason']}") from error
+        raise _damaged(folder, f"{error.what.rstrip('.')}: {error.evidence['reason']}") from error
     except _DAMAGE as error:
         raise _damaged(folder, _reason(error)) from error
     return SavedRun(folder, about, config, model, empty_table, failed, is_cut, tuple(lines))

@@ -197,8 +197,8 @@ def write_stopping_rule(path: Path, rule: hbr.StoppingRule, index: hbr.DenseInde
     """
     values = stopping_rule_values(rule, index, made_utc=made_utc)
     text = json.dumps(values, ensure_ascii=False, indent=1, allow_nan=False)
-    step = "free space on the disk, or get permission to write to the folder"
-    with os_errors_as(CatalogError, f"the stopping rule cannot be written to {path}", next_step=step):
+    step = "Free space on the disk, or make the folder writable for this user."
+    with os_errors_as(CatalogError, f"The stopping rule cannot be written to {path}.", next_step=step):
         write(path, (text + "\n").encode())
 
 
@@ -253,8 +253,8 @@ def read_stopping_rule(folder: Path) -> StoredRule | None:
         return None
     except (OSError, ValueError, KeyError, TypeError, AttributeError, ArithmeticError) as error:
         raise CatalogError(
-            f"the stopping rule in {path} cannot be read",
-            next_step="to renew it: rig catalog calibrate",
+            f"The stopping rule in {path} cannot be read.",
+            next_step="Renew it: rig catalog calibrate",
             evidence={"reason": str(error)},
         ) from error
 

@@ -99,8 +99,8 @@ def within(image_bgr: NDArray[np.uint8], region: tuple[int, int, int, int] | Non
     x, y, width, height = region
     if min(x, y) < 0 or min(width, height) < 1 or x + width > image_bgr.shape[1] or y + height > image_bgr.shape[0]:
         raise UsageError(
-            f"the region {list(region)} does not lie within an image of {image_bgr.shape[1]}x{image_bgr.shape[0]}",
-            next_step="give a region within the images: x, y, width, height in pixels",
+            f"The region {list(region)} does not lie within an image of {image_bgr.shape[1]}x{image_bgr.shape[0]}.",
+            next_step="Give a region within the images: x, y, width, height in pixels.",
         )
     return image_bgr[y : y + height, x : x + width]
 

@@ -201,7 +201,7 @@ def _metadata(bench: Bench, *, quiet: bool = False) -> _Stored | None:
         text = bench.state.read_file(_FILE)
         stored = None if text is None else _Stored.model_validate_json(text).upgraded()
     except StateNotStored as error:
-        detail = error.what
+        detail = error.what.rstrip(".")
     except ValidationError as error:
         detail = f"{_FILE} is damaged ({error.errors(include_url=False)[0]['msg']})"
     else:
@@ -220,7 +220,7 @@ def _read(bench: Bench) -> EmptyTable | None:
     try:
         png = bench.state.read_file(stored.image)
     except StateNotStored as error:
-        raise _Unreadable(error.what) from error
+        raise _Unreadable(error.what.rstrip(".")) from error
     if png is None:
         raise _Unreadable(f"{stored.image} is missing")
     if hashlib.sha256(png).hexdigest() != stored.sha256:

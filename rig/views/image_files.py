@@ -49,15 +49,15 @@ def encode(image_bgr: NDArray[np.uint8]) -> bytes:
     """
     if image_bgr.dtype != np.uint8 or image_bgr.ndim != 3 or image_bgr.shape[2] != 3 or not image_bgr.size:
         raise UsageError(
-            f"an image of {image_bgr.dtype} with shape {image_bgr.shape} cannot be stored",
-            next_step="store BGR images as uint8 with shape (H, W, 3)",
+            f"An image of {image_bgr.dtype} with shape {image_bgr.shape} cannot be stored.",
+            next_step="Store BGR images as uint8 with shape (H, W, 3).",
         )
     if max(image_bgr.shape) > MAX_SIDE or image_bgr.shape[0] * image_bgr.shape[1] > MAX_PIXELS:
-        raise UsageError(f"an image of shape {image_bgr.shape} cannot be stored", next_step="store a smaller image")
+        raise UsageError(f"An image of shape {image_bgr.shape} cannot be stored.", next_step="Store a smaller image.")
     encoded, png = cv2.imencode(".png", np.ascontiguousarray(image_bgr), PNG_SETTINGS)
     if not encoded:
         raise UsageError(
-            f"an image of shape {image_bgr.shape} cannot be encoded as PNG", next_step="store a smaller image"
+            f"An image of shape {image_bgr.shape} cannot be encoded as PNG.", next_step="Store a smaller image."
         )
     return png.tobytes()
 
@@ -143,19 +143,19 @@ def checked(fetch: Callable[[], bytes], where: str, sha256: str) -> NDArray[np.u
     CatalogError
         The file is missing or differs from the one that was stored.
     """
-    fix = "run rig catalog verify --repair to find a copy; otherwise enroll the object again with --replace"
+    fix = "Run rig catalog verify --repair to find a copy; otherwise enroll the object again with --replace."
     try:
         content = fetch()
     except FileNotFoundError as error:
-        raise CatalogError(f"the image {where} is missing", next_step=fix) from error
+        raise CatalogError(f"The image {where} is missing.", next_step=fix) from error
     except OSError as error:
-        raise CatalogError(f"the image {where} cannot be read: {error.strerror}", next_step=fix) from error
+        raise CatalogError(f"The image {where} cannot be read: {error.strerror}.", next_step=fix) from error
     if digest(content) != sha256:
-        raise CatalogError(f"the image {where} is not the one that was stored", next_step=fix)
+        raise CatalogError(f"The image {where} is not the one that was stored.", next_step=fix)
     try:
         return decode(content)
     except BadImage as error:
-        raise CatalogError(f"the image {where} is not readable: {error}", next_step=fix) from error
+        raise CatalogError(f"The image {where} is not readable: {error}.", next_step=fix) from error
 
 
 def folder(object_id: int, object_name: str, enrollment_id: int) -> Path:

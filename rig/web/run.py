@@ -126,7 +126,7 @@ def checked_catalog(server: Server) -> AbstractContextManager[object]:
 
     def report(damage: RigError) -> None:
         server.damage = damage
-        print_note(f"{damage.what}. Next step: {damage.next_step}")
+        print_note(f"{damage.what} Next step: {damage.next_step}")
 
     return BackgroundCheck(place, server.clock, report)
 

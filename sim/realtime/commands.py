@@ -117,7 +117,7 @@ class Commands:
         if name not in {*operator.objects, *calibration_targets(operator.optics)}:
             raise UsageError(
                 f"There is no object {name!r}.",
-                next_step="Choose a listed object: objects",
+                next_step="Choose a listed object. To list them: objects",
                 evidence={"objects": list(operator.objects)},
             )
         operator.next_object = name

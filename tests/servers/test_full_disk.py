@@ -53,7 +53,7 @@ def full(action: Callable[[], object]) -> bool:
     try:
         action()
     except CatalogError as error:
-        if "is full" in error.what and "earlier ones are safe" in error.what and "free some space" in error.next_step:
+        if "is full" in error.what and "earlier ones are safe" in error.what and "Free some space" in error.next_step:
             return True
         raise
     return False

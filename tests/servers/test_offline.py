@@ -251,7 +251,7 @@ def test_wrong_password_and_absent_server_have_their_own_messages(
         postgres.start()
     assert (gone.exit_code, "does not answer" in gone.stderr) == (7, True)
     missing = rig("catalog", "deliver", "--replace", "star", *words)
-    assert "there is no object 'star'" in missing.stderr
+    assert "There is no object 'star'" in missing.stderr
     with Journal.of(place, CLOCK) as journal:
         true_fill(journal, "star", 2, 30)
     monkeypatch.setattr("rig.catalog.image_store.write_local", _full)
@@ -276,7 +276,7 @@ def test_bench_works_while_its_share_is_not_mounted(place: CatalogPlace, tmp_pat
         with Journal.of(place, CLOCK) as journal:
             true_fill(journal, f"star {mount_point}", 2, 30)
             assert journal.unreachable is not None
-            assert "mount the network share" in journal.unreachable.next_step
+            assert "Mount the network share" in journal.unreachable.next_step
     share.rmdir()
     (tmp_path / "not mounted").rename(share)
     with Journal.of(place, CLOCK) as journal, Catalog.open(place, clock=CLOCK) as shared:

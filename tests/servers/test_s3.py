@@ -124,7 +124,7 @@ def test_catalog_with_images_in_s3_does_everything(postgres: PostgresServer, s3:
         opened(CatalogPlace(tmp_path / "other", place.url, "s3://rig/elsewhere"))
     with pytest.raises(CatalogError, match="does not exist") as error:
         opened(place_in(postgres.url, tmp_path / "new", "s3://no-such-bucket/new"))
-    assert "create its bucket" in error.value.next_step
+    assert "Create its bucket" in error.value.next_step
 
 
 def test_objects_are_imported_into_s3(postgres: PostgresServer, s3: S3Server, tmp_path: Path) -> None:

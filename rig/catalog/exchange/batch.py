@@ -83,8 +83,8 @@ class BundledDescriptor(_Part):
             unpack([self.as_packed()])
             region_of(self.settings)
         except RigError as error:
-            raise ValueError(error.what) from error
-        as_json(self.settings, "the settings of a descriptor")
+            raise ValueError(error.what.rstrip(".")) from error
+        as_json(self.settings, "The settings of a descriptor")
         return self
 
     def as_packed(self) -> PackedDescriptor:
@@ -128,8 +128,8 @@ class View(_Part):
             raise ValueError("imu_deg and imu_sigma_deg: give both or none")
         if len({(one.name, one.version) for one in self.descriptors}) < len(self.descriptors):
             raise ValueError("a descriptor is listed twice in the same version")
-        as_json(self.evidence, "the evidence")
-        as_json(self.segmentation or {}, "the segmentation")
+        as_json(self.evidence, "The evidence")
+        as_json(self.segmentation or {}, "The segmentation")
         return self
 
 
@@ -149,8 +149,8 @@ class Session(_Part):
 
     @model_validator(mode="after")
     def _is_json(self) -> Self:
-        as_json(self.devices, "the devices")
-        as_json(self.conditions, "the conditions")
+        as_json(self.devices, "The devices")
+        as_json(self.conditions, "The conditions")
         return self
 
 

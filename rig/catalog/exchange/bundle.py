@@ -96,7 +96,7 @@ def _check_readable(path: Path, part: Path) -> None:
     except ImportRejected as error:
         raise ExportFailed(
             f"{path} was not written, because no import would accept it: {error.what}",
-            next_step="check the catalog: rig catalog verify; or export fewer objects into each bundle",
+            next_step="Check the catalog with `rig catalog verify`, or export fewer objects into each bundle.",
         ) from error
 
 
@@ -110,7 +110,7 @@ def new_file(path: Path) -> Iterator[IO[bytes]]:
         It exists already or cannot be written.
     """
     if path.exists():
-        raise ExportFailed(f"{path} exists already", next_step="give another name, or remove it")
+        raise ExportFailed(f"{path} exists already.", next_step="Give another name, or remove it.")
     part = path.with_name(f"{path.name}.part")
     try:
         with open_new(part) as file:
@@ -120,8 +120,8 @@ def new_file(path: Path) -> Iterator[IO[bytes]]:
         sync_folder(path.parent)
     except OSError as error:
         raise ExportFailed(
-            f"{path} cannot be written: {error.strerror or error}",
-            next_step="give a path with write permission, on a disk with free space",
+            f"{path} cannot be written: {error.strerror or error}.",
+            next_step="Give a path with write permission, on a disk with free space.",
         ) from error
     finally:
         with suppress(OSError):
@@ -130,13 +130,13 @@ def new_file(path: Path) -> Iterator[IO[bytes]]:
 
 def read_stored(path: Path, sha256: str | None) -> bytes:
     """Return the bytes of an image of the catalog. `ExportFailed` if it is not the stored one."""
-    fix = "check the catalog: rig catalog verify --repair"
+    fix = "Check the catalog: rig catalog verify --repair"
     try:
         content = images.read_file(path)
     except OSError as error:
-        raise ExportFailed(f"the image {path} cannot be read: {error.strerror}", next_step=fix) from error
+        raise ExportFailed(f"The image {path} cannot be read: {error.strerror}.", next_step=fix) from error
     if images.digest(content) != sha256:
-        raise ExportFailed(f"the image {path} is not the stored one", next_step=fix)
+        raise ExportFailed(f"The image {path} is not the stored one.", next_step=fix)
     return content
 
 
@@ -194,8 +194,8 @@ def _open(path: Path) -> IO[bytes]:
 def rejected(path: Path, why: str) -> ImportRejected:
     """Return the error for a bundle that is not imported."""
     return ImportRejected(
-        f"{path} was not imported: {why}",
-        next_step="export the bundle again at its origin; do not unpack it by hand if you do not know its origin",
+        f"{path} was not imported: {why}.",
+        next_step="Ask for another export of the bundle. Do not unpack it by hand if you do not know its origin.",
     )
 
 
@@ -269,8 +269,8 @@ def _objects(
         raise rejected(path, f"its format has version {version!r:.40}")
     if version > VERSION:
         raise ImportRejected(
-            f"{path} was written by a newer program: its format has version {version}, this program knows {VERSION}",
-            next_step="update hbr-rig on this computer",
+            f"{path} was written by a newer program: its format has version {version}, this program knows {VERSION}.",
+            next_step="Update hbr-rig on this computer.",
         )
     found: list[Object] = []
     names: set[str] = set()
@@ -298,7 +298,7 @@ def _object(path: Path, number: int, line: bytes) -> Object:
         where = ".".join(map(str, first["loc"]))
         raise rejected(path, f"line {number} of {OBJECTS}, {where or 'the object'}: {first['msg']}") from error
     except RigError as error:
-        raise rejected(path, f"line {number} of {OBJECTS}: {error.what}") from error
+        raise rejected(path, f"line {number} of {OBJECTS}: {error.what.rstrip('.')}") from error
 
 
 def _images_of(path: Path, number: int, item: Object, sizes: Mapping[str, int]) -> set[str]:

@@ -60,7 +60,7 @@ def read_folder(
     """
     named = _regex(pattern)
     if not folder.is_dir():
-        raise ImportRejected(f"there is no folder {folder}", next_step="check the path")
+        raise ImportRejected(f"There is no folder {folder}.", next_step="Check the path.")
     real = folder.resolve()
     inside: dict[Path, bool] = {}
     names = _names(folder / NAMES)
@@ -83,8 +83,8 @@ def read_folder(
             photographs.append((found["object"], Photograph(path=path, azimuth_deg=azimuth_deg, values={}, **texts)))
     if not photographs:
         raise ImportRejected(
-            f"no photograph in {folder} matches the pattern {pattern}.png",
-            next_step="give the pattern of their names, e.g. --pattern '{object}/{angle}'",
+            f"No photograph in {folder} matches the pattern {pattern}.png.",
+            next_step="Give the pattern of their names, e.g. --pattern '{object}/{angle}'",
             evidence={"rejected": [f"{file.path} {file.reason}" for file in rejected[:5]]},
         )
     in_order = [photograph for _, photograph in sorted(photographs, key=lambda pair: _natural(pair[0]))]
@@ -117,7 +117,7 @@ def write_folder(folder: Path, objects: Iterable[ExportedObject]) -> int:
                 target = made / f"obj{count}__{angle}{Path(view.image).suffix}"
                 if target.exists():
                     raise ExportFailed(
-                        f"{item.name!r} has two views from {angle}°", next_step="export a bundle instead"
+                        f"{item.name!r} has two views from {angle}°.", next_step="Export a bundle instead."
                     )
                 target.write_bytes(read_stored(files[view.image], view.image_sha256))
     return count
@@ -135,8 +135,8 @@ def _stays(path: Path, real: Path, inside: dict[Path, bool]) -> bool:
 def _regex(pattern: str) -> re.Pattern[str]:
     if pattern.count("{object}") != 1 or pattern.count("{angle}") != 1:
         raise UsageError(
-            f"the pattern {pattern!r} does not contain {{object}} and {{angle}} once each",
-            next_step="give a pattern such as '{object}/view-{angle}'",
+            f"The pattern {pattern!r} does not contain {{object}} and {{angle}} once each.",
+            next_step="Give a pattern such as '{object}/view-{angle}'.",
         )
     stem = re.sub(r"\.(png|jpe?g)$", "", pattern, flags=re.IGNORECASE)
     return re.compile(
@@ -160,8 +160,8 @@ def _names(path: Path) -> dict[str, dict[str, Any]]:
             }
     except (OSError, ValueError, csv.Error) as error:
         raise ImportRejected(
-            f"{path} cannot be read: {error}",
-            next_step="fix or remove it; without it, objects get the names of their files",
+            f"{path} cannot be read: {error}.",
+            next_step="Fix or remove it; without it, objects get the names of their files.",
         ) from error
 
 

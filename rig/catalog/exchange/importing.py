@@ -138,8 +138,8 @@ def _rejected(staged: Mapping[str, StagedImage]) -> list[RejectedFile]:
 
 def _import_error(plan: Plan, rejected: Sequence[RejectedFile]) -> ImportRejected:
     return ImportRejected(
-        f"{plan.batch.origin} was not imported: {len(rejected)} of its files cannot be used",
-        next_step="fix or remove the listed files and import it again",
+        f"{plan.batch.origin} was not imported: {len(rejected)} of its files cannot be used.",
+        next_step="Fix or remove the listed files and import it again.",
         evidence={"rejected": [f"{file.path}: {file.reason}" for file in rejected[:20]]},
     )
 

@@ -21,7 +21,7 @@ def new_folder(path: Path) -> Iterator[Path]:
     """
     try:
         if path.exists() and (not path.is_dir() or any(path.iterdir())):
-            raise ExportFailed(f"{path} exists already", next_step="give another name, or remove it")
+            raise ExportFailed(f"{path} exists already.", next_step="Give another name, or remove it.")
         path.parent.mkdir(parents=True, exist_ok=True)
         made = Path(mkdtemp(prefix=f".{path.name}.", dir=path.parent))
         try:
@@ -34,6 +34,6 @@ def new_folder(path: Path) -> Iterator[Path]:
             shutil.rmtree(made, ignore_errors=True)
     except OSError as error:
         raise ExportFailed(
-            f"{path} cannot be written: {error.strerror or error}",
-            next_step="give a path with write permission, on a disk with free space",
+            f"{path} cannot be written: {error.strerror or error}.",
+            next_step="Give a path with write permission, on a disk with free space.",
         ) from error

@@ -55,7 +55,9 @@ def assemble(
             check_azimuth(photograph.azimuth_deg)
         except UsageError as error:
             all_rejected.append(
-                RejectedFile(str(photograph.path), Reason(ImportProblem.INVALID_VALUE, {"error": error.what}))
+                RejectedFile(
+                    str(photograph.path), Reason(ImportProblem.INVALID_VALUE, {"error": error.what.rstrip(".")})
+                )
             )
             continue
         taken = by_name.setdefault(name, {})

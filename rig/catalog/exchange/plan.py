@@ -66,8 +66,8 @@ def make_plan(batch: ImportBatch, conflict: Conflict, known: Set[str]) -> Plan:
     if both and conflict == Conflict.REJECT:
         raise ObjectExists(
             f"{len(both)} of {len(batch.objects)} objects {'is' if len(both) == 1 else 'are'} in the catalog already; "
-            "nothing was imported",
-            next_step="skip them (--on-conflict skip), or import them as new enrollments (--on-conflict replace)",
+            "nothing was imported.",
+            next_step="Skip them (--on-conflict skip), or import them as new enrollments (--on-conflict replace).",
             evidence={"objects": list(both[:20])},
         )
     skipped, replaced = (both, ()) if conflict == Conflict.SKIP else ((), both)

@@ -57,13 +57,13 @@ def read_table(path: Path, *, now: datetime) -> ImportBatch:
     photographs, rejected = [], []
     try:
         if path.stat().st_size > _MAX_BYTES:
-            raise ImportRejected(f"{path} is larger than {_MAX_BYTES} bytes", next_step="split it")
+            raise ImportRejected(f"{path} is larger than {_MAX_BYTES} bytes.", next_step="Split it.")
         with path.open(encoding="utf-8-sig", newline="") as file:
             rows = csv.DictReader(file, strict=True)
             if missing := [name for name in _NEEDED if name not in (rows.fieldnames or ())]:
                 raise ImportRejected(
-                    f"{path} has no column {' or '.join(missing)}",
-                    next_step=f"write the names of the columns into the first line: {', '.join(_NEEDED)}",
+                    f"{path} has no column {' or '.join(missing)}.",
+                    next_step=f"Write the names of the columns into the first line: {', '.join(_NEEDED)}.",
                     evidence={"columns": list(rows.fieldnames or ())},
                 )
             for row in rows:
@@ -73,11 +73,11 @@ def read_table(path: Path, *, now: datetime) -> ImportBatch:
                     reason = Reason(ImportProblem.INVALID_VALUE, {"error": str(error)})
                     rejected.append(RejectedFile(f"{path.name}, line {rows.line_num}", reason))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise ImportRejected(f"{path} cannot be read: {error}", next_step="save it as CSV in UTF-8") from error
+        raise ImportRejected(f"{path} cannot be read: {error}.", next_step="Save it as CSV in UTF-8.") from error
     if not photographs:
         raise ImportRejected(
-            f"{path} has no row that can be used",
-            next_step="fix the listed rows" if rejected else "add one row per view",
+            f"{path} has no row that can be used.",
+            next_step="Fix the listed rows." if rejected else "Add one row per view.",
             evidence={"rejected": [f"{file.path}: {file.reason}" for file in rejected[:5]]},
         )
     return assemble(str(path), photographs, rejected, now, this_software())
@@ -159,7 +159,7 @@ def pyarrow() -> tuple[Any, Any]:
         import pyarrow.parquet as pq
     except ImportError as error:
         raise ExportFailed(
-            "Parquet needs pyarrow, which is not installed", next_step="install it: pip install 'hbr-rig[parquet]'"
+            "Parquet needs pyarrow, which is not installed.", next_step="Install it: pip install 'hbr-rig[parquet]'"
         ) from error
     return pa, pq
 

@@ -115,7 +115,9 @@ def write_training(
     complete = [(_complete(item), files) for item, files in objects]
     complete = [(item, files) for item, files in complete if item.enrollments]
     if not complete:
-        raise ExportFailed("there are no complete enrollments to export", next_step="enroll an object: rig enroll NAME")
+        raise ExportFailed(
+            "There are no complete enrollments to export.", next_step="Enroll an object: rig enroll NAME"
+        )
     kept = [item for item, _ in complete]
     items = [one for item, files in complete for one in _items(item, files)]
     part_of = _divided(kept, split, fractions, seed)
@@ -153,7 +155,7 @@ def _check_fractions(fractions: Sequence[float]) -> None:
     else:
         return
     shown = ",".join(f"{one:g}" for one in fractions)
-    raise UsageError(f"the fractions {shown} {problem}", next_step="give the shares of train, val, test: 0.8,0.1,0.1")
+    raise UsageError(f"The fractions {shown} {problem}.", next_step="Give the shares of train, val, test: 0.8,0.1,0.1.")
 
 
 def _complete(item: Object) -> Object:

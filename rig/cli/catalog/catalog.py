@@ -180,7 +180,7 @@ def label_(
     from rig.core.errors import UsageError
 
     if label is None and note is None:
-        raise UsageError("neither a label nor a note is given", next_step="give a label, --note, or both")
+        raise UsageError("Neither a label nor a note is given.", next_step="Give a label, --note, or both.")
     with settings.open_catalog() as catalog:
         set_texts(catalog, name, label=label, note=note)
         summary = catalog.object(name).summary

@@ -39,7 +39,10 @@ def deliver(
 
     place = settings.load().catalog_place(settings.bench_name)
     if place.url is None:
-        raise UsageError("the catalog is in a folder of this computer", next_step="nothing has to be delivered")
+        raise UsageError(
+            "The catalog is in a folder of this computer.",
+            next_step="Enroll and identify as usual: there is nothing to deliver.",
+        )
     if rename is not None or discard is not None or replace:
         with Journal.of(place, SystemClock()) as journal:
             for name in replace or ():

@@ -114,7 +114,7 @@ def run_import(
         conflict = Conflict(on_conflict)
     except ValueError as error:
         raise UsageError(
-            f"--on-conflict {on_conflict!r} is unknown", next_step="give reject, skip or replace"
+            f"--on-conflict {on_conflict!r} is unknown.", next_step="Give reject, skip or replace."
         ) from error
     clock = SystemClock()
     begin_ns = clock.now_ns()
@@ -140,20 +140,20 @@ def _read_batch(source: Path, pattern: str | None, table_angles: bool) -> "Impor
     now = SystemClock().utc()
     if source.is_dir():
         if (source / "catalog.sqlite").exists():
-            raise UsageError(f"{source} is a catalog", next_step=f"import it with rig catalog merge {source}")
+            raise UsageError(f"{source} is a catalog.", next_step=f"Import it: rig catalog merge {source}")
         if (source / MANIFEST).exists():
             return read_unpacked(source)
         return read_folder(source, pattern=pattern or DEFAULT_PATTERN, table_angles=table_angles, now=now)
     if pattern is not None or table_angles:
-        raise UsageError(f"{source} is not a folder", next_step="use --pattern and --table-angles only with a folder")
+        raise UsageError(f"{source} is not a folder.", next_step="Use --pattern and --table-angles only with a folder.")
     if not source.exists():
-        raise ImportRejected(f"{source} does not exist", next_step="check the path")
+        raise ImportRejected(f"{source} does not exist.", next_step="Check the path.")
     if source.suffix.lower() == ".zip":
         return read_bundle(source)
     if source.suffix.lower() == ".csv":
         return read_table(source, now=now)
     raise ImportRejected(
-        f"{source} is not a folder, a .zip file or a .csv file", next_step="give one of these: rig import --help"
+        f"{source} is not a folder, a .zip file or a .csv file.", next_step="Give one of these: rig import --help"
     )
 
 
@@ -237,7 +237,7 @@ def export(
             labelled = [item.name for item in catalog.objects() if item.label == label]
             wanted = [name for name in labelled if not wanted or name in wanted]
         if label is not None and not wanted:
-            raise ExportFailed(f"no object has the label {label!r}", next_step="list the objects: rig catalog list")
+            raise ExportFailed(f"No object has the label {label!r}.", next_step="List the objects: rig catalog list")
         objects = read_objects(catalog, wanted)
         match form:
             case Format.BUNDLE:
@@ -280,8 +280,8 @@ def _export_training(
         divided = None if split is None else Split(split)
     except ValueError as error:
         raise UsageError(
-            f"--split {split} or --fractions {fractions} is not possible",
-            next_step="give object or view, and shares such as 0.8,0.1,0.1",
+            f"--split {split} or --fractions {fractions} is not possible.",
+            next_step="Give object or view, and shares such as 0.8,0.1,0.1.",
         ) from error
     job = write_training(
         *(target, objects, Annotations(form.value)),

@@ -146,7 +146,7 @@ def export(
         form = TableFormat(target.suffix.lower().removeprefix("."))
     except ValueError as error:
         known = ", ".join(f".{one}" for one in TableFormat)
-        raise UsageError(f"the format of {target} is unknown", next_step=f"give a file with {known}") from error
+        raise UsageError(f"The format of {target} is unknown.", next_step=f"Give a file with {known}.") from error
     found = _find(settings, sample, name, outcome, taken_on, since, before, corrected)
     write_results(target, found, form)
     settings.say(
@@ -201,7 +201,7 @@ def _find(
     try:
         wanted = None if outcome is None else Outcome(outcome)
     except ValueError as error:
-        raise UsageError(f"--outcome {outcome!r} is unknown", next_step=f"give {', '.join(Outcome)}") from error
+        raise UsageError(f"--outcome {outcome!r} is unknown.", next_step=f"Give {', '.join(Outcome)}.") from error
     begin, end = parse_time(since, "--since"), parse_time(before, "--before")
     with settings.open_catalog(read_only=True) as catalog:
         return find_results(catalog, ResultFilter(sample, name, wanted, taken_on, begin, end, corrected))

@@ -308,7 +308,7 @@ def _region(settings: Settings, text: str) -> Any:
     try:
         return parse_region(text)
     except ValueError as error:
-        raise UsageError(str(error), next_step="give stored, config, whole, or X,Y,WIDTH,HEIGHT") from error
+        raise UsageError(str(error), next_step="Give stored, config, whole, or X,Y,WIDTH,HEIGHT.") from error
 
 
 def parse_time(text: str | None, option: str) -> datetime | None:
@@ -327,7 +327,7 @@ def parse_time(text: str | None, option: str) -> datetime | None:
         when = datetime.fromisoformat(text)
     except (ValueError, OverflowError) as error:
         raise UsageError(
-            f"{option} {text!r} is not a time", next_step="give a date such as 2026-01-31, or 12h for 12 hours ago"
+            f"{option} {text!r} is not a time.", next_step="Give a date such as 2026-01-31, or 12h for 12 hours ago."
         ) from error
     return when.replace(tzinfo=UTC) if when.tzinfo is None else when
 

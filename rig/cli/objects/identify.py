@@ -165,13 +165,13 @@ def _checked_sample(sample: str | None, *, scan: bool, watch: bool, records: boo
 
     if sample is not None and (watch or scan):
         raise UsageError(
-            "--sample names the sample of one object; --watch and --scan are for several",
-            next_step="remove --sample, and use --scan to give the sample of each object",
+            "--sample names the sample of one object; --watch and --scan are for several.",
+            next_step="Remove --sample, and use --scan to give the sample of each object.",
         )
     if (sample is not None or scan) and not records:
         raise UsageError(
-            "the answer is not recorded, because identify.record is none",
-            next_step="allow it: rig config set identify.record image",
+            "The answer is not recorded, because identify.record is none.",
+            next_step="Allow it: rig config set identify.record image",
         )
     return None if sample is None else clean_text(sample, "sample")
 

@@ -31,5 +31,5 @@ def jobs_of(jobs: int | None, cluster: str | None) -> "Jobs | None":
     if cluster is None:
         return jobs
     if jobs is not None:
-        raise UsageError("--jobs and --cluster are both given", next_step="give one of them; local:2 has 2 workers")
+        raise UsageError("--jobs and --cluster are both given.", next_step="Give one of them; local:2 has 2 workers.")
     return Cluster(cluster)

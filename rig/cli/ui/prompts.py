@@ -21,7 +21,7 @@ def ask_sample() -> str | None:
         try:
             return clean_text(answer, "sample") if answer else None
         except UsageError as error:
-            print(f"{error.what}; {error.next_step}", file=sys.stderr)
+            print(f"{error.what} {error.next_step}", file=sys.stderr)
 
 
 def ask_line(question: str, *, otherwise: str = "add --yes") -> str:

@@ -162,7 +162,7 @@ class Settings:
         from rig.core.clock import SystemClock
 
         def report(damage: RigError) -> None:
-            _report(f"{damage.what}. Next step: {damage.next_step}")
+            _report(f"{damage.what} Next step: {damage.next_step}")
 
         return BackgroundCheck(self.load().catalog_place(self.bench_name), SystemClock(), report)
 

@@ -125,7 +125,7 @@ def test_full_disk_loses_only_the_present_view(
             patch.setattr(os, call, failure)
             with pytest.raises(CatalogError, match=r"full.*earlier ones are safe") as error:
                 enrollment.add(record(1), image(1))
-        assert "free some space" in error.value.next_step
+        assert "Free some space" in error.value.next_step
         assert enrollment.missing() == (1,)
         assert [file.name for file in (tmp_path / enrollment.folder).iterdir()] == ["000.png"]
         enrollment.add(record(1), image(1))
@@ -159,7 +159,7 @@ def test_second_writer_gets_busy_error_after_the_timeout(tmp_path: Path) -> None
         enrollment = begin(catalog, "mug", 1)
         with closing(sqlite3.connect(tmp_path / "catalog.sqlite", isolation_level=None)) as other:
             other.execute("BEGIN IMMEDIATE")
-            with pytest.raises(CatalogBusy, match=r"0\.02 s; nothing was changed") as error:
+            with pytest.raises(CatalogBusy, match=r"0\.02 s\. Nothing was changed") as error:
                 enrollment.add(record(0), image(0))
             assert error.value.exit_code == 9
             assert len(catalog.views().views) == 1  # readers do not wait

@@ -53,7 +53,7 @@ def test_newer_catalog_is_rejected(enrolled: Path) -> None:
     with pytest.raises(CatalogError, match="newer program") as error:
         open_catalog(enrolled)
     assert error.value.evidence == {"found": SCHEMA_VERSION + 1, "known": SCHEMA_VERSION}
-    assert "update" in error.value.next_step
+    assert "Update" in error.value.next_step
 
 
 @pytest.mark.parametrize(("create", "read_only"), [(False, False), (True, True)])

@@ -229,7 +229,7 @@ class TestRedescribe:
         assert np.array_equal(catalog.views().views.descriptors[2], hbr.describe(image(20)))
         outside = finished(redescribe(catalog, region=(0, 0, 100, 10)))
         assert [reason for _, reason in outside.failed] == [
-            "the region [0, 0, 100, 10] does not lie within an image of 16x12"
+            "The region [0, 0, 100, 10] does not lie within an image of 16x12"
         ] * 2
         assert np.array_equal(catalog.views().views.descriptors[0], hbr.describe(image(0)[:10, :10]))
 

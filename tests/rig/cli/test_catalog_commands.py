@@ -142,7 +142,7 @@ def test_identify_names_redescribe_for_a_new_descriptor(two: Rig, monkeypatch: p
     monkeypatch.setitem(registry._KNOWN, "cedd", Cedd(version=2))
     stopped = two("identify", "--max-views", "2")
     assert stopped.exit_code == 7
-    assert "Next step: describe the stored images again: rig catalog redescribe" in stopped.stderr
+    assert "Next step: Describe the stored images again: rig catalog redescribe" in stopped.stderr
     assert result(two("catalog", "redescribe", "--json"))["described"] == 8
     assert two("identify", "--max-views", "2").exit_code in (0, 8)
     assert two("catalog", "redescribe", "--descriptor", "sift").exit_code == 2
@@ -244,7 +244,7 @@ def test_import_rejects_bad_source(rig: Rig, tmp_path: Path) -> None:
     for source, words in (
         ("evil.rigcat.zip", "outside the catalog"),
         ("notes.txt", "is not a folder"),
-        ("empty", "no photograph"),
+        ("empty", "No photograph"),
         ("nowhere", "does not exist"),
     ):
         done = rig("import", source)
@@ -261,7 +261,7 @@ def test_busy_catalog_is_reported_after_the_timeout(two: Rig, monkeypatch: pytes
         assert names(two) == ["mug", "tin"]  # readers do not wait
         done = two("catalog", "rename", "mug", "cup")
     assert done.exit_code == 9
-    assert "another process has been writing" in done.stderr
+    assert "Another process has been writing" in done.stderr
     assert two("catalog", "rename", "mug", "cup").exit_code == 0
 
 

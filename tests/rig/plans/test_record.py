@@ -55,7 +55,7 @@ def test_full_disk_does_not_keep_the_answer_back(recorder, monkeypatch):
     assert isinstance(warned, Warned)
     assert warned.note.code is NoteCode.NOT_RECORDED
     assert "full" in warned.note.values["what"]
-    assert "free some space" in warned.note.values["next_step"]
+    assert "Free some space" in warned.note.values["next_step"]
 
 
 def stream_with(recorder, monkeypatch, fail):

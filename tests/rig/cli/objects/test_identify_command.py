@@ -35,7 +35,7 @@ def test_identification_is_recorded_corrected_and_exported(rig, tmp_path):
     assert "dice, rotated" in shown
     wrong = rig("results", "correct", "1", "--object", "dise", "--reason", "label")
     assert wrong.exit_code == 7
-    assert "did you mean 'dice'?" in wrong.stderr
+    assert "Did you mean 'dice'?" in wrong.stderr
     assert rig("results", "correct", "1", "--sample", "S-1", "--reason", "label \x1b[2J read").exit_code == 2
     corrected = rig("results", "correct", "1", "--sample", "S-1", "--reason", "label read")
     assert corrected.stdout == "Result 1 is now dice, sample S-1.\n"
@@ -79,7 +79,7 @@ def no_place_for_images(root: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("spoil", "fix"), [(earlier_version, "rig catalog migrate"), (no_place_for_images, "check the folder")]
+    ("spoil", "fix"), [(earlier_version, "rig catalog migrate"), (no_place_for_images, "Check the folder")]
 )
 def test_answer_is_printed_even_if_it_cannot_be_recorded(rig, tmp_path, spoil, fix):
     shutil.copytree("catalog", tmp_path / "catalog", ignore=shutil.ignore_patterns("results"))
