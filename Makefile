@@ -20,11 +20,11 @@ help:
 	@echo "make kernel-test  run the program with Linux's real drivers in a virtual machine"
 	@echo "make test-servers  test catalogs on PostgreSQL and S3, Dask and bluesky with real servers"
 	@echo "make fuzz   attack every kind of input for about an hour (a part of test-nightly)"
-	@echo "make lint   formatting, lint, types, import contracts"
-	@echo "make docs   the documentation as a site in site/"
+	@echo "make lint   check formatting, lint, types and import contracts"
+	@echo "make docs   build the documentation as a site in site/"
 	@echo "make wheel  build wheel and sdist in dist/, and try the wheel in an empty environment"
-	@echo "make bench  speed, as ratios against named peers"
-	@echo "make clean  remove what the others made"
+	@echo "make bench  measure speeds, as ratios to other programs"
+	@echo "make clean  remove the files that these commands made"
 
 demo: $(READY) $(LIBRARY)
 	@$(BIN)/rig demo

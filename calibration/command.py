@@ -271,7 +271,7 @@ def show(settings: Settings) -> None:
 @command
 def history(
     settings: Settings,
-    name: Annotated[str | None, typer.Argument(help="One kind, for example imu.scale; default: all.")] = None,
+    name: Annotated[str | None, typer.Argument(help="One kind, for example imu.scale (default: all).")] = None,
 ) -> None:
     """List all stored calibrations, passed or not, oldest first.
 

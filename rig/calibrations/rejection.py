@@ -39,8 +39,8 @@ class RejectionCode(Enum):
         "and keep vibration off the bench."
     )
     ENCODER_ERROR_TOO_LARGE = (
-        "The encoder seems wrong by up to {error_deg:.1f}°, more than {limit_deg:g}°, the limit for a sound one. Look "
-        "for a platter that is loose on its shaft, or a sensor that shifts."
+        "The encoder seems wrong by up to {error_deg:.1f}°, more than {limit_deg:g}°, the limit for an undamaged one. "
+        "Look for a platter that is loose on its shaft, or a sensor that shifts."
     )
     ENCODER_UNCERTAIN = (
         "The uncertainty of the harmonics is {uncertainty_deg:.3f}°, more than {limit_deg:g}°. Give more --turns, and "
@@ -69,8 +69,8 @@ class RejectionCode(Enum):
         "needed{reasons}. Give more --turns. If the rate is too high, lower table.velocity_dps or raise imu.range_dps."
     )
     GYRO_IMPLAUSIBLE = (
-        "The gyro reads {ratio:.3f}° for each degree of the encoder: no sound part deviates so much. Check imu.axis, "
-        "imu.sign and table.direction, that the sensor lies flat on the platter, and that no gear is between."
+        "The gyro reads {ratio:.3f}° for each degree of the encoder: no undamaged part deviates so much. Check "
+        "imu.axis, imu.sign and table.direction, that the sensor lies flat on the platter, and that no gear is between."
     )
     DIRECTIONS_DIFFER = (
         "The scale differs between the directions: {up:.5f} upwards, {down:.5f} downwards. The gyro's bias drifts, or "
@@ -183,8 +183,8 @@ class RejectionCode(Enum):
         "hub."
     )
     PLATTER_SLIPPED = (
-        "Encoder and gyro differ by {residual_deg:.2f}° during a turn: the platter slipped. Tighten the platter, and "
-        "calibrate again."
+        "Encoder and gyro differ by {residual_deg:.2f}° during a revolution: the platter slipped. Tighten the platter, "
+        "and calibrate again."
     )
     # -- board and table --
     FOREIGN_MARKERS = (

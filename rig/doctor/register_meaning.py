@@ -10,8 +10,8 @@ AX_BAUD = 2_000_000  # protocol 1.0: the value of Baud Rate is this number divid
 _OPERATING_MODES = {
     0: "current",
     1: "velocity",
-    3: "position, within one turn",
-    4: "extended position, many turns",
+    3: "position, within one revolution",
+    4: "extended position, many revolutions",
     5: "current-based position",
     16: "PWM",
 }

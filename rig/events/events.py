@@ -302,7 +302,7 @@ class SimilarObject:
 class SimilarObjects:
     """Confusions of a new object: with itself, rotated by ``period_deg``, and with other objects.
 
-    ``period_deg`` is 360 if the object has no symmetry, 0 if it looks the same from everywhere, None if it has too few
+    ``period_deg`` is 360 if the object has no symmetry, 0 if it looks the same from all sides, None if it has too few
     views. ``neighbour_similarity`` is the mean of neighbouring views, ``period_similarity`` of views a period apart.
     """
 

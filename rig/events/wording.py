@@ -47,7 +47,7 @@ def rotation_words(decided: Decided) -> str:
                 f"({min(similarity):.2f}–{max(similarity):.2f} all around)"
             )
         case RotationReason.SEPARATES_CANDIDATES if len(decided.candidates) >= 2:
-            return f"what is seen on the way distinguishes {decided.candidates[0]} from {decided.candidates[1]}"
+            return f"the frames on the way distinguish {decided.candidates[0]} from {decided.candidates[1]}"
         case RotationReason.ONE_CANDIDATE | RotationReason.NEW_SIDE:
             return "no second object is likely, so a new side is viewed"
         case RotationReason.EVEN_STEPS:
@@ -170,7 +170,7 @@ _SPEED_LIMITS: Final = {
 def scan_words(scan: ScanStarted) -> str:
     """Return a sentence that a scan begins, with its speed and the cause that limits it."""
     limit = _SPEED_LIMITS[scan.limit].format(value=scan.value, speed=scan.speed_dps)
-    return f"one turn from {angle_words(scan.from_deg)} to {angle_words(scan.to_deg)}: {limit}"
+    return f"one revolution from {angle_words(scan.from_deg)} to {angle_words(scan.to_deg)}: {limit}"
 
 
 def unwinding_words(unwinding: Unwinding) -> str:
@@ -249,7 +249,7 @@ def symmetry_words(similar: SimilarObjects) -> str:
         return ""
     numbers = f"similarity {similar.period_similarity:.3f}, of neighbouring views {similar.neighbour_similarity:.3f}"
     if similar.period_deg == 0:
-        return f"looks the same from everywhere (smallest {numbers}): its pose cannot be determined"
+        return f"looks the same from all sides (smallest {numbers}): its pose cannot be determined"
     if similar.period_deg < 360:
         return f"looks the same every {similar.period_deg:g}° ({numbers}): its pose is known up to that angle"
     return ""

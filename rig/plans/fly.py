@@ -206,7 +206,7 @@ def _disagreement(bench: Bench, move: Move, residual_deg: float | None) -> Rotat
     if residual_deg is not None:
         what += f", and on the way they differed by up to {residual_deg:.2f}°"
     error = RotationDisagreement(
-        f"{what}. No view of this turn is stored.",
+        f"{what}. No view of this revolution is stored.",
         next_step="Tighten the platter, and enroll the object again with --replace. If the gyro lost samples, check "
         "the IMU's cable and continue with --resume.",
         evidence={

@@ -51,7 +51,7 @@ def _words(frames: list[FrameUsed], enough: FrameUsed | None, rotated: dict[int,
     if not frames:
         return ""
     last = frames[-1]
-    used = f"{counted(len(frames), 'frame')} of the turn used (views {frames[0].index + 1} to {last.index + 1})"
+    used = f"{counted(len(frames), 'frame')} of the rotation used (views {frames[0].index + 1} to {last.index + 1})"
     used += f", {last.rejected} rejected."
     if enough is None:
         return f"{used} Their evidence was not enough for an answer before the search ended."

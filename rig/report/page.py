@@ -55,7 +55,7 @@ _HEADS: Final = (
     ("rotation", "how far the table rotated in all", "n"),
     ("pose error", "distance of the answered rotation from the true one; – if it is not determined", "n"),
     ("score", "similarity of the views to the enrolled views of the answer, per view; 1 is a perfect match", "n"),
-    ("margin", "how far the score leads that of every other enrolled object at least, per view", "n"),
+    ("margin", "smallest difference of the score to that of any other enrolled object, per view", "n"),
 )
 """Heads of the columns of the results, their meanings and classes."""
 _WITH_TRUTH: Final = ("on the table", "correct?", "pose error")

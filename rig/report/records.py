@@ -139,7 +139,7 @@ class Truth:
 
     ``name`` is None for an object that was never enrolled. ``yaw_deg`` is its rotation relative to its enrollment,
     counter-clockwise, None if it is not known. ``symmetry_deg`` is the smallest rotation after which it looks the same:
-    360 for an object without symmetry, 0 for one that looks the same from everywhere. ``description`` is the common
+    360 for an object without symmetry, 0 for one that looks the same from all sides. ``description`` is the common
     name of an object that was never enrolled.
     """
 

@@ -108,7 +108,7 @@ def _symmetry(similar: SimilarObjects) -> SummaryItem:
     if similar.period_deg == 360:
         return SummaryItem("symmetry", "none", note)
     return SummaryItem(
-        "symmetry", f"every {similar.period_deg:g}°" if similar.period_deg else "the same from everywhere", note
+        "symmetry", f"every {similar.period_deg:g}°" if similar.period_deg else "the same from all sides", note
     )
 
 

@@ -17,7 +17,7 @@ _TEXT: Final = {
     IssueCode.BACKDROP_LEVEL: "the backdrop is too dark or too bright to correct the exposure",
     IssueCode.BACKGROUND_NOT_PLAIN: "the background is not plain",
     IssueCode.NO_GUESS: "no part of the frame stands out",
-    IssueCode.NO_OBJECT: "no object was found while the table turned",
+    IssueCode.NO_OBJECT: "no object was found while the table rotated",
     IssueCode.NO_DIFFERENCE: "nothing differs from the background",
     IssueCode.PATCH_UNEVEN: "the grey patch is uneven",
     IssueCode.PATCH_EXPOSURE: "the grey patch is overexposed or too dark",

@@ -350,7 +350,7 @@ def _acknowledge(context: Context, *, reboot: bool) -> None:
 
 def _refer(context: Context, request: ReferenceRequest) -> None:
     if request.here == (request.turns is not None):
-        raise UsageError("Neither or both of turns and here are given.", next_step="Give one of them.")
+        raise UsageError("turns and here are both given, or both missing.", next_step="Give one of them.")
     safety = context.bench.safety
     if request.turns is None:
         safety.set_angle(0.0)

@@ -60,8 +60,8 @@ def demo(
 ) -> None:
     """Enroll objects on the simulated bench, then identify each of them, and two objects that are not enrolled.
 
-    Each object is enrolled with 36 views, half of what rig enroll takes, so that the demo is short (--views 72). The
-    exit code is 6 if fewer than 80 % of the answers are right.
+    The demo takes 36 views of each object, half as many as rig enroll; --views 72 takes as many. The exit code is 6 if
+    fewer than 80 % of the answers are right.
 
     Example: rig demo --seed 7 --out /tmp/demo
 

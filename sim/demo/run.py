@@ -55,7 +55,7 @@ ENROLLED = (
         "nutcracker",
     ),
 )
-"""Objects to enroll first: two similar pairs, a vase that is the same from everywhere, a bowl with 8-fold symmetry."""
+"""Objects to enroll first: two similar pairs, a vase that is the same from all sides, a bowl with 8-fold symmetry."""
 
 UNKNOWN_OBJECTS = ("radio", "clock")  # objects that are put on the table but not enrolled
 

@@ -9,7 +9,7 @@ from rig.cli.ui.command import command
 from rig.cli.ui.settings import Settings
 
 Link = Annotated[Path | None, typer.Option(metavar="PATH", help="Create this link to the port while the program runs.")]
-Seconds = Annotated[float | None, typer.Option(min=0, help="Stop after this time. Default: until Ctrl+C.")]
+Seconds = Annotated[float | None, typer.Option(min=0, help="Stop after this time (default: until Ctrl+C).")]
 
 
 @command
@@ -21,14 +21,15 @@ def sim_bench(
     ] = None,
     folder: Annotated[
         Path | None,
-        typer.Option(metavar="FOLDER", help="Folder of the bench. Default: sim-bench, or that of rig.toml."),
+        typer.Option(metavar="FOLDER", help="Folder of the bench (default: sim-bench, or that of rig.toml)."),
     ] = None,
     seconds: Seconds = None,
 ) -> None:
     """Run a simulated bench in real time: servo, IMU, camera and table of one world, for several programs at once.
 
     Its folder has a rig.toml, so each `rig` command in that folder uses the bench. It starts with the configuration in
-    force. Type commands such as `put mug-white` or `jam` into its terminal, or give them as words in another one.
+    force. Type commands such as `put mug-white` or `jam` into its terminal, or give them as arguments
+    of this command in another terminal.
 
     Example: rig sim-bench; in a second terminal: cd sim-bench; rig sim-bench put mug-white; rig goto 90; rig stop
     """
@@ -49,7 +50,7 @@ def sim_bench(
 def sim_servo(
     settings: Settings,
     ids: Annotated[
-        list[int] | None, typer.Option("--id", min=0, max=252, help="Id of a servo. Repeatable. Default: servo.id.")
+        list[int] | None, typer.Option("--id", min=0, max=252, help="Id of a servo. Repeatable (default: servo.id).")
     ] = None,
     link: Link = None,
     seconds: Seconds = None,

@@ -47,7 +47,7 @@ def show(
     settings: Settings,
     wanted: Annotated[
         list[str] | None,
-        typer.Argument(metavar="[KEY]...", help="Keys or sections; default: all.", autocompletion=config_keys),
+        typer.Argument(metavar="[KEY]...", help="Keys or sections (default: all).", autocompletion=config_keys),
     ] = None,
     changed: Annotated[bool, typer.Option("--changed", help="Show only values that differ from the defaults.")] = False,
 ) -> None:

@@ -33,7 +33,7 @@ def doctor(
 ) -> None:
     """Check everything that the bench needs. Print one finding per line, and a fix for each problem.
 
-    Moves nothing, and writes nothing but the bundle. The exit code is 0, or that of the first finding marked ✗.
+    Moves nothing, and writes only the bundle. The exit code is 0, or that of the first finding marked ✗.
 
     Example: rig doctor --bench sim
     """

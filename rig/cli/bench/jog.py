@@ -42,7 +42,7 @@ def jog(
     """Rotate the table with the arrow keys: right is counter-clockwise, left is clockwise.
 
     Up and down change the step. h rotates to home. q ends. Ctrl+C stops a rotation at once. Keys that you press during
-    a rotation do not count. At the end the torque is off.
+    a rotation have no effect. At the end the torque is off.
 
     Example: rig jog --step 1 --bench sim
     """

@@ -22,7 +22,7 @@ MAX_UPLOAD_BYTES = 500_000_000
 def serve(
     settings: Settings,
     host: Annotated[
-        str, typer.Option(metavar="ADDRESS", help="Address to listen to. Any but this computer's needs a token.")
+        str, typer.Option(metavar="ADDRESS", help="Address to listen to. Other computers need a token.")
     ] = "127.0.0.1",
     port: Annotated[
         int, typer.Option(min=0, max=65535, help="Port to listen to; 0 chooses a free one.")

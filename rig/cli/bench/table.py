@@ -45,7 +45,7 @@ def home(
             metavar="N",
             min=-250,
             max=250,
-            help="The cable is wound up by N revolutions, as you saw; 0 if it hangs free.",
+            help="Revolutions by which the cable is wound up; 0 if it hangs free.",
         ),
     ] = None,
     here: Annotated[bool, typer.Option("--here", help="Make the present angle home. Moves nothing.")] = False,
@@ -103,7 +103,7 @@ def _rotate(settings: Settings, table: "Turntable", angle_deg: float) -> None:
 
 @command
 def status(settings: Settings) -> None:
-    """Show the state of the bench and its devices, also if some of them are missing. Moves nothing.
+    """Show the state of the bench and its devices, even if some of them are missing. Moves nothing.
 
     Example: rig status --bench sim --json
     """

@@ -35,10 +35,10 @@ def calibrate(
 ) -> None:
     """Calibrate the stopping rule, which decides when rig identify ends a search.
 
-    Search for each enrolled object with its own views, as if the camera had stood beside them, and again with the whole
-    object left out, as an unknown object. Of more than 1000 objects, 1000 are searched for, among all. The command
-    reports what the rule cannot guarantee, and how much more data that needs. Repeat it when the catalog has changed;
-    rig identify reports that.
+    The command searches for each enrolled object with its own views, as if the camera had been a little to the side.
+    Then it leaves the object out and searches again, as for an unknown object. In a catalog of more than 1000 objects,
+    it searches for 1000 of them among all. It reports what the rule cannot guarantee, and how much more data is needed.
+    Repeat the command when rig identify reports that the catalog has changed.
 
     Example: rig catalog calibrate --bench sim --error-rate 0.005
     """

@@ -27,7 +27,7 @@ def deliver(
 ) -> None:
     """Deliver what this computer enrolled and answered while the server of the catalog did not answer.
 
-    rig enroll and rig identify do it, too. The options are for conflicts of names, which a person decides.
+    rig enroll and rig identify do this, too. The options resolve a name that both the journal and the server have.
 
     Example: rig catalog deliver --rename mug-white mug-white-2
     """

@@ -51,7 +51,7 @@ def import_(
     ],
     pattern: Annotated[
         str | None,
-        typer.Option(help="Names of the files in a folder, e.g. '{object}/view-{angle}'. Default: {object}__{angle}."),
+        typer.Option(help="Names of the files in a folder, e.g. '{object}/view-{angle}' (default: {object}__{angle})."),
     ] = None,
     table_angles: Annotated[
         bool,
@@ -73,7 +73,7 @@ def import_(
         ),
     ] = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Only report what would be imported.")] = False,
-    jobs: Annotated[int | None, typer.Option(min=1, help="Number of processes. Default: one per core.")] = None,
+    jobs: Annotated[int | None, typer.Option(min=1, help="Number of processes (default: one per core).")] = None,
     cluster: ClusterOption = None,
 ) -> None:
     """Import photographs with known angles, or objects of another bench; all or nothing.
@@ -198,21 +198,24 @@ def export(
     target: Annotated[Path, typer.Argument(metavar="TARGET", help="File or folder to write. It must not exist.")],
     names: Annotated[
         list[str] | None,
-        typer.Argument(metavar="[NAME]...", help="Names of the objects. Default: all.", autocompletion=object_names),
+        typer.Argument(metavar="[NAME]...", help="Names of the objects (default: all).", autocompletion=object_names),
     ] = None,
     format_: Annotated[
-        Format | None, typer.Option("--format", help="Format. Default: by the suffix of the target, coil for a folder.")
+        Format | None,
+        typer.Option("--format", help="Format (default: by the suffix of the target, coil for a folder)."),
     ] = None,
     label: Annotated[str | None, typer.Option(help="Only objects with this label.")] = None,
     split: Annotated[
         str | None,
-        typer.Option(metavar="object|view", help="Of a training set: divide the objects, or the views of each object."),
+        typer.Option(
+            metavar="object|view", help="For a training set: divide the objects, or the views of each object."
+        ),
     ] = None,
     fractions: Annotated[
-        str, typer.Option(metavar="TRAIN,VAL,TEST", help="Of a training set: shares of its parts.")
+        str, typer.Option(metavar="TRAIN,VAL,TEST", help="For a training set: shares of its parts.")
     ] = "0.8,0.1,0.1",
     jobs: Annotated[
-        int | None, typer.Option(min=1, help="Of a training set: number of processes. Default: one per core.")
+        int | None, typer.Option(min=1, help="For a training set: number of processes (default: one per core).")
     ] = None,
 ) -> None:
     """Export objects in an open format.

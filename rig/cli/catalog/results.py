@@ -30,7 +30,7 @@ SinceOption = Annotated[
     typer.Option(
         "--since",
         metavar="WHEN",
-        help="Only answers since 2026-01-31, 2026-01-31T14:00 (UTC), or 30m, 12h, 7d, 4w ago.",
+        help="Only answers since this time: 2026-01-31, 2026-01-31T14:00 (UTC), or a time ago: 30m, 12h, 7d, 4w.",
     ),
 ]
 BeforeOption = Annotated[str | None, typer.Option("--before", metavar="WHEN", help="Only answers before this time.")]

@@ -15,7 +15,7 @@ from rig.cli.ui.jobs import confirm, print_table, run_job, size_words
 from rig.cli.ui.models import descriptor_name
 from rig.cli.ui.settings import Settings
 
-JobsOption = Annotated[int | None, typer.Option(min=1, help="Number of processes. Default: one per core.")]
+JobsOption = Annotated[int | None, typer.Option(min=1, help="Number of processes (default: one per core).")]
 EXIT_CATALOG = 7
 
 
@@ -26,7 +26,7 @@ def verify(
     repair: Annotated[bool, typer.Option("--repair", help="Repair what can be repaired. Nothing is deleted.")] = False,
     quick: Annotated[bool, typer.Option("--quick", help="Only compare the hashes of the files.")] = False,
     resume: Annotated[
-        bool, typer.Option("--resume", help="Continue an interrupted check: do not check again what was right.")
+        bool, typer.Option("--resume", help="Continue an interrupted check. Do not check again what it found right.")
     ] = False,
     jobs: JobsOption = None,
     cluster: ClusterOption = None,
@@ -207,10 +207,10 @@ def migrate(settings: Settings) -> None:
 def copy(
     settings: Settings,
     source: Annotated[str, typer.Argument(metavar="FROM", help="Folder or database URL of the catalog.")],
-    target: Annotated[str, typer.Argument(metavar="TO", help="Folder or database URL; a new or an empty catalog.")],
+    target: Annotated[str, typer.Argument(metavar="TO", help="Folder or database URL of a new or empty catalog.")],
     images: Annotated[
         str | None,
-        typer.Option(metavar="PLACE", help="Folder or store of the images of a database. Default: catalog.images."),
+        typer.Option(metavar="PLACE", help="Folder or store of the images of a database (default: catalog.images)."),
     ] = None,
 ) -> None:
     """Copy a whole catalog, for example from this computer to a server, and compare all digests.
@@ -250,7 +250,8 @@ def log(
     since: Annotated[
         str | None,
         typer.Option(
-            metavar="WHEN", help="Only entries since 2026-01-31, 2026-01-31T14:00 (UTC), or 30m, 12h, 7d, 4w ago."
+            metavar="WHEN",
+            help="Only entries since this time: 2026-01-31, 2026-01-31T14:00 (UTC), or a time ago: 30m, 12h, 7d, 4w.",
         ),
     ] = None,
     name: Annotated[

@@ -55,7 +55,8 @@ def enroll(
     fly: Annotated[
         bool | None,
         typer.Option(
-            "--fly/--at-rest", help="Take the views in one turn without a stop, or at rest (default: enroll.mode)."
+            "--fly/--at-rest",
+            help="Take the views in one revolution without a stop, or at rest (default: enroll.mode).",
         ),
     ] = None,
     dry_run: Annotated[
@@ -72,11 +73,11 @@ def enroll(
 
     Once a day, the command first asks for an empty table and takes its image (see rig empty-table).
 
-    p or the space bar pauses and resumes. Ctrl+Z pauses, fg resumes. Ctrl+C stops; the views taken so far stay stored.
+    p or the space bar pauses and resumes. Ctrl+Z pauses, fg resumes. Ctrl+C stops: the views taken so far stay stored.
+
+    With --fly, the table does not stop, and the revolution takes a few seconds. Run rig calibrate camera-time first.
 
     Example: rig enroll mug-white --bench sim --views 36 --report mug.html
-
-    With --fly the table does not stop: a turn takes some seconds. Run rig calibrate camera-time before.
 
     Example: rig enroll --list tray.csv --bench sim
 

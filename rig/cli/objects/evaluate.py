@@ -104,7 +104,8 @@ def evaluate(
         typer.Option(
             min=1,
             metavar="OBJECTS",
-            help="Leave this number of objects out, five times, and search for them, too: false accepts and rejects.",
+            help="Leave this number of objects out, five times, and search for them, too. "
+            "Reports false accepts and rejects.",
         ),
     ] = None,
     bench_change: Annotated[
@@ -122,14 +123,14 @@ def evaluate(
         str | None,
         typer.Option(
             metavar="FIRST-LAST",
-            help="Report only these objects, searched for among all; with --resume for earlier runs.",
+            help="Report only these objects; the searches use all objects. With --resume: also for earlier runs.",
         ),
     ] = None,
     margin: Annotated[
         float | None,
-        typer.Option(min=0, help="Margin per view that ends a search of the paper; default: identify.margin."),
+        typer.Option(min=0, help="Margin per view that ends a search of the paper (default: identify.margin)."),
     ] = None,
-    jobs: Annotated[int | None, typer.Option(min=1, help="Number of processes; default: one for each core.")] = None,
+    jobs: Annotated[int | None, typer.Option(min=1, help="Number of processes (default: one per core).")] = None,
     cluster: ClusterOption = None,
     out: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder for the results.")] = Path("rig-eval"),
     resume: Annotated[bool, typer.Option("--resume", help="Continue with the results in the folder.")] = False,

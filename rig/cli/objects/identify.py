@@ -56,8 +56,9 @@ def identify(
 ) -> None:
     """Identify the object on the table. The exit code is 0 if it is found, 8 if it is unknown, 10 if it is ambiguous.
 
-    Put the object on the table in any orientation. The default strategy, dense, rotates to the next best view and stops
-    by the rule that rig catalog calibrate has measured. If the catalog has no descriptors for it, the default is ahbr.
+    Put the object on the table in any orientation. The default strategy, dense, rotates to the next best view. It
+    stops by the stopping rule, which rig catalog calibrate measures. If the catalog has no descriptors for dense, the
+    default is ahbr.
 
     The catalog records each answer (rig results list).
 

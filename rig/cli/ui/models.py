@@ -10,7 +10,9 @@ from rig.core.errors import UsageError
 ModelOption = Annotated[
     Path | None,
     typer.Option(
-        "--model", metavar="FILE", help="ONNX file of the run's descriptor, if it is a network. The run has its digest."
+        "--model",
+        metavar="FILE",
+        help="ONNX file of the run's descriptor, if it is a network. It must match the digest in the run.",
     ),
 ]
 

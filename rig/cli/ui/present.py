@@ -47,7 +47,7 @@ def dry_run_lines(found: Sequence[DryRun]) -> list[str]:
         if not one.views:
             lines.append(f"{one.name}: {'skipped' if one.action == 'skip' else 'not possible'}, {_obstacle_words(one)}")
             continue
-        way = " in one turn" if one.in_motion else ""
+        way = " in one revolution" if one.in_motion else ""
         lines.append(
             f"{one.name}: {one.action}, {counted(one.views, 'view')}{way}, about {duration_words(one.seconds)}"
         )

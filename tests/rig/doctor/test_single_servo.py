@@ -116,7 +116,7 @@ def test_ax_12a_is_changed_by_protocol_1(monkeypatch):
         ("Baud Rate", 3, "1000000 bit/s"),
         ("Return Delay Time", 250, "500 µs"),
         ("Drive Mode", 0b1101, "reversed direction, time-based profile, torque on by goal"),
-        ("Operating Mode", 4, "extended position, many turns"),
+        ("Operating Mode", 4, "extended position, many revolutions"),
         ("Secondary ID", 255, "off"),
         ("Homing Offset", -1024, "-90.00°"),
         ("Min Voltage Limit", 95, "9.5 V"),

@@ -149,7 +149,7 @@ def test_similar_objects() -> None:
         "looks like cup from 120–200° and 300° (similarity up to 0.990)",
     ]
     vase = replace(mug, period_deg=0.0, objects=())
-    assert similar_objects_words(vase)[0].startswith("looks the same from everywhere")
+    assert similar_objects_words(vase)[0].startswith("looks the same from all sides")
     assert similar_objects_words(replace(vase, period_deg=None)) == ["looks like no other enrolled object"]
 
 
