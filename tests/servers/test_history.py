@@ -2,7 +2,6 @@
 
 import random
 import uuid
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -13,15 +12,9 @@ from rig.core.clock import SystemClock
 from tests.programs import Program
 from tests.rig.catalog.catalog_samples import finished
 from tests.servers.history import Operation, read_log, serial_order
-from tests.servers.postgres import PostgresServer, place_in, server
+from tests.servers.postgres import PostgresServer, place_in
 
 CODE = "from tests.servers.history import main; main()"
-
-
-@pytest.fixture(scope="module")
-def postgres() -> Iterator[PostgresServer]:
-    with server() as running:
-        yield running
 
 
 def op(process: int, begun: int, ended: int | None, name: str, *arguments: object, result: object) -> Operation:

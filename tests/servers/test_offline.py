@@ -5,7 +5,7 @@ import json
 import os
 import sys
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -39,15 +39,9 @@ from tests.rig.catalog.catalog_samples import (
     record,
     true_fill,
 )
-from tests.servers.postgres import PostgresServer, place_in, server
+from tests.servers.postgres import PostgresServer, place_in
 
 CLOCK = SystemClock()
-
-
-@pytest.fixture(scope="module")
-def postgres() -> Iterator[PostgresServer]:
-    with server() as running:
-        yield running
 
 
 @pytest.fixture

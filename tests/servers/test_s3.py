@@ -27,13 +27,7 @@ from rig.core.clock import SystemClock
 from rig.core.errors import CatalogError, CatalogUnavailable
 from sim.clock import VirtualClock
 from tests.rig.catalog.catalog_samples import finished, image, new_result, true_fill
-from tests.servers.postgres import PostgresServer, place_in, server
-
-
-@pytest.fixture(scope="module")
-def postgres() -> Iterator[PostgresServer]:
-    with server() as running:
-        yield running
+from tests.servers.postgres import PostgresServer, place_in
 
 
 class S3Server:

@@ -2,7 +2,7 @@
 
 import json
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -21,16 +21,10 @@ from rig.events.events import NoteCode
 from rig.search.current_model import CurrentModel
 from tests.rig.catalog.catalog_samples import finished, true_fill
 from tests.rig.web.conftest import Served, serve  # noqa: F401 - a fixture
-from tests.servers.postgres import PostgresServer, place_in, server
+from tests.servers.postgres import PostgresServer, place_in
 
 CLOCK = SystemClock()
 SMALL = ("camera.width=320", "camera.height=240", "view.roi=[40,0,240,240]", "bench.sim.object='mug-white'")
-
-
-@pytest.fixture(scope="module")
-def postgres() -> Iterator[PostgresServer]:
-    with server() as running:
-        yield running
 
 
 @pytest.fixture

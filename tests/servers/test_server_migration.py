@@ -22,7 +22,7 @@ from rig.core.errors import CatalogBusy, CatalogDamaged, CatalogError, CatalogOu
 from sim.clock import VirtualClock
 from tests.rig.catalog.catalog_samples import finished, true_fill
 from tests.rig.catalog.test_migration import DUMPS, catalog_of_version
-from tests.servers.postgres import PostgresServer, place_in, server
+from tests.servers.postgres import PostgresServer, place_in
 
 NEXT = SCHEMA_VERSION + 1
 STEP = f"""
@@ -38,12 +38,6 @@ def upgrade():
         objects.add_column(sqlalchemy.Column("shelf", sqlalchemy.Integer))
     op.create_index("objects_of_shelves", "objects", ["shelf"])
 """
-
-
-@pytest.fixture(scope="module")
-def postgres() -> Iterator[PostgresServer]:
-    with server() as running:
-        yield running
 
 
 @pytest.fixture
