@@ -233,10 +233,7 @@ def report(
         store, standings = stored_results(bench)
         notes = [error.what for error in store.unreadable]
         write_page(out, standings, store.history(), bench=bench.name, now_utc=bench.clock.utc(), notes=notes)
-    if settings.json:
-        settings.print_json({"file": str(out), "calibrations": [s.result.name for s in standings]})
-    else:
-        print(out)
+    settings.say(str(out), {"file": str(out), "calibrations": [s.result.name for s in standings]})
 
 
 @app.command("show")
@@ -313,12 +310,9 @@ def run(settings: Settings, *procedures: "Procedure") -> None:
         for procedure in procedures:
             for result in _results(settings, bench, procedure):
                 path = store.add(result)
-                if settings.json:
-                    outcome = {"event": "calibrated", "passed": result.passed, "id": result.id, "file": str(path)}
-                    settings.print_json({**outcome, **as_json(result)})
-                else:
-                    then = ", in force from now on." if result.passed else "; earlier results stay in force."
-                    print(f"{outcome_text(result)}\nStored in {path}{then}")
+                then = ", in force from now on." if result.passed else "; earlier results stay in force."
+                outcome = {"event": "calibrated", "passed": result.passed, "id": result.id, "file": str(path)}
+                settings.say(f"{outcome_text(result)}\nStored in {path}{then}", {**outcome, **as_json(result)})
                 if not result.passed:
                     raise typer.Exit(EXIT_QUALITY)
             reported, region = bench.calibration_findings, bench.config.view.roi

@@ -36,9 +36,7 @@ def enrolled_levels(dataset: Dataset, j: int, condition: Condition, size: tuple[
 
 def query_levels(dataset: Dataset, j: int, condition: Condition, size: tuple[int, int], seed: int) -> LevelArray:
     """Return the descriptors of all views of object `j` as queries, uint8 (n, length). Each has its own noise."""
-    name = dataset.objects[j].name
-    images = enumerate(_images(dataset, j, size))
-    return _levels((condition.query(image, generator(seed, name, "photograph", i)) for i, image in images), condition)
+    return _levels(_queries(dataset, j, condition, size, seed), condition)
 
 
 def segmented_queries(dataset: Dataset, j: int, condition: Condition, size: tuple[int, int], seed: int) -> Queries:
@@ -47,13 +45,16 @@ def segmented_queries(dataset: Dataset, j: int, condition: Condition, size: tupl
     if kind.whole_image:
         levels = query_levels(dataset, j, condition, size, seed)
         return Queries(levels, ("",) * len(levels))
-    name = dataset.objects[j].name
-    shown = (
-        condition.query(image, generator(seed, name, "photograph", i))
-        for i, image in enumerate(_images(dataset, j, size))
-    )
-    found = [segment(image, empty_table=empty) for image, empty in shown]
+    found = [segment(image, empty_table=empty) for image, empty in _queries(dataset, j, condition, size, seed)]
     return Queries(np.stack([kind.describe(one) for one in found]), tuple(one.method.value for one in found))
+
+
+def _queries(
+    dataset: Dataset, j: int, condition: Condition, size: tuple[int, int], seed: int
+) -> Iterator[EvaluationImage]:
+    name = dataset.objects[j].name
+    for i, image in enumerate(_images(dataset, j, size)):
+        yield condition.query(image, generator(seed, name, "photograph", i))
 
 
 def _levels(images: Iterable[EvaluationImage], condition: Condition) -> LevelArray:

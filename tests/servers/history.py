@@ -75,10 +75,6 @@ def _begin(state: State, operation: Operation) -> tuple[State, Any]:
     return state, "ObjectExists"
 
 
-def _own(state: State, owner: str) -> int:
-    return next(i for i, one in enumerate(state) if one.owner == owner)
-
-
 def _add(state: State, operation: Operation) -> tuple[State, Any]:
     owner = operation.arguments[0]
     place = next((i for i, one in enumerate(state) if one.owner == owner), None)

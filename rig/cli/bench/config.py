@@ -31,14 +31,13 @@ def check(settings: Settings) -> None:
     Example: rig config check --config rig.toml
     """
     from rig.config.wording import key_info
+    from rig.events.phrases import counted
 
     values, config, _ = _checked(settings)
     given = sum(values.origin(info.key) != "default" for info in key_info(type(config)))
     where = str(values.path) if values.path else "No file: every key has its default"
-    if settings.json:
-        settings.print_json({"path": values.path, "valid": True, "keys_given": given})
-    else:
-        print(f"{where}: no mistakes, {given} key{'s' if given != 1 else ''} given.")
+    text = f"{where}: no mistakes, {counted(given, 'key')} given."
+    settings.say(text, {"path": values.path, "valid": True, "keys_given": given})
 
 
 @app.command("show")
@@ -109,12 +108,8 @@ def path(settings: Settings) -> None:
     from rig.config.values import default_path, search_paths
 
     found = settings.config or default_path()
-    if settings.json:
-        settings.print_json({"path": found, "searched": search_paths()})
-    elif found:
-        print(found)
-    else:
-        print(f"No file: the defaults are used. Looked for: {', '.join(map(str, search_paths()))}")
+    none = f"No file: the defaults are used. Looked for: {', '.join(map(str, search_paths()))}"
+    settings.say(str(found or none), {"path": found, "searched": search_paths()})
 
 
 @app.command("init")
@@ -136,10 +131,7 @@ def init(settings: Settings) -> None:
             next_step="Change single values with `rig config set KEY VALUE`, or write another file with --config FILE.",
         )
     save(target, blank_file(RigConfig))
-    if settings.json:
-        settings.print_json({"path": target})
-    else:
-        print(f"Wrote {target}: all keys with their defaults, as comments. Next: rig setup")
+    settings.say(f"Wrote {target}: all keys with their defaults, as comments. Next: rig setup", {"path": target})
 
 
 @app.command("set", context_settings={"ignore_unknown_options": True})
@@ -182,14 +174,11 @@ def set_(
     new = with_values(old, {tuple(key.split(".")): parsed(value)})
     if new != old:
         save(target, new)
-    if settings.json:
-        settings.print_json({"path": target, "key": key, "changed": changed_lines(old, new)})
-        return
-    print(
-        "\n".join([f"{target}:", *changed_lines(old, new)])
-        if new != old
-        else f"{target}: no change, the key has this value already."
+    changed = changed_lines(old, new)
+    text = (
+        "\n".join([f"{target}:", *changed]) if new != old else f"{target}: no change, the key has this value already."
     )
+    settings.say(text, {"path": target, "key": key, "changed": changed})
 
 
 def _checked(settings: Settings) -> "tuple[Values, RigConfig, dict[str, BaseModel]]":

@@ -73,10 +73,8 @@ def setup(
         save(path, new)
     done = f"Wrote {path}." if write else f"{path} is unchanged."
     after = replace(settings, _loaded={}) if path.exists() else now
-    if settings.json:
-        settings.print_json({"path": path, "written": write, "settings": {".".join(k): v for k, v in changes.items()}})
-    else:
-        print(f"{done}\n")
+    written = {".".join(key): value for key, value in changes.items()}
+    settings.say(f"{done}\n", {"path": path, "written": write, "settings": written})
     code = print_findings(after)
     if not settings.json:
         print(_next(context, code))
