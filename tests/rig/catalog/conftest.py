@@ -10,6 +10,7 @@ from rig.catalog import Catalog
 from rig.config.catalog_place import CatalogPlace
 from sim.clock import VirtualClock
 from tests.rig.catalog.catalog_samples import without_waiting
+from tests.rig.catalog.exchange.exchange_samples import NOW, OpenCatalog
 from tests.servers.postgres import VARIABLE, server, use_postgres
 
 
@@ -48,3 +49,16 @@ def clock() -> VirtualClock:
 def catalog(tmp_path: Path, clock: VirtualClock) -> Iterator[Catalog]:
     with Catalog.open(tmp_path / "catalog", clock=clock) as catalog:
         yield catalog
+
+
+@pytest.fixture
+def open_catalog(tmp_path: Path) -> Iterator[OpenCatalog]:
+    opened = []
+
+    def open_one(name: str) -> Catalog:
+        opened.append(Catalog.open(tmp_path / name, clock=VirtualClock(NOW)))
+        return opened[-1]
+
+    yield open_one
+    for catalog in opened:
+        catalog.close()

@@ -1,6 +1,6 @@
 """Segmentations and descriptors of the object alone: computed later, verified, and exported to other catalogs."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -50,19 +50,6 @@ def view(index: int) -> NDArray[np.uint8]:
     image[20:50, 25 + 3 * index : 50 + 3 * index] = (20, 20, 230)
     image[28:38, 30 + 3 * index : 40 + 3 * index] = (230, 230, 20)
     return image
-
-
-@pytest.fixture
-def open_catalog(tmp_path: Path) -> Iterator[Callable[[str], Catalog]]:
-    opened: list[Catalog] = []
-
-    def open_one(name: str) -> Catalog:
-        opened.append(Catalog.open(tmp_path / name, clock=SystemClock()))
-        return opened[-1]
-
-    yield open_one
-    for catalog in opened:
-        catalog.close()
 
 
 def enrolled(catalog: Catalog, name: str, *, names: tuple[str, ...] = DESCRIPTORS, empty_table: bool = True) -> None:

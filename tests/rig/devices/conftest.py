@@ -9,6 +9,7 @@ from sim.noise import NoiseModel
 from sim.objects.shelf import shelf
 from sim.world import World
 from tests.contract.heads import Head, opened_head
+from tests.rig.bench_parts import Wires, servo_wires
 from tests.rig.devices.mpu6050_bench import Bench
 
 
@@ -25,6 +26,11 @@ def world() -> World:
 def bench() -> Iterator[Bench]:
     with Bench() as b:
         yield b
+
+
+@pytest.fixture
+def wires() -> Wires:
+    return servo_wires()
 
 
 @pytest.fixture

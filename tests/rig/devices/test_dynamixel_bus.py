@@ -22,11 +22,6 @@ TABLE = control_table("xl430_w250")
 
 
 @pytest.fixture
-def wires():
-    return servo_wires()
-
-
-@pytest.fixture
 def bus(wires):
     return open_bus(wires)
 

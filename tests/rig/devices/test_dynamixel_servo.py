@@ -14,11 +14,6 @@ from tests.rig.bench_parts import open_bus, open_servo, servo_wires
 
 
 @pytest.fixture
-def wires():
-    return servo_wires()
-
-
-@pytest.fixture
 def servo(wires):
     return open_servo(wires)
 

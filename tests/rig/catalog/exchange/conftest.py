@@ -1,7 +1,6 @@
 """Catalogs and bundles to import and export. No test waits for the disk."""
 
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -17,19 +16,6 @@ from tests.rig.catalog.catalog_samples import (
     without_waiting,
 )
 from tests.rig.catalog.exchange.exchange_samples import NOW, OpenCatalog, fill_full
-
-
-@pytest.fixture
-def open_catalog(tmp_path: Path) -> Iterator[OpenCatalog]:
-    opened = []
-
-    def open_one(name: str) -> Catalog:
-        opened.append(Catalog.open(tmp_path / name, clock=VirtualClock(NOW)))
-        return opened[-1]
-
-    yield open_one
-    for catalog in opened:
-        catalog.close()
 
 
 @pytest.fixture(scope="session")
