@@ -34,6 +34,9 @@ class ImageStore(ABC):
     Every method raises an `OSError` with the reason if it fails, and `CatalogUnavailable` if a store does not answer.
     """
 
+    moves = False
+    """Whether a folder beside the images can be moved in among them (`rig.catalog.staging`)."""
+
     @abstractmethod
     def where(self, name: str) -> str:
         """Return the place of an image for messages."""
@@ -62,13 +65,16 @@ class ImageStore(ABC):
     def make_folder(self, name: str) -> None:
         """Create the folder of an enrollment, if the store has folders."""
 
-    @abstractmethod
     def names(self) -> set[str]:
         """Return the names of all files within ``images/``."""
+        return self._names(images.IMAGE_FOLDER)
 
-    @abstractmethod
     def lost(self) -> set[str]:
         """Return the names of all files within ``lost+found/``."""
+        return self._names(LOST)
+
+    @abstractmethod
+    def _names(self, top: str) -> set[str]: ...
 
     @abstractmethod
     def size(self, name: str) -> int:
@@ -81,11 +87,6 @@ class ImageStore(ABC):
     @abstractmethod
     def set_aside(self, name: str) -> str:
         """Move a file to ``lost+found/`` and return its name there."""
-
-    @property
-    @abstractmethod
-    def moves(self) -> bool:
-        """Whether a folder beside the images can be moved in among them (`rig.catalog.staging`)."""
 
     @abstractmethod
     def free_bytes(self) -> int | None:
@@ -114,7 +115,7 @@ class FolderImages(ImageStore):
 
     def __init__(self, root: Path, *, moves: bool = True) -> None:
         self.root = root
-        self._moves = moves
+        self.moves = moves
 
     def where(self, name: str) -> str:
         return str(self.root / name)
@@ -140,12 +141,6 @@ class FolderImages(ImageStore):
 
     def make_folder(self, name: str) -> None:
         make_folder_within(self.root, image_file(self.root, name))
-
-    def names(self) -> set[str]:
-        return self._names(images.IMAGE_FOLDER)
-
-    def lost(self) -> set[str]:
-        return self._names(LOST)
 
     def _names(self, top: str) -> set[str]:
         return {path.relative_to(self.root).as_posix() for path in files_within(self.root / top)}
@@ -178,10 +173,6 @@ class FolderImages(ImageStore):
             number += 1
         (self.root / name).rename(target)
         return target.relative_to(self.root).as_posix()
-
-    @property
-    def moves(self) -> bool:
-        return self._moves
 
     def free_bytes(self) -> int | None:
         disk = os.statvfs(self.root)
@@ -244,12 +235,6 @@ class FsspecImages(ImageStore):
     def make_folder(self, name: str) -> None:
         """Do nothing: a store has no folders."""
 
-    def names(self) -> set[str]:
-        return self._names(images.IMAGE_FOLDER)
-
-    def lost(self) -> set[str]:
-        return self._names(LOST)
-
     def _names(self, top: str) -> set[str]:
         with self._store() as (files, root):
             found = files.find(f"{root}/{top}")
@@ -281,10 +266,6 @@ class FsspecImages(ImageStore):
             files.cp_file(f"{root}/{name}", f"{root}/{target}")
             files.rm_file(f"{root}/{name}")
         return target
-
-    @property
-    def moves(self) -> bool:
-        return False
 
     def free_bytes(self) -> int | None:
         return None

@@ -91,6 +91,8 @@ class Bno055:
         Its fusion does not run, or it does not keep its settings.
     """
 
+    rate_hz = RATE_HZ
+    range_dps = RANGE_DPS
     _last: _Reading
     _newest_ns: int
     _owed_deg: Floats
@@ -109,14 +111,6 @@ class Bno055:
     @property
     def statistics(self) -> I2cStatistics:
         return self._registers.statistics
-
-    @property
-    def rate_hz(self) -> float:
-        return RATE_HZ
-
-    @property
-    def range_dps(self) -> float:
-        return RANGE_DPS
 
     def close(self) -> None:
         self._registers.close()

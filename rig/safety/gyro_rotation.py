@@ -167,7 +167,8 @@ class GyroRotationMeter:
         self._column = "xyz".index(axis)
         self._to_table = sign * scale
         self._scale_sigma = scale_sigma
-        self._arw = imu.identity.gyro_noise_dps_rthz / sqrt(2)
+        self.arw = imu.identity.gyro_noise_dps_rthz / sqrt(2)
+        """The angle random walk by the datasheet, in °/√s."""
         self._saturated_dps = imu.range_dps
         self._time_ns: NDArray[np.int64] = np.empty(0, np.int64)
         self._rate_dps: NDArray[np.float64] = np.empty(0)
@@ -242,11 +243,6 @@ class GyroRotationMeter:
             raise NotReady("The gyro's bias is not known.", next_step="Measure it at rest first.")
         return self._to_table * self.bias.rate_dps, abs(self._to_table) * self.bias.sigma_dps
 
-    @property
-    def arw(self) -> float:
-        """The angle random walk by the datasheet, in °/√s."""
-        return self._arw
-
     def update(self, *, now: bool = False) -> None:
         """Collect the sensor's new samples, unless it was done very recently and ``now`` is false."""
         if now or self._clock.now_ns() - self._drained_ns >= self._drain_s * 1e9:
@@ -292,7 +288,7 @@ class GyroRotationMeter:
             count, sum_dps = count - later.size, sum_dps - float(later.sum())
         duration_s = count / self._imu.rate_hz
         angle_deg = self._to_table * (sum_dps / self._imu.rate_hz - self.bias.rate_dps * duration_s)
-        drift_deg = abs(self._to_table) * hypot(self._arw * sqrt(duration_s), self.bias.sigma_dps * duration_s)
+        drift_deg = abs(self._to_table) * hypot(self.arw * sqrt(duration_s), self.bias.sigma_dps * duration_s)
         sigma_deg = hypot(drift_deg, self._scale_sigma * angle_deg)
         return Rotation(angle_deg, sigma_deg, duration_s, self._issue, self._issue_limit)
 
@@ -374,4 +370,4 @@ class GyroRotationMeter:
 
     def _noise(self, rate: NDArray[np.float64]) -> float:
         """Return the angle random walk in °/√s: the datasheet's value, or the measured one if that is larger."""
-        return max(self._arw, float(rate.std()) / sqrt(self._imu.rate_hz))
+        return max(self.arw, float(rate.std()) / sqrt(self._imu.rate_hz))

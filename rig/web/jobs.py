@@ -5,6 +5,7 @@ import secrets
 import threading
 from collections.abc import Callable
 from pathlib import Path
+from shlex import join
 from typing import Final
 
 from pydantic import ValidationError
@@ -202,12 +203,12 @@ class JobQueue:
             words = ["rig", "enroll", request.name, *(["--resume"] if started else [])]
             if not started and request.replace:
                 words.append("--replace")
-            job.command = _shell([*words, *self._arguments])
+            job.command = join([*words, *self._arguments])
         elif isinstance(request, TrayRequest):
             job.resume = request  # complete objects are skipped, and interrupted ones resumed
         elif isinstance(request, IdentifyRequest):
             job.resume = request
-            job.command = _shell(["rig", "identify", *(["--watch"] if request.watch else []), *self._arguments])
+            job.command = join(["rig", "identify", *(["--watch"] if request.watch else []), *self._arguments])
 
     def _find(self, job_id: str) -> Job:
         if job_id not in self._jobs:
@@ -260,9 +261,3 @@ class JobQueue:
 def _json_error(error: RigError) -> dict[str, object]:
     values: dict[str, object] = json.loads(json.dumps(error.as_dict(), default=str))
     return values
-
-
-def _shell(words: list[str]) -> str:
-    from shlex import join
-
-    return join(words)

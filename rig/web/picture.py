@@ -26,7 +26,8 @@ class LivePicture:
         self._clock = clock
         self._lock = threading.Lock()
         self._image: NDArray[np.uint8] | None = None
-        self._number = 0
+        self.number = 0
+        """Number of the newest frame, from 1; 0 if there is none."""
         self._encoded: tuple[int, bytes] | None = None
         self._encoding = threading.Lock()
         self._shown_ns = clock.now_ns()
@@ -38,21 +39,16 @@ class LivePicture:
         """Replace the picture, from the bench's thread; the array must not be changed afterwards."""
         with self._lock:
             self._image = image_bgr
-            self._number += 1
+            self.number += 1
             self._shown_ns = self._clock.now_ns()
 
-    def want(self, seconds: float = 5.0) -> None:
-        """Ask for pictures from an idle camera for the next seconds."""
-        self.wanted_until_ns = self._clock.now_ns() + round(seconds * 1e9)
+    def want(self) -> None:
+        """Ask for pictures from an idle camera for the next five seconds."""
+        self.wanted_until_ns = self._clock.now_ns() + 5_000_000_000
 
     @property
     def wanted(self) -> bool:
         return self.viewers > 0 or self._clock.now_ns() < self.wanted_until_ns
-
-    @property
-    def number(self) -> int:
-        """Number of the newest frame, from 1; 0 if there is none."""
-        return self._number
 
     @property
     def age_s(self) -> float:
@@ -62,7 +58,7 @@ class LivePicture:
         """Return the number of the newest frame and the frame as JPEG; None if there is none yet."""
         with self._encoding:
             with self._lock:
-                number, image = self._number, self._image
+                number, image = self.number, self._image
             if image is None:
                 return None
             if self._encoded is None or self._encoded[0] != number:
@@ -76,7 +72,7 @@ class LivePicture:
         waited_s = 0.0
         try:
             while not self.closed:
-                if self._number != sent or waited_s > VIEWER_GONE_S:
+                if self.number != sent or waited_s > VIEWER_GONE_S:
                     found = await asyncio.to_thread(self.jpeg)
                     if found is not None:
                         sent, content = found

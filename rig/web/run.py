@@ -8,6 +8,7 @@ import threading
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -169,16 +170,10 @@ def make_server(
     def changed(job: Job) -> None:
         hub.publish("job", job.model_dump(mode="json"))
 
-    def lease_changed(values: dict[str, Any]) -> None:
-        hub.publish("lease", values)
-
     def opened() -> Bench:
         return open_bench(bench, config, seed=seed)
 
-    def catalog_changed(values: dict[str, Any]) -> None:
-        hub.publish("catalog", values)
-
-    catalog = BenchCatalog(config.catalog_place(bench), clock, catalog_changed, print_note)
+    catalog = BenchCatalog(config.catalog_place(bench), clock, partial(hub.publish, "catalog"), print_note)
     queue = JobQueue(folder, clock, changed, arguments)
     runs = config.catalog_path(bench) / RUNS
     works = Works(catalog, runs, lambda: doctor_findings(bench, config, seed, arguments), seed or 0)
@@ -192,7 +187,7 @@ def make_server(
         hub=hub,
         picture=picture,
         sessions=Sessions(tokens, clock),
-        lease=Lease(clock, lease_changed),
+        lease=Lease(clock, partial(hub.publish, "lease")),
         runs=runs,
         catalog=catalog,
         needs_login=listening.needs_login,
