@@ -1,7 +1,7 @@
 """Parts that the long jobs of a catalog share: progress, and portions of images for processes."""
 
 import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby, islice
 from typing import Final, TypeVar
@@ -21,6 +21,17 @@ class JobProgress:
 
     done: int
     total: int
+
+
+def finished(job: Generator[JobProgress, None, _T], progress: Callable[[JobProgress], None] = lambda _: None) -> _T:
+    """Run a job to its end and return its result."""
+    while True:
+        try:
+            at = next(job)
+        except StopIteration as end:
+            result: _T = end.value
+            return result
+        progress(at)
 
 
 def portions(items: Iterable[_T]) -> Iterator[tuple[_T, ...]]:

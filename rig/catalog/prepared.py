@@ -29,7 +29,7 @@ import hbr
 from hbr.descriptors import Descriptor
 from rig.catalog.catalog import Catalog
 from rig.catalog.describing import known_descriptor
-from rig.catalog.jobs import JobProgress
+from rig.catalog.jobs import JobProgress, finished
 from rig.catalog.places import PREPARED, file_mode, make_folder_within
 from rig.catalog.queries import model_set, retrieved
 from rig.catalog.schema import enrollments, objects
@@ -116,15 +116,12 @@ def prepared_views(
     catalog: Catalog, descriptor: str = PAPER_DESCRIPTOR, progress: Callable[[JobProgress], None] | None = None
 ) -> hbr.Views:
     """Return the views of `load_views`; ``progress`` is called while it reads the database."""
-    loading = load_views(catalog, descriptor)
-    while True:
-        try:
-            at = next(loading)
-        except StopIteration as end:
-            views: hbr.Views = end.value
-            return views
+
+    def show(at: JobProgress) -> None:
         if progress is not None and at.total:
             progress(at)
+
+    return finished(load_views(catalog, descriptor), show)
 
 
 def _wanted(catalog: Catalog) -> list[_Wanted]:

@@ -12,6 +12,7 @@ from starlette.background import BackgroundTask
 from rig.catalog import ObjectSummary
 from rig.catalog.edit import delete, deleted_objects, rename, set_texts, undelete
 from rig.catalog.exchange import Conflict, import_objects, plan_import, read_bundle, read_objects, write_bundle
+from rig.catalog.jobs import finished
 from rig.catalog.prepared import prepared_views
 from rig.events.events import plain
 from rig.plans.similar_objects import similar_objects
@@ -154,12 +155,7 @@ def add_catalog(api: APIRouter, server: Server) -> None:
 def _import(server: Server, path: Path, on_conflict: str) -> dict[str, Any]:
     with server.catalog.open_to_change() as catalog:
         plan = plan_import(catalog, read_bundle(path), Conflict(on_conflict))
-        steps = import_objects(catalog, plan, jobs=1)
-        while True:
-            try:
-                next(steps)
-            except StopIteration as end:
-                return dict(plain(end.value))
+        return dict(plain(finished(import_objects(catalog, plan, jobs=1))))
 
 
 def _summary(one: ObjectSummary) -> dict[str, Any]:

@@ -21,19 +21,17 @@ def run_job(title: str, job: "Generator[JobProgress, None, _T]", *, interrupted:
 
     Ctrl+C prints ``interrupted``, or what it returns.
     """
+    from rig.catalog.jobs import finished
     from rig.cli.ui.present import Progress
+
+    def show(at: "JobProgress") -> None:
+        if not at.done:
+            progress.start(at.total)
+        progress.at(at.done)
 
     try:
         with Progress(title) as progress:
-            while True:
-                try:
-                    at = next(job)
-                except StopIteration as end:
-                    result: _T = end.value
-                    return result
-                if not at.done:
-                    progress.start(at.total)
-                progress.at(at.done)
+            return finished(job, show)
     except KeyboardInterrupt:
         print(interrupted if isinstance(interrupted, str) else interrupted(), file=sys.stderr)
         raise

@@ -8,11 +8,11 @@ import os
 import signal
 import sqlite3
 import sys
-from collections.abc import Generator, Sequence
+from collections.abc import Sequence
 from contextlib import closing
 from itertools import count
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ from sqlalchemy import Engine, event
 
 import hbr
 from rig.catalog import Catalog, Provenance, ViewRecord
-from rig.catalog.jobs import JobProgress
+from rig.catalog.jobs import finished as finished
 from rig.catalog.records import Outcome
 from rig.catalog.results import Answer, NewResult
 from rig.catalog.results import record as record_result
@@ -30,7 +30,6 @@ from rig.views.description import within
 from tests.programs import Program
 from tests.servers.postgres import use_postgres
 
-_T = TypeVar("_T")
 
 PROVENANCE = Provenance("bench-1", {"servo": {"model": "XL430-W250", "id": 1}}, {"noise": "defaults"})
 
@@ -101,15 +100,6 @@ def new_result(
         "catalog_version": "c" * 64,
     }
     return NewResult(**values | changes)
-
-
-def finished(job: Generator[JobProgress, None, _T]) -> _T:
-    """Run a job of the catalog and return its result."""
-    while True:
-        try:
-            next(job)
-        except StopIteration as end:
-            return cast(_T, end.value)
 
 
 def main() -> None:

@@ -14,6 +14,7 @@ import pytest
 import hbr
 from rig.catalog import Catalog, prepared
 from rig.catalog.edit import delete, rename
+from rig.catalog.jobs import JobProgress, finished
 from rig.catalog.prepared import load_views
 from rig.core.errors import CatalogDamaged, DescriptorOutdated
 from rig.search.model import load_model
@@ -57,14 +58,8 @@ def path(enrolled: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pat
 
 def load(catalog: Catalog, kind: str = KIND) -> tuple[hbr.Views, int]:
     """Return the views, checked against those of the database, and how many objects were read from the database."""
-    loading = load_views(catalog, kind)
-    steps = []
-    while True:
-        try:
-            steps.append(next(loading))
-        except StopIteration as end:
-            views: hbr.Views = end.value
-            break
+    steps: list[JobProgress] = []
+    views = finished(load_views(catalog, kind), steps.append)
     expected = catalog.views(kind).views
     assert views.object_names == expected.object_names
     for name in ("descriptors", "azimuth_deg", "object_index"):
