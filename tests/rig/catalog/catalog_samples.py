@@ -30,7 +30,6 @@ from rig.views.description import within
 from tests.programs import Program
 from tests.servers.postgres import use_postgres
 
-
 PROVENANCE = Provenance("bench-1", {"servo": {"model": "XL430-W250", "id": 1}}, {"noise": "defaults"})
 
 
