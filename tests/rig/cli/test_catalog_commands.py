@@ -236,7 +236,7 @@ def test_old_catalog_is_migrated_by_one_command(rig: Rig) -> None:
     assert "is up to date" in rig("catalog", "migrate").stdout
 
 
-def test_import_rejects_bad_source(rig: Rig, tmp_path: Path) -> None:
+def test_import_rejects_bad_source(rig: Rig) -> None:
     with zipfile.ZipFile("evil.rigcat.zip", "w") as archive:
         archive.writestr("../../evil.png", b"x")
     Path("notes.txt").write_text("x")

@@ -58,7 +58,7 @@ def test_changed_bench_is_searched_with_the_faults_of_file_command_line_and_conf
         assert f"fault ends: {name}" in done.stderr
 
 
-def test_faults_of_the_configuration_apply_to_every_command(tmp_path):
+def test_faults_of_the_configuration_apply_to_every_command():
     done = rig("goto", "10", "--bench", "sim", "--set", 'bench.sim.faults=["unplug"]')
     assert done.exit_code == 4
     assert "Next step:" in done.stderr

@@ -130,7 +130,7 @@ BEYOND_LIMITS = {
 
 
 @pytest.mark.parametrize("value", BEYOND_LIMITS.values(), ids=BEYOND_LIMITS)
-def test_values_beyond_the_limits_are_config_errors(value, tmp_path):
+def test_values_beyond_the_limits_are_config_errors(value):
     with pytest.raises(ConfigError) as caught:
         load_config(None, [f"identify.max_views={value}"])
     assert caught.value.next_step

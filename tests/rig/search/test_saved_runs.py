@@ -330,7 +330,7 @@ def test_json_of_another_kind_is_damage(saved, tmp_path, name, content):
         assert "Error" not in error.evidence["reason"]  # noqa: PT017
 
 
-def test_run_opens_no_file_outside_its_folder(saved, tmp_path, monkeypatch):
+def test_run_opens_no_file_outside_its_folder(saved, tmp_path):
     folder = spoiled(saved, tmp_path)
     secret = tmp_path / "secret.png"
     shutil.copy(folder / "frames/000.png", secret)

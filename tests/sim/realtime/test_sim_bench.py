@@ -100,7 +100,7 @@ def connected(folder: Path) -> socket.socket:
 # -- the folder -------------------------------------------------------------------------------------------------------
 
 
-def test_benches_have_their_own_folders_and_clean_them(start, tmp_path, capsys):
+def test_benches_have_their_own_folders_and_clean_them(start):
     one, other = start("one"), start("a-folder-whose-name-is-longer-than-the-path-of-a-socket-may-be-" * 3)
     tell(one, "put", "lamp")
     assert [tell(folder, "status")["world"]["object"] for folder in (one, other)] == ["lamp", None]
@@ -115,7 +115,7 @@ def test_benches_have_their_own_folders_and_clean_them(start, tmp_path, capsys):
         tell(one, "status")
 
 
-def test_bench_recognizes_the_state_of_a_killed_program(start, tmp_path):
+def test_bench_recognizes_the_state_of_a_killed_program(start):
     folder = start("bench", "servo.id=7", "table.limits_deg=[-500, 500]")
     tell(folder, "quit")
     until(lambda: {path.name for path in folder.iterdir()} == LEFT)
@@ -149,7 +149,7 @@ def test_default_folder_is_the_first_that_is_not_in_use(start, tmp_path, monkeyp
     assert str(tmp_path / "sim-bench-2") in capsys.readouterr().out
 
 
-def test_configuration_of_another_bench_is_rejected(start, tmp_path):
+def test_configuration_of_another_bench_is_rejected(start):
     """It could name the port of a real servo."""
     folder = start()
     with pytest.raises(ConfigError, match="does not belong") as error:

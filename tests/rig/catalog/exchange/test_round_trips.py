@@ -73,7 +73,7 @@ class TestRoundTrips:
             stored = cv2.imdecode(np.frombuffer(archive.read(view["image"]), np.uint8), cv2.IMREAD_COLOR)
             assert np.array_equal(stored, image(20))
 
-    def test_catalogs_are_merged(self, full: Catalog, open_catalog: OpenCatalog, tmp_path: Path) -> None:
+    def test_catalogs_are_merged(self, full: Catalog, open_catalog: OpenCatalog) -> None:
         copy = open_catalog("copy")
         true_fill(copy, "tin", 2, 50)
         with pytest.raises(ObjectExists) as error:

@@ -109,7 +109,7 @@ def test_shell_completes_objects_benches_and_strategies(enrolled):
     assert complete("enroll", "--config", "nonsense.toml", "l") == set()
 
 
-def test_operator_is_asked_for_each_object(rig, with_operator, tmp_path):
+def test_operator_is_asked_for_each_object(rig, with_operator):
     Path("tray.csv").write_text("name,label\nlamp,\nradio,desk\nclock,\nbook-atlas,\n", encoding="utf-8")
     done = CliRunner().invoke(
         app, ["enroll", "--list", "tray.csv", "--views", "4", "--set", "view.min_sharpness=0"], input="\ns\nq\n"

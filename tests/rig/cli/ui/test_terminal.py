@@ -97,7 +97,7 @@ def test_terminal_gets_only_the_colors_of_rich(attack, monkeypatch):
     assert is_safe(re.sub(r"\x1b\[[01]m", "", out))
 
 
-def test_mistaken_arguments_are_neutral_and_with_json_an_object(tmp_path):
+def test_mistaken_arguments_are_neutral_and_with_json_an_object():
     done = CliRunner().invoke(app, ["\x1b[31mnix\u202e", "--json"])
     assert done.exit_code == 2
     assert is_safe(done.output)
