@@ -6,6 +6,7 @@ Jacobian at the solution, times the scatter of the residuals.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import partial
 
 import cv2
 import numpy as np
@@ -16,12 +17,12 @@ from calibration.board_views import (
     as_json,
     by_stand,
     coverage,
+    plot_views,
     points,
     reject_loose_board,
     span_deg,
     take_views,
 )
-from calibration.board_views import plot_views as plot_views_of
 from calibration.procedure import Evaluation, Measured, Procedure
 from rig.bench import Bench
 from rig.calibrations import CalibrationResult, RejectionCode
@@ -94,17 +95,12 @@ def plot_residuals(result: CalibrationResult) -> Chart | None:
     )
 
 
-def plot_views(result: CalibrationResult) -> Chart | None:
-    """Return a chart of the corners' deviation in each view; see `calibration.board_views.plot_views`."""
-    return plot_views_of(result, MAX_RMS_PX)
-
-
 @dataclass(frozen=True)
 class CameraModel(Procedure):
     """A procedure that takes views of the board in four positions, from nine sides each."""
 
     names, title, devices, valid_days = (NAME,), "lens of the camera", ("camera",), 365
-    plots = (plot, plot_residuals, plot_views)
+    plots = (plot, plot_residuals, partial(plot_views, limit_px=MAX_RMS_PX))
     board: Board = field(default_factory=Board)
 
     def measure(self, bench: Bench, *_: CalibrationResult) -> Measured:

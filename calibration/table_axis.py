@@ -14,6 +14,7 @@ stands.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from math import degrees, hypot, radians, sqrt
 from typing import Any
 
@@ -24,8 +25,7 @@ from scipy.optimize import least_squares
 
 from calibration import camera_model
 from calibration.board_views import STANDS as ALL_STANDS
-from calibration.board_views import BoardView, as_json, points, reject_loose_board, span_deg, take_views
-from calibration.board_views import plot_views as plot_views_of
+from calibration.board_views import BoardView, as_json, plot_views, points, reject_loose_board, span_deg, take_views
 from calibration.camera_model import PARAMETERS, matrix_of
 from calibration.procedure import Evaluation, Measured, Procedure, Progress
 from rig.bench import Bench
@@ -125,11 +125,6 @@ def plot(result: CalibrationResult) -> Chart | None:
     )
 
 
-def plot_views(result: CalibrationResult) -> Chart | None:
-    """Return a chart of the corners' deviation in each view; see `calibration.board_views.plot_views`."""
-    return plot_views_of(result, MAX_RMS_PX)
-
-
 @dataclass(frozen=True)
 class TableAxis(Procedure):
     """A procedure that takes views of the board in two positions, from thirteen sides each, and fits the axis.
@@ -138,7 +133,7 @@ class TableAxis(Procedure):
     """
 
     names, title, devices, valid_days = (NAME,), "axis of the table", ("camera", "servo"), 365
-    requires, plots = (camera_model.NAME,), (plot, plot_views)
+    requires, plots = (camera_model.NAME,), (plot, partial(plot_views, limit_px=MAX_RMS_PX))
     board: Board = field(default_factory=Board)
     space: ObjectSpace = field(default_factory=ObjectSpace)
 
