@@ -139,61 +139,34 @@ class ServerAddress(_Saved):
 
 
 class StateStore(Protocol):
-    """Stores the state of one bench."""
+    """Stores the state of one bench.
+
+    Methods that write raise `StateNotStored` if the disk is full, or may not be written to. `read_file` raises it if
+    the file exists but cannot be read.
+    """
 
     def load(self) -> BenchState: ...
 
     def save(self, state: BenchState) -> None:
-        """Store ``state``; on return it survives a power cut.
-
-        Raises
-        ------
-        StateNotStored
-            The disk is full, or may not be written to.
-        """
+        """Store ``state``; on return it survives a power cut."""
 
     def latch(self, fault: LatchedFault | None) -> None:
-        """Store the latched fault, even on a full disk if a state was saved before; None removes it.
-
-        Raises
-        ------
-        StateNotStored
-            The file may not be written to.
-        """
-        ...
+        """Store the latched fault, even on a full disk if a state was saved before; None removes it."""
 
     def stop_requested(self) -> bool:
         """Return whether the operator requested a stop; called in each round of the control loop."""
 
     def request_stop(self) -> None:
-        """Request a stop from the program that uses the bench; may be called from any thread.
-
-        Raises
-        ------
-        StateNotStored
-            The disk is full, or may not be written to.
-        """
+        """Request a stop from the program that uses the bench; may be called from any thread."""
 
     def clear_stop(self) -> None:
         """Remove the request: it was carried out, or it is old."""
 
     def read_file(self, name: str) -> bytes | None:
-        """Return the file ``name`` that was stored beside the state; None if there is none.
-
-        Raises
-        ------
-        StateNotStored
-            The file exists but cannot be read.
-        """
+        """Return the file ``name`` that was stored beside the state; None if there is none."""
 
     def store_file(self, name: str, content: bytes) -> None:
-        """Store a file beside the state; on return it survives a power cut.
-
-        Raises
-        ------
-        StateNotStored
-            The disk is full, or may not be written to.
-        """
+        """Store a file beside the state; on return it survives a power cut."""
 
     def remove_file(self, name: str) -> None:
         """Delete the file ``name`` if it exists."""
