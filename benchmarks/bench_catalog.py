@@ -93,7 +93,7 @@ def run(home: Path, words: list[str], *, first_ranking: bool) -> tuple[float, fl
             if first_ranking and stop_ns is None and json.loads(line).get("event") == "ranked":
                 stop_ns = _CLOCK.now_ns()
         messages = process.stderr.read()
-    # A search for an object of the simulator, which is not enrolled, ends with one of these codes.
+    # A search for an object of the simulator that is not enrolled ends with one of these codes.
     expected = (EXIT_UNKNOWN, EXIT_AMBIGUOUS) if first_ranking else (0,)
     if process.returncode not in expected or first_ranking != (stop_ns is not None):
         raise RuntimeError(f"rig {shlex.join(words)} failed with exit code {process.returncode}: {messages}")
@@ -107,7 +107,7 @@ def cpu_s() -> float:
 
 
 def imports(folder: Path, photographs: Path) -> None:
-    """Import everything between two halves of the bare loop, so that other programs disturb both equally."""
+    """Measure the import of all photographs between two halves of the bare loop, so that load affects both equally."""
     files = sorted(photographs.glob("*.png"))
     half = len(files) // 2
     bare_s, bare_cpu_s = bare_loop(files[:half])

@@ -44,7 +44,7 @@ def milliseconds(function: Callable[[], object], repeats: int = REPEATS) -> floa
 
 
 def bench(objects: int) -> None:
-    """Measure the steps among so many objects."""
+    """Measure the steps of a search among this number of objects."""
     packed = packed_views(objects)
     views = PackedViews(
         packed,

@@ -43,7 +43,7 @@ def main() -> None:
 
 
 def compare_engines(folder: Path, objects: int) -> None:
-    """Time what a program does before its first ranking."""
+    """Measure the time of the steps before the first ranking of a program."""
     build(folder / "sqlite", objects)
     with closing(PostgresServer()) as server:
         place = place_in(server.url, folder / "postgres")
@@ -53,7 +53,7 @@ def compare_engines(folder: Path, objects: int) -> None:
         ):
             for _ in copy_catalog(source, target):
                 pass
-        for first in (True, False):  # the second time the prepared file of the index is there
+        for first in (True, False):  # in the second round the prepared file of the index exists
             embedded, shared = steps(folder / "sqlite"), steps(place)
             for name, took_ms in shared.items():
                 label = f"{objects:,} objects on PostgreSQL: {name}{', nothing prepared' if first else ''}"

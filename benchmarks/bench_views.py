@@ -60,7 +60,7 @@ def fastest(work: Callable[[], object], repeats: int) -> float:
 
 
 def guess_by_opencv(work: Callable[[], object]) -> object:
-    """Let OpenCV's GrabCut cut out what is guessed."""
+    """Segment a frame by a guess with OpenCV's GrabCut."""
     with patch.object(guess, "grab_cut", return_value=None):
         return work()
 

@@ -59,7 +59,7 @@ Figures = dict[str, list[float]]
 
 
 def calibrated_on(bench: Bench, store: CalibrationStore, figures: Figures, name: str) -> None:
-    """Calibrate the bench; the results that pass are in force."""
+    """Calibrate the bench, and put the results that pass in force."""
     found: dict[str, CalibrationResult] = {}
     procedures = (
         Backlash(),

@@ -1,7 +1,7 @@
 """Comparison of calibration results and their uncertainties with the true values of simulated benches.
 
 `python -m benchmarks.calibration_truth [--seeds 20] [--first-seed 0] [--only servo.backlash]` prints a table in
-Markdown: for each quantity the median error and uncertainty, the spread of error over uncertainty (1 is honest), and
+Markdown: for each quantity the median error and uncertainty, the spread of error over uncertainty (1 is ideal), and
 the share of 95 % intervals that contain the true value. Each seed's error over uncertainty goes to stderr.
 """
 
@@ -97,7 +97,7 @@ def encoder(seed: int) -> tuple[CalibrationResult, Truth]:
     with opened(seed, NoiseModel(encoder_harmonic_deg=0.2)) as (bench, parts):
         result = last(Encoder().live(bench))
         (a1, b1), (a2, b2) = parts.servo._controller.harmonics_deg
-        # The angle 0 of the servo is 180° from that of the shaft: odd harmonics change their sign.
+        # The angle 0 of the servo is 180° from that of the shaft, so odd harmonics change their sign.
         return result, {"cos1": (-a1, "°"), "sin1": (-b1, "°"), "cos2": (a2, "°"), "sin2": (b2, "°")}
 
 

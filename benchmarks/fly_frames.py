@@ -7,7 +7,7 @@ that of another bench. The catalog has random descriptions, which a search compa
 frames is not counted. The median and the 95 % quantile of the CPU time of one thread are given for each step.
 
 Then the same frames are fed in real time at 30 frames/s for ten seconds (``--seconds``), and those are counted that
-the search drops because it is too slow. That says something on an idle computer only; the load is printed.
+the search drops because it is too slow. The result is valid only on an idle computer; the load is printed.
 """
 
 import argparse
@@ -75,7 +75,7 @@ def random_index(rng: np.random.Generator, objects: int, views: int) -> hbr.Dens
 
 
 def measured(index: hbr.DenseIndex, background: str) -> tuple[dict[str, list[float]], list[Image], Callable[[], Work]]:
-    """Return the CPU time of each step for each frame of a turn in seconds, the images, and what begins a search."""
+    """Return the CPU time of each step for each frame in seconds, the images, and a function that begins a search."""
     operator = ShelfOperator(World(seed=2), shelf(), next_object="mug-star")
     config = load_config(None, ("camera_time.offset_ms=1", "camera_time.jitter_ms=0.2"))
     spent: dict[str, list[float]] = defaultdict(list)
@@ -119,13 +119,13 @@ def measured(index: hbr.DenseIndex, background: str) -> tuple[dict[str, list[flo
 
 
 def begun(index: hbr.DenseIndex, config: RigConfig) -> tuple[SearchDescriber, ArcSession]:
-    """Return the beginning of a search that never ends."""
+    """Return a search that never ends."""
     never = StoppingRule(30.0, 2.0, np.zeros((len(index), 4)), (-9.0,) * 4, 0.01, 0.02, 0.0, 0)
     return SearchDescriber(config.view, BENCH_DESCRIPTOR, revise=False), ArcSession(index, ArcRule(never, 2.0))
 
 
 class PlayedCamera:
-    """A camera that delivers JPEG images in real time and decodes them, again from the first one after the last."""
+    """A camera that delivers JPEG images in real time and decodes them, in a loop."""
 
     def __init__(self, images: list[Image], clock: SystemClock) -> None:
         self.identity = SimpleNamespace(fps=float(FPS))
@@ -144,7 +144,7 @@ class PlayedCamera:
 
 
 def fed(images: list[Image], begin: Callable[[], Work], seconds: float) -> tuple[int, int]:
-    """Search again and again in real time; return how many frames were used, and how many were dropped."""
+    """Search repeatedly in real time; return the numbers of used and of dropped frames."""
     clock = SystemClock()
     stream = FrameStream(PlayedCamera(images, clock), clock)  # type: ignore[arg-type]
     used, until_ns = 0, clock.now_ns() + round(seconds * 1e9)
@@ -159,7 +159,7 @@ def fed(images: list[Image], begin: Callable[[], Work], seconds: float) -> tuple
 
 
 def timed(spent: list[float], work: Callable[[], Any]) -> Any:
-    """Do some work, and add the CPU time that it took."""
+    """Call a function, and add the CPU time that it took."""
     begun = time.thread_time()
     result = work()
     spent.append(time.thread_time() - begun)

@@ -3,9 +3,9 @@
 `python -m benchmarks.fly_recorded RECORDING [--trials 240] [--seed 0] [--strength 0] [--objects 40] [--json FILE]`
 
 `benchmarks.fly_search` runs both searches on the simulated bench, which draws some 50 frames for each. Here each
-built-in object is recorded once: 24 views at rest, which are enrolled, and, placed again, a turn in motion and 24 views
-at rest, which are searched for. RECORDING keeps the descriptions. The searches are those of the bench
-(`rig.search.session`); their times come from the motion profile, not from a bench.
+built-in object is recorded once: 24 views at rest, which are enrolled, and, after the object was placed again, a
+revolution in motion and 24 views at rest, which are searched for. RECORDING stores the descriptions. The searches are
+those of the bench (`rig.search.session`); their times come from the motion profile, not from a bench.
 
 Each of four catalogs leaves out four objects that are unknown then; one search in five is for one of these. With
 ``--strength`` the descriptions change as those of another bench would (`hbr.descriptors.shift`).
@@ -100,7 +100,7 @@ def revolution(bench: Bench, table: Turntable, describe: ViewDescriber) -> Seen:
 
 
 def nearest(seen: Seen, angle_deg: float) -> tuple[float, Any]:
-    """Return what was seen at the nearest angle."""
+    """Return the description of the nearest angle."""
     return seen[int(size_deg(np.array([at for at, _ in seen]) - angle_deg).argmin())]
 
 
@@ -137,14 +137,14 @@ def search(model: Model, config: RigConfig, seen: dict[str, Seen], start_deg: fl
                 goal_deg = min(max(table_deg + sign * step.rotation_deg, limits_deg[0]), limits_deg[1])
         if isinstance(step, Finish):
             break
-        table_deg, seconds = goal_deg, seconds + 0.3  # the table has arrived, and rests
+        table_deg, seconds = goal_deg, seconds + 0.3  # the table has arrived and is at rest
     answer = session.answer(ranked, step, travelled_deg=travelled_deg, seconds=seconds)
     found = answer.name if answer.outcome is hbr.Outcome.FOUND else answer.outcome.value
     return {"found": found, "seconds": seconds, "views": answer.views, "travelled_deg": travelled_deg}
 
 
 def changed(seen: dict[str, Seen], rng: np.random.Generator, strength: float) -> dict[str, Seen]:
-    """Return what another bench would see."""
+    """Return the description as of another bench."""
     shift, kind = Shift.drawn(rng, strength), hbr.descriptor(BENCH_DESCRIPTOR)
     return {name: [(at, kind.shifted(levels, shift)) for at, levels in part] for name, part in seen.items()}
 

@@ -104,7 +104,7 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def mean(values: Any) -> float | None:
-    """Return the mean; None of nothing."""
+    """Return the mean; None if there are no values."""
     found = list(values)
     return float(np.mean(found)) if found else None
 

@@ -107,7 +107,7 @@ def _frames() -> list[list[NDArray[np.uint8]]]:
 
 
 def _link_images(connection: sqlite3.Connection, folder: Path, frames: Sequence[Sequence[NDArray[np.uint8]]]) -> None:
-    """Give each view an image of its own name, and what describes it."""
+    """Give each view an image with its own name, and the descriptors of that image."""
     describe = ViewDescriber(ViewConfig(roi=_SMALL_REGION))
     kept = folder / "frames"
     kept.mkdir()

@@ -1,4 +1,4 @@
-"""How often an empty-table image is trusted: the search's own, one in another light, and one of another bench.
+"""Shares of accepted empty-table images: the search's own, one in another light, and one of another bench.
 
     python -m benchmarks.picture_trust
 

@@ -1,4 +1,4 @@
-"""Draw how the cost of a search grows with the catalog, from ``bench.json``, as docs/results/search-cost.svg.
+"""Draw the cost of a search over the size of the catalog, from ``bench.json``, as docs/results/search-cost.svg.
 
 python -m benchmarks.bench_scale --objects 100 300 1000 3000 10000 && python -m benchmarks.plot_scale
 """

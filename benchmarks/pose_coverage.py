@@ -1,4 +1,4 @@
-"""Coverage of the pose's uncertainty: how often the true rotation is within one and two standard uncertainties.
+"""Coverage of the pose's uncertainty: shares of true rotations within one and two standard uncertainties.
 
 `python -m benchmarks.pose_coverage FOLDER` searches for objects 51-100 of COIL-100 under Gaussian noise, and for
 built-in objects on the simulated bench. An answer with several equivalent poses counts as right if one of them is. The
@@ -84,7 +84,7 @@ def built_in(views: int) -> Iterator[Found]:
 
 
 def row(name: str, found: list[Found]) -> None:
-    """Print the coverage of determined poses, and how many are not unique."""
+    """Print the coverage of determined poses, and the number of poses that are not unique."""
     kinds = Counter(
         "unique" if one.period_deg == 360 else "free" if one.period_deg == 0 else "n-fold" if one.period_deg else "none"
         for one, _ in found

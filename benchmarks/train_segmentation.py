@@ -77,7 +77,7 @@ def sides(rng: np.random.Generator, drawn: list[list[CutOut]]) -> list[CutOut]:
 
 
 def scenes(rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return frames, what they show, and their differences from the empty table and from other views."""
+    """Return frames, their true masks, and their differences from the empty table and from other views."""
     drawn = simulated(12)
     frames = np.empty((count, HEIGHT, WIDTH, 3), np.uint8)
     shown = np.empty((count, 2, HEIGHT, WIDTH), np.uint8)
@@ -103,7 +103,7 @@ def scenes(rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray
 def batch(
     rng: np.random.Generator, data: tuple[np.ndarray, ...], rows: np.ndarray
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return inputs and what they show, with other colours, sizes and places."""
+    """Return inputs and their true masks, with random colours, sizes and places."""
     frames, shown, apart = data
     colours = frames[rows].astype(np.float32)
     for image in colours:

@@ -23,9 +23,9 @@ class CutOut(NamedTuple):
 
 
 class Scene(NamedTuple):
-    """A frame, three frames of the turned table and the empty table, uint8 (144, 192, 3), and what the frame shows.
+    """A frame, three frames of the rotated table and one of the empty table, uint8 (144, 192, 3), and the true masks.
 
-    That is the share of object and platter in each pixel, uint8 (144, 192).
+    The masks are the shares of object and platter in each pixel, uint8 (144, 192).
     """
 
     image: NDArray[np.uint8]
@@ -36,7 +36,7 @@ class Scene(NamedTuple):
 
 
 def simulated(azimuths: int) -> list[list[CutOut]]:
-    """Return cut-outs of each of the simulator's objects, from so many sides."""
+    """Return cut-outs of each of the simulator's objects, from a number of sides."""
     found = []
     for solid in shelf().values():
         own = []
@@ -176,7 +176,7 @@ def _ground(rng: np.random.Generator) -> Floats:
 
 
 def scene(rng: np.random.Generator, sides: list[CutOut], clutter: list[CutOut]) -> Scene:
-    """Draw an object near the middle from four sides; ``clutter`` stands beside and behind the platter."""
+    """Draw an object near the middle from four sides; ``clutter`` is beside and behind the platter."""
     picture = _ground(rng)
     if rng.random() < 0.9:
         horizon = int(rng.uniform(0.4, 0.8) * HEIGHT)
@@ -197,7 +197,7 @@ def scene(rng: np.random.Generator, sides: list[CutOut], clutter: list[CutOut]) 
         else:
             x, y = rng.uniform(0.2, 0.8) * WIDTH, rng.uniform(0.1, 0.6) * HEIGHT
         place(picture, other, rng.uniform(0.15, 0.55), x, y)
-    # the platter, turned in the picture of the empty table
+    # the platter, rotated in the picture of the empty table
     x, y = WIDTH * rng.uniform(0.45, 0.55), HEIGHT * rng.uniform(0.68, 0.9)
     across = WIDTH * rng.uniform(0.18, 0.42)
     flat = rng.uniform(0.15, 0.5)
@@ -238,7 +238,7 @@ def scene(rng: np.random.Generator, sides: list[CutOut], clutter: list[CutOut]) 
 def _platter(
     pictures: list[Floats], at: tuple[float, float], across: float, flat: float, rng: np.random.Generator
 ) -> Floats:
-    """Draw the platter, whose marks turn between the pictures; return the share of each pixel that it covers."""
+    """Draw the platter, whose marks rotate between the pictures; return the share of each pixel that it covers."""
     x, y = at
     colour = rng.uniform(15, 225) + rng.normal(0, 14, 3)
     thick, rim = int(rng.integers(0, 7)), rng.uniform(0.4, 0.9)

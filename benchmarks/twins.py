@@ -1,4 +1,4 @@
-"""Searches for objects of which the catalog holds a near twin, on the simulated bench.
+"""Searches on the simulated bench for objects with a near twin in the catalog.
 
 `python -m benchmarks.twins [--searches 200] [--views 36] [--modes dense,arc] [--alone] [--seed 0] [--json FILE]
 [--catalog FOLDER]`

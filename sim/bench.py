@@ -88,9 +88,9 @@ class ShelfOperator:
     devices, faults
         The simulated devices and faults of the bench, once it is open.
     state
-        What the benches of this world store about the table.
+        Store for the state of the table on the benches of this world.
     optics
-        Through which the camera sees the boards, drawn from the world's seed.
+        The camera's optics for the boards, drawn from the world's seed.
     """
 
     def __init__(
@@ -154,7 +154,7 @@ class ShelfOperator:
         change.visit(self.devices, self._days)
 
     def clear(self) -> bool:
-        """Clear the table and return whether that is possible: a photograph shows its own table."""
+        """Clear the table and return whether that is possible: a photograph always shows its own table."""
         if any(isinstance(thing, PhotographedObject) for thing in self.objects.values()):
             return False
         self.world.put(None)
@@ -239,7 +239,7 @@ def open_sim_bench(
 
 
 class SimBenchKind:
-    """Opens a simulated bench in a new world whose clock starts at the computer's time."""
+    """The kind of bench ``sim``: a simulated bench in a new world whose clock starts at the computer's time."""
 
     options: type[BaseModel] = SimOptions
 

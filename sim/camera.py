@@ -29,25 +29,25 @@ from sim.visit import seen_on_visit
 from sim.world import HISTORY_S, Activity, Scene, World
 
 CAMERA_DEVICE = "simulated camera"
-"""What identifies the camera of a simulated bench; a bench has one."""
+"""Identity of the camera of a simulated bench; a bench has one camera."""
 READOUT_NS = 15_000_000  # time from the end of the exposure until the computer has the frame
 SELECT_S = 10.0  # how long OpenCV's V4L2 backend waits for a frame (OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT)
 
-_FOCUS_STEP = 15  # by which the autofocus moves the lens between two measurements
+_FOCUS_STEP = 15  # distance by which the autofocus moves the lens between two measurements
 MODES = tuple(
     v4l2.VideoMode(fourcc, WIDTH // n, HEIGHT // n, float(FPS)) for fourcc in ("MJPG", "YUYV") for n in (1, 2)
 )
 """The modes that it offers; MJPG has no errors of compression."""
 _NO_CONTROLS = (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT, cv2.CAP_PROP_FPS, cv2.CAP_PROP_POS_MSEC)
-"""What OpenCV answers without asking the camera."""
+"""Properties that OpenCV answers without asking the camera."""
 _REMEMBERED = (
     *(cv2.CAP_PROP_GAIN, cv2.CAP_PROP_SHARPNESS, cv2.CAP_PROP_BACKLIGHT),
     *(v4l2.POWER_LINE_FREQUENCY, v4l2.EXPOSURE_DYNAMIC_FRAMERATE),
 )
-"""Controls of which the camera does not say that they change by themselves: the driver asks it once."""
+"""Controls that change by themselves although the camera does not report it; the driver reads them once."""
 
 
-_METER_FRAMES = 5  # the automatic settings change every so many frames
+_METER_FRAMES = 5  # number of frames between two changes of the automatic settings
 _METER_TARGET = 70.0
 _EDGE_PX_PER_DEG = radians(1.0) * 80 * PX_PER_MM  # motion in the image of a point 80 mm from the axis
 _STILL_PX = 0.25
@@ -71,7 +71,7 @@ class SimCapture:
         Whether the driver remembers controls that it has set or asked for once, as ``uvcvideo`` does. A gain that the
         camera changes by itself is not read back then.
     every
-        The camera exposes every so many frames: more than 1 for a slow camera.
+        The camera exposes one of this many frames: more than 1 for a slow camera.
     latency_ns
         Additional delay of each frame.
     grab_failures
@@ -85,7 +85,7 @@ class SimCapture:
     times
         The errors of its time.
     stamp_shift_ns
-        By how much the time stamps have jumped, of a fault.
+        Jump of the time stamps by a fault.
     lamp
         Frequency in Hz and depth of the light's flicker, which leaves bands because rows are read out one after the
         other; None for a steady light.
@@ -143,7 +143,7 @@ class SimCapture:
             self._change(self._clock.now_ns(), Controls(autofocus=True, focus=0))
 
     def node(self) -> tuple[int, ...] | None:
-        """Return what identifies its device file until it is unplugged; None while it is unplugged."""
+        """Return the identity of its device file until it is unplugged; None while it is unplugged."""
         return (self._plugs,) if self._plugged else None
 
     def reopen(self) -> bool:
@@ -202,7 +202,7 @@ class SimCapture:
         return True
 
     def wait_ns(self) -> int:
-        """Return how long `grab` would wait for a frame that is on its way."""
+        """Return the time that `grab` would wait for a frame that is on its way."""
         self._receive()
         if not self._delivers or self._queue:
             return 0
@@ -211,7 +211,7 @@ class SimCapture:
         return max(self._arrival_ns(self._next) - self._clock.now_ns(), 0)
 
     def wait(self, seconds: float) -> bool:
-        """Wait for a frame at most so long; return whether `grab` then returns at once."""
+        """Wait for a frame for at most this time; return whether `grab` then returns at once."""
         self._clock.advance_to(self._clock.now_ns() + min(self.wait_ns(), round(seconds * 1e9)))
         return not self.wait_ns()
 
@@ -226,7 +226,7 @@ class SimCapture:
         return True, image
 
     def retrieval(self) -> Callable[[], tuple[bool, Image | None]]:
-        """Return a function that does what `retrieve` does now, at any time and in any thread."""
+        """Return a function that returns, at any time and in any thread, the frame that `retrieve` would return now."""
         if self._grabbed is not None and self._delivers:
             self._world.notify(Activity.FRAME_FETCHED)
         still = copy(self)
@@ -337,7 +337,7 @@ class SimCapture:
         )
 
     def _exposed(self, scene: Scene, start: int, exposure: int) -> NDArray[np.uint8] | NDArray[np.float32]:
-        """Return what the rows collect: each is exposed for as long, the last one begins `FrameTimes.readout_ns` later.
+        """Return the light that the rows collect: all are exposed equally long, the last `FrameTimes.readout_ns` later.
 
         At rest this is one image, otherwise a mean of images in steps of a pixel of motion in the present mode.
         """

@@ -18,7 +18,7 @@ from sim.sensor import Gains
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """How strongly the bench changes.
+    """The strength of each change of the bench.
 
     The world's seed gives each change, uniformly distributed between −strength and +strength. The light changes for
     each object, like daylight. The camera's settings and the surroundings change once.

@@ -107,7 +107,7 @@ class VirtualClock:
 
 
 class PacedClock(VirtualClock):
-    """A `VirtualClock` that also takes time: ``speed`` seconds pass in a second of the computer's clock.
+    """A `VirtualClock` that also takes real time: ``speed`` seconds pass in a second of the computer's clock.
 
     Time that the program spends computing is not added, so a slow computer does not trip the watchdogs.
     """

@@ -113,7 +113,7 @@ class ComputerFiles:
     ) -> None:
         """Add a node of a camera, on a USB port such as 1-2; nodes with an index above 0 deliver no images.
 
-        The node's text is what VIDIOC_QUERYCAP returns.
+        The node's text is the answer of VIDIOC_QUERYCAP.
         """
         self.write(f"sys/class/video4linux/video{number}/name", f"{name}\n")
         self.write(f"sys/class/video4linux/video{number}/index", f"{index}\n")
@@ -183,7 +183,7 @@ def simulated_computer(config: RigConfig, devices: SimDevices) -> Iterator[SimCo
 
 @contextmanager
 def _temporary_folder() -> Iterator[Path]:
-    """Yield an empty folder. Another process removes it at the end, also if this program is killed."""
+    """Yield an empty folder. Another process removes it at the end, even if this program is killed."""
     script = """trap '' PIPE; folder=$(mktemp -d "$1/sim-host-XXXXXX") && printf '%s\\n' "$folder"
         read -r _; [ -z "$folder" ] || rm -rf -- "$folder" """
     with subprocess.Popen(

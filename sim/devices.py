@@ -25,7 +25,7 @@ from sim.world import World
 class SimDevices(AbstractContextManager["SimDevices"]):
     """The devices in one world and the connections to them, which the end of a ``with`` block closes.
 
-    They outlive a bench: a second bench on the same devices finds them as the first one left them.
+    They outlive a bench: a second bench on the same devices finds them in the state after the first one.
     """
 
     world: World
@@ -76,7 +76,7 @@ class SimDevices(AbstractContextManager["SimDevices"]):
         return self.camera
 
     def reopen_adapter(self) -> SimSerial:
-        """Open the servo's port, also after its adapter was unplugged.
+        """Open the servo's port, even after its adapter was unplugged.
 
         Raises `DeviceNotFound` if the adapter is unplugged.
         """
@@ -92,7 +92,7 @@ class SimDevices(AbstractContextManager["SimDevices"]):
         return self.adapter
 
     def open_connections(self) -> None:
-        """Open what closing a bench has closed: the port, and the camera's stream if the camera is plugged in.
+        """Open the port again that a bench has closed, and the camera's stream if the camera is plugged in.
 
         Raises `DeviceNotFound` if the adapter is unplugged.
         """

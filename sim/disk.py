@@ -1,6 +1,6 @@
 """A simulated full disk for this process: `os.fsync` fails.
 
-A file system with delayed allocation or a quota reports a full disk there, too.
+File systems with delayed allocation or a quota also report a full disk at `os.fsync`.
 """
 
 import errno

@@ -1,4 +1,4 @@
-"""When the frames of a simulated camera are exposed and arrive, and which of them are lost.
+"""Times of exposure and arrival of the frames of a simulated camera, and lost frames.
 
 Each number is drawn from the frame's number and the world's seed alone, so that it does not depend on what a program
 has read before.
@@ -20,11 +20,11 @@ class FrameTimes:
     Attributes
     ----------
     offset_ns
-        By how much a frame is stamped after the exposure of its first row began, on average.
+        Mean time from the beginning of the exposure of the first row to the frame's time stamp.
     readout_ns
         Time from the exposure of the first row to that of the last one.
     stamped_late_ns
-        Standard deviation of the time by which the computer stamps frames late, of a fault.
+        Standard deviation of the delay with which the computer stamps frames during a fault.
     lost_share
         Share of the frames that do not arrive; a fault raises it.
     """
@@ -40,13 +40,13 @@ class FrameTimes:
         self.lost_share = noise.lost_frames
 
     def exposed_ns(self, stamp_ns: int, frame: int) -> int:
-        """Return when the exposure of the first row of a frame truly begins."""
+        """Return the true beginning of the exposure of a frame's first row."""
         if not self._jitter_ns:
             return stamp_ns - self.offset_ns
         return stamp_ns - self.offset_ns + round(self._jitter_ns * _NORMAL.inv_cdf(self._uniform(b"jitter", frame)))
 
     def stamp_error_ns(self, frame: int) -> int:
-        """Return by how much the computer stamps a frame late because it is busy."""
+        """Return the delay with which the busy computer stamps a frame."""
         if not self.stamped_late_ns:
             return 0
         return round(self.stamped_late_ns * abs(_NORMAL.inv_cdf(self._uniform(b"busy", frame))))
@@ -65,7 +65,7 @@ class FrameTimes:
 
 
 def start_ns(frame: int) -> int:
-    """Return when the exposure of a frame begins; V4L2 stamps whole microseconds."""
+    """Return the nominal beginning of a frame's exposure; V4L2 stamps whole microseconds."""
     return frame * 1_000_000 // FPS * 1000
 
 

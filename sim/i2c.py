@@ -32,7 +32,7 @@ FUNCTIONS = (
     | smbus.I2cFunc.I2C
     | smbus.I2cFunc.SMBUS_BLOCK_PROC_CALL
 ) & ~smbus.I2cFunc.SMBUS_PEC
-"""What the adapter can do, for the ioctl I2C_FUNCS."""
+"""Capabilities of the adapter, for the ioctl I2C_FUNCS."""
 
 _MAX_MESSAGES = 42
 _MAX_MESSAGE_LENGTH = 8192
@@ -105,7 +105,7 @@ class SimI2cBus(AbstractContextManager["SimI2cBus"]):
         self.close()
 
     def close(self) -> None:
-        """Take the bus away; a second call does nothing."""
+        """Remove the bus; a second call does nothing."""
         self._file.close()
 
     # -- world side -----------------------------------------------------------------------------------------------
@@ -126,13 +126,13 @@ class SimI2cBus(AbstractContextManager["SimI2cBus"]):
         self._nacks = count
 
     def cut_read(self, after_bytes: int) -> None:
-        """Break the next read of more than ``after_bytes`` bytes off after so many."""
+        """Interrupt the next read of more than ``after_bytes`` bytes after that number of bytes."""
         self._cut = after_bytes
 
     # -- bus side: for an adapter that transfers single messages --------------------------------------------------
 
     def message(self, address: int, content: bytes | int, *, last: bool) -> bytes:
-        """Transfer one message: write the bytes ``content``, or read so many bytes; a stop follows the ``last``.
+        """Transfer one message: write the bytes ``content``, or read a number of bytes; a stop follows the ``last``.
 
         Raises OSError with the kernel's number for what happened on the wire: ETIMEDOUT at once if the bus hangs.
         """
@@ -317,7 +317,7 @@ class RoutedFile:
 
     def __init__(self, adapter: Adapter) -> None:
         global _kernel_ioctl
-        self._fd: int | None = os.memfd_create("sim-i2c")  # without a name: a program that is killed leaves nothing
+        self._fd: int | None = os.memfd_create("sim-i2c")  # without a name, so that a killed program leaves no file
         self.path = f"/dev/fd/{self._fd}"
         self._key = _file_key(self._fd)
         if not _routed:

@@ -1,7 +1,7 @@
 """Trajectories of the servo's shaft and the resulting motion of the platter, in closed form.
 
-All functions take arrays of times, also past ones. So the gyro's FIFO and a frame's exposure get the angle at their own
-time, and nothing is integrated in steps.
+All functions take arrays of times, including past ones. So the gyro's FIFO and a frame's exposure get the angle at
+their own time, without an integration in steps.
 """
 
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ class Trajectory:
     Attributes
     ----------
     start_s : float64 (k,)
-        Times at which the pieces begin, rising; the last piece holds for ever.
+        Times at which the pieces begin, rising; the last piece has no end.
     position_deg, velocity_dps, acceleration_dps2 : float64 (k,)
         State at the beginning of each piece, and its acceleration.
     """
@@ -95,7 +95,7 @@ def to_position(
         braking = [((u0 - v_max) / a_max, -direction * a_max)]
     x1 = position_deg + sum(v0 * d + 0.5 * a * d * d for d, a in braking)
     u1 = min(u0, v_max)
-    distance = (goal_deg - x1) * direction  # negative where the shaft runs away from the goal and has to come back
+    distance = (goal_deg - x1) * direction  # negative if the shaft runs away from the goal and has to come back
     u_peak = min(v_max, sqrt(max(distance * a_max + 0.5 * u1 * u1, 0.0)))
     ramps = (2 * u_peak**2 - u1 * u1) / (2 * a_max)
     cruise = max(distance - ramps, 0.0) / u_peak if u_peak > 0 else 0.0
@@ -106,7 +106,7 @@ def to_position(
 
 
 def to_velocity(start_s: float, position_deg: float, velocity_dps: float, goal_dps: float, a_max: float) -> Trajectory:
-    """Return a ramp from ``velocity_dps`` to ``goal_dps``, held for ever."""
+    """Return a ramp from ``velocity_dps`` to ``goal_dps``, followed by that speed without end."""
     change = goal_dps - velocity_dps
     path = _from_pieces(
         start_s, position_deg, velocity_dps, [(abs(change) / a_max, copysign(a_max, change))] if change else []
@@ -159,7 +159,8 @@ def dragged(path: Trajectory, start_deg: float, half_deg: float, offset_deg: flo
 class Ripple:
     """A ripple of the shaft's speed by the share ``share``, which repeats every `_PERIOD_DEG` of the shaft.
 
-    The shaft leaves its commanded angle by a fixed wave of the angle. Towards standstill the wave fades away.
+    The deviation from the commanded angle is a fixed wave over the shaft's angle. Its amplitude falls to 0 with the
+    speed.
     """
 
     _PERIOD_DEG = 15.0
@@ -170,12 +171,12 @@ class Ripple:
         self._per_deg = 2 * np.pi / self._PERIOD_DEG
 
     def angle_deg(self, angle_deg: float, speed_dps: float) -> float:
-        """Return what the ripple adds to the angle of a shaft: as `angles_deg`, for one time."""
+        """Return the deviation of a shaft's angle by the ripple: like `angles_deg`, for one time."""
         fade = min(abs(speed_dps) / self._FADES_DPS, 1.0)
         return self._amplitude_deg * fade * float(np.sin(angle_deg * self._per_deg))
 
     def angles_deg(self, angle_deg: Floats, speed_dps: Floats) -> Floats | float:
-        """Return what the ripple adds to the angle of a shaft with these angles and speeds."""
+        """Return the deviations of a shaft's angle by the ripple, at these angles and speeds."""
         if not self._amplitude_deg:
             return 0.0
         fade = np.minimum(np.abs(speed_dps) / self._FADES_DPS, 1.0)
@@ -199,7 +200,7 @@ class Platter:
         self._shake = np.zeros((1, 2))  # deflection and its rate at each knot
 
     def follow(self, path: Trajectory, previous: "Platter | None") -> None:
-        """Take ``path`` as the shaft's motion, going on from where ``previous`` leaves the platter at its start."""
+        """Use ``path`` as the shaft's motion; at its start the platter is where ``previous`` leaves it."""
         if previous is None:
             platter, shake = float(path.position_deg[0]), (0.0, 0.0)
         else:

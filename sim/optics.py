@@ -55,10 +55,10 @@ class Optics:
 
     @classmethod
     def drawn(cls, rng: np.random.Generator, *, wobble_deg: float = 0.0, mount: float = 1.0) -> Self:
-        """Return a camera as they are: focal length ±5 %, principal point ±10 px, mounted askew by some degrees.
+        """Return a typical camera: focal length ±5 %, principal point ±10 px, mounted at an angle of some degrees.
 
-        ``mount`` is how carelessly it was mounted; at 0 it looks as it should, and the platter's middle is seen where
-        `sim.objects.projection` draws it, and as large.
+        ``mount`` is the error of its mounting. At 0 the camera has its nominal position, and the platter's middle is
+        seen where `sim.objects.projection` draws it, at the same size.
         """
         plain = cls()
         fx = FOCAL_PX * (1 + 0.05 * float(rng.standard_normal()))

@@ -1,9 +1,9 @@
 """A fake of the Python package picamera2 in front of the simulated camera: a Raspberry Pi with a Camera Module 3.
 
 It has the part of picamera2's interface that `rig.devices.picamera2_capture` uses, with the behaviour that a driver can
-get wrong: settings take effect some frames later, only the metadata of a frame tell which were in force, a name that
-the camera lacks is an error, there are only as many frames as released buffers, and the time stamp is that of the
-readout.
+handle wrongly: settings take effect some frames later, only the metadata of a frame contain the settings in force, a
+name that the camera lacks is an error, there are only as many frames as released buffers, and the time stamp is that of
+the readout.
 """
 
 from collections import deque

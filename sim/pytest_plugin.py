@@ -25,7 +25,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.fixture
 def sim_world(request: pytest.FixtureRequest) -> "World":
-    """What is really there: true angle, light, and what stands on the table; tests set it."""
+    """The simulated world: true angle, light, and the object on the table; tests set it."""
     from sim.world import World
 
     mark = request.node.get_closest_marker("sim")
@@ -37,8 +37,8 @@ def sim_world(request: pytest.FixtureRequest) -> "World":
 def sim_bench(request: pytest.FixtureRequest, sim_world: "World") -> "Iterator[Bench]":
     """An open bench in `sim_world`: real drivers on simulated wires, on a virtual clock.
 
-    `sim_bench.operator` puts objects on the table: `next_object` and `yaw_deg` say which, and how. The marker's
-    `faults`, such as "jam@move3", happen to it.
+    `sim_bench.operator` puts objects on the table: `next_object` is the object and `yaw_deg` its rotation. The marker's
+    `faults`, such as "jam@move3", are injected.
     """
     from rig.config import RigConfig, load_config
     from sim.bench import ShelfOperator, open_sim_bench

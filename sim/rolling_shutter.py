@@ -1,4 +1,4 @@
-"""What the rows of a rolling shutter collect: each row is exposed for as long, one after the other."""
+"""Exposure of the rows of a rolling shutter: all rows are exposed equally long, one after the other."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -7,7 +7,7 @@ from sim.objects.projection import HEIGHT
 
 
 def row_weights(exposure: int, readout: int, steps: int) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-    """Choose times at which a frame is drawn: return them (n,), and the share of each image in each row, (n, HEIGHT).
+    """Return times at which a frame is drawn, (n,), and the share of each image in each row, (n, HEIGHT).
 
     A row is the mean of images that are interpolated linearly between those of the times. So its mean time is exactly
     the middle of its exposure. Times in ns from the beginning of the first row; at least two.

@@ -31,7 +31,7 @@ class Sensor:
     noise
         Its noise.
     rng
-        Draws the noise tile from which all frames take a part.
+        Generator of the noise tile; each frame uses a part of it.
     binning
         Number of pixels along each side that are combined into one.
     """

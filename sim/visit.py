@@ -1,4 +1,4 @@
-"""What the simulated camera sees after a hard change of the bench: the drawn object on a bench of `rig eval`."""
+"""Images of the simulated camera after a hard change of the bench: the drawn object on a bench of `rig eval`."""
 
 from typing import Protocol
 
@@ -13,13 +13,13 @@ _OPAQUE = 104  # an object's pixels differ by less on the two grounds; those of 
 
 
 class Draws(Protocol):
-    """Draws an object into an image, uint8 (480, 640, 3)."""
+    """A function that draws an object into an image, uint8 (480, 640, 3)."""
 
     def __call__(self, image: Image, /) -> None: ...
 
 
 def seen_on_visit(visit: Visit, draw: Draws | None, table_deg: float) -> Image:
-    """Return what the camera sees under nominal light, uint8 (480, 640, 3); without an object, the empty table.
+    """Return the camera's image under nominal light, uint8 (480, 640, 3); without an object, the empty table.
 
     The object is cut out by drawing it on a dark and on a bright ground. The bench is drawn at half the size.
     """

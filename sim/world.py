@@ -18,7 +18,7 @@ from sim.clock import VirtualClock
 from sim.motion import Floats, Platter, Ripple, Trajectory, rest
 from sim.noise import NoiseModel
 
-HISTORY_S = 12.0  # how far back the past is stored: longer than the IMU's FIFO and the camera's buffers
+HISTORY_S = 12.0  # time for which the past is stored: longer than the IMU's FIFO and the camera's buffers
 
 
 class SimObject(Protocol):
@@ -30,10 +30,10 @@ class SimObject(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """What the camera can see, apart from the table's angle.
+    """The scene before the camera, apart from the table's angle.
 
-    ``yaw_deg`` is the object's counter-clockwise rotation against the platter, ``offset_mm`` where its axis stands in
-    the platter's frame, ``light`` the light relative to the nominal light, as B, G, R.
+    ``yaw_deg`` is the object's counter-clockwise rotation relative to the platter, ``offset_mm`` the position of its
+    axis in the platter's frame, ``light`` the light relative to the nominal light, as B, G, R.
     """
 
     object: SimObject | None = None
@@ -81,7 +81,7 @@ class World:
         return np.random.default_rng([self.seed, crc32(name.encode())])
 
     def frozen(self) -> "World":
-        """Return a copy that stands still, which another thread can look at. Nothing listens to it."""
+        """Return a copy that does not change, for another thread. It has no listeners."""
         still = copy(self)
         still.listeners = []
         still._scenes, still._motions, still._slips = self._scenes[:], self._motions[:], self._slips[:]

@@ -38,7 +38,7 @@
 #define ATTEMPTS 3
 #define TRANSFER_US 5000 /* the longest takes 0.6 ms at 400 kHz; a sensor may stretch the clock */
 #define CHECK_US 50000   /* without an edge, check the FIFO: the pin is not connected, or the sensor is gone */
-#define AGAIN_US 100000  /* between two attempts to get a lost sensor back */
+#define AGAIN_US 100000  /* between two attempts to set up a lost sensor again */
 
 enum phase {
     OFF,

@@ -1,4 +1,4 @@
-/* Sampling of the IMU: sets the sensor up, reads it in the background, and gets it back when it is lost. */
+/* Sampling of the IMU: sets the sensor up, reads it in the background, and sets it up again when it is lost. */
 #ifndef HEAD_IMU_H
 #define HEAD_IMU_H
 

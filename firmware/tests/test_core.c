@@ -1,7 +1,5 @@
-/* Unit tests of the core on this machine, under sanitizers: `make test`. The deeper ones are in ../tests, in Python. */
-#include <stdio.h>
-#include <stdlib.h>
-#include <string.h>
+/* Unit tests of the core on this computer, under sanitizers: `make test`. More tests of the behaviour are in ../tests,
+in Python. */ #include <stdio.h> #include <stdlib.h> #include <string.h>
 
 #include "../boards/host/board.h"
 #include "../core/frame.h"

@@ -10,7 +10,7 @@ from rig.events.wording import share_words
 
 
 class MoveLines:
-    """Turns the events of `rig.plans.identify` into lines; a line is complete when the next view is decided."""
+    """Converts the events of `rig.plans.identify` to lines; a line is complete when the next view is decided."""
 
     HEADING: ClassVar = (
         "      camera     rotation of the table                   similarity of candidates\n"

@@ -1,6 +1,6 @@
 """Simulated faults: they change the simulated world, buses and devices, never a driver.
 
-`fault_kinds` lists them, `Fault` is one with its parameters and its time, `Faults` lets them happen.
+`fault_kinds` lists them, `Fault` is one with its parameters and its time, `Faults` injects them.
 """
 
 from sim.faults.injector import Faults

@@ -1,4 +1,4 @@
-"""Lets simulated faults happen at their times."""
+"""Injects simulated faults at their times."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -51,7 +51,7 @@ class Faults:
         devices.world.listeners.append(self._notice)
 
     def schedule(self, *faults: Fault) -> None:
-        """Let faults happen at their times; a time that has passed means now."""
+        """Schedule faults for their times; a time that has passed means now."""
         for fault in faults:
             if fault.trigger is not Trigger.AT:
                 self._waiting.append(fault)

@@ -17,7 +17,7 @@ from sim.devices import SimDevices
 DEVICES = ("servo", "imu", "camera")
 
 End = Callable[[], None]
-"""Removes the cause of a fault; its consequences remain."""
+"""A function that removes the cause of a fault; its consequences remain."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,7 +21,7 @@ _KEYS = ("name", "at_s", "during_move", "after_view", "for_s")
 
 
 class Trigger(Enum):
-    """What starts a fault."""
+    """The events that start a fault."""
 
     AT = "at_s"
     MOVE = "during_move"
@@ -84,9 +84,9 @@ class Fault:
 
     @classmethod
     def from_table(cls, table: Mapping[str, Any]) -> Self:
-        """Return what a table says: ``name``, one of ``at_s``, ``during_move``, ``after_view``, ``for_s``, parameters.
+        """Return the fault of a table: ``name``, ``at_s`` or ``during_move`` or ``after_view``, ``for_s``, parameters.
 
-        Raises `UsageError` if there is no such fault or parameter, or a value is none.
+        Raises `UsageError` if there is no such fault or parameter, or a value is not valid.
         """
         name = table.get("name")
         if not isinstance(name, str):

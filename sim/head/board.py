@@ -1,7 +1,8 @@
 """A simulated rig head: the firmware, the devices on its pins, and its serial connection to the host.
 
 The board runs up to the virtual clock's time whenever its state is read, and every few milliseconds. The world answers
-its requests, such as reading a register over I2C, as of the board's own time. So nothing depends on how often it runs.
+its requests, such as reading a register over I2C, for the board's own time. So the result does not depend on how often
+the board runs.
 
 Decision: docs/decisions/0021.
 """

@@ -22,12 +22,12 @@ _IN_SYNC, _OK = b"\x14", b"\x10"
 _GET_PARAMETER, _SET_DEVICE, _SET_DEVICE_EXT, _LEAVE, _LOAD_ADDRESS, _UNIVERSAL = 0x41, 0x42, 0x45, 0x51, 0x55, 0x56
 _PROGRAM_PAGE, _READ_PAGE, _READ_SIGNATURE = 0x64, 0x74, 0x75
 _MORE: Final = {_GET_PARAMETER: 1, _SET_DEVICE: 20, _SET_DEVICE_EXT: 5, _LOAD_ADDRESS: 2, _UNIVERSAL: 4, _READ_PAGE: 3}
-"""Bytes that follow a command; `_PROGRAM_PAGE` says in its first two how much data follows. Others have none."""
+"""Bytes that follow a command; the first two of `_PROGRAM_PAGE` are the length of its data. Others have none."""
 
 
 @dataclass(frozen=True, slots=True)
 class Kind:
-    """A boot loader: its baud rate, how long it waits, and whether it tells EEPROM from flash."""
+    """A boot loader: its baud rate, the time that it waits, and whether it distinguishes EEPROM and flash."""
 
     name: str
     baud: int
@@ -36,7 +36,7 @@ class Kind:
 
 
 OPTIBOOT: Final = Kind("Optiboot", 115_200, 1.0, has_eeprom=False)
-"""Nano since 2018, Uno. It ignores the kind of memory: what is meant for the EEPROM overwrites a page of the flash."""
+"""Nano since 2018, Uno. It ignores the kind of memory: data for the EEPROM overwrites a page of the flash."""
 ATMEGABOOT: Final = Kind("ATmegaBOOT", 57_600, 2.0, has_eeprom=True)
 """Nano before 2018."""
 
@@ -59,7 +59,7 @@ class Arduino:
     Attributes
     ----------
     flash, eeprom
-        What is in the memories. An erased byte is 0xFF.
+        Content of the memories. An erased byte is 0xFF.
     program
         The running program; None while the boot loader runs.
     resets
@@ -147,7 +147,7 @@ class Arduino:
             for _ in range(count):
                 words.append((yield))
             if (yield) != _END:
-                continue  # out of step: a real one resets itself
+                continue  # out of synchronisation: a real boot loader resets itself
             self._answer += _IN_SYNC + self._done(command, bytes(words)) + _OK
             if command == _LEAVE:
                 self._heard_ns -= round(self._kind.wait_s * 1e9)  # its watchdog ends the boot loader

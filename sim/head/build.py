@@ -21,7 +21,7 @@ COMPILE_S = 120
 
 
 def missing(kind: str) -> str:
-    """Return what is missing to build a ``memory`` or ``avr`` head, and how to install it; empty if nothing is."""
+    """Return what a build of a ``memory`` or ``avr`` head lacks, and how to install it; empty if nothing is missing."""
     if not (FIRMWARE / "Makefile").is_file():
         return "the firmware's sources are not installed: use a clone of the repository"
     if not (shutil.which("make") and compiler()):

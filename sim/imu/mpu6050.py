@@ -67,7 +67,7 @@ class SimMpu6050:
     LSB_PER_C: ClassVar[float] = 340.0
     ZERO_C: ClassVar[float] = 36.53
     SELF_TEST_DPS: ClassVar[tuple[float, float, float]] = (58.0, -58.0, 58.0)
-    """What the gyro reads more during its self-test (PS 6.1, RM 4.1: 25 to 101 °/s by the factory trim)."""
+    """Change of the gyro's reading during its self-test (PS 6.1, RM 4.1: 25 to 101 °/s by the factory trim)."""
     GYRO_NOISIER: ClassVar[float] = 1.0
     """Ratio of its gyro's noise to that of the bench's noise model."""
 

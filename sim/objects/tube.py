@@ -1,4 +1,4 @@
-"""Handles and spouts: a sphere swept along a curve, which parallel projection shows as a thick line."""
+"""Handles and spouts: a sphere that is moved along a curve, which parallel projection shows as a thick line."""
 
 from dataclasses import dataclass
 from functools import cached_property, partial

@@ -34,7 +34,7 @@ class SimBenchComputer(Computer):
     folder
         The folder of the simulated bench.
     config
-        Names the devices.
+        Configuration with the names of the devices.
     """
 
     def __init__(self, folder: Path, config: RigConfig) -> None:
@@ -66,13 +66,13 @@ class SimBenchComputer(Computer):
         return CAMERA_DEVICE
 
     def close(self) -> None:
-        """Take its I2C bus away."""
+        """Remove its I2C bus."""
         if self._i2c is not None:
             self._i2c.close()
 
 
 class RunningSimBench(HardwareBench):
-    """Opens the devices of a running simulated bench as those of a real one."""
+    """The kind of bench ``sim-bench``: opens the devices of a running simulated bench as those of a real one."""
 
     name = "sim-bench"
     options: type[BaseModel] = SimBenchOptions

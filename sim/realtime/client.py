@@ -1,4 +1,4 @@
-"""The other programs' end of the simulated bench: its camera and its I2C bus, below the drivers."""
+"""Access of other programs to a simulated bench: its camera and its I2C bus, below the drivers."""
 
 import ctypes
 import os
@@ -41,7 +41,7 @@ class RemoteCapture:
         return bool(self._ask("grab")[0].get("ok"))
 
     def wait(self, seconds: float) -> bool:
-        """Wait for a frame at most so long; return whether `grab` then returns at once."""
+        """Wait for a frame for at most this time; return whether `grab` then returns at once."""
         answer = self._ask("wait", seconds=seconds)[0]
         return bool(answer.get("ok", True))  # `grab` fails if the simulated bench has ended
 
@@ -69,7 +69,7 @@ class RemoteCapture:
 
 
 def camera_node(folder: Path) -> tuple[int, ...] | None:
-    """Return what identifies the device file of the simulated bench's camera; None if it is unplugged."""
+    """Return the identity of the device file of the simulated bench's camera; None if it is unplugged."""
     try:
         with closing(Wire(folder)) as wire:
             node = wire.ask(ask="camera", call="node")[0].get("node")
@@ -89,7 +89,7 @@ class RemoteI2c:
         self.path = self._file.path
 
     def close(self) -> None:
-        """Take the bus away; a second call does nothing."""
+        """Remove the bus; a second call does nothing."""
         self._file.close()
         if self._wire is not None:
             self._wire.close()

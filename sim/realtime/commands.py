@@ -1,4 +1,4 @@
-"""What the trainee does to the simulated world: words such as ``put mug-white``, ``jam`` or ``turn 90``."""
+"""Commands of the trainee to the simulated world, such as ``put mug-white``, ``jam`` or ``turn 90``."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -32,12 +32,12 @@ _OF_ONE_PROGRAM: Final = ("disk_full", "clock_jump")
 
 
 class Commands:
-    """Changes a simulated world as the trainee says.
+    """The commands of the trainee, which change a simulated world.
 
     Parameters
     ----------
     operator
-        Puts objects on the table.
+        The operator that puts objects on the table.
     devices, faults
         The devices and simulated faults of the bench.
     quit
@@ -54,7 +54,7 @@ class Commands:
         self._quit = quit
 
     def do(self, words: Sequence[str]) -> str:
-        """Do what the words say, and return the result in words.
+        """Carry out a command, and return the result in words.
 
         Raises
         ------
@@ -188,7 +188,7 @@ class Commands:
 
 
 def run(commands: Commands, words: Sequence[str]) -> dict[str, Any]:
-    """Do what the words say; return the result, or the error, as plain data with the state of the world."""
+    """Carry out a command; return the result, or the error, as plain data with the state of the world."""
     try:
         return {"text": commands.do(words), "world": commands.state()}
     except RigError as error:

@@ -22,7 +22,7 @@ LOCK = "lock"
 
 
 def reserve(folder: Path | None, ends: ExitStack) -> Path:
-    """Create a folder, reserve it for this program until ``ends``, and remove what a killed program left there.
+    """Create a folder, reserve it for this program until ``ends``, and remove files that a killed program left there.
 
     Without a ``folder`` it is `DEFAULT_FOLDER`, or the first of those with a number that no program uses.
 

@@ -13,7 +13,7 @@ from sim.clock import VirtualClock
 STEP_NS: Final = 20_000_000
 """Longest step of the world. After a pause of this program, requests are answered between the steps that catch up."""
 ACTIVE_NS: Final = 100_000_000
-"""How long after the last byte a port is looked at each `ACTIVE_WAIT_S`."""
+"""Time after the last byte during which a port is checked every `ACTIVE_WAIT_S`."""
 ACTIVE_WAIT_S: Final = 0.001
 LONGEST_WAIT_S: Final = 0.1
 
@@ -56,7 +56,7 @@ class RealTime:
         self._active_until_ns = 0
 
     def now_ns(self) -> int:
-        """Return the present on the world's clock; transfers on a bus can bring the world itself a little ahead."""
+        """Return the present on the world's clock; after a transfer on a bus, the world may be a little ahead of it."""
         return self._system.now_ns() + self._lead_ns
 
     def system_ns(self, world_ns: int) -> int:
@@ -71,18 +71,19 @@ class RealTime:
             yield
 
     def wait(self) -> None:
-        """Wait until the present has reached the world, which a transfer on a bus has brought ahead."""
+        """Wait until the present has reached the time of the world, which is ahead after a transfer on a bus."""
         self._system.sleep((self._clock.now_ns() - self.now_ns()) * 1e-9)
 
     def run(self, seconds: float | None = None, inputs: dict[int, Callable[[], bool]] | None = None) -> None:
         """Let the time pass for ``seconds``, or until `over` is set.
 
-        ``inputs`` are further file descriptors and what to do when they are readable; False: do not ask again.
+        ``inputs`` are further file descriptors, each with a function to call when it is readable; False from it removes
+        it.
         """
         try:
             self._run(seconds, {} if inputs is None else inputs)
         finally:
-            with self._lock:  # other threads leave the world alone from now on
+            with self._lock:  # other threads do not use the world from now on
                 self.over = True
 
     def _run(self, seconds: float | None, inputs: dict[int, Callable[[], bool]]) -> None:

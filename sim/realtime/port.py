@@ -54,7 +54,7 @@ class PtyPort:
 
     @property
     def near(self) -> int:
-        """The end of programs, as a file descriptor: its settings are those that a program has made."""
+        """The end that programs open, as a file descriptor; it has the settings that a program has made."""
         return self._near
 
     def pump(self) -> bool:

@@ -57,7 +57,7 @@ def run_bench(settings: Settings, folder: Path | None, seconds: float | None) ->
         faults.listeners.append(lambda occurrence: _print_fault(settings, occurrence))
         faults.schedule(*read_faults(options.faults))
 
-        # What other programs and the trainee use.
+        # The interfaces for other programs and for the trainee.
         ports = [_port(devices.reopen_adapter, folder / SERVO, ends)]
         if devices.head is not None:
             ports.append(_port(devices.head_port, folder / HEAD, ends))
@@ -75,7 +75,7 @@ def run_bench(settings: Settings, folder: Path | None, seconds: float | None) ->
             "Type what happens at the bench, for example: put mug-white. For a list: help"
         )
         settings.say(text, {"folder": str(folder), "servo": ports[0].path, "head": config.imu.connection == "head"})
-        with suppress(KeyboardInterrupt):  # Ctrl+C is how it is meant to end
+        with suppress(KeyboardInterrupt):  # Ctrl+C is the usual end
             time.run(seconds, inputs)
     settings.say("The simulated bench has ended.", {"ended": True})
 
@@ -127,7 +127,7 @@ def run_head(settings: Settings, kind: str, spin_dps: float, link: Path | None, 
 
 
 class _Keyboard:
-    """The trainee's commands from standard input."""
+    """Commands of the trainee from standard input."""
 
     def __init__(self, settings: Settings, time: RealTime, commands: Commands) -> None:
         self._settings, self._time, self._commands = settings, time, commands
@@ -142,7 +142,7 @@ class _Keyboard:
         return False
 
     def read(self) -> bool:
-        """Do what was typed; return False at the end of the input."""
+        """Carry out the typed command; return False at the end of the input."""
         try:
             typed = os.read(sys.stdin.fileno(), 4096)
         except OSError:  # in the background
@@ -165,7 +165,7 @@ def _port(open_connection: Callable[[], SerialConnection], link: Path | None, en
 
 
 def _set_up(devices: SimDevices, config: ServoConfig) -> None:
-    """Write the servo's permanent settings, also if its supply is off."""
+    """Write the servo's permanent settings, even if its supply is off."""
     was_on = devices.servo.powered
     devices.servo.power_on()
     devices.world.clock.sleep(BOOT_S)

@@ -1,7 +1,7 @@
-"""The end of the simulated bench that answers other programs: its camera, its I2C bus, and the trainee's commands.
+"""The server of a simulated bench for other programs: its camera, its I2C bus, and the trainee's commands.
 
-A request is one line of JSON. So is its answer, followed by as many raw bytes as its ``bytes`` says. A request that is
-none ends its connection, and nothing else.
+A request is one line of JSON. The answer is also one line of JSON, followed by the number of raw bytes in its field
+``bytes``. An invalid request ends only its own connection.
 """
 
 import ctypes
@@ -30,7 +30,7 @@ MAX_LINE: Final = 100_000
 MAX_MESSAGES, MAX_MESSAGE_BYTES = 42, 8192
 MAX_CONNECTIONS: Final = 64
 _POLL_S: Final = 0.05
-"""How often a program that waits for a frame looks whether the camera was unplugged."""
+"""Period with which the wait for a frame checks whether the camera was unplugged."""
 _LAST_ANSWERS_S: Final = 2.0
 """How long the end of the bench waits for programs that do not read their answer."""
 
@@ -155,7 +155,7 @@ class Session:
 
 
 def _transfer(rest: Mapping[object, Any]) -> tuple[tuple[int, Any], Callable[[], bytes]]:
-    """Return the arguments of the ``ioctl``, and what returns the bytes that were read."""
+    """Return the arguments of the ``ioctl``, and a function that returns the bytes that were read."""
     match rest:
         case {"smbus": [int(direction), int(command), int(size)], "data": str(text)}:
             sent, data = bytes.fromhex(text), smbus.union_i2c_smbus_data()
@@ -250,11 +250,11 @@ class Server(socketserver.ThreadingMixIn, socketserver.UnixStreamServer):
         return True
 
     def server_close(self) -> None:
-        """Answer what was asked, then end the connections."""
+        """Answer the pending requests, then end the connections."""
         super().server_close()
         connections = dict(self._connections)
         for connection in connections:
-            _shut(connection, socket.SHUT_RD)  # no more requests; an answer that is under way arrives
+            _shut(connection, socket.SHUT_RD)  # no more requests; an answer that was begun is completed
         clock = SystemClock()
         begun_ns = clock.now_ns()
         for connection, thread in connections.items():

@@ -60,7 +60,7 @@ class Wire:
 
 
 def tell(folder: Path, *words: str) -> dict[str, Any]:
-    """Have the running bench in ``folder`` do what the words say; return its answer and the state of its world.
+    """Send a command to the running bench in ``folder``; return its answer and the state of its world.
 
     Raises
     ------

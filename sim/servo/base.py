@@ -79,7 +79,7 @@ class SimulatedServoBase(ABC):
         self._check_shutdown()
 
     def set_temperature(self, temperature_c: float) -> None:
-        """Set the temperature of the case; then it follows the thermal model again."""
+        """Set the temperature of the case, from which the thermal model continues."""
         self.motor.set_temperature(temperature_c)
         self._check_shutdown()
 

@@ -17,7 +17,7 @@ PING_SLOT_S = 0.003
 PING_STATUS_BYTES = 14
 """Broadcast Ping: each id has a slot of one status packet and 3 ms, as in the SDK's timeout."""
 COLLISION_SHIFT_BITS = 3
-"""Delay of the second of two devices with one id: they never answer at exactly the same time."""
+"""Delay of the second of two devices with one id, because they never answer at exactly the same time."""
 
 
 class Source(Enum):
