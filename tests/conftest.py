@@ -1,4 +1,4 @@
-"""Fixtures for the whole suite: a simulated bench with its world in reach."""
+"""Fixtures for the whole suite: a simulated bench, and access to its world."""
 
 import gc
 import os
@@ -29,23 +29,23 @@ from sim.objects.shelf import shelf
 from sim.world import World
 from tests.small import SMALL
 
-# A deadline measures the machine, not the code; pytest-timeout catches what hangs. A clone passes or fails the same way
-# for everybody; `--hypothesis-profile=nightly` looks for what no run has seen.
+# Without deadlines, because they measure the computer, not the code; pytest-timeout ends tests that hang. Examples are
+# the same in every clone; `--hypothesis-profile=nightly` searches for new ones.
 settings.register_profile("rig", deadline=None, derandomize=True, database=None, max_examples=15)
 settings.register_profile("nightly", deadline=None, max_examples=1000)
 settings.load_profile("rig")
 
-# What is imported and collected stays: the garbage collector would search it in vain for a sixth of that time.
+# Imported and collected objects live until the end. The garbage collector would visit them for a sixth of that time.
 gc.disable()
 
 # Typer builds all commands for each invocation, which takes longer than most commands.
 typer.testing._get_command = cache(typer.testing._get_command)
 
-# Tests start many processes: compiled modules save a fifth of the time of each.
+# Tests start many processes, and compiled modules save a fifth of the time of each.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
 
-# The catalogs of the tests are durable, so that a disk would be waited for. Memory is used if there is room.
+# The catalogs of the tests are durable, so that tests would wait for a disk. They are in memory if it has room.
 MEMORY = Path("/dev/shm")
 if os.access(MEMORY, os.W_OK | os.X_OK) and shutil.disk_usage(MEMORY).free > 2e9:
     os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", str(MEMORY))
@@ -73,7 +73,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_collection_finish() -> None:
-    """Let the garbage collector pass over what lives as long as the process: modules and collected tests.
+    """Exclude modules and collected tests, which live as long as the process, from garbage collection.
 
     It would visit these millions of objects again and again, which takes a sixth of the time of all tests.
     """
@@ -84,7 +84,7 @@ def pytest_collection_finish() -> None:
 
 
 def share_firmware(cache: Path, base: Path) -> None:
-    """Let all workers of a run use the firmware that the first of them builds."""
+    """Let all workers of a run use the firmware that the first worker builds."""
     shared = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "firmware"
     shared.mkdir(exist_ok=True)
     (cache / APP).mkdir(parents=True)
@@ -93,7 +93,7 @@ def share_firmware(cache: Path, base: Path) -> None:
 
 @pytest.fixture(autouse=True, scope="session")
 def _nobodys_home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Keep the tests apart from the data of whoever runs them, and remove what they leave."""
+    """Separate the tests from the data of the user who runs them, and remove their files."""
     home = tmp_path_factory.mktemp("home")
     share_firmware(home / "cache", tmp_path_factory.getbasetemp())
     get_temp_dir()  # Python removes this one at its own end
@@ -121,7 +121,7 @@ def rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Result
 
 @dataclass(frozen=True)
 class SimulatedBench:
-    """A bench, and the hands and the world behind it."""
+    """A simulated bench with its operator and its world."""
 
     bench: Bench
     operator: ShelfOperator

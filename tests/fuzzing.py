@@ -1,4 +1,4 @@
-"""How many cases a property is tested with: tens by default, thousands in the nightly profile, each with limits."""
+"""Numbers of cases of property tests: tens by default, thousands in the nightly profile, each with limits."""
 
 import resource
 import signal
@@ -41,7 +41,7 @@ class LimitExceeded(BaseException):
 
 @contextmanager
 def limited(cpu_s: float = MAX_CPU_S, memory: int = MAX_MEMORY) -> Iterator[None]:
-    """Limit the processor time, and what this process may allocate in addition, in a ``with`` block (MemoryError)."""
+    """Limit the processor time, and the memory that this process may allocate, in a ``with`` block (MemoryError)."""
 
     def too_long(*_: object) -> NoReturn:
         raise LimitExceeded

@@ -1,4 +1,4 @@
-"""Programs in processes of their own, forked from a server that has imported what they need.
+"""Programs in processes of their own, forked from a server that has imported their modules.
 
 A start takes milliseconds instead of a second of computing. Signals, locks, pipes and exit codes are those of any
 process. Tests of the start or the end of the interpreter start Python instead.
@@ -162,7 +162,7 @@ main()
 def _run(
     words: tuple[str, ...], code: str, folder: Path, environment: dict[str, str], streams: list[Connection]
 ) -> None:
-    """Become the program."""
+    """Run the program in this process."""
     gc.freeze()  # its garbage collector need not visit what the server has imported
     for number, stream in enumerate(streams):
         os.dup2(stream.fileno(), number)

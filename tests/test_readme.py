@@ -1,4 +1,4 @@
-"""The README shows only what the program does."""
+"""The commands, outputs and files that the README shows are those of the program."""
 
 import re
 from pathlib import Path

@@ -1,1 +1,1 @@
-"""Modules that all other packages of `rig` use: clock, errors, files, processes."""
+"""Parts that all rooms use: clock, errors, files, processes."""

@@ -1,4 +1,4 @@
-"""A day at the simulated bench by clicks alone, in a real Chromium."""
+"""A day at the simulated bench, operated only by clicks in a real Chromium."""
 
 import signal
 import subprocess
@@ -24,7 +24,7 @@ def job_done(page, title, state="done"):
 
 
 @pytest.mark.parametrize("viewport", [None, PHONE], ids=["desktop", "phone"])
-def test_day_at_the_bench(page, serve_process, tmp_path, viewport):
+def test_all_pages_work_in_a_day_at_the_bench(page, serve_process, tmp_path, viewport):
     server = serve_process("bench.sim.speed=50", 'bench.sim.object="mug-star"')
     if viewport:
         page.set_viewport_size(viewport)
@@ -85,7 +85,7 @@ def test_day_at_the_bench(page, serve_process, tmp_path, viewport):
     assert server.kill(signal.SIGTERM) == 128 + signal.SIGTERM
 
 
-def test_stop_is_in_reach_above_an_open_dialog_and_stops(page, serve_process):
+def test_stop_button_above_an_open_dialog_stops_the_table(page, serve_process):
     server = serve_process("bench.sim.speed=5")
     enroll(page, server, "lamp", 24)
     page.wait_for_selector("#thumbs img", timeout=WAIT_MS)
@@ -199,10 +199,10 @@ def test_pages_pass_axe(page, serve_process):
     assert found == {}
 
 
-def test_search_in_motion_shows_its_frames_and_stop_ends_it_in_the_turn(page, serve_process):
+def test_search_in_motion_shows_its_frames_and_stop_ends_it_during_the_rotation(page, serve_process):
     known = ("camera_time.offset_ms=8", "camera_time.uncertainty_ms=0.3", "camera_time.jitter_ms=0.3")
     server = serve_process("bench.sim.speed=1", 'bench.sim.object="bottle-harvest"', *known)
-    for name in ("bottle-green", "bottle-harvest"):  # twins: one view does not tell them apart
+    for name in ("bottle-green", "bottle-harvest"):  # twins: one view does not distinguish them
         enroll(page, server, name, 6)
         job_done(page, f"Enroll {name}")
     page.goto(f"{server.url}identify")

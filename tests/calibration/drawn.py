@@ -1,4 +1,4 @@
-"""Measurements of benches without a simulator: what procedures evaluate, drawn at random or exact."""
+"""Measurements without a simulator, random or exact, for the evaluations of the procedures."""
 
 import numpy as np
 
@@ -12,7 +12,7 @@ AXIS = np.array([0.02, -0.03, 1.0]) / np.linalg.norm([0.02, -0.03, 1.0])
 def measured(
     axis=AXIS, *, zero_g=(0.01, -0.02, 0.03), table_axis_deg=(0.0, 0.0)
 ) -> tuple[list[RecordedMove], list[GravityReading]]:
-    """Return what a bench without noise measures."""
+    """Return the measurements of a bench without noise."""
     rate = np.linspace(10.0, 90.0, 20)
     moves = [RecordedMove(45.0, 45.0 * axis, 0.01, 0.002 * rate, rate) for _ in range(8)]
     levels = []

@@ -1,9 +1,9 @@
-"""What the tests of the calibrations share."""
+"""A function that the tests of the calibrations share."""
 
 from calibration.procedure import Evaluation
 from rig.calibrations import CalibrationResult, RejectionCode
 
 
 def codes(found: Evaluation | CalibrationResult) -> list[RejectionCode]:
-    """Return why a calibration was rejected."""
+    """Return the codes of the rejections of a calibration."""
     return [rejection.code for rejection in found.rejections]

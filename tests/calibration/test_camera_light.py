@@ -31,7 +31,7 @@ def frames(noise: NoiseModel, scene=SCENE, *, n: int = 12, exposure: float = 1.0
 
 
 def card(levels=(170.0, 170.0, 170.0), *, mean=None, slope: float = 0.0, flicker: float = 0.004) -> CardFrames:
-    """Return what 40 frames of a card over four minutes come to; ``slope`` is the light's drift in % a minute."""
+    """Return the means of 40 frames of a card over four minutes; ``slope`` is the light's drift in % per minute."""
     rng = np.random.default_rng(0)
     seconds = np.linspace(0, 240, 40)
     light = (1 + slope / 100 * seconds / 60) * (1 + flicker * rng.standard_normal(40))

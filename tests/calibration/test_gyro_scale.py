@@ -22,7 +22,7 @@ SLIP_DELAY_NS = 4_000_000_000
 
 
 def true_scale(seed: int) -> float:
-    """Return what the simulated part of this seed needs: its gain, and its tilt against the axis."""
+    """Return the true scale of the simulated sensor of this seed, from its gain and its tilt relative to the axis."""
     part = InertialModel(World(seed=seed), "imu-68")
     return 1 / float(part.gyro_gain[2] * part.up[2])
 
@@ -32,7 +32,7 @@ def fit(legs: list[Leg]) -> Evaluation:
 
 
 def drawn(rng: np.random.Generator, scale: float, legs: int = 4, revolution_deg: float = 720.0) -> list[Leg]:
-    """Return legs as a bench measures them that errs as stated: rests anywhere in a count, a gyro with noise."""
+    """Return legs as a bench with the stated errors measures them: rests anywhere in a count, a gyro with noise."""
     rests = np.arange(legs + 1) % 2 * revolution_deg + rng.uniform(-COUNT_DEG / 2, COUNT_DEG / 2, legs + 1)
     read = np.round(rests / COUNT_DEG) * COUNT_DEG
     sigma = 0.03
@@ -41,7 +41,7 @@ def drawn(rng: np.random.Generator, scale: float, legs: int = 4, revolution_deg:
 
 
 def run(s, *, revolutions: int = 4, during=None) -> CalibrationResult:
-    """Calibrate; ``during`` maps the index of a leg, from 1, to what happens to the world in the middle of it."""
+    """Calibrate; ``during`` maps the index of a leg, from 1, to an action on the world in the middle of the leg."""
     events = GyroScale(revolutions=revolutions).live(s.bench)
     for event in events:
         if isinstance(event, Moved) and during and (happens := during.get(event.index + 1)):

@@ -1,4 +1,4 @@
-"""The duration of rotations: true within its uncertainty, predicts new rotations, and rejects a hindered one."""
+"""The duration of rotations: true within its uncertainty, predicts new rotations, and rejects an obstructed one."""
 
 from dataclasses import replace
 
@@ -56,7 +56,7 @@ def test_new_rotations_are_predicted(simulated):
             assert table.goto(goal_deg).seconds == pytest.approx(predicted_s, abs=0.25)
 
 
-def test_hindered_rotation_is_rejected():
+def test_obstructed_rotation_is_rejected():
     moves = drawn(np.random.default_rng(2), 0.012, 0.3, 0.4)
     moves[5] = replace(moves[5], seconds=moves[5].seconds + 1.0)
     result = fit(moves)

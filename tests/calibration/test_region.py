@@ -23,7 +23,7 @@ def rig(rig, monkeypatch):
 
 
 def region(rig, name: str) -> list[int]:
-    """Return what the object's first view is described within."""
+    """Return the region that the object's first view is described within."""
     reported = json.loads(rig("catalog", "show", name, "--json").stdout)
     return reported["views"][0]["record"]["region"]
 

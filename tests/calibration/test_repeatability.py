@@ -15,7 +15,7 @@ from tests.calibration.rejected import codes
 
 
 def drawn(rng: np.random.Generator, placements: int, *, flips: int = 4, drift: int = 0) -> list[Placement]:
-    """Return placings whose views differ in some levels, more with every placing where the light drifts."""
+    """Return placements whose views differ in some levels; with a drifting light the differences grow."""
     truth = rng.integers(0, 8, (AZIMUTHS, 144))
 
     def seen(drifted: int) -> np.ndarray:
@@ -33,7 +33,7 @@ def fit(placements: list[Placement], error_rate: float = 0.02) -> Evaluation:
     return evaluate(placements, error_rate=error_rate, views=2)
 
 
-def test_promised_share_of_later_placements_falls_below():
+def test_stated_share_of_later_placements_is_below_the_threshold():
     rng = np.random.default_rng(1)
     below, n = 0, 0
     for _ in range(30):

@@ -30,7 +30,7 @@ CLOCK_ERROR = 2e-3
 
 @dataclass
 class Head:
-    """A driver on its clock, the simulated head that it talks to, and the sensor on that one."""
+    """A driver on its clock, the simulated head that it uses, and the sensor on that head."""
 
     imu: RigHead
     clock: Clock
@@ -41,7 +41,7 @@ class Head:
 
 
 def needs(kind: str) -> None:
-    """Skip the test where this machine cannot build a head of this kind."""
+    """Skip the test if this computer cannot build a head of this kind."""
     if lacking := missing(kind):
         pytest.skip(lacking)
 
@@ -98,7 +98,7 @@ def opened_head(
 
 PUMP_S = 0.001
 READ_S = 0.002
-"""How long a read waits for the first byte, as the timeout of the real port."""
+"""Time that a read waits for the first byte, as with the timeout of the real port."""
 
 
 @contextmanager
@@ -137,7 +137,7 @@ TERMINAL_BYTES = 4095
 class _PtyWire:
     """pyserial on a pseudo-terminal whose other end is in this very thread, with virtual time.
 
-    What one end has written is waited for at the other: how long a busy kernel takes to carry it is not under test.
+    Each end waits for the bytes that the other end has written, because the delay of a busy kernel is not tested.
     """
 
     def __init__(self, port: serial.Serial, clock: Clock, terminal: PtyPort) -> None:

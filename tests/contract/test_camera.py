@@ -1,4 +1,4 @@
-"""What every `rig.devices.camera.Camera` keeps to, whatever is behind it."""
+"""The contract of every `rig.devices.camera.Camera`."""
 
 import os
 import sys

@@ -1,4 +1,4 @@
-"""What every `rig.devices.imu.Imu` must keep; a new driver joins by an entry in `SENSORS`."""
+"""The contract of every `rig.devices.imu.Imu`; a new driver is tested by an entry in `SENSORS`."""
 
 import os
 from collections.abc import Callable, Iterator
@@ -30,8 +30,8 @@ NIGHTLY = pytest.mark.nightly
 class Sensor:
     """An opened IMU in its world; `unplug` pulls its cable; its z axis points up, ``latency_s`` is its filter's lag.
 
-    ``buffer_s`` says how seldom it may be read for each sample to be one that was taken, ``late_s`` is
-    later than any of its buffers reaches; ``resolution_dps`` is what its rate may be off by at no noise.
+    ``buffer_s`` is the longest time between readings without a lost sample, ``late_s`` is longer than any of its
+    buffers, and ``resolution_dps`` is the largest error of its rate without noise.
     """
 
     imu: Imu
@@ -65,7 +65,7 @@ def on_i2c(
 
 
 DELIVERY_S = 0.015
-"""How late a sensor may hand a sample over."""
+"""Largest delay with which a sensor may deliver a sample."""
 LATE_S = 4.0
 """A head's driver keeps 2 s."""
 

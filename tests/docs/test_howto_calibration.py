@@ -24,7 +24,7 @@ def test_new_calibration_measures_on_the_simulated_bench(page, tmp_path, monkeyp
     assert len(list(tmp_path.rglob("*-servo.step_time-*.json"))) == 1
 
 
-def test_new_calibration_states_its_uncertainty_and_rejects_a_hindered_rotation(page):
+def test_new_calibration_states_its_uncertainty_and_rejects_an_obstructed_rotation(page):
     rng = np.random.default_rng(1)
     found = [page["evaluate"](0.9 + rng.normal(0, 0.01, 10)).estimates["duration"] for _ in range(200)]
     deviations = np.array([(estimate.value - 0.9) / estimate.uncertainty for estimate in found])

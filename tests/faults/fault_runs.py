@@ -33,7 +33,7 @@ from tests.small import SMALL
 
 VIEWS = 72
 SHORT = 5
-"""Views of an enrollment that need not be longer."""
+"""Views of an enrollment that may be short."""
 LATE = 12
 """Views of an enrollment that detects the fault only at its end, or only in a large move."""
 NAME = "toy-car"

@@ -165,11 +165,11 @@ def remove_cause(rig: Rig, scenario: Scenario) -> None:
 
 
 def check_recovery(rig: Rig, scenario: Scenario, outcome: Outcome, planned: int, at_most: int | None) -> None:
-    """Check that the enrollment is replaced or resumed, as the scenario says; resume at most so many views."""
+    """Check that the enrollment is replaced or resumed, as the scenario says; resume at most this number of views."""
     if scenario.after is After.REPLACE:
         again = enrollment(rig, replace=True, views=SHORT)
         assert enrolled(again), again.error
-        # What slipped stays where it is: the new views agree with each other.
+        # A slipped part stays at its place, so the new views agree with each other.
         check_stored(rig, again.stored, tolerance_deg=TOLERANCE_DEG, planned=SHORT, offset=True)
         return
     missing = sorted(set(range(planned)) - outcome.stored)

@@ -1,4 +1,4 @@
-"""A process that is killed at any point of an enrollment loses no view that it has reported, and can go on."""
+"""A process that is killed at any point of an enrollment loses no reported view, and can be resumed."""
 
 import json
 from pathlib import Path

@@ -95,7 +95,7 @@ def test_stream_runs_in_real_time(terminal):
 
 
 @pytest.mark.parametrize("deadman_s", [0.25, 1.0])
-def test_killed_program_leaves_the_bench_dark_and_unpowered(terminal, deadman_s):
+def test_light_and_servo_power_are_off_after_a_killed_program(terminal, deadman_s):
     program = host(terminal.port, deadman_s, "stay")
     assert program.stdout.readline() == "on\n"
     terminal.wait_for("light", 128)

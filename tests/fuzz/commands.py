@@ -1,4 +1,4 @@
-"""Runs a command with input from an attacker, and checks what must hold for every input.
+"""Runs a command with input from an attacker, and checks the rules for every input.
 
 No traceback, an exit code of the registry, no hang, at most 1 GiB of memory, nothing written outside its place, nothing
 that controls a terminal, and with ``--json`` lines of JSON.
@@ -50,7 +50,7 @@ class Done:
 
 
 class Commands:
-    """Runs commands in the folder ``inside``; everything beside it is out of bounds, except the program's own folders.
+    """Commands in the folder ``inside``; they may change nothing outside of it, except the program's own folders.
 
     Parameters
     ----------
@@ -95,7 +95,7 @@ class Commands:
         return self.inside
 
     def run(self, *arguments: str) -> Done:
-        """Run a command and check what must hold for every input."""
+        """Run a command and check the rules for every input."""
         assert self._worker.stdin is not None
         assert self._worker.stdout is not None
         before = tree(self.outside)
@@ -107,7 +107,7 @@ class Commands:
 
 
 def check(done: Done, arguments: tuple[str, ...]) -> None:
-    """Check what must hold for every input."""
+    """Check the rules for every input."""
     assert done.exit_code in EXIT_CODES, (arguments, done)
     assert done.exit_code != 1, (arguments, done)
     assert "Traceback" not in done.err, (arguments, done)

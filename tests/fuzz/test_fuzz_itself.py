@@ -1,4 +1,4 @@
-"""The checks of the fuzz targets notice what they are there for."""
+"""The checks of the fuzz targets detect each kind of error."""
 
 import signal
 import subprocess

@@ -13,7 +13,7 @@ from pathlib import Path
 from tests.fuzzing import MAX_CPU_S, MAX_MEMORY
 
 MAX_WAIT_S = 40
-"""A command that computes nothing waits for something. The limit leaves room for a computer that does other things."""
+"""Time after which a command without computing counts as hanging; long enough for a busy computer."""
 MAX_OUTPUT = 1 << 20
 
 
@@ -49,7 +49,7 @@ def main() -> None:
 
 
 def run(rig, arguments: list[str], folder: Path) -> None:
-    """Become a program that runs one command: limits, empty standard input, output into files."""
+    """Run one command in this process, with limits, empty standard input, and output into files."""
     resource.setrlimit(resource.RLIMIT_DATA, (MAX_MEMORY, MAX_MEMORY))
     resource.setrlimit(resource.RLIMIT_CPU, (MAX_CPU_S, MAX_CPU_S))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))

@@ -12,7 +12,7 @@ from tests.kernel.machine import Machine, NotReady, Result, kernel_folder
 from tests.kernel.played_bench import PlayedBench
 
 BRLTTY_RULE = '''SUBSYSTEM=="usb", ENV{PRODUCT}=="403/6014/*", ENV{SYSTEMD_WANTS}+="brltty-device@.service"'''
-"""What the rules of the package brltty do with a USB adapter that they take for a braille display."""
+"""A rule as in the package brltty, which handles a USB adapter as a braille display."""
 PATIENT = {
     "servo": ("retries = 10",),
     "table": ("poll_s = 0.1", "quiet_dps = 2.0", "watchdog_s = 2.5"),
@@ -50,7 +50,7 @@ def guest(machine: Machine) -> Iterator[GuestBench]:
 
 @dataclass(frozen=True, slots=True)
 class FirstDay:
-    """What the commands of a first day have printed."""
+    """The outputs of the commands of a first day."""
 
     find: Result
     rules: Result
@@ -86,6 +86,6 @@ def first_day(guest: GuestBench) -> FirstDay:
 
 @pytest.fixture
 def bench(guest: GuestBench, first_day: FirstDay) -> Iterator[GuestBench]:
-    """Return a bench that is ready; at the end, bring what the test has changed into order."""
+    """Return a bench that is ready; at the end, undo the changes of the test."""
     yield guest
     guest.restore()

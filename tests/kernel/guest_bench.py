@@ -24,7 +24,7 @@ _POLL_S: Final = 0.05
 
 
 class GuestBench:
-    """Runs programs in the machine and moves cables.
+    """The bench in the machine: runs programs and moves cables.
 
     Attributes
     ----------
@@ -52,11 +52,11 @@ class GuestBench:
         return GuestProcess(self.machine, self.machine.ask("start", **asked))
 
     def rig(self, *words: object, timeout: float = 200.0, **options: Any) -> Result:
-        """Return how `rig ...` has ended."""
+        """Return the result of `rig ...`."""
         return self.start(*words, **options).wait(timeout)
 
     def python(self, code: str, timeout: float = 120.0) -> Result:
-        """Return how a piece of Python has ended, in the project's folder; it starts faster than with `sh`."""
+        """Return the result of a piece of Python in the project's folder; it starts faster than with `sh`."""
         return self.start(code=code, folder=str(PROJECT)).wait(timeout)
 
     def files(self, pattern: object) -> dict[str, str]:
@@ -77,7 +77,7 @@ class GuestBench:
         return result.output.strip()
 
     def restore(self) -> None:
-        """End all programs, plug every device in, end all faults, and acknowledge what is latched."""
+        """End all programs, plug every device in, end all faults, and acknowledge latched faults."""
         self.machine.ask("end_all")
         self.played.restore()
         self.plug_in(*(device for device in self.played.usb if device.plug is None))
@@ -143,5 +143,5 @@ class GuestBench:
             raise AssertionError(f"it has not printed {text!r} in {seconds:g} s:\n{process.output}") from None
 
     def pause(self, seconds: float) -> None:
-        """Let time pass."""
+        """Wait for some time."""
         SystemClock().sleep(seconds)

@@ -28,7 +28,7 @@ MODULES: Final = ("virtio_pci", "9pnet_virtio", "9p", "overlay")
 """What the kernel needs to find its files."""
 BOOT_S: Final = 300.0
 BOOTS: Final = 3
-"""How often the kernel may stop at once: it measures its timer, which fails while other programs use the processor."""
+"""Attempts to start the kernel, whose measurement of its timer fails while other programs use the processor."""
 ANSWER_S: Final = 300.0
 PROJECT: Final = Path(__file__).parents[2]
 _INIT = """#!/bin/busybox sh
@@ -115,7 +115,7 @@ def _cpio(files: list[tuple[str, int, bytes]]) -> Iterator[bytes]:
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """How a program in the machine has ended: its exit code, all that it printed, and its standard output."""
+    """The result of a program in the machine: its exit code, its whole output, and its standard output."""
 
     code: int
     output: str
@@ -123,7 +123,7 @@ class Result:
 
 
 class Machine:
-    """A running virtual machine, which does what its agent is asked for."""
+    """A running virtual machine, whose agent carries out requests."""
 
     def __init__(self, kernel: Path, folder: Path) -> None:
         release = next((kernel / "lib/modules").iterdir()).name
@@ -217,7 +217,7 @@ class GuestProcess:
 
     @property
     def output(self) -> str:
-        """What it has printed so far."""
+        """The output of the program so far."""
         return str(self._machine.ask("output", pid=self.pid))
 
     @property
@@ -228,7 +228,7 @@ class GuestProcess:
         self._machine.ask("signal", pid=self.pid, signal_number=number)
 
     def wait(self, timeout: float = ANSWER_S) -> Result:
-        """Return how it has ended; raises TimeoutError."""
+        """Return the result of the program; raises TimeoutError."""
         ended = self._machine.ask("wait", answer_s=timeout + 10, pid=self.pid, timeout=timeout)
         if ended is None:
             raise TimeoutError(f"the program has not ended in {timeout:g} s:\n{self.output}")

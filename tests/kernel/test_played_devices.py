@@ -207,7 +207,7 @@ def test_second_adapter_reads_a_register_of_a_sensor(u2c: DiolanU2c) -> None:
     assert who_am_i(u2c, 0x68) == [b"\0", b"\0", b"\0", b"\0", b"\0", b"\x68\0", b"\0"]
 
 
-def test_second_adapter_tells_a_missing_acknowledge_from_a_timeout(u2c: DiolanU2c, bus: SimI2cBus) -> None:
+def test_second_adapter_distinguishes_a_missing_acknowledge_and_a_timeout(u2c: DiolanU2c, bus: SimI2cBus) -> None:
     assert who_am_i(u2c, 0x50)[1] == b"\x07"
     bus.stuck = True
     assert who_am_i(u2c, 0x68)[1] == b"\x09"

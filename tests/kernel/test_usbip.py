@@ -199,7 +199,7 @@ def test_racing_ends_and_cancellations_never_give_both():
         assert ended | cancelled == set(numbers)
 
 
-def test_garbage_ends_the_connection():
+def test_invalid_bytes_end_the_connection():
     ours, theirs = socket.socketpair()
     with ours, theirs:
         ours.sendall(b"\xff" * HEADER)

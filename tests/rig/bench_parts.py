@@ -97,8 +97,8 @@ def program(wires: Wires, i2c: SimI2cBus, state: StateStore, *settings: str, **s
 
 
 def kill(wires: Wires, motion: Generator[Any, None, None] | None = None) -> None:
-    """Let the program die as by SIGKILL: no clean-up runs, the kernel closes its port, the servo continues."""
-    _dead.append(motion)  # a generator that is forgotten would be closed, and its exits run
+    """End the program as by SIGKILL: no clean-up runs, the kernel closes its port, the servo continues."""
+    _dead.append(motion)  # without a reference, the generator would be closed and its clean-up would run
     wires.serial.close()
 
 

@@ -1,4 +1,4 @@
-"""Random operations on a shared catalog, and a search for a serial order that explains what each of them saw.
+"""Random operations on a shared catalog, and a search for a serial order that explains their results.
 
 An operation takes effect at one moment between its call and its return (strict serializability). One that was killed
 may have had its effect at any later moment, or none.

@@ -1,4 +1,4 @@
-"""Programs that enroll and identify without end, and the same searches in one process; for `tests.servers.test_soak`.
+"""Programs that enroll and identify without end, and the same searches in one process, for `tests.servers.test_soak`.
 
 They import little: each kill is followed by a start.
 """

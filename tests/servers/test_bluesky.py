@@ -157,7 +157,7 @@ def test_plans_enroll_and_identify_and_tiled_reads_them_back(devices: BenchDevic
         client.context.http_client.close()
 
 
-def test_flyer_enrolls_in_one_turn(tmp_path: Path) -> None:
+def test_flyer_enrolls_in_one_revolution(tmp_path: Path) -> None:
     documents: Documents = []
     with flying(tmp_path) as (bench, catalog, _), BenchDevices(bench, hold=False) as devices:
         flyer = FlyScan(devices, catalog, "block", views=12)

@@ -1,4 +1,4 @@
-"""Jobs on a Dask cluster: the same results as without, and a dead worker costs its item alone."""
+"""Jobs on a Dask cluster: the same results as without one, and only the items of a dead worker are repeated."""
 
 import json
 import os
@@ -62,12 +62,12 @@ def test_error_of_an_item_is_raised(cluster: Cluster) -> None:
         list(map_on_cluster(half, [1, "x"], cluster))
 
 
-def test_dead_worker_costs_its_item_alone(tmp_path: Path) -> None:
+def test_only_the_items_of_a_dead_worker_are_repeated(tmp_path: Path) -> None:
     found = dict(map_on_cluster(partial(die_once, tmp_path), range(12), Cluster("local:2")))
     assert found == {n: n * n for n in range(12)}
     workers = {number: (tmp_path / str(number)).read_text().split() for number in range(12)}
     assert len(workers[3]) == 2
-    dead = workers[3][0]  # what lay finished there is done again, and nothing else
+    dead = workers[3][0]  # only its finished items are done again
     assert all(len(own) == 1 for own in workers.values() if own[0] != dead)
     assert all(len(own) <= 2 for own in workers.values())
 
@@ -90,7 +90,7 @@ def test_wrong_addresses_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
         list(map_on_cluster(half, [1], Cluster("local:two")))
 
 
-def test_catalog_jobs_give_the_same(cluster: Cluster, tmp_path: Path) -> None:
+def test_catalog_jobs_on_a_cluster_give_the_same_results(cluster: Cluster, tmp_path: Path) -> None:
     with Catalog.open(tmp_path, clock=VirtualClock()) as catalog:
         for number in range(4):
             true_fill(catalog, f"object {number}", 4, 10 * number)
@@ -186,7 +186,9 @@ def test_evaluation_survives_a_killed_worker_and_is_resumed(pictures: Path, tmp_
     assert results(tmp_path / "alone") == results(tmp_path / "spread") == results(tmp_path / "stopped")
 
 
-def test_import_gives_the_same(cluster: Cluster, pictures: Path, rig: Callable[..., Result]) -> None:
+def test_import_on_a_cluster_gives_the_same_catalog(
+    cluster: Cluster, pictures: Path, rig: Callable[..., Result]
+) -> None:
     versions = []
     for place, words in {"alone": ("--jobs", "1"), "spread": ("--cluster", cluster.address)}.items():
         done = rig("import", pictures, *words, "--set", f'catalog.path="{place}"')

@@ -1,4 +1,4 @@
-"""What several processes do to one catalog has a serial order."""
+"""The operations of several processes on one catalog have a serial order."""
 
 import random
 import uuid
@@ -40,7 +40,7 @@ BEGUN = [
         ([op(1, 0, 3, "list", result=[["mug", 0, 0]]), op(2, 5, 9, "begin", "mug", "a", result="done")], False),
     ],
 )
-def test_checker_knows_wrong_histories(history: list[Operation], is_serial: bool) -> None:
+def test_checker_detects_wrong_histories(history: list[Operation], is_serial: bool) -> None:
     assert (serial_order(history) is not None) is is_serial
 
 

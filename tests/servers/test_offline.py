@@ -65,7 +65,7 @@ def settings_of(place: CatalogPlace) -> list[str]:
     return [f"catalog.{key}={json.dumps(value)}" for key, value in values.items()]
 
 
-def test_copy_has_what_searches_compare_and_follows(place: CatalogPlace) -> None:
+def test_copy_has_the_searched_views_and_is_updated(place: CatalogPlace) -> None:
     with Catalog.open(place, clock=CLOCK) as catalog:
         assert not update_copy(catalog)
         with open_copy(place, CLOCK) as copy:
@@ -133,7 +133,7 @@ def test_name_is_reserved_while_the_server_answers(place: CatalogPlace) -> None:
         true_fill(shared, "gone", 1, 50)  # the reservation was given up
 
 
-def test_conflict_is_kept_and_resolved_by_a_person(
+def test_conflict_stays_until_the_operator_resolves_it(
     postgres: PostgresServer, place: CatalogPlace, rig: Callable[..., Result]
 ) -> None:
     postgres.stop()
@@ -326,7 +326,7 @@ def killed(kind: str) -> None:
 
 
 def finish(journal: Journal, name: str, step: int) -> None:
-    """Enroll an object, or what a killed program has left to do of it."""
+    """Enroll an object, or complete the enrollment of a killed program."""
     known = {one.name: one for one in journal.known_objects()}.get(name)
     if known is None:
         true_fill(journal, name, 2, step)

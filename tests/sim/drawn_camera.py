@@ -16,7 +16,7 @@ QUIET = NoiseModel.none()
 
 @dataclass(frozen=True)
 class Card:
-    """Fills the frame with a picture, whatever the table does."""
+    """A card that fills the frame with a picture at any table angle."""
 
     picture: Image
     name: str = "card"
@@ -52,7 +52,7 @@ def camera(world: World, **values: float) -> SimCapture:
 
 
 def frame(capture: SimCapture) -> NDArray[np.float64]:
-    """Return the next frame that is exposed entirely under what holds now."""
+    """Return the next frame that is exposed completely under the present conditions."""
     capture._clock.sleep(0.5)
     for _ in range(5):  # the buffers
         assert capture.grab()

@@ -1,4 +1,4 @@
-"""The simulated camera: image formation, noise, settings, and that the same seed gives the same bytes."""
+"""The simulated camera: image formation, noise, settings, and equal bytes for equal seeds."""
 
 from dataclasses import dataclass
 

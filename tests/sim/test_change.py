@@ -1,4 +1,4 @@
-"""Another day at the simulated bench: what differs, by how much, and by which seed."""
+"""Changes of the simulated bench: the changed properties, their size, and their seeds."""
 
 import numpy as np
 import pytest

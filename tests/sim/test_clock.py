@@ -1,4 +1,4 @@
-"""The virtual clock: time moves only for who waits, and timers fire at their time and in their order."""
+"""The virtual clock: time advances only during sleeps, and timers fire at their time and in their order."""
 
 from datetime import UTC, datetime, timedelta
 
@@ -96,7 +96,7 @@ def test_civil_time_starts_at_the_given_time_and_advances() -> None:
     assert clock.utc() - timedelta(days=1) == datetime(2024, 2, 29, 12, tzinfo=UTC)
 
 
-def test_error_in_a_timer_reaches_the_sleeper_and_keeps_other_timers() -> None:
+def test_error_in_a_timer_is_raised_by_sleep_and_other_timers_stay() -> None:
     clock = VirtualClock()
     fired: list[int] = []
 

@@ -22,7 +22,7 @@ BYTE_S = 9 / 400_000
 
 
 class Memory:
-    """256 registers behind a pointer; keeps what the pins saw; takes at most `accepts` bytes a message."""
+    """256 registers behind a pointer; records the signals, and accepts at most `accepts` bytes of a message."""
 
     def __init__(self) -> None:
         self.cells = bytearray(256)
@@ -170,7 +170,7 @@ def test_faults_carry_the_kernels_numbers(wires: Wires) -> None:
     wires.bus.cut_read(2)
     with fails(EIO):
         read()
-    assert wires.memory.pointer == 2  # so many bytes are gone
+    assert wires.memory.pointer == 2  # this number of bytes was read
     assert read() == [0, 0, 0, 0]
 
     wires.bus.stuck = True

@@ -1,4 +1,4 @@
-"""Trajectories and the platter's answer to them, as properties of any motion."""
+"""Properties of trajectories and of the platter's motion, for any motion."""
 
 from math import sqrt
 
@@ -75,7 +75,7 @@ def test_move_from_rest_takes_the_closed_forms_time(x: float, goal: float, v_max
     expected = distance / v_max + v_max / a_max if reaches_v_max else 2 * sqrt(distance / a_max)
     assert path.end_s == pytest.approx(expected, rel=1e-9, abs=1e-9)
     position, _ = path.at(samples(path))
-    assert np.all(np.diff(position) * np.sign(goal - x) >= -1e-9)  # straight there
+    assert np.all(np.diff(position) * np.sign(goal - x) >= -1e-9)  # without a detour
 
 
 @quick
@@ -177,7 +177,7 @@ def test_backlash_is_a_hysteresis(play_deg: float, there: float, back: float) ->
         nxt = Platter(play_deg, 0.0, 0.0)
         shaft = follower.shaft.at(10.0 * k)
         nxt.follow(to_position(10.0 * k, float(shaft[0]), 0.0, goal, 50.0, 500.0), follower)
-        assert float(nxt.at(10.0 * k)) == pytest.approx(x)  # nothing jumps
+        assert float(nxt.at(10.0 * k)) == pytest.approx(x)  # without a jump
         follower = nxt
         side = 1 if k else -1
         assert float(follower.at(10.0 * k + 9.0)) == pytest.approx(goal + side * play_deg / 2)

@@ -338,10 +338,10 @@ def test_rate_and_gravity_come_through_the_tilted_mounting() -> None:
 @given(views_ms=st.lists(st.integers(1, 120), min_size=1, max_size=12), seed=st.integers(0, 2**32))
 @examples(7)
 def test_samples_do_not_depend_on_the_reading_rate(views_ms: list[int], seed: int) -> None:
-    """The same seed gives the same bytes, in whatever portions they are fetched."""
+    """The same seed gives the same bytes, for any sizes of the portions."""
 
     def fetch(views: list[int]) -> bytes:
-        # Straight at the device, where time does not pass while it talks.
+        # Reads the device directly, so that no time passes during the transfers.
         world = World(seed=seed)
         sensor = SimMpu6050(world)
 

@@ -36,7 +36,7 @@ def render(solid: Visible, azimuth_deg: float, offset_mm: tuple[float, float] = 
 
 
 def middle(image: Image, colour: tuple[int, int, int]) -> tuple[float, float]:
-    """Return the centroid (x, y) of what is coloured like ``colour``, whatever its shading."""
+    """Return the centroid (x, y) of the pixels with the hue of ``colour``, with any shading."""
     hue = np.array(colour, dtype=float) / np.linalg.norm(colour)
     pixels = image.astype(float)
     length = np.linalg.norm(pixels, axis=2)
@@ -179,7 +179,7 @@ def test_confusable_objects_differ_from_some_sides_only(one: str, other: str) ->
 
 
 @pytest.mark.parametrize(("one", "other"), MORE_CONFUSABLE)
-def test_more_twins_differ_little_but_visibly(one: str, other: str) -> None:
+def test_further_twins_differ_little_but_visibly(one: str, other: str) -> None:
     apart = [difference(render(twins()[one], o), render(twins()[other], o)) for o in (0.0, 90.0, 180.0, 270.0)]
     assert 0.02 < max(apart) < 4
 

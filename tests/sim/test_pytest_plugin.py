@@ -1,4 +1,4 @@
-"""The pytest plug-in, as another project meets it: in a folder of its own, in a process of its own."""
+"""The pytest plug-in in another project: in its own folder and its own process."""
 
 import re
 import subprocess

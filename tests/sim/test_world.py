@@ -1,4 +1,4 @@
-"""The world: one motion for all who look, now and in the past, and the scene on the platter."""
+"""The world: one motion for all devices, now and in the past, and the scene on the platter."""
 
 from collections.abc import Callable
 
@@ -137,7 +137,7 @@ def test_object_is_put_on_the_platters_mark() -> None:
     world = World(noise=perfect)
     world.drive(rest(0.0, 40.0))
     world.put(Mug(), yaw_deg=100.0, offset_mm=(1.0, -2.0))
-    assert world.scene.yaw_deg == 100.0  # wherever the table stands
+    assert world.scene.yaw_deg == 100.0  # at any table angle
     assert world.scene.offset_mm == (1.0, -2.0)
     assert world.scene.object is not None
     world.put(None)

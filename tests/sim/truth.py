@@ -1,4 +1,4 @@
-"""What a simulated world knows and no device measures."""
+"""True values of a simulated world that no device measures."""
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray

@@ -14,7 +14,7 @@ angle = st.floats(-1e6, 1e6)
     ("angle_deg", "in_360", "in_180"),
     [(0, 0, 0), (360, 0, 0), (-90, 270, -90), (180, 180, -180), (-180, 180, -180), (725, 5, 5), (179.5, 179.5, 179.5)],
 )
-def test_wrap_of_known_angles(angle_deg: float, in_360: float, in_180: float) -> None:
+def test_known_angles_are_wrapped(angle_deg: float, in_360: float, in_180: float) -> None:
     assert wrap360(float(angle_deg)) == in_360
     assert wrap180(float(angle_deg)) == in_180
 

@@ -34,7 +34,7 @@ def rest(index: DenseIndex) -> StoppingRule:
 
 
 def pass_by(session: ArcSession, of: Views, row: int, degrees: float) -> list[Outcome]:
-    """Show the views of an object from one of them on, a frame every 4°; return the outcome after each."""
+    """Add the views of an object from one view on, a frame every 4°; return the outcome after each."""
     rows = of.of(int(of.object_index[row]))
     found = []
     for angle in np.arange(0.0, degrees + 1, 4.0).tolist():
@@ -108,7 +108,7 @@ def test_search_ends_after_the_arc_as_ambiguous_or_unknown(index: DenseIndex, re
     assert outcomes.index(Outcome.UNKNOWN) == (len(rest.open_set_thresholds) - 1) * SIDE_DEG // 4
 
 
-def test_promised_rate_counts_only_where_a_search_can_end(index: DenseIndex, rest: StoppingRule) -> None:
+def test_error_rate_counts_only_decisions_that_can_end_a_search(index: DenseIndex, rest: StoppingRule) -> None:
     searches = leave_one_out(index, views=DECISIONS, searches=4, step_deg=STEP_DEG, weight=STEP_WEIGHT)
     rest = replace(rest, error_rate=0.05)
     correct = searches.correct.copy()

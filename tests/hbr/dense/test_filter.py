@@ -29,7 +29,7 @@ def catalog(seed: int, objects: int = 4, *, ragged: bool = True) -> Views:
 
 
 def written_out(queries: np.ndarray, angles: list[float], views: Views, omega: float, power: float = 4.0) -> np.ndarray:
-    """A_n(j, φ), object by object, bin by bin, view by view."""
+    """Return A_n(j, φ), computed object by object, bin by bin, view by view."""
     total = np.zeros((len(views.object_names), BINS))
     for j in range(len(views.object_names)):
         rows = views.of(j)

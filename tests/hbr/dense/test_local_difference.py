@@ -59,7 +59,7 @@ def test_views_of_a_twin_are_recognised_by_its_sticker(objects, sticker: bool) -
     assert away[1] < 16
 
 
-def test_nothing_is_decided_where_twins_look_the_same(objects) -> None:
+def test_comparison_decides_nothing_if_twins_look_the_same(objects) -> None:
     plain, _ = objects
     found = compare_objects([shown(4.0, sticker=False, noise=91)], (plain, plain[::-1]), ([0.0], [0.0]))
     assert found.winner is None
@@ -84,7 +84,7 @@ def test_small_displacements_are_no_difference_but_missing_details_are() -> None
         assert pixel_difference(one, other)[:, 20:22].min() > 60
 
 
-def test_views_are_compared_that_lie_apart_the_last_ones_first() -> None:
+def test_last_views_that_are_far_apart_are_compared() -> None:
     assert chosen_views([0.0, 5.0, 90.0, 359.0]) == [2, 3]
     assert len(chosen_views(np.arange(0.0, 360.0, 3.0).tolist())) == MOST_VIEWS
 

@@ -1,4 +1,4 @@
-"""The next view: the turn after which the hypotheses differ most, in the cable's reach and worth its way."""
+"""The next view: the rotation with the best balance of expected information and time within the cable budget."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ STEP = 15
 
 
 def twins() -> Views:
-    """Two objects that differ from 180 to 210 degrees only, and a third that is nothing like them."""
+    """Return two objects that differ only from 180 to 210 degrees, and a third one that is different."""
     rng = np.random.default_rng(0)
     azimuth = np.arange(0, 360, STEP, dtype=float)
     rotation = np.radians(azimuth)[:, None]
@@ -44,7 +44,7 @@ def test_twins_are_distinguished_at_the_azimuth_of_their_difference(azimuth: flo
     assert low <= see.rotation_deg <= high
     assert see.pair in ((0, 1), (1, 0))
     assert see.orientation_deg == see.rotation_deg % 360
-    # the baseline sees it, too
+    # the baseline finds the difference, too
     assert low <= most_informative_rotation(update_belief(viewed(azimuth), 0.0, INDEX), beta=60.0) <= high
 
 
@@ -78,7 +78,7 @@ def test_visited_view_has_no_expected_gain() -> None:
 @examples(5)
 @given(st.integers(0, 23), st.floats(5, 100))
 def test_expected_confusion_equals_the_formula(start: int, sharpness: float) -> None:
-    """Once more from the posterior of single hypotheses that the decision keeps, written out."""
+    """The expected values are computed from the posterior of single hypotheses, with explicit loops."""
     from hbr.dense.next_view import strongest
 
     belief = update_belief(viewed(start * STEP), 20.0, INDEX)

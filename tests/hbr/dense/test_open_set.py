@@ -34,7 +34,8 @@ def plain(index: DenseIndex) -> StoppingRule:
 
 
 def drawn(searches: int = 500, seed: int = 0) -> ShiftedSearches:
-    """Searches whose known objects score less under a stronger change; unknown ones score most without any."""
+    """Return searches whose known objects score less under a stronger change; unknown ones score most without a
+    change."""
     rng = np.random.default_rng(seed)
     strength = np.array(STRENGTHS)[np.arange(searches) % len(STRENGTHS)]
     shape = searches, VIEWS, len(NUMBERS)
@@ -69,7 +70,7 @@ def test_threshold_is_lower_on_a_bench_that_is_known_to_have_changed(plain: Stop
 
 
 def by_bench(plain: StoppingRule) -> StoppingRule:
-    """A rule with which each object scores 0, and whose thresholds depend on the bench."""
+    """Return a rule with which each object scores 0, and whose thresholds depend on the bench."""
     score = np.zeros((VIEWS, len(NUMBERS)))
     return replace(
         plain,
@@ -90,7 +91,7 @@ def by_bench(plain: StoppingRule) -> StoppingRule:
         (False, Outcome.FOUND, Outcome.FOUND),
     ],
 )
-def test_decision_depends_on_what_is_known_of_the_bench(
+def test_decision_depends_on_whether_the_bench_is_known_to_be_the_same(
     index: DenseIndex, plain: StoppingRule, same_bench: bool | None, early: Outcome, last: Outcome
 ) -> None:
     rule, views = by_bench(plain), index.views
@@ -139,6 +140,6 @@ def test_rule_states_that_twins_are_accepted_more_often_than_promised(plain: Sto
 
 
 def renamed(views: Views) -> Views:
-    """The same objects by other names."""
+    """Return the same objects with other names."""
     names = tuple(f"twin of {name}" for name in views.object_names)
     return Views(views.descriptors, views.azimuth_deg, views.object_index, names, views.descriptor)

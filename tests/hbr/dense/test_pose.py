@@ -56,7 +56,7 @@ def ring(period: int, seed: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("period", "period_deg"), [(36, 360.0), (18, 180.0), (9, 90.0), (1, 0.0)])
-def test_symmetry_is_seen_at_the_answer(period: int, period_deg: float) -> None:
+def test_symmetry_is_reported_with_the_answer(period: int, period_deg: float) -> None:
     azimuth_deg = np.arange(36) * 10.0
     objects = [
         Views.of_object(name, ring(size, seed), azimuth_deg) for name, size, seed in (("a", period, 1), ("b", 36, 2))

@@ -61,7 +61,7 @@ def test_conformal_threshold_rejects_nothing_with_too_few_scores() -> None:
 def test_min_confidence_is_the_smallest_that_keeps_the_error_rate() -> None:
     rng = np.random.default_rng(0)
     confidence = rng.uniform(0.3, 1, (2000, 1))
-    correct = rng.random((2000, 1)) < confidence  # as probable as it says
+    correct = rng.random((2000, 1)) < confidence  # the confidences are the true probabilities
     least = min_confidence_for(confidence, correct, 0.05)
     assert (~correct[confidence >= least]).mean() <= 0.05
     assert 0.85 < least < 0.95  # the mean above it is 0.95
@@ -78,7 +78,7 @@ def test_leave_one_out_searches_for_each_object_between_its_own_views() -> None:
     assert (found.unknown.object_index != found.known.object_index).all()
     assert (found.unknown.score < found.known.score).all()
     assert found.correct.mean() == 1
-    # The first view of the first search by hand: 0.618 of a step aside, to the right.
+    # The first view of the first search by hand: 0.618 of a step to the right.
     rows = views.of(0)
     similar = tanimoto(views.descriptors[rows[0]], views.descriptors)[0]
     similar[rows[0]] = 1 - 0.618034 * (1 - similar[rows[17]])
@@ -152,7 +152,9 @@ def test_small_catalog_guarantees_no_rate_and_reports_the_data_it_needs() -> Non
         ((-inf,), 1.1, 1, 1, Outcome.AMBIGUOUS, StopReason.MAX_VIEWS),
     ],
 )
-def test_decisions(thresholds, min_confidence, views, max_views, outcome, reason) -> None:
+def test_decision_follows_the_confidence_and_the_open_set_score(
+    thresholds, min_confidence, views, max_views, outcome, reason
+) -> None:
     everything = catalog(3)
     usual = np.zeros((3, len(thresholds)))
     rule = StoppingRule(BETA, min_confidence, usual, thresholds, 0.01, 0.02, 0.0, 100)

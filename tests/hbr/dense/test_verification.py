@@ -1,4 +1,4 @@
-"""A doubtful leader is found if its enrolled views explain the pixels of the views, whatever the light."""
+"""A doubtful leader is found if its enrolled views explain the pixels of the views in any light."""
 
 from dataclasses import replace
 from math import inf
@@ -31,7 +31,7 @@ SIDE = 160
 def painted(
     seed: int, *, moved: tuple[float, float] = (0, 0), light: tuple[float, float, float] = (1, 1, 1)
 ) -> LocalView:
-    """A box with coloured spots, the same for the same seed, on a background of its own."""
+    """Return a box with coloured spots, the same for the same seed, on its own background."""
     rng = np.random.default_rng(seed)
     crop = np.full((SIDE, SIDE, 3), rng.integers(60, 120, 3), np.uint8)
     mask = np.zeros((SIDE, SIDE), np.uint8)
@@ -85,7 +85,7 @@ def test_outcome_follows_from_fit_and_open_set_score(fitted: float, confidence: 
 
 
 @pytest.mark.parametrize("fitted", [0.5, 0.8])
-def test_on_an_unchanged_bench_an_object_fits_better_before_it_is_found(rule: StoppingRule, fitted: float) -> None:
+def test_object_on_an_unchanged_bench_needs_a_better_fit(rule: StoppingRule, fitted: float) -> None:
     renewed = replace(rule, leave_one_out_thresholds=(0.9,) * 4)
     assert found_from(renewed, True) == FOUND_FROM_SAME_BENCH > FOUND_FROM
     assert found_from(renewed, None) == found_from(renewed, False) == FOUND_FROM
@@ -119,7 +119,7 @@ def rule(index: DenseIndex) -> StoppingRule:
         (-inf, 4, Outcome.UNKNOWN, False),
     ],
 )
-def test_ends_between_certain_scores_are_doubtful(
+def test_search_that_ends_between_two_scores_is_doubtful(
     rule: StoppingRule, score: float, views: int, outcome: Outcome, doubtful: bool
 ) -> None:
     assert is_doubtful(rule, decision(score, outcome=outcome), views, KIND) is doubtful

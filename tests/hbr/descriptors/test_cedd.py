@@ -59,7 +59,7 @@ side = st.one_of(st.integers(1, 45), st.sampled_from([2, 39, 40, 41, 79, 80, 81,
 
 @st.composite
 def images(draw: st.DrawFn) -> Image:
-    """Noise, patches of few colours, gradients and greys, which together reach every branch of the definition."""
+    """Draw noise, patches of few colours, gradients and greys, which together reach every branch of the definition."""
     height, width = draw(side), draw(side)
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     patch = draw(st.sampled_from([1, 2, 3, 5, 16]))
@@ -115,7 +115,7 @@ def test_areas_with_a_whole_mean_round_like_the_reference() -> None:
 
 
 def drawing(name: str, height: int, width: int) -> Image:
-    """Greys with mostly integer sums, and many equal quarters of blocks."""
+    """Return greys with mostly integer sums, and many equal quarters of blocks."""
     y, x = np.mgrid[:height, :width]
     grey = {
         "flat": 127 + 0 * x,

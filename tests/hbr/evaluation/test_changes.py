@@ -8,7 +8,7 @@ def result(leader: str, outcome: hbr.Outcome, views: int = 1, left_out: hbr.Outc
     return SearchResult((leader,) * 4, outcome, leader, views, left_out=left_out)
 
 
-def test_shares_of_enrolled_objects_and_of_others() -> None:
+def test_shares_of_enrolled_objects_and_of_others_are_counted() -> None:
     known = {
         "a": [
             result("a", hbr.Outcome.FOUND, 1, hbr.Outcome.UNKNOWN),
@@ -42,6 +42,6 @@ def test_answers_of_the_comparison_count_as_decided() -> None:
     assert (found["right_by_comparison"], found["wrong_by_comparison"]) == (0.25, 0.25)
 
 
-def test_every_so_many_th_object_is_never_enrolled() -> None:
+def test_one_of_every_n_objects_is_never_enrolled() -> None:
     changes = Changes(every=3)
     assert [changes.is_enrolled(place) for place in range(6)] == [True, True, False, True, True, False]

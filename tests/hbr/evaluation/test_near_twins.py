@@ -22,7 +22,7 @@ SIZE = (96, 96)
 
 
 def drawn(kind: int, angle_deg: float, *, sticker: bool) -> np.ndarray:
-    """A cylinder with painted spots before a dark background; the sticker is a spot that one twin has alone."""
+    """Draw a cylinder with spots before a dark background; the sticker is a spot that only one twin has."""
     image = np.zeros((*SIZE, 3), np.uint8)
     cv2.rectangle(image, (20, 12), (76, 84), (90 + 60 * kind, 150, 200 - 50 * kind), -1)
     rng = np.random.default_rng(kind)

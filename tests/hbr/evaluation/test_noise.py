@@ -68,7 +68,7 @@ def test_invalid_noise_is_rejected(text: str) -> None:
 
 
 def ball(size: int = 64) -> np.ndarray:
-    """A bright ball with a black pupil, on a dark ground with some noise."""
+    """Return a bright ball with a black pupil, on a dark ground with some noise."""
     y, x = np.indices((size, size)) - (size - 1) / 2
     image = np.random.default_rng(0).integers(0, 20, (size, size, 3), dtype=np.uint8)
     image[np.hypot(x, y) < size / 3] = (40, 90, 220)

@@ -1,4 +1,4 @@
-"""Queries that differ from the enrolled views in place, light, and what is around."""
+"""Queries that differ from the enrolled views in place, light and surroundings."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from hbr.evaluation.scenes import HEIGHT, WIDTH, other_bench, plain_bench
 
 
 def ball() -> np.ndarray:
-    """A ball of two colours in the dark, 128 x 128."""
+    """Return a ball of two colours before a dark background, 128 x 128."""
     y, x = np.indices((128, 128))
     inside = (y - 64) ** 2 + (x - 64) ** 2 < 40**2
     image = np.full((128, 128, 3), 20, np.uint8)
@@ -26,7 +26,7 @@ def captured(text: str, seed: int = 0, bench: np.ndarray | None = None) -> tuple
 
 
 def differs(text: str) -> float:
-    """Mean change of the grey levels over some draws."""
+    """Return the mean change of the grey levels over some draws."""
     return float(np.mean([np.abs(captured(text, seed)[0].astype(int) - ball()).mean() for seed in range(12)]))
 
 
@@ -93,7 +93,7 @@ def test_perturbations_round_trip_as_text() -> None:
 
 
 def test_bench_descriptor_is_robust_to_another_bench_and_cedd_is_not() -> None:
-    """The whole way that `rig eval --background other-bench` goes."""
+    """The test runs all steps of `rig eval --background other-bench`."""
     conditions = {
         name: Condition(background="other-bench", perturbations=Perturbations.parse("shift:1+gain:2"), descriptor=name)
         for name in ("cedd", "edges+colours")

@@ -17,7 +17,7 @@ ALL = choose_methods(["all"])
 
 
 def world(seed: int = 0, objects: int = 6) -> tuple[Views, np.ndarray]:
-    """Objects whose levels change slowly around them, and all their views again with errors: the queries."""
+    """Return objects whose levels change slowly around them, and all their views with errors as the queries."""
     rng = np.random.default_rng(seed)
     azimuth = np.arange(0, 360, STEP, dtype=float)
     rotation = np.radians(azimuth)[:, None]
@@ -43,7 +43,7 @@ def run(j: int, methods: tuple[Method, ...] = ALL, protocol: Protocol = PROTOCOL
 @pytest.mark.parametrize("name", ["hbr", "hbr-visual", "hbr-0-orient", "ahbr", "ahbr-90", "coin", "sweep-90"])
 @pytest.mark.parametrize("removal", ["near", "paper79", "queries"])
 def test_trial_equals_the_literal_protocol(name: str, removal: Removal) -> None:
-    """Every number once more from `retrieve`, `lead` and `next_view` on a model with the views taken out."""
+    """Each expected number comes from `retrieve`, `lead` and `next_view` on a model without the removed views."""
     method, protocol = METHODS[name], replace(PROTOCOL, removal=removal, drift_deg=1.0)
     j = 2
     own = VIEWS.of(j)

@@ -9,7 +9,7 @@ PAIR = (METHODS["ahbr"], METHODS["hbr"])
 
 
 def runs_of(rank: list, **arrays: list) -> Runs:
-    """Runs of one trial an object: methods x objects x views."""
+    """Return runs with one trial for each object: methods x objects x views."""
     ranks = np.array(rank, np.int32)[:, :, None]
     runs = Runs.blank(*ranks.shape)
     runs.rank[:] = ranks

@@ -23,7 +23,7 @@ def test_mcnemar_equals_the_binomial_test(a: int, b: int) -> None:
     assert mcnemar_exact(a, b) == pytest.approx(expected, rel=1e-9)
 
 
-def test_mcnemar_by_hand() -> None:
+def test_mcnemar_equals_values_computed_by_hand() -> None:
     assert mcnemar_exact(6, 0) == 2 / 64
     assert mcnemar_exact(1, 3) == mcnemar_exact(3, 1) == 2 * 5 / 16
 

@@ -27,7 +27,7 @@ KIND = "edges+colours"
 
 @st.composite
 def images(draw: st.DrawFn) -> np.ndarray:
-    """Noise, few greys, patches and flat images of any size, also as views with other strides."""
+    """Return noise, few greys, patches and flat images of any size, also as views with other strides."""
     rng = np.random.default_rng(draw(seeds))
     height, width = (draw(st.one_of(st.integers(1, 90), st.sampled_from([159, 160, 241, 640]))) for _ in range(2))
     patch, channels = draw(st.sampled_from([1, 2, 8, 50])), draw(st.sampled_from([1, 3]))
@@ -119,7 +119,7 @@ def test_tanimoto_has_the_bits_of_the_reference(queries: int, count: int, length
 @compiled
 @examples(12)
 @given(st.integers(1, 300), st.integers(0, 50), st.integers(1, 320), seeds)
-def test_the_paper_s_search_returns_what_it_returns_without_kernels(count: int, more: int, k: int, seed: int) -> None:
+def test_paper_search_is_the_same_with_and_without_kernels(count: int, more: int, k: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
     levels = (rng.integers(0, 8, (count + more, 144)) * (rng.random((count + more, 144)) < 0.1)).astype(np.uint8)
     levels[rng.integers(0, len(levels), len(levels) // 3)] = levels[0]  # equal similarities

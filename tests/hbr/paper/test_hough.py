@@ -21,7 +21,7 @@ def one_hot(*levels: tuple[int, int]) -> np.ndarray:
 
 @st.composite
 def small_cases(draw: st.DrawFn) -> tuple[np.ndarray, list[float], Views, float, int]:
-    """Model sets with few bins and levels, so that similarities are equal; azimuths regular or not."""
+    """Draw model sets with few bins and levels, so that similarities are equal; azimuths are regular or not."""
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     count = draw(st.integers(1, 14))
     steps = draw(st.integers(1, 4))
@@ -33,7 +33,7 @@ def small_cases(draw: st.DrawFn) -> tuple[np.ndarray, list[float], Views, float,
         descriptors[:, :bins] = rng.integers(0, top + 1, (n, bins))
         return descriptors
 
-    # multiples of an eighth of a degree: differences are exact, so that the oracle's ties are ties
+    # multiples of an eighth of a degree: differences are exact, so that ties of the reference are ties
     azimuth = (5 * rng.integers(0, 72, count)).astype(np.float64)
     if draw(st.booleans()):
         azimuth = rng.integers(0, 2880, count) / 8.0
@@ -100,7 +100,7 @@ def by_hand(extension: Extension, omega: float, list_length: int = 1) -> tuple[A
 @pytest.mark.parametrize(
     ("extension", "omega", "expected"),
     [
-        # lists: {view 0}, {view 2}; view 2 is 180 from view 0, a quarter turn more than the camera's 90: 2 - 1 * 0.25
+        # lists: {view 0}, {view 2}; view 2 is 180 from view 0, 90 degrees more than the camera's 90: 2 - 1 * 0.25
         ("visual", 1.0, [("a", 1.75, [0, 2])]),
         ("orient", 1.0, [("a", 1.75, [0, 2])]),
         # view 0 leads to view 1 at the second query (1 + 0.5, no penalty), view 2 back to view 1 at the first
@@ -109,13 +109,13 @@ def by_hand(extension: Extension, omega: float, list_length: int = 1) -> tuple[A
         ("orient", 4.0, [("a", 1.0, [0, 2])]),
     ],
 )
-def test_extensions_of_a_known_example(
+def test_extensions_add_the_views_of_a_known_example(
     extension: Extension, omega: float, expected: list[tuple[str, float, list[int]]]
 ) -> None:
     assert by_hand(extension, omega)[0] == expected
 
 
-def test_missing_object_of_a_known_example() -> None:
+def test_missing_object_of_a_known_example_is_added() -> None:
     """b is only on the second list: its one view is also used for the first query, 90° off."""
     for extension in EXTENSIONS:
         found, ranking = by_hand(extension, 1.0, list_length=2)

@@ -18,7 +18,7 @@ def views_of(descriptors: np.ndarray) -> Views:
 
 
 def adversarial(rng: np.random.Generator, count: int) -> np.ndarray:
-    """Rows that are difficult for a search: zeros, equal rows, ties, one-hot, saturated, sparse, dense."""
+    """Draw rows that are difficult for a search: zeros, equal rows, ties, one-hot, saturated, sparse, dense."""
     kinds = [
         np.zeros((1, 144), np.uint8),
         np.full((1, 144), 7, np.uint8),

@@ -51,7 +51,7 @@ def test_object_is_found_by_the_empty_table_image_in_any_illumination(patterned:
     assert seen.agreement == 1
     assert box_error(seen.box) < 0.06
     assert seen.crop.shape == (CROP_PX, CROP_PX, 3)
-    if patterned:  # not taken for grey
+    if patterned:  # not accepted as grey
         same = segment(with_object(empty), empty_table=empty)
         assert same.issues == (Issue(IssueCode.BACKDROP_COLOURS),)
         np.testing.assert_allclose(same.gains, 1, atol=0.03)

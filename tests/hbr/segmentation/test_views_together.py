@@ -126,7 +126,7 @@ def test_no_answer_on_a_guessed_view_while_another_one_is_possible() -> None:
     session = hbr.DenseSession(index, rule)
     decision = session.add(views.levels[0], 0.0, reliable=views.reliable)
     assert (decision.outcome, decision.reason) == (hbr.Outcome.CONTINUE, hbr.StopReason.BADLY_SEGMENTED)
-    assert session.end().outcome is hbr.Outcome.FOUND  # the table cannot turn: no further view
+    assert session.end().outcome is hbr.Outcome.FOUND  # the table cannot rotate: no further view
     other = np.full_like(views.levels[0], 3)
     unknown = hbr.DenseSession(index, replace(rule, open_set_thresholds=(2.0,)))
     assert unknown.add(other, 0.0, reliable=False).outcome is hbr.Outcome.CONTINUE

@@ -1,6 +1,6 @@
-"""Runs in the virtual machine: does what the tests ask for, over one connection to the computer that runs them.
+"""The agent in the virtual machine: carries out requests of the tests, over one connection to their computer.
 
-A request is a line of JSON; so is its answer. Requests run side by side, each in its own thread.
+A request and its answer are a line of JSON each. Requests run in parallel, each in its own thread.
 """
 
 import json
@@ -34,7 +34,7 @@ IMPORTED = (
     *("rig.plans.watch", "rig.report.contact_sheet", "rig.search.current_model", "dynamixel_easy_sdk"),
     *("rich._emoji_codes", "typer._adapters"),
 )
-"""What the programs import, once for all of them: an emulated processor takes seconds for it."""
+"""Modules that are imported once for all programs, because an emulated processor takes seconds for it."""
 
 
 class Agent:
@@ -110,7 +110,7 @@ class Agent:
         return found
 
     def do_output(self, pid: int) -> str:
-        """Return what the process has printed so far."""
+        """Return the output of the process so far."""
         return "".join(text for _, text in self._outputs[pid])
 
     def do_runs(self, pid: int) -> bool:

@@ -20,7 +20,7 @@ class Speed(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """What a device says about itself; ``kind`` is class, subclass and protocol."""
+    """The identity of a device; ``kind`` is class, subclass and protocol."""
 
     vendor: int
     product: int

@@ -111,7 +111,7 @@ class UsbDevice:
         """Receive the host's bytes."""
 
     def asked(self, endpoint: int) -> None:
-        """Learn that the host waits for bytes from an endpoint."""
+        """Note that the host waits for bytes from an endpoint."""
 
     def halt_cleared(self, endpoint: int) -> None:
         """Start an endpoint again."""

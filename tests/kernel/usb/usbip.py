@@ -103,7 +103,7 @@ class Hang(Exception):
 
 
 class Device(Protocol):
-    """What `Plug` needs of a device."""
+    """The interface of a device for `Plug`."""
 
     def control(self, setup: bytes, data: bytes) -> bytes:
         """Return the answer to a control transfer; raises `Stall` or `Hang`."""
@@ -112,7 +112,7 @@ class Device(Protocol):
         """Receive the host's bytes."""
 
     def asked(self, endpoint: int) -> None:
-        """Learn that the host waits for bytes from an endpoint."""
+        """Note that the host waits for bytes from an endpoint."""
 
 
 class Plug:

@@ -32,7 +32,7 @@ HEADER_BYTES: Final = 12
 CLOCK_HZ: Final = 30_000_000
 LONGEST_WAIT_S: Final = 0.05
 EVERY: Final = 5
-"""The camera exposes every so many frames: an emulated processor does not keep up with more."""
+"""The camera exposes one of this many frames, because an emulated processor does not process more."""
 
 _CAMERA_UNIT, _PROCESSING_UNIT, _OUTPUT = 1, 2, 3
 _VIDEO, _CONTROL_INTERFACE, _STREAM_INTERFACE = 14, 1, 2
@@ -216,7 +216,7 @@ class Webcam(UsbDevice):
         self._wanted.set()
 
     def halt_cleared(self, endpoint: int) -> None:
-        """Stop the stream: so a host ends a stream of bulk transfers."""
+        """Stop the stream, because a host ends a stream of bulk transfers in this way."""
         self._streaming.clear()
 
     # -- requests ---------------------------------------------------------------------------------------------------
@@ -295,7 +295,8 @@ class Webcam(UsbDevice):
             self._send(encoded(image, self._mode[0]), stream)
 
     def _send(self, data: bytes, stream: int) -> None:
-        """Send an image of a stream in payloads, as the host asks for them; nothing of it in the next stream."""
+        """Send an image of a stream in payloads, as the host asks for them; no part of it is sent in the next
+        stream."""
         self._odd = not self._odd
         position = 0
 

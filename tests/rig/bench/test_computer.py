@@ -24,7 +24,7 @@ def test_serial_port_has_adapter_stable_name_and_latency(computer):
     computer.serial_port("ttyUSB10", serial="FT1", latency_ms=16)
     computer.serial_port("ttyUSB9", serial="FT2", latency_ms=None)
     first, second = host(computer).serial_ports()
-    assert (first.path, second.path) == ("/dev/ttyUSB9", "/dev/ttyUSB10")  # as people count
+    assert (first.path, second.path) == ("/dev/ttyUSB9", "/dev/ttyUSB10")  # in numeric order
     assert (first.latency_ms, second.latency_ms) == (None, 16)
     assert second.name == "FTDI USB <-> Serial Converter"
     assert second.usb["serial"] == "FT1"

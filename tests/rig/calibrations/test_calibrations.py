@@ -210,6 +210,6 @@ def test_every_rejection_has_words(code):
     assert code.value.format_map(Values())
 
 
-def test_rejection_in_words():
+def test_rejection_states_its_numbers():
     assert str(FEW) == "Only 2 reversals can be used, 6 are needed (the sensor lost 3 samples)."
     assert str(Rejection(FEW.code, {**FEW.values, "reasons": []})) == "Only 2 reversals can be used, 6 are needed."

@@ -1,4 +1,4 @@
-"""Damage of what a command does not load is found beside its work; listings compare what they list."""
+"""Damage of rows that a command does not load is found in the background; listings compare the rows that they list."""
 
 import json
 import shutil
@@ -22,7 +22,7 @@ pytestmark = pytest.mark.sqlite
 
 @pytest.fixture(scope="module")
 def sample(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A catalog with a complete, a superseded, an unfinished and a deleted enrollment, and 120 entries in its log."""
+    """Return a catalog with a complete, a superseded, an unfinished and a deleted enrollment, and 120 log entries."""
     folder = tmp_path_factory.mktemp("sample") / "catalog"
     with pytest.MonkeyPatch.context() as patch, Catalog.open(folder, clock=VirtualClock()) as catalog:
         without_waiting(patch)

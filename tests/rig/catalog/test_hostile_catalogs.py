@@ -46,7 +46,7 @@ SECRET = b"not a part of the catalog"
 
 @pytest.fixture(scope="module")
 def sample(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A catalog with a complete, a superseded, an unfinished and a deleted enrollment."""
+    """Return a catalog with a complete, a superseded, an unfinished and a deleted enrollment."""
     folder = tmp_path_factory.mktemp("sample") / "catalog"
     with pytest.MonkeyPatch.context() as patch, Catalog.open(folder, clock=VirtualClock()) as catalog:
         without_waiting(patch)
@@ -67,7 +67,7 @@ def root(sample: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture
 def outside(tmp_path: Path) -> Iterator[Path]:
-    """A file outside of the catalog. It is unchanged in the end."""
+    """Return a file outside of the catalog, and check at the end that it is unchanged."""
     path = tmp_path / "secret.png"
     path.write_bytes(SECRET)
     yield path
@@ -322,7 +322,7 @@ def test_edited_log_or_result_is_found(root: Path, statement: str) -> None:
 
 
 def reported(root: Path) -> Any:
-    """Everything that a catalog answers and lists."""
+    """Return all answers and lists of a catalog."""
     with opened(root) as catalog:
         names = [item.name for item in catalog.objects()]
         details = [catalog.object(name) for name in names]

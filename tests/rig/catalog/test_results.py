@@ -113,7 +113,7 @@ def test_correction_keeps_the_answer_and_is_in_the_log(catalog: Catalog) -> None
     [
         ({"object_name": "mugg"}, ObjectNotFound),
         ({"object_name": "mug", "unknown": True}, UsageError),
-        ({"object_name": "mug"}, UsageError),  # it is so already
+        ({"object_name": "mug"}, UsageError),  # the object is already correct
         ({"unknown": True, "reason": " "}, UsageError),
         ({"sample": "a\tb"}, UsageError),
         ({"sample": "x" * 2000}, UsageError),

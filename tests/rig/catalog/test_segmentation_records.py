@@ -237,7 +237,7 @@ def test_views_are_described_the_same_in_several_threads(open_catalog):
     assert one == several
 
 
-def test_views_described_while_the_table_turns_equal_those_described_afterwards(open_catalog):
+def test_views_described_while_the_table_rotates_equal_those_described_afterwards(open_catalog):
     catalog = open_catalog("catalog")
     enrolled(catalog, "box")
     store = catalog.database.images

@@ -31,7 +31,7 @@ AREA = np.pi * 28 * 44
 
 
 def scene(index: int | None, colour: tuple[int, int, int] = (40, 60, 200)) -> NDArray[np.uint8]:
-    """A plain frame with an ellipse; without it for None."""
+    """Return a plain frame with an ellipse; for None without it."""
     frame = np.random.default_rng(index or 0).normal(128, 1.5, (144, 192, 3)).clip(0, 255).astype(np.uint8)
     if index is not None:
         cv2.ellipse(frame, (80 + 2 * index, 72), (28, 44), 0, 0, 360, colour, -1)
@@ -67,7 +67,7 @@ def enroll(
 
 @pytest.fixture(scope="module")
 def sample(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two objects with 4 views each: one with an empty-table image and a region, one with neither."""
+    """Return two objects with 4 views each: one with an empty-table image and a region, one without both."""
     path = tmp_path_factory.mktemp("training") / "catalog"
     with pytest.MonkeyPatch.context() as patch, Catalog.open(path, clock=VirtualClock()) as catalog:
         without_waiting(patch)

@@ -1,4 +1,4 @@
-"""The charts' geometry and numbers are those of the data, whatever the names hold."""
+"""The charts' geometry and numbers are those of the data, with any names."""
 
 from itertools import pairwise
 from math import atan2, degrees, hypot
@@ -23,12 +23,12 @@ HOSTILE = "<script>alert(1)</script>&\"'"
 
 
 def having(svg: str, *classes: str) -> list[ET.Element]:
-    """The elements of all the classes, in the order they are drawn."""
+    """Return the elements that have all the classes, in the order of drawing."""
     return [e for e in ET.fromstring(svg).iter() if set(classes) <= set(e.get("class", "").split())]
 
 
 def azimuth_of(x: float, y: float) -> float:
-    """As seen from above: 0° at the top, counter-clockwise."""
+    """Return the azimuth of a point, seen from above: 0° at the top, counter-clockwise."""
     return degrees(atan2(CENTRE[0] - x, CENTRE[1] - y)) % 360
 
 
@@ -126,7 +126,7 @@ class TestPolarPath:
         )
         assert words(having(svg, "step-label")) == ["90.0°", "47.3°", "120.5°"]
         assert words(having(svg, "step-name")) == ["left 90.0°", "left 47.3°", "right 120.5°"]
-        # equal at two decimals: as many more as tell them apart
+        # equal at two decimals, so more decimals are shown
         assert {
             "as enrolled; left is counter-clockwise",
             "fixed",

@@ -62,7 +62,7 @@ def test_logarithmic_axis_spaces_decades_evenly() -> None:
     assert np.diff(x) == pytest.approx([x[1] - x[0]] * 3, abs=0.05)
 
 
-def test_svg_scales_names_itself_and_repeats_to_the_byte() -> None:
+def test_svg_scales_has_a_label_and_equal_bytes_for_equal_charts() -> None:
     root = ElementTree.fromstring(CHART.svg())
     assert root.get("role") == "img"
     assert root.get("aria-label") == CHART.label

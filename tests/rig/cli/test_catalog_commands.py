@@ -191,7 +191,7 @@ def test_export_can_be_imported(two: Rig, target: str, options: tuple[str, ...])
     assert two("export", target, *options).exit_code == 7  # it exists already
 
 
-def test_export_of_some_objects_and_of_pages(two: Rig) -> None:
+def test_some_objects_and_pages_are_exported(two: Rig) -> None:
     assert result(two("export", "mug.rigcat.zip", "mug", "--json"))["objects"] == 1
     assert two("export", "none.rigcat.zip", "jug").exit_code == 7
     assert two("export", "none.rigcat.zip", "--label", "lab").exit_code == 7

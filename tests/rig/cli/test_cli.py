@@ -30,7 +30,7 @@ def lines(output: str) -> list[dict]:
     return [json.loads(line) for line in output.splitlines()]
 
 
-def test_enroll_list_show_identify(rig):
+def test_enrolled_object_is_listed_shown_and_identified(rig):
     done = rig("enroll", "mug-dots", "--views", "4", "--label", "kitchen")
     assert done.exit_code == 0, done.output
     assert rig("enroll", "lamp", "--views", "8").exit_code == 0

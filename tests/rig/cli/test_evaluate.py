@@ -196,7 +196,7 @@ def test_damaged_photograph_is_reported_by_its_name(photographs: Path, tmp_path:
     assert "nowhere is not a folder" in done.output
 
 
-def test_catalog_is_evaluated_where_no_folder_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_catalog_is_evaluated_if_no_folder_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     Path("rig.toml").write_text('default_bench = "sim"\n[catalog]\npath = "catalog"\n[view]\nroi = [4, 0, 40, 40]\n')
     with Catalog.open("catalog", clock=SystemClock()) as catalog:

@@ -98,7 +98,7 @@ def test_help_imports_no_heavy_module():
         ),
     ],
 )
-def test_no_color_works_in_every_place(arguments):
+def test_no_color_works_at_any_position(arguments):
     environment = {**os.environ, "FORCE_COLOR": "1", "TERM": "xterm-256color", "COLUMNS": "90"}
     environment.pop("NO_COLOR", None)
     done = subprocess.run([*RIG, *arguments], env=environment, capture_output=True, text=True)
@@ -115,7 +115,7 @@ def test_terminal_without_unicode_shows_question_marks(tmp_path):
     assert "(asked 20.00?)" in done.stdout
 
 
-def test_a_start_builds_only_the_command_that_is_called():
+def test_start_builds_only_the_called_command():
     for one in (*app.registered_commands, *app.registered_groups):
         assert list(typer.main.get_command(_with_command([one.name])).commands) == [one.name]
     for first in ([], ["--bench"], ["gotoo"], ["--help"]):

@@ -1,4 +1,4 @@
-"""`rig jog` in a terminal of its own: the torque is off when it ends, however it ends."""
+"""`rig jog` in a terminal of its own: the torque is off after every kind of end."""
 
 import os
 import signal

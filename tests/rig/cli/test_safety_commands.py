@@ -168,12 +168,12 @@ def test_running_plan_blocks_the_bench_and_stop_ends_it(rig, running):
     assert "No program held the bench" in rig("stop").stdout
 
 
-def test_killed_program_leaves_the_bench_free(rig, running):
+def test_bench_is_free_after_its_program_was_killed(rig, running):
     process = running()
     process.kill()
     process.wait()
     assert holder(Path("state/sim")) is None
-    # The simulated servo died with its world, as in a power cut: where it was in a motion, its turns are in doubt.
+    # The simulated servo ended with its world, as in a power cut. If it was in a motion, its revolutions are in doubt.
     cut_off = state()["table"]["path_deg"] is not None
     reported = json.loads(rig("status", "--json").stdout)
     assert reported["state"] == ("unreferenced" if cut_off else "ready")

@@ -21,7 +21,7 @@ from tests.rig.doctor.doctor_parts import unopened
 
 @pytest.fixture
 def home(tmp_path, monkeypatch):
-    """An empty folder, and no configuration of the user's."""
+    """Return an empty folder; there is no configuration of the user."""
     monkeypatch.chdir(tmp_path)
     for name in ("XDG_CONFIG_HOME", "XDG_DATA_HOME", "XDG_STATE_HOME"):
         monkeypatch.setenv(name, str(tmp_path / "home" / name))
@@ -34,7 +34,7 @@ def rig(*arguments: str, answers: str = ""):
 
 @pytest.fixture
 def parts(home, monkeypatch):
-    """A bench whose parts lie on the table as from the factory; the command line looks at it."""
+    """Return a bench whose parts have factory settings; the command line uses it."""
     with unopened() as bench:
 
         class Kind:
@@ -276,7 +276,7 @@ def test_find_detects_a_rig_head(home):
     assert config.head.port.endswith("SIM00002-if00-port0")
 
 
-def test_find_on_an_empty_computer(parts, home):
+def test_find_on_an_empty_computer_reports_no_device(parts, home):
     for folder in ("sys/class", "dev"):
         shutil.rmtree(parts.computer.root / folder)
     done = rig("find")

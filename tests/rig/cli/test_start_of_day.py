@@ -84,7 +84,7 @@ def test_rejected_enrollment_leaves_no_folder(rig: Callable[..., Any]) -> None:
 
 
 class Answers(io.StringIO):
-    """A person who types these lines at a terminal, and takes the object off and puts it on as asked."""
+    """An operator who types these lines at a terminal, and takes the object off and puts it on as asked."""
 
     def __init__(self, text: str, asked: Callable[[], None] = lambda: None) -> None:
         super().__init__(text)
@@ -102,7 +102,7 @@ class Answers(io.StringIO):
 def asked(
     simulated: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> Callable[..., tuple[Any, str]]:
-    """Return a function that asks a person with an object on the table; their answers, one a line, in the end."""
+    """Return a function that asks an operator with an object on the table; the answers are lines of text."""
 
     def run(
         answers: Answers | io.StringIO, *, ask: bool = True, as_json: bool = False, stays: bool = False
@@ -153,5 +153,5 @@ def test_automation_is_never_asked(asked: Callable[..., tuple[Any, str]], option
     assert "To take a new one: rig empty-table" in said
 
 
-def test_no_question_without_a_terminal(asked: Callable[..., tuple[Any, str]]) -> None:
+def test_operator_is_not_asked_without_a_terminal(asked: Callable[..., tuple[Any, str]]) -> None:
     assert asked(io.StringIO("\n\n\n"))[0] is None

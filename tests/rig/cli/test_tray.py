@@ -42,7 +42,7 @@ def folder(tmp_path):
 
 
 def enroll_until(folder: Path, views: int, number: int | None) -> tuple[list[dict[str, Any]], int, str]:
-    """Enroll the tray and send a signal after so many views; return the events, the exit code and stderr."""
+    """Enroll the tray and send a signal after a number of views; return the events, the exit code and stderr."""
     process = Program("enroll", "--list", "tray.csv", "--json", code=stopping_after_view(views), folder=folder)
     if number is not None:
         process.wait_until_stopped()

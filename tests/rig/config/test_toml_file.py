@@ -1,4 +1,4 @@
-"""Edits of rig.toml: the value changes, everything that a person wrote around it stays."""
+"""Edits of rig.toml: the value changes, and all other text stays."""
 
 import tomllib
 

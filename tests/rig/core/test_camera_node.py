@@ -1,4 +1,4 @@
-"""Which sources of a camera are device files."""
+"""Sources of a camera that are device files."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""The registry of errors: codes are distinct, and every one leads to an exit code of the design."""
+"""The registry of errors: codes are distinct, and each one gives a documented exit code."""
 
 from rig.core import errors
 

@@ -1,4 +1,4 @@
-"""Files of others are read without waiting, and only up to a limit."""
+"""Files from other users are read without waiting, and only up to a limit."""
 
 import os
 from pathlib import Path

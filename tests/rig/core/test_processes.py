@@ -1,4 +1,4 @@
-"""Work over processes ends in words when one of them is lost."""
+"""Work in several processes ends with an explained error if one process is killed."""
 
 from pathlib import Path
 

@@ -46,6 +46,6 @@ class Bench:
         self.world.drive(to_velocity(now_ns * 1e-9, self.world.table_deg(), dps, dps, 1.0))
 
     def write(self, *data: int) -> None:
-        """Do behind the driver's back what another program on the bus might."""
+        """Write a register as another program on the bus would, without the driver."""
         self.sensor.start(reading=False)
         self.sensor.write(bytes(data))

@@ -1,4 +1,4 @@
-"""A serial port whose other end says what a test wants, on the virtual clock."""
+"""A serial port whose other end sends the bytes of a test, on the virtual clock."""
 
 from collections.abc import Iterable, Iterator
 

@@ -1,4 +1,4 @@
-"""The BNO055 driver over the real smbus2, against the simulated sensor; what all IMUs keep is in tests/contract."""
+"""The BNO055 driver over the real smbus2, with the simulated sensor; tests/contract has the contract of all IMUs."""
 
 from collections.abc import Iterator
 from contextlib import closing
@@ -197,7 +197,7 @@ def test_bench_with_bno055_moves_settles_and_agrees(simulated) -> None:
 def test_bus_that_corrupts_the_identity_is_named_with_its_fix(bench: Bench, share: float) -> None:
     bench.bus.stretch_errors = share
     with pytest.raises(DeviceFault) as corrupt:
-        for _ in range(8):  # one reading in a row may be right
+        for _ in range(8):  # a single reading may be right
             bench.open().close()
     assert "i2c_arm_baudrate=10000" in corrupt.value.next_step
     assert "i2c-gpio" in corrupt.value.next_step
@@ -218,7 +218,7 @@ def test_rare_corrupt_readings_are_repeated_and_counted(bench: Bench, imu: Bno05
 def test_bench_works_with_a_bus_at_10_khz(simulated) -> None:
     s = simulated("imu.model=bno055")
     bus = s.operator.devices.i2c
-    bus.bit_ns, bus.stretch_errors = 100_000, 1.0  # as slow as that, a stretch ends within its bit
+    bus.bit_ns, bus.stretch_errors = 100_000, 1.0  # at this low speed, a stretch ends within its bit
     with Turntable(s.bench) as table:
         for angle_deg in (90.0, 45.0):
             move = table.goto(angle_deg)

@@ -1,6 +1,6 @@
-"""Parsers of bytes from devices, fed with damaged bytes: no hang, and no wrong value that stays.
+"""Parsers of bytes from devices, tested with damaged bytes: they never hang, and no wrong value stays.
 
-A packet is taken only when its sum is right; the oracles below look for such packets in the bytes by themselves.
+A packet is accepted only if its checksum is right; the reference functions below search the bytes for such packets.
 """
 
 from collections.abc import Callable, Iterator
@@ -31,7 +31,7 @@ from tests.rig.devices.scripted_serial import scripted_bus
 pytestmark = pytest.mark.timeout(1200)  # the nightly profile's 20,000 cases a parser
 
 ANSWER_S = 2.0
-"""Longest that a read with two retries may take, whatever comes."""
+"""Longest time that a read with two retries may take, with any received bytes."""
 
 TABLES = {2: control_table("xl430_w250"), 1: control_table("ax_12a")}
 PACKETS: dict[int, Callable[[int, Status], bytes]] = {2: status_packet, 1: status_packet1}

@@ -1,4 +1,4 @@
-"""The OpenCV camera driver with a pulled cable, another camera after it, and frames that take long."""
+"""The OpenCV camera driver with an unplugged cable, with another camera after that, and with slow frames."""
 
 from pathlib import Path
 
@@ -115,7 +115,7 @@ def test_meanwhile_is_called_while_waiting_for_a_slow_camera(world: World, secon
     capture = SimCapture(world)
     camera = OpenCvCamera(capture, clock=world.clock)
     capture.every = round(FPS * seconds_a_frame)
-    for _ in range(3):  # how slow it is shows in its first frames
+    for _ in range(3):  # the driver measures its speed with the first frames
         camera.capture(world.clock.now_ns())
     done_ns: list[int] = [world.clock.now_ns()]
     for _ in range(3):
@@ -142,5 +142,5 @@ def test_enrollment_with_a_slow_camera_loses_no_gyro_samples(simulated, tmp_path
     with Catalog.open(tmp_path, clock=s.bench.clock, create=True) as catalog:
         events = list(enroll(s.bench, catalog, "lamp", views=6))
     rejected = [reason for event in events if isinstance(event, Rejected) for reason in event.reasons]
-    assert len(rejected) <= 2, rejected  # until the camera's pace is known
+    assert len(rejected) <= 2, rejected  # until the camera's period is known
     assert s.bench.imu.statistics.overflows <= 3

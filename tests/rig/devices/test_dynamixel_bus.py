@@ -1,4 +1,4 @@
-"""The bus driver, through the unmodified SDK, on a line that misbehaves."""
+"""The bus driver, through the unmodified SDK, on a bus with faults."""
 
 import os
 from dataclasses import replace
@@ -48,7 +48,7 @@ def test_crc_error_is_retried_and_counted(wires, bus):
     wires.bus.filters.append(flip_once)
     assert bus.ping(1) == 1060
     assert (bus.statistics.corrupt, bus.statistics.retries, bus.statistics.transactions) == (1, 1, 2)
-    assert len(wires.instructions) == 2  # the question really went out again
+    assert len(wires.instructions) == 2  # the request was sent again
 
 
 def test_permanent_corruption_raises_device_silent(wires):
@@ -94,7 +94,7 @@ def test_watchdog_units_round_up_and_never_disable_it(timeout_s):
 
 
 def test_adapter_unplugged_from_a_real_port_raises_device_silent():
-    """pyserial itself, on a pseudo-terminal whose other end goes away: it then raises what is no OSError."""
+    """The real pyserial, on a pseudo-terminal whose other end is closed, raises an error that is no OSError."""
     far, near = os.openpty()
     path = os.ttyname(near)
     os.close(near)
@@ -119,7 +119,7 @@ def test_adapter_unplugged_while_draining_raises_device_silent(monkeypatch, wire
 
 
 def test_reply_to_an_interrupted_request_never_answers_the_next_one(wires, bus):
-    """Ctrl+C in the middle of a transaction, and then torque off with its own questions: Protocol 2.0 numbers none."""
+    """Ctrl+C interrupts a transaction, and torque off sends new requests; Protocol 2.0 has no sequence numbers."""
 
     def interrupt() -> None:
         raise KeyboardInterrupt

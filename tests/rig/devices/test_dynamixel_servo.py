@@ -132,7 +132,7 @@ def test_registers_round_trip(name):
 
 
 def test_drive_mode_with_torque_by_goal_is_corrected(wires):
-    """After a dip of the supply such a servo would obey the next goal, as fast as it can and perhaps a turn away."""
+    """After a dip of the supply such a servo would go to the next goal at full speed, perhaps a revolution away."""
     wires.device.memory["Drive Mode"] = 0b1000
     servo = open_servo(wires)
     assert wires.device.memory["Drive Mode"] == 0

@@ -1,4 +1,4 @@
-"""The rig head's driver on the firmware itself: opening, outputs, and what makes the bench safe."""
+"""The rig head's driver on the firmware itself: opening, outputs, and safety functions."""
 
 import pytest
 
@@ -119,7 +119,7 @@ def test_light_and_power_follow_requests(opened):
     opened.imu.set_light(0.2)
     assert opened.head.light == pytest.approx(0.2, abs=0.005)
     assert opened.head.relay_closed
-    opened.clock.sleep(5.0)  # the heart beats beside the program
+    opened.clock.sleep(5.0)  # heartbeats are sent in the background
     assert opened.head.relay_closed
     assert opened.imu.status.state is HeadState.ACTIVE
     opened.imu.close()
@@ -127,7 +127,7 @@ def test_light_and_power_follow_requests(opened):
     assert opened.head.light == 0
     opened.clock.sleep(1.0)
     assert [value for _, value in opened.head.pulses("relay")] == [1, 0]
-    assert not opened.imu.status.faults  # it rests in peace
+    assert not opened.imu.status.faults  # no fault at rest
 
 
 @AVR_NIGHTLY
@@ -138,7 +138,7 @@ def test_trigger_pulse_has_the_requested_width_and_time(opened):
     (up_ns, up), (down_ns, down) = opened.head.pulses("trigger")
     assert (up, down) == (1, 0)
     assert began_ns == pytest.approx(up_ns, abs=2e3 * opened.imu.health()["time_uncertainty_us"])
-    assert down_ns - up_ns == pytest.approx(2 * MS, rel=0.003)  # by a clock that is 0.2 % off
+    assert down_ns - up_ns == pytest.approx(2 * MS, rel=0.003)  # the clock has an error of 0.2 %
     with pytest.raises(RequestRejected, match="range"):
         opened.imu.trigger(0.04)
     opened.imu.trigger(0.03)
@@ -146,12 +146,12 @@ def test_trigger_pulse_has_the_requested_width_and_time(opened):
         opened.imu.trigger(0.001)
 
 
-# -- what makes the bench safe --------------------------------------------------------------------------------------
+# -- safety functions -----------------------------------------------------------------------------------------------
 
 
 def test_silent_computer_switches_outputs_off(opened):
     switch_on(opened)
-    opened.imu._cancel()  # the program is killed: nothing beats any more
+    opened.imu._cancel()  # the program is killed: no more heartbeats
     last_ns = opened.clock.now_ns()
     opened.clock.sleep(1.0)
     for pin in ("relay", "light"):
@@ -166,7 +166,7 @@ def test_silent_computer_switches_outputs_off(opened):
         opened.imu.set_power(True)
     opened.imu.acknowledge()
     assert opened.imu.fault is None
-    assert not opened.head.relay_closed  # never by itself
+    assert not opened.head.relay_closed  # the head never closes the relay by itself
     opened.imu.set_power(True)
     assert opened.head.relay_closed
 

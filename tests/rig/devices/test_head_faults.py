@@ -1,4 +1,4 @@
-"""The rig head's driver on the firmware itself: a bad line, a pulled cable, a faulty sensor."""
+"""The rig head's driver on the firmware itself: a disturbed connection, an unplugged cable, a faulty sensor."""
 
 import numpy as np
 import pytest
@@ -56,7 +56,7 @@ def test_corrupt_frames_cost_samples_but_give_no_wrong_value(opened):
     elapsed_s = (opened.clock.now_ns() - start_ns) * 1e-9
     assert lost + sum(map(len, rates)) == pytest.approx(200 * elapsed_s, abs=6)
     assert all(np.diff(np.concatenate(times)) > 0)
-    assert opened.imu.status.state is HeadState.ACTIVE  # a beat that is lost is beaten again in time
+    assert opened.imu.status.state is HeadState.ACTIVE  # a lost heartbeat is repeated in time
 
 
 @AVR_NIGHTLY
@@ -184,7 +184,7 @@ def test_lost_sensor_is_reported_and_recovered(opened):
     opened.imu.read_samples()
     opened.head.detach(0x68)
     opened.clock.sleep(0.2)
-    opened.imu.read_samples()  # the head tries to get it back
+    opened.imu.read_samples()  # the head tries to set it up again
     opened.clock.sleep(1.0)
     with pytest.raises(DeviceSilent, match="does not answer"):
         opened.imu.read_samples()

@@ -1,4 +1,4 @@
-"""Frames of the rig head's line: whole ones come through however the stream is cut, garbage never does."""
+"""Frames of the rig head: complete ones are found in any parts of the stream, and noise is never accepted."""
 
 import binascii
 
@@ -63,7 +63,7 @@ def test_frames_are_found_however_the_stream_is_split(parts, data):
     deframer = Deframer()
     got = [f for a, b in zip([0, *cuts], [*cuts, len(stream)], strict=True) for f in deframer.feed(stream[a:b])]
     assert [f for f in got if f in expected] == expected
-    for frame in got:  # noise that is a frame by chance is one: its checksum holds
+    for frame in got:  # noise that is a valid frame by chance has a right checksum
         content = bytes([frame.id, frame.sequence]) + frame.body
         assert encode(frame) == cobs.encode(content + binascii.crc_hqx(content, 0xFFFF).to_bytes(2, "big")) + b"\0"
 

@@ -1,4 +1,4 @@
-"""The head's clock on the bench's: never off by more than its uncertainty allows, whatever the line does."""
+"""The head's clock converted to the bench's: the error is within the uncertainty for all delays of the connection."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ LINE_NS = 1_600_000
 
 
 class Line:
-    """A head whose clock is off, and a line on which frames are held up."""
+    """A head with a clock error, and a connection that delays frames."""
 
     def __init__(self, drift: float, start_us: int, seed: int = 0) -> None:
         self.drift, self.start_us = drift, start_us
@@ -35,7 +35,7 @@ class Line:
         return float(self._rng.exponential(typical_ns))
 
     def error_ns(self, at_ns: int) -> tuple[float, float]:
-        """Return how far a time is off, and its stated uncertainty."""
+        """Return the error of a time, and its stated uncertainty."""
         time_ns, sigma_ns = self.clock.to_host(np.array([self.clock.unwrap(self.head_us(at_ns) % 2**32)]))
         return float(time_ns[0]) - at_ns, sigma_ns
 

@@ -33,7 +33,7 @@ def test_rates_are_in_degrees_per_second_up_to_the_end_of_all_ranges(bench: Benc
 @given(pauses_ms=st.lists(st.integers(0, 300), min_size=2, max_size=10), divider=st.integers(2, 40))
 @examples(9)
 def test_sample_times_are_even_and_correct(pauses_ms: list[int], divider: int) -> None:
-    """Times come out of the count and the rate alone; they must still be those at which the sensor sampled."""
+    """Times are computed from the count and the rate; they must be the true sample times."""
     period_ns = divider * 1_000_000
     with Bench() as bench:
         imu = bench.open(rate_hz=1000 / divider)
@@ -94,7 +94,7 @@ def test_reading_samples_takes_two_transactions(bench: Bench, imu: Mpu6050) -> N
     assert bench.bus.wire[-1].data == b"".join(np.rint(samples.gyro_dps * 131).astype(">i2"))
 
 
-def test_gravity_and_temperature(bench: Bench, imu: Mpu6050) -> None:
+def test_gravity_and_temperature_are_measured(bench: Bench, imu: Mpu6050) -> None:
     bench.sensor.temperature_c = 31.0
     bench.clock.sleep(0.1)
     assert imu.read_gravity_g() == pytest.approx([0, 0, 1], abs=1e-4)

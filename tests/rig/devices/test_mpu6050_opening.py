@@ -106,7 +106,7 @@ def test_mpu6500_that_is_awake_after_a_reset_is_a_fault() -> None:
 @pytest.mark.parametrize("who_am_i", [0x72, 0x98])
 @pytest.mark.parametrize("rate_hz", [4.0, 200.0, 1000.0])
 @pytest.mark.parametrize("device", [SimMpu6050, SimMpu6050Clone])
-def test_clone_that_behaves_is_accepted(who_am_i: int, rate_hz: float, device: type[SimMpu6050]) -> None:
+def test_clone_with_plausible_samples_is_accepted(who_am_i: int, rate_hz: float, device: type[SimMpu6050]) -> None:
     with Bench(NoiseModel(), who_am_i=who_am_i, device=device) as bench:
         imu = bench.open(Mpu6050Clone, rate_hz=rate_hz)
         assert (imu.identity.model, imu.identity.who_am_i) == ("MPU-6050 clone", who_am_i)
@@ -130,7 +130,7 @@ def test_clone_that_behaves_is_accepted(who_am_i: int, rate_hz: float, device: t
     ],
     ids=["rate", "frozen", "gravity", "noise", "self-test"],
 )
-def test_clone_that_misbehaves_is_rejected(spoil: Any, problem: str) -> None:
+def test_clone_with_implausible_samples_is_rejected(spoil: Any, problem: str) -> None:
     with Bench(NoiseModel(), device=SimMpu6050Clone) as bench:
         spoil(bench.sensor)
         with pytest.raises(DeviceMismatch, match=problem):
@@ -164,7 +164,7 @@ def test_missing_permission_names_the_group(monkeypatch: pytest.MonkeyPatch, tmp
     path = tmp_path / "i2c-1"
     path.touch(stat.S_IRUSR)
 
-    def denied(*_: object) -> int:  # root may open anything, so the kernel's answer is played
+    def denied(*_: object) -> int:  # root may open any file, so the kernel's answer is simulated
         raise PermissionError(13, "Permission denied")
 
     monkeypatch.setattr("smbus2.smbus2.os.open", denied)

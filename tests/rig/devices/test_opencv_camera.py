@@ -1,4 +1,4 @@
-"""The OpenCV camera driver: settings, choosing frames by their time, and what it says when a camera fails."""
+"""The OpenCV camera driver: settings, choice of frames by their time, and errors of a camera."""
 
 import threading
 from collections.abc import Iterator
@@ -139,7 +139,7 @@ def test_unplugged_camera_raises_device_silent(world: World) -> None:
 
 
 class Lagging(SimCapture):
-    """A camera that can fall behind: its frames continue, but each is hardly newer than the previous one."""
+    """A camera that can lag: its frames continue, but each is hardly newer than the previous one."""
 
     stuck_at_ms: float | None = None
 
@@ -253,7 +253,7 @@ def test_network_stream_is_current_after_a_pause(stream: tuple[str, list[float]]
     url, level = stream
     clock = SystemClock()
     settings = CameraSettings(None, None, None, None, None, None)
-    # The latency leaves a busy machine time to drain what piled up before a stall can pass for waiting.
+    # The latency gives a busy computer time to read the buffered frames, so that a pause does not count as waiting.
     camera = OpenCvCamera(open_capture(url), clock=clock, settings=settings, timeout_s=20.0, latency_s=0.4)
     try:
         assert camera.time_base is TimeBase.PACED
@@ -356,7 +356,7 @@ def test_pixel_format_is_chosen_or_configured(world: World) -> None:
 
 
 def test_autofocus_is_pinned_where_it_settles(world: World) -> None:
-    """A camera wakes with its autofocus on; switched off at once, the lens stays where it happens to be."""
+    """A camera starts with its autofocus on. If it is switched off at once, the lens stays at any position."""
     capture = SimCapture(world)
     capture.drift(autofocus=True, focus=0)
     camera = OpenCvCamera(capture, clock=world.clock)

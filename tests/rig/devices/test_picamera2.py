@@ -1,4 +1,4 @@
-"""A camera on the ribbon cable of a Raspberry Pi: the same locks, true time stamps, and what is missing."""
+"""A camera on the ribbon cable of a Raspberry Pi: the same locks, true time stamps, and errors for missing parts."""
 
 import sys
 from importlib.machinery import ModuleSpec
@@ -108,7 +108,7 @@ def test_hanging_sensor_is_silent_in_bounded_time(world, sensor):
     assert camera.capture(world.clock.now_ns()).exposed_ns > begun_ns
 
 
-def test_missing_camera_other_user_and_missing_package_say_what_to_do(sensor, monkeypatch):
+def test_missing_camera_other_user_and_missing_package_have_a_next_step(sensor, monkeypatch):
     with pytest.raises(DeviceNotFound, match="no camera 1") as missing:
         open_capture("picamera2:1")
     assert missing.value.evidence == {"found": ["imx708"]}

@@ -1,4 +1,4 @@
-"""An answer that arrives twice is never taken for a new reading, whatever its delay."""
+"""An answer that arrives twice is never accepted as a new reading, with any delay."""
 
 import random
 

@@ -1,4 +1,4 @@
-"""What dynamixel-sdk 4.1 does wrong, one test a defect: none of it reaches a user of the rig."""
+"""Defects of dynamixel-sdk 4.1, one test for each: the rig is not affected."""
 
 import os
 import threading
@@ -35,7 +35,7 @@ WORDS = {"Model Number": 1060, "Max Voltage Limit": 140, "Min Voltage Limit": 60
 tricky = st.lists(st.sampled_from([0xFF, 0xFF, 0xFF, 0xFD, 0xFD, 0x00, 0x55]), max_size=24).map(bytes)
 
 
-# -- what the SDK takes for an answer ----------------------------------------------------------------------------------
+# -- packets that the SDK accepts as answers --------------------------------------------------------------------------
 
 
 def test_lost_reply_is_not_read_as_zero() -> None:
@@ -56,7 +56,7 @@ def test_lost_reply_is_not_read_as_zero() -> None:
     fifo=st.booleans(),
 )
 def test_late_reply_answers_no_other_read(late_ms: float, pauses_ms: list[float], which: int, fifo: bool) -> None:
-    """However late, whether it overtakes or holds up those behind it: every value is the one that was asked for."""
+    """The reply may be late, early or delay the next ones; every value is the requested one."""
     wires = servo_wires(baudrate=1_000_000)
     bus = open_bus(wires, retries=4)
     number, free_ns = count(1), 0
@@ -72,7 +72,7 @@ def test_late_reply_answers_no_other_read(late_ms: float, pauses_ms: list[float]
     wires.bus.filters.append(delay)
     for i, pause_ms in enumerate(pauses_ms):
         name = list(WORDS)[i % len(WORDS)]
-        with suppress(DeviceSilent):  # a line that is held up for a second may count as silent
+        with suppress(DeviceSilent):  # a bus that is delayed for a second may count as silent
             assert bus.read(1, TABLE[name]) == WORDS[name]
         with suppress(DeviceSilent):
             bus.write(1, TABLE["LED"], i % 2)
@@ -82,7 +82,7 @@ def test_late_reply_answers_no_other_read(late_ms: float, pauses_ms: list[float]
 
 @pytest.mark.parametrize("size", [0, 1, 3, 25])
 def test_reply_of_another_length_is_ignored(size: int) -> None:
-    """The SDK slices the bytes it wants out of it, and takes the CRC for the value where there are too few."""
+    """The SDK reads the requested number of bytes, and uses the CRC as the value if there are too few."""
     bus, _ = scripted_bus(status_packet(1, Status(0, bytes(range(size)))))
     with pytest.raises(DeviceSilent):
         bus.read(1, TABLE["Present Input Voltage"])
@@ -96,7 +96,7 @@ def test_reply_of_another_servo_is_ignored() -> None:
 
 
 def test_rejection_without_parameters_raises_no_index_error() -> None:
-    """Model and firmware of a ping that is answered by an error alone: the SDK looks at bytes that are not there."""
+    """If only an error answers a ping, the SDK reads model and firmware from missing bytes."""
     bus, _ = scripted_bus(status_packet(1, Status(0x07)))
     with pytest.raises(RequestRejected, match="access error"):
         bus.ping(1)
@@ -172,7 +172,7 @@ def test_reading_ends_despite_endless_noise() -> None:
 
 
 def test_timeouts_ignore_the_time_of_day(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The SDK's own time-outs look at time.time(): set back by an hour, it waits for an hour."""
+    """The SDK's own time-outs use time.time(): if the clock is set back by an hour, it waits for an hour."""
 
     def asked() -> float:
         raise AssertionError("time-outs must not depend on the time of day")
@@ -186,7 +186,7 @@ def test_timeouts_ignore_the_time_of_day(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 def test_waiting_uses_no_cpu() -> None:
-    """On a real (pseudo) terminal: the SDK spins through its time-out."""
+    """The test uses a real (pseudo) terminal; the SDK itself uses the CPU during its whole time-out."""
     far, near = os.openpty()
     wire = open_serial(os.ttyname(near), 57_600)
     bus = DynamixelBus(ClockedPort(wire, SystemClock()), retries=2)
@@ -264,7 +264,7 @@ def test_any_baud_rate_is_accepted(baud: int) -> None:
 def test_port_in_use_is_reported_as_busy() -> None:
     far, near = os.openpty()
     first = open_serial(os.ttyname(near), 57_600)
-    serial.Serial(os.ttyname(near), 57_600).close()  # the defect: opened so, two programs talk at once
+    serial.Serial(os.ttyname(near), 57_600).close()  # the defect: without the lock, two programs send at once
     with pytest.raises(DeviceNotFound) as caught:
         open_serial(os.ttyname(near), 57_600)
     assert "Close the other program" in caught.value.next_step

@@ -1,4 +1,4 @@
-"""The servo drivers on every simulated model: what each can do on a rig, behind a gear, as an arm, spinning."""
+"""The servo drivers on every simulated model: as a turntable, behind a gear, as an arm, and at constant speed."""
 
 from contextlib import closing
 
@@ -37,7 +37,7 @@ def servo_of(devices: SimDevices, *overrides: str, write: bool = True) -> Regist
 
 
 def go(devices: SimDevices, servo: RegisterServo, angle_deg: float) -> float:
-    """Move to ``angle_deg`` and return how far the table's shaft really turned."""
+    """Move to ``angle_deg`` and return the true rotation of the table's shaft."""
     start_deg = devices.world.shaft()[0]
     servo.set_profile(MotionProfile(90.0, 500.0))
     servo.torque_on()
@@ -109,7 +109,7 @@ def test_ax12_pans_within_its_300_degrees(goal_deg: float) -> None:
     assert state.position_deg == pytest.approx(goal_deg, abs=DEG_PER_COUNT)
     assert state.in_position
     assert not state.moving
-    assert state.trajectory_deg is None  # it does not tell
+    assert state.trajectory_deg is None  # it does not report it
 
 
 def test_missing_features_of_the_ax12_are_reported() -> None:

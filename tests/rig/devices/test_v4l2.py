@@ -58,7 +58,7 @@ def test_modes_are_those_that_opencv_converts(monkeypatch, tmp_path, stepwise):
     assert v4l2.modes(Path("/nowhere")) == ()
 
 
-def test_uncompressed_is_chosen_where_it_is_fast_enough(monkeypatch, tmp_path):
+def test_uncompressed_mode_is_chosen_if_it_is_fast_enough(monkeypatch, tmp_path):
     node = tmp_path / "video0"
     node.touch()
     monkeypatch.setattr(v4l2, "ioctl", driver(C920))

@@ -115,7 +115,7 @@ def test_ax_12a_reports_its_missing_functions():
         assert set(bench.problems("servo")) == {FindingCode.SERVO_LIMITATION}
 
 
-# -- faults of the whole vocabulary -----------------------------------------------------------------------------------
+# -- all simulated faults ---------------------------------------------------------------------------------------------
 
 FOUND = {
     "servo.off": ("servo", FindingCode.NO_SERVO),

@@ -85,7 +85,7 @@ def test_servo_that_keeps_its_rate_is_still_reached(monkeypatch):
         monkeypatch.setattr(type(bench.devices.servo), "baudrate", property(lambda _: 57_600))
         with pytest.raises(RequestRejected, match="1000000 baud"):
             servo.set_baud(1_000_000)
-        assert servo.read()["Baud Rate"] == 3  # what it was told; it answers at the rate that it has
+        assert servo.read()["Baud Rate"] == 3  # the register has the new value; the servo answers at its old rate
 
 
 def test_servo_that_answers_only_reads_can_be_changed(bench):

@@ -1,4 +1,4 @@
-"""docs/events.md is the schema of the events: as documented, so emitted."""
+"""Emitted events agree with docs/events.md, which is their schema."""
 
 import re
 from dataclasses import fields, is_dataclass
@@ -94,7 +94,7 @@ def check_fields(value: dict[str, Any], kind: str, where: str) -> None:
 
 
 def check_event(event: Event) -> str:
-    """Hold an event against the document and return its kind."""
+    """Compare an event with the document and return its kind."""
     return check_values(event_dict(event))
 
 

@@ -30,7 +30,7 @@ from tests.rig.report.report_samples import NOTE
         (NoteCode.EARLIER_VERSION, {"text": "as it was"}, "as it was"),
     ],
 )
-def test_notes(code: NoteCode, values: dict[str, object], words: str) -> None:
+def test_note_is_put_into_words(code: NoteCode, values: dict[str, object], words: str) -> None:
     assert words in note_words(Note(code, values))
 
 
@@ -65,5 +65,5 @@ NUMBERS = {"rate": 0.01, "searches": 24, "needed": 100, "min_confidence": 0.98, 
         (LimitationCode.EARLIER_VERSION, {"text": "as it was"}, "as it was"),
     ],
 )
-def test_limitations(code: LimitationCode, values: dict[str, object], words: str) -> None:
+def test_limitation_is_put_into_words(code: LimitationCode, values: dict[str, object], words: str) -> None:
     assert words in limitation_words(Limitation(code, values))

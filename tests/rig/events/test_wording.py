@@ -133,7 +133,7 @@ def test_end_of_a_search_has_a_reason() -> None:
     assert reason_words(replace(dense, reason=StopReason.CONFIDENT)) == "the confidence 60.0 % reaches 95.0 %"
 
 
-def test_comparisons() -> None:
+def test_comparison_is_put_into_words() -> None:
     views = (ComparedView(3, -0.9, 5000.0),)
     found = Compared(4, ("a", "b"), "b", -0.9, (0.9, -0.9), 0.004, 0.01, 0.1, 0.2, 1.5, views, ((0.0,), (10.0,)))
     assert comparison_words(found).endswith("it is b, with an error rate of at most 0.4 % (score −0.90)")
@@ -142,7 +142,7 @@ def test_comparisons() -> None:
     assert line(found).startswith("  Compared with a and b")
 
 
-def test_similar_objects() -> None:
+def test_similar_objects_are_put_into_words() -> None:
     mug = SimilarObjects("mug", 180.0, 0.95, 0.96, (SimilarObject("cup", ((120.0, 200.0), (300.0, 300.0)), 0.2, 0.99),))
     assert similar_objects_words(mug) == [
         "looks the same every 180° (similarity 0.960, of neighbouring views 0.950): its pose is known up to that angle",
@@ -153,7 +153,7 @@ def test_similar_objects() -> None:
     assert similar_objects_words(replace(vase, period_deg=None)) == ["looks like no other enrolled object"]
 
 
-def test_moves() -> None:
+def test_move_is_put_into_words() -> None:
     move = Moved(1, -90.0, -90.1, -90.1, -89.99, 0.12, 0.6, True, 1.0)
     assert move_words(move) == "rotation −90.10° (encoder), −89.99 ± 0.12° (gyro)"
     slipped = replace(move, agrees=False, rotation_imu_deg=-80.0)
@@ -176,7 +176,7 @@ def test_probability_of_a_candidate_is_not_given_for_an_unknown_object() -> None
     assert share_words(replace(candidate, probability=None), None) == ""
 
 
-def test_percentages_near_0_and_100() -> None:
+def test_percentages_near_0_and_100_are_bounds() -> None:
     assert [percent_words(p) for p in (0.0, 0.0005, 0.5, 0.9995, 1.0)] == [
         "<0.1 %",
         "<0.1 %",

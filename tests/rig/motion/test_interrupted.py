@@ -60,7 +60,7 @@ def test_torque_is_off_after_signals_at_any_line(seed):
 
 
 class bench_closed:  # noqa: N801 - a with block
-    """The second way out: the bench switches the torque off, too."""
+    """Closes the bench at the end, which switches the torque off, too."""
 
     def __init__(self, bench) -> None:
         self._bench = bench

@@ -1,4 +1,4 @@
-"""A servo that takes the camera around the object, and one that pans over less than a turn, under both plans."""
+"""A servo that moves the camera around the object, and one that pans over less than a revolution, in both plans."""
 
 from pathlib import Path
 
@@ -33,7 +33,7 @@ def enrolled(simulated, catalog: Catalog, name: str, *overrides: str, views: int
 
 
 def test_azimuths_agree_whether_object_or_camera_rotates(simulated, tmp_path: Path) -> None:
-    """At one azimuth both kinds of bench see the same side of a mug, its handle to the same hand."""
+    """At one azimuth both kinds of bench see the same side of a mug, with its handle on the same side."""
     views = []
     for overrides in ((), ARM):
         with Catalog.open(tmp_path / str(len(views)), clock=simulated().bench.clock, create=True) as catalog:

@@ -117,7 +117,7 @@ def test_reading_that_jumps_by_a_revolution_does_not_become_a_goal(jumps_deg):
                 assert wires.device.memory["Torque Enable"] == 0
 
 
-def test_one_place_writes_goals():
+def test_goals_are_written_in_one_place_only():
     calls = [
         (path.name, node.lineno)
         for folder in ("rig", "calibration")

@@ -52,7 +52,8 @@ def test_angle_and_its_uncertainty_are_true_at_any_time(
 
 
 def test_angle_of_a_fast_platter_is_neither_late_nor_early() -> None:
-    """A platter at rest and at full speed, in both directions: a late angle would change its sign with the speed."""
+    """Views at rest and at full speed, in both directions: the error of a late angle would change its sign with the
+    speed."""
     late_ms = []
     for seed in range(3):
         for start_deg, end_deg in ((0.0, 150.0), (150.0, 0.0)):

@@ -41,7 +41,7 @@ def test_backlash_is_taken_up_on_the_same_side_in_both_directions():
 
 
 def test_backlash_is_visible_without_approach():
-    """The test above proves something: there is backlash."""
+    """Without the approach, the backlash is visible: the test above would fail."""
     noise = NoiseModel(backlash_deg=2.0)
     with (
         motion_bench("table.approach_deg=0", "table.backlash_deg=3", noise=noise) as (bench, wires),
@@ -76,7 +76,7 @@ def test_steady_load_adds_to_the_friction():
         assert 120.0 - table.goto(120.0).encoder_deg == pytest.approx(0.01 * 885 / 5 * 0.0879, abs=0.1)
 
 
-def test_table_that_friction_holds_beyond_the_tolerance_says_how_far_it_is():
+def test_distance_of_a_table_that_friction_holds_beyond_the_tolerance_is_reported():
     with (
         motion_bench() as (bench, wires),
         pytest.raises(NoProgress, match=r"[01]\.\d° from its goal: friction") as held,
@@ -274,7 +274,7 @@ def test_armed_watchdog_of_a_killed_program_does_not_stop_the_next_run():
         bench.servo.arm_watchdog(0.2)  # and the host is killed: no torque off
         wires.world.clock.sleep(0.1)
         with Turntable(bench) as table:
-            assert wires.device.memory["Profile Velocity"] > 0  # 0 would be: as fast as it can
+            assert wires.device.memory["Profile Velocity"] > 0  # 0 would mean full speed
             assert table.goto(20.0).encoder_deg == pytest.approx(20.0, abs=0.3)
 
 

@@ -1,4 +1,4 @@
-"""The cable's budget in the plans: moves inside it, unwinding announced before it happens, and a table left unwound."""
+"""The cable budget in the plans: moves stay within it, unwinding is announced, and the cable is unwound at the end."""
 
 from itertools import pairwise
 

@@ -1,4 +1,4 @@
-"""Enrollment in motion: true angles, complete enrollments, and no view where something is wrong."""
+"""Enrollment in motion: true angles, complete enrollments, and no view with a wrong angle."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -29,7 +29,7 @@ from tests.rig.motion.times import SMALL, camera_time
 WHITE = (200, 200, 200)
 
 BLOCK = Solid("block", (box((60, 40, 50), ((30, 30, 220), (40, 200, 40), (220, 60, 30), (30, 200, 220)), top=WHITE),))
-"""Has no print, so that the many frames of a turn are drawn fast."""
+"""An object without print, so that the many frames of a revolution are drawn fast."""
 FAST = ("table.velocity_dps=200", "view.max_smear_px=9")
 
 
@@ -57,7 +57,7 @@ def true_errors(events: list[Event], bench: Bench, world: World) -> np.ndarray[A
     return np.array(found)
 
 
-def test_one_turn_enrolls_all_views_at_their_true_angles(tmp_path: Path) -> None:
+def test_one_revolution_enrolls_all_views_at_their_true_angles(tmp_path: Path) -> None:
     with flying(tmp_path, lost_frames=0.02, usb_latency_ms=1.0) as (bench, catalog, world):
         (planned_scan,) = dry_run(bench, catalog, {"block": None}, views=24, fly=True)
         events: list[Event] = []
@@ -153,7 +153,7 @@ def test_long_fault_of_frames_leaves_only_true_views(tmp_path: Path, kind: str) 
 def check_true_views(tmp_path: Path, *faults: str) -> None:
     error, events, worst = outcome(tmp_path, *faults)
     assert error is None
-    assert isinstance(events[-1], Enrolled)  # complete: what is missing was taken at rest
+    assert isinstance(events[-1], Enrolled)  # complete: the missing views were taken at rest
     assert worst < 0.4
 
 
@@ -165,13 +165,13 @@ def check_true_views(tmp_path: Path, *faults: str) -> None:
         pytest.param("unplug@2s", RigError, marks=pytest.mark.nightly),
     ],
 )
-def test_failed_turn_stores_no_view(tmp_path: Path, fault: str, kind: type[RigError]) -> None:
+def test_failed_revolution_stores_no_view(tmp_path: Path, fault: str, kind: type[RigError]) -> None:
     error, events, _ = outcome(tmp_path, fault)
     assert isinstance(error, kind)
     assert not any(isinstance(event, Accepted) for event in events)
 
 
-def test_interrupted_turn_resumes_and_can_be_paused(tmp_path: Path) -> None:
+def test_interrupted_revolution_is_resumed_and_can_be_paused(tmp_path: Path) -> None:
     with flying(tmp_path, *FAST, camera_readout_ms=0.0) as (bench, catalog, _):
         events = enroll(bench, catalog, "block", views=8, fly=True)
         for event in events:
@@ -180,7 +180,7 @@ def test_interrupted_turn_resumes_and_can_be_paused(tmp_path: Path) -> None:
         events.close()
         assert not bench.servo.read_condition().torque
         for done in enroll(bench, catalog, "block", resume=True, fly=True):
-            # The operator pauses before the turn, and between its views.
+            # The operator pauses before the revolution, and between its views.
             if isinstance(done, ScanStarted) or (isinstance(done, Accepted) and done.index in (1, 5)):
                 assert abs(bench.servo.read_state().velocity_dps) < 1
                 bench.clock.sleep(40.0)
@@ -188,7 +188,7 @@ def test_interrupted_turn_resumes_and_can_be_paused(tmp_path: Path) -> None:
         assert len(catalog.object("block").views) == 8
 
 
-def test_moved_object_abandons_the_turn(tmp_path: Path) -> None:
+def test_enrollment_in_motion_is_abandoned_if_the_object_moved(tmp_path: Path) -> None:
     with (
         flying(tmp_path, *FAST, camera_readout_ms=0.0, faults=("object_falls@2.5s",)) as (bench, catalog, _),
         pytest.raises(ObjectMoved),

@@ -1,4 +1,4 @@
-"""The recorder of results: the answer comes first, and nothing keeps it back."""
+"""The recorder of results: the answer is reported first, even if it cannot be recorded."""
 
 import errno
 import os
@@ -46,7 +46,7 @@ def test_each_answer_is_recorded_with_its_sample_and_its_first_image(recorder, t
             assert result.provenance.devices["camera"]
 
 
-def test_full_disk_does_not_keep_the_answer_back(recorder, monkeypatch):
+def test_answer_is_reported_on_a_full_disk(recorder, monkeypatch):
     def fail(_: int) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 

@@ -69,7 +69,7 @@ def identifying(
     shape: tuple[int, int] = (48, 64),
     min_score: float = 0.75,
 ) -> Iterator[Event]:
-    """The camera turns by ``rotations_deg``; the scores of all candidates are (0.9 - 0.1 rank) + 0.01 a view."""
+    """Yield a search with these rotations; the candidates' scores are (0.9 - 0.1 rank) + 0.01 for each view."""
     rng = np.random.default_rng(5)
     yield Started("identify", None, 8, {})
     orientation_deg = 0.0
@@ -110,7 +110,7 @@ def identifying(
 def searching_densely(
     answer: str | None = "mug-star", rotations_deg: Sequence[float] = (80.0, -115.0), *, pair: bool = True
 ) -> Iterator[Event]:
-    """The dense search turns by ``rotations_deg``, the best of all, to tell the first two of `NAMES` apart."""
+    """Yield a dense search with these rotations, which distinguish the first two of `NAMES` best."""
     rng = np.random.default_rng(6)
     yield Started("identify", None, 8, {}, strategy="dense", descriptor="edges+colours", notes=(NOTE,))
     possible_deg = tuple(float(rotation) for rotation in range(-175, 185, 5) if rotation)

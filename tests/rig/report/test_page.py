@@ -1,4 +1,4 @@
-"""The report is one file that needs nothing else, says what the records say, and trusts no name."""
+"""The report is one self-contained file, shows the content of the records, and escapes all names."""
 
 import re
 from base64 import b64decode
@@ -28,7 +28,7 @@ META = Meta(
 
 
 class Page(HTMLParser):
-    """Collects what the tests ask of a page; fails on tags that do not nest."""
+    """Collects the parts of a page for the tests; fails on tags that do not nest."""
 
     def __init__(self, html: str) -> None:
         super().__init__()
@@ -118,7 +118,7 @@ def test_heads_of_tables_are_explained() -> None:
     legend = dict(re.findall(r"<dt>([^<]+)</dt><dd>([^<]+)</dd>", html))
     for head in ("#", "on the table", "found as", "correct?", "views", "rotation", "pose error", "score", "margin"):
         assert legend[head] in explained
-    # without the heads, on a phone, each cell says what it is
+    # on a phone, which shows no heads, each cell has its own label
     labels = {attributes["data-label"] for attributes in Page(html).all("td") if "data-label" in attributes}
     assert labels >= {"found as", "views", "rotation", "pose error", "score", "margin"}
 
@@ -166,7 +166,7 @@ def test_images_decode_and_have_alternative_text() -> None:
         head, data = attributes["src"].split(",", 1)
         assert head == "data:image/jpeg;base64"
         assert cv2.imdecode(np.frombuffer(b64decode(data), np.uint8), cv2.IMREAD_COLOR) is not None
-        # a stamp repeats what stands beside it: no words for screen readers
+        # a stamp repeats the text beside it, so it has no text for screen readers
         assert bool(attributes["alt"]) != (attributes.get("class") == "stamp")
     assert all(attributes["aria-label"] for attributes in page.all("svg"))
     assert all(attributes.get("scope") for attributes in page.all("th"))

@@ -1,4 +1,4 @@
-"""Records keep of a stream what a report needs: pictures in small, evidence, and what was right."""
+"""Records store the parts of an event stream that a report needs: thumbnails, evidence, and the truth."""
 
 from dataclasses import replace
 

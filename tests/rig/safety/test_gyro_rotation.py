@@ -45,7 +45,7 @@ class Bench:
         return self.world.shaft()[0]
 
     def move(self, by_deg: float, v_max: float = 90.0) -> Rotation:
-        """Do what the turntable does."""
+        """Rotate as the turntable does."""
         self.heading.begin()
         self.drive(by_deg, v_max)
         for _ in range(int(abs(by_deg) / v_max / 0.03) + 20):
@@ -135,7 +135,7 @@ def test_sensor_without_samples_is_not_at_rest(bench: Bench, monkeypatch: pytest
 @pytest.mark.parametrize("by_deg", [90.0, -35.0, 5.0, -180.0])
 def test_rotation_without_errors_is_exact(by_deg: float) -> None:
     with Bench(NoiseModel.none()) as bench:
-        bench.heading.rest(1.0)  # without noise: not taken for a sensor that hangs
+        bench.heading.rest(1.0)  # a sensor without noise does not count as hanging
         rotation = bench.move(by_deg)
         assert rotation.valid
         assert rotation.angle_deg == pytest.approx(by_deg, abs=0.02)
@@ -164,7 +164,7 @@ def test_fifo_is_read_in_time_at_each_rate(rate_hz: float) -> None:
     ],
 )
 def test_errors_match_the_stated_uncertainty(noise: NoiseModel, scale_sigma: float) -> None:
-    """|error|/σ over parts and moves: neither too proud nor too shy."""
+    """The ratio |error|/σ over parts and moves shows that the uncertainty is neither too small nor too large."""
     pulls = []
     for seed in range(80):
         with Bench(noise, seed, scale_sigma=scale_sigma) as bench:
@@ -191,7 +191,7 @@ def test_uncertainty_grows_with_time_angle_and_bias_uncertainty() -> None:
         assert t == pytest.approx(60 / 30 + 0.7, abs=0.4)
 
 
-def test_mounting_upside_down_and_scale() -> None:
+def test_mounting_upside_down_and_scale_are_corrected() -> None:
     with Bench(NoiseModel.none(), sign=-1, scale=1.5) as bench:
         bench.heading.rest()
         assert bench.move(40.0).angle_deg == pytest.approx(-60.0, abs=0.03)

@@ -1,4 +1,4 @@
-"""What breaks a motion off: each fault is found in time, the table stopped, its torque off, and the fault latched."""
+"""Faults that end a motion: each is found in time, the table stops, its torque goes off, and the fault is latched."""
 
 from dataclasses import replace
 
@@ -199,7 +199,7 @@ def test_normal_motion_is_never_stopped(velocity, target):
             assert table.goto(goal).agrees
 
 
-# -- the watch alone -------------------------------------------------------------------------------------------------
+# -- the monitor alone -----------------------------------------------------------------------------------------------
 
 
 def monitor(goal_deg: float = 300.0) -> MotionMonitor:
@@ -211,7 +211,7 @@ def at(k: int, **values) -> ServoState:
 
 
 def readings_until(error, watch: MotionMonitor, state, angle_deg, lag_deg) -> float:
-    """Return after how many seconds of such readings the watch raises ``error``."""
+    """Return the number of seconds of such readings after which the monitor raises ``error``."""
     for k in range(200):
         try:
             watch.check(at(k, **state), angle_deg(k), lag_deg)

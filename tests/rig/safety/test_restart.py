@@ -1,4 +1,4 @@
-"""What one program leaves, the next one finds: killed, without supply, without its cable, with another servo."""
+"""The state of the bench after an ended program: killed, without supply, without its cable, or with another servo."""
 
 import json
 from collections.abc import Generator
@@ -33,7 +33,7 @@ from tests.rig.bench_parts import Wires, kill, program, sensor, servo_wires
 
 @pytest.fixture
 def bench_of(tmp_path):
-    """Return a function that starts a program on one and the same bench, whose cable hung free at first."""
+    """Return a function that starts a program on the same bench each time; at first its cable hangs free."""
     with sensor(servo_wires()) as (wires, i2c):
         wires.i2c = i2c
         store = FileStore(tmp_path / "state")
@@ -128,7 +128,7 @@ def test_sigkill_and_power_cut_need_a_new_reference(start, wires):
     wires.device.power_cycle()
     wires.world.clock.sleep(1.0)
     stands_deg = wires.world.shaft()[0]
-    assert stands_deg > 200  # 200° read as 20° would wind the cable up by a turn
+    assert stands_deg > 200  # 200° read as 20° would wind the cable up by a revolution
     with start() as bench:
         assert bench.safety.state is TableState.UNREFERENCED
         assert bench.safety.doubt.finding is AngleFinding.POWER_LOST_IN_MOTION
@@ -154,7 +154,7 @@ def test_power_cut_between_programs_loses_no_revolution(start, wires):
             assert table.rest_deg == pytest.approx(-370.0, abs=0.3)
             table.goto(-360.0)
         assert wires.world.shaft()[0] == pytest.approx(-360.0, abs=0.3)
-    with start() as bench:  # what was restored is written down
+    with start() as bench:  # the restored state is stored
         assert not bench.findings
         assert bench.safety.state is TableState.READY
 
@@ -300,7 +300,7 @@ def test_reboot_with_changed_settings_keeps_the_fault(start, wires):
 def test_old_goal_of_a_killed_program_is_not_continued(start, wires):
     with start() as bench:
         killed_in_motion(bench, wires, 300.0, after_s=1.0)
-    wires.world.clock.sleep(0.2)  # armed still, and turning
+    wires.world.clock.sleep(0.2)  # still armed, and rotating
     with start() as bench:
         assert "still armed" in " ".join(bench.findings)
         with Turntable(bench) as table:
@@ -395,12 +395,12 @@ def test_stop_request_ends_the_motion_with_torque_off(tmp_path, start, wires):
         assert wires.world.shaft()[1] == 0
         assert 20 < wires.world.shaft()[0] < 200
         assert not FileStore(tmp_path / "state").stop_requested()
-        with Turntable(bench) as table:  # stopped, not broken
+        with Turntable(bench) as table:  # a stop is no fault
             assert table.goto(0.0).agrees
 
 
 @pytest.mark.parametrize("after_s", [0.05, 0.3, 0.5, 0.6, 0.7, 0.8])
-def test_stop_is_not_reported_as_the_death_of_a_program(tmp_path, start, wires, after_s):
+def test_stop_is_not_reported_as_a_killed_program(tmp_path, start, wires, after_s):
     """Also while the table comes to rest or stands, with its watchdog armed."""
     with pytest.raises(MotionStopped), start() as bench, Turntable(bench) as table:
         after(wires, after_s, FileStore(tmp_path / "state").request_stop)

@@ -1,4 +1,4 @@
-"""The state machine: whatever happens, in whatever order, READY means that the cable's turns are right."""
+"""The state machine: after any events in any order, READY means that the cable's revolutions are right."""
 
 from contextlib import ExitStack, suppress
 
@@ -34,7 +34,8 @@ from tests.fuzzing import fuzz_settings
 class Shaft:
     """A servo as far as the safety layer sees it, and the truth about the cable.
 
-    It can be asked, verified and restarted; that the safety layer wrote anything else to it would be an AttributeError.
+    It can be read, verified and restarted. If the safety layer wrote anything else to it, an AttributeError would
+    result.
     """
 
     identity = ServoIdentity("xl430_w250", 1060, 1, 46)
@@ -88,7 +89,7 @@ ENDS = {
 
 
 class Bench(RuleBasedStateMachine):
-    """A bench, its technician, its cable and everything that happens to them."""
+    """A bench with its technician, its cable, and all events."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -104,7 +105,7 @@ class Bench(RuleBasedStateMachine):
         return Safety(self.shaft, RigConfig(), VirtualClock(), self.store)
 
     def check_ready_angle(self) -> None:
-        """What is READY knows its turns."""
+        """Check that the revolutions are right if the table is READY."""
         if self.safety.state is TableState.READY:
             reported_deg = self.safety.angle_reference.to_table(self.shaft.read_state().position_deg)
             assert reported_deg == pytest.approx(self.shaft.cable_deg, abs=1e-6)
@@ -196,7 +197,8 @@ class Bench(RuleBasedStateMachine):
 
     @rule()
     def everything_is_fixed(self) -> None:
-        """What a technician does in the morning; without it, most days would be spent in the first fault."""
+        """Fix everything, as a technician does in the morning; without this, most runs would stay in the first
+        fault."""
         self.shaft.there, self.shaft.other, self.shaft.errors = True, False, ()
         self.a_program_starts()
         if self.safety.fault:
@@ -248,7 +250,7 @@ class Bench(RuleBasedStateMachine):
     def a_device_fails_or_is_well_again(self, there: bool, other: bool, errors: tuple[str, ...]) -> None:
         self.shaft.there, self.shaft.other, self.shaft.errors = there, other, errors
 
-    # -- promises -----------------------------------------------------------------------------------------------------
+    # -- invariants ---------------------------------------------------------------------------------------------------
 
     @invariant()
     def a_fault_outlives_its_program(self) -> None:
@@ -304,7 +306,7 @@ def test_nothing_moves_if_the_state_cannot_be_stored():
         pytest.fail("it moves")
     assert safety.state is TableState.READY
     stalled = Stalled("Blocked.", next_step="Free it.")
-    safety.latch(stalled)  # a fault is a fault, whether the disk is full or not
+    safety.latch(stalled)  # the fault is latched even if the disk is full
     assert safety.state is TableState.FAULT
     assert "in this program only" in stalled.__notes__[0]
 

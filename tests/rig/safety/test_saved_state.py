@@ -1,4 +1,4 @@
-"""What a bench remembers on the disk, and who holds it."""
+"""The state of a bench on the disk, and the program that holds the bench."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""Searches in motion: they end in mid-turn, can be replayed, and take no false frame for evidence."""
+"""Searches in motion: they end during the rotation, can be replayed, and use no faulty frame as evidence."""
 
 from collections.abc import Iterator
 from contextlib import suppress
@@ -43,7 +43,7 @@ def moving(world: World, *settings: str, faults: tuple[str, ...] = ()) -> Bench:
     return open_sim_bench(camera_time(world, *SMALL, *settings), operator, faults=[Fault.parse(one) for one in faults])
 
 
-def test_search_ends_in_mid_turn_and_can_be_replayed(model: Model, tmp_path: Path) -> None:
+def test_search_ends_during_the_rotation_and_can_be_replayed(model: Model, tmp_path: Path) -> None:
     live: list[FrameUsed] = []
     with moving(World(seed=2)) as bench, RunWriter(tmp_path / "run", bench, model) as writer:
         events = []
@@ -51,7 +51,7 @@ def test_search_ends_in_mid_turn_and_can_be_replayed(model: Model, tmp_path: Pat
             writer.add(event)
             events.append(event)
             if isinstance(event, Accepted) and event.evidence.motion is not None:
-                assert live  # its event was reported in the turn
+                assert live  # its event was reported during the rotation
         answer = events[-1]
         assert isinstance(answer, Identified)
         assert answer.name == "bottle-harvest"
@@ -132,7 +132,7 @@ def test_search_at_rest_stays_without_calibration_and_motion_asks_for_it(model: 
 
 
 @pytest.mark.parametrize(("fault", "at_rest"), [("camera.stuck@0.8s+1.5s", 1), ("camera.off@0.8s+4s", 2)])
-def test_table_rotates_on_while_the_camera_delivers_nothing(model: Model, fault: str, at_rest: int) -> None:
+def test_table_continues_to_rotate_while_the_camera_delivers_nothing(model: Model, fault: str, at_rest: int) -> None:
     """Frames of the same arc end the search, or a view at rest where the arc has ended."""
     with moving(World(seed=2), faults=(fault,)) as bench:
         *events, answer = identify(bench, model)

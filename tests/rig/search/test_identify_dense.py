@@ -43,7 +43,7 @@ def search(s, model, name, **options):
     return events, answer
 
 
-def test_objects_enrolled_without_an_empty_table_image_are_searched_without(simulated, shelf):
+def test_objects_enrolled_without_an_empty_table_image_are_searched_without_one(simulated, shelf):
     s = simulated()
     events, answer = search(s, shelf, "dice")
     started = events[0]

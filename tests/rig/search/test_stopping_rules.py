@@ -273,7 +273,7 @@ def test_rotations_stay_within_the_cable_budget():
 
 
 class Around:
-    """A strategy of your own on the dense search: always to the far side."""
+    """A custom strategy on the dense search: always rotates to the far side."""
 
     name = "around"
     descriptor = "edges+colours"
@@ -350,7 +350,8 @@ def test_objects_without_the_descriptor_are_searched_by_the_paper(sim_catalog_of
 
 @pytest.fixture
 def sim_catalog_of_both(tmp_path, simulated):
-    """Return a catalog of two objects by both descriptors, and what takes the bench's own from one view."""
+    """Return a catalog of two objects with both descriptors, and a function that removes the bench's own from one
+    view."""
     from rig.catalog.seal import seal_enrollments
     from rig.plans.enroll import enroll
 

@@ -62,7 +62,7 @@ def test_every_strategy_takes_all_allowed_views_without_a_margin(name, max_views
     assert again == rotations
 
 
-def test_rotations_of_each_strategy():
+def test_each_strategy_takes_its_rotations():
     sweep, _, _ = run("sweep", max_views=6, margin=1.0)
     assert [rotation.rotation_deg for rotation in sweep] == [60.0] * 5
     for name in ("random", "hbr"):

@@ -1,4 +1,4 @@
-"""Which frames are accepted as views, with the simulated camera behind the real driver."""
+"""Acceptance of frames as views, with the simulated camera behind the real driver."""
 
 from dataclasses import replace
 

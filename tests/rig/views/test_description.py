@@ -122,7 +122,7 @@ def test_first_view_of_a_search_shows_whether_the_bench_is_that_of_the_enrollmen
 
 
 @pytest.mark.parametrize("change", ["none", "noise", "arm"])
-def test_enrolled_view_is_described_alike_from_its_first_segmentation(change: str) -> None:
+def test_enrolled_view_is_described_the_same_from_its_first_segmentation(change: str) -> None:
     table = _table()
     image = _with_object(table)
     rng = np.random.default_rng(3)

@@ -60,7 +60,7 @@ def test_logins_are_limited_for_each_address(sessions, clock):
 
 
 @pytest.mark.parametrize("content", [b"", b"[", b"{}", b'[{"name": "x"}]', b"\xff\xfe"])
-def test_damaged_tokens_are_reported_and_let_no_one_in(tmp_path, sessions, content):
+def test_damaged_tokens_are_reported_and_allow_no_login(tmp_path, sessions, content):
     (tmp_path / "tokens.json").write_bytes(content)
     with pytest.raises(ConfigError):
         sessions.login("rig_x", "10.0.0.1")

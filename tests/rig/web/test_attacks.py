@@ -150,7 +150,7 @@ def test_damage_of_the_catalog_is_in_the_status(serve, capsys):
     assert "rig catalog verify" in capsys.readouterr().err
 
 
-def test_metrics_tell_the_state_of_the_bench(serve):
+def test_metrics_contain_the_state_of_the_bench(serve):
     served = serve()
     served.run(kind="goto", angle_deg=30)
     text = served.client.get("/metrics").text

@@ -1,4 +1,4 @@
-"""A whole bench on a rig head: its gyro measures, its light lights, its relay feeds the servo, its e-stop stops."""
+"""A whole bench with a rig head: its gyro, its light, its relay for the servo, and its e-stop."""
 
 import pytest
 
@@ -43,7 +43,7 @@ def test_object_is_enrolled_and_found_with_the_heads_gyro_alone(on_head, tmp_pat
             taken = (event for event in enroll(s.bench, catalog, name, views=4) if isinstance(event, Accepted))
             truth_deg += [(event.azimuth_deg, -s.world.table_deg()) for event in taken]
         for azimuth_deg, true_deg in truth_deg:
-            assert abs(wrap180(azimuth_deg - true_deg)) < 4.0  # an uncalibrated gyro: 1 % of a turn
+            assert abs(wrap180(azimuth_deg - true_deg)) < 4.0  # an uncalibrated gyro: 1 % of a revolution
         assert any(abs(wrap180(a + round(-a / 90) * 90)) > 0.01 for a, _ in truth_deg)  # and not the encoder's stops
         s.operator.next_object, s.operator.yaw_deg = "mug-dots", 90.0
         *_, answer = identify(s.bench, ViewIndex(catalog.views().views))
@@ -52,7 +52,7 @@ def test_object_is_enrolled_and_found_with_the_heads_gyro_alone(on_head, tmp_pat
     assert (health["lost"], health["crc_errors"], health["missed"]) == (0, 0, 0)
 
 
-def test_bench_is_dark_and_unpowered_before_and_after(on_head):
+def test_light_and_servo_power_are_off_before_and_after_a_program(on_head):
     needs("memory")
     s = on_head()
     assert s.operator.devices.head.relay_closed
@@ -63,7 +63,7 @@ def test_bench_is_dark_and_unpowered_before_and_after(on_head):
     assert not s.operator.devices.servo.powered
 
 
-def test_estop_in_mid_motion_stops_the_table_and_latches(on_head):
+def test_estop_during_a_motion_stops_the_table_and_latches(on_head):
     s = on_head()
     head = s.operator.devices.head
     with pytest.raises(EmergencyStop), Turntable(s.bench) as table:

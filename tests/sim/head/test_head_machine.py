@@ -1,4 +1,4 @@
-"""Whatever a host, an operator and a bad supply do in whatever order: light and power are on only while all is well."""
+"""After any actions of a host, an operator and a bad supply, light and power are on only without a fault."""
 
 import pytest
 from hypothesis import settings
@@ -35,7 +35,7 @@ SLACK_NS = 3 * MS
 
 
 class Head(RuleBasedStateMachine):
-    """The firmware's core against a model of what may be on."""
+    """The firmware's core, compared with a model of the allowed outputs."""
 
     @initialize()
     def power_up(self):
@@ -64,7 +64,7 @@ class Head(RuleBasedStateMachine):
             return False
         return True
 
-    # -- what may happen ------------------------------------------------------------------------------------------
+    # -- events ---------------------------------------------------------------------------------------------------
 
     @rule(deadman_ms=st.sampled_from([DEADMAN_MIN_MS, 100, 250, DEADMAN_MAX_MS]))
     def beat(self, deadman_ms):
@@ -147,10 +147,10 @@ class Head(RuleBasedStateMachine):
         self.head.send(noise + b"\0")
         self.world.clock.sleep(0.003)
 
-    # -- what always holds ------------------------------------------------------------------------------------------
+    # -- invariants -------------------------------------------------------------------------------------------------
 
     def expire(self):
-        """The deadman, as the model has it: near its end either answer is right, so that nothing is asked then."""
+        """Let the deadman of the model expire; near its end both states are right, so nothing is checked then."""
         if self.beaten_ns is None or self.latched:
             return
         self.head.catch_up()

@@ -1,4 +1,4 @@
-"""A long stream: no sample is lost, and each is dated right, against the truth of which sample it is."""
+"""A long stream: no sample is lost, and each sample has the right time, compared with its true number."""
 
 import struct
 
@@ -19,7 +19,7 @@ FRAME = struct.Struct(">7h")
 
 
 class CountingSensor:
-    """An MPU-6050, as far as a head uses it, whose samples say which one they are: gyro x and y count them."""
+    """The parts of an MPU-6050 that a head uses; gyro x and y of each sample are its number."""
 
     def __init__(self, head: SimHead, error: float) -> None:
         self._head = head

@@ -1,4 +1,4 @@
-"""The emulated head in lock-step with the virtual clock: the same to the cycle, however and how often it is run."""
+"""The emulated head in lock-step with the virtual clock: equal to the cycle for any division of the run."""
 
 from dataclasses import dataclass, field
 
@@ -17,7 +17,7 @@ KINDS = ["memory", pytest.param("avr", marks=pytest.mark.nightly)]
 
 @dataclass
 class Trace:
-    """Everything that left a head, and what its driver made of it."""
+    """All outputs of a head, and the values that its driver read."""
 
     line: list[tuple[bool, int, int]] = field(default_factory=list)
     pins: list[tuple[int, str, float]] = field(default_factory=list)
@@ -26,7 +26,7 @@ class Trace:
 
 
 def eventful(kind: str) -> Trace:
-    """Run two seconds in which everything happens."""
+    """Run two seconds with events of all kinds."""
     trace = Trace()
     rng = np.random.default_rng(3)
     with opened_head(kind, NoiseModel()) as h:
@@ -107,7 +107,7 @@ def undisturbed(kind: str) -> list[tuple[int, int]]:
 
 
 def test_host_build_and_the_binary_measure_the_same():
-    """What differs is when a byte leaves, not what was measured."""
+    """Only the times of the bytes differ, not the measured values."""
     angles = {}
     for kind in ("memory", "avr"):
         with opened_head(kind, NoiseModel.none()) as h:

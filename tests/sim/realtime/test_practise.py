@@ -1,4 +1,4 @@
-"""docs/how-to/practise-on-a-simulated-bench.md: every command is typed, and answers as the page says."""
+"""docs/how-to/practise-on-a-simulated-bench.md: every command is typed, and its output is that of the page."""
 
 import os
 import re
@@ -30,7 +30,7 @@ IN_DEPTH = ("A cable is unplugged", "A program is killed", "Enroll and identify"
 
 @dataclass
 class Typed:
-    """A command of the page, with the answer that it promises."""
+    """A command of the page, with the answer on the page."""
 
     section: str
     terminal: str
@@ -60,7 +60,7 @@ def commands() -> Iterator[Typed]:
 
 
 def until(reached: Callable[[], bool]) -> None:
-    """Wait for progress, however long a busy computer takes for it."""
+    """Wait for progress, which may take long on a busy computer."""
     start_ns = CLOCK.now_ns()
     while not reached():
         assert seconds_between(start_ns, CLOCK.now_ns()) < PATIENCE_S

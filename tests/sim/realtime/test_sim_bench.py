@@ -175,7 +175,7 @@ def test_unplugged_port_disappears_and_returns_under_its_name(start):
     assert ping(folder) == 1
 
 
-def test_garbage_does_not_end_the_bench(start):
+def test_random_bytes_do_not_end_the_bench(start):
     folder = start()
     rng = np.random.default_rng(1)
     port = open_serial(str(folder / "servo"), 57_600)
@@ -187,7 +187,7 @@ def test_garbage_does_not_end_the_bench(start):
             client.sendall(garbage + b"\n")
             client.shutdown(socket.SHUT_WR)
             assert client.recv(1) == b""
-    crowd = [connected(folder) for _ in range(MAX_CONNECTIONS + 5)]  # and none of them asks for anything
+    crowd = [connected(folder) for _ in range(MAX_CONNECTIONS + 5)]  # none of them sends a request
     for client in crowd:
         client.close()
     until(lambda: answers(folder))

@@ -1,4 +1,4 @@
-"""A bench with one or more simulated servos, and the unmodified SDK at the other end of the line."""
+"""A bench with one or more simulated servos, and the unmodified SDK at the other end of the bus."""
 
 from dataclasses import dataclass, field
 
@@ -16,7 +16,7 @@ ALERT = 0x80
 
 @dataclass
 class Line:
-    """One bus, its servos by id, the SDK, and all frames that went over the line."""
+    """One bus, its servos by id, the SDK, and all frames on the bus."""
 
     baudrate: int = 1_000_000
     noise: NoiseModel = field(default_factory=NoiseModel.none)
@@ -45,7 +45,7 @@ class Line:
         return control_table(servo.model.name, servo.memory["Firmware Version"])
 
     def read(self, name: str, bus_id: int = 1) -> int:
-        """Read a register that must answer without an error; the alert is let pass."""
+        """Read a register that must answer without an error; an alert is allowed."""
         register = self.table(bus_id)[name]
         data, result, error = self.sdk.readTxRx(self.port, bus_id, register.address, register.size)
         assert (result, error & ~ALERT) == (COMM_SUCCESS, 0), name

@@ -1,4 +1,4 @@
-"""The line and the serial port: time byte by byte, and everything that spoils it."""
+"""The bus and the serial port: times of each byte, and disturbances."""
 
 import errno
 from collections.abc import Callable
@@ -80,7 +80,7 @@ def test_read_returns_when_complete_or_at_the_timeout(line: Line) -> None:
         line.serial.read(1)
 
 
-# -- spoilt lines ---------------------------------------------------------------------------------------------------
+# -- disturbances ---------------------------------------------------------------------------------------------------
 
 
 def flip(index: int) -> Callable[[Frame], Frame]:
@@ -101,7 +101,7 @@ def test_crc_error_on_the_wire_is_a_corrupt_packet_for_the_sdk(line: Line, index
 
 
 def test_late_reply_is_received_by_the_next_read(line: Line) -> None:
-    """The hazard that makes a driver drain the line: the answer to one read is taken for the answer to the next."""
+    """This is why a driver must drain the bus: the answer to one read is accepted as the answer to the next."""
     held_up = [0.05]
     line.bus.filters.append(
         lambda frame: replace(frame, start_ns=frame.start_ns + round(held_up.pop() * 1e9)) if held_up else frame

@@ -1,4 +1,4 @@
-"""What goes wrong with a servo, when it notices, and what brings it back."""
+"""Faults of a servo, their detection, and their end."""
 
 from typing import Any
 

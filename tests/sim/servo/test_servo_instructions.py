@@ -181,7 +181,7 @@ def test_bulk_read_reads_other_registers_of_each_servo(three: Line, fast: bool) 
 
 @pytest.mark.parametrize("instruction", [0x82, 0x8A, 0x92, 0x9A])
 @pytest.mark.parametrize("size", [65_527, 65_528, 65_531, 65_535])
-def test_read_of_more_than_a_packet_holds_is_no_crash(three: Line, instruction: int, size: int) -> None:
+def test_read_of_more_than_a_packet_does_not_stop_the_servo(three: Line, instruction: int, size: int) -> None:
     request = [0, 0, *word(size), 1] if instruction in (0x82, 0x8A) else [1, 0, 0, *word(size)]
     body = bytes([instruction, *request])
     three.bus.send(with_crc(b"\xff\xff\xfd\x00\xfe" + bytes(word(len(body) + 2)) + body), three.baudrate)

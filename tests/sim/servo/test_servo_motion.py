@@ -1,4 +1,4 @@
-"""How the shaft moves and what the registers say meanwhile, against the closed form of the profiles."""
+"""The motion of the shaft and the registers during it, compared with the closed form of the profiles."""
 
 from math import sqrt
 
@@ -18,7 +18,7 @@ TRIANGULAR, TRAPEZOIDAL, RECTANGULAR = 0x20, 0x30, 0x10
 
 
 def duration(distance_deg: float, v: float, a: float) -> float:
-    """Return how long a trapezoid or triangle from rest to rest takes."""
+    """Return the duration of a trapezoid or triangle from rest to rest."""
     return 2 * sqrt(distance_deg / a) if distance_deg * a <= v * v else distance_deg / v + v / a
 
 
@@ -158,7 +158,7 @@ def test_current_models_report_current() -> None:
     assert line.read("Present Current") == round(855 * FRICTION_LOAD)
 
 
-# -- position: turns, direction, offset -----------------------------------------------------------------------------
+# -- position: revolutions, direction, offset -----------------------------------------------------------------------
 
 
 def test_extended_position_counts_revolutions_also_with_torque_off(line: Line) -> None:

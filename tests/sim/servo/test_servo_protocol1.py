@@ -106,7 +106,7 @@ def test_flipped_bit_is_never_accepted(parameters: bytes, data: st.DataObject) -
 
 
 def test_control_tables_of_driver_and_servo_are_equal() -> None:
-    """Two tables, written down apart from each other."""
+    """The two tables were written independently."""
     assert {n: (r.address, r.size) for n, r in control_table("ax_12a").items()} == {
         n: (e.address, e.size) for n, e in ENTRIES.items()
     }

@@ -1,4 +1,4 @@
-"""The slave's codec against the SDK's own and against the e-manual's examples."""
+"""The servo's codec, compared with the SDK's and with the e-manual's examples."""
 
 import pytest
 from dynamixel_sdk import Protocol2PacketHandler
@@ -130,7 +130,7 @@ def test_sdk_unstuffs_the_bytes_that_the_servo_stuffs(bus_id: int, error: int, d
 @given(sent=st.lists(st.tuples(payloads, packets), max_size=6), cuts=st.lists(st.integers(0, 400), max_size=8))
 def test_packets_are_found_in_noise_and_in_pieces(sent: list[tuple[bytes, InstructionPacket]], cuts: list[int]) -> None:
     stream = b"".join(noise + instruction_frame(p.bus_id, p.instruction, p.parameters) for noise, p in sent)
-    stream += bytes(1100)  # completes whatever the noise may have announced
+    stream += bytes(1100)  # completes any packet that the noise has begun
     parser = PacketParser()
     found = []
     start = 0

@@ -1,4 +1,4 @@
-"""The control table against a small model of what the e-manual allows, under any sequence of instructions."""
+"""The control table, compared with a small model of the e-manual's rules, under any sequence of instructions."""
 
 from dynamixel_sdk import COMM_SUCCESS
 from hypothesis import settings
@@ -143,7 +143,7 @@ class ServoMachine(RuleBasedStateMachine):
     def arrive(self) -> None:
         remaining_s = self.servo.motor.commanded.end_s - self.line.clock.now_ns() * 1e-9
         if remaining_s > 300:
-            return  # hundreds of turns at a crawl
+            return  # hundreds of revolutions at a low speed
         self.line.sleep(remaining_s)
         assert self.line.read("Present Position") == self.goal
         assert self.line.read("Moving Status") & 0x03 == 0x01

@@ -63,7 +63,7 @@ def test_each_search_of_watch_asks_for_the_sample(enrolled, monkeypatch):
     assert [one["operator"] for one in listed] == ["A. Silva"]
 
 
-def test_sample_is_rejected_where_it_cannot_be_recorded(rig):
+def test_sample_is_rejected_if_it_cannot_be_recorded(rig):
     assert rig("identify", "--sample", "S-1", "--watch").exit_code == 2
     assert rig("identify", "--sample", "S-1", "--set", "identify.record=none").exit_code == 2
     assert rig("identify", "--sample", " ").exit_code == 2

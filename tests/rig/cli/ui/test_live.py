@@ -96,7 +96,7 @@ def test_enrollment_in_a_pipe_has_one_line_for_each_view():
 
 
 def in_motion(events: list[Event]) -> list[Event]:
-    """Return events as if the views had been taken in one turn, 45° apart."""
+    """Return events as if the views had been taken in one revolution, 45° apart."""
     return [
         replace(one, evidence=replace(one.evidence, stillness=None, motion=flight(45.0 * one.index)))
         if isinstance(one, Accepted | Rejected)
@@ -320,7 +320,7 @@ def test_operator_is_asked_for_the_next_object():
     assert question.startswith("3 of 25: put mug (kitchen) on the table")
     assert "\a" not in question  # a pipe makes no sound
     assert asked("s\n")[0] is TrayDecision.SKIP
-    assert asked("what?\nn\nQ\n")[0] is TrayDecision.STOP  # what is no answer is asked again
+    assert asked("what?\nn\nQ\n")[0] is TrayDecision.STOP  # after an invalid answer, the question is asked again
     assert asked("")[0] is TrayDecision.STOP
 
 
