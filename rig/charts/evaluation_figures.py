@@ -137,7 +137,7 @@ def _title(results: dict[str, Any]) -> str:
     if condition["background"] != "same":
         words.append(f"{condition['background']} background")
     if condition["rotation_deg"]:
-        words.append(f"turned by up to {condition['rotation_deg']:g}°")
+        words.append(f"rotated by up to {condition['rotation_deg']:g}°")
     if condition["perturbations"] != "none":
         kinds = condition["perturbations"].split("+")
         words.append("+".join(kinds) if len(kinds) <= 2 else f"{len(kinds)} perturbations")

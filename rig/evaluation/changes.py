@@ -83,7 +83,7 @@ def run_changes(
 def change_rows(results: dict[str, Any]) -> Rows:
     """Return a table of the shares, in percent: of all objects, and of those that are reported alone."""
     heads = ["change, %", "ranking, N = 1 / 2 / 4", "decided right", "wrong", "ambiguous", "called unknown"]
-    heads += ["leader verified", "leaders compared", "so right / wrong", "unknown accepted"]
+    heads += ["leader verified", "leaders compared", "right / wrong by it", "unknown accepted"]
     rows = [_row(results["settings"], results["changed_bench"])]
     if "reported" in results:
         rows.append(_row(results["settings"], results["reported"]))

@@ -207,7 +207,7 @@ def test_search_in_motion_shows_its_frames_and_stop_ends_it_during_the_rotation(
         job_done(page, f"Enroll {name}")
     page.goto(f"{server.url}identify")
     page.click("#start button:has-text('Identify')")
-    page.wait_for_selector("#answer:has-text('Looking …')", timeout=WAIT_MS)
+    page.wait_for_selector("#answer:has-text('Searching …')", timeout=WAIT_MS)
     page.click("#stop")
     page.wait_for_selector("#messages:has-text('Stopped')", timeout=WAIT_MS)
     job_done(page, "Identify", "cancelled")

@@ -21,7 +21,7 @@ function card(one) {
   const views = one.unfinished_views !== null ? `interrupted, ${one.unfinished_views} views` : `${one.views} views`;
   const image = one.picture === null ? null : h("img", { src: `${API}/views/${one.picture}/image`, alt: "", loading: "lazy" });
   const action = $("deleted").checked ? () => act(async () => { await request("POST", "/undelete", { name: one.name }); await load(false); }) : () => act(() => open(one.name));
-  return h("li", {}, h("button", { onclick: action }, image, h("strong", {}, one.name), h("br"), h("span", { class: "soft" }, $("deleted").checked ? "Bring back" : `${one.label ? `${one.label}, ` : ""}${views}`)));
+  return h("li", {}, h("button", { onclick: action }, image, h("strong", {}, one.name), h("br"), h("span", { class: "soft" }, $("deleted").checked ? "Restore" : `${one.label ? `${one.label}, ` : ""}${views}`)));
 }
 
 async function open(name) {

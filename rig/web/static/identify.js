@@ -15,7 +15,7 @@ function answer(words, kind, detail) {
 
 function clear() {
   for (const id of ["thumbs", "steps", "candidates"]) $(id).replaceChildren();
-  answer("Looking …", "", "");
+  answer("Searching …", "", "");
 }
 
 function bars(candidates) {
@@ -38,7 +38,7 @@ export function result(event) {
 
 on("plan", (event) => {
   if (event.job !== current) return;
-  if (event.event === "frame_used") return answer("Looking …", "", event.text.trim());
+  if (event.event === "frame_used") return answer("Searching …", "", event.text.trim());
   if (event.event === "started") clear();
   if (event.event === "waiting") answer(event.reason === "first-object" ? "Put an object on the table" : "Put the next object on the table", "", "");
   if (event.event === "accepted") $("thumbs").append(thumb(event.job, event.picture, `view ${event.index + 1}, ${event.azimuth_deg.toFixed(0)}°`));

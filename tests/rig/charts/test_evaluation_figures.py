@@ -55,7 +55,7 @@ def test_curves_go_through_the_rates() -> None:
     label = drawn["hit-rate"].label
     assert "label <ahbr> 90" in label
     assert "a & b, 3 objects, noise gn:0.012 at 128 px; 10 trials an object; objects 1 to 3; uniform" in label
-    assert "turned by up to 20°; prefilter 1.5 px" in label
+    assert "rotated by up to 20°; prefilter 1.5 px" in label
     assert ahbr.label == "label <ahbr>"
 
 
