@@ -9,7 +9,7 @@ Decision: docs/decisions/0018.
 """
 
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
 from importlib.metadata import version
@@ -31,7 +31,7 @@ from rig.config.values import validate
 from rig.core.errors import CatalogError, RigError, UsageError, os_errors_as
 from rig.core.files import json_values, read, write
 from rig.events.compared import Compared
-from rig.events.events import Accepted, Event, Identified, Moved, Ranked, Started, event_dict
+from rig.events.events import Accepted, Event, Failed, Identified, Moved, Ranked, Started, event_dict
 from rig.events.reading import event_of
 from rig.search.earlier_runs import NOT_SAVED, upgraded
 from rig.search.model import Model, empty_table_for, model_of
@@ -151,6 +151,41 @@ class RunWriter:
     def _line(self, value: dict[str, Any]) -> None:
         self._events.write(json.dumps(value, ensure_ascii=False, allow_nan=False, default=str) + "\n")
         self._events.flush()
+
+
+class RunSaver:
+    """Saves each search in the folder that ``next_folder`` returns; without ``next_folder`` it saves nothing.
+
+    ``folder`` is the folder of the last search, None before the first one.
+    """
+
+    def __init__(self, next_folder: Callable[[], Path] | None, bench: Bench, model: Callable[[], Model]) -> None:
+        self.folder: Path | None = None
+        self._next_folder = next_folder
+        self._bench = bench
+        self._model = model
+        self._writer: RunWriter | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._writer is not None:
+            self._writer.__exit__(kind, error, trace)
+
+    def add(self, event: Event) -> None:
+        """Store an event. Errors as for `RunWriter.add`."""
+        if self._next_folder is not None and isinstance(event, Started):
+            folder = self._next_folder()
+            self._writer = RunWriter(folder, self._bench, self._model())
+            self.folder = folder
+        if self._writer is not None:
+            self._writer.add(event)
+            if isinstance(event, Identified | Failed):
+                self._writer.close()
+                self._writer = None
 
 
 @dataclass(frozen=True, slots=True)

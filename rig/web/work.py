@@ -14,7 +14,7 @@ from rig.catalog.shared import comparable_views, journal_words
 from rig.config import RigConfig
 from rig.core.clock import SystemClock
 from rig.core.errors import RigError, TableNotEmpty, UsageError, ViewRejected
-from rig.events.events import Enrolled, Event, Failed, FrameUsed, Identified, Started, event_dict, plain
+from rig.events.events import Enrolled, Event, FrameUsed, Identified, Started, event_dict, plain
 from rig.events.lines import line
 from rig.events.phrases import counted, duration_words
 from rig.motion.turntable import Turntable
@@ -29,7 +29,7 @@ from rig.plans.tray import TrayDecision, TrayItem, enroll_tray
 from rig.plans.watch import watch
 from rig.search.current_model import CurrentModel
 from rig.search.model import Model
-from rig.search.saved_run import RunWriter
+from rig.search.saved_run import RunSaver
 from rig.search.strategies import descriptor_for
 from rig.search.strategies import strategy as strategy_named
 from rig.views.description import PAPER_DESCRIPTOR
@@ -288,25 +288,17 @@ def _saved(
     context: Context, runs: Path, events: Generator[Event, None, object], model: Callable[[], Model]
 ) -> Generator[Event, None, None]:
     """Yield the events of searches, and save each search in its own folder."""
-    writer: RunWriter | None = None
-    with closing(events):
-        try:
-            for event in events:
-                if isinstance(event, Started):
-                    name = f"{context.bench.clock.utc():%Y%m%d-%H%M%S}-{context.job.id}"
-                    folder = runs / (name if not (runs / name).exists() else f"{name}-{context.job.views}")
-                    writer = RunWriter(folder, context.bench, model())
-                    context.job.run = folder.name
-                if writer is not None:
-                    writer.add(event)
-                    if isinstance(event, Identified | Failed):
-                        writer.close()
-                        writer = None
-                yield event
-        except BaseException as error:
-            if writer is not None:
-                writer.__exit__(type(error), error, None)
-            raise
+
+    def next_folder() -> Path:
+        name = f"{context.bench.clock.utc():%Y%m%d-%H%M%S}-{context.job.id}"
+        return runs / (name if not (runs / name).exists() else f"{name}-{context.job.views}")
+
+    with closing(events), RunSaver(next_folder, context.bench, model) as saver:
+        for event in events:
+            saver.add(event)
+            if saver.folder is not None:
+                context.job.run = saver.folder.name
+            yield event
 
 
 def _check_free(catalog: Catalog, request: EnrollRequest) -> None:

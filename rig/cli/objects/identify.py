@@ -1,8 +1,9 @@
 """`rig identify`."""
 
 import sys
-from collections.abc import Callable, Generator
+from collections.abc import Generator
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -15,10 +16,7 @@ from rig.cli.ui.exit_codes import EXIT_AMBIGUOUS, EXIT_UNKNOWN
 from rig.cli.ui.settings import Settings
 
 if TYPE_CHECKING:
-    from rig.bench import Bench
     from rig.events.events import Event
-    from rig.search.model import Model
-    from rig.search.saved_run import RunWriter
 
 
 @command
@@ -81,6 +79,7 @@ def identify(
     from rig.plans.record import ResultRecorder
     from rig.plans.watch import watch as watch_table
     from rig.search.current_model import CurrentModel
+    from rig.search.saved_run import RunSaver
     from rig.search.strategies import descriptor_for
     from rig.search.strategies import strategy as strategy_named
     from rig.views.description import PAPER_DESCRIPTOR
@@ -141,9 +140,9 @@ def identify(
             recorder.sample = sample
             if config.record != "none":
                 events = recorder.stream(events)
-            saver = _RunSaver(save_run, bench, model, several=watch)
+            folder = None if save_run is None else partial(_run_folder, save_run, several=watch)
             try:
-                with saver:
+                with RunSaver(folder, bench, model) as saver:
                     for event in events:
                         saver.add(event)
                         if not isinstance(event, FrameUsed):  # shown during the revolution
@@ -177,40 +176,9 @@ def _checked_sample(sample: str | None, *, scan: bool, watch: bool, records: boo
     return None if sample is None else clean_text(sample, "sample")
 
 
-class _RunSaver:
-    """Saves each run in ``folder``, or with ``several`` in its subfolders 0001, 0002, ...; None saves nothing."""
-
-    def __init__(self, folder: Path | None, bench: "Bench", model: Callable[[], "Model"], *, several: bool) -> None:
-        self._folder = folder
-        self._bench = bench
-        self._model = model
-        self._several = several
-        self._writer: RunWriter | None = None
-
-    def __enter__(self) -> "_RunSaver":
-        return self
-
-    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
-        if self._writer is not None:
-            self._writer.__exit__(None, error, None)
-            self._writer = None
-
-    def add(self, event: "Event") -> None:
-        from rig.events.events import Failed, Identified, Started
-        from rig.search.saved_run import RunWriter
-
-        if self._folder is None:
-            return
-        if isinstance(event, Started):
-            self._writer = RunWriter(self._next(self._folder), self._bench, self._model())
-        if self._writer is not None:
-            self._writer.add(event)
-            if isinstance(event, Identified | Failed):
-                self._writer.close()
-                self._writer = None
-
-    def _next(self, folder: Path) -> Path:
-        if not self._several:
-            return folder
-        numbers = [int(path.name) for path in folder.glob("[0-9][0-9][0-9][0-9]") if path.name.isdecimal()]
-        return folder / f"{max(numbers, default=0) + 1:04d}"
+def _run_folder(folder: Path, *, several: bool) -> Path:
+    """Return the folder of the next run: ``folder``, or of several runs its subfolder 0001, 0002, ..."""
+    if not several:
+        return folder
+    numbers = [int(path.name) for path in folder.glob("[0-9][0-9][0-9][0-9]") if path.name.isdecimal()]
+    return folder / f"{max(numbers, default=0) + 1:04d}"
