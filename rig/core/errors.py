@@ -40,7 +40,6 @@ class RigError(Exception):
         self.what = what
         self.next_step = next_step
         self.evidence: dict[str, Any] = dict(evidence or {})
-        self._asks_to_acknowledge = False
 
     @property
     def exit_code(self) -> int:
@@ -48,9 +47,8 @@ class RigError(Exception):
 
     def ask_to_acknowledge(self, *, reboot: bool = False) -> Self:
         """Add `rig acknowledge` to the next step, once; with ``reboot`` if only a restart clears the fault."""
-        if not self._asks_to_acknowledge:
-            self._asks_to_acknowledge = True
-            self.next_step += f" Then `rig acknowledge{' --reboot' * reboot}`."
+        if "rig acknowledge" not in self.next_step:
+            self.next_step += f" Then run `rig acknowledge{' --reboot' * reboot}`."
         return self
 
     def as_dict(self) -> dict[str, Any]:

@@ -360,7 +360,7 @@ def _fault_of_damage(damage: str) -> LatchedFault:
         code=StateNotStored.code,
         title=StateNotStored.title,
         what=f"The bench's stored state is lost, and a fault may be lost with it: {damage}.",
-        next_step="Look at the table and its cable. Then `rig acknowledge`.",
+        next_step="Look at the table and its cable. Then run `rig acknowledge`.",
         utc="an unknown time",
     )
 

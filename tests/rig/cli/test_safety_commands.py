@@ -117,7 +117,7 @@ def test_every_command_reports_a_fault_until_it_is_acknowledged(rig):
     rig("goto", "5")
     store = FileStore(Path("state/sim"))
     stalled = Stalled(
-        "The table is blocked at 7.0°.", next_step="Free it. Then `rig acknowledge`.", evidence={"load_percent": 99}
+        "The table is blocked at 7.0°.", next_step="Free it. Then run `rig acknowledge`.", evidence={"load_percent": 99}
     )
     store.save(store.load().model_copy(update={"fault": LatchedFault.of(stalled, "2026-01-02T03:04:05+00:00")}))
     for rejected in (
@@ -128,7 +128,7 @@ def test_every_command_reports_a_fault_until_it_is_acknowledged(rig):
     ):
         assert rejected.exit_code == 5
         assert "2026-01-02T03:04:05+00:00: The table is blocked at 7.0°." in rejected.stderr
-        assert "Free it. Then `rig acknowledge`." in rejected.stderr
+        assert "Free it. Then run `rig acknowledge`." in rejected.stderr
     reported = rig("status")
     assert reported.exit_code == 0
     assert "fault 505" in reported.stdout
