@@ -62,25 +62,7 @@ class PostgresDatabase(Database):
     A commit is durable. Transactions that change one enrollment share a lock of the whole catalog and have a lock of
     the enrollment; all others have the lock of the catalog alone. Readers have a snapshot and do not wait.
 
-    Parameters
-    ----------
-    place
-        Where the catalog is, with the URL of the database.
-    create
-        Create the tables if there are none.
-    read_only
-        Write nothing.
-    busy_timeout_s
-        How long a writer waits for another one.
-
-    Raises
-    ------
-    CatalogError
-        The database has no catalog, it is of a newer version, or the server denies access.
-    CatalogUnavailable
-        The server does not answer.
-    CatalogBusy
-        Other processes lock the catalog for longer than the timeout.
+    Parameters and errors are those of `rig.catalog.Catalog.open`.
     """
 
     def __init__(self, place: CatalogPlace, *, create: bool, read_only: bool, busy_timeout_s: float) -> None:

@@ -40,23 +40,7 @@ class SqliteDatabase(Database):
     A commit is durable (WAL, synchronous FULL). A writer takes the write lock at the start of its transaction: it waits
     there, or the transaction succeeds. Readers never wait.
 
-    Parameters
-    ----------
-    place
-        Where the catalog is.
-    create
-        Create the catalog if there is none.
-    read_only
-        Write nothing.
-    busy_timeout_s
-        How long a writer waits for another one.
-
-    Raises
-    ------
-    CatalogError
-        There is no catalog, it is damaged or of a newer version, or the system denies access.
-    CatalogBusy
-        Another process locks the catalog for longer than the timeout.
+    Parameters and errors are those of `rig.catalog.Catalog.open`.
     """
 
     def __init__(self, place: CatalogPlace, *, create: bool, read_only: bool, busy_timeout_s: float) -> None:

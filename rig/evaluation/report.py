@@ -22,10 +22,8 @@ def evaluate(
 
     Parameters
     ----------
-    margin
-        Margin per view that ends a search of the paper.
-    min_views
-        Smallest number of views of a search.
+    margin, min_views
+        As for `hbr.evaluation.results.method_results`.
     reported
         The first and the last reported object, counted from 1; None: all.
     """
