@@ -139,6 +139,7 @@ def evaluate(
     if len(views) < MIN_VIEWS:
         values = {"found": len(views), "span_deg": span_deg(views), "needed": MIN_VIEWS, "needed_deg": 0}
         return found.reject(RejectionCode.TOO_FEW_VIEWS, **values)
+    # Fit the camera and the poses of the board.
     rms, matrix, distortion, rotations, translations, deviations, _, each = cv2.calibrateCameraExtended(
         [points(board, view).astype(np.float32) for view in views],
         [view.corners_px.astype(np.float32) for view in views],
@@ -153,6 +154,7 @@ def evaluate(
     parameters = [matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *np.ravel(distortion)[:4]]
     for (name, unit), value, sigma in zip(PARAMETERS, parameters, np.ravel(deviations)[:8], strict=True):
         found.estimate(name, value, sigma, unit)
+    # Check the fit: a loose board, residuals, coverage, and the uncertainty of the focal length.
     poses = [
         (np.asarray(r, dtype=np.float64), np.asarray(t, dtype=np.float64))
         for r, t in zip(rotations, translations, strict=True)

@@ -208,6 +208,7 @@ def open_sim_bench(
             wires.callback(operator.faults.clear)
         devices.open_connections()
         operator.faults.schedule(*faults)
+        # Assemble the bench, with a cable that is not wound up in a new world.
         bench = assemble(
             "sim",
             config,

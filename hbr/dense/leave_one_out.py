@@ -177,6 +177,7 @@ def leave_one_out(
     shape = len(index.views), index.length
     if seen is not None and seen.shape != shape:
         raise ValueError(f"seen has shape {seen.shape}; the catalog's views have {shape}")
+    # List the objects to search for; each continues the sequence of distances, so that tasks are independent.
     counts = np.bincount(index.views.object_index)[index.object_index]
     places = np.flatnonzero(counts >= (max(views, 2) if weight is None else 2))
     if most_objects is not None and len(places) > most_objects:
@@ -187,6 +188,7 @@ def leave_one_out(
         drawn = views if weight is None else 1  # shares of a step that each search draws
         for _ in range(drawn * len(np.unique(np.arange(searches) * count // searches))):
             aside = (aside + _GOLDEN) % 1
+    # Search, then join the results in the order of the objects.
     work = partial(_searches_for, index, beta, views, seen, searches, step_deg, weight)
     by_place: dict[int, Found] = {}
     for (place, _), found in ((one, work(one)) for one in todo) if tasks is None else tasks(work, todo):

@@ -108,6 +108,7 @@ def next_best_view(
                 f"{len(angles_deg)} rotations and times of shape {times_s.shape}; one finite time each is needed"
             )
 
+    # Weigh each rotation: expected confusion plus cost.
     here_deg = float(belief.orientation_deg[-1])
     landing_deg = here_deg + angles_deg
     apart_deg = size_deg(landing_deg[:, None] - belief.orientation_deg).min(axis=1)
@@ -123,6 +124,7 @@ def next_best_view(
         confusion = np.log(np.maximum(2 * remaining.sum(axis=1), 1e-300))
     else:  # one object alone: a new side helps to find its azimuth
         confusion = -sharpness * novelty
+    # Choose the best one, and name the pair that it separates most.
     chosen = int((confusion + cost).argmin())
     pair: tuple[int, int] | None = None
     similarity: FloatArray | None = None

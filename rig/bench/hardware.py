@@ -127,6 +127,7 @@ def assemble(
         The servo does not support the configuration, or does not reach the table's limits.
     """
     with ExitStack() as opened:
+        # Open the rig head and the servo.
         head: RigHead | None = None
         fault: RigError | None = None
         if config.imu.connection == "head" and head_port is not None:
@@ -140,6 +141,7 @@ def assemble(
         if head is None and (note := imu_kind(config.imu.model).note):
             findings += (f"imu: {note}",)
 
+        # Prepare the camera and the IMU, which are opened at their first use.
         def open_camera() -> Camera:
             with ExitStack() as failed:
                 source = capture()
@@ -165,6 +167,7 @@ def assemble(
 
         imu = cast(Imu, head or OnDemand(lambda: open_imu(config.imu, i2c_bus, clock)))
         camera = cast(Camera, OnDemand(open_camera))
+        # Connect the safety layer with the devices.
         bench = Bench(name, config, clock, servo, imu, camera, findings=findings, state=state, head=head)
         bench.safety.connect()
         if head is not None:

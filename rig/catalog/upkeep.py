@@ -72,6 +72,7 @@ def statistics(catalog: Catalog) -> Statistics:
     """Return the statistics of a catalog."""
     known = {name: descriptor(name).version for name in names()}
     with catalog.database.read() as connection:
+        # Count objects, enrollments and views.
         total, in_use = connection.execute(
             select(func.count(), func.count(case((objects.c.deleted_utc.is_(None), 1)))).select_from(objects)
         ).one()
@@ -90,6 +91,7 @@ def statistics(catalog: Catalog) -> Statistics:
                 .group_by(enrollments.c.status, "deleted")
             )
         }
+        # Group objects by label, and views by bench and by descriptor.
         labels = connection.execute(
             select(objects.c.label, func.count())
             .where(objects.c.deleted_utc.is_(None))
@@ -107,6 +109,7 @@ def statistics(catalog: Catalog) -> Statistics:
             .group_by(descriptors.c.name, descriptors.c.version)
             .order_by(descriptors.c.name, descriptors.c.version)
         ).all()
+        # Count log entries and results.
         entries = len(audit.entries(connection))
         database_bytes = catalog.database.size_bytes(connection)
         recorded, recorded_bytes = 0, 0

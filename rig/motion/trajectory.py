@@ -153,12 +153,14 @@ class TrajectoryRecorder:
         rate: Floats = np.concatenate(self._rate) - self.bias_dps
         if len(time_ns) < FEWEST_READINGS:
             return None
+        # Integrate the gyro's rate, and find the gaps in its samples.
         start_ns = int(time_ns[0])
         time_s: Floats = ((time_ns - start_ns) * 1e-9).astype(np.float64)
         steps_s = np.diff(time_s)
         integral = np.concatenate([[0.0], np.cumsum(steps_s * (rate[1:] + rate[:-1]) / 2)])
         missing = steps_s > 2.5 * np.median(steps_s)
         gaps: Floats = (time_s[:-1] + time_s[1:])[missing] / 2
+        # Select the encoder readings that the backlash does not hide.
         encoder_t = np.array([(t - start_ns) * 1e-9 for t, _ in self._readings])
         encoder_deg = np.array([angle for _, angle in self._readings])
         played, used = backlash_states(encoder_deg, self.backlash_deg)
@@ -177,6 +179,7 @@ class TrajectoryRecorder:
                 [COMPLIANCE_S2, self.backlash_deg / 2, self.backlash_deg / 2],
             ]
         )
+        # Fit, with less weight for outliers each time; the delay changes the times of the readings.
         rates = np.abs(np.interp(t, time_s, rate))
         acceleration = np.gradient(rate, time_s)
         noise = np.hypot(self.resolution_deg / 2, rates * READ_TIME_S)
@@ -192,6 +195,7 @@ class TrajectoryRecorder:
             values = np.linalg.solve(normal, rows.T @ right)
             residual = e - base - design @ values
             weight = 1 / (noise * np.maximum(1, np.abs(residual) / (OUTLIER * noise)))
+        # Scale the covariance by the scatter, and find the largest mean deviation of readings in a row.
         freedom = max(len(t) - 4, 1)
         birge = max(1.0, float(np.square(residual * weight).sum()) / freedom)
         run = min(SLIP_READINGS, len(residual))

@@ -399,6 +399,7 @@ class Turntable(AbstractContextManager["Turntable"]):
                 self._clock.sleep(config.poll_s)
             else:
                 steer_deg = flight.each()
+            # Read the devices.
             self._safety.check_stop_request()
             state = self._servo.read_state()
             for observer in self._safety.observers:
@@ -409,10 +410,12 @@ class Turntable(AbstractContextManager["Turntable"]):
             angle_deg = to_table(state.position_deg)
             if flight is not None:
                 flight.recorder.add_reading(state.sampled_ns or state.time_ns, angle_deg)
+            # Steer to another goal.
             if flight is not None and steer_deg is not None and abs(steer_deg - goal_deg) > config.tolerance_deg / 2:
                 goal_deg = min(max(steer_deg, flight.reach_deg[0]), flight.reach_deg[1])
                 monitor = self._steer(state, goal_deg)
                 allowed_s = seconds_between(start_ns, self._clock.now_ns()) + self._allowed_s(goal_deg - angle_deg)
+            # Check the motion, then whether the table has arrived and is quiet.
             if monitor:
                 lag_deg = None if state.trajectory_deg is None else state.trajectory_deg - state.position_deg
                 monitor.check(state, angle_deg, lag_deg)

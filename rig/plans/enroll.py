@@ -88,6 +88,7 @@ def enroll(
             "empty_table": status.as_json(),
         },
     )
+    # Begin or resume the enrollment in the catalog.
     if resume:
         check_camera(bench, unfinished_camera_settings(catalog, name))
         enrollment = catalog.resume(name, provenance=provenance)
@@ -112,6 +113,7 @@ def enroll(
         angles_deg=tuple(to_go.values()),
         in_motion=in_motion,
     )
+    # Take and store the missing views.
     started_ns = bench.clock.now_ns()
     retakes = 0
     if missing:
@@ -130,6 +132,7 @@ def enroll(
                 with suppress(RigError):  # it has views to resume
                     enrollment.discard()  # a mistyped name, or a table that did not start, is not left in the catalog
             raise
+    # Segment all views together, then let searches use them.
     enrollment.revise()
     enrollment.finish()
     done = Enrolled(enrollment.object_name, views, retakes, seconds_between(started_ns, bench.clock.now_ns()))

@@ -103,6 +103,7 @@ def fly_views(
     RotationDisagreement
         Encoder and gyro disagree: no view of the revolution is stored.
     """
+    # Plan the revolution and its speed.
     config = bench.config
     require_camera_time(config)
     start_deg = start_of_revolution(bench, angles_deg)
@@ -118,6 +119,7 @@ def fly_views(
     speed = scan_speed(
         config, fps=bench.camera.identity.fps, gyro_range_dps=bench.imu.range_dps, spacing_deg=spacing_deg
     )
+    # Rotate, between two frames at rest of the same side.
     if abs(table.rest_deg - start_deg) > config.table.tolerance_deg:
         yield moved(0, (yield from announced(0, table, start_deg)))
     before = yield from capture(0, viewer, table, bench.clock.now_ns())
@@ -131,6 +133,7 @@ def fly_views(
     if trajectory is None or move.agreement is None or not (move.agreement.agrees and trajectory.consistent):
         raise _disagreement(bench, move, None if trajectory is None else trajectory.residual_deg)
     after = yield from capture(0, viewer, table, move.settled_ns)
+    # Judge the nearest frame to each angle, and store the accepted ones.
     judge = FlightJudge(
         config,
         before.evidence.locks,

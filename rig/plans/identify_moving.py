@@ -81,6 +81,7 @@ class _Passing:
         self.stamps_ns = [*self.stamps_ns[1 - STAMPS :], frame.stamp_ns]
         if self.ended_ns is not None or self.rejected_in_a_row >= MOST_REJECTED:
             return self.goal_deg
+        # Judge the frame.
         trajectory = self.recorder.fit()
         if trajectory is None:
             return None
@@ -91,6 +92,7 @@ class _Passing:
             self.rejected_in_a_row += 1
             self.events.append(Rejected(self.number + 1, 1, attempt.reasons, attempt.evidence))
             return self._stop() if self.rejected_in_a_row >= MOST_REJECTED else None
+        # Describe it, and add it to the search.
         self.rejected_in_a_row = 0
         self.number += 1
         described = self.describe(attempt.image_bgr)
@@ -105,6 +107,7 @@ class _Passing:
         used = self.search.frame_used(self.number, azimuth_deg, seconds, self.rejected)
         self.live(used)
         self.events.append(used)
+        # Follow a new decision: stop, or steer to another goal.
         if not self.search.is_new_decision:
             return None
         self.events.append(self.ranked)

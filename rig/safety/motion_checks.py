@@ -155,6 +155,7 @@ class MotionMonitor:
             "temperature_c": state.temperature_c,
             "voltage_v": round(state.voltage_v, 1),
         }
+        # Load: a blocked table, then one that is hard to rotate.
         standing = abs(state.velocity_dps) < self._standing_dps
         pushing = abs(state.load_percent) >= config.max_load_percent
         if self._lasts("stall", pushing and standing, state.time_ns, config.stall_s):
@@ -169,6 +170,7 @@ class MotionMonitor:
                 next_step="Look for friction (cable, bearing) and for an object that is too heavy.",
                 evidence=evidence,
             )
+        # Position: behind the profile, then off the path.
         lagging = lag_deg is not None and abs(lag_deg) > config.following_error_deg
         if self._lasts("lag", lagging, state.time_ns, config.overload_s / 2):
             raise FollowingError(
@@ -183,6 +185,7 @@ class MotionMonitor:
                 next_step="Find out what rotated the table, and check its angle with `rig status`.",
                 evidence=evidence,
             )
+        # Progress: at rest away from the goal.
         away_deg = abs(angle_deg - self._goal_deg)
         if away_deg > self._tolerance_deg and self._stands_still(state.time_ns, angle_deg):
             if not state.moving and away_deg <= HELD_DEG:

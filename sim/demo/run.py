@@ -142,6 +142,7 @@ def run_demo(
             f"The demo runs on the simulated bench only, not on {settings.bench!r}.",
             next_step="Remove --bench. On a real bench, use rig enroll and rig identify.",
         )
+    # Build the simulated world.
     system = SystemClock()
     wall_ns, begun = system.now_ns(), system.utc()
     config = settings.load()
@@ -157,6 +158,7 @@ def run_demo(
         _folder_within(out) as folder,
         open_sim_bench(config, operator, faults=[*read_faults(options.faults), *faults], on_fault=heard) as bench,
     ):
+        # Enroll, then change the bench if asked for, then identify.
         _photograph(bench, operator)
         with Catalog.open(folder, clock=bench.clock) as catalog:
             each = views or (config.enroll.views if "views" in config.enroll.model_fields_set else VIEWS)
@@ -175,6 +177,7 @@ def run_demo(
         searched_by = (chosen or strategy_for(model.descriptor)).name
         bench_s = bench.clock.now_ns() * 1e-9
         devices = bench.devices()
+    # Write the report.
     wall_s = seconds_between(wall_ns, system.now_ns())
     report = out / "report.html"
     result = DemoResult(tuple(enrollments), tuple(trials), seed, searched_by, change, bench_s, wall_s, report)
