@@ -66,7 +66,7 @@ def _small(cut: CutOut, longest: int = 140) -> CutOut:
 
 
 def shape(rng: np.random.Generator) -> CutOut:
-    """Draw a random object: turned on a lathe, a box, or a union of rounded parts, with random texture and shading."""
+    """Draw a random object: a body of revolution, a box, or a union of rounded parts, with random texture."""
     height, width = int(rng.integers(60, 141)), int(rng.integers(50, 141))
     mask = np.zeros((height, width), np.uint8)
     light = np.ones((height, width), np.float32)

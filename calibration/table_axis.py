@@ -8,8 +8,8 @@ to their centres a point on it. Starting from there, one fit uses all corners, w
 by `least_squares(loss="soft_l1")`, with L the lean of a bearing that is out of true; its direction rotates twice per
 revolution.
 
-The result sets ``view.roi``: the part of the frame in which the objects stay while they rotate, wherever the camera
-stands.
+The result sets ``view.roi``: the part of the frame in which the objects stay while they rotate, for any position of the
+camera.
 """
 
 from collections.abc import Mapping, Sequence

@@ -126,7 +126,7 @@ def output(net: cv2.dnn.Net, image: ImageArray) -> NDArray[np.float32]:
 
 
 def to_levels(vector: NDArray[np.float32]) -> LevelArray:
-    """Return the levels of a vector, whatever its length; 128 is 0."""
+    """Return the levels of a vector, for any length; 128 is 0."""
     length = float(np.sqrt((vector * vector).sum()))
     entries = vector * (_STEPS * np.sqrt(vector.size) / length) if length > 0 else vector
     levels: NDArray[np.float32] = np.clip(np.rint(entries) + 128, 0, 255)

@@ -1,4 +1,4 @@
-"""Compiled kernels in C, with the same bits as their references in NumPy, which stay the fallback.
+"""Compiled kernels in C, with the same bits as their references in NumPy, which are the fallback.
 
 Decision: docs/decisions/0040.
 """

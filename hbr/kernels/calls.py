@@ -13,20 +13,20 @@ from hbr.core.cores import THREADS
 from hbr.kernels.library import address, library
 
 _ROWS_OF_A_THREAD: Final = 100_000
-"""Fewer rows take less time than a thread is worth."""
+"""Smallest number of rows for a thread: fewer take less time than its start."""
 
 
 class Addresses:
     """Addresses of arrays, for a kernel that reads a struct of them."""
 
     def __init__(self, *arrays: NDArray[Any]) -> None:
-        self._arrays = arrays  # keeps them alive
+        self._arrays = arrays  # holds references to the arrays
         self._struct = (ctypes.c_void_p * len(arrays))(*map(address, arrays))
         self.address = ctypes.addressof(self._struct)
 
 
 class _Workspace(threading.local):
-    """Memory for short calls, one for each thread: NumPy takes microseconds to say where an array lies."""
+    """Memory for short calls, one for each thread, because NumPy takes microseconds to return an array's address."""
 
     def __init__(self) -> None:
         self.array: FloatArray = np.empty(0)
@@ -71,7 +71,7 @@ class _Measure(ctypes.Structure):
 
 
 class Measure(NamedTuple):
-    """How packed rows of edges, colours, or both are compared.
+    """Settings of the comparison of packed rows of edges, colours, or both.
 
     Attributes
     ----------
@@ -181,14 +181,14 @@ class PackedRows:
         return similar
 
     def among(self, rows: IndexArray) -> FloatArray:
-        """Return the similarity of rows to each other within groups: indices (g, k) in, (g, k, k) out."""
+        """Return the similarity of rows to each other within groups, indices (g, k), as (g, k, k)."""
         first, second = np.triu_indices(rows.shape[1])
         similar = np.empty((*rows.shape, rows.shape[1]))
         similar[:, first, second] = similar[:, second, first] = self.pairs(rows, first, second)
         return similar
 
     def bounds(self, query: LevelArray, segments: Segments) -> FloatArray:
-        """Return what the similarity of each object's rows to a packed query cannot exceed, (k,)."""
+        """Return an upper bound of the similarity of each object's rows to a packed query, (k,)."""
         bounds = np.empty(len(segments.lengths))
         threads = max(1, min(THREADS, len(self) // _ROWS_OF_A_THREAD))
         limits = [len(bounds) * i // threads for i in range(threads + 1)]
@@ -293,7 +293,7 @@ def support(
     part_deg: float,
     whole: int,
 ) -> NDArray[np.float32] | None:
-    """Return what one query adds to every azimuth of each object, (objects, 72); see `hbr.dense.index`."""
+    """Return the support that one query adds to every azimuth of each object, (objects, 72); see `hbr.dense.index`."""
     found = library()
     if found is None:
         return None
@@ -321,7 +321,7 @@ def peak_weights(posterior: FloatArray) -> FloatArray | None:
 def nearest_view(
     segments: Segments, azimuth_deg: FloatArray, places: IndexArray, at_deg: FloatArray
 ) -> tuple[IndexArray, FloatArray] | None:
-    """Return which view of each object, (m,), is nearest to azimuths, (a, m), and how far away it is."""
+    """Return the view of each object, (m,), that is nearest to azimuths, (a, m), and its distance in degrees."""
     found = library()
     if found is None:
         return None
@@ -341,7 +341,7 @@ def rotated(
     by_object: tuple[IndexArray, IndexArray],
     azimuth_deg: FloatArray,
 ) -> IndexArray | None:
-    """Return for each view the view of its object whose azimuth is closest to rotation_deg further on."""
+    """Return for each view the view of its object that is nearest to its azimuth plus ``rotation_deg``."""
     found = library()
     if found is None:
         return None

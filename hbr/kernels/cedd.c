@@ -22,7 +22,7 @@ struct grid {
     int64_t rows, columns, height, width; /* height and width of a quarter of a block, in pixels */
 };
 
-/* What is known of each block of a row. */
+/* The values of each block of a row. */
 struct blocks {
     int32_t *hue, *saturation, *value, *textures;
 };
@@ -209,7 +209,7 @@ PART void describe_blocks(const int32_t *restrict channels, const double *restri
 PART double lesser(double a, double b) { return a < b ? a : b; }
 
 /* Add the votes of the two fuzzy systems for a colour to the bins of the texture classes of its block. A histogram has
-   four places for the three shades of each colour: a sum that is stored as a whole is at hand for the next block. */
+   four places for the three shades of each colour: the next block can read a sum that was stored as one vector. */
 PART void vote(const struct cedd_tables *t, int32_t hue, int32_t saturation, int32_t value, unsigned textures,
                double *histogram) {
     const double *s = t->saturation + RULES * saturation, *v = t->value + RULES * value;

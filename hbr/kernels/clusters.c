@@ -4,7 +4,7 @@
    numbers, so sums of colours and of the first distances are exact in any order. */
 #include "grab_cut.h"
 
-#define ROUNDS 10 /* of the centres, the ones drawn at random included */
+#define ROUNDS 10 /* of the centres, including the ones drawn at random */
 #define TRIALS 3  /* drawn for each further centre; the best one is used */
 #define BLOCK 4096
 #define STILL (1.1920928955078125e-07 * 1.1920928955078125e-07) /* squared movement of centres that do not move */

@@ -1,6 +1,6 @@
 """Compile the kernels, if there is a C compiler: ``python hbr/kernels/compile.py``. Only the standard library is used.
 
-A library that was compiled from the present sources stays.
+A library that was compiled from the present sources is not compiled again.
 
 The build of the wheel calls it (`hatch_build.py`), and so does ``make``. Without a compiler NumPy does the work.
 """
@@ -58,7 +58,7 @@ def compile_kernels(output: Path = LIBRARY) -> str | None:
         done = subprocess.run([*command, *FLAGS.split(), digest, *parts, "-o", str(new)], check=False)
         if done.returncode:
             return None
-        new.replace(output)  # a program that runs with the old library keeps it
+        new.replace(output)  # a running program continues with the old library
         return target(command)
     except OSError:
         return None

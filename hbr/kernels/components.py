@@ -21,7 +21,7 @@ def largest_parts(mask: Bytes, framed: bool, near: int, least: float, of_border:
     ----------
     mask : uint8 array (h, w)
     framed : bool
-        Whether parts that touch the border are left out, and the others are nearer than ``near`` pixels.
+        Whether parts that touch the border are left out, and only parts nearer than ``near`` pixels count.
     near : int
     least : float
         Smallest area of the largest part; also a share ``of_border`` of the largest part at the border.
@@ -53,11 +53,11 @@ def likely_parts(mask: Bytes, prior: NDArray[np.float32], near: int, share: floa
     mask : uint8 array (h, w)
     prior : float32 array (h, w)
     near : int
-        Other parts are nearer than so many pixels,
+        Smallest distance, in pixels, of parts that do not belong to the main part.
     share : float
-        have this share of the area,
+        Smallest share of the main part's area for another part.
     mean : float
-        and a higher mean of ``prior``.
+        Smallest mean of ``prior`` for another part.
 
     Returns
     -------

@@ -22,13 +22,13 @@ def samples(
     small : uint8 array (h, w, 3)
         An image,
     useful : bool array (h, w)
-        and which pixels of the other one are useful.
+        Which pixels of the other image are useful.
     logarithm : float32 array (256,)
-        The logarithm of each level of the one,
+        The logarithm of each level of ``small``.
     table_log : float32 array (h, w, 3)
-        and the logarithms of the other one.
+        The logarithms of the other image.
     plane : float64 array (rows, columns, 3)
-        What is fitted at these pixels.
+        The basis of the fit at these pixels.
 
     Returns
     -------

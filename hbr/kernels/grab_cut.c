@@ -9,12 +9,12 @@
 #define SINGULAR 1e-6           /* a covariance with a smaller determinant has no inverse */
 #define EPSILON 2.220446049250313e-16
 #define NOISE 0.01              /* that is added to it */
-#define CLEAR 1e-6              /* difference of logarithms that rounding does not turn over */
+#define CLEAR 1e-6              /* difference of logarithms whose sign rounding does not change */
 #define TINY (-600.0)           /* logarithm of a density that is far above the smallest number */
 #define LOST 40.0               /* in logarithms: a density so much smaller does not change a sum */
 #define ZERO (-746.0)           /* the exponential of less is 0 */
 #define KNOWN 4096              /* differences whose weight is kept */
-#define MOST_PIXELS 65000       /* more sums of colours are not exact in float32 */
+#define MOST_PIXELS 65000       /* with more, sums of colours are not exact in float32 */
 
 typedef double (*function)(double);
 

@@ -32,8 +32,8 @@ def grab_cut(image: ImageArray, start: NDArray[np.bool_], inner: tuple[int, int,
     """Return the mask of one iteration of `cv2.grabCut` with the seed 0 of its random numbers, 0 or 1 (h, w).
 
     Pixels outside of the rectangle ``inner`` (left, top, right, bottom), which is not at the frame's border, are
-    background. Inside, ``start`` (h, w) marks the object as far as it is known. Returns None also for images whose
-    colours OpenCV cannot separate, or with too many pixels.
+    background. Inside, ``start`` (h, w) marks the pixels that probably show the object. Also returns None for images
+    whose colours OpenCV cannot separate, or with too many pixels.
 
     The mask is that of OpenCV 5.0.0 on x86-64, bit by bit.
     """

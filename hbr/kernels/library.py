@@ -12,7 +12,7 @@ import numpy as np
 
 from hbr.kernels.compile import LIBRARY, sources_digest
 
-#: Set to ``numpy``, this variable of the environment switches the compiled part off.
+#: Variable of the environment; the value ``numpy`` switches the compiled part off.
 SWITCH: Final = "HBR_KERNELS"
 
 _POINTER, _INTEGER, _REAL = ctypes.c_void_p, ctypes.c_int64, ctypes.c_double
@@ -102,7 +102,7 @@ _first_byte, _address_of = ctypes.c_char.from_buffer, ctypes.addressof
 def address(array: "np.ndarray[Any, Any]") -> int:
     """Return where the data of an array begins; the array must live as long as the pointer is used."""
     try:
-        return _address_of(_first_byte(array.data))  # a third of the time of the array's own way
+        return _address_of(_first_byte(array.data))  # takes a third of the time of `array.ctypes`
     except (TypeError, ValueError, BufferError):  # read-only, empty, or with gaps
         found: int = array.__array_interface__["data"][0]
         return found

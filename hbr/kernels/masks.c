@@ -1,7 +1,7 @@
 /* Masks of 0 and 1: opened, closed and filled with the same pixels as by OpenCV in hbr/segmentation/silhouette.py.
 
-   Each pixel is one bit. A row begins with a margin of `EDGE` zeros and ends with at least as many, so that what grows past
-   an end of a row does not come to the next one. */
+   Each pixel is one bit. A row begins with a margin of `EDGE` zeros and ends with at least as many, so that bits that
+   grow past an end of a row do not reach the next one. */
 #include "kernels.h"
 
 #define EDGE 16 /* wider than the discs */
@@ -128,7 +128,7 @@ EXPORT FOR_EVERY_PROCESSOR void hbr_filled(const uint8_t *mask, int64_t height, 
     const int64_t words = words_of(width), rows = height + 2 * EDGE, n = rows * words;
     uint64_t *near = work + 1, *far = near + n + 2, *open = far + n + 1, *outside = open + n;
 
-    /* close; what is not closed is open */
+    /* close the mask; all other pixels are open */
     pack(mask, height, width, words, near + EDGE * words);
     grow(rows, words, reach, radius, near, far, open);
     for (int64_t i = 0; i < n; i++) near[i] = ~open[i];

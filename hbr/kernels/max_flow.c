@@ -2,8 +2,8 @@
 
    Source: Y. Boykov and V. Kolmogorov, "An experimental comparison of min-cut/max-flow algorithms for energy minimization
    in vision", IEEE TPAMI 2004. A tree grows from the source and a tree grows from the sink, until they touch; flow is
-   sent along the path; vertices that this cuts off look for another parent. Vertices that end in neither tree keep the
-   tree that they were in last, so the order of all steps is that of OpenCV. */
+   sent along the path; vertices that this cuts off search for another parent. Vertices that end in neither tree stay in
+   their last tree, so the order of all steps is that of OpenCV. */
 #include "grab_cut.h"
 
 #define SIDES 8 /* neighbours: lower right, below, lower left, right, and the opposite ones from the upper right on */
@@ -14,7 +14,7 @@ enum { SOURCE, SINK };
 
 static const int8_t opposite[SIDES] = {6, 5, 4, 7, 2, 1, 0, 3};
 
-PART double smaller(double a, double b) { return b < a ? b : a; } /* of a and NaN: a */
+PART double smaller(double a, double b) { return b < a ? b : a; } /* a if b is NaN */
 PART double magnitude(double a) { return a < 0 ? -a : a; }
 
 struct search {

@@ -1,4 +1,4 @@
-/* What the next view is chosen by, with the same bits as hbr/dense/next_view.py and hbr/dense/index.py. */
+/* Parts of the choice of the next view, with the same bits as hbr/dense/next_view.py and hbr/dense/index.py. */
 #include "kernels.h"
 
 #define BINS 72

@@ -470,7 +470,7 @@ static int64_t bounds_of_rows(const struct query *q, const struct loops *loops, 
     return some;
 }
 
-/* Store what the similarity of each object's rows cannot exceed. */
+/* Store upper bounds of the similarity of each object's rows. */
 EXPORT void hbr_bounds(const struct measure *m, const uint8_t *query, const uint8_t *rows, int64_t stride,
                        const double *squares, const struct segments *s, double *bounds) {
     const struct loops *loops = fastest();

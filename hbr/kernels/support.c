@@ -30,7 +30,7 @@ PART int is_clear(const double *seen_deg, const double *end_deg, int64_t two, co
     return clear;
 }
 
-/* Store what one query adds to every azimuth of each object, (objects, 72).
+/* Store the support that one query adds to every azimuth of each object, (objects, 72).
 
    Object j has the `count[j]` rows from `rows[begin[j]]` on, by rising azimuth. `levels` are the powers of the
    similarities of all rows. `scratch` has room for 4 floats and 2 doubles for each of twice the largest count. */

@@ -13,7 +13,7 @@ from hbr.kernels.library import address, library
 Floats = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
 
-#: Sums of more bytes do not fit into 16 bits.
+#: Largest number of bytes whose sum fits into 16 bits.
 _MOST_ROWS: Final = 257
 
 
@@ -80,7 +80,7 @@ def average(image: ImageArray, side: int) -> ImageArray | None:
 
 
 def surround(crop: ImageArray, mask: Bytes, bright: float) -> ImageArray | None:
-    """Return a square crop with an even grey around the object, this share as bright, as `Segmentation.alone` is."""
+    """Return a square crop with an even grey around the object, like `Segmentation.alone`."""
     found = library()
     side = len(crop)
     if found is None or crop.shape != (side, side, 3) or mask.shape != (side, side):

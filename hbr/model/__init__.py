@@ -1,1 +1,1 @@
-"""The enrolled views as arrays, and what they say about an object: its symmetry and similar objects."""
+"""The enrolled views as arrays, and properties of objects from them: symmetry and similar objects."""

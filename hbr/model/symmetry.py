@@ -16,7 +16,7 @@ from hbr.model.views import Views
 Similarity = Callable[[LevelArray, LevelArray], FloatArray]
 
 SLACK: Final = 0.01
-"""Similarities that differ by less count as equal: two frames of the same view differ by as much."""
+"""Largest difference of similarities that count as equal, because two frames of the same view differ by this much."""
 _MIN_VIEWS: Final = 18  # with fewer views, neighbours are more than 20° apart and too different to compare with
 _ORDERS: Final = range(2, 13)
 _AT_ONCE: Final = 50  # objects whose views are compared at once: the memory does not grow with the catalog

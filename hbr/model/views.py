@@ -118,7 +118,7 @@ class Views:
 
     def select(self, rows: IndexArray | NDArray[np.bool_]) -> "Views":
         """Return the views of these indices, or of a mask. Every object keeps its index and name."""
-        chosen = copy(self)  # which has been checked
+        chosen = copy(self)  # without a new check: the views were checked before
         chosen.__dict__.pop("by_object", None)
         rows = np.flatnonzero(rows) if rows.dtype == np.bool_ else rows
         for name in ("descriptors", "azimuth_deg", "object_index"):

@@ -23,7 +23,7 @@ _SMALL: Final = 10_000
 _COMPONENTS: Final = 15
 #: Rows that share one maximum in the search for the first candidates.
 _GROUP: Final = 64
-#: Results of so many searches are cached; then the cache is cleared.
+#: Number of searches whose results are cached; then the cache is cleared.
 _REMEMBERED: Final = 64
 #: Rows that are converted to float at once.
 _CHUNK: Final = 4_096
@@ -164,7 +164,7 @@ def _searcher(descriptors: LevelArray, method: Method, known: _Searcher | None =
 
 
 class _Compiled:
-    """The compiled kernel compares with every view where it lies; only the squared lengths are stored."""
+    """The compiled kernel: compares with every view without a copy; only the squared lengths are stored."""
 
     def __init__(self, descriptors: LevelArray, known: NDArray[np.int32] | None = None) -> None:
         self._rows = ByteRows(descriptors, known)

@@ -27,14 +27,14 @@ Floats = NDArray[np.float32]
 SIDE_PX: Final = 128
 #: Step between the pixels that a plane is fitted to.
 _EVERY: Final = 5
-#: Added to grey levels before the logarithm, because noise dominates below this level.
+#: Number that is added to grey levels before the logarithm, because noise dominates below it.
 _FLOOR: Final = 6.0
 _LOG: Final = np.log(np.arange(256) + _FLOOR).astype(np.float32)
 #: Noise of the logarithm of each grey level.
 _NOISE: Final = (0.35 * 8.0 / (np.arange(256) + _FLOOR)).astype(np.float32)
-#: Keeps the least squares solvable.
+#: Small regularisation that makes the least squares solvable.
 _RIDGE: Final = 1e-9 * np.eye(3)
-#: A pixel agrees if the residual is smaller than this, in logarithms: about 15 % more or less light.
+#: Largest residual of a pixel that agrees, in logarithms: about 15 % more or less light.
 _AGREES: Final = 0.15
 #: Cells of a 4 x 4 grid at the frame's border; the object is in the middle.
 _BORDER: Final = tuple((y, x) for y in range(4) for x in range(4) if y in (0, 3) or x in (0, 3))
@@ -157,12 +157,12 @@ class Background:
 
     @property
     def correction(self) -> Illumination | None:
-        """Makes a plain backdrop grey; None if its colour cannot be taken for grey."""
+        """The correction that makes a plain backdrop grey; None if its colour is too far from grey."""
         return self._backdrop[0]
 
     @property
     def issue(self) -> IssueCode | None:
-        """Why the correction is missing or incomplete."""
+        """The reason why the correction is missing or incomplete."""
         return self._backdrop[1]
 
     def difference(self, small: ImageArray) -> Difference:

@@ -40,9 +40,9 @@ class Segmentation:
     agreement : float or None
         Share of the frame's border that looks like the empty-table image; None without such an image.
     method : Method
-        How the box was found.
+        Method by which the box was found.
     issues : tuple of Issue
-        What could not be done, and why.
+        Steps that were not possible, with their reasons.
     correction : Illumination or None
         The illumination correction.
     silhouette : bool array (h, w) or None
@@ -101,7 +101,7 @@ class Segmentation:
 class Found:
     """A silhouette or box that was found in a frame; the object is cut out only if it is needed.
 
-    Attributes as those of `Segmentation`; ``given`` is a box that was not found but given.
+    Its attributes are those of `Segmentation`; ``given`` is a box that the caller gave.
     """
 
     image: ImageArray

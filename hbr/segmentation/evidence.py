@@ -1,4 +1,4 @@
-"""How a segmentation found the object, and what it could not do: enums with numbers, no sentences."""
+"""The evidence of a segmentation: its method and its issues, as codes with numbers."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -7,7 +7,7 @@ from typing import Any
 
 
 class Method(StrEnum):
-    """How the object's box was found."""
+    """The methods of finding the object's box."""
 
     EMPTY_TABLE = "empty-table"
     """The object differs from the empty-table image."""
@@ -26,7 +26,7 @@ class Method(StrEnum):
 
 
 class IssueCode(StrEnum):
-    """What a segmentation could not do. The parameters of an issue are listed with its code."""
+    """The issues of a segmentation. The parameters of an issue are listed with its code."""
 
     TABLE_SIZE = "empty-table-size"
     """The empty-table image has another size: ``table_px`` and ``frame_px``, [width, height]."""

@@ -1,4 +1,4 @@
-"""A frame with what several segmentations of it share."""
+"""A frame, with the data that several segmentations of it share."""
 
 from functools import cached_property
 
@@ -29,12 +29,12 @@ class Frame:
         return image_bgr if isinstance(image_bgr, Frame) else cls(image_bgr)
 
     def difference(self, background: Background) -> Difference:
-        """Return the difference from a background. The last one is kept, for further segmentations of the frame."""
+        """Return the difference from a background. The last one is cached for further segmentations of the frame."""
         if self._compared is None or self._compared[0] is not background:
             self._compared = background, background.difference(self.small)
         return self._compared[1]
 
     @cached_property
     def differs(self) -> Mask | None:
-        """Where the small image differs from a plain background, bool (h, w); None if the background is not plain."""
+        """Return where the small image differs from a plain background, bool (h, w); None if it is not plain."""
         return plain_difference(self.small)

@@ -1,8 +1,8 @@
 """Segmentation by rotation: the background is learned from the views of one search or enrollment.
 
 While the table rotates, the background stands still, and the object and the platter's marks move. So a view is compared
-with the median of the other views: behind the object most of them show the background. The network knows that such a
-median can show the object, too, and weighs it with what it sees.
+with the median of the other views: behind the object most of them show the background. Such a median can show the
+object, too; the network was trained with such medians and combines them with the frame.
 """
 
 from collections.abc import Sequence
@@ -49,7 +49,7 @@ class LearnedBackground:
         others = [n for n in range(len(self)) if n != view]
         if not others or self._shape is None:
             return None
-        if len(others) > _MOST:  # spread over all of them
+        if len(others) > _MOST:  # evenly spread over all views
             others = [others[n * len(others) // _MOST] for n in range(_MOST)]
         return Background.learned(median([self._small[n] for n in others]), self._shape)
 

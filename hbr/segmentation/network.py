@@ -1,7 +1,7 @@
 """Segmentation by a small neural network: the object, the platter, and everything else.
 
 The network sees a small frame and, where the background is known, the frame's difference from it. The background is
-known from the empty-table image, or was learned while the table turned. Its weights are in the wheel, and
+known from the empty-table image, or was learned while the table rotated. Its weights are in the wheel, and
 `benchmarks/train_segmentation.py` makes them. Model card: docs/explanation/segmentation-network.md.
 
 Decision: docs/decisions/0048.
@@ -86,7 +86,7 @@ def _logits(planes: Floats) -> Floats:
     """Return the network's answer to its input, float32 (2, HEIGHT, WIDTH)."""
     try:
         net = _IDLE.pop()
-    except IndexError:  # all others are at work in other threads
+    except IndexError:  # other threads use all others
         net = cv2.dnn.readNetFromONNX(np.frombuffer(_weights(), np.uint8))
     net.setInput(planes)
     logits: Floats = np.array(net.forward(), np.float32)[0]

@@ -23,7 +23,7 @@ _NOISE: Final = 1.5
 def plain_difference(small: ImageArray) -> Mask | None:
     """Return where a small image differs from its background, bool (h, w); None if the background is not plain.
 
-    The background of each row is interpolated between its two ends, so that a horizon does no harm.
+    The background of each row is interpolated between its two ends, so that a horizon does not matter.
     """
     height, width = small.shape[:2]
     image = cv2.GaussianBlur(small, (7, 7), 1.3)

@@ -25,7 +25,7 @@ _LEVELS: Final = (0.5, 0.2, 0.8)
 #: The same of an enrolled view with a learned background: where an object looks the same from all sides, it is part of
 #: that background, and less probable.
 _ENROLLED_LEVEL: Final = 0.25
-#: Boxes that overlap by more are one.
+#: Smallest overlap of two boxes that count as one.
 _SAME_BOX: Final = 0.85
 MOST_HYPOTHESES: Final = 5
 
@@ -212,7 +212,7 @@ def _cut_out(found: Segmentation | Found) -> Segmentation:
 
 
 def _as_found(frame: Frame, one: Segmentation) -> Found:
-    """Return what a segmentation of this frame was cut out from."""
+    """Return the silhouette or box of a segmentation of this frame."""
     return Found(frame.image, one.silhouette, None, one.correction, one.agreement, one.method, one.issues)
 
 

@@ -1,7 +1,7 @@
 """Segmentations that are stored with a view: its evidence holds the silhouette.
 
-The other views of an enrollment, and the network, decide on a silhouette. With the silhouette itself, a stored view is
-described again from its image alone: on another computer, by a later network, or after other views were lost.
+A silhouette depends on the other views of an enrollment and on the network. With the stored silhouette, a view is
+described again from its image alone: on another computer, with a later network, or after other views were lost.
 """
 
 import zlib

@@ -82,7 +82,7 @@ class Utc(_Checked):
 
 
 class Words(_Checked):
-    """Text. Its order is that of its code points, whatever the language of the server."""
+    """Text. Its order is that of its code points, for any language of the server."""
 
     impl = Text
 

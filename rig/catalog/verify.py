@@ -108,7 +108,7 @@ def verify(
         if unfinished is not None:
             unfinished.store(_right(portion, found, quick))
         yield JobProgress(len(checked), len(items))
-    checked = {item: checked[item] for item in items}  # in the order of the catalog, whichever process was faster
+    checked = {item: checked[item] for item in items}  # in the order of the catalog, not of the processes
 
     with catalog.database.read() as connection:
         orphans = sorted(files - _referenced(state, connection))

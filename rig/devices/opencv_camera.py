@@ -64,7 +64,7 @@ class OpenCvCamera:
     name
         The camera's name in records.
     device
-        Identifies the camera itself, wherever it is connected; None if it is not known.
+        Identity of the camera itself, at any port; None if it is not known.
     timeout_s
         How long `capture` waits for a new frame.
     latency_s

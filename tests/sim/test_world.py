@@ -17,7 +17,7 @@ perfect = NoiseModel.none()
 
 
 def drive(world: World, goal: float, v_max: float = 60.0, a_max: float = 300.0) -> None:
-    """Send the shaft to ``goal`` from wherever it is."""
+    """Send the shaft to ``goal`` from its present angle."""
     world.drive(to_position(world.clock.now_ns() * 1e-9, *world.shaft(), goal, v_max, a_max))
 
 

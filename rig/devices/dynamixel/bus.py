@@ -160,7 +160,7 @@ class DynamixelBus:
         data = register.encode(value)
 
         def attempt() -> Answers:
-            doubtful = self._owes(0) or self._repeats_replies()  # an earlier reply may be taken for this one
+            doubtful = self._owes(0) or self._repeats_replies()  # an earlier reply may look like this one
             parameters = self._packets.write_parameters(register.address, data)
             answers = self._ask(device_id, WRITE, parameters, 0, (device_id,) if answered else ())
             reply = answers[0].get(device_id)

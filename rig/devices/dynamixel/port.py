@@ -176,7 +176,7 @@ class ClockedPort(PortHandler):  # type: ignore[misc]
     def drain(self, quiet_s: float = 0.005, limit_s: float = 0.25) -> None:
         """Drop what arrives until the bus has been quiet for ``quiet_s``.
 
-        Otherwise a reply after its timeout would be taken for the reply to the next request, because Protocol 2.0 has
+        Otherwise a reply after its timeout would be accepted as the reply to the next request, because Protocol 2.0 has
         no sequence numbers.
         """
         start_ns = last_ns = self.clock.now_ns()

@@ -143,7 +143,7 @@ def test_small_catalog_guarantees_no_rate_and_reports_the_data_it_needs() -> Non
         ((0.0, 9.0, 9.0), 0.5, 1, 8, Outcome.CONTINUE, StopReason.BELOW_OPEN_SET_THRESHOLD),
         ((0.0, 9.0, 9.0), 0.5, 1, 1, Outcome.FOUND, StopReason.CONFIDENT),
         ((0.0, 9.0, 9.0), 0.5, 2, 8, Outcome.CONTINUE, StopReason.BELOW_OPEN_SET_THRESHOLD),
-        # From then on, an object below it is unknown, however many views are left.
+        # From then on, an object below it is unknown, even if views are left.
         ((0.0, 9.0, 9.0), 0.5, 3, 8, Outcome.UNKNOWN, StopReason.BELOW_OPEN_SET_THRESHOLD),
         ((9.0,), 0.5, 1, 8, Outcome.UNKNOWN, StopReason.BELOW_OPEN_SET_THRESHOLD),
         ((0.0, 0.0, 0.0), 0.5, 3, 8, Outcome.FOUND, StopReason.CONFIDENT),

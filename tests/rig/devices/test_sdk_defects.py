@@ -202,7 +202,7 @@ def test_waiting_uses_no_cpu() -> None:
 
 
 def test_defective_sdk_functions_are_not_called() -> None:
-    """`broadcastPing` waits 0.8 s at 1 MBd and 1.4 s at 57,600 whoever answers (only a scan may take so long);
+    """`broadcastPing` waits 0.8 s at 1 MBd and 1.4 s at 57,600 for any answers (only a scan may take this long);
     `fastSyncRead` raises IndexError.
     """
     sources = [path.read_text(encoding="utf-8") for path in Path(rig.devices.__file__).parent.rglob("*.py")]
@@ -227,7 +227,7 @@ def test_failed_port_is_released() -> None:
 
 
 def test_threads_use_the_bus_one_after_the_other() -> None:
-    """The SDK tells a second thread that the port is busy, or mixes up their packets."""
+    """The SDK reports to a second thread that the port is busy, or mixes up their packets."""
     wires = servo_wires()
     bus = open_bus(wires, retries=0)
     wrong: list[object] = []

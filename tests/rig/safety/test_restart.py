@@ -112,7 +112,7 @@ def test_servo_stops_after_sigkill_and_the_next_program_reports_it(start, wires)
         assert "torque was on" in reported
         assert "watchdog stopped it" in reported
         assert "interrupted during a motion" in reported
-        assert bench.safety.state is TableState.READY  # it kept its supply: it has counted its turns
+        assert bench.safety.state is TableState.READY  # it kept its supply and counted its revolutions
         assert all(frame[7] != 3 for frame in wires.instructions[sent:])  # no write, so nothing moved
         with Turntable(bench) as table:
             assert wires.world.shaft()[0] == pytest.approx(stands_deg, abs=0.1)

@@ -1,4 +1,4 @@
-"""An import happens completely or not at all, whatever interrupts it."""
+"""An import happens completely or not at all, after any interruption."""
 
 from pathlib import Path
 
