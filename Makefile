@@ -13,7 +13,7 @@ LIBRARY := hbr/kernels/_kernels.so
 help:
 	@echo "make demo   enroll and find objects on the simulated bench, and write rig-demo/report.html"
 	@echo "make web    show the simulated bench in a browser"
-	@echo "make test   run the tests (three to four minutes on two idle cores)"
+	@echo "make test   run the tests (two to four minutes on two idle cores)"
 	@echo "make test-nightly  run all tests, with many more cases in each"
 	@echo "make test-kills  kill the program at a hundred points of its work, and check what is left"
 	@echo "make test-web   use the pages in a real browser, and attack the server"

@@ -1,5 +1,8 @@
 /* Unit tests of the core on this computer, under sanitizers: `make test`. More tests of the behaviour are in ../tests,
-in Python. */ #include <stdio.h> #include <stdlib.h> #include <string.h>
+   in Python. */
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
 
 #include "../boards/host/board.h"
 #include "../core/frame.h"
