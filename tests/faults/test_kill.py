@@ -11,10 +11,10 @@ from tests.faults.killed_enrollments import VIEWS
 from tests.programs import Program
 
 
-@pytest.mark.parametrize("kills", [5, pytest.param(400, marks=[pytest.mark.nightly, pytest.mark.timeout(1800)])])
+@pytest.mark.parametrize("kills", [8, pytest.param(400, marks=[pytest.mark.nightly, pytest.mark.timeout(1800)])])
 def test_killed_enrollment_keeps_reported_views_and_resumes(tmp_path: Path, kills: int) -> None:
     code = "from tests.faults.killed_enrollments import main; main()"
-    process = Program(str(tmp_path), str(kills), "1", code=code)
+    process = Program(str(tmp_path), str(kills), "2", code=code)
     output, errors = process.communicate()
     assert process.returncode == 0, errors
     runs = [json.loads(line) for line in output.splitlines()]

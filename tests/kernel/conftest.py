@@ -44,6 +44,9 @@ def guest(machine: Machine) -> Iterator[GuestBench]:
     """Plug the devices in."""
     with PlayedBench() as played:
         guest = GuestBench(machine, played)
+        guest.sh(
+            "getent group i2c || echo i2c:x:1501: >> /etc/group", folder="/"
+        )  # else only the package i2c-tools adds it
         guest.plug_in(*played.usb)
         yield guest
 

@@ -150,7 +150,7 @@ def test_conflict_stays_until_the_operator_resolves_it(
     words = [word for one in settings_of(place) for word in ("--set", one)]
     reported = rig("catalog", "deliver", *words)
     assert reported.exit_code == 7, reported.output
-    assert "another object of that name; nothing is lost" in reported.stderr
+    assert "another object of that name. Nothing is lost." in reported.stderr
     assert names(place) == {"mug": 2, "tin": 2, "star": 3, "cube": 3, "cone": 3}
     with Catalog.open(journal_folder(place), clock=CLOCK, read_only=True) as journal:
         assert len(journal.objects()) == 3

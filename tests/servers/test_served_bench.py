@@ -79,7 +79,7 @@ def test_served_bench_works_without_the_server_and_delivers_once(
     with catalog.background_delivery():  # beside the worker, which is idle
         state = wait_until(lambda: catalog.state["reasons"] and waiting(place, CLOCK) == 1 and catalog.state)
     (conflict,) = state["reasons"]
-    assert "another object of that name; nothing is lost" in conflict
+    assert "another object of that name. Nothing is lost." in conflict
     assert "rig catalog deliver --rename mug-star" in conflict
     shown = [json.loads(one.data) for one in served.server.hub.since(0)[0] if one.kind == "catalog"]
     assert shown[-1] == served.client.get("/api/v1/status").json()["catalog"]

@@ -81,7 +81,7 @@ def test_step_runs_while_other_benches_use_the_catalog(bench: Catalog, place: Ca
         with pytest.raises(CatalogOutdated, match=f"version {SCHEMA_VERSION}"):
             Catalog.open(place, clock=VirtualClock())
         # A search that has a table open must not make the migration wait for ever.
-        with pytest.raises(CatalogBusy, match="another process"):
+        with pytest.raises(CatalogBusy, match="Another process"):
             migrate(place, clock=VirtualClock(), busy_timeout_s=0.1)
         reading.rollback()
         done = migrate(place, clock=VirtualClock())
