@@ -43,6 +43,7 @@ def technician(guest: GuestBench, first_day: object) -> Iterator[None]:
     guest.sh(f"echo technician:x:{UID}:{UID}::{HOME}:/bin/bash >> /etc/passwd")
     guest.sh(f"mkdir -p {HOME}; cp {FOLDER}/rig.toml {HOME}; chown -R {UID}:{UID} {HOME}")
     guest.sh("chmod o+x /root")
+    guest.sh("udevadm trigger --action=add --subsystem-match=i2c-dev && udevadm settle")  # by the rig's own rule
     yield
     guest.sh("chmod o-x /root; sed -i '/^technician:/d' /etc/passwd")
 
