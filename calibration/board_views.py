@@ -14,6 +14,7 @@ from calibration.procedure import Ask, Evaluation, Progress
 from rig.bench import Bench
 from rig.calibrations import CalibrationResult, RejectionCode
 from rig.charts.xy import LIMIT, MEASURED, MODEL, OTHER, Axis, Chart, Series
+from rig.core.phrases import angle_words, percent
 from rig.events.events import Event
 from rig.motion.turntable import Turntable
 from rig.plans.capture import capture, moved
@@ -172,7 +173,7 @@ def plot_views(result: CalibrationResult, limit_px: float) -> Chart | None:
     numbered = [{**view, "number": i + 1, "rms": value} for i, (view, value) in enumerate(zip(views, rms, strict=True))]
     worst = sorted(numbered, key=lambda view: -view["rms"])[:2]
     named = ", ".join(
-        f"{view['number']} (stand {view['stand'] + 1} at {view['table_deg']:.0f}°) {view['rms']:.2f} px"
+        f"{view['number']} (stand {view['stand'] + 1} at {angle_words(view['table_deg'], 0)}) {view['rms']:.2f} px"
         for view in worst
     )
     return Chart(
@@ -193,4 +194,4 @@ def _words(seen: BoardDetection, board: Board, views: Sequence[BoardView], bench
     identity = bench.camera.identity
     cells = coverage(views, (identity.width, identity.height)) if views else np.zeros(GRID)
     covered = float((cells > 0).mean())
-    return f"{seen.ids.size} of {board.corners} corners; {covered:.0%} of the frame covered so far"
+    return f"{seen.ids.size} of {board.corners} corners; {percent(covered, 0)} of the frame covered so far"

@@ -20,6 +20,7 @@ from calibration.procedure import Ask, Evaluation, Measured, Procedure, Progress
 from rig.bench import Bench
 from rig.calibrations import CalibrationResult, RejectionCode
 from rig.charts.xy import MODEL, Axis, Chart, Series
+from rig.core.phrases import percent
 from rig.devices.camera import CameraLocks
 from rig.events.events import plain
 from rig.views.capture import ImageQuality
@@ -94,7 +95,14 @@ def plot(result: CalibrationResult) -> Chart | None:
                 Axis("squared distance from the middle (corner: 1)"),
                 Axis("share of the light"),
                 [
-                    Series(f"loses {loss:.0%}", [0.0, 1.0], [level, level * (1 - loss)], MODEL, dots=False, curve=True),
+                    Series(
+                        f"loses {percent(loss, 0)}",
+                        [0.0, 1.0],
+                        [level, level * (1 - loss)],
+                        MODEL,
+                        dots=False,
+                        curve=True,
+                    ),
                     Series("mean of a ring", at.tolist(), means.tolist()),
                 ],
             )

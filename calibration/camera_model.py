@@ -27,6 +27,7 @@ from calibration.procedure import Evaluation, Measured, Procedure
 from rig.bench import Bench
 from rig.calibrations import CalibrationResult, RejectionCode
 from rig.charts.xy import Axis, Chart, Series
+from rig.core.phrases import percent
 from rig.views.charuco_board import Board
 
 NAME = "camera.intrinsics"
@@ -61,7 +62,7 @@ def plot(result: CalibrationResult) -> Chart | None:
         x, y = np.concatenate([view["corners_px"] for view in of_stand]).T.tolist()
         seen.append(Series(name, x, y, colour))
     return Chart(
-        f"Corners seen: {covered:.0%} of the frame{rms}",
+        f"Corners seen: {percent(covered, 0)} of the frame{rms}",
         Axis("x, px"),
         Axis("y, px", falling=True),
         [_frame(result), *seen],

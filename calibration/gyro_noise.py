@@ -22,6 +22,7 @@ from calibration.procedure import Evaluation, Measured, Procedure, Progress, req
 from rig.bench import Bench
 from rig.calibrations import CalibrationResult, RejectionCode
 from rig.charts.xy import MODEL, Axis, Chart, Series
+from rig.core.phrases import number, percent
 
 NAME = "imu.noise"
 
@@ -100,7 +101,7 @@ class GyroNoise(Procedure):
                 waiting = waiting[per_block:]
             if (share := len(blocks) / needed) * 20 >= reported + 1:
                 reported = int(share * 20)
-                words = f"{share:.0%} of {self.minutes:g} minutes, {temperature_c:.1f} °C"
+                words = f"{percent(share, 0)} of {self.minutes:g} minutes, {number(temperature_c, '.1f')} °C"
                 yield Progress(min(share, 1.0), words)
         rest = RestRecord(np.array(blocks), np.array(temperatures), per_block / imu.rate_hz, lost)
         yield evaluate(rest, column="xyz".index(bench.config.imu.axis))

@@ -27,6 +27,7 @@ from rig.bench import Bench
 from rig.calibrations import CalibrationResult, RejectionCode
 from rig.charts.xy import LIMIT, OTHER, Axis, Chart, Series
 from rig.core.errors import UsageError
+from rig.core.phrases import percent
 from rig.events.events import Accepted
 from rig.motion.turntable import Turntable
 from rig.plans.capture import capture, moved
@@ -82,7 +83,7 @@ class Repeatability(Procedure):
         needed = needed_placements(self.error_rate)
         if self.placements < needed:
             raise UsageError(
-                f"{self.placements} placements are too few for an error rate of {self.error_rate:.1%}.",
+                f"{self.placements} placements are too few for an error rate of {percent(self.error_rate)}.",
                 next_step=f"Place the object {needed} times (--placements {needed}), or give a larger --error-rate.",
             )
         viewer = Viewer(bench.camera, bench.config)

@@ -17,6 +17,7 @@ from rig.config import RigConfig, Section
 from rig.config.imus import imu_kind
 from rig.core.clock import Clock, SystemClock
 from rig.core.errors import ConfigError, DeviceMismatch, RigError, StateNotStored
+from rig.core.phrases import angle_range
 from rig.devices.camera import Camera
 from rig.devices.dynamixel.guardian import Guardian
 from rig.devices.dynamixel.opening import open_servo
@@ -259,7 +260,8 @@ def _check_reach(config: RigConfig, servo: Servo) -> None:
         return
     reached = sorted(table.direction * (end - table.zero_deg) for end in (low, high))
     raise ConfigError(
-        f"The servo reaches {low:.0f}° to {high:.0f}°, but the table's limits need {first:.0f}° to {last:.0f}°.",
+        f"The servo reaches {angle_range((low, high), 0)}, but the table's limits need "
+        f"{angle_range((first, last), 0)}.",
         next_step=f"Set table.limits_deg within [{reached[0]:.0f}, {reached[1]:.0f}], or set table.zero_deg, the "
         "servo's angle at home, to the middle of its reach.",
         evidence={"limits_deg": list(table.limits_deg), "zero_deg": table.zero_deg, "reach_deg": [low, high]},

@@ -7,6 +7,8 @@ from typing import Annotated, Any
 
 from pydantic import BeforeValidator, PlainSerializer
 
+from rig.core.phrases import filled
+
 
 @unique
 class RejectionCode(Enum):
@@ -279,7 +281,7 @@ class Rejection:
             key: (f" ({'; '.join(map(str, value))})" if value else "") if isinstance(value, list | tuple) else value
             for key, value in self.values.items()
         }
-        return self.code.value.format_map(shown)
+        return filled(self.code.value, **shown)
 
 
 def stored_rejection(value: Any) -> Any:

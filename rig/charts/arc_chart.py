@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 from rig.charts.xy import MEASURED, MODEL, OTHER, Axis, Chart, Series
+from rig.core.phrases import percent
 
 _COLOURS = (MEASURED, OTHER, MODEL)
 
@@ -39,7 +40,9 @@ def arc_chart(
             ordered = sorted(points.items())
             series.append(Series("", [at for at, _ in ordered], [p for _, p in ordered], colour, False, True))
     ends = [decisions[0][0], max(decisions[-1][0], decisions[0][0] + 1.0)]
-    series.append(Series(f"{min_confidence:.1%} ends the search", ends, [min_confidence] * 2, OTHER, False, True, True))
+    series.append(
+        Series(f"{percent(min_confidence)} ends the search", ends, [min_confidence] * 2, OTHER, False, True, True)
+    )
     if enough_at is not None:
         series.append(Series("enough for an answer", [enough_at] * 2, [0.0, 1.0], MODEL, False, True, True))
     return Chart(

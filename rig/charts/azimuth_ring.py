@@ -6,7 +6,7 @@ from typing import Final, NamedTuple
 
 from rig.charts import svg
 from rig.charts.compass import CENTRE, RIM, SIZE, polar, rim
-from rig.events.phrases import azimuth_words
+from rig.core.phrases import azimuth_words
 
 _FLOOR: Final = 62.0
 _CEILING: Final = 150.0

@@ -6,8 +6,8 @@ from typing import Final
 
 from rig.charts import svg
 from rig.charts.compass import CENTRE, RIM, SIZE, polar, rim
+from rig.core.phrases import azimuth_words, percent_words, short
 from rig.events.events import Weighed
-from rig.events.phrases import azimuth_words, percent_words, short
 
 _INNER: Final = 34.0
 _OUTER: Final = 118.0

@@ -7,7 +7,7 @@ from typing import Final, NamedTuple
 from rig.charts import svg
 from rig.charts.compass import CENTRE, SIZE, polar, rim
 from rig.charts.svg import Point
-from rig.events.phrases import azimuth_words, distinct, short
+from rig.core.phrases import azimuth_words, distinct, short
 
 _STOP_PX: Final = 10.0
 _ARROW_PX: Final = 9.0

@@ -6,6 +6,7 @@ from enum import Enum, StrEnum, unique
 from typing import Any
 
 from rig.core.errors import RigError
+from rig.core.phrases import filled
 
 
 class Severity(StrEnum):
@@ -221,7 +222,7 @@ def of_error(topic: str, error: RigError, fix: str = "") -> Finding:
 def finding_words(finding: Finding) -> str:
     """Return the text of a finding."""
     shown = {key: _listed(value) for key, value in finding.parameters.items()}
-    return finding.code.value.format_map(shown)
+    return filled(finding.code.value, **shown)
 
 
 def _listed(value: Any) -> Any:

@@ -1,5 +1,6 @@
 """The meaning of a servo's registers, with the units of the e-manual."""
 
+from rig.core.phrases import angle_words, filled, number
 from rig.devices.dynamixel.register_servo import hardware_errors
 from rig.devices.dynamixel.registers import ControlTable
 
@@ -59,7 +60,7 @@ def meaning(table: ControlTable, name: str, value: int) -> str:
     """Return the meaning of a register's value; empty if the number needs none."""
     if name in _SCALED:
         factor, template = _SCALED[name]
-        return template.format(factor * value)
+        return filled(template, factor * value)
     if name in _SWITCHES:
         return "on" if value else "off"
     if name == "Status Return Level":
@@ -92,13 +93,13 @@ def meaning(table: ControlTable, name: str, value: int) -> str:
         case "Moving Status":
             return "arrived" if value & 1 else "not arrived"
         case "Present Load":
-            return f"{0.1 * value:.1f} %"
+            return f"{number(0.1 * value, '.1f')} %"
     if name in _DEGREES:
-        return f"{value * 360 / 4096:.2f}°"
+        return angle_words(value * 360 / 4096, 2)
     if name in _VELOCITIES:
-        return f"{value * 0.229 * 6:.2f} °/s"
+        return f"{number(value * 0.229 * 6, '.2f')} °/s"
     if name in _CURRENTS and (unit := _MILLIAMPERES.get(table.model.partition("_")[0])):
-        return f"{value * unit:.0f} mA"
+        return f"{number(value * unit, '.0f')} mA"
     return ""
 
 

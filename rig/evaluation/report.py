@@ -12,6 +12,7 @@ from hbr.descriptors import descriptor
 from hbr.evaluation.draws import generator
 from hbr.evaluation.protocol import Runs
 from hbr.evaluation.results import Contest, contests, method_results, pose_rmse_by_object, step_median_ms
+from rig.core.phrases import percent, signed
 from rig.evaluation.plan import Plan
 
 
@@ -158,9 +159,9 @@ def _sentence(contest: Contest, labels: dict[str, str]) -> str:
     else:
         result = "no difference shown"
     return (
-        f"{first} ({100 * contest.first_rate:.1f} %) against {second} ({100 * contest.second_rate:.1f} %): "
-        f"{100 * contest.difference:+.1f} points "
-        f"[{100 * contest.difference_low:+.1f}, {100 * contest.difference_high:+.1f}], "
+        f"{first} ({percent(contest.first_rate)}) against {second} ({percent(contest.second_rate)}): "
+        f"{signed(100 * contest.difference, 1)} points "
+        f"[{signed(100 * contest.difference_low, 1)}, {signed(100 * contest.difference_high, 1)}], "
         f"McNemar p = {contest.p_value:.2g} ({contest.only_first} trials to {contest.only_second}); {result}"
     )
 

@@ -3,6 +3,16 @@
 from typing import Final
 
 from hbr import Outcome
+from rig.core.phrases import (
+    angle_words,
+    azimuth_words,
+    counted,
+    duration_words,
+    percent,
+    percent_words,
+    sentence,
+    signed,
+)
 from rig.events.compared import Compared, Verified
 from rig.events.events import (
     Accepted,
@@ -28,7 +38,6 @@ from rig.events.events import (
     Warned,
 )
 from rig.events.note_wording import next_step_words, note_words, wait_words
-from rig.events.phrases import angle_words, azimuth_words, counted, duration_words, percent_words, sentence, signed
 from rig.events.wording import (
     answer_lines,
     comparison_words,
@@ -99,7 +108,7 @@ def line(event: Event) -> str:
         case SimilarObjects():
             return "\n".join(f"  {words}" for words in similar_objects_words(event))
         case EmptyTableImage():
-            share = "" if event.turning_share is None else f", {event.turning_share * 100:.1f} % rotates with the table"
+            share = "" if event.turning_share is None else f", {percent(event.turning_share)} rotates with the table"
             return f"Empty-table image: {event.width} × {event.height} pixels{share}"
         case Warned():
             return f"Warning: {note_words(event.note)}.\nNext step: {next_step_words(event.note)}"

@@ -3,8 +3,8 @@
 from typing import Any
 
 from hbr.dense.stopping import Limitation, LimitationCode
+from rig.core.phrases import counted, joined, percent
 from rig.events.events import Note, NoteCode, WaitReason
-from rig.events.phrases import counted, joined, percent
 from rig.views.table_problems import problem_text
 
 _NEXT_IMAGE = "to take one: rig empty-table"

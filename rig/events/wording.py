@@ -4,6 +4,7 @@ from math import ceil, isfinite, nan
 from typing import Final
 
 from hbr import Outcome, StopDecision, StopReason
+from rig.core.phrases import angle_range, angle_words, counted, distinct, joined, percent_words, sentence, signed
 from rig.events.compared import Compared, Verified
 from rig.events.events import (
     Candidate,
@@ -16,7 +17,6 @@ from rig.events.events import (
     SimilarObjects,
     Unwinding,
 )
-from rig.events.phrases import angle_words, counted, distinct, joined, percent_words, sentence, signed
 from rig.motion.scan_speed import SpeedLimit
 
 NAMED = 5
@@ -175,10 +175,9 @@ def scan_words(scan: ScanStarted) -> str:
 
 def unwinding_words(unwinding: Unwinding) -> str:
     """Return a sentence that the table frees its cable by a long rotation, with the reason."""
-    low, high = (f"{angle:g}°".replace("-", "−") for angle in unwinding.limits_deg)
     return (
         f"Unwinding the cable: the table rotates from {angle_words(unwinding.from_deg)} back to "
-        f"{angle_words(unwinding.to_deg)} (the cable allows {low} to {high})"
+        f"{angle_words(unwinding.to_deg)} (the cable allows {angle_range(unwinding.limits_deg)})"
     )
 
 

@@ -4,6 +4,7 @@ from math import isfinite
 
 from rig.config import SafetyConfig
 from rig.core.errors import DeviceFault, MotionTimeout, RigError, SupplyLost, WatchdogTripped
+from rig.core.phrases import angle_words
 from rig.devices.servo import Servo, ServoState
 from rig.safety.gyro_rotation import finite
 from rig.safety.motion_checks import find_servo_fault
@@ -70,24 +71,25 @@ def explain_unsettled(
     }
     if not arrived:
         return MotionTimeout(
-            f"The table did not arrive at {goal_deg:.1f}° within {allowed_s:.1f} s.",
+            f"The table did not arrive at {angle_words(goal_deg)} within {allowed_s:.1f} s.",
             next_step="Look for what slows the table down, and check that its cable is not taut.",
             evidence=evidence,
         )
     if not isfinite(peak_dps):
         return DeviceFault(
-            f"The table arrived at {goal_deg:.1f}°, but samples of the gyro are missing: its rest cannot be checked.",
+            f"The table arrived at {angle_words(goal_deg)}, but samples of the gyro are missing: "
+            "its rest cannot be checked.",
             next_step="Check the IMU's cable and supply.",
             evidence=evidence,
         )
     if peak_dps > cruise_dps:
         return DeviceFault(
-            f"The table arrived at {goal_deg:.1f}°, but the gyro measures {peak_dps:.0f} °/s.",
+            f"The table arrived at {angle_words(goal_deg)}, but the gyro measures {peak_dps:.0f} °/s.",
             next_step="Check the IMU: a table at rest cannot rotate that fast.",
             evidence=evidence,
         )
     return MotionTimeout(
-        f"The table arrived at {goal_deg:.1f}° but did not come to rest within {allowed_s:.1f} s.",
+        f"The table arrived at {angle_words(goal_deg)} but did not come to rest within {allowed_s:.1f} s.",
         next_step="Look for what shakes the bench; table.quiet_dps is the limit.",
         evidence=evidence,
     )

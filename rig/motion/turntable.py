@@ -24,6 +24,7 @@ from rig.core.errors import (
     TorqueStaysOn,
     UsageError,
 )
+from rig.core.phrases import angle_words, budget_words
 from rig.core.signals import uninterrupted
 from rig.devices.servo import MotionProfile, ServoState
 from rig.motion.fault_causes import explain_unsettled, find_cause
@@ -149,8 +150,8 @@ class Turntable(AbstractContextManager["Turntable"]):
         low, high = self._config.limits_deg
         if not low <= target_deg <= high:
             raise LimitExceeded(
-                f"The table cannot rotate from {self._rest_deg:.1f}° to {target_deg:.1f}°: its cable budget is "
-                f"{low:g}° to {high:g}° ({low / 360:+.2f} to {high / 360:+.2f} revolutions).",
+                f"The table cannot rotate from {angle_words(self._rest_deg)} to {angle_words(target_deg)}: its cable "
+                f"budget is {budget_words((low, high))}.",
                 next_step="Give an angle within these limits: add or subtract 360° for the same view.",
                 evidence={"from_deg": round(self._rest_deg, 2), "to_deg": target_deg, "limits_deg": [low, high]},
             )

@@ -17,6 +17,7 @@ from rig.catalog import Catalog, Enrollment, Provenance, ViewRecord
 from rig.catalog.descriptions import unfinished_camera_settings
 from rig.core.clock import seconds_between
 from rig.core.errors import ObjectMoved, RigError, RotationDisagreement
+from rig.core.phrases import angle_words
 from rig.events.events import Accepted, Enrolled, Event, Started, plain
 from rig.motion.move import Move
 from rig.motion.scan_speed import require_camera_time, takes_in_motion
@@ -285,14 +286,15 @@ class _ImuAngle:
 def _disagreement(move: Move) -> RotationDisagreement:
     if move.agreement is None:
         return RotationDisagreement(
-            f"It is not known whether the platter followed the servo's rotation of {move.rotation_encoder_deg:.2f}°: "
-            f"{move.gyro.reason}.",
+            "It is not known whether the platter followed the servo's rotation of "
+            f"{angle_words(move.rotation_encoder_deg, 2)}: {move.gyro.reason}.",
             next_step="If nothing hit the table, continue with --resume. Otherwise enroll the object again with "
             "--replace.",
             evidence={"table_deg": round(move.encoder_deg, 2)},
         )
     return RotationDisagreement(
-        f"The servo rotated {move.rotation_encoder_deg:.2f}°, but the platter {move.gyro.angle_deg:.2f}°.",
+        f"The servo rotated {angle_words(move.rotation_encoder_deg, 2)}, but the platter "
+        f"{angle_words(move.gyro.angle_deg, 2)}.",
         next_step="Tighten the platter, run `rig acknowledge`, and enroll the object again with --replace. Views from "
         "before and after a slip do not fit together.",
         evidence={

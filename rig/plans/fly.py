@@ -19,6 +19,7 @@ from hbr.core.angles import wrap360
 from rig.bench import Bench
 from rig.catalog import Enrollment, ViewRecord
 from rig.core.errors import LimitExceeded, RotationDisagreement
+from rig.core.phrases import angle_words
 from rig.events.events import Accepted, Event, Rejected, ScanStarted, plain
 from rig.motion.flight_views import FlightJudge
 from rig.motion.move import Move
@@ -205,7 +206,8 @@ def park(table: Turntable, bench: Bench) -> Move:
 
 
 def _disagreement(bench: Bench, move: Move, residual_deg: float | None) -> RotationDisagreement:
-    what = f"The servo rotated {move.rotation_encoder_deg:.2f}°, the platter {move.gyro.angle_deg:.2f}°"
+    servo, platter = (angle_words(angle_deg, 2) for angle_deg in (move.rotation_encoder_deg, move.gyro.angle_deg))
+    what = f"The servo rotated {servo}, the platter {platter}"
     if residual_deg is not None:
         what += f", and on the way they differed by up to {residual_deg:.2f}°"
     error = RotationDisagreement(

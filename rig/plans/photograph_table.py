@@ -8,6 +8,7 @@ from hbr.segmentation import MIN_AGREEMENT
 from rig.bench import Bench, TableClearer
 from rig.core.clock import seconds_between
 from rig.core.errors import TableNotEmpty, UsageError
+from rig.core.phrases import percent
 from rig.events.events import EmptyTableImage, Event, Note, NoteCode, Warned, plain
 from rig.motion.turntable import Turntable
 from rig.plans.capture import announced, capture
@@ -129,7 +130,7 @@ def _check(share: float, agreement: float | None) -> None:
         )
     if share > MAX_CHANGED_SHARE:
         raise TableNotEmpty(
-            f"Something is on the table: {share:.1%} of the image changes as the table rotates.",
+            f"Something is on the table: {percent(share)} of the image changes as the table rotates.",
             next_step=f"Clear the table and run `{COMMAND}` again. If it always stays there, such as a pattern or a "
             f"screw: {COMMAND} --anyway",
             evidence=numbers,

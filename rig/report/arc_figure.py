@@ -7,8 +7,8 @@ from markupsafe import Markup
 from hbr import Outcome
 from hbr.core.angles import wrap180
 from rig.charts.arc_chart import arc_chart
+from rig.core.phrases import azimuth_words, counted
 from rig.events.events import FrameUsed
-from rig.events.phrases import azimuth_words, counted
 from rig.report.records import IdentificationRecord
 
 

@@ -14,8 +14,8 @@ from rig.catalog.exchange.bundle import new_file, read_stored
 from rig.catalog.exchange.new_folder import new_folder
 from rig.catalog.records import EnrollmentStatus
 from rig.core.errors import ExportFailed
+from rig.core.phrases import counted
 from rig.core.templates import environment
-from rig.events.phrases import counted
 from rig.report.contact_sheet import Image, contact_sheet, thumbnail
 from rig.report.page import JPEG_QUALITY
 from rig.report.records import TILE

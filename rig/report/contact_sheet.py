@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.events.phrases import azimuth_words
+from rig.core.phrases import azimuth_words
 
 Image = NDArray[np.uint8]
 Region = tuple[int, int, int, int]

@@ -20,10 +20,10 @@ from rig.charts.polar_path import polar_path
 from rig.charts.score_chart import score_chart
 from rig.core.errors import UsageError, os_errors_as
 from rig.core.files import write
+from rig.core.phrases import azimuth_words, counted, listed, sentence, signed
 from rig.core.templates import environment
 from rig.events.events import Candidate, Ranked
 from rig.events.note_wording import note_words
-from rig.events.phrases import azimuth_words, counted, listed, sentence, signed
 from rig.events.wording import (
     answer_words,
     comparison_words,

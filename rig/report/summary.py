@@ -5,8 +5,8 @@ from statistics import fmean, median
 from typing import NamedTuple
 
 from hbr import Outcome
+from rig.core.phrases import counted, listed, percent_words
 from rig.events.events import SimilarObjects
-from rig.events.phrases import counted, listed, percent_words
 from rig.events.wording import outcome_words, similar_object_words
 from rig.report.records import EnrollmentRecord, IdentificationRecord
 

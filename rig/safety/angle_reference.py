@@ -13,6 +13,7 @@ from typing import Final
 
 from hbr.core.angles import wrap180
 from rig.config import TableConfig
+from rig.core.phrases import filled
 from rig.devices.servo import ServoCondition, ServoIdentity
 from rig.safety.saved_state import SavedTable
 
@@ -107,7 +108,8 @@ class SavedAngleCheck:
         return self.finding in _CERTAIN
 
     def __str__(self) -> str:
-        return _TEXTS[self.finding].format(
+        return filled(
+            _TEXTS[self.finding],
             now=self.position_deg,
             before=self.saved_position_deg,
             firmware=self.firmware,

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from rig.core.clock import Clock
 from rig.core.errors import ConfigError, DeviceFault, DeviceSilent, NotReady, UsageError
+from rig.core.phrases import signed
 from rig.devices.imu import Imu
 
 Axis = Literal["x", "y", "z"]
@@ -213,7 +214,7 @@ class GyroRotationMeter:
         if peak > REST_PEAK_DPS or abs(mean) > MAX_BIAS_DPS:
             self._resting_ns = self._clock.now_ns()
             raise NotReady(
-                f"The table is not at rest: the gyro measures {mean:+.2f} °/s on average, with deviations up to "
+                f"The table is not at rest: the gyro measures {signed(mean, 2)} °/s on average, with deviations up to "
                 f"{peak:.2f} °/s.",
                 next_step="Wait until the table stands still. If it shakes, use a steadier bench.",
                 evidence={"mean_dps": mean, "peak_dps": peak, "peak_limit_dps": REST_PEAK_DPS},

@@ -19,6 +19,7 @@ from rig.core.errors import (
     Stalled,
     SupplyOutOfRange,
 )
+from rig.core.phrases import angle_words
 from rig.devices.servo import ServoLimits, ServoState
 from rig.safety.gyro_rotation import Rotation
 
@@ -160,7 +161,7 @@ class MotionMonitor:
         pushing = abs(state.load_percent) >= config.max_load_percent
         if self._lasts("stall", pushing and standing, state.time_ns, config.stall_s):
             raise Stalled(
-                f"The table is blocked at {angle_deg:.1f}°: the servo pushes, but the table does not rotate.",
+                f"The table is blocked at {angle_words(angle_deg)}: the servo pushes, but the table does not rotate.",
                 next_step="Remove what blocks the table; check the cable, too.",
                 evidence=evidence,
             )
@@ -181,7 +182,7 @@ class MotionMonitor:
         beyond_deg = max(self._path_deg[0] - angle_deg, angle_deg - self._path_deg[1])
         if beyond_deg > config.following_error_deg:
             raise FollowingError(
-                f"The table is at {angle_deg:.1f}°, which is not on its path to {self._goal_deg:.1f}°.",
+                f"The table is at {angle_words(angle_deg)}, which is not on its path to {angle_words(self._goal_deg)}.",
                 next_step="Find out what rotated the table, and check its angle with `rig status`.",
                 evidence=evidence,
             )
@@ -190,13 +191,14 @@ class MotionMonitor:
         if away_deg > self._tolerance_deg and self._stands_still(state.time_ns, angle_deg):
             if not state.moving and away_deg <= HELD_DEG:
                 raise NoProgress(
-                    f"The table rests at {angle_deg:.1f}°, {away_deg:.1f}° from its goal: friction or a load holds it.",
+                    f"The table rests at {angle_words(angle_deg)}, {away_deg:.1f}° from its goal: "
+                    "friction or a load holds it.",
                     next_step="Reduce the friction (bearing, cable), or balance the load. Or set table.tolerance_deg "
                     f"above {away_deg:.1f}: each view stores the measured angle.",
                     evidence=evidence,
                 )
             raise NoProgress(
-                f"The table stands still at {angle_deg:.1f}° on its way to {self._goal_deg:.1f}°.",
+                f"The table stands still at {angle_words(angle_deg)} on its way to {angle_words(self._goal_deg)}.",
                 next_step="Check the servo's cable and supply, and check that the table rotates freely by hand.",
                 evidence=evidence,
             )
@@ -253,7 +255,8 @@ class SlipMonitor:
         bound_deg = self._config.slip_deg + 4 * gyro.sigma_deg
         if gyro.valid and abs(difference_deg) > bound_deg:
             raise RotationDisagreement(
-                f"The servo rotated by {encoder_deg:.1f}° so far, but the platter by {gyro.angle_deg:.1f}°.",
+                f"The servo rotated by {angle_words(encoder_deg)} so far, but the platter by "
+                f"{angle_words(gyro.angle_deg)}.",
                 next_step="Tighten the platter. If it is tight, check imu.axis, imu.sign and table.direction.",
                 evidence={"difference_deg": round(difference_deg, 2), "bound_deg": round(bound_deg, 2)},
             )

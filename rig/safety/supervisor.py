@@ -23,6 +23,7 @@ from rig.core.errors import (
     Unreferenced,
     UsageError,
 )
+from rig.core.phrases import angle_range, angle_words
 from rig.core.signals import uninterrupted
 from rig.devices.servo import Servo, ServoCondition, ServoState
 from rig.safety.angle_reference import AngleFinding, AngleReference, SavedAngleCheck
@@ -325,9 +326,9 @@ class Safety:
             The angle is beyond the table's limits; nothing is stored.
         """
         if self._record.beyond_limits(table_deg):
-            low_deg, high_deg = self._config.table.limits_deg
             raise UsageError(
-                f"The table cannot be at {table_deg:.1f}°: its cable budget is {low_deg:g}° to {high_deg:g}°.",
+                f"The table cannot be at {angle_words(table_deg)}: its cable budget is "
+                f"{angle_range(self._config.table.limits_deg)}.",
                 next_step=f"Check the revolutions that you gave. {_SET_HOME}",
             )
         if not self._machine.accepts(StateEvent.REFER):

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.config import RigConfig, ViewConfig
+from rig.core.phrases import filled
 from rig.devices.camera import Camera, CameraLocks, Frame
 from rig.safety.gyro_rotation import Stillness
 from rig.views.description import within
@@ -276,4 +277,4 @@ def rejection_text(reason: str, evidence: ViewEvidence | ImageQuality) -> str:
 
     Version 0.1 saved the text itself.
     """
-    return _TEXTS[reason].format(evidence) if reason in _TEXTS else str(reason)
+    return filled(_TEXTS[reason], evidence) if reason in _TEXTS else str(reason)

@@ -5,6 +5,7 @@ from enum import StrEnum
 from typing import Any
 
 from hbr.segmentation.evidence import Issue
+from rig.core.phrases import filled
 
 
 class TableProblemCode(StrEnum):
@@ -62,7 +63,7 @@ def problem_text(problem: Mapping[str, Any]) -> str:
         case {"code": "setting", "name": name, "before": before, "now": now}:
             return f"{name} was {_setting(before)}, is {_setting(now)}"
     try:
-        return _TEXTS[problem["code"]].format_map(problem)
+        return filled(_TEXTS[problem["code"]], **problem)
     except LookupError:  # a code or a parameter of another version
         return str(problem.get("text", problem["code"]))
 

@@ -14,9 +14,9 @@ from rig.catalog.shared import comparable_views, journal_words
 from rig.config import RigConfig
 from rig.core.clock import SystemClock
 from rig.core.errors import RigError, TableNotEmpty, UsageError, ViewRejected
+from rig.core.phrases import counted, duration_words
 from rig.events.events import Enrolled, Event, FrameUsed, Identified, Started, event_dict, plain
 from rig.events.lines import line
-from rig.events.phrases import counted, duration_words
 from rig.motion.turntable import Turntable
 from rig.plans.capture import announced, moved
 from rig.plans.enroll import enroll

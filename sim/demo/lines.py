@@ -3,9 +3,9 @@
 from typing import ClassVar
 
 from hbr import StopDecision
+from rig.core.phrases import azimuth_words, distinct, signed
 from rig.events.events import Accepted, Candidate, Decided, Event, Identified, Moved, Ranked
 from rig.events.lines import line
-from rig.events.phrases import azimuth_words, distinct, signed
 from rig.events.wording import share_words
 
 

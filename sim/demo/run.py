@@ -21,9 +21,9 @@ from rig.cli.ui.settings import Settings
 from rig.config.values import validate
 from rig.core.clock import SystemClock, seconds_between
 from rig.core.errors import UsageError, os_errors_as
+from rig.core.phrases import duration_words, signed
 from rig.events.events import Accepted, Started
 from rig.events.lines import line
-from rig.events.phrases import duration_words, signed
 from rig.plans.enroll import enroll
 from rig.plans.identify import identify
 from rig.plans.photograph_table import photograph_table

@@ -5,6 +5,7 @@ from dataclasses import replace
 from typing import Any, Final
 
 from rig.core.errors import RigError, UsageError
+from rig.core.phrases import angle_words, percent
 from sim.bench import ShelfOperator
 from sim.calibration_board import calibration_targets
 from sim.devices import SimDevices
@@ -78,7 +79,7 @@ class Commands:
                 if factor < 0:
                     raise UsageError("The light cannot be negative.", next_step="Give 0 (dark) or more.")
                 self._world.change(light=(factor,) * 3)
-                return f"The light is at {factor:.0%}."
+                return f"The light is at {percent(factor, 0)}."
             case "power-cycle":
                 _arguments(command, given)
                 self._devices.servo.power_cycle()
@@ -129,7 +130,7 @@ class Commands:
             seconds = self._devices.servo.rotate_by_hand(angle_deg)
         except ValueError as held:
             raise UsageError("The servo holds the table.", next_step="Switch the torque off first: rig stop") from held
-        return f"The table is rotated by {angle_deg:g}° by hand, in {seconds:.1f} s."
+        return f"The table is rotated by {angle_words(angle_deg, None)} by hand, in {seconds:.1f} s."
 
     def _head(self, part: str, action: str) -> str:
         head = self._devices.head
@@ -182,7 +183,7 @@ class Commands:
     def _describe(self) -> str:
         now = self.state()
         return (
-            f"On the table: {now['object'] or 'nothing'}. The table is at {now['table_deg']:.1f}°, its torque "
+            f"On the table: {now['object'] or 'nothing'}. The table is at {angle_words(now['table_deg'])}, its torque "
             f"{'on' if now['torque'] else 'off'}. Faults: {', '.join(now['faults']) or 'none'}."
         )
 

@@ -31,7 +31,7 @@ def check(settings: Settings) -> None:
     Example: rig config check --config rig.toml
     """
     from rig.config.wording import key_info
-    from rig.events.phrases import counted
+    from rig.core.phrases import counted
 
     values, config, _ = _checked(settings)
     given = sum(values.origin(info.key) != "default" for info in key_info(type(config)))

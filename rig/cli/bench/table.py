@@ -9,6 +9,7 @@ from rig.cli.ui.command import command
 from rig.cli.ui.exit_codes import EXIT_DECLINED
 from rig.cli.ui.prompts import ask_yes_no
 from rig.cli.ui.settings import Settings
+from rig.core.phrases import angle_words, budget_words, signed
 
 if TYPE_CHECKING:
     from rig.core.errors import RigError
@@ -72,7 +73,8 @@ def home(
             angle_deg = bench.safety.angle_reference.with_revolutions(position_deg, turns)
             if abs(angle_deg) > 180.0 and not bench.safety.beyond_limits(angle_deg) and not yes:
                 question = (
-                    f"The table is then at {angle_deg:.0f}° and rotates by {-angle_deg:+.0f}° to home. Rotate it?"
+                    f"The table is then at {angle_words(angle_deg, 0)} and rotates by {signed(-angle_deg, 0)}° to "
+                    "home. Rotate it?"
                 )
                 if not ask_yes_no(question):
                     raise typer.Exit(EXIT_DECLINED)
@@ -247,9 +249,8 @@ def _served_status(settings: Settings, server: "ServerAddress") -> None:
 
 
 def _table_text(angle_deg: float | None, limits_deg: tuple[float, float]) -> str:
-    low, high = limits_deg
-    budget = f"cable budget {low:g}° to {high:g}° ({low / 360:+.2f} to {high / 360:+.2f} revolutions)".replace("-", "−")
-    return f"angle in doubt; {budget}" if angle_deg is None else f"{angle_deg:.2f}°; {budget}"
+    budget = f"cable budget {budget_words(limits_deg)}"
+    return f"angle in doubt; {budget}" if angle_deg is None else f"{angle_words(angle_deg, 2)}; {budget}"
 
 
 def _state_text(safety: "Safety") -> str:

@@ -139,8 +139,8 @@ def _interruptible(unfinished: "UnfinishedJob") -> "Iterator[None]":
 def _lines(found: "CalibratedRule", objects: int, seconds: float) -> list[str]:
     from math import isfinite
 
+    from rig.core.phrases import counted, percent, percent_words, sentence
     from rig.events.note_wording import limitation_words
-    from rig.events.phrases import counted, percent, percent_words, sentence
 
     rule = found.rule
     searched = (f"{found.searched} of " if 0 < found.searched < objects else "") + counted(objects, "object")

@@ -10,6 +10,7 @@ from rig.cli.ui.command import command
 from rig.cli.ui.complete import object_names
 from rig.cli.ui.jobs import confirm, print_table, size_words
 from rig.cli.ui.settings import Settings
+from rig.core.phrases import number
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -111,7 +112,7 @@ def show(
 
 
 def _print_object(details: "ObjectDetails", folder: str, *, full: bool) -> None:
-    from rig.events.phrases import counted
+    from rig.core.phrases import counted
     from rig.views.segmentation_evidence import SegmentationSummary
 
     summary = details.summary
@@ -204,7 +205,7 @@ def delete_(
     Example: rig catalog delete mug-white --yes --bench sim
     """
     from rig.catalog.edit import delete
-    from rig.events.phrases import counted
+    from rig.core.phrases import counted
 
     with settings.open_catalog() as catalog:
         found = [catalog.summary(name) for name in dict.fromkeys(names)]
@@ -229,7 +230,7 @@ def undelete_(
     Example: rig catalog undelete mug-white --bench sim
     """
     from rig.catalog.edit import undelete
-    from rig.events.phrases import counted
+    from rig.core.phrases import counted
 
     with settings.open_catalog() as catalog:
         undelete(catalog, name)
@@ -314,7 +315,7 @@ def report_other_regions(settings: Settings, catalog: "Catalog", bench: "Bench")
 
 
 def _number(value: Any, width: int, digits: int) -> str:
-    return f"{value:{width}.{digits}f}" if isinstance(value, int | float) else "–".rjust(width)
+    return (number(value, f".{digits}f") if isinstance(value, int | float) else "–").rjust(width)
 
 
 def _model(identity: Any) -> Any:

@@ -158,7 +158,7 @@ def _read_batch(source: Path, pattern: str | None, table_angles: bool) -> "Impor
 
 
 def _report(settings: Settings, done: "Imported", seconds: float, *, dry_run: bool) -> None:
-    from rig.events.phrases import counted
+    from rig.core.phrases import counted
 
     if settings.json:
         from rig.events.events import plain
@@ -230,7 +230,7 @@ def export(
     """
     from rig.catalog.exchange import read_objects, write_bundle, write_folder, write_parquet, write_table
     from rig.core.errors import ExportFailed
-    from rig.events.phrases import counted
+    from rig.core.phrases import counted
     from rig.report.catalog_page import write_catalog_page, write_sheets
 
     form = format_ or _format(target)
@@ -275,8 +275,8 @@ def _export_training(
 ) -> None:
     from rig.catalog.exchange.training import Annotations, Split, write_training
     from rig.core.errors import UsageError
+    from rig.core.phrases import counted
     from rig.events.events import plain
-    from rig.events.phrases import counted
 
     try:
         shares = [float(part) for part in fractions.split(",")]

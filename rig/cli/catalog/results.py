@@ -140,7 +140,7 @@ def export(
     """
     from rig.catalog.exchange.results_table import TableFormat, write_results
     from rig.core.errors import UsageError
-    from rig.events.phrases import counted
+    from rig.core.phrases import counted
 
     try:
         form = TableFormat(target.suffix.lower().removeprefix("."))

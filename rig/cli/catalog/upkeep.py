@@ -38,8 +38,8 @@ def verify(
     from rig.catalog.unfinished import UnfinishedJob
     from rig.catalog.verify import verify as job
     from rig.cli.catalog.findings import finding_text
+    from rig.core.phrases import counted
     from rig.events.events import plain
-    from rig.events.phrases import counted
 
     with (
         settings.open_catalog(read_only=not repair) as catalog,
@@ -108,8 +108,8 @@ def redescribe(
     """
     from rig.catalog.redescribe import redescribe as job
     from rig.catalog.unfinished import UnfinishedJob
+    from rig.core.phrases import counted
     from rig.events.events import plain
-    from rig.events.phrases import counted
 
     part, name = _region(settings, region), descriptor_name(descriptor)
     with (
@@ -160,8 +160,8 @@ def gc(
     Example: rig catalog gc --dry-run --bench sim
     """
     from rig.catalog.upkeep import GarbageReport, collect_garbage
+    from rig.core.phrases import counted
     from rig.events.events import plain
-    from rig.events.phrases import counted
 
     def words(found: GarbageReport) -> str:
         names = ", ".join(found.objects[:10]) + (" and others" if len(found.objects) > 10 else "")
@@ -221,7 +221,7 @@ def copy(
     from rig.catalog.copying import copy_catalog
     from rig.config.catalog_place import CatalogPlace
     from rig.core.clock import SystemClock
-    from rig.events.phrases import counted
+    from rig.core.phrases import counted
 
     def place(text: str) -> CatalogPlace:
         if "://" not in text:

@@ -59,7 +59,7 @@ def ensure_empty_table_image(settings: Settings, bench: "Bench", *, ask: bool, t
     """
     from rig.bench import ObjectAlreadyPlaced, TableClearer
     from rig.core.errors import TableNotEmpty, ViewRejected
-    from rig.events.phrases import sentence
+    from rig.core.phrases import sentence
     from rig.views.empty_table import COMMAND, empty_table_status
 
     status = empty_table_status(bench)

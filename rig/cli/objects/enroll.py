@@ -250,7 +250,7 @@ class _Job:
             record.complete((view.record, self._catalog.read_image(view)) for view in stored)
 
     def _write(self, path: Path) -> None:
-        from rig.events.phrases import counted
+        from rig.core.phrases import counted
         from rig.report import Meta, render_report, write_report
 
         names = ", ".join(record.name for record in self._records[:3])

@@ -42,8 +42,8 @@ def replay(
         return
     from rig.cli.ui.live import IdentifyView
     from rig.cli.ui.present import console
+    from rig.core.phrases import counted
     from rig.events.events import event_dict
-    from rig.events.phrases import counted
 
     if settings.json:
         for event in saved.events():
@@ -86,8 +86,8 @@ def report(
 
 def _check(settings: Settings, saved: "SavedRun", *, every: bool) -> None:
     from rig.core.errors import ReplayMismatch, RunIncomplete
+    from rig.core.phrases import counted
     from rig.events.events import plain
-    from rig.events.phrases import counted
     from rig.search.replay import check
 
     with saved.damage():

@@ -14,6 +14,7 @@ from rich.text import Text
 from rig.cli.ui.keys import HINT, Pause
 from rig.cli.ui.view_rows import COLUMNS, COLUMNS_IN_MOTION, NARROW, WIDE, Columns, ViewRow
 from rig.config import RigConfig
+from rig.core.phrases import azimuth_words, counted, duration_words, signed
 from rig.events.events import (
     Accepted,
     Candidate,
@@ -31,7 +32,6 @@ from rig.events.events import (
     Waiting,
 )
 from rig.events.lines import line
-from rig.events.phrases import azimuth_words, counted, duration_words, signed
 from rig.events.wording import decision_words, move_words, share_words, similar_objects_words, stop_words
 from rig.motion.motion_model import MotionModel
 from rig.plans.estimate import TimeLeft

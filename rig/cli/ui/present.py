@@ -13,7 +13,7 @@ from rich.segment import Segment
 
 from rig.cli.ui.terminal import unguarded
 from rig.core.control_characters import neutral
-from rig.events.phrases import angle_words, azimuth_words, counted, duration_words
+from rig.core.phrases import angle_range, angle_words, azimuth_words, counted, duration_words
 from rig.plans.estimate import DryRun, Obstacle
 
 _PIPE_COLUMNS: Final = 240
@@ -54,11 +54,10 @@ def dry_run_lines(found: Sequence[DryRun]) -> list[str]:
         if len(found) > 1:
             continue
         first, last = one.angles_deg[0], one.angles_deg[-1]
-        low, high = (f"{angle:g}°".replace("-", "−") for angle in one.limits_deg)
         lines += [
             f"  The table is at {angle_words(one.table_deg)}. {_beginning(one.table_deg, first)}, rotates up to "
             f"{angle_words(last)} and back to 0°: {one.travel_deg:.0f}° of rotation.",
-            f"  The cable budget is {low} to {high}.",
+            f"  The cable budget is {angle_range(one.limits_deg)}.",
             "  Table angles: " + ", ".join(angle_words(angle) for angle in one.angles_deg),
             "  Azimuths:     " + ", ".join(f"{azimuth_words(azimuth)}°" for azimuth in one.azimuths_deg),
         ]

@@ -4,8 +4,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
+from rig.core.phrases import angle_words, percent
 from rig.events.events import Moved
-from rig.events.phrases import angle_words
 from rig.views.capture import ViewEvidence
 
 WIDE, NARROW = 88, 60
@@ -55,7 +55,7 @@ COLUMNS: Final[Columns] = (
     ("IMU", NARROW, lambda row: row.imu),
     ("sharpness", NARROW, lambda row: f"{row.evidence.sharpness:.1f}"),
     ("brightness", WIDE, lambda row: f"{row.evidence.mean_level:.0f}"),
-    ("saturated", WIDE, lambda row: f"{row.evidence.saturated_share * 100:.0f} %"),
+    ("saturated", WIDE, lambda row: percent(row.evidence.saturated_share, 0)),
 )
 """Columns of an enrollment's table: heading, width that the terminal needs to show it, and cell."""
 

@@ -61,7 +61,7 @@ def test_rotation_beyond_the_cable_budget_is_rejected(rig):
     done = rig("goto", "401")
     assert done.exit_code == 5
     assert "from 30.0° to 401.0°" in done.stderr
-    assert "-400° to 400° (-1.11 to +1.11 revolutions)" in done.stderr
+    assert "−400° to 400° (−1.11 to +1.11 revolutions)" in done.stderr
 
 
 def test_angle_in_doubt_is_reported_and_resolved_by_the_operator(rig):
@@ -87,7 +87,7 @@ def test_home_shows_a_long_rotation_and_asks(rig):
     rig("goto", "10")
     asked = rig("home", "--turns", "1")  # standard input has ended: no answer
     assert asked.exit_code == 2
-    assert "rotates by -370° to home" in asked.stderr
+    assert "rotates by −370° to home" in asked.stderr
     assert "--yes" in asked.stderr
     assert json.loads(rig("status", "--json").stdout)["table_deg"] == pytest.approx(10, abs=0.3)
     for rotations in ("3", "249", "99999999", "9" * 400):

@@ -86,6 +86,6 @@ def test_target_beyond_the_budget_is_rejected_with_limits(simulated):
     s = simulated()
     with Turntable(s.bench) as table:
         table.goto(20.0)
-        with pytest.raises(LimitExceeded, match=r"from 20\.0° to 401\.0°.*-1\.11 to \+1\.11 revolutions"):
+        with pytest.raises(LimitExceeded, match=r"from 20\.0° to 401\.0°.*−1\.11 to \+1\.11 revolutions"):
             table.goto(401.0)
         assert table.goto(25.0).agrees  # a rejection is no fault

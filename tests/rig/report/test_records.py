@@ -161,7 +161,7 @@ def test_rejected_frames_belong_to_the_next_view() -> None:
     record.add(Accepted(0, 0.0, evidence(), np.zeros((9, 9, 3), np.uint8)))
     record.add(Accepted(1, 0.0, evidence(), np.zeros((9, 9, 3), np.uint8)))
     assert record.views[0].rejected == (
-        "too dark (mean level 90.0, 0% black), blurred (sharpness 100.0)",
+        "too dark (mean level 90.0, 0 % black), blurred (sharpness 100.0)",
         "blurred (sharpness 100.0)",
     )
     assert record.views[1].rejected == ()

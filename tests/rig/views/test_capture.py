@@ -76,7 +76,7 @@ def test_darkness_is_rejected_until_the_retakes_are_used_up(on_the_table):
     attempts = attempts_of(s, table, viewer)
     assert [a.number for a in attempts] == [1, 2, 3, 4]
     assert all(RejectReason.TOO_DARK in a.reasons for a in attempts)
-    assert rejection_text(RejectReason.TOO_DARK, attempts[0].evidence) == "too dark (mean level 0.1, 100% black)"
+    assert rejection_text(RejectReason.TOO_DARK, attempts[0].evidence) == "too dark (mean level 0.1, 100 % black)"
 
 
 def test_short_darkness_costs_one_retake(on_the_table):

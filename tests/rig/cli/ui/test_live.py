@@ -21,6 +21,7 @@ from rig.cli.ui.operator_prompts import OperatorPrompts
 from rig.config import load_config
 from rig.core.clock import SystemClock
 from rig.core.errors import UsageError, ViewRejected
+from rig.core.phrases import angle_words
 from rig.events.events import (
     Accepted,
     Event,
@@ -34,7 +35,6 @@ from rig.events.events import (
     Waiting,
     WaitReason,
 )
-from rig.events.phrases import angle_words
 from rig.plans.tray import TrayDecision, TrayItem
 from rig.views.capture import MotionEvidence
 from tests.programs import Program

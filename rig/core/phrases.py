@@ -1,10 +1,12 @@
 """Numbers, times and lists as people read them."""
 
 from collections.abc import Iterable, Sequence
+from string import Formatter
+from typing import Any
 
 
 def percent_words(probability: float) -> str:
-    """Return a probability in percent; "below 0.1 %" and "above 99.9 %" at the ends."""
+    """Return a probability in percent; "<0.1 %" and ">99.9 %" at the ends."""
     if probability > 0.999:
         return ">99.9 %"
     return "<0.1 %" if probability < 0.001 else percent(probability)
@@ -40,9 +42,20 @@ def counted(n: int, noun: str) -> str:
     return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
 
 
-def angle_words(angle_deg: float, decimals: int = 1) -> str:
-    """Return an angle of the table: "−12.5°"."""
-    return f"{round(angle_deg, decimals) + 0.0:.{decimals}f}°".replace("-", "−")  # + 0.0 removes the sign of a zero
+def angle_words(angle_deg: float, decimals: int | None = 1) -> str:
+    """Return an angle of the table: "−12.5°"; without decimals, the digits that it has: "−540°"."""
+    return f"{number(angle_deg, 'g' if decimals is None else f'.{decimals}f')}°"
+
+
+def angle_range(limits_deg: tuple[float, float], decimals: int | None = None) -> str:
+    """Return a range of the table's angles: "−540° to 540°"."""
+    return " to ".join(angle_words(limit_deg, decimals) for limit_deg in limits_deg)
+
+
+def budget_words(limits_deg: tuple[float, float]) -> str:
+    """Return a cable budget: "−540° to 540° (−1.50 to +1.50 revolutions)"."""
+    revolutions = " to ".join(signed(limit_deg / 360, 2) for limit_deg in limits_deg)
+    return f"{angle_range(limits_deg)} ({revolutions} revolutions)"
 
 
 def joined(items: Sequence[str], conjunction: str = "and") -> str:
@@ -68,4 +81,28 @@ def distinct(a: float, b: float, *, decimals: int = 2) -> tuple[str, str]:
 
 def signed(value: float, decimals: int) -> str:
     """Return a number with its sign, a real minus."""
-    return f"{round(value, decimals) + 0.0:+.{decimals}f}".replace("-", "−")  # + 0.0 removes the sign of a zero
+    return number(value, f"+.{decimals}f")
+
+
+def number(value: float, form: str) -> str:
+    """Return a number in a format of Python, with a real minus, no minus of a zero, and a space before "%"."""
+    words = format(value, form)
+    if words.startswith("-") and not words.strip("-0.%"):
+        words = format(0.0, form)
+    return words.replace("-", "−").replace("%", " %")
+
+
+def filled(template: str, *values: object, **named: object) -> str:
+    """Return a template of `str.format` with its values; numbers with a format are written by `number`."""
+    return _FILLER.vformat(template, values, named)
+
+
+class _Filler(Formatter):
+    def format_field(self, value: Any, format_spec: str) -> str:
+        """Write a number for people. A number without a format is a setting, which is typed: "imu.sign = -1"."""
+        if format_spec and isinstance(value, int | float):
+            return number(value, format_spec)
+        return format(value, format_spec)
+
+
+_FILLER = _Filler()
