@@ -57,7 +57,7 @@ def configured() -> RigConfig:
 
 
 def record(bench: Bench, operator: ShelfOperator, name: str) -> dict[str, Seen]:
-    """Record one object: views to enroll, a turn in motion, and views at rest."""
+    """Record one object: views to enroll, a revolution in motion, and views at rest."""
     describe = ViewDescriber(bench.config.view, (BENCH_DESCRIPTOR,))
     viewer = Viewer(bench.camera, bench.config.view)
     found: dict[str, Seen] = {}

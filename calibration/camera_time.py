@@ -98,8 +98,8 @@ class CameraTime(Procedure):
             middle_deg = lower_end(bench, table.rest_deg, length_deg) + length_deg / 2
             stream = FrameStream(bench.camera, bench.clock)
             worst_deg = 0.0
-            turns = [speed for _ in range(self.rounds) for speed in sorted({*speeds, speeds[0]})]
-            for number, speed in enumerate(turns):
+            speeds_dps = [speed for _ in range(self.rounds) for speed in sorted({*speeds, speeds[0]})]
+            for number, speed in enumerate(speeds_dps):
                 half_deg = ARC_DEG / 2 + _ramp_deg(speed, bench)
                 ends_deg = middle_deg - half_deg, middle_deg + half_deg
                 goto(ends_deg[0])
@@ -111,7 +111,7 @@ class CameraTime(Procedure):
                     one, residual_deg, missing = taken
                     worst_deg, lost, frames = max(worst_deg, residual_deg), lost + missing, frames + len(one.angle_deg)
                     passes.append(one)
-                yield Progress((number + 1) / len(turns), f"{speed:.0f} °/s in both directions")
+                yield Progress((number + 1) / len(speeds_dps), f"{speed:.0f} °/s in both directions")
         share = lost / max(lost + frames, 1)
         found = evaluate(passes, exposure_ms=config.camera.exposure_us * 1e-3, fastest_dps=max(speeds), bench=bench)
         found.reject_if(worst_deg > SLIP_DEG, RejectionCode.PLATTER_SLIPPED, residual_deg=worst_deg)

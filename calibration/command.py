@@ -45,7 +45,7 @@ app = typer.Typer(help="Measure the bench's own errors.", no_args_is_help=True)
 def servo(
     settings: Settings,
     reversals: Annotated[int, typer.Option(min=6, help="Reversals for the backlash.")] = 24,
-    turns: Annotated[int, typer.Option(min=1, help="Revolutions for the encoder.")] = 2,
+    revolutions: Annotated[int, typer.Option(min=1, help="Revolutions for the encoder.")] = 2,
     rounds: Annotated[int, typer.Option(min=2, help="Rounds of timed rotations.")] = 3,
 ) -> None:
     """Calibrate direction, gear ratio, backlash, encoder and motion of the servo.
@@ -56,7 +56,7 @@ def servo(
     """
     from calibration.procedures import Backlash, Encoder, MotionModel
 
-    run(settings, Backlash(reversals), Encoder(turns), MotionModel(rounds))
+    run(settings, Backlash(reversals), Encoder(revolutions), MotionModel(rounds))
 
 
 @app.command("cable")
@@ -75,7 +75,7 @@ def cable(settings: Settings) -> None:
 @command
 def imu(
     settings: Settings,
-    turns: Annotated[int, typer.Option(min=4, help="Least number of revolutions, both directions together.")] = 8,
+    revolutions: Annotated[int, typer.Option(min=4, help="Least number of revolutions, both directions together.")] = 8,
     minutes: Minutes = 20.0,
     repeats: Annotated[int, typer.Option(min=4, help="Repeated rotations at each speed, to verify σ.")] = 10,
 ) -> None:
@@ -83,11 +83,11 @@ def imu(
 
     Takes half an hour. Exit code 6 if a calibration does not pass.
 
-    Example: rig calibrate imu --bench sim --turns 12
+    Example: rig calibrate imu --bench sim --revolutions 12
     """
     from calibration.procedures import GyroNoise, GyroRotation, GyroScale, ImuMounting
 
-    run(settings, GyroScale(turns), ImuMounting(), GyroNoise(minutes), GyroRotation(repeats))
+    run(settings, GyroScale(revolutions), ImuMounting(), GyroNoise(minutes), GyroRotation(repeats))
 
 
 @app.command("camera")

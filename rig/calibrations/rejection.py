@@ -45,8 +45,8 @@ class RejectionCode(Enum):
         "Look for a platter that is loose on its shaft, or a sensor that shifts."
     )
     ENCODER_UNCERTAIN = (
-        "The uncertainty of the harmonics is {uncertainty_deg:.3f}°, more than {limit_deg:g}°. Give more --turns, and "
-        "keep vibration off the bench."
+        "The uncertainty of the harmonics is {uncertainty_deg:.3f}°, more than {limit_deg:g}°. Give more "
+        "--revolutions, and keep vibration off the bench."
     )
     MOVE_HINDERED = (
         "The rotation by {distance_deg:.0f}° took {seconds:.2f} s, {residual_s:.2f} s off the others: something "
@@ -68,7 +68,8 @@ class RejectionCode(Enum):
     # -- IMU --
     TOO_FEW_REVOLUTIONS = (
         "Only {up} revolutions upwards and {down} downwards can be used, {needed} in each direction are "
-        "needed{reasons}. Give more --turns. If the rate is too high, lower table.velocity_dps or raise imu.range_dps."
+        "needed{reasons}. Give more --revolutions. If the rate is too high, lower table.velocity_dps or raise "
+        "imu.range_dps."
     )
     GYRO_IMPLAUSIBLE = (
         "The gyro reads {ratio:.3f}° for each degree of the encoder: no undamaged part deviates so much. Check "
@@ -80,7 +81,7 @@ class RejectionCode(Enum):
     )
     SCALE_UNCERTAIN = (
         "The uncertainty of the scale is {uncertainty:.2%}, more than {limit:.1%}: the gyro is noisy. Keep vibration "
-        "off the bench, or give more --turns."
+        "off the bench, or give more --revolutions."
     )
     TOO_FEW_RECORDED_MOVES = (
         "Only {used} of {planned} rotations can be used: the sensor lost samples. Close other programs, and calibrate "

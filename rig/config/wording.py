@@ -27,7 +27,6 @@ _UNIT_SUFFIXES = {
     "_v": "V",
     "_mm": "mm",
     "_percent": "%",
-    "_turns": "turns",
 }
 _OR_NONE = ", or none"
 _KINDS: Mapping[Any, str] = {

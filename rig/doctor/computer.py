@@ -42,7 +42,7 @@ def bench_state(context: DoctorContext) -> Iterator[Finding]:
             "bench",
             FindingCode.STATE_DAMAGED,
             "Check how far the cable is wound up, then: "
-            f"{context.rig('acknowledge')} and {context.rig('home --turns N')}",
+            f"{context.rig('acknowledge')} and {context.rig('home --revolutions N')}",
             5,
             what=state.fault.what if state.fault else state.damage,
             damage=state.damage,

@@ -42,8 +42,8 @@ from rig.safety.state_machine import TableState as TableState
 from rig.safety.table_record import TableRecord
 
 _CHECK_CABLE: Final = (
-    "Look at the cable. If it hangs free, run `rig home --turns 0`. Otherwise, give the revolutions that it is wound "
-    "up. Or rotate the table by hand to its home and run `rig home --here`."
+    "Look at the cable. If it hangs free, run `rig home --revolutions 0`. Otherwise, give the revolutions that it is "
+    "wound up. Or rotate the table by hand to its home and run `rig home --here`."
 )
 _SET_HOME: Final = "Rotate the table by hand to its home with the cable hanging free, then run `rig home --here`."
 _WAYS_OUT: Final = {

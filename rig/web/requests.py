@@ -3,7 +3,7 @@
 from enum import StrEnum
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AliasChoices, BaseModel, ConfigDict, Field
 
 
 class _Request(BaseModel):
@@ -89,7 +89,15 @@ class ReferenceRequest(_Request):
     """Set the table's angle after the operator has looked at the cable. Moves nothing."""
 
     kind: Literal["reference"] = "reference"
-    turns: Annotated[int | None, Field(ge=-100, le=100, description="revolutions that the cable is wound up")] = None
+    revolutions: Annotated[
+        int | None,
+        Field(
+            ge=-100,
+            le=100,
+            description="revolutions that the cable is wound up",
+            validation_alias=AliasChoices("revolutions", "turns"),  # "turns" of version 0.1, until 0.3
+        ),
+    ] = None
     here: bool = Field(False, description="the present angle is home, with the cable hanging free")
 
 

@@ -341,13 +341,13 @@ def _acknowledge(context: Context, *, reboot: bool) -> None:
 
 
 def _refer(context: Context, request: ReferenceRequest) -> None:
-    if request.here == (request.turns is not None):
-        raise UsageError("turns and here are both given, or both missing.", next_step="Give one of them.")
+    if request.here == (request.revolutions is not None):
+        raise UsageError("revolutions and here are both given, or both missing.", next_step="Give one of them.")
     safety = context.bench.safety
-    if request.turns is None:
+    if request.revolutions is None:
         safety.set_angle(0.0)
     else:
-        safety.set_revolutions(request.turns)
+        safety.set_revolutions(request.revolutions)
     context.job.result_text = "The table's angle is set."
 
 

@@ -1,4 +1,4 @@
-"""Commands of the trainee to the simulated world, such as ``put mug-white``, ``jam`` or ``turn 90``."""
+"""Commands of the trainee to the simulated world, such as ``put mug-white``, ``jam`` or ``rotate 90``."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -16,7 +16,7 @@ HELP: Final = """\
 put NAME [DEGREES]  Put an object on the table, rotated by so many degrees (default: at random). Clears the table first.
 clear               Clear the table.
 objects             List the objects.
-turn DEGREES        Rotate the table by hand, counter-clockwise. Works only while the torque is off.
+rotate DEGREES      Rotate the table by hand, counter-clockwise. Works only while the torque is off.
 light FACTOR        Change the light: 1 is the normal light, 0.5 half of it.
 power-cycle         Switch the servo's supply off and on.
 estop press         Press the emergency stop of the rig head; estop release releases it.
@@ -72,7 +72,7 @@ class Commands:
                 return "The table is empty."
             case "objects":
                 return "\n".join([*self._operator.objects, *calibration_targets(self._operator.optics)])
-            case "turn":
+            case "rotate" | "turn":  # "turn" is the name of version 0.1; 0.3 removes it
                 return self._rotate_by_hand(_number(_arguments(command, given, 1, 1)[0], "degrees", MAX_DEG))
             case "light":
                 factor = _number(_arguments(command, given, 1, 1)[0], "factor", MAX_LIGHT)

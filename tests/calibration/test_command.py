@@ -21,7 +21,7 @@ from tests.calibration.drawn import measured, moves
 CONFIG = 'default_bench = "sim"\ncalibration_dir = "calibrations"\n[catalog]\npath = "catalog"\n'
 
 
-SERVO = ("calibrate", "servo", "--reversals", "8", "--turns", "1", "--rounds", "2")
+SERVO = ("calibrate", "servo", "--reversals", "8", "--revolutions", "1", "--rounds", "2")
 
 
 def calibrated(folder, *arguments: str):
@@ -36,7 +36,7 @@ def calibrated(folder, *arguments: str):
 
 @pytest.fixture(scope="module")
 def imu_calibration(tmp_path_factory):
-    words = ("calibrate", "imu", "--turns", "4", "--minutes", "3", "--repeats", "4")
+    words = ("calibrate", "imu", "--revolutions", "4", "--minutes", "3", "--repeats", "4")
     with pytest.MonkeyPatch.context() as patch:
         # Measured by the tests of these procedures; here their data are drawn, because the table moves for long.
         mounting = imu_mounting.evaluate(*measured(), column=2, sign=1)
@@ -81,7 +81,7 @@ def test_passed_results_are_stored_and_in_force(rig, tmp_path, imu_calibration):
 def test_json_is_one_object_per_line_and_ends_with_the_result(rig, monkeypatch):
     for slow in (ImuMounting, GyroRotation):
         monkeypatch.setattr(slow, "measure", lambda *_: (event for event in ()))
-    done = rig("calibrate", "imu", "--turns", "4", "--minutes", "3", "--seed", "6", "--json")
+    done = rig("calibrate", "imu", "--revolutions", "4", "--minutes", "3", "--seed", "6", "--json")
     events = [json.loads(line) for line in done.stdout.splitlines()]
     assert {event["event"] for event in events} == {"moved", "progress", "calibrated"}
     scale, noise = [event for event in events if event["event"] == "calibrated"]
@@ -92,7 +92,7 @@ def test_json_is_one_object_per_line_and_ends_with_the_result(rig, monkeypatch):
 
 def test_rejected_calibration_exits_with_6_and_changes_nothing(rig, tmp_path, imu_calibration):
     copytree(imu_calibration[0], tmp_path / "calibrations")
-    done = rig("calibrate", "imu", "--turns", "4", "--set", "imu.axis=x")
+    done = rig("calibrate", "imu", "--revolutions", "4", "--set", "imu.axis=x")
     assert done.exit_code == 6
     assert "FAIL imu.scale" in done.stdout
     assert "imu.axis" in done.stdout
@@ -102,7 +102,7 @@ def test_rejected_calibration_exits_with_6_and_changes_nothing(rig, tmp_path, im
 
 
 def test_too_few_revolutions_are_a_usage_error(rig):
-    assert rig("calibrate", "imu", "--turns", "3").exit_code == 2
+    assert rig("calibrate", "imu", "--revolutions", "3").exit_code == 2
 
 
 def test_servo_results_replace_earlier_ones(rig, tmp_path, monkeypatch, servo_calibration):
@@ -120,7 +120,7 @@ def test_show_and_history_list_results(rig, tmp_path, imu_calibration):
     assert "No calibrations in" in rig("calibrate", "show").output
     assert "No calibrations of imu.scale in" in rig("calibrate", "history", "imu.scale").output
     assert rig("calibrate", "report", "--out", "no/where.html").exit_code == 2
-    rig("calibrate", "imu", "--turns", "4", "--set", "imu.axis=x")
+    rig("calibrate", "imu", "--revolutions", "4", "--set", "imu.axis=x")
     assert "imu.scale never passed" in rig("calibrate", "show").output
     for path in sorted((imu_calibration[0] / "sim").iterdir()):
         CalibrationStore(tmp_path / "calibrations" / "sim").add(CalibrationResult.from_file(path))

@@ -51,7 +51,7 @@ RETIRED = (
 )
 RETIRED_NAMES = frozenset(
     {
-        *("told", "trouble", "turn", "turned", "turning", "look", "looks", "looked", "shot", "shots"),
+        *("told", "trouble", "turn", "turns", "turned", "turning", "look", "looks", "looked", "shot", "shots"),
         *("refusal", "refused", "rehearse", "stranger", "familiar", "sitting", "verdict", "anew"),
     }
 )

@@ -16,7 +16,7 @@ class Step(Enum):
 
     ACKNOWLEDGE = "`rig acknowledge`"
     REBOOT = "`rig acknowledge --reboot`"
-    HOME = "`rig home --turns 0`"
+    HOME = "`rig home --revolutions 0`"
 
 
 class After(Enum):

@@ -89,15 +89,26 @@ COMMANDS = [
     *("catalog label", "catalog delete", "catalog verify", "catalog gc", "catalog stats", "log", "status", "goto"),
     *("home", "stop", "acknowledge", "replay", "report", "export", "import", "servo", "catalog merge", "eval"),
 ]
-OPTIONS = ["--json", "--yes", "--seed", "--views", "--turns", "--config", "--list", "--check", "--set", "--dry-run"]
+OPTIONS = [
+    "--json",
+    "--yes",
+    "--seed",
+    "--views",
+    "--revolutions",
+    "--config",
+    "--list",
+    "--check",
+    "--set",
+    "--dry-run",
+]
 
 
 @cases(10)
 @given(st.sampled_from(COMMANDS), st.lists(st.one_of(ARGUMENTS, st.sampled_from(OPTIONS)), max_size=4))
 @example("goto", ["nan"])
 @example("goto", ["--", "-1e308"])
-@example("home", ["--turns", "99999999"])
-@example("home", ["--here", "--turns", "-99999999", "--json"])
+@example("home", ["--revolutions", "99999999"])
+@example("home", ["--here", "--revolutions", "-99999999", "--json"])
 @example("replay", ["/dev/zero", "--json"])
 @example("status", ["--seed", "9" * 4000])
 def test_any_arguments_end_with_a_documented_exit_code(commands, command, arguments):

@@ -40,7 +40,7 @@ def goto(
 @command
 def home(
     settings: Settings,
-    turns: Annotated[
+    revolutions: Annotated[
         int | None,
         typer.Option(
             metavar="N",
@@ -54,23 +54,23 @@ def home(
         bool, typer.Option("--yes", "-y", help="Rotate more than half a revolution without asking.")
     ] = False,
 ) -> None:
-    """Rotate the table to home (0°). If its revolutions are in doubt, look at the cable and give --turns.
+    """Rotate the table to home (0°). If its revolutions are in doubt, look at the cable and give --revolutions.
 
-    Example: rig home --turns 0 --bench sim
+    Example: rig home --revolutions 0 --bench sim
     """
     from rig.core.errors import UsageError
     from rig.motion.turntable import Turntable
 
-    if here and turns is not None:
-        raise UsageError("--here and --turns cannot be combined.", next_step="Give one of them.")
+    if here and revolutions is not None:
+        raise UsageError("--here and --revolutions cannot be combined.", next_step="Give one of them.")
     with settings.open_bench(devices=("imu",)) as bench:
         if here:
             bench.safety.set_angle(0.0)
             settings.say("The present angle is home now.", {"table_deg": 0.0})
             return
-        if turns is not None:
+        if revolutions is not None:
             position_deg = bench.servo.read_state().position_deg
-            angle_deg = bench.safety.angle_reference.with_revolutions(position_deg, turns)
+            angle_deg = bench.safety.angle_reference.with_revolutions(position_deg, revolutions)
             if abs(angle_deg) > 180.0 and not bench.safety.beyond_limits(angle_deg) and not yes:
                 question = (
                     f"The table is then at {angle_words(angle_deg, 0)} and rotates by {signed(-angle_deg, 0)}° to "
@@ -78,7 +78,7 @@ def home(
                 )
                 if not ask_yes_no(question):
                     raise typer.Exit(EXIT_DECLINED)
-            bench.safety.set_revolutions(turns)
+            bench.safety.set_revolutions(revolutions)
         with Turntable(bench) as table:
             _rotate(settings, table, 0.0)
 

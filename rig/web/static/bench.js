@@ -108,7 +108,7 @@ $("goto").addEventListener("submit", (event) => {
 });
 $("refer").addEventListener("submit", (event) => {
   event.preventDefault();
-  submit({ kind: "reference", turns: Number($("turns").value) });
+  submit({ kind: "reference", revolutions: Number($("revolutions").value) });
 });
 $("here").addEventListener("click", () => submit({ kind: "reference", here: true }));
 for (const [id, kind] of [["home", "home"], ["empty", "empty-table"], ["acknowledge", "acknowledge"], ["doctor", "doctor"]]) {

@@ -298,15 +298,15 @@ def test_numbers_are_short_and_accurate(value: float) -> None:
     assert "e" not in number(value)
 
 
-TURNS = tuple(float(rotate) for rotate in range(-175, 185, 5) if rotate)
+ROTATIONS = tuple(float(rotate) for rotate in range(-175, 185, 5) if rotate)
 
 
 class TestDecisionChart:
     @examples(6)
-    @given(here=ANGLE, chosen=st.sampled_from(TURNS), seen=st.lists(ANGLE, min_size=1, max_size=4))
+    @given(here=ANGLE, chosen=st.sampled_from(ROTATIONS), seen=st.lists(ANGLE, min_size=1, max_size=4))
     def test_chosen_rotation_is_innermost_at_its_azimuth(self, here: float, chosen: float, seen: list[float]) -> None:
-        away = tuple(abs(rotate - chosen) for rotate in TURNS)
-        weighed = Weighed(TURNS, tuple(-9 + a for a in away), tuple(abs(t) / 100 for t in TURNS), away)
+        away = tuple(abs(rotate - chosen) for rotate in ROTATIONS)
+        weighed = Weighed(ROTATIONS, tuple(-9 + a for a in away), tuple(abs(t) / 100 for t in ROTATIONS), away)
         svg = decision_chart(here, weighed, chosen, candidates=("a", HOSTILE), seen_deg=seen, number=len(seen))
         goal, *others = having(svg, "stop", "last")
         assert not others
@@ -314,7 +314,7 @@ class TestDecisionChart:
         assert apart(azimuth_of(x, y), here + chosen) < 1
         radii = [hypot(px - CENTRE[0], py - CENTRE[1]) for px, py in points(having(svg, "confusion")[0])]
         assert min(radii) == pytest.approx(hypot(x - CENTRE[0], y - CENTRE[1]), abs=0.02)
-        assert len(radii) == len(having(svg, "cost")) == len(TURNS)
+        assert len(radii) == len(having(svg, "cost")) == len(ROTATIONS)
         stops = [centre(e) for e in having(svg, "stop") if "last" not in e.get("class", "")]
         assert all(apart(azimuth_of(*at), angle) < 1 for at, angle in zip(stops, seen, strict=True))
         text = " ".join(words(having(svg, "step-name")))
@@ -322,7 +322,7 @@ class TestDecisionChart:
         assert f"{abs(chosen):.0f}°" in text
 
     def test_single_object_and_equal_values_are_drawn(self) -> None:
-        for revolutions in ((5.0,), (-5.0, 5.0), TURNS):
+        for revolutions in ((5.0,), (-5.0, 5.0), ROTATIONS):
             even = (0.0,) * len(revolutions)
             svg = decision_chart(0.0, Weighed(revolutions, even, even), revolutions[0])
             assert "only one object is likely" in svg

@@ -242,7 +242,7 @@ def test_next_command_waits_for_the_guardian_of_a_killed_program():
 
 
 NIGHTLY = [
-    *(["home", "--turns", "0"], ["enroll", "cup", "--yes"], ["empty-table"]),
+    *(["home", "--revolutions", "0"], ["enroll", "cup", "--yes"], ["empty-table"]),
     *(["calibrate", "servo"], ["calibrate", "imu"], ["identify", "--strategy", "sweep"], ["serve", "--port", "0"]),
 ]
 

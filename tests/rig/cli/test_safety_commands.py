@@ -75,25 +75,34 @@ def test_angle_in_doubt_is_reported_and_resolved_by_the_operator(rig):
     assert reported["table_deg"] is None
     rejected = rig("goto", "0")
     assert rejected.exit_code == 5
-    assert "rig home --turns 0" in rejected.stderr
+    assert "rig home --revolutions 0" in rejected.stderr
     assert rig("home").exit_code == 5
-    assert rig("home", "--turns", "0", "--here").exit_code == 2
-    done = rig("home", "--turns", "0", "--json")
+    assert rig("home", "--revolutions", "0", "--here").exit_code == 2
+    done = rig("home", "--revolutions", "0", "--json")
     assert json.loads(done.stdout)["rotation_encoder_deg"] == pytest.approx(-90, abs=0.3)
     assert json.loads(rig("status", "--json").stdout)["state"] == "ready"
 
 
+def test_the_former_name_of_an_option_works_and_names_the_present_one(rig):
+    rig("goto", "10")
+    done = rig("home", "--turns", "0")
+    assert done.exit_code == 0
+    assert "--turns is now --revolutions" in done.stderr
+    assert json.loads(rig("status", "--json").stdout)["table_deg"] == pytest.approx(0, abs=0.3)
+    assert "--turns" not in rig("home", "--help").stdout
+
+
 def test_home_shows_a_long_rotation_and_asks(rig):
     rig("goto", "10")
-    asked = rig("home", "--turns", "1")  # standard input has ended: no answer
+    asked = rig("home", "--revolutions", "1")  # standard input has ended: no answer
     assert asked.exit_code == 2
     assert "rotates by −370° to home" in asked.stderr
     assert "--yes" in asked.stderr
     assert json.loads(rig("status", "--json").stdout)["table_deg"] == pytest.approx(10, abs=0.3)
     for rotations in ("3", "249", "99999999", "9" * 400):
-        assert rig("home", "--turns", rotations, "--yes").exit_code == 2, rotations
+        assert rig("home", "--revolutions", rotations, "--yes").exit_code == 2, rotations
     assert json.loads(rig("status", "--json").stdout)["table_deg"] == pytest.approx(10, abs=0.3)
-    moved = [json.loads(line) for line in rig("home", "--turns", "1", "--yes", "--json").stdout.splitlines()]
+    moved = [json.loads(line) for line in rig("home", "--revolutions", "1", "--yes", "--json").stdout.splitlines()]
     assert moved[-1]["rotation_encoder_deg"] == pytest.approx(-370, abs=0.3)
 
 
@@ -177,7 +186,7 @@ def test_bench_is_free_after_its_program_was_killed(rig, running):
     cut_off = state()["table"]["path_deg"] is not None
     reported = json.loads(rig("status", "--json").stdout)
     assert reported["state"] == ("unreferenced" if cut_off else "ready")
-    assert rig("home", "--turns", "0").exit_code == 0
+    assert rig("home", "--revolutions", "0").exit_code == 0
     assert json.loads(rig("status", "--json").stdout)["state"] == "ready"
 
 

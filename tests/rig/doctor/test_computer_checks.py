@@ -174,7 +174,7 @@ def test_latched_fault_and_damaged_state_are_reported(bench):
     (store.path / "state.json").write_text("{")
     problem = bench.problem("bench")
     assert problem.code is FindingCode.STATE_DAMAGED
-    assert "rig home --turns" in problem.fix
+    assert "rig home --revolutions" in problem.fix
 
 
 @pytest.mark.parametrize(("free", "level"), [(50e9, Severity.FINE), (1e9, Severity.WARNING), (1e8, Severity.BAD)])

@@ -41,7 +41,7 @@ def bench_of(tmp_path):
             assert bench.safety.state is TableState.UNREFERENCED
             with pytest.raises(Unreferenced) as rejected, Turntable(bench):
                 pass
-            assert "rig home --turns 0" in rejected.value.next_step
+            assert "rig home --revolutions 0" in rejected.value.next_step
             bench.safety.set_revolutions(0)
         yield lambda: program(wires, i2c, FileStore(tmp_path / "state")), wires
 

@@ -355,7 +355,7 @@ def commands() -> Iterator[Commands]:
 def test_each_command_changes_the_world(commands):
     commands.do(["put", "lamp", "30"])
     commands.do(["light", "0.5"])
-    commands.do(["turn", "-30"])
+    commands.do(["rotate", "-30"])
     commands._world.clock.sleep(2.0)
     commands.do(["jam"])
     commands.do(["camera.off@3s+2s"])
@@ -384,7 +384,7 @@ def test_each_command_changes_the_world(commands):
         (["put"], "Write: put NAME [DEGREES]"),
         (["put", "nothing"], "objects"),
         (["put", "lamp", "nan"], "number"),
-        (["turn", "fast"], "number"),
+        (["rotate", "fast"], "number"),
         (["light", "-1"], "0 (dark) or more"),
         (["jamm"], "Did you mean jam? For a list of all commands: rig sim-bench help"),
         (["jam:x=1"], "Remove the parameter"),
@@ -410,7 +410,7 @@ def test_held_table_cannot_be_rotated_by_hand(commands):
     commands._devices.servo.memory["Torque Enable"] = 1
     commands._devices.servo._on_torque_enable()
     with pytest.raises(UsageError, match="holds the table"):
-        commands.do(["turn", "90"])
+        commands.do(["turn", "90"])  # the former name of rotate
 
 
 def test_lost_connection_is_an_error_of_the_device(tmp_path):
