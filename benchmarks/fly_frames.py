@@ -27,7 +27,7 @@ from hbr.dense.stopping import StoppingRule
 from rig.config import RigConfig, load_config
 from rig.core.clock import SystemClock
 from rig.devices.camera import Frame
-from rig.motion.flight_views import FlightJudge
+from rig.motion.flight_views import FlightFrameCheck
 from rig.motion.turntable import Flight, Turntable
 from rig.views.description import BENCH_DESCRIPTOR, SearchDescriber
 from rig.views.stream import FrameStream, StreamFrame
@@ -88,7 +88,7 @@ def measured(index: hbr.DenseIndex, background: str) -> tuple[dict[str, list[flo
         locks = bench.camera.read_locks()
         with Turntable(bench) as table:
             recorder, stream = table.recorder(), FrameStream(bench.camera, bench.clock)
-            judge = FlightJudge(config, locks, True, bench.clock.now_ns(), stream.period_s)
+            frame_check = FlightFrameCheck(config, locks, True, bench.clock.now_ns(), stream.period_s)
 
             def begin() -> Work:
                 describe, session = begun(index, config)
@@ -99,7 +99,7 @@ def measured(index: hbr.DenseIndex, background: str) -> tuple[dict[str, list[flo
                 trajectory = timed(spent["angle"], recorder.fit)
                 if trajectory is None:
                     return
-                attempt = timed(spent["checks"], lambda: judge.judge(frame, trajectory, irregular=False))
+                attempt = timed(spent["checks"], lambda: frame_check.attempt(frame, trajectory, irregular=False))
                 levels = timed(spent["description"], lambda: describe(frame.image_bgr)).levels[BENCH_DESCRIPTOR]
                 motion = attempt.evidence.motion
                 assert motion is not None

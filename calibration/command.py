@@ -230,10 +230,10 @@ def report(
     from calibration.report import write_page
 
     with settings.open_bench(tell=False) as bench:
-        store, standings = stored_results(bench)
+        store, calibrations = stored_results(bench)
         notes = [error.what for error in store.unreadable]
-        write_page(out, standings, store.history(), bench=bench.name, now_utc=bench.clock.utc(), notes=notes)
-    settings.say(str(out), {"file": str(out), "calibrations": [s.result.name for s in standings]})
+        write_page(out, calibrations, store.history(), bench=bench.name, now_utc=bench.clock.utc(), notes=notes)
+    settings.say(str(out), {"file": str(out), "calibrations": [s.result.name for s in calibrations]})
 
 
 @app.command("show")
@@ -247,20 +247,20 @@ def show(settings: Settings) -> None:
     from rig.events.events import plain
 
     with settings.open_bench(tell=False) as bench:
-        store, standings = stored_results(bench)
+        store, calibrations = stored_results(bench)
         if settings.json:
-            rows = [{"state": s.status, "words": str(s), **as_json(s.result)} for s in standings]
+            rows = [{"state": s.status, "words": str(s), **as_json(s.result)} for s in calibrations]
             settings.print_json({"folder": str(store.folder), "calibrations": plain(rows)})
             return
         for finding in bench.findings:
             print(f"! {finding}")
-        for standing in standings:
-            if standing.status is CalibrationStatus.IN_FORCE:
-                print(f"✓ {standing}")
-                print("\n".join(f"    {name} = {estimate}" for name, estimate in standing.result.estimates.items()))
-                for key, value in standing.result.settings.items():
+        for calibration in calibrations:
+            if calibration.status is CalibrationStatus.IN_FORCE:
+                print(f"✓ {calibration}")
+                print("\n".join(f"    {name} = {estimate}" for name, estimate in calibration.result.estimates.items()))
+                for key, value in calibration.result.settings.items():
                     print(f"    sets {key} = {plain_value(value)}")
-        if not standings:
+        if not calibrations:
             print(f"No calibrations in {store.folder} yet: run `rig calibrate all`.")
 
 

@@ -4,15 +4,15 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from rig.bench import Bench
-    from rig.calibrations import CalibrationResult, CalibrationStanding, CalibrationStore
+    from rig.calibrations import BenchCalibration, CalibrationResult, CalibrationStore
 
 
-def stored_results(bench: "Bench") -> "tuple[CalibrationStore, list[CalibrationStanding]]":
-    """Return the bench's calibration results and their standings."""
+def stored_results(bench: "Bench") -> "tuple[CalibrationStore, list[BenchCalibration]]":
+    """Return the store of the bench's results, and its calibrations with their status."""
     from rig.calibrations import CalibrationStore
 
     store = CalibrationStore(bench.config.calibration_path(bench.name))
-    return store, store.standings(bench.apparatus(), bench.clock.utc())
+    return store, store.on_bench(bench.apparatus(), bench.clock.utc())
 
 
 def in_force(bench: "Bench", name: str) -> "CalibrationResult":
@@ -20,9 +20,9 @@ def in_force(bench: "Bench", name: str) -> "CalibrationResult":
     from rig.calibrations import CalibrationStatus
     from rig.core.errors import UsageError
 
-    for standing in stored_results(bench)[1]:
-        if standing.result.name == name and standing.status is CalibrationStatus.IN_FORCE:
-            return standing.result
+    for calibration in stored_results(bench)[1]:
+        if calibration.result.name == name and calibration.status is CalibrationStatus.IN_FORCE:
+            return calibration.result
     raise UsageError(
         f"{name} is not calibrated on this bench.", next_step=f"Run `rig calibrate {name.partition('.')[0]}` first."
     )

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 from markupsafe import Markup
 
 from calibration.procedures import PROCEDURES
-from rig.calibrations import CalibrationResult, CalibrationStanding, CalibrationStatus
+from rig.calibrations import BenchCalibration, CalibrationResult, CalibrationStatus
 from rig.charts.xy import Chart
 from rig.core.errors import UsageError, os_errors_as
 from rig.core.files import write
@@ -35,21 +35,21 @@ def plots(result: CalibrationResult) -> list[Chart]:
 
 def write_page(
     path: Path,
-    standings: Sequence[CalibrationStanding],
+    calibrations: Sequence[BenchCalibration],
     history: Sequence[CalibrationResult],
     *,
     bench: str,
     now_utc: datetime,
     notes: Sequence[str] = (),
 ) -> None:
-    """Write the page: the standing of each calibration, and the rejections of newer attempts.
+    """Write the page: the status of each calibration, and the rejections of newer attempts.
 
     Parameters
     ----------
     path
         The file.
-    standings
-        See `rig.calibrations.CalibrationStore.standings`.
+    calibrations
+        See `rig.calibrations.CalibrationStore.on_bench`.
     history
         All stored results, oldest first.
     bench, now_utc
@@ -62,8 +62,8 @@ def write_page(
     UsageError
         The file cannot be written.
     """
-    shown = [_shown(standing, history) for standing in standings]
-    count = {status: sum(standing.status is status for standing in standings) for status in CalibrationStatus}
+    shown = [_shown(calibration, history) for calibration in calibrations]
+    count = {status: sum(calibration.status is status for calibration in calibrations) for status in CalibrationStatus}
     template = environment("calibration", "rig.report").get_template("report.html.j2")
     page = template.render(
         bench=bench,
@@ -81,15 +81,15 @@ def write_page(
         write(path, page.encode())
 
 
-def _shown(standing: CalibrationStanding, history: Sequence[CalibrationResult]) -> _Shown:
-    result = standing.result
+def _shown(calibration: BenchCalibration, history: Sequence[CalibrationResult]) -> _Shown:
+    result = calibration.result
     latest = [stored for stored in history if stored.name == result.name][-1]
     return _Shown(
         result,
-        standing.status is CalibrationStatus.IN_FORCE,
-        str(standing.status),
-        str(standing),
-        standing.command,
+        calibration.status is CalibrationStatus.IN_FORCE,
+        str(calibration.status),
+        str(calibration),
+        calibration.command,
         [f"Rejected on {latest.when_utc:%Y-%m-%d %H:%M} UTC: {rejection}" for rejection in latest.rejections],
         # Trusted markup: the SVG escapes its texts.
         [Markup(figure.svg(themed=True)) for figure in plots(result)],

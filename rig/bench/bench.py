@@ -268,8 +268,8 @@ def calibrate(bench: Bench, store: CalibrationStore) -> None:
     """
     bench._as_opened = bench._as_opened or (bench.config, bench.findings)
     config, findings = bench._as_opened
-    standings = store.standings(bench.apparatus(), bench.clock.utc())
-    in_force = [standing.result for standing in standings if standing.status is CalibrationStatus.IN_FORCE]
+    calibrations = store.on_bench(bench.apparatus(), bench.clock.utc())
+    in_force = [calibration.result for calibration in calibrations if calibration.status is CalibrationStatus.IN_FORCE]
     bench.config, notes = apply_results(config, in_force)
     bench.safety.angle_reference.calibrate(bench.config.table)
     bench.conditions = {**bench.conditions, CALIBRATIONS: [result.id for result in in_force]}
@@ -277,9 +277,9 @@ def calibrate(bench: Bench, store: CalibrationStore) -> None:
         *notes,
         *(error.what for error in store.unreadable),
         *(
-            f"{str(standing).removesuffix('.')}. To calibrate again: `{standing.command}`"
-            for standing in standings
-            if standing.status is not CalibrationStatus.IN_FORCE
+            f"{str(calibration).removesuffix('.')}. To calibrate again: `{calibration.command}`"
+            for calibration in calibrations
+            if calibration.status is not CalibrationStatus.IN_FORCE
         ),
     )
     bench.findings = (*findings, *bench.calibration_findings)

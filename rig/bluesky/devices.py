@@ -169,7 +169,7 @@ class TableDevice(Device):
 
 
 class CameraDevice(Device):
-    """The camera: `trigger` takes and judges a frame; it is Readable, with the image as an array."""
+    """The camera: `trigger` takes and checks a frame; it is Readable, with the image as an array."""
 
     def __init__(self, devices: BenchDevices) -> None:
         super().__init__(devices, "camera")

@@ -3,11 +3,11 @@
 from rig.calibrations.apply import apply_results
 from rig.calibrations.rejection import Rejection, RejectionCode
 from rig.calibrations.result import CalibrationResult, Estimate
-from rig.calibrations.store import CalibrationStanding, CalibrationStatus, CalibrationStore, apparatus
+from rig.calibrations.store import BenchCalibration, CalibrationStatus, CalibrationStore, apparatus
 
 __all__ = [
+    "BenchCalibration",
     "CalibrationResult",
-    "CalibrationStanding",
     "CalibrationStatus",
     "CalibrationStore",
     "Estimate",

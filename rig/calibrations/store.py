@@ -31,7 +31,7 @@ class CalibrationStatus(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class CalibrationStanding:
+class BenchCalibration:
     """The decisive result of one kind of calibration, and its status on the bench.
 
     ``age_days`` is the result's age; ``changes`` are the differences between the calibrated devices and the bench's.
@@ -105,15 +105,15 @@ class CalibrationStore:
     def _files(self, name: str = "") -> list[Path]:
         return sorted(self.folder.glob(f"[0-9]*-{escape(name)}*.json"))
 
-    def standings(self, device: Mapping[str, Any], now_utc: datetime) -> list[CalibrationStanding]:
-        """Return the standing of each kind of calibration on the bench with these devices, sorted by name.
+    def on_bench(self, device: Mapping[str, Any], now_utc: datetime) -> list[BenchCalibration]:
+        """Return the calibrations of the bench with these devices, one of each kind, sorted by name.
 
         The newest result that passed on these devices decides; if there is none, the newest that passed at all.
         """
         kinds: dict[str, list[CalibrationResult]] = {}
         for result in self.history():
             kinds.setdefault(result.name, []).append(result)
-        return [_standing(kinds[name], device, now_utc) for name in sorted(kinds)]
+        return [_bench_calibration(kinds[name], device, now_utc) for name in sorted(kinds)]
 
 
 def apparatus(
@@ -153,14 +153,16 @@ def _differences(path: str, then: Any, now: Any) -> Iterable[str]:
         yield f"{path} was {then}, is {now}"
 
 
-def _standing(results: list[CalibrationResult], device: Mapping[str, Any], now_utc: datetime) -> CalibrationStanding:
+def _bench_calibration(
+    results: list[CalibrationResult], device: Mapping[str, Any], now_utc: datetime
+) -> BenchCalibration:
     passed = [result for result in results if result.passed]
     if not passed:
-        return CalibrationStanding(results[-1], CalibrationStatus.FAILED)
+        return BenchCalibration(results[-1], CalibrationStatus.FAILED)
     here = [result for result in passed if not differences(result, device)]
     if not here:
         changes = tuple(sorted(differences(passed[-1], device)))
-        return CalibrationStanding(passed[-1], CalibrationStatus.OTHER_DEVICE, changes=changes)
+        return BenchCalibration(passed[-1], CalibrationStatus.OTHER_DEVICE, changes=changes)
     age_days = max((now_utc - here[-1].when_utc).total_seconds() / 86400, 0.0)  # a simulated clock runs ahead
     status = CalibrationStatus.EXPIRED if here[-1].expired(now_utc) else CalibrationStatus.IN_FORCE
-    return CalibrationStanding(here[-1], status, age_days)
+    return BenchCalibration(here[-1], status, age_days)

@@ -139,7 +139,7 @@ class FindingCode(Enum):
     DATABASE_DAMAGED = "{path}: the database is damaged: {damage}, {orphans} orphaned rows"
     IMAGES_DAMAGED = "{broken} of {images} verified images are damaged: {first}"
     UNFINISHED = "unfinished enrollments: {objects}"
-    CALIBRATION = "{standing}"
+    CALIBRATION = "{calibration}"
     NEVER_CALIBRATED = "{name} was never calibrated: {consequence}"
     CAMERA_DELAY = (
         "views wait {delay_ms:.0f} ms longer: by camera.time, exposures begin that long before their time stamp"

@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Iterator
 
 from rig.calibrations import CalibrationStatus, CalibrationStore, apparatus, apply_results
-from rig.calibrations.store import CalibrationStanding
+from rig.calibrations.store import BenchCalibration
 from rig.catalog import Catalog
 from rig.core.errors import CatalogError
 from rig.doctor.context import DoctorContext
@@ -55,31 +55,31 @@ def calibrations(context: DoctorContext) -> Iterator[Finding]:
     """Check that calibrations of this bench's devices exist and have not expired."""
     store = CalibrationStore(context.config.calibration_path(context.bench))
     device = apparatus(context.bench, context.identities, context.config, {})
-    standings = store.standings(device, context.computer.clock.utc())
+    calibrations = store.on_bench(device, context.computer.clock.utc())
     for error in store.unreadable:
         yield of_error("calibration", error)
-    for standing in standings:
+    for calibration in calibrations:
         found = {
-            "standing": standing,
-            "name": standing.result.name,
-            "status": standing.status,
-            "id": standing.result.id,
+            "calibration": calibration,
+            "name": calibration.result.name,
+            "status": calibration.status,
+            "id": calibration.result.id,
         }
-        recalibrate = context.rig(standing.command.removeprefix("rig "))
-        if standing.status is CalibrationStatus.IN_FORCE:
+        recalibrate = context.rig(calibration.command.removeprefix("rig "))
+        if calibration.status is CalibrationStatus.IN_FORCE:
             yield fine("calibration", FindingCode.CALIBRATION, **found)
         else:
             yield warning("calibration", FindingCode.CALIBRATION, recalibrate, **found)
-    yield _camera_delay(context, standings)
+    yield _camera_delay(context, calibrations)
     for name, without in WANTED.items():
-        if name not in {standing.result.name for standing in standings} and not _configured(context, name):
+        if name not in {calibration.result.name for calibration in calibrations} and not _configured(context, name):
             fix = context.rig(f"calibrate {name.partition('.')[0]}")
             yield warning("calibration", FindingCode.NEVER_CALIBRATED, fix, name=name, consequence=without)
 
 
-def _camera_delay(context: DoctorContext, standings: Iterable[CalibrationStanding]) -> Finding:
+def _camera_delay(context: DoctorContext, calibrations: Iterable[BenchCalibration]) -> Finding:
     """Return the time that views wait for a delay inside the camera, which its time stamps do not show."""
-    in_force = (one.result for one in standings if one.status is CalibrationStatus.IN_FORCE)
+    in_force = (one.result for one in calibrations if one.status is CalibrationStatus.IN_FORCE)
     config, _ = apply_results(context.config, in_force)
     if config.camera_time.offset_ms is None:
         return fine("calibration", FindingCode.CAMERA_DELAY_UNKNOWN, command=context.rig("calibrate camera-time"))

@@ -1,4 +1,4 @@
-"""Judges frames that were taken while the table rotated, as `rig.views.capture` does for frames at rest."""
+"""Checks frames that were taken while the table rotated, as `rig.views.capture` does for frames at rest."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -16,8 +16,8 @@ from rig.views.stream import StreamFrame, after_middle_row_ns, irregular_stamps,
 
 
 @dataclass(frozen=True, slots=True)
-class FlightJudge:
-    """Judges the frames of one motion.
+class FlightFrameCheck:
+    """Checks the frames of one motion.
 
     Attributes
     ----------
@@ -39,7 +39,7 @@ class FlightJudge:
         """Return which time stamps of consecutive frames cannot be trusted, bool (n,)."""
         return irregular_stamps(stamps_ns, self.period_s, self.config.camera_time.jitter_ms)
 
-    def judge(self, frame: StreamFrame, trajectory: Trajectory, *, irregular: bool) -> Attempt:
+    def attempt(self, frame: StreamFrame, trajectory: Trajectory, *, irregular: bool) -> Attempt:
         """Return a frame as an attempt at a view: its evidence, and the reasons to reject it."""
         quality = ImageQuality.of(frame.image_bgr, self.config.view)
         middle = middle_ns(frame.stamp_ns, self.config.camera_time)

@@ -1,7 +1,7 @@
 """The part of an enrollment in which the views are taken while the table rotates: a fly scan.
 
 The table rotates from rest to rest by one revolution. For each planned angle the plan holds the nearest frame in
-memory. After the revolution, the trajectory of the platter gives each frame its angle, and each frame is judged like a
+memory. After the revolution, the trajectory of the platter gives each frame its angle, and each frame is checked like a
 view at rest. Nothing is stored before that, so an interrupted revolution leaves no view.
 
 Decision: docs/decisions/0047.
@@ -21,7 +21,7 @@ from rig.catalog import Enrollment, ViewRecord
 from rig.core.errors import LimitExceeded, RotationDisagreement
 from rig.core.phrases import angle_words
 from rig.events.events import Accepted, Event, Rejected, ScanStarted, plain
-from rig.motion.flight_views import FlightJudge
+from rig.motion.flight_views import FlightFrameCheck
 from rig.motion.move import Move
 from rig.motion.scan_speed import require_camera_time, scan_speed
 from rig.motion.trajectory import TrajectoryRecorder
@@ -134,22 +134,22 @@ def fly_views(
     if trajectory is None or move.agreement is None or not (move.agreement.agrees and trajectory.consistent):
         raise _disagreement(bench, move, None if trajectory is None else trajectory.residual_deg)
     after = yield from capture(0, viewer, table, move.settled_ns)
-    # Judge the nearest frame to each angle, and store the accepted ones.
-    judge = FlightJudge(
+    # Check the nearest frame to each angle, and store the accepted ones.
+    frame_check = FlightFrameCheck(
         config,
         before.evidence.locks,
         before.evidence.locks_hold and after.evidence.locks_hold,
         begun_ns,
         scan.stream.period_s,
     )
-    off = dict(zip(scan.stamps_ns, judge.irregular(scan.stamps_ns).tolist(), strict=True))
+    off = dict(zip(scan.stamps_ns, frame_check.irregular(scan.stamps_ns).tolist(), strict=True))
     stored: set[int] = set()
     encoder = Encoder()
     for index, angle_deg in angles_deg.items():
         _, frame = scan.nearest.pop(index, (inf, None))
         if frame is None:
             continue
-        attempt = judge.judge(frame, trajectory, irregular=off[frame.stamp_ns])
+        attempt = frame_check.attempt(frame, trajectory, irregular=off[frame.stamp_ns])
         assert attempt.evidence.motion is not None
         if abs(attempt.evidence.motion.angle_deg - angle_deg) > NEAR_SHARE * spacing_deg:
             continue  # the frames near this angle were lost
@@ -158,7 +158,7 @@ def fly_views(
             continue
         encoded = encoder.begin(attempt.image_bgr)
         described = describe(attempt.image_bgr)
-        attempt = judge.at_the_object(attempt, described.segmentation, trajectory)
+        attempt = frame_check.at_the_object(attempt, described.segmentation, trajectory)
         yield from _store(bench, enrollment, index, angle_deg, attempt, described, encoded)
         stored.add(index)
     return stored, start_deg, before.image_bgr, after.image_bgr

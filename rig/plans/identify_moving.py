@@ -1,6 +1,6 @@
 """The part of an identification in which the table rotates: every frame on the way is evidence.
 
-The first view is taken at rest. Then the table rotates along an arc; each frame is judged, described and added to the
+The first view is taken at rest. Then the table rotates along an arc; each frame is checked, described and added to the
 belief. Each time the frames have covered another step of the circle, the search decides: it ends during the rotation,
 continues, or gives the table another goal without a stop. If the table arrives first, the next view is taken at rest.
 
@@ -17,7 +17,7 @@ from rig.bench import Bench
 from rig.core.clock import seconds_between
 from rig.core.errors import RigError
 from rig.events.events import Decided, Event, FrameUsed, Ranked, Rejected
-from rig.motion.flight_views import FlightJudge
+from rig.motion.flight_views import FlightFrameCheck
 from rig.motion.scan_speed import scan_speed
 from rig.motion.trajectory import TrajectoryRecorder
 from rig.motion.turntable import Flight, Turntable
@@ -58,7 +58,7 @@ class _Passing:
     search: ArcSearch
     stream: FrameStream
     recorder: TrajectoryRecorder
-    judge: FlightJudge
+    frame_check: FlightFrameCheck
     describe: ViewDescriber
     top: int
     live: Callable[[FrameUsed], object]
@@ -81,12 +81,12 @@ class _Passing:
         self.stamps_ns = [*self.stamps_ns[1 - STAMPS :], frame.stamp_ns]
         if self.ended_ns is not None or self.rejected_in_a_row >= MOST_REJECTED:
             return self.goal_deg
-        # Judge the frame.
+        # Check the frame.
         trajectory = self.recorder.fit()
         if trajectory is None:
             return None
-        irregular = bool(self.judge.irregular(self.stamps_ns)[-1])
-        attempt = self.judge.judge(frame, trajectory, irregular=irregular)
+        irregular = bool(self.frame_check.irregular(self.stamps_ns)[-1])
+        attempt = self.frame_check.attempt(frame, trajectory, irregular=irregular)
         if not attempt.accepted:
             self.rejected += 1
             self.rejected_in_a_row += 1
@@ -96,7 +96,7 @@ class _Passing:
         self.rejected_in_a_row = 0
         self.number += 1
         described = self.describe(attempt.image_bgr)
-        attempt = self.judge.at_the_object(attempt, described.segmentation, trajectory)
+        attempt = self.frame_check.at_the_object(attempt, described.segmentation, trajectory)
         motion = attempt.evidence.motion
         assert motion is not None
         sign = self.bench.config.table.orientation_sign
@@ -172,14 +172,14 @@ def search_in_motion(
                 yield decided(number, step, goal_deg, top)
             recorder = recorder or table.recorder()
             stream = stream or FrameStream(bench.camera, bench.clock)
-            judge = FlightJudge(config, captured.evidence.locks, True, bench.clock.now_ns(), stream.period_s)
+            frame_check = FlightFrameCheck(config, captured.evidence.locks, True, bench.clock.now_ns(), stream.period_s)
             passing = _Passing(
                 bench,
                 table,
                 search,
                 stream,
                 recorder,
-                judge,
+                frame_check,
                 describe,
                 top,
                 live,

@@ -33,7 +33,7 @@ RETIRED = (
     r"next look",
     r"facts?",
     r"(?:the|its|their|gears'|no|without) play",
-    r"hbr\.judge",
+    r"judg(?:e|es|ed|ing)",
     r"attendants?",
     r"remed(?:y|ies)",
     r"certainty|sureness",

@@ -205,7 +205,9 @@ SCENARIOS: dict[str, Scenario] = {
             answer=FOUND,
             step=ACK,
         ),
-        survived("friction", "arrival is judged by the end of the profile, standing still and `table.tolerance_deg`"),
+        survived(
+            "friction", "the rig checks arrival by the end of the profile, standing still and `table.tolerance_deg`"
+        ),
         stopped(
             "jam@move3",
             509,

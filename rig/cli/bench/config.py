@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from pydantic import BaseModel
 
-    from rig.calibrations import CalibrationResult, CalibrationStanding
+    from rig.calibrations import BenchCalibration, CalibrationResult
     from rig.config import RigConfig
     from rig.config.values import Values
     from rig.config.wording import KeyInfo
@@ -62,8 +62,8 @@ def show(
     from rig.config.wording import setting_line
 
     values, config, options = _checked(settings)
-    standings = _standings(settings, config)
-    in_force = [standing.result for standing in standings if standing.status is CalibrationStatus.IN_FORCE]
+    calibrations = _calibrations_on_bench(settings, config)
+    in_force = [calibration.result for calibration in calibrations if calibration.status is CalibrationStatus.IN_FORCE]
     applied, _ = apply_results(config, in_force)
     layers = _Layers(values, settings, in_force)
 
@@ -76,11 +76,13 @@ def show(
         for info, value in every
         if is_wanted(info.name) and not (changed and value == info.default)
     ]
-    standings = [one for one in standings if is_wanted(one.result.name) or any(map(is_wanted, one.result.settings))]
-    if wanted and not rows and not standings and not changed:
+    calibrations = [
+        one for one in calibrations if is_wanted(one.result.name) or any(map(is_wanted, one.result.settings))
+    ]
+    if wanted and not rows and not calibrations and not changed:
         raise _unknown(wanted[0], [info.name for info, _ in every])
     if settings.json:
-        _print_json(settings, values, rows, standings)
+        _print_json(settings, values, rows, calibrations)
         return
     print(f"# {values.path or 'no file: the defaults'}")
     section = None
@@ -90,12 +92,12 @@ def show(
             print(f"\n[{'.'.join(section)}]" if section else "")
         others = ", ".join(f"{stated(info.key, other)} ({source})" for source, other in overridden)
         print(setting_line(info, value, f"{origin}, overrides {others}" if others else ""))
-    if standings:
+    if calibrations:
         print(f"\n# Calibrations of the bench {settings.bench_name}. With its devices: rig calibrate show")
-    for standing in standings:
-        estimates = ", ".join(f"{name} {estimate}" for name, estimate in standing.result.estimates.items())
-        is_used = standing.status is CalibrationStatus.IN_FORCE
-        print(f"#   {f'{standing.result.id}: {estimates}' if is_used else f'not in force: {standing}'}")
+    for calibration in calibrations:
+        estimates = ", ".join(f"{name} {estimate}" for name, estimate in calibration.result.estimates.items())
+        is_used = calibration.status is CalibrationStatus.IN_FORCE
+        print(f"#   {f'{calibration.result.id}: {estimates}' if is_used else f'not in force: {calibration}'}")
 
 
 @app.command("path")
@@ -193,7 +195,7 @@ def _print_json(
     settings: Settings,
     values: "Values",
     rows: "Sequence[tuple[KeyInfo, Any, list[tuple[str, Any]]]]",
-    standings: "Sequence[CalibrationStanding]",
+    calibrations: "Sequence[BenchCalibration]",
 ) -> None:
     from rig.events.events import plain
 
@@ -219,20 +221,20 @@ def _print_json(
                     "estimates": plain(one.result.estimates),
                     "settings": plain(one.result.settings),
                 }
-                for one in standings
+                for one in calibrations
             ],
         }
     )
 
 
-def _standings(settings: Settings, config: "RigConfig") -> "list[CalibrationStanding]":
-    """Return the standing of the bench's calibrations, as far as it is known without opening the bench."""
+def _calibrations_on_bench(settings: Settings, config: "RigConfig") -> "list[BenchCalibration]":
+    """Return the bench's calibrations; their status as far as it is known without opening the bench."""
     from rig.calibrations import CalibrationStore, apparatus
     from rig.core.clock import SystemClock
 
     name = settings.bench or config.default_bench
     mounted = apparatus(name, {part: {} for part in ("servo", "imu", "camera")}, config, {})
-    return CalibrationStore(config.calibration_path(name)).standings(mounted, SystemClock().utc())
+    return CalibrationStore(config.calibration_path(name)).on_bench(mounted, SystemClock().utc())
 
 
 class _Layers:

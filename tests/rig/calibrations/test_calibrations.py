@@ -1,4 +1,4 @@
-"""Calibration results on disk, their standing, and their effect on the configuration."""
+"""Calibration results on disk, their status, and their effect on the configuration."""
 
 import json
 from dataclasses import replace
@@ -115,16 +115,16 @@ HERE = {"bench": "sim", "imu": {"model": "MPU-6050", "axis": "z"}, "servo": {"id
 
 def test_newest_result_that_passed_on_these_devices_decides(tmp_path):
     store = CalibrationStore(tmp_path / "results")
-    assert store.standings(HERE, NOW) == []
+    assert store.on_bench(HERE, NOW) == []
     days = [timedelta(days=n) for n in range(4)]
     elsewhere = {"bench": "sim", "imu": {"model": "BNO055"}}
     store.add(RESULT)
     store.add(replace(RESULT, when_utc=RESULT.when_utc + days[1]))
     store.add(replace(RESULT, when_utc=RESULT.when_utc + days[2], device=elsewhere))
     store.add(replace(RESULT, when_utc=RESULT.when_utc + days[3], rejections=(FEW,)))
-    (standing,) = store.standings(HERE, NOW)
-    assert standing.status is CalibrationStatus.IN_FORCE
-    assert standing.result.when_utc == RESULT.when_utc + days[1]
+    (calibration,) = store.on_bench(HERE, NOW)
+    assert calibration.status is CalibrationStatus.IN_FORCE
+    assert calibration.result.when_utc == RESULT.when_utc + days[1]
     assert [result.passed for result in store.history("imu.scale")] == [True, True, True, False]
     assert store.history("imu.bias") == []
 
@@ -146,10 +146,10 @@ def test_calibration_belongs_to_the_camera_and_not_to_its_source(tmp_path, then,
     camera = [dict(zip(("name", "device"), values, strict=False)) for values in (then, now)]
     store = CalibrationStore(tmp_path)
     store.add(replace(RESULT, name="camera.noise", device={"bench": "sim", "camera": {**camera[0], "width": 640}}))
-    (standing,) = store.standings({"bench": "sim", "camera": {**camera[1], "width": 640}}, NOW)
-    assert standing.status is status
+    (calibration,) = store.on_bench({"bench": "sim", "camera": {**camera[1], "width": 640}}, NOW)
+    assert calibration.status is status
     if "USB B" in now:
-        assert standing.changes == ("camera.device was USB A, is USB B",)
+        assert calibration.changes == ("camera.device was USB A, is USB B",)
 
 
 def test_age_other_device_and_failure_are_reported(tmp_path):
@@ -157,7 +157,7 @@ def test_age_other_device_and_failure_are_reported(tmp_path):
     store.add(replace(RESULT, name="a.old", valid_days=5))
     store.add(replace(RESULT, name="b.moved", device={"bench": "sim", "imu": {"model": "MPU-6050", "axis": "y"}}))
     store.add(replace(RESULT, name="c.failed", rejections=(FEW,)))
-    old, moved, failed = store.standings(HERE, NOW)
+    old, moved, failed = store.on_bench(HERE, NOW)
     assert (old.status, old.command) == (CalibrationStatus.EXPIRED, "rig calibrate a")
     assert "6 days ago; it is valid for 5 days" in str(old)
     assert moved.status is CalibrationStatus.OTHER_DEVICE

@@ -311,7 +311,7 @@ def test_missing_expired_and_other_device_calibrations_are_warnings(bench):
     store.add(result(bench, 100, valid_days=30))
     problem = bench.problem("calibration")
     assert problem.parameters["status"] is CalibrationStatus.EXPIRED
-    assert problem.parameters["standing"].age_days == pytest.approx(100, abs=0.1)
+    assert problem.parameters["calibration"].age_days == pytest.approx(100, abs=0.1)
     assert problem.fix == "rig calibrate imu --bench sim"
     store.add(result(bench, 1, imu={"who_am_i": 0x99}))
     bench.findings("servo", "imu")  # the devices are known only after their checks
@@ -321,7 +321,7 @@ def test_missing_expired_and_other_device_calibrations_are_warnings(bench):
     store.add(result(bench, 1, imu={"who_am_i": 0x99}))
     problem = bench.problem("calibration")
     assert problem.parameters["status"] is CalibrationStatus.OTHER_DEVICE
-    assert problem.parameters["standing"].changes == ("imu.who_am_i was 153, is 104",)
+    assert problem.parameters["calibration"].changes == ("imu.who_am_i was 153, is 104",)
     store.add(result(bench, 0.5, valid_days=30))
     assert not bench.problems("calibration")
     (store.folder / "20260430T000000.000000Z-imu.scale.json").write_text("{")
