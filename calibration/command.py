@@ -320,7 +320,7 @@ def run(settings: Settings, *procedures: "Procedure") -> None:
             for finding in bench.calibration_findings:
                 if finding not in reported:  # a setting in the configuration takes precedence
                     print(f"Note: {finding}.", file=sys.stderr)
-            if bench.config.view.roi != region and (catalog := settings.catalog_there()):
+            if bench.config.view.roi != region and (catalog := settings.existing_catalog()):
                 with catalog:
                     report_other_regions(settings, catalog, bench)
 

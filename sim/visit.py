@@ -12,13 +12,13 @@ _GROUNDS = (24, 232)
 _OPAQUE = 104  # an object's pixels differ by less on the two grounds; those of its soft shadow by more
 
 
-class Draws(Protocol):
+class DrawFunction(Protocol):
     """A function that draws an object into an image, uint8 (480, 640, 3)."""
 
     def __call__(self, image: Image, /) -> None: ...
 
 
-def seen_on_visit(visit: Visit, draw: Draws | None, table_deg: float) -> Image:
+def seen_on_visit(visit: Visit, draw: DrawFunction | None, table_deg: float) -> Image:
     """Return the camera's image under nominal light, uint8 (480, 640, 3); without an object, the empty table.
 
     The object is cut out by drawing it on a dark and on a bright ground. The bench is drawn at half the size.

@@ -102,10 +102,10 @@ def _segmentations(
     """Return a view by one to three segmentations, a row for each."""
     more = int(rng.choice(len(_SEVERAL), p=_SEVERAL))
     strengths = [strength, *[max(_LEAST_WORSE, _WORSE * strength)] * more]
-    return np.stack([_beside(shifted, pair, one, rng) for one in strengths])
+    return np.stack([_mixed_view(shifted, pair, one, rng) for one in strengths])
 
 
-def _beside(
+def _mixed_view(
     shifted: Callable[[LevelArray, Shift], LevelArray], pair: LevelArray, strength: float, rng: np.random.Generator
 ) -> LevelArray:
     """Return a view between two enrolled ones, on a changed bench: each entry comes from one of the two."""

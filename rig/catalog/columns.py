@@ -90,7 +90,7 @@ class Words(_Checked):
         return Text(collation="C" if dialect.name == "postgresql" else None)
 
     def check(self, value: Any) -> None:
-        _is(value, str)
+        _check_type(value, str)
 
 
 class Name(_Checked):
@@ -102,7 +102,7 @@ class Name(_Checked):
         return String(self.impl_instance.length, collation="C" if dialect.name == "postgresql" else None)  # type: ignore[attr-defined]
 
     def check(self, value: Any) -> None:
-        _is(value, str)
+        _check_type(value, str)
 
 
 class Status(_Checked):
@@ -132,7 +132,7 @@ class ImagePath(_Checked):
     impl = Text
 
     def check(self, value: Any) -> None:
-        _is(value, str)
+        _check_type(value, str)
         image_path(value)
 
 
@@ -145,7 +145,7 @@ class Number(_Checked):
         return value if value is None else value + 0.0
 
     def check(self, value: Any) -> None:
-        _is_number(value)
+        _check_number(value)
 
 
 class Count(_Checked):
@@ -154,7 +154,7 @@ class Count(_Checked):
     impl = Integer
 
     def check(self, value: Any) -> None:
-        _is(value, int)
+        _check_type(value, int)
 
 
 class Nanoseconds(Count):
@@ -169,7 +169,7 @@ class Bytes(_Checked):
     impl = LargeBinary
 
     def check(self, value: Any) -> None:
-        _is(value, bytes)
+        _check_type(value, bytes)
 
 
 class JsonText(_Checked):
@@ -185,7 +185,7 @@ class JsonMapping(JsonText):
     """A JSON object."""
 
     def check(self, value: Any) -> None:
-        _is(value, dict)
+        _check_type(value, dict)
 
 
 class SegmentationEvidence(JsonText):
@@ -199,9 +199,9 @@ class Azimuths(JsonText):
     """A list of azimuths as JSON."""
 
     def check(self, value: Any) -> None:
-        _is(value, list)
+        _check_type(value, list)
         for azimuth_deg in value:
-            _is_number(azimuth_deg)
+            _check_number(azimuth_deg)
 
 
 def parse_mapping(text: str) -> Mapping[str, Any]:
@@ -214,17 +214,17 @@ def parse_mapping(text: str) -> Mapping[str, Any]:
     """
     try:
         found = json.loads(text)
-        _is(found, dict)
+        _check_type(found, dict)
     except (ValueError, TypeError, RecursionError) as error:
         raise damaged("a text that should be a JSON object", text) from error
     return dict(found)
 
 
-def _is(value: object, kind: type) -> None:
+def _check_type(value: object, kind: type) -> None:
     if not isinstance(value, kind):
         raise TypeError(f"a value that should be of type {kind.__name__}")
 
 
-def _is_number(value: object) -> None:
+def _check_number(value: object) -> None:
     if not isinstance(value, int | float) or isinstance(value, bool) or not math.isfinite(value):
         raise ValueError("a value that should be a finite number")

@@ -70,12 +70,12 @@ def deliver(journal: Catalog, server: Catalog, *, replacing: Collection[str] = (
     CatalogBusy
         Another program delivers this journal.
     """
-    with _alone(journal):
+    with _only_delivery(journal):
         return _deliver_all(journal, server, replacing)
 
 
 @contextmanager
-def _alone(journal: Catalog) -> Iterator[None]:
+def _only_delivery(journal: Catalog) -> Iterator[None]:
     """Prevent a delivery of the journal by another program: each would remove objects that the other one reads."""
     lock = no_follow(str(journal.path / _LOCK), os.O_RDWR | os.O_CREAT, mode=0o600)
     try:

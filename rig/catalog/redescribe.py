@@ -131,7 +131,7 @@ def redescribe(
     return Redescribed(kind.name, kind.version, done - len(failed), unchanged, tuple(failed))
 
 
-class _Known(NamedTuple):
+class _KnownDescriptors(NamedTuple):
     """By the id of each view: settings of its descriptors, those of the wanted one, and the current descriptors."""
 
     settings: dict[int, JsonObject]
@@ -186,8 +186,8 @@ def _items(catalog: Catalog, kind: Descriptor, region: Region | Stored | None, a
     return items, unchanged
 
 
-def _known(connection: Connection, kind: Descriptor) -> _Known:
-    known = _Known({}, {}, defaultdict(set))
+def _known(connection: Connection, kind: Descriptor) -> _KnownDescriptors:
+    known = _KnownDescriptors({}, {}, defaultdict(set))
     distinct: dict[str, JsonObject] = {}  # many views share a few distinct ones
     for view_id, name, version, settings in connection.execute(
         select(descriptors.c.view_id, descriptors.c.name, descriptors.c.version, descriptors.c.settings),

@@ -148,12 +148,12 @@ class _Recording(ClockedPort):
 
     def __init__(self, port: ClockedPort) -> None:
         super().__init__(port.ser, port.clock)
-        self._heard = bytearray()
+        self._received = bytearray()
         self._sent = b""
 
     @property
     def answered(self) -> bytes:
-        return bytes(self._heard).removeprefix(self._sent)
+        return bytes(self._received).removeprefix(self._sent)
 
     def writePort(self, packet: list[int]) -> int:  # noqa: N802 - the SDK's names
         self._sent = bytes(packet)
@@ -161,7 +161,7 @@ class _Recording(ClockedPort):
 
     def readPort(self, length: int) -> bytes:  # noqa: N802
         data = super().readPort(length)
-        self._heard += data
+        self._received += data
         return data
 
 

@@ -50,7 +50,7 @@ class Found:
 
 
 @dataclass
-class _Passing:
+class _ArcFrames:
     """The frames of an arc: the function `Flight.each` of a search."""
 
     bench: Bench
@@ -173,7 +173,7 @@ def search_in_motion(
             recorder = recorder or table.recorder()
             stream = stream or FrameStream(bench.camera, bench.clock)
             frame_check = FlightFrameCheck(config, captured.evidence.locks, True, bench.clock.now_ns(), stream.period_s)
-            passing = _Passing(
+            arc_frames = _ArcFrames(
                 bench,
                 table,
                 search,
@@ -192,14 +192,14 @@ def search_in_motion(
             )
             reach_deg = max(low_deg, table.rest_deg - 360.0), min(high_deg, table.rest_deg + 360.0)
             try:
-                move = table.fly(goal_deg, Flight(passing.each, reach_deg, recorder, speed.dps, quiet=False))
+                move = table.fly(goal_deg, Flight(arc_frames.each, reach_deg, recorder, speed.dps, quiet=False))
             finally:
-                yield from passing.events
-            number, rejected, ranked, step = passing.number, passing.rejected, passing.ranked, passing.step
+                yield from arc_frames.events
+            number, rejected, ranked, step = arc_frames.number, arc_frames.rejected, arc_frames.ranked, arc_frames.step
             travelled_deg += abs(move.rotation_deg)
             yield moved(number, move)
-            if passing.ended_ns is not None:
-                ended_ns = passing.ended_ns
+            if arc_frames.ended_ns is not None:
+                ended_ns = arc_frames.ended_ns
                 break
             number += 1
             still = table.hold()

@@ -220,22 +220,22 @@ def read_stopping_rule(folder: Path) -> StoredRule | None:
         usual = {str(name): [float(score) for score in scores] for name, scores in values["usual_scores"].items()}
         rule = hbr.StoppingRule(
             beta=float(values["beta"]),
-            min_confidence=_or(values["min_confidence"], inf),
+            min_confidence=_value_or(values["min_confidence"], inf),
             usual_scores=np.array(list(usual.values()), np.float64),
-            open_set_thresholds=tuple(_or(threshold, -inf) for threshold in values["open_set_thresholds"]),
+            open_set_thresholds=tuple(_value_or(threshold, -inf) for threshold in values["open_set_thresholds"]),
             error_rate=float(values["error_rate"]),
             false_reject=float(values["false_reject"]),
-            false_accept=_or(values["false_accept"], nan),
+            false_accept=_value_or(values["false_accept"], nan),
             searches=int(values["searches"]),
             limitations=tuple(
                 Limitation(LimitationCode(one["code"]), dict(one["values"])) for one in values["limitations"]
             ),
             open_set=_open_set(values.get("open_set")),
-            unknown_thresholds=tuple(_or(threshold, -inf) for threshold in values.get("unknown_thresholds", ())),
+            unknown_thresholds=tuple(_value_or(threshold, -inf) for threshold in values.get("unknown_thresholds", ())),
             changed_bench_thresholds=tuple(map(float, values.get("changed_bench_thresholds", ()))),
             same_bench_thresholds=tuple(map(float, values.get("same_bench_thresholds", ()))),
             leave_one_out_thresholds=tuple(
-                _or(threshold, -inf) for threshold in values.get("leave_one_out_thresholds", ())
+                _value_or(threshold, -inf) for threshold in values.get("leave_one_out_thresholds", ())
             ),
             rates=tuple(ShiftRates(**one) for one in values.get("rates", ())),
         )
@@ -286,5 +286,5 @@ def _from_version_1(values: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _or(value: float | None, otherwise: float) -> float:
+def _value_or(value: float | None, otherwise: float) -> float:
     return otherwise if value is None else float(value)

@@ -86,7 +86,7 @@ def add_jobs(api: APIRouter, server: Server) -> None:
     @api.post("/jobs/{job_id}/resume", tags=["jobs"])
     def resume(job_id: str, _person: OperatorPerson) -> Job:
         """Resume a paused job."""
-        return server.queue.go_on(job_id)
+        return server.queue.resume(job_id)
 
     @api.post("/jobs/{job_id}/answer", tags=["jobs"])
     def answer(job_id: str, body: AnswerBody, _person: OperatorPerson) -> Job:

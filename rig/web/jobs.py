@@ -114,7 +114,7 @@ class JobQueue:
             self._pausing.add(job_id)
             return job.model_copy()
 
-    def go_on(self, job_id: str) -> Job:
+    def resume(self, job_id: str) -> Job:
         """Resume a paused job. Raises `JobNotFound`, `JobRejected`."""
         with self._lock:
             job = self._unended(job_id)

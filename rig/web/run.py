@@ -32,7 +32,7 @@ from rig.web.jobs import JobQueue
 from rig.web.picture import LivePicture
 from rig.web.requests import Job
 from rig.web.server import Server
-from rig.web.work import Works, doctor_findings
+from rig.web.work import WorkFactory, doctor_findings
 from rig.web.worker import BenchWorker
 
 MAX_CONNECTIONS: Final = 400
@@ -176,8 +176,8 @@ def make_server(
     catalog = BenchCatalog(config.catalog_place(bench), clock, partial(hub.publish, "catalog"), print_note)
     queue = JobQueue(folder, clock, changed, arguments)
     runs = config.catalog_path(bench) / RUNS
-    works = Works(catalog, runs, lambda: doctor_findings(bench, config, seed, arguments), seed or 0)
-    worker = BenchWorker(opened, queue, hub, picture, works, clock)
+    factory = WorkFactory(catalog, runs, lambda: doctor_findings(bench, config, seed, arguments), seed or 0)
+    worker = BenchWorker(opened, queue, hub, picture, factory, clock)
     return Server(
         bench=bench,
         config=config,

@@ -89,7 +89,7 @@ def calibrations() -> dict[str, Calibration]:
 
 
 @dataclass(slots=True)
-class Works:
+class WorkFactory:
     """A factory of the work of a job.
 
     Parameters

@@ -233,10 +233,10 @@ def moved(solid: Polyhedron, at: tuple[float, float, float], rotation_deg: float
     """Return ``solid`` rotated about its own axis and moved to ``at`` in the object's frame."""
     pose = Pose(rotation_deg)
 
-    def there(points: Floats) -> Floats:
+    def placed(points: Floats) -> Floats:
         return np.asarray(pose.rotate(points) + np.array(at))
 
-    faces = tuple(Face(there(f.corners), f.paint, _three(there(np.array(f.frame)))) for f in solid.faces)
+    faces = tuple(Face(placed(f.corners), f.paint, _three(placed(np.array(f.frame)))) for f in solid.faces)
     return Polyhedron(faces, solid.layer, solid.depth_at)
 
 

@@ -36,9 +36,9 @@ def sim_bench(
     known = settings.load().bench.get("sim-bench", {}).get("folder")
     folder = folder or (Path(str(known)) if known else None)
     if words:
-        from sim.realtime.wire import DEFAULT_FOLDER, tell
+        from sim.realtime.wire import DEFAULT_FOLDER, send_command
 
-        answer = tell((folder or DEFAULT_FOLDER).absolute(), *words)
+        answer = send_command((folder or DEFAULT_FOLDER).absolute(), *words)
         settings.say(answer["text"], answer)
         return
     from sim.realtime.run import run_bench

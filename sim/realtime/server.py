@@ -37,7 +37,7 @@ _LAST_ANSWERS_S: Final = 2.0
 Answer = tuple[dict[str, Any], bytes]
 
 
-class NotARequest(ValueError):
+class InvalidRequest(ValueError):
     """The line is no request."""
 
 
@@ -49,7 +49,7 @@ class Session:
         self._devices, self._time = bench.devices, bench.time
 
     def answer(self, request: Any) -> Answer:
-        """Return the answer; raises `NotARequest`."""
+        """Return the answer; raises `InvalidRequest`."""
         match request:
             case {"ask": "do", "words": [*words]} if all(isinstance(word, str) for word in words):
                 with self._time.present():
@@ -68,7 +68,7 @@ class Session:
                 if self._bench.camera_user is not self:
                     return {"ok": False}, b""
                 return self._camera(call, rest)
-        raise NotARequest
+        raise InvalidRequest
 
     def close(self) -> None:
         """Close the camera if the connection has it open."""
@@ -114,7 +114,7 @@ class Session:
                     return {"value": value}, b""
                 case "set", {"property": int(number), "value": int() | float() as value}:
                     return {"ok": camera.set(number, value)}, b""
-        raise NotARequest
+        raise InvalidRequest
 
     def _grab(self) -> bool:
         if not self._wait(SELECT_S):
@@ -140,7 +140,7 @@ class Session:
     def _i2c(self, address: int, rest: Mapping[object, Any]) -> Answer:
         bus = self._devices.i2c
         if not isinstance(bus, SimI2cBus):
-            raise NotARequest
+            raise InvalidRequest
         transfer, received = _transfer(rest)
         with self._time.present():
             try:
@@ -160,7 +160,7 @@ def _transfer(rest: Mapping[object, Any]) -> tuple[tuple[int, Any], Callable[[],
         case {"smbus": [int(direction), int(command), int(size)], "data": str(text)}:
             sent, data = bytes.fromhex(text), smbus.union_i2c_smbus_data()
             if len(sent) != ctypes.sizeof(data) or not all(0 <= n < 256 for n in (direction, command, size)):
-                raise NotARequest
+                raise InvalidRequest
             ctypes.memmove(ctypes.pointer(data), sent, len(sent))
             argument = smbus.i2c_smbus_ioctl_data(
                 read_write=direction, command=command, size=size, data=ctypes.pointer(data)
@@ -169,10 +169,10 @@ def _transfer(rest: Mapping[object, Any]) -> tuple[tuple[int, Any], Callable[[],
         case {"messages": [*given]} if 0 < len(given) <= MAX_MESSAGES:
             messages = [_message(*each) for each in given if isinstance(each, list) and len(each) == 3]
             if len(messages) < len(given):
-                raise NotARequest
+                raise InvalidRequest
             combined = smbus.i2c_rdwr_ioctl_data.create(*messages)
             return (smbus.I2C_RDWR, combined), lambda: b"".join(bytes(m) for m in messages if m.flags & smbus.I2C_M_RD)
-    raise NotARequest
+    raise InvalidRequest
 
 
 def _message(address: Any, count: Any, text: Any) -> Any:
@@ -182,7 +182,7 @@ def _message(address: Any, count: Any, text: Any) -> Any:
             return smbus.i2c_msg.read(address, count)
         case int(), int(), str() if 0 <= address < 128 and len(text) <= 2 * MAX_MESSAGE_BYTES:
             return smbus.i2c_msg.write(address, list(bytes.fromhex(text)))
-    raise NotARequest
+    raise InvalidRequest
 
 
 class _Handler(socketserver.StreamRequestHandler):

@@ -59,7 +59,7 @@ class Wire:
         self._socket.close()
 
 
-def tell(folder: Path, *words: str) -> dict[str, Any]:
+def send_command(folder: Path, *words: str) -> dict[str, Any]:
     """Send a command to the running bench in ``folder``; return its answer and the state of its world.
 
     Raises

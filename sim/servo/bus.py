@@ -106,7 +106,7 @@ class ServoBus:
         self._deliver: Callable[[Frame], None] | None = None
         self._sent_until_ns = 0
         self._parsers: dict[int, PacketParser] = {1: PacketParser1(), 2: PacketParser()}
-        self._heard = Frame(Source.HOST, 0, 1, b"")
+        self._last_frame = Frame(Source.HOST, 0, 1, b"")
 
     def attach(self, device: Device) -> None:
         """Connect a servo to the bus."""
@@ -135,7 +135,7 @@ class ServoBus:
         if self.echo and self._deliver is not None:
             self._deliver(frame)
         if not self.deaf:
-            self.clock.call_at(frame.end_ns, lambda: self._hear(frame))
+            self.clock.call_at(frame.end_ns, lambda: self._receive(frame))
         return frame.end_ns
 
     def disturb(self, data: bytes, baudrate: int) -> None:
@@ -143,11 +143,11 @@ class ServoBus:
         if self._deliver is not None:
             self._deliver(Frame(Source.DEVICE, self.clock.now_ns(), baudrate, data))
 
-    def _hear(self, frame: Frame) -> None:
-        if frame.baudrate != self._heard.baudrate or frame.start_ns - self._heard.end_ns > ABANDON_S * 1e9:
+    def _receive(self, frame: Frame) -> None:
+        if frame.baudrate != self._last_frame.baudrate or frame.start_ns - self._last_frame.end_ns > ABANDON_S * 1e9:
             for parser in self._parsers.values():
                 parser.reset()
-        self._heard = frame
+        self._last_frame = frame
         for protocol, parser in self._parsers.items():
             for packet in parser.feed(frame.data):
                 self._dispatch(packet, frame.baudrate, protocol)

@@ -73,7 +73,9 @@ def ask(device: UsbDevice, kind: int, number: int, value: int = 0, index: int = 
     return device.control(struct.pack("<BBHHH", kind | TO_HOST, number, value, index, length), b"")
 
 
-def tell(device: UsbDevice, kind: int, number: int, value: int = 0, index: int = 0, data: bytes = b"") -> None:
+def control_transfer(
+    device: UsbDevice, kind: int, number: int, value: int = 0, index: int = 0, data: bytes = b""
+) -> None:
     """Send a request that writes."""
     assert device.control(struct.pack("<BBHHH", kind, number, value, index, len(data)), data) == b""
 
@@ -130,7 +132,7 @@ def divisor(rate: int) -> tuple[int, int]:
 def test_adapter_understands_the_divisors_of_the_kernel(adapter: FtdiAdapter, rate: int) -> None:
     value, index = divisor(rate)
     assert baud_rate(value, index) == rate
-    tell(adapter, 0x40, 3, value, index)
+    control_transfer(adapter, 0x40, 3, value, index)
     assert adapter._connection.baudrate == rate
 
 
@@ -142,7 +144,7 @@ def test_a_baud_rate_is_right_within_what_a_servo_tolerates(rate: int) -> None:
 
 def test_adapter_keeps_its_latency_timer_until_it_is_plugged_in_again(adapter: FtdiAdapter) -> None:
     assert ask(adapter, 0x40, 10) == b"\x10"
-    tell(adapter, 0x40, 9, 1)
+    control_transfer(adapter, 0x40, 9, 1)
     assert ask(adapter, 0x40, 10) == b"\x01"
     adapter.plugged()
     assert ask(adapter, 0x40, 10) == b"\x10"
@@ -155,7 +157,7 @@ WHO_AM_I = 0x75
 
 
 def read_register(i2c: I2cTinyUsb, address: int) -> bytes:
-    tell(i2c, 0x40, IO | FIRST, 0, address, bytes([WHO_AM_I]))
+    control_transfer(i2c, 0x40, IO | FIRST, 0, address, bytes([WHO_AM_I]))
     return ask(i2c, 0x40, IO | LAST, 1, address, 1)
 
 
@@ -247,9 +249,9 @@ EXPOSURE_MODE, EXPOSURE = control(1, 0x02), control(1, 0x04)
 
 def test_webcam_keeps_its_settings_in_the_simulated_camera(webcam: Webcam) -> None:
     with pytest.raises(Stall):  # the automatic exposure sets it
-        tell(webcam, 0x21, Setting.SET, **EXPOSURE, data=struct.pack("<I", 50))
-    tell(webcam, 0x21, Setting.SET, **EXPOSURE_MODE, data=b"\x01")
-    tell(webcam, 0x21, Setting.SET, **EXPOSURE, data=struct.pack("<I", 50))
+        control_transfer(webcam, 0x21, Setting.SET, **EXPOSURE, data=struct.pack("<I", 50))
+    control_transfer(webcam, 0x21, Setting.SET, **EXPOSURE_MODE, data=b"\x01")
+    control_transfer(webcam, 0x21, Setting.SET, **EXPOSURE, data=struct.pack("<I", 50))
     assert ask(webcam, 0x21, Setting.NOW, **EXPOSURE) == struct.pack("<I", 50)
     assert webcam._camera.get(cv2.CAP_PROP_EXPOSURE) == 50
 
@@ -258,7 +260,7 @@ def test_webcam_keeps_its_settings_in_the_simulated_camera(webcam: Webcam) -> No
 @pytest.mark.parametrize("form", list(Format))
 def test_webcam_agrees_on_format_and_size(webcam: Webcam, form: Format, size: int) -> None:
     wanted = struct.pack("<HBBI", 0, form, size, 333_333) + bytes(18)
-    tell(webcam, 0x21, Setting.SET, 1 << 8, 1, wanted)
+    control_transfer(webcam, 0x21, Setting.SET, 1 << 8, 1, wanted)
     agreed = ask(webcam, 0x21, Setting.NOW, 1 << 8, 1)
     width, height = SIZES[size - 1]
     assert struct.unpack_from("<HBBI", agreed)[1:] == (form, size, 333_333)

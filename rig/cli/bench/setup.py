@@ -104,7 +104,7 @@ class Dialogue:
 
         scan = DeviceScan()
         self._scan(scan)
-        while not scan.servos and not scan.duplicate_ids and self._again("No servo was found."):
+        while not scan.servos and not scan.duplicate_ids and self._search_again("No servo was found."):
             scan = DeviceScan()
             self._scan(scan)
         computer = self.context.computer
@@ -144,7 +144,7 @@ class Dialogue:
         for finding in run_checks(self.context, scan.checks, show_progress):
             print_finding(screen, finding)
 
-    def _again(self, what: str) -> bool:
+    def _search_again(self, what: str) -> bool:
         if self.ask_nothing:
             return False
         return prompts.ask_yes_no(f"{what} Check cables and supply. Search again?", default=False)

@@ -120,8 +120,8 @@ def run_import(
     begin_ns = clock.now_ns()
     nothing = "Interrupted; nothing was imported."
     if dry_run:
-        with settings.catalog_there() or nullcontext() as there:
-            plan = plan_import(there, batch, conflict)
+        with settings.existing_catalog() or nullcontext() as existing:
+            plan = plan_import(existing, batch, conflict)
         done = run_job("checking", preview_import(plan, strict=strict, jobs=jobs), interrupted=nothing)
     else:
         with settings.open_catalog(create=True) as catalog:

@@ -199,7 +199,7 @@ def evaluate(
             return
         store = Store(out / "runs", plan.settings(), resume=resume)
 
-        def tell(progress: Progress, event: str) -> Callable[[str], None]:
+        def started(progress: Progress, event: str) -> Callable[[str], None]:
             progress.start(len(dataset.objects))
 
             def advance(name: str) -> None:
@@ -210,9 +210,9 @@ def evaluate(
             return advance
 
         with Progress("describing") as progress:
-            model = enrolled_views(plan, workers, tell(progress, "described"))
+            model = enrolled_views(plan, workers, started(progress, "described"))
         with Progress("searching") as progress:
-            runs = run_plan(plan, model, store, workers, tell(progress, "searched"))
+            runs = run_plan(plan, model, store, workers, started(progress, "searched"))
     except ValueError as error:
         raise UsageError(
             str(error), next_step="Correct the options or the data set, then continue with --resume."

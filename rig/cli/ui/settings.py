@@ -116,7 +116,7 @@ class Settings:
     def catalog_to_plan(self, clock: "Clock") -> "Catalog | None":
         """Open the catalog that an enrollment would use; None if there is none yet."""
         place = self.load().catalog_place(self.bench_name)
-        return self.catalog_there() if place.url is None else self.open_for_enrollment(clock)
+        return self.existing_catalog() if place.url is None else self.open_for_enrollment(clock)
 
     def deliver_waiting(self) -> None:
         """Deliver the journal if something is in it."""
@@ -179,7 +179,7 @@ class Settings:
             evidence={"folder": str(path), "benches with a catalog": others},
         )
 
-    def catalog_there(self) -> "Catalog | None":
+    def existing_catalog(self) -> "Catalog | None":
         """Return the bench's catalog, opened for reading; None if there is none yet."""
         place = self.load().catalog_place(self.bench_name)
         return self.open_catalog(read_only=True) if place.may_exist() else None

@@ -17,7 +17,7 @@ from rig.devices.dynamixel.packets import PING, READ, REBOOT, WRITE, Packets, Pa
 from rig.devices.dynamixel.port import BusBabble, ClockedPort
 from rig.devices.dynamixel.registers import Register
 
-OWED_S = 2.0
+OUTSTANDING_S = 2.0
 """How long a missing reply may still arrive: longer than any buffer can delay it."""
 
 DOUBT_S = 60.0
@@ -90,7 +90,7 @@ class DynamixelBus:
         self._alerts: dict[int, int] = {}
         self._reads = 0
         self._unanswered = False  # the last request, also if Ctrl+C interrupted it: its reply may still arrive
-        self._owed: list[
+        self._outstanding: list[
             tuple[int, int]
         ] = []  # replies that may still arrive: number of parameters, time of the request
         self._foreign_ns: int | None = None  # when the last reply arrived that belongs to no request
@@ -101,7 +101,7 @@ class DynamixelBus:
 
     def ping(self, device_id: int) -> int:
         """Return the model number of the device."""
-        if self.protocol == 1 or self._owes(3):  # an echoed ping of Protocol 1.0 is a valid reply to itself
+        if self.protocol == 1 or self._is_outstanding(3):  # an echoed ping of Protocol 1.0 is a valid reply to itself
             return int.from_bytes(self.read_block(device_id, 0, 3)[:2], "little")
         answer = self._transact("ping", (device_id,), lambda: self._ask(device_id, PING, b"", 3))[device_id]
         return int.from_bytes(answer.data[:2], "little")
@@ -160,7 +160,7 @@ class DynamixelBus:
         data = register.encode(value)
 
         def attempt() -> Answers:
-            doubtful = self._owes(0) or self._repeats_replies()  # an earlier reply may look like this one
+            doubtful = self._is_outstanding(0) or self._repeats_replies()  # an earlier reply may look like this one
             parameters = self._packets.write_parameters(register.address, data)
             answers = self._ask(device_id, WRITE, parameters, 0, (device_id,) if answered else ())
             reply = answers[0].get(device_id)
@@ -244,8 +244,8 @@ class DynamixelBus:
         """
         answering = (target,) if answering is None else answering
         self._drop_foreign()
-        ambiguous = size > 0 and self._owes(0)
-        self._owed += [(size, self.port.clock.now_ns())] * max(len(answering), 1)
+        ambiguous = size > 0 and self._is_outstanding(0)
+        self._outstanding += [(size, self.port.clock.now_ns())] * max(len(answering), 1)
         result = self._packets.send(self.port, target, instruction, parameters)
         if result != COMM_SUCCESS:
             return {}, result
@@ -268,22 +268,22 @@ class DynamixelBus:
                 self._foreign_ns = self.port.clock.now_ns()
             else:
                 replies[reply.bus_id] = reply
-                del self._owed[[owed for owed, _ in self._owed].index(size)]
+                del self._outstanding[[one for one, _ in self._outstanding].index(size)]
         return replies, COMM_SUCCESS
 
-    def _owes(self, size: int) -> bool:
+    def _is_outstanding(self, size: int) -> bool:
         """Return whether a reply with ``size`` parameters may still arrive."""
-        if not self._owed:
+        if not self._outstanding:
             return False
         now_ns = self.port.clock.now_ns()
-        self._owed = [owed for owed in self._owed if seconds_between(owed[1], now_ns) <= OWED_S]
-        return any(owed == size for owed, _ in self._owed)
+        self._outstanding = [one for one in self._outstanding if seconds_between(one[1], now_ns) <= OUTSTANDING_S]
+        return any(one == size for one, _ in self._outstanding)
 
     def _unambiguous(self, address: int, size: int) -> tuple[int, int]:
         """Return start and size of a read that includes ``size`` bytes at ``address`` and has an unambiguous reply."""
         asked = size + min(self._reads % READ_LENGTHS[self.protocol], address)
         self._reads += 1
-        while self._owes(asked) or (self.protocol == 1 and asked == _ECHO_SIZE):
+        while self._is_outstanding(asked) or (self.protocol == 1 and asked == _ECHO_SIZE):
             asked += 1
         return max(address - (asked - size), 0), asked
 

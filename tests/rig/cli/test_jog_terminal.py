@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from rig.core.clock import SystemClock
-from sim.realtime.wire import tell
+from sim.realtime.wire import send_command
 from tests.programs import Program
 
 CLOCK = SystemClock()
@@ -60,7 +60,7 @@ def test_torque_is_off_however_jog_ends_in_motion(running_sim_bench: Path) -> No
     config = ("--config", str(running_sim_bench / "rig.toml"))
 
     def world() -> dict[str, float]:
-        known: dict[str, float] = tell(running_sim_bench, "status")["world"]
+        known: dict[str, float] = send_command(running_sim_bench, "status")["world"]
         return known
 
     def until(condition: object, seconds: float = 30.0) -> None:

@@ -20,7 +20,7 @@ from rig.core.clock import SystemClock
 from rig.core.errors import DeviceNotFound
 from rig.devices.dynamixel.opening import open_servo
 from rig.devices.dynamixel.port import GUARDIAN, open_serial
-from sim.realtime.wire import tell
+from sim.realtime.wire import send_command
 from tests.programs import Program
 
 pytestmark = pytest.mark.realtime
@@ -278,7 +278,7 @@ def test_guardian_switches_the_torque_off_of_each_command_that_moves(running_sim
         urllib.request.urlopen(job, timeout=30).close()
 
     def torque() -> bool:
-        return tell(running_sim_bench, "status")["world"]["torque"]
+        return send_command(running_sim_bench, "status")["world"]["torque"]
 
     until(lambda: torque() or process.poll() is not None, 30.0)
     assert process.poll() is None, process.stdout.read()

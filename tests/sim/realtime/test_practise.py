@@ -17,7 +17,7 @@ from rig.cli.main import app
 from rig.core.clock import SystemClock, seconds_between
 from rig.core.errors import DeviceNotFound
 from rig.devices.dynamixel.port import open_serial
-from sim.realtime.wire import tell
+from sim.realtime.wire import send_command
 from tests.docs.pages import DOCS
 from tests.programs import Program
 
@@ -114,11 +114,15 @@ def test_practice_shows_the_output_of_the_page(in_depth, tmp_path, monkeypatch):
                 killed = others.pop()[1]
                 killed.kill()
                 killed.communicate()
-                until(lambda: not tell(folder, "status")["world"]["torque"] and is_free(folder / "servo"))
+                until(lambda: not send_command(folder, "status")["world"]["torque"] and is_free(folder / "servo"))
             elif following and (typed.terminal, following.terminal) == ("second terminal", "third terminal"):
-                start_deg = tell(folder, "status")["world"]["table_deg"]
+                start_deg = send_command(folder, "status")["world"]["table_deg"]
                 others.append((typed, Program(*words, folder=folder, OPENBLAS_NUM_THREADS="1", COLUMNS="500")))
-                until(lambda start_deg=start_deg: abs(tell(folder, "status")["world"]["table_deg"] - start_deg) > 20.0)
+                until(
+                    lambda start_deg=start_deg: (
+                        abs(send_command(folder, "status")["world"]["table_deg"] - start_deg) > 20.0
+                    )
+                )
             else:
                 typed.check(CliRunner().invoke(app, words).output)
         for typed, other in others:

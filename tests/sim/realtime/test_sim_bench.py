@@ -33,7 +33,7 @@ from sim.realtime.commands import HELP, Commands
 from sim.realtime.pace import RealTime
 from sim.realtime.run import run_bench
 from sim.realtime.server import MAX_CONNECTIONS, MAX_LINE, Server, Session
-from sim.realtime.wire import SOCKET, Wire, short_path, tell
+from sim.realtime.wire import SOCKET, Wire, send_command, short_path
 from sim.world import World
 from tests.contract.heads import needs
 from tests.fuzzing import fuzz_settings
@@ -61,13 +61,13 @@ def start(tmp_path) -> Iterator[Callable[..., Path]]:
     yield begin
     for folder, thread in running:
         with suppress(DeviceNotFound):  # it has ended
-            tell(folder, "quit")
+            send_command(folder, "quit")
         thread.join()
 
 
 def answers(folder: Path) -> bool:
     try:
-        return "world" in tell(folder, "status")
+        return "world" in send_command(folder, "status")
     except (DeviceNotFound, FileNotFoundError):
         return False
 
@@ -102,22 +102,22 @@ def connected(folder: Path) -> socket.socket:
 
 def test_benches_have_their_own_folders_and_clean_them(start):
     one, other = start("one"), start("a-folder-whose-name-is-longer-than-the-path-of-a-socket-may-be-" * 3)
-    tell(one, "put", "lamp")
-    assert [tell(folder, "status")["world"]["object"] for folder in (one, other)] == ["lamp", None]
+    send_command(one, "put", "lamp")
+    assert [send_command(folder, "status")["world"]["object"] for folder in (one, other)] == ["lamp", None]
     assert (one / "servo").readlink() != (other / "servo").readlink()
     with pytest.raises(BenchBusy, match="running already"):
         run_bench(Settings(), one, None)
-    tell(one, "quit")
+    send_command(one, "quit")
     until(lambda: not answers(one))
     until(lambda: {path.name for path in one.iterdir()} == LEFT)
     assert ping(other) == 1
     with pytest.raises(DeviceNotFound, match="No simulated bench is running"):
-        tell(one, "status")
+        send_command(one, "status")
 
 
 def test_bench_recognizes_the_state_of_a_killed_program(start):
     folder = start("bench", "servo.id=7", "table.limits_deg=[-500, 500]")
-    tell(folder, "quit")
+    send_command(folder, "quit")
     until(lambda: {path.name for path in folder.iterdir()} == LEFT)
     (folder / "servo").symlink_to("/dev/pts/no-such-terminal")
     left = socket.socket(socket.AF_UNIX)
@@ -127,7 +127,7 @@ def test_bench_recognizes_the_state_of_a_killed_program(start):
     (folder / "computer" / "dev").mkdir(parents=True)
     (folder / "rig.toml").write_text("# mine\n" + (folder / "rig.toml").read_text())
     with pytest.raises(DeviceNotFound, match="No simulated bench is running"):
-        tell(folder, "status")
+        send_command(folder, "status")
     assert ping(start("bench")) == 7  # the settings of the first start
     text = (folder / "rig.toml").read_text()
     assert text.startswith("# mine\n")
@@ -165,12 +165,12 @@ def test_unplugged_port_disappears_and_returns_under_its_name(start):
     before = serial.Serial(str(folder / "servo"), timeout=0.01, exclusive=True)
     with pytest.raises(DeviceNotFound, match="Cannot open"):
         ping(folder)  # another program uses it
-    tell(folder, "unplug")
+    send_command(folder, "unplug")
     with pytest.raises(serial.SerialException):
         until(lambda: bool(before.write(b"1") and before.read()))
     before.close()
     assert not os.path.lexists(folder / "servo")
-    tell(folder, "end", "unplug")
+    send_command(folder, "end", "unplug")
     until((folder / "servo").exists)
     assert ping(folder) == 1
 
@@ -200,20 +200,20 @@ def test_servo_and_rig_head_are_parts_of_one_world(start, monkeypatch):
     monkeypatch.setattr("rig.devices.head.link.REPLY_S", 10.0)  # the bench may have to wait for a processor
     folder = start("bench", "imu.connection=head", "head.power=true", "head.light=0.5", *PATIENT)
     config = load_config(folder / "rig.toml")
-    assert not tell(folder, "status")["world"]["light"][0]
+    assert not send_command(folder, "status")["world"]["light"][0]
     with open_bench("sim-bench", config) as bench:
-        assert tell(folder, "status")["world"]["light"][0] == pytest.approx(1.0, abs=0.01)
+        assert send_command(folder, "status")["world"]["light"][0] == pytest.approx(1.0, abs=0.01)
         bench.safety.set_revolutions(0)
         with Turntable(bench) as table:
             move = table.goto(60.0)
         assert move.gyro.angle_deg == pytest.approx(60.0, abs=3.0)
         assert move.rotation_encoder_deg == pytest.approx(60.0, abs=1.0)
-        assert tell(folder, "status")["world"]["table_deg"] == pytest.approx(60.0, abs=1.0)
-        tell(folder, "estop", "press")
+        assert send_command(folder, "status")["world"]["table_deg"] == pytest.approx(60.0, abs=1.0)
+        send_command(folder, "estop", "press")
         with pytest.raises(EmergencyStop):
             until(lambda: bool(bench.head.check()))
-        tell(folder, "estop", "release")
-    tell(folder, "head", "unplug")
+        send_command(folder, "estop", "release")
+    send_command(folder, "head", "unplug")
     assert not os.path.lexists(folder / "head")
     with pytest.raises(DeviceNotFound, match="Cannot open the head's port"):
         open_bench("sim-bench", config)
@@ -229,7 +229,7 @@ def test_camera_shows_the_world_on_the_clock_of_all_programs(start):
     assert not camera.set(cv2.CAP_PROP_FRAME_WIDTH, 123)
     asked_ns, frames = CLOCK.now_ns(), []
     for command in (["status"], ["put", "lamp", "0"]):
-        tell(folder, *command)
+        send_command(folder, *command)
         changed_ns = CLOCK.now_ns() + 33_400_000  # a frame is stamped up to a period after its exposure began
         while camera.grab() and camera.get(cv2.CAP_PROP_POS_MSEC) * 1e6 < changed_ns:
             pass
@@ -242,15 +242,15 @@ def test_camera_shows_the_world_on_the_clock_of_all_programs(start):
     with pytest.raises(DeviceNotFound, match="camera") as busy:
         RemoteCapture(folder)
     assert busy.value.next_step == "Close the program that uses it."
-    tell(folder, "camera.off")
+    send_command(folder, "camera.off")
     assert (camera.isOpened(), camera.grab(), camera_node(folder)) == (True, False, None)
     camera.release()
     with pytest.raises(DeviceNotFound):
         until(lambda: RemoteCapture(folder).isOpened())
-    tell(folder, "end")
+    send_command(folder, "end")
     again = RemoteCapture(folder)
     assert again.grab()
-    tell(folder, "quit")
+    send_command(folder, "quit")
     until(lambda: not again.grab())
     again.release()
 
@@ -269,10 +269,10 @@ def test_i2c_transfers_arrive_as_on_a_bus_of_the_computer(start):
         assert list(answer) == [7, 3]
         with pytest.raises(OSError, match="No such device or address"):
             bus.read_byte(0x50)
-        tell(folder, "imu.off")
+        send_command(folder, "imu.off")
         with pytest.raises(OSError, match="No such device or address"):
             bus.read_byte_data(0x68, 0x75)
-        tell(folder, "quit")
+        send_command(folder, "quit")
         until(lambda: not answers(folder))
         with pytest.raises(OSError, match="Input/output error"):
             bus.read_byte_data(0x68, 0x75)
