@@ -78,7 +78,7 @@ PART int any(const uint8_t *bytes, int64_t count) {
     return (found | (i < count ? bytes[i] : 0)) != 0;
 }
 
-/* Luminance of a quarter with the rounding errors of the reference: pixel by pixel, in raster order. */
+/* Return the luminance of a quarter with the rounding errors of the reference: add up the pixels in raster order. */
 PART double area_as_rounded(const uint8_t *quarter, int64_t stride, const struct grid *grid,
                                      const double luminance[3][256]) {
     double total = 0;
@@ -90,19 +90,20 @@ PART double area_as_rounded(const uint8_t *quarter, int64_t stride, const struct
     return (double)(int64_t)(total * (4.0 / (double)(4 * grid->height * grid->width)));
 }
 
-/* Where the bytes of 32 pixels differ from the next one; of every three, the third belongs to two pixels. */
+/* Mark the bytes of 32 pixels that differ from the next byte. Of each pixel, the third byte is compared with the next
+   pixel: ignore its mark. */
 PART void add_differences(const uint8_t *image, uint8_t *differs) {
     for (int n = 0; n < 96; n++) differs[n] |= image[n] ^ image[n + 1];
 }
 
-/* Whether all pixels of a row of quarters, (height, length), are grey. */
+/* Return whether all pixels of a row of quarters, (height, length), are grey. */
 PART int is_grey(const uint8_t *image, int64_t stride, int64_t height, int64_t length) {
     uint8_t differs[96] = {0};
     if (image[0] != image[1] || image[1] != image[2]) return 0;
     for (int64_t k = 0; k < height; k++, image += stride) {
         int64_t i = 0;
         for (; i + 96 < length; i += 96) add_differences(image + i, differs);
-        if (length >= 99) add_differences(image + length - 99, differs), i = length - 3; /* some of them again */
+        if (length >= 99) add_differences(image + length - 99, differs), i = length - 3; /* marks some bytes twice */
         for (; i + 1 < length; i++) differs[i % 96] |= image[i] ^ image[i + 1];
     }
     unsigned found = 0;
@@ -110,7 +111,7 @@ PART int is_grey(const uint8_t *image, int64_t stride, int64_t height, int64_t l
     return !found;
 }
 
-/* Luminance of the quarters of a row, 0..255. `greys` are the luminances of grey pixels. */
+/* Store the luminance of the quarters of a row, 0..255. `greys` are the luminances of grey pixels. */
 PART void row_areas(const uint8_t *image, int64_t stride, const struct grid *grid, const int32_t *luminances,
                              const double luminance[3][256], const double *greys, int32_t *rest, uint8_t *changes,
                              double *areas) {
@@ -125,13 +126,13 @@ PART void row_areas(const uint8_t *image, int64_t stride, const struct grid *gri
         undecided += rest[q] == 0;
     }
     if (!undecided) return;
-    /* In grey images, a quarter of n pixels is undecided in one of n cases. */
+    /* In grey images, about one of n quarters of n pixels is undecided. */
     if (count == 1 && is_grey(image, stride, 1, 3 * quarters)) {
         for (int64_t q = 0; q < quarters; q++) areas[q] = (double)(int32_t)greys[image[3 * q]];
         return;
     }
     if (grid->height == 2 && grid->width == 2 && is_grey(image, stride, 2, 6 * quarters)) {
-        int64_t count_undecided = 0; /* without a branch: about every fourth one is undecided */
+        int64_t count_undecided = 0; /* no branch: about one of four is undecided */
         for (int64_t q = 0; q < quarters; q++) {
             const int is_undecided = rest[q] == 0;
             rest[count_undecided] = (int32_t)q;
@@ -145,7 +146,7 @@ PART void row_areas(const uint8_t *image, int64_t stride, const struct grid *gri
         }
         return;
     }
-    /* In drawings and other flat images, most quarters equal the one on their left, which is undecided, too. */
+    /* In drawings and other flat images, most quarters equal the quarter on their left, which is also undecided. */
     const int64_t step = 3 * grid->width;
     const int flat = 4 * (int64_t)undecided > quarters;
     if (flat) mark_changes(image, stride, grid->height, quarters * step, step, changes);
@@ -160,7 +161,7 @@ PART void row_areas(const uint8_t *image, int64_t stride, const struct grid *gri
     }
 }
 
-/* The texture classes of a block, as bits, by the luminance of its quarters. */
+/* Return the texture classes of a block, as bits, from the luminance of its quarters. */
 PART int32_t textures_of(double a, double b, double c, double d) {
     const double root = 1.4142135623730951;
     const double m0 = __builtin_fabs(2 * a - 2 * b - 2 * c + 2 * d), m1 = __builtin_fabs(a + b - c - d),
@@ -176,7 +177,7 @@ PART int32_t textures_of(double a, double b, double c, double d) {
     return strongest < 14.0 ? 1 : classes;
 }
 
-/* Hue 0..358, saturation 0..255 and value 0..255 of integer B, G, R. Fractions have denominators of at most 255. */
+/* Store hue 0..358, saturation 0..255 and value 0..255 of integer B, G, R. Fractions have denominators of at most 255. */
 PART void hsv_of(int32_t b, int32_t g, int32_t r, const double *inverse, int32_t *hue, int32_t *saturation,
                           int32_t *value) {
     const int32_t most = b > g ? (b > r ? b : r) : (g > r ? g : r), least = b < g ? (b < r ? b : r) : (g < r ? g : r);
@@ -209,7 +210,7 @@ PART void describe_blocks(const int32_t *restrict channels, const double *restri
 PART double lesser(double a, double b) { return a < b ? a : b; }
 
 /* Add the votes of the two fuzzy systems for a colour to the bins of the texture classes of its block. A histogram has
-   four places for the three shades of each colour: the next block can read a sum that was stored as one vector. */
+   four places for the three shades of each colour, so the next block can read a sum that was stored as one vector. */
 PART void vote(const struct cedd_tables *t, int32_t hue, int32_t saturation, int32_t value, unsigned textures,
                double *histogram) {
     const double *s = t->saturation + RULES * saturation, *v = t->value + RULES * value;
@@ -267,7 +268,7 @@ EXPORT void hbr_cedd(const uint8_t *image, int64_t stride, int64_t rows, int64_t
             row_areas(strip, stride, &grid, own + 3 * quarters, luminance, greys, rest, (uint8_t *)sums,
                       areas + quarters * half);
         }
-        /* in the place of the luminances, which are used up */
+        /* stored over the luminances, which are not needed any more */
         int32_t *const upper = channels + 3 * quarters, *const lower = channels + 7 * quarters;
         const struct blocks blocks = {upper, upper + columns, lower, lower + columns};
         describe_blocks(channels, areas, columns, inverse, inverses, blocks);

@@ -7,7 +7,7 @@
 #define ROUNDS 10 /* of the centres, including the ones drawn at random */
 #define TRIALS 3  /* drawn for each further centre; the best one is used */
 #define BLOCK 4096
-#define STILL (1.1920928955078125e-07 * 1.1920928955078125e-07) /* squared movement of centres that do not move */
+#define STILL (1.1920928955078125e-07 * 1.1920928955078125e-07) /* largest squared movement of centres that count as still */
 
 /* Multiply with carry, as cv::RNG does. */
 PART uint32_t drawn(uint64_t *random) {
@@ -27,7 +27,7 @@ struct samples {
     int64_t count;
 };
 
-/* Squared distances to one of the samples, where they are smaller than `before`. Returns their sum. */
+/* Store the smaller of `before` and the squared distance to one of the samples. Returns the sum of the stored ones. */
 PART int64_t distances(const struct samples *s, int64_t at, const int32_t *before, int32_t *after) {
     const float blue = s->blue[at], green = s->green[at], red = s->red[at];
     int64_t sum = 0;
@@ -46,7 +46,7 @@ PART int64_t distances(const struct samples *s, int64_t at, const int32_t *befor
     return sum;
 }
 
-/* The first sample at which the distances add up to a value; the last one if they do not. */
+/* Return the first sample up to which the distances add up to a value; the last one if their sum is smaller. */
 PART int64_t reached(const int32_t *distance, int64_t count, double value) {
     int64_t at = 0;
     for (; at + 64 < count; at += 64) {
@@ -179,6 +179,6 @@ FOR_EVERY_PROCESSOR void hbr_find_clusters(const float *colours, int64_t stride,
             }
             farthest = farthest < squared ? squared : farthest;
         }
-        if (round == ROUNDS - 1 || farthest <= STILL) return; /* the labels stay */
+        if (round == ROUNDS - 1 || farthest <= STILL) return; /* the labels do not change any more */
     }
 }

@@ -1,12 +1,12 @@
-/* The connected parts of a mask, and which of them belong to the object. Two pixels are connected if their sides or corners
-   touch. Of equal parts the first one counts, in the order of cv2.connectedComponents: by the first square of 2 x 2 pixels
-   that a part is in. */
+/* The connected parts of a mask, and which of them belong to the object. Two pixels are connected if their sides or
+   corners touch. Of equal parts, the first one in the order of cv2.connectedComponents counts: the order of the first
+   square of 2 x 2 pixels that contains a pixel of the part. */
 #include "kernels.h"
 
 struct run {
     int32_t y, begin, end; /* pixels [begin, end) of row y */
-    int32_t root;          /* a run of the same part; of the root itself: its own */
-    int32_t left, top, right, bottom, area, square; /* of the part, in its root */
+    int32_t root;          /* index of a run of the same part; a root has its own index */
+    int32_t left, top, right, bottom, area, square; /* of the whole part; only the root has them */
     double weight;
 };
 
@@ -75,7 +75,7 @@ PART int is_near(const struct run *a, const struct run *b, int32_t away) {
            b->top < a->bottom + away;
 }
 
-/* Keep the runs of the parts that are marked by a weight below 0. */
+/* Store the runs of the parts that are marked by a weight below 0. */
 static void paint(struct run *run, int32_t count, int32_t height, int32_t width, uint8_t *out) {
     for (int32_t i = 0; i < height * width; i++) out[i] = 0;
     for (int32_t i = 0; i < count; i++)
@@ -83,8 +83,8 @@ static void paint(struct run *run, int32_t count, int32_t height, int32_t width,
             for (int32_t x = run[i].begin; x < run[i].end; x++) out[run[i].y * width + x] = 1;
 }
 
-/* Keep the largest part and those that have this share of its area. If `framed`, parts at the border are not counted, and
-   others have to be near. `found` is 0 if the largest part is smaller than `least`, or than this share of one at the
+/* Select the largest part and those that have this share of its area. If `framed`, parts at the border do not count, and
+   the others must be near it. `found` is 0 if the largest part is smaller than `least`, or than this share of one at the
    border. `work` holds 6 numbers for each run, at most height * (width + 1) / 2. */
 EXPORT void hbr_largest_parts(const uint8_t *mask, int64_t height, int64_t width, int64_t framed, int64_t near,
                               double least, double of_border, double share, void *work, uint8_t *out, int64_t *found) {
@@ -115,8 +115,8 @@ EXPORT void hbr_largest_parts(const uint8_t *mask, int64_t height, int64_t width
     *found = 1;
 }
 
-/* Keep the part with the largest sum of `prior` (height, width), and those near it that have this share of its area, and
-   a mean of `prior` above `mean`. */
+/* Select the part with the largest sum of `prior` (height, width), and the parts near it that have this share of its area
+   and a mean of `prior` above `mean`. */
 EXPORT void hbr_likely_parts(const uint8_t *mask, int64_t height, int64_t width, const float *prior, int64_t near,
                              double share, double mean, void *work, uint8_t *out, int64_t *found) {
     struct run *run = work, *main = 0;

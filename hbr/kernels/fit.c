@@ -5,7 +5,7 @@
 PART double absolute(double a) { return a < 0 ? -a : a; }
 PART double larger(double a, double b) { return a > b ? a : b; }
 
-/* Return the value that would have this place if the values were sorted; they are reordered. */
+/* Return the value that has this place after sorting. Changes the order of the values. */
 static double selected(double *value, int64_t count, int64_t place) {
     int64_t first = 0, last = count - 1;
     while (first < last) {
@@ -29,10 +29,10 @@ static double selected(double *value, int64_t count, int64_t place) {
     return value[place];
 }
 
-/* Take every fifth pixel in both directions from the third one on, where both images (height, width) are neither black nor
-   overexposed: `useful` marks these pixels of the one image, `small` (height, width, 3) has the levels of the other, whose
-   logarithms are in `logarithm` (256). `plane` (rows, columns, 3) is what is fitted there. -> `count` rows of `basis` and
-   `difference` (count, 3), and the medians (3) of the latter. `work` holds 3 * rows * columns numbers. */
+/* Take every fifth pixel in both directions, from the third one on, if both images (height, width) are neither black
+   nor overexposed there: `useful` marks these pixels of one image, `small` (height, width, 3) has the levels of the
+   other, whose logarithms are in `logarithm` (256). `plane` (rows, columns, 3) is what is fitted there. -> `count` rows
+   of `basis` and `difference` (count, 3), and the medians (3) of the latter. `work` has 3 * rows * columns numbers. */
 EXPORT void hbr_samples(const uint8_t *small, const uint8_t *useful, const float *logarithm, const float *table_log,
                         int64_t height, int64_t width, const double *plane, double *work, double *basis,
                         double *difference, double *median, int64_t *count) {
@@ -61,8 +61,9 @@ EXPORT void hbr_samples(const uint8_t *small, const uint8_t *useful, const float
     }
 }
 
-/* Choose the rows (count, 3) that differ from what is fitted by at most `tolerance`, or, if these are too few, the nearest
-   ones up to the place `quarter`. -> `kept` rows of `own_basis` and `own_values`. `work` holds 2 * count numbers. */
+/* Choose the rows (count, 3) that differ from what is fitted by at most `tolerance`, or, if these are too few, the
+   nearest ones up to the place `quarter`. -> `kept` rows of `own_basis` and `own_values`. `work` holds 2 * count
+   numbers. */
 EXPORT void hbr_inliers(const double *values, const double *fitted, const double *basis, int64_t count, double tolerance,
                         int64_t quarter, double *work, double *own_basis, double *own_values, int64_t *kept) {
     double *away = work, *sorted = work + count;

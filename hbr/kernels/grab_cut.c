@@ -8,12 +8,12 @@
 #define DIAGONAL (GAMMA / (double)1.41421353816986083984375f)
 #define SINGULAR 1e-6           /* a covariance with a smaller determinant has no inverse */
 #define EPSILON 2.220446049250313e-16
-#define NOISE 0.01              /* that is added to it */
+#define NOISE 0.01              /* added to the diagonal of such a covariance */
 #define CLEAR 1e-6              /* difference of logarithms whose sign rounding does not change */
 #define TINY (-600.0)           /* logarithm of a density that is far above the smallest number */
-#define LOST 40.0               /* in logarithms: a density so much smaller does not change a sum */
-#define ZERO (-746.0)           /* the exponential of less is 0 */
-#define KNOWN 4096              /* differences whose weight is kept */
+#define LOST 40.0               /* difference of logarithms: a density smaller by more does not change a sum */
+#define ZERO (-746.0)           /* the exponential of a smaller number is 0 */
+#define KNOWN 4096              /* number of differences whose weights are stored */
 #define MOST_PIXELS 65000       /* with more, sums of colours are not exact in float32 */
 
 typedef double (*function)(double);
@@ -109,7 +109,7 @@ FOR_EVERY_PROCESSOR static void exponents(const struct mixture *m, const double 
     }
 }
 
-/* The part of a mixture with the highest density. */
+/* Return the part of a mixture with the highest density. */
 PART int likeliest(const struct mixture *m, const double *exponent, int64_t stride, function exponential) {
     double highest = 0;
     int best = 0;
@@ -124,8 +124,8 @@ PART int likeliest(const struct mixture *m, const double *exponent, int64_t stri
     return best;
 }
 
-/* The same for each pixel of a row, by the logarithms of the densities: (COLOURS, stride) -> (count). `clear` is 0 where
-   they are too close or too small. */
+/* Find the same part for each pixel of a row by the logarithms of the densities: (COLOURS, stride) -> (count). `clear`
+   is 0 if they are too close or too small. */
 FOR_EVERY_PROCESSOR static void compare(const struct mixture *m, const double *exponent, int64_t count, int64_t stride,
                                         double *part, double *clear) {
 #pragma GCC ivdep
@@ -143,7 +143,7 @@ FOR_EVERY_PROCESSOR static void compare(const struct mixture *m, const double *e
     }
 }
 
-/* The density of a mixture. Parts that do not change the sum are not computed. */
+/* Return the density of a mixture. Does not compute parts that do not change the sum. */
 PART double density(const struct mixture *m, const double *exponent, int64_t stride, function exponential) {
     double most = -__builtin_inf();
     int part[COLOURS], parts = 0;
@@ -204,9 +204,10 @@ PART double weight(struct weights *w, int diagonal, int64_t squared) {
     return *known;
 }
 
-/* Cut the object out of an image (height, width, 3): `mask` (height, width) is 1 for it. Pixels outside of the rectangle
-   `inner` (left, top, right, bottom; not at the frame's border) are background. Inside, the object is thought to be where
-   `start` (height, width) is not 0. `work` holds 18 numbers for each pixel. `done` is 0 if this kernel cannot do it. */
+/* Cut the object out of an image (height, width, 3): `mask` (height, width) is 1 for it. Pixels outside of the
+   rectangle `inner` (left, top, right, bottom; not at the frame's border) are background. Inside, `start` (height,
+   width) is not 0 for the pixels that probably show the object. `work` holds 18 numbers for each pixel. `done` is 0 if
+   this kernel cannot cut this image. */
 EXPORT void hbr_grab_cut(const uint8_t *image, int64_t height, int64_t width, const int64_t *inner, const uint8_t *start,
                          function exponential, function logarithm, double *work, uint8_t *mask, int64_t *done) {
     const int64_t pixels = height * width, left = inner[0], top = inner[1], right = inner[2], bottom = inner[3];

@@ -3,13 +3,13 @@
 
 #define LONGEST 4096
 
-/* The distance of two directions in revolutions, as hbr/core/angles.py has it: rounded to even by a large summand. */
+/* The distance of two directions in revolutions, as in hbr/core/angles.py. A large summand rounds halves to even. */
 PART double revolutions(double difference_deg) {
-    const double large = 6755399441055744.0, turns = difference_deg / 360.0;
-    return __builtin_fabs(difference_deg - 360.0 * ((turns + large) - large)) / 360.0;
+    const double large = 6755399441055744.0, quotient = difference_deg / 360.0;
+    return __builtin_fabs(difference_deg - 360.0 * ((quotient + large) - large)) / 360.0;
 }
 
-/* For each view of `anchors`, store the view of its object whose azimuth is closest to `rotation_deg` further on.
+/* For each view of `anchors`, store the view of its object whose azimuth is closest to the anchor's plus `rotation_deg`.
 
    Object j has the views `order[start[j]]` to `order[start[j + 1] - 1]`; of equally close ones, the first is stored. */
 EXPORT void hbr_rotated(const int64_t *anchors, const double *rotation_deg, int64_t count, const int64_t *object_index,
@@ -63,7 +63,7 @@ PART int32_t dot(const int16_t *query, const uint8_t *row, int64_t length) {
     return sum;
 }
 
-/* Store the score and the best path of every object, by rising object, and how many objects there are.
+/* Store the score and the best path of every object, in ascending order of the objects, and the number of objects.
 
    The views `rows[begin[i]]` to `rows[begin[i + 1] - 1]` are those of query i; they are sorted in place. Every object has
    a view for each query. `value` and `predecessor` have room for all of them, `paths` is (objects, queries). */
@@ -74,7 +74,7 @@ EXPORT void hbr_paths(const uint8_t *queries, int64_t query_stride, int64_t quer
                       int64_t *rows, double *value, int64_t *predecessor, double *scores, int64_t *paths,
                       int64_t *objects) {
     int16_t query[LONGEST];
-    int64_t before = 0, before_count = 0; /* the views of the query before */
+    int64_t before = 0, before_count = 0; /* the views of the previous query */
     /* forward: the best value of a path that ends at each view, and its predecessor on that path */
     for (int64_t i = 0; i < query_count; i++) {
         int64_t *here = rows + begin[i];
@@ -99,8 +99,8 @@ EXPORT void hbr_paths(const uint8_t *queries, int64_t query_stride, int64_t quer
                 while (object_index[rows[before + tail]] < object) tail++;
                 best = -__builtin_inf();
                 for (int64_t t = tail; t < before_count && object_index[rows[before + t]] == object; t++) {
-                    const double turned_deg = azimuth_deg[rows[before + t]] - azimuth_deg[here[k]];
-                    const double through = value[before + t] - omega * revolutions(turned_deg - rotated_deg);
+                    const double azimuth_step_deg = azimuth_deg[rows[before + t]] - azimuth_deg[here[k]];
+                    const double through = value[before + t] - omega * revolutions(azimuth_step_deg - rotated_deg);
                     if (through > best) {
                         best = through;
                         predecessor[begin[i] + k] = before + t;

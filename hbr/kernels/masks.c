@@ -9,7 +9,7 @@
 
 PART int64_t words_of(int64_t width) { return (width + 2 * EDGE + 63) / 64; }
 
-/* Put a mask (height, width) into rows of bits; their margins stay. */
+/* Write a mask (height, width) to rows of bits; their margins do not change. */
 PART void pack(const uint8_t *mask, int64_t height, int64_t width, int64_t words, uint64_t *rows) {
     for (int64_t y = 0; y < height; y++, mask += width) {
         uint8_t *row = (uint8_t *)(rows + y * words) + EDGE / 8;
@@ -24,7 +24,7 @@ PART void pack(const uint8_t *mask, int64_t height, int64_t width, int64_t words
     }
 }
 
-/* Return what `pack` packed, inverted: 1 for each bit that is 0. */
+/* Write rows of bits to a mask, inverted: 1 for each bit that is 0. */
 PART void unpack_inverted(const uint64_t *rows, int64_t height, int64_t width, int64_t words, uint8_t *mask) {
     for (int64_t y = 0; y < height; y++, mask += width) {
         const uint8_t *row = (const uint8_t *)(rows + y * words) + EDGE / 8;
@@ -40,7 +40,7 @@ PART void unpack_inverted(const uint64_t *rows, int64_t height, int64_t width, i
 }
 
 /* Grow rows of bits by a symmetric disc, whose rows reach `reach[j]` pixels to both sides, j = 0 .. 2 radius. There is a
-   word of zeros before and behind `near` and `far`; the former holds the mask and is lost. */
+   word of zeros before and after `near` and `far`. `near` holds the mask and is overwritten. */
 PART void grow(int64_t height, int64_t words, const int64_t *reach, int64_t radius, uint64_t *near, uint64_t *far,
                uint64_t *out) {
     const int64_t n = height * words;
@@ -63,8 +63,8 @@ PART void grow(int64_t height, int64_t words, const int64_t *reach, int64_t radi
     }
 }
 
-/* Open a mask (height, width) with one disc, then close it with another one. What is outside counts neither as part of the
-   mask nor as a gap in it. `work` (4 height words + 4) holds zeros. */
+/* Open a mask (height, width) with one disc, then close it with another one. Pixels outside the image count neither as
+   part of the mask nor as a gap in it. `work` (4 height words + 4) holds zeros. */
 EXPORT FOR_EVERY_PROCESSOR void hbr_cleaned(const uint8_t *mask, int64_t height, int64_t width, const int64_t *open_reach,
                                             int64_t open_radius, const int64_t *close_reach, int64_t close_radius,
                                             uint64_t *work, uint8_t *out) {

@@ -2,8 +2,8 @@
 
    Source: Y. Boykov and V. Kolmogorov, "An experimental comparison of min-cut/max-flow algorithms for energy minimization
    in vision", IEEE TPAMI 2004. A tree grows from the source and a tree grows from the sink, until they touch; flow is
-   sent along the path; vertices that this cuts off search for another parent. Vertices that end in neither tree stay in
-   their last tree, so the order of all steps is that of OpenCV. */
+   sent along the path; vertices that this cuts off search for another parent. A vertex that is in neither tree at the end
+   has the side of its last tree, so the order of all steps must be that of OpenCV. */
 #include "grab_cut.h"
 
 #define SIDES 8 /* neighbours: lower right, below, lower left, right, and the opposite ones from the upper right on */
@@ -30,7 +30,7 @@ struct search {
     int32_t now, waiting;     /* number of this path, and of orphans */
 };
 
-/* The place of the capacity from a vertex to a side; that of the way back differs in the last bit. */
+/* Return the index of the capacity from a vertex to a side. That of the opposite direction differs in the last bit. */
 PART int32_t edge_of(const struct search *s, int32_t at, int side) { return at * SIDES + s->edge[side]; }
 
 PART void append(struct search *s, int32_t at) {
@@ -62,7 +62,7 @@ static void mark(struct search *s, int32_t edge, int possible) {
     *in = (uint8_t)(possible ? *in | entering : *in & ~entering);
 }
 
-/* Send flow along an edge. Returns whether no more can flow. */
+/* Send flow along an edge. Returns whether the edge is then full. */
 PART int push(struct search *s, int32_t edge, double flow) {
     double *there = s->capacity + edge, *back = s->capacity + (edge ^ 1);
     const double before = *back;
@@ -74,7 +74,7 @@ PART int push(struct search *s, int32_t edge, double flow) {
     return 1;
 }
 
-/* Grow the trees until they touch. Returns the edge from the one to the other, -1 if they never do. */
+/* Grow the trees until they touch. Returns the edge from one to the other, or -1 if they cannot touch. */
 static int32_t grow(struct search *s, int32_t *from, int32_t *to) {
     while (s->first != s->end) {
         const int32_t at = s->first;
@@ -136,7 +136,7 @@ static void augment(struct search *s, int32_t edge, int32_t from, int32_t to) {
     if (s->rest[end] == 0) abandon(s, end);
 }
 
-/* Find the distance to the terminal over a vertex; INT32_MAX if it is cut off. */
+/* Return the distance to the terminal through a vertex; INT32_MAX if the vertex is cut off. */
 PART int32_t distance_over(struct search *s, int32_t start) {
     const int32_t now = s->now;
     int32_t distance = 1, at = start;
@@ -157,7 +157,7 @@ PART int32_t distance_over(struct search *s, int32_t start) {
     return found;
 }
 
-/* Find each vertex that was cut off the nearest parent in its tree, or free it, and cut off its children. */
+/* Give each vertex that was cut off the nearest parent in its tree. Without one, free it and cut off its children. */
 static void restore(struct search *s) {
     while (s->waiting) {
         const int32_t at = s->orphans[--s->waiting];

@@ -13,8 +13,8 @@ PART double sum_of_row(const double *row) {
     return ((part[0] + part[1]) + (part[2] + part[3])) + ((part[4] + part[5]) + (part[6] + part[7]));
 }
 
-/* Store the weight of each hypothesis of a posterior, (objects, 72). A hypothesis that is a peak of its object stands for
-   the slopes beside it; the others have none. */
+/* Store the weight of each hypothesis of a posterior, (objects, 72). A hypothesis that is a peak of its object gets
+   the weight of the slopes beside it; the others have the weight 0. */
 FOR_EVERY_PROCESSOR
 EXPORT void hbr_peak_weights(const double *posterior, int64_t objects, double *weights) {
     for (int64_t j = 0; j < objects; j++, posterior += BINS, weights += BINS) {
@@ -31,16 +31,16 @@ EXPORT void hbr_peak_weights(const double *posterior, int64_t objects, double *w
     }
 }
 
-/* The nearest whole number, the even one of two, below 2^51. */
+/* Return the nearest whole number; halves are rounded to even. For values below 2^51. */
 PART double nearest_whole(double value) { return (value + 6755399441055744.0) - 6755399441055744.0; }
 
-/* The size of a difference of directions, 0..180. */
+/* Return the size of a difference of directions, 0..180. */
 PART double size_deg(double difference) {
     const double size = difference - 360.0 * nearest_whole(difference / 360.0);
     return size < 0 ? -size : size;
 }
 
-/* The remainder, in [0, 360), of an angle below 10^9: the product and the differences are exact. */
+/* Return an angle below 10^9 in [0, 360): the product and the differences are exact. */
 PART double wrap360(double deg) {
     double rest = deg - 360.0 * (double)(int64_t)(deg / 360.0);
     if (rest >= 360.0) rest -= 360.0;
@@ -48,17 +48,17 @@ PART double wrap360(double deg) {
     return rest == 360.0 ? 0.0 : rest; /* a tiny negative angle is rounded up */
 }
 
-/* Store which view of each object is nearest to azimuths, (angles, size), and how far away it is; of equally near ones,
-   the one with the smaller azimuth.
+/* Store which view of each object is nearest to the azimuths, (angles, size), and how far away it is; of equally near
+   views, the one with the smaller azimuth.
 
-   Object j has the `count[j]` rows from `order[begin[j]]` on, by rising azimuth. */
+   Object j has the `count[j]` rows from `order[begin[j]]` on, by ascending azimuth. */
 EXPORT void hbr_nearest_view(const int64_t *order, const int64_t *begin, const int64_t *count,
                              const double *azimuth_deg, const int64_t *places, int64_t size, const double *at_deg,
                              int64_t angles, int64_t *rows, double *away_deg) {
     for (int64_t m = 0; m < size; m++) {
         const int64_t *own = order + begin[places[m]], n = count[places[m]];
         const double shift = 1000.0 * (double)m; /* as the reference searches all objects at once */
-        int64_t next = 0;                        /* the first view at or behind the azimuth: often near the last one */
+        int64_t next = 0;                        /* the first view at or after the azimuth: often near the last one */
         for (int64_t a = 0; a < angles; a++) {
             const double at = at_deg[a * size + m], key = wrap360(at) + shift;
             while (next < n && azimuth_deg[own[next]] + shift < key) next++;

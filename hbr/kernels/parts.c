@@ -24,7 +24,7 @@ EXPORT FOR_EVERY_PROCESSOR void hbr_strongest(const float *x, const float *y, in
     }
 }
 
-/* Share the magnitude of each pixel between the two nearest of eight directions, which repeat every 180 degrees: (count)
+/* Divide the magnitude of each pixel between the two nearest of eight directions, which repeat every 180 degrees: (count)
    -> (8, count). */
 EXPORT FOR_EVERY_PROCESSOR void hbr_votes(const float *magnitude, const float *angle, int64_t count, float scale,
                                           float *votes) {

@@ -8,7 +8,7 @@
 #define EDGE_BYTES 128
 #define EDGE_LEVELS (4 * EDGE_BYTES)
 #define COLOUR_BYTES 32
-#define COARSE 59 /* the largest value is 63 of this unit; rounding up adds 0.5 % at most to the values that matter */
+#define COARSE 59 /* the largest value is 63 of this unit; rounding up adds at most 0.5 % to the values that matter */
 #define CHUNK 128 /* rows whose intermediate results stay in the cache */
 
 /* How packed rows are compared. */
@@ -87,7 +87,7 @@ static const struct loops PLAIN = {prepare_plain, 0, edges_plain, edges_plain, c
 #if defined(__x86_64__)
 #define AVX2 __attribute__((target("avx2")))
 
-/* One byte of the value of the first or second level in each of the 16 half bytes, twice. */
+/* Return a table: one byte of the value of the first or second level for each of the 16 half bytes, twice. */
 AVX2 static inline __m256i values_of_halves(const int32_t v[4], int second, int shift) {
     uint8_t table[32];
     for (int i = 0; i < 32; i++) table[i] = (uint8_t)(v[second ? i & 3 : i >> 2 & 3] >> shift);
@@ -212,11 +212,11 @@ static const struct loops WITH_AVX2 = {prepare_avx2, coarsen_avx2, edges_avx2, e
 #define EVEN_LANES _MM_SHUFFLE(2, 0, 2, 0) /* of two vectors, for _mm512_shuffle_i64x2 */
 #define ODD_LANES _MM_SHUFFLE(3, 1, 3, 1)
 
-/* The low and the high bit of all levels of a row, a bit each, in the same order for every row. */
+/* Store the low and the high bits of all levels of a row, in the same order for every row. */
 AVX512 static inline void bits_of_levels(const uint8_t *edges, __m512i *low, __m512i *high) {
     const __m512i first = _mm512_loadu_si512(edges), second = _mm512_loadu_si512(edges + EDGE_BYTES / 2);
     const __m512i even = _mm512_set1_epi8(0x55);
-    const int chosen = 0xCA; /* where the first operand has ones the second one, elsewhere the third */
+    const int chosen = 0xCA; /* the second operand where the first one has ones, else the third */
     *low = _mm512_ternarylogic_epi64(even, first, _mm512_slli_epi64(second, 1), chosen);
     *high = _mm512_ternarylogic_epi64(even, _mm512_srli_epi64(first, 1), second, chosen);
 }
@@ -260,8 +260,8 @@ AVX512 static inline __m512i sums_of_eight(const __m512i v[8]) {
     return sums_of_lanes(two);
 }
 
-/* The levels are counted that are i in the query and j in the row, for i and j from 1 to 3, and those that are j in the
-   row. Each count times its weight makes the product larger than that with a row whose levels are all 0. */
+/* Count the levels that are i in the query and j in the row, for i and j from 1 to 3, and those that are j in the row.
+   Each count times its weight is added to the product with a row whose levels are all 0. */
 AVX512 static void edges_avx512(const struct query *q, const uint8_t *const *rows, int64_t count, double *dots) {
     const int32_t *v = q->measure->edge_values;
     const __m512i one = _mm512_load_si512(q->at_level[0]), two = _mm512_load_si512(q->at_level[1]),
@@ -346,7 +346,7 @@ static void begin_query(struct query *q, const struct measure *m, const uint8_t 
         }
 }
 
-/* Prepare a query of unknown length, for bounds, too. */
+/* Prepare a query whose length is not known, also for bounds. */
 static void begin_new(struct query *q, const struct measure *m, const uint8_t *packed, const struct loops *loops) {
     begin_query(q, m, packed, loops);
     if (m->edges_at < 0) return;
@@ -396,8 +396,8 @@ EXPORT void hbr_squares(const struct measure *m, const uint8_t *rows, int64_t st
     }
 }
 
-/* Store the similarity of packed queries to packed rows, (queries, count): to those at `places`, or to the first ones
-   if it is null. */
+/* Store the similarity of packed queries to packed rows, (queries, count): to those at `places`, or to the first
+   rows if it is null. */
 EXPORT void hbr_similarity(const struct measure *m, const uint8_t *queries, int64_t query_stride, int64_t query_count,
                            const uint8_t *rows, int64_t stride, const double *squares, const int64_t *places,
                            int64_t count, double *similar) {
@@ -420,7 +420,7 @@ EXPORT void hbr_similarity(const struct measure *m, const uint8_t *queries, int6
 }
 
 /* Store the similarity of two rows of each group, for all pairs: places (groups, size) -> (groups, pairs). Pairs with
-   the same first one follow each other. */
+   the same first row follow each other. */
 EXPORT void hbr_pairs(const struct measure *m, const uint8_t *rows, int64_t stride, const double *squares,
                       const int64_t *places, int64_t groups, int64_t size, const int64_t *first, const int64_t *second,
                       int64_t pairs, double *similar) {
@@ -488,13 +488,13 @@ EXPORT void hbr_bounds(const struct measure *m, const uint8_t *query, const uint
     }
 }
 
-/* Whether an object is further away than another: less similar, or as similar and later. */
+/* Return whether an object is further away than another: less similar, or as similar and later. */
 static inline int further(double a, int64_t object_a, double b, int64_t object_b) {
     return a < b || (a == b && object_a > object_b);
 }
 
 /* Store the `kept` objects with the most similar views, of equal ones the first, in any order, and their similarities.
-   `by_bound` has the objects by falling bound; `bounds` are those of `hbr_bounds`. */
+   `by_bound` has the objects by descending bound; `bounds` are those of `hbr_bounds`. */
 EXPORT void hbr_nearest(const struct measure *m, const uint8_t *query, const uint8_t *rows, int64_t stride,
                         const double *squares, const struct segments *s, const int64_t *by_bound,
                         const double *bounds, int64_t kept, int64_t *nearest, double *similar) {

@@ -1,4 +1,4 @@
-/* Says which sources the library was compiled from: a library that is older than the sources is not used. */
+/* The digest of the sources from which the library was compiled. A library of other sources is not used. */
 #include "kernels.h"
 
 EXPORT const char hbr_sources[] = HBR_SOURCES;

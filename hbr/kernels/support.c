@@ -7,8 +7,8 @@
 
 PART float larger(float a, float b) { return a > b ? a : b; }
 
-/* Find the view on whose arc each azimuth lies: the first of `two` - 1 ends that is not before it, or the view behind them.
-   The azimuths are those of object j among all, as the reference searches. */
+/* Find the view whose arc contains each azimuth: the first of `two` - 1 ends that is not before it, or the view after
+   them. The azimuths are shifted for object j, because the reference searches all objects at once. */
 PART void find_arcs(const double *seen_deg, const double *end_deg, int64_t two, int64_t j, int64_t *nearest) {
     const double shift = 2 * FAR_DEG * (double)j;
     int64_t at = 0;
@@ -19,7 +19,7 @@ PART void find_arcs(const double *seen_deg, const double *end_deg, int64_t two, 
     }
 }
 
-/* Whether no azimuth is so near to an end, without being there, that the rounding of another object's shift matters. */
+/* Return whether each azimuth is at an end, or so far from it that the rounding of another shift has no effect. */
 PART int is_clear(const double *seen_deg, const double *end_deg, int64_t two, const int64_t *nearest) {
     int clear = 1;
     for (int b = 0; b < BINS; b++) {
@@ -32,7 +32,7 @@ PART int is_clear(const double *seen_deg, const double *end_deg, int64_t two, co
 
 /* Store the support that one query adds to every azimuth of each object, (objects, 72).
 
-   Object j has the `count[j]` rows from `rows[begin[j]]` on, by rising azimuth. `levels` are the powers of the
+   Object j has the `count[j]` rows from `rows[begin[j]]` on, by ascending azimuth. `levels` are the powers of the
    similarities of all rows. `scratch` has room for 4 floats and 2 doubles for each of twice the largest count. */
 FOR_EVERY_PROCESSOR
 EXPORT void hbr_support(const int64_t *rows, const int64_t *begin, const int64_t *count, int64_t objects,
@@ -43,7 +43,7 @@ EXPORT void hbr_support(const int64_t *rows, const int64_t *begin, const int64_t
     const float none = -__builtin_inff();
     double seen_deg[BINS];
     float slope_at[BINS], best[BINS];
-    int64_t nearest[BINS], ready = 0; /* the number of views for which the arcs are known; 0 if they are not */
+    int64_t nearest[BINS], ready = 0; /* number of views for which the arcs are known; 0 if unknown */
     for (int b = 0; b < BINS; b++) {
         seen_deg[b] = part_deg + b * 5.0;
         slope_at[b] = (float)(seen_deg[b] * slope);
@@ -52,7 +52,7 @@ EXPORT void hbr_support(const int64_t *rows, const int64_t *begin, const int64_t
         const int64_t n = count[j], two = 2 * n;
         const int64_t *mine = rows + begin[j];
 
-        /* two revolutions, from 180° before 0 on; usually at the azimuths of the object before */
+        /* two revolutions, from −180° on; usually at the azimuths of the previous object */
         int64_t first = 0, moved = n != ready;
         while (first < n && azimuth_deg[mine[first]] < 180) first++;
         for (int64_t i = 0; i < n; i++) {
@@ -72,7 +72,7 @@ EXPORT void hbr_support(const int64_t *rows, const int64_t *begin, const int64_t
             ready = is_clear(seen_deg, end_deg, two, nearest) ? n : 0;
         }
 
-        /* the best before and behind each view: first within each revolution, because each waits for its last maximum */
+        /* the best before and after each view: first within each revolution, because each step needs the previous maximum */
         float one_before = none, two_before = none, one_behind = none, two_behind = none;
         before[0] = behind[two - 1] = none;
         for (int64_t i = 0; i + 1 < n; i++) {

@@ -3,7 +3,7 @@
 
 #define LONGEST 4096
 
-/* The product of two rows; 4096 products of bytes are below 2^31. */
+/* Return the product of two rows; the sum of 4096 products of bytes is below 2^31. */
 PART int32_t dot(const int16_t *query, const uint8_t *row, int64_t length) {
     int32_t sum = 0;
     for (int64_t i = 0; i < length; i++) sum += query[i] * (int16_t)row[i];
@@ -39,7 +39,7 @@ EXPORT void hbr_tanimoto(const uint8_t *a, int64_t stride_a, int64_t count_a, co
     }
 }
 
-/* Store the `kept` rows with the largest coefficients, best first, of equal ones the first. */
+/* Store the `kept` rows with the largest coefficients, best first; of equal ones, the first. */
 FOR_EVERY_PROCESSOR
 EXPORT void hbr_tanimoto_top(const uint8_t *asked, const uint8_t *rows, int64_t stride, int64_t length,
                              const int32_t *squares, int64_t count, int64_t kept, int64_t *best, double *similar) {

@@ -5,7 +5,7 @@
 
 PART uint8_t rounded(float value) { return (uint8_t)((value + MAGIC) - MAGIC); }
 
-/* Three channels are computed as four numbers, the last of which belongs to the next pixel. */
+/* Vectors of four numbers for three channels; the fourth number belongs to the next pixel. */
 typedef float float4 __attribute__((vector_size(16)));
 typedef int32_t int4 __attribute__((vector_size(16)));
 typedef uint16_t short4 __attribute__((vector_size(8)));
@@ -31,7 +31,7 @@ PART void shrink_row(const uint16_t *sums, int64_t width, int64_t factor, float 
 }
 
 /* Average squares of `factor` x `factor` pixels: (height factor, width factor, 3) -> (height, width, 3). `sums` holds
-   a row of the image and one number more; sums of up to 257 bytes fit. */
+   a row of the image and one more number; it can hold sums of up to 257 bytes. */
 EXPORT FOR_EVERY_PROCESSOR void hbr_shrink(const uint8_t *image, int64_t stride, int64_t height, int64_t width,
                                            int64_t factor, uint16_t *sums, uint8_t *small) {
     const int64_t length = 3 * width * factor;
@@ -73,7 +73,7 @@ PART void average_row(const float *pixels, int64_t side, const int64_t *first, c
 EXPORT FOR_EVERY_PROCESSOR void hbr_average(const uint8_t *image, int64_t stride, int64_t size, int64_t side,
                                             const int64_t *first, const float *weights, int64_t most, float *pixels,
                                             float *line, float *sums, uint8_t *out) {
-    int64_t ready = -1; /* the row of which `line` has the averages */
+    int64_t ready = -1; /* the row whose averages are in `line` */
     for (int64_t y = 0; y < side; y++) {
         for (int64_t i = 0; i < 4 * side; i++) sums[i] = 0;
         for (int64_t k = 0; k < most; k++) {
@@ -144,7 +144,7 @@ EXPORT FOR_EVERY_PROCESSOR void hbr_difference(const uint8_t *small, const uint8
 
 #define REACH 7 /* pixels that the blur of a mask reaches to each side */
 
-/* Where a row or column is mirrored beyond its ends, without the end itself. */
+/* Return the place in a row or column of which `at`, beyond an end, is the mirror image. The end is not repeated. */
 PART int64_t mirrored(int64_t at, int64_t side) {
     at = at < 0 ? -at : at;
     return at < side ? at : 2 * side - 2 - at;
@@ -152,7 +152,7 @@ PART int64_t mirrored(int64_t at, int64_t side) {
 
 #define WHOLE 6755399441055744.0 /* 1.5 * 2^52: adding it rounds to a whole number, halves to even */
 
-/* The mean of the colours of the pixels whose mask is above 127, as cv2.mean adds them up. */
+/* Return the mean of the colours of the pixels whose mask is above 127, added up as by cv2.mean. */
 PART double brightness(const uint8_t *crop, const uint8_t *mask, int64_t count) {
     int64_t blue = 0, green = 0, red = 0, pixels = 0;
     for (int64_t begin = 0; begin < count; begin += 4096) {
@@ -174,9 +174,9 @@ PART double brightness(const uint8_t *crop, const uint8_t *mask, int64_t count) 
     return ((double)blue * each + (double)green * each + (double)red * each) / 3.0;
 }
 
-/* Put an even grey around the object: (side, side, 3) and its mask (side, side) -> (side, side, 3). It is as bright as this
-   share of the object. The mask is blurred by a Gaussian of sigma 2.5 in fixed point. `line` holds side + 14 bytes,
-   `blurred` side * side values. */
+/* Put an even grey around the object: (side, side, 3) and its mask (side, side) -> (side, side, 3). Its level is
+   `bright` times the brightness of the object. The mask is blurred by a Gaussian of sigma 2.5 in fixed point. `line`
+   holds side + 14 bytes, `blurred` side * side values. */
 EXPORT FOR_EVERY_PROCESSOR void hbr_surround(const uint8_t *crop, const uint8_t *mask, int64_t side, double bright,
                                              uint8_t *line, uint16_t *blurred, uint8_t *out) {
     static const uint16_t share[REACH + 1] = {40, 38, 30, 20, 11, 6, 2, 1}; /* of 256, from the middle on */
@@ -210,7 +210,7 @@ EXPORT FOR_EVERY_PROCESSOR void hbr_surround(const uint8_t *crop, const uint8_t 
         for (int64_t x = 0; x < side;) {
             uint64_t eight = 1;
             if (x + 8 <= side) __builtin_memcpy(&eight, line + x, sizeof eight);
-            if (eight == 0 || eight == UINT64_MAX) { /* the same as by the products below */
+            if (eight == 0 || eight == UINT64_MAX) { /* the same result as by the products below */
                 for (int64_t i = 0; i < 24; i++) out[i] = eight ? crop[i] : level;
                 x += 8, crop += 24, out += 24;
                 continue;

@@ -1,4 +1,4 @@
-/* Prints checksums of what the kernels compute of pseudo-random numbers: they must be equal on every processor. */
+/* Print checksums of the kernels' results for pseudo-random numbers. They must be equal on every processor. */
 #include "kernels.h"
 
 #include <stdio.h>
