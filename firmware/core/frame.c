@@ -3,7 +3,7 @@
 uint16_t frame_crc(const uint8_t *bytes, uint8_t length) {
     uint16_t crc = 0xFFFF;
     while (length--) {
-        /* One byte of the polynomial 0x1021 without a table: x = top ^ byte, folded. */
+        /* One byte of the polynomial 0x1021 without a table: x is the upper byte of the CRC ^ the byte, folded. */
         uint8_t x = (uint8_t)(crc >> 8 ^ *bytes++);
         x = (uint8_t)(x ^ x >> 4);
         crc = (uint16_t)(crc << 8 ^ (uint16_t)x << 12 ^ (uint16_t)x << 5 ^ x);
@@ -11,13 +11,13 @@ uint16_t frame_crc(const uint8_t *bytes, uint8_t length) {
     return crc;
 }
 
-uint8_t frame_encode(uint8_t *line, uint8_t *frame, uint8_t body_length) {
+uint8_t frame_encode(uint8_t *encoded, uint8_t *frame, uint8_t body_length) {
     uint8_t length = (uint8_t)(body_length + FRAME_HEADER);
     uint16_t crc = frame_crc(frame, length);
     frame[length++] = (uint8_t)(crc >> 8);
     frame[length++] = (uint8_t)crc;
 
-    uint8_t *code = line, *out = line + 1;
+    uint8_t *code = encoded, *out = encoded + 1;
     uint8_t run = 1;
     while (length--) {
         uint8_t byte = *frame++;
@@ -32,12 +32,12 @@ uint8_t frame_encode(uint8_t *line, uint8_t *frame, uint8_t body_length) {
     }
     *code = run;
     *out++ = 0;
-    return (uint8_t)(out - line);
+    return (uint8_t)(out - encoded);
 }
 
 int8_t frame_decode(uint8_t *bytes, uint8_t length) {
     uint8_t in = 0, out = 0;
-    if (length > FRAME_LINE - 1) {
+    if (length > FRAME_ENCODED - 1) {
         return FRAME_MALFORMED;
     }
     while (in < length) {

@@ -47,7 +47,7 @@ static void latch(struct head *head, uint8_t fault) {
 static void outputs_off(struct head *head) {
     hal_relay(false);
     hal_light(0);
-    hal_trigger_rest();
+    hal_trigger_off();
     head->light = 0;
     head->inputs &= (uint8_t)~INPUT_RELAY_CLOSED;
 }
@@ -56,13 +56,13 @@ static void outputs_off(struct head *head) {
 
 /* Queue the frame whose body is in frame[FRAME_HEADER...]. */
 static bool transmit(uint8_t *frame, uint8_t id, uint8_t sequence, uint8_t body_length) {
-    uint8_t line[FRAME_LINE];
+    uint8_t encoded[FRAME_ENCODED];
     frame[0] = id;
     frame[1] = sequence;
-    return hal_uart_write(line, frame_encode(line, frame, body_length));
+    return hal_uart_write(encoded, frame_encode(encoded, frame, body_length));
 }
 
-static void tell_change(struct head *head) {
+static void send_change(struct head *head) {
     uint8_t frame[FRAME_MAX];
     uint8_t before = hal_lock();
     head->changed = false;
@@ -83,7 +83,7 @@ static void tell_change(struct head *head) {
     }
 }
 
-static void tell_sample(struct head *head, const struct imu_sample *sample) {
+static void send_sample(struct head *head, const struct imu_sample *sample) {
     uint8_t frame[FRAME_MAX];
     struct sample m = {
         .index = sample->index,
@@ -151,7 +151,7 @@ static uint8_t acknowledge(struct head *head, uint8_t seen) {
     return rejection;
 }
 
-static void rest(struct head *head) {
+static void shut_down(struct head *head) {
     uint8_t before = hal_lock();
     outputs_off(head);
     if (head->state == HEAD_STATE_ACTIVE) {
@@ -222,7 +222,7 @@ static uint8_t trigger(struct head *head, uint16_t width_us, uint8_t *body) {
     return rejection;
 }
 
-/* Only at rest: storing takes some milliseconds, in which no sample is sent. */
+/* Rejected while the head is active: storing takes some milliseconds, in which no sample is sent. */
 static uint8_t set_serial(struct head *head, uint32_t serial) {
     if (head->state == HEAD_STATE_ACTIVE) {
         return REJECTION_BUSY;
@@ -263,7 +263,7 @@ static uint8_t execute(struct head *head, uint8_t id, const uint8_t *body, uint8
             answer = answer_heartbeat(head, out);
             break;
         case MESSAGE_SHUTDOWN:
-            rest(head);
+            shut_down(head);
             break;
         case MESSAGE_ACKNOWLEDGE:
             rejection = acknowledge(head, body[ACKNOWLEDGE_FAULTS]);
@@ -306,8 +306,8 @@ static uint8_t execute(struct head *head, uint8_t id, const uint8_t *body, uint8
     return answer;
 }
 
-/* A frame is complete. If a request arrives twice in a row, its reply was lost: it is answered again, but not carried
- * out again. */
+/* A frame is complete. If a request arrives twice in a row, its reply was lost: the head answers it again, but does
+ * not carry it out again. */
 static void take_frame(struct head *head) {
     int8_t length = frame_decode(head->received, head->received_length);
     if (length < 0) {
@@ -330,7 +330,7 @@ static void receive(struct head *head) {
     uint8_t byte;
     while (hal_uart_read(&byte)) {
         if (byte) {
-            if (head->received_length < FRAME_LINE) {
+            if (head->received_length < FRAME_ENCODED) {
                 head->received[head->received_length++] = byte;
             }
         } else {
@@ -369,12 +369,12 @@ void head_step(struct head *head) {
     struct imu_sample sample;
     uint8_t status = head->imu.status;
     if (imu_step(&head->imu, &head->counters, &sample) && head->streaming) {
-        tell_sample(head, &sample);
+        send_sample(head, &sample);
     }
     if (status != head->imu.status) {
         head->changed = true;
     }
     if (head->changed) {
-        tell_change(head);
+        send_change(head);
     }
 }

@@ -1,7 +1,7 @@
 /* The rig head: communicates with the host, and switches its outputs off when necessary.
  *
  * Two contexts: `head_tick` in a timer interrupt, every TICK_US, does the safety functions and never waits;
- * `head_step` in the main loop does everything else. Shared data is written with the tick locked out. */
+ * `head_step` in the main loop does everything else. The main loop writes shared data while the tick is locked out. */
 #ifndef HEAD_HEAD_H
 #define HEAD_HEAD_H
 
@@ -24,7 +24,7 @@ struct head {
     uint8_t reset_cause;
     bool streaming;
     uint8_t sequence; /* of the events */
-    uint8_t received[FRAME_LINE];
+    uint8_t received[FRAME_ENCODED];
     uint8_t received_length;
     bool answered; /* the reply to the last request is stored in case the host missed it */
     uint8_t reply[FRAME_MAX];

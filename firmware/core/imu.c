@@ -56,7 +56,7 @@ enum phase {
     BNO_LEARNING,
     BNO_RUN,
     BNO_READ,
-    BNO_FELT,
+    BNO_ACCEL_READ,
     BNO_CHECKED,
     LOST,
 };
@@ -76,7 +76,7 @@ static const struct step mpu_steps[] = {
     {5, {MPU_SMPLRT_DIV, 0, 0, 0, 0}, 0},
     {2, {MPU_FIFO_EN, 0xF8}, 0},            /* temperature, gyro, accelerometer */
     {3, {MPU_INT_PIN_CFG, 0x00, 0x01}, 0},  /* a pulse of 50 us for each sample */
-    {2, {MPU_USER_CTRL, 0x04}, 0},          /* the FIFO can only be emptied while it is off */
+    {2, {MPU_USER_CTRL, 0x04}, 0},          /* empty the FIFO: this works only while it is off */
     {2, {MPU_USER_CTRL, 0x40}, 0},
 };
 
@@ -126,7 +126,7 @@ static void empty_fifo(struct imu *imu) {
     imu->phase = WRITE;
 }
 
-/* Whether the transfer succeeded. If it failed, `again` is the phase that repeats it. */
+/* Return whether the transfer succeeded. If it failed, continue with the phase `again`, which repeats it. */
 static bool ended(struct imu *imu, struct counters *counters, uint8_t again) {
     enum hal_i2c_result result = hal_i2c_result();
     uint8_t status = IMU_STATUS_ABSENT;
@@ -150,7 +150,7 @@ static bool ended(struct imu *imu, struct counters *counters, uint8_t again) {
     if (++imu->attempts >= ATTEMPTS) {
         lost(imu, status);
     } else if (again == MPU_FETCH && result != HAL_I2C_NACK) {
-        /* It was interrupted within a frame: the FIFO's content no longer begins with a frame. */
+        /* The transfer ended within a frame, so the FIFO's content no longer begins with a frame. */
         empty_fifo(imu);
     } else {
         imu->phase = again;
@@ -199,24 +199,25 @@ static uint8_t load_step(struct imu *imu) {
     return step->length;
 }
 
-static bool settings_kept(const struct imu *imu) {
+static bool settings_unchanged(const struct imu *imu) {
     if (!is_mpu(imu)) {
         return (imu->got[0] & 0x0F) == BNO_MODE_IMU;
     }
     return imu->got[0] == imu->divider && imu->got[1] == imu->filter && imu->got[2] == imu->range << 3;
 }
 
-static void look_at_mode(struct imu *imu) {
+static void read_mode(struct imu *imu) {
     read_registers(imu, BNO_TEMP, BNO_OPR_MODE - BNO_TEMP + 1);
     imu->phase = BNO_CHECKED;
 }
 
-static void feel(struct imu *imu) {
+static void read_acceleration(struct imu *imu) {
     read_registers(imu, BNO_ACC_DATA, 6);
-    imu->phase = BNO_FELT;
+    imu->phase = BNO_ACCEL_READ;
 }
 
-/* The BNO055 calibrates its gyro at rest; its rates may jump before that. Checks again until it is done. */
+/* Return whether the BNO055 has calibrated its gyro, which it does at a standstill; its rates may jump before that. If it
+ * has not, check again later. */
 static bool calibrated(struct imu *imu, uint32_t now) {
     if (imu->phase == BNO_LEARNING && ((imu->got[BNO_CALIB_STAT - BNO_TEMP] & 0x30) == 0x30 || passed(now, imu->learnt_us))) {
         return true;
@@ -229,7 +230,7 @@ static bool calibrated(struct imu *imu, uint32_t now) {
     return false;
 }
 
-/* The sensor runs, for the first time or again: samples that it did not take count as lost. */
+/* Start sampling, for the first time or again. Samples that the sensor did not take count as lost. */
 static void run(struct imu *imu, struct counters *counters) {
     uint32_t now = hal_micros(), edge_us;
     if (!is_mpu(imu) && !calibrated(imu, now)) {
@@ -241,10 +242,10 @@ static void run(struct imu *imu, struct counters *counters) {
             count(&counters->restarts);
         }
     }
-    if (!imu->edges_come || imu->status != IMU_STATUS_RUNNING) {
+    if (!imu->edges_arrive || imu->status != IMU_STATUS_RUNNING) {
         imu->edges = hal_imu_edges(&edge_us);
         imu->base = (uint16_t)(imu->newest - imu->edges);
-        imu->edges_come = false;
+        imu->edges_arrive = false;
     }
     imu->status = IMU_STATUS_RUNNING;
     imu->last_us = now;
@@ -253,7 +254,7 @@ static void run(struct imu *imu, struct counters *counters) {
     imu->phase = MPU_RUN;
     if (!is_mpu(imu)) {
         imu->due_us = imu->newest_us = now;
-        feel(imu);
+        read_acceleration(imu);
     }
 }
 
@@ -264,8 +265,8 @@ static void fetch(struct imu *imu) {
     imu->phase = MPU_FETCHED;
 }
 
-/* The FIFO's count is known: date its samples. The newest belongs to the last edge unless a new edge occurred. */
-static void look(struct imu *imu, struct counters *counters) {
+/* Date the samples in the FIFO by its count. The newest one belongs to the last edge unless a new edge occurred. */
+static void date_samples(struct imu *imu, struct counters *counters) {
     uint32_t now = hal_micros(), edge_us;
     uint16_t bytes = (uint16_t)(imu->got[0] << 8 | imu->got[1]);
     uint16_t edges = hal_imu_edges(&edge_us);
@@ -277,14 +278,14 @@ static void look(struct imu *imu, struct counters *counters) {
         return;
     }
     if (edges != imu->edges && passed(edge_us, imu->began_us + 1)) {
-        return; /* an edge occurred during the request: the count may include it or not. Ask again */
+        return; /* an edge occurred during the request, so the count may include it or not: read it again */
     }
     if (!frames) {
         bool silent = edges == imu->edges && passed(now, imu->last_us + CHECK_US + imu->period_us);
         imu->edges = edges;
-        imu->due_us = now + (imu->edges_come ? CHECK_US : imu->period_us / 2);
+        imu->due_us = now + (imu->edges_arrive ? CHECK_US : imu->period_us / 2);
         if (silent) {
-            lost(imu, IMU_STATUS_SETTINGS_LOST); /* it takes no samples: it fell asleep after a brown-out */
+            lost(imu, IMU_STATUS_SETTINGS_LOST); /* the sensor takes no samples: it sleeps after a brown-out */
         }
         return;
     }
@@ -299,20 +300,20 @@ static void look(struct imu *imu, struct counters *counters) {
     imu->polls = 0;
     uint16_t newest = (uint16_t)(imu->newest + frames);
     if (edges != imu->edges) {
-        if (!imu->edges_come) {
+        if (!imu->edges_arrive) {
             imu->base = (uint16_t)(newest - edges);
-            imu->edges_come = true;
+            imu->edges_arrive = true;
         }
         newest = (uint16_t)(imu->base + edges);
         imu->newest_us = edge_us;
     } else {
-        imu->edges_come = false;
+        imu->edges_arrive = false;
         imu->newest_us = now - imu->period_us / 2;
     }
     imu->newest = newest;
     imu->edges = edges;
     imu->frames = frames;
-    imu->due_us = now + (imu->edges_come ? CHECK_US : imu->period_us / 2);
+    imu->due_us = now + (imu->edges_arrive ? CHECK_US : imu->period_us / 2);
     fetch(imu);
 }
 
@@ -320,7 +321,7 @@ static void mpu_sample(struct imu *imu, struct imu_sample *sample) {
     uint8_t older = --imu->frames;
     sample->index = (uint16_t)(imu->newest - older);
     sample->time_us = imu->newest_us - older * imu->period_us;
-    sample->flags = imu->edges_come ? SAMPLE_FLAG_EDGE : 0;
+    sample->flags = imu->edges_arrive ? SAMPLE_FLAG_EDGE : 0;
     for (uint8_t i = 0; i < 7; i++) {
         sample->words[i] = (int16_t)(imu->got[2 * i] << 8 | imu->got[2 * i + 1]);
     }
@@ -332,8 +333,8 @@ static void mpu_sample(struct imu *imu, struct imu_sample *sample) {
     }
 }
 
-/* The fusion does not signal a new sample, so it is polled faster than that. Unchanged data is the last sample again,
- * unless a sample is overdue: at rest, samples may be equal. */
+/* The fusion does not signal a new sample, so the head polls faster than the fusion's rate. Unchanged data is the last
+ * sample again, unless a sample is overdue: samples of a table at a standstill may be equal. */
 static bool bno_sample(struct imu *imu, struct imu_sample *sample) {
     uint16_t seen = frame_crc(imu->got, BNO_BURST);
     bool fresh = seen != imu->seen;
@@ -359,7 +360,7 @@ static bool bno_sample(struct imu *imu, struct imu_sample *sample) {
     imu->sampled = true;
     imu->polls = (uint8_t)((imu->polls + 1) % BNO_CHECK);
     if (imu->polls % BNO_ACCEL == 0) {
-        feel(imu);
+        read_acceleration(imu);
     }
     return true;
 }
@@ -406,7 +407,7 @@ bool imu_step(struct imu *imu, struct counters *counters, struct imu_sample *sam
         break;
     case VERIFIED:
         if (ended(imu, counters, WAITING)) {
-            if (settings_kept(imu)) {
+            if (settings_unchanged(imu)) {
                 run(imu, counters);
             } else {
                 lost(imu, IMU_STATUS_SETTINGS_LOST);
@@ -421,7 +422,7 @@ bool imu_step(struct imu *imu, struct counters *counters, struct imu_sample *sam
         break;
     case MPU_COUNTED:
         if (ended(imu, counters, MPU_RUN)) {
-            look(imu, counters);
+            date_samples(imu, counters);
         }
         break;
     case MPU_FETCH:
@@ -435,7 +436,7 @@ bool imu_step(struct imu *imu, struct counters *counters, struct imu_sample *sam
         break;
     case BNO_LEARN:
         if (passed(now, imu->due_us)) {
-            look_at_mode(imu);
+            read_mode(imu);
             imu->phase = BNO_LEARNING;
         }
         break;
@@ -453,14 +454,14 @@ bool imu_step(struct imu *imu, struct counters *counters, struct imu_sample *sam
         break;
     case BNO_READ:
         return ended(imu, counters, BNO_RUN) && bno_sample(imu, sample);
-    case BNO_FELT:
+    case BNO_ACCEL_READ:
         if (ended(imu, counters, BNO_RUN)) {
             for (uint8_t i = 0; i < 3; i++) {
                 imu->accel[i] = (int16_t)get_u16(imu->got + 2 * i);
             }
             imu->phase = BNO_RUN;
             if (imu->polls == 0) {
-                look_at_mode(imu);
+                read_mode(imu);
             }
         }
         break;

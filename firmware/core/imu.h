@@ -23,14 +23,14 @@ struct imu {
 
     /* Progress. */
     uint8_t phase;
-    uint8_t at;       /* step of the script */
+    uint8_t at;       /* step of the set-up */
     uint8_t attempts; /* of the present transfer */
     bool sampled;     /* there was a sample since the last set-up request */
-    bool edges_come;  /* the data-ready pin is connected */
+    bool edges_arrive; /* the data-ready pin is connected */
     uint8_t frames;   /* still to be read from the FIFO */
     uint8_t polls;    /* MPU-6050: odd counts in a row; BNO055: samples since the last check of its mode */
     uint16_t seen;    /* BNO055: checksum of the last sample */
-    int16_t accel[3]; /* BNO055: read less often than the gyro */
+    int16_t accel[3]; /* BNO055: read less often than the gyro's rates */
     uint16_t edges;   /* count at the last check of the FIFO */
     uint16_t base;    /* index = base + count of edges */
     uint16_t newest;  /* index of the newest sample that the sensor took */

@@ -7,10 +7,10 @@
 
 /* -- time, interrupts, watchdog ---------------------------------------------------------------------------------- */
 
-/* Microseconds since the start; wraps after 71.6 minutes. */
+/* Return the microseconds since the start; they wrap after 71.6 minutes. */
 uint32_t hal_micros(void);
 
-/* Lock the safety tick out between the two calls; pass the result of `hal_lock` to `hal_unlock`. */
+/* Lock out the safety tick between the two calls; pass the result of `hal_lock` to `hal_unlock`. */
 uint8_t hal_lock(void);
 void hal_unlock(uint8_t before);
 
@@ -21,16 +21,16 @@ void hal_feed_watchdog(void);
 /* Take the next received byte; returns false if there is none. */
 bool hal_uart_read(uint8_t *byte);
 
-/* When the last zero byte (the end of a frame) was received. */
+/* Return the time at which the last zero byte (the end of a frame) was received. */
 uint32_t hal_uart_frame_us(void);
 
-/* Bytes that the receiver lost since the last call. */
+/* Return the number of bytes that the receiver lost since the last call. */
 uint8_t hal_uart_overruns(void);
 
-/* Queue all bytes, or none and return false. */
+/* Queue all bytes; if they do not fit, queue none and return false. */
 bool hal_uart_write(const uint8_t *bytes, uint8_t length);
 
-/* Microseconds until a byte that is queued now starts to be sent. */
+/* Return the time until the transmission of a byte that is queued now begins. */
 uint16_t hal_uart_backlog_us(void);
 
 /* -- I2C, one transfer at a time, in the background -------------------------------------------------------------- */
@@ -46,7 +46,7 @@ enum hal_i2c_result hal_i2c_result(void);
  * Returns whether the bus is free: SDA and SCL high. */
 bool hal_i2c_free(void);
 
-/* Count of the sensor's data-ready edges, and when the last one was. */
+/* Return the number of the sensor's data-ready edges; `*last_us` is the time of the last one. */
 uint16_t hal_imu_edges(uint32_t *last_us);
 
 /* -- outputs and inputs ------------------------------------------------------------------------------------------ */
@@ -56,9 +56,9 @@ void hal_relay(bool closed);
 
 /* Start one pulse of `width_us`; returns false during another pulse. `*begins_us` is its leading edge. */
 bool hal_trigger(uint16_t width_us, uint32_t *begins_us);
-void hal_trigger_rest(void);
+void hal_trigger_off(void);
 
-/* Whether the e-stop loop is open: pressed, unplugged or broken. */
+/* Return whether the e-stop loop is open: pressed, unplugged or broken. */
 bool hal_estop_open(void);
 
 /* -- identity -------------------------------------------------------------------------------------------------- */

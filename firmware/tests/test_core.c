@@ -34,29 +34,29 @@ static void test_crc_is_ccitt_false(void) {
 
 static void test_every_frame_comes_back(void) {
     for (int round = 0; round < 20000; round++) {
-        uint8_t frame[FRAME_MAX], sent[FRAME_MAX], line[FRAME_LINE];
+        uint8_t frame[FRAME_MAX], sent[FRAME_MAX], encoded[FRAME_ENCODED];
         uint8_t body = (uint8_t)(random_byte() % (MAX_BODY + 1));
         for (uint8_t i = 0; i < body + FRAME_HEADER; i++) {
             frame[i] = sent[i] = random_byte() % 3 ? random_byte() : 0;
         }
-        uint8_t length = frame_encode(line, frame, body);
+        uint8_t length = frame_encode(encoded, frame, body);
         CHECK(length == body + FRAME_OVERHEAD + 2);
-        CHECK(strlen((const char *)line) == (size_t)length - 1);
-        CHECK(frame_decode(line, (uint8_t)(length - 1)) == body);
-        CHECK(!memcmp(line, sent, body + FRAME_HEADER));
+        CHECK(strlen((const char *)encoded) == (size_t)length - 1);
+        CHECK(frame_decode(encoded, (uint8_t)(length - 1)) == body);
+        CHECK(!memcmp(encoded, sent, body + FRAME_HEADER));
     }
 }
 
 static void test_garbage_stays_within_its_bytes(void) {
     for (int round = 0; round < 200000; round++) {
-        uint8_t length = (uint8_t)(random_byte() % (FRAME_LINE + 8));
-        uint8_t *line = malloc(length ? length : 1); /* the exact length: the sanitizer detects a byte beyond it */
+        uint8_t length = (uint8_t)(random_byte() % (FRAME_ENCODED + 8));
+        uint8_t *encoded = malloc(length ? length : 1); /* the exact length: the sanitizer detects a byte beyond it */
         for (uint8_t i = 0; i < length; i++) {
-            line[i] = random_byte() % 4 ? (uint8_t)(random_byte() % 6) : random_byte();
+            encoded[i] = random_byte() % 4 ? (uint8_t)(random_byte() % 6) : random_byte();
         }
-        int8_t body = frame_decode(line, length);
+        int8_t body = frame_decode(encoded, length);
         CHECK(body <= MAX_BODY);
-        free(line);
+        free(encoded);
     }
 }
 
@@ -80,10 +80,10 @@ static uint64_t now_ns;
 static uint8_t sequence;
 static int relay, light, trigger;
 static uint64_t relay_ns, light_ns;
-static uint8_t answer[FRAME_LINE], event[FRAME_LINE];
+static uint8_t answer[FRAME_ENCODED], event[FRAME_ENCODED];
 
 static void run_ms(uint64_t ms) {
-    static uint8_t line[FRAME_LINE];
+    static uint8_t encoded[FRAME_ENCODED];
     static uint8_t length;
     struct board_output outputs[64];
     uint32_t count;
@@ -104,14 +104,14 @@ static void run_ms(uint64_t ms) {
                 break;
             case BOARD_BYTE:
                 if (outputs[i].value) {
-                    line[length++] = (uint8_t)outputs[i].value;
+                    encoded[length++] = (uint8_t)outputs[i].value;
                     break;
                 }
                 if (!length) {
                     break; /* the zero that ends a frame that the reset interrupted */
                 }
-                CHECK(frame_decode(line, length) >= 0);
-                memcpy(line[0] >= MESSAGE_SAMPLE ? event : answer, line, sizeof line);
+                CHECK(frame_decode(encoded, length) >= 0);
+                memcpy(encoded[0] >= MESSAGE_SAMPLE ? event : answer, encoded, sizeof encoded);
                 length = 0;
                 break;
             default:
@@ -122,16 +122,16 @@ static void run_ms(uint64_t ms) {
 }
 
 static void send(uint8_t id, const void *body, uint8_t length, uint8_t number) {
-    uint8_t frame[FRAME_MAX] = {id, number}, line[FRAME_LINE];
+    uint8_t frame[FRAME_MAX] = {id, number}, encoded[FRAME_ENCODED];
     memcpy(frame + FRAME_HEADER, body, length);
-    length = frame_encode(line, frame, length);
+    length = frame_encode(encoded, frame, length);
     for (uint8_t i = 0; i < length; i++) {
-        board_receive(board, now_ns + (i + 1) * 40000U, line[i]);
+        board_receive(board, now_ns + (i + 1) * 40000U, encoded[i]);
     }
     run_ms(4);
 }
 
-/* Returns the rejection. */
+/* Send a request and return its rejection. */
 static uint8_t ask(uint8_t id, const void *body, uint8_t length) {
     send(id, body, length, ++sequence);
     CHECK(answer[1] == sequence);
@@ -219,7 +219,7 @@ static void test_a_repeated_request_is_answered_but_not_done_twice(void) {
     uint8_t width[SIZE_TRIGGER] = {100, 0};
     send(MESSAGE_TRIGGER, width, sizeof width, 77);
     CHECK(answer[0] == MESSAGE_TRIGGERED && trigger == 0);
-    uint8_t first[FRAME_LINE];
+    uint8_t first[FRAME_ENCODED];
     memcpy(first, answer, sizeof first);
     send(MESSAGE_TRIGGER, width, sizeof width, 77);
     CHECK(!memcmp(first, answer, FRAME_HEADER + SIZE_TRIGGERED));
@@ -256,5 +256,5 @@ int main(void) {
     test_a_repeated_request_is_answered_but_not_done_twice();
     test_unknown_and_malformed_requests_are_rejected();
     test_a_program_that_hangs_is_restarted();
-    printf("%u checks, all well\n", checks);
+    printf("%u checks passed\n", checks);
 }

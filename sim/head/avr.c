@@ -24,7 +24,7 @@
 #define BYTE_CYCLES (10 * F_CPU / BAUD)
 #define EDGE_CYCLES (50 * F_CPU / 1000000) /* the sensor's pulse */
 #define QUEUE 8192U
-#define FOR_EVER UINT8_MAX
+#define FOREVER UINT8_MAX
 
 enum { MCUSR = 0x54, TWCR = 0xBC, TCCR2A = 0xB0, OCR2B = 0xB4, PORTD = 0x2B, PORF = 1, EXTRF = 2, BORF = 4, WDRF = 8 };
 enum { D_READY = 2, D_LIGHT = 3, D_RELAY = 4, D_ESTOP = 5, B_TRIGGER = 1, C_SDA = 4, C_SCL = 5 };
@@ -111,7 +111,7 @@ static void on_trigger(struct avr_irq_t *irq, uint32_t value, void *param) {
 }
 
 /* The light's duty: the compare value while the timer drives the pin, else the port's level. */
-static void look_at_light(struct board *b) {
+static void update_light(struct board *b) {
     const uint8_t *data = b->avr->data;
     int32_t level = data[PORTD] >> D_LIGHT & 1 ? 255 : 0;
     set(b, &b->light, BOARD_LIGHT, data[TCCR2A] & 0x20 ? data[OCR2B] : level);
@@ -119,13 +119,13 @@ static void look_at_light(struct board *b) {
 
 static void on_light_register(struct avr_t *avr, avr_io_addr_t addr, uint8_t value, void *param) {
     avr->data[addr] = value;
-    look_at_light(param);
+    update_light(param);
 }
 
 static void on_light_port(struct avr_irq_t *irq, uint32_t value, void *param) {
     (void)irq;
     (void)value;
-    look_at_light(param);
+    update_light(param);
 }
 
 /* -- I2C ----------------------------------------------------------------------------------------------------------- */
@@ -134,40 +134,40 @@ static int32_t ask(struct board *b, int32_t operation, uint8_t *data, int32_t le
     return b->outside.i2c(to_ns(cycle_now(b)), operation, data, length);
 }
 
-static void look_for_edges(struct board *b) {
+static void schedule_edge(struct board *b) {
     b->next_edge = to_cycle(b->outside.edge(to_ns(cycle_now(b))));
 }
 
 static void on_twi(struct avr_irq_t *irq, uint32_t value, void *param) {
     (void)irq;
     struct board *b = param;
-    avr_twi_msg_irq_t told = {.u.v = value};
-    uint8_t condition = told.u.twi.msg, byte;
+    avr_twi_msg_irq_t message = {.u.v = value};
+    uint8_t condition = message.u.twi.msg, byte;
     if (condition & TWI_COND_STOP) {
         ask(b, BOARD_I2C_STOP, &b->address, 0);
         b->acknowledged = false;
-        look_for_edges(b); /* the write may have switched the signal on or off */
+        schedule_edge(b); /* the write may have switched the signal on or off */
     }
     if (condition & TWI_COND_START) {
-        b->address = (uint8_t)(told.u.twi.addr >> 1);
-        b->acknowledged = ask(b, told.u.twi.addr & 1 ? BOARD_I2C_START_READ : BOARD_I2C_START_WRITE, &b->address, 1);
+        b->address = (uint8_t)(message.u.twi.addr >> 1);
+        b->acknowledged = ask(b, message.u.twi.addr & 1 ? BOARD_I2C_START_READ : BOARD_I2C_START_WRITE, &b->address, 1);
         if (b->acknowledged) {
-            avr_raise_irq(b->twi_in, avr_twi_irq_msg(TWI_COND_ACK, told.u.twi.addr, 1));
+            avr_raise_irq(b->twi_in, avr_twi_irq_msg(TWI_COND_ACK, message.u.twi.addr, 1));
         }
     }
     if (condition & TWI_COND_WRITE && b->acknowledged) {
-        byte = told.u.twi.data;
+        byte = message.u.twi.data;
         bool taken = ask(b, BOARD_I2C_WRITE, &byte, 1) == 1;
-        avr_raise_irq(b->twi_in, avr_twi_irq_msg(TWI_COND_ACK, told.u.twi.addr, taken));
+        avr_raise_irq(b->twi_in, avr_twi_irq_msg(TWI_COND_ACK, message.u.twi.addr, taken));
     }
     if (condition & TWI_COND_READ && b->acknowledged) {
         byte = 0xFF;
         ask(b, BOARD_I2C_READ, &byte, 1);
-        avr_raise_irq(b->twi_in, avr_twi_irq_msg(TWI_COND_READ, told.u.twi.addr, byte));
+        avr_raise_irq(b->twi_in, avr_twi_irq_msg(TWI_COND_READ, message.u.twi.addr, byte));
     }
 }
 
-/* A start on a stuck bus waits without end: the hardware never reports that it was sent. */
+/* A start condition on a stuck bus waits forever: the hardware never reports that it was sent. */
 static void on_twcr(struct avr_t *avr, avr_io_addr_t addr, uint8_t value, void *param) {
     struct board *b = param;
     if (b->stuck && value & 0x20 /* TWSTA */) {
@@ -187,19 +187,19 @@ static void drive_bus(struct board *b) {
     avr_raise_irq(b->sda, !b->stuck);
 }
 
-/* The firmware frees the bus by clock pulses, with SCL as a plain pin. */
+/* Count the clock pulses by which the firmware frees the bus; it uses SCL as a plain pin. */
 static void on_scl(struct avr_irq_t *irq, uint32_t value, void *param) {
     (void)irq;
     struct board *b = param;
     bool high = value & 1;
     bool rises = high && !b->scl;
     b->scl = high;
-    if (rises && b->stuck && b->stuck != FOR_EVER && --b->stuck == 0) {
+    if (rises && b->stuck && b->stuck != FOREVER && --b->stuck == 0) {
         drive_bus(b);
     }
 }
 
-/* -- power-up and reset ---------------------------------------------------------------------------------------------- */
+/* -- power-up and reset -------------------------------------------------------------------------------------------- */
 
 static void no_sleep(avr_t *avr, avr_cycle_count_t cycles) {
     (void)avr;
@@ -219,7 +219,7 @@ static void on_reset(avr_t *avr) {
     b->reset(avr);
 }
 
-/* After any reset, the external connections still exist. */
+/* Connect the surroundings again, after power-up or a reset. */
 static void wire_up(struct board *b) {
     /* At reset these pins are level-triggered, and simavr would poll low ones in every cycle. */
     avr_extint_set_strict_lvl_trig(b->avr, EXTINT_IRQ_OUT_INT0, 0);
@@ -233,7 +233,7 @@ static void wire_up(struct board *b) {
     set(b, &b->light, BOARD_LIGHT, 0); /* pins are inputs again; external resistors pull them to their inactive levels */
     set(b, &b->relay, BOARD_RELAY, 0);
     set(b, &b->trigger, BOARD_TRIGGER, 0);
-    look_for_edges(b);
+    schedule_edge(b);
 }
 
 uint32_t board_abi(void) {
@@ -318,7 +318,7 @@ void board_reset(struct board *b, uint8_t cause) {
                                                      : 0;
 }
 
-/* -- interface to the world ------------------------------------------------------------------------------------------ */
+/* -- the interface of board.h -------------------------------------------------------------------------------------- */
 
 void board_set_estop(struct board *b, bool open) {
     b->estop_open = open;
@@ -331,7 +331,7 @@ void board_set_stuck(struct board *b, uint8_t clocks) {
     drive_bus(b);
 }
 
-/* The main loop jumps to the endless loop that avr-libc appends to every program. */
+/* Make the main loop jump to the endless loop that avr-libc appends to every program. */
 void board_hang(struct board *b, bool hangs) {
     if (!hangs) {
         return;
@@ -367,7 +367,7 @@ uint32_t board_take(struct board *b, struct board_output *outputs, uint32_t room
     return taken;
 }
 
-/* -- running --------------------------------------------------------------------------------------------------------- */
+/* -- running ------------------------------------------------------------------------------------------------------- */
 
 static avr_cycle_count_t nothing(struct avr_t *avr, avr_cycle_count_t when, void *param) {
     (void)avr;
@@ -384,7 +384,7 @@ static uint64_t earliest(uint64_t a, uint64_t b) {
 static void run_to(struct board *b, uint64_t cycle) {
     avr_t *avr = b->avr;
     if (cycle_now(b) < cycle) {
-        /* Neither a sleep nor a burst of instructions passes a timer. */
+        /* The timer ends a sleep or a burst of instructions at this cycle. */
         avr_cycle_timer_register(avr, cycle - cycle_now(b), nothing, b);
     }
     while (cycle_now(b) < cycle) {
@@ -412,7 +412,7 @@ void board_run(struct board *b, uint64_t ns) {
         if (b->next_edge <= now) {
             avr_raise_irq(b->ready, 1);
             b->edge_falls = b->next_edge + EDGE_CYCLES;
-            look_for_edges(b);
+            schedule_edge(b);
         }
         if (b->edge_falls <= now) {
             avr_raise_irq(b->ready, 0);

@@ -27,9 +27,9 @@ static struct head head;
 static volatile bool woken; /* an interrupt has work for the main loop */
 static uint8_t reset_flags __attribute__((section(".noinit")));
 
-/* Runs before main: after a watchdog reset the watchdog is still on, with 16 ms. */
-static void keep_reset_flags(void) __attribute__((naked, used, section(".init3")));
-static void keep_reset_flags(void) {
+/* Runs before main, because the watchdog is still on after a watchdog reset, with 16 ms. */
+static void store_reset_flags(void) __attribute__((naked, used, section(".init3")));
+static void store_reset_flags(void) {
     reset_flags = MCUSR;
     MCUSR = 0;
     wdt_disable();
@@ -43,7 +43,7 @@ ISR(TIMER1_OVF_vect) {
     overflows++;
 }
 
-/* With interrupts off. */
+/* Call it with interrupts off. */
 static uint32_t micros_locked(void) {
     uint16_t low = TCNT1;
     uint32_t high = overflows;
@@ -77,7 +77,7 @@ void hal_feed_watchdog(void) {
 ISR(TIMER0_COMPA_vect) {
     static uint8_t ticks;
     head_tick(&head);
-    if (head.changed || ++ticks >= 1000 / TICK_US) { /* the waits of the main loop need a millisecond only */
+    if (head.changed || ++ticks >= 1000 / TICK_US) { /* the main loop's waits need a resolution of only 1 ms */
         ticks = 0;
         woken = true;
     }
@@ -245,7 +245,7 @@ enum hal_i2c_result hal_i2c_result(void) {
 bool hal_i2c_free(void) {
     TWCR = 0;
     i2c.result = HAL_I2C_ERROR;
-    PORTC &= (uint8_t) ~(_BV(SDA) | _BV(SCL)); /* a line is either driven low or released */
+    PORTC &= (uint8_t) ~(_BV(SDA) | _BV(SCL)); /* a pin either drives its signal low or releases it */
     for (uint8_t i = 0; i < 9 && !(PINC & _BV(SDA)); i++) {
         DDRC |= _BV(SCL);
         _delay_us(5);
@@ -297,7 +297,7 @@ void hal_relay(bool closed) {
     }
 }
 
-/* The timer switches the pin: set at the first match, clear at the second. Called with interrupts off. */
+/* The timer sets the pin at the first match and clears it at the second. Call it with interrupts off. */
 static uint16_t trigger_ticks;
 
 bool hal_trigger(uint16_t width_us, uint32_t *begins_us) {
@@ -313,7 +313,7 @@ bool hal_trigger(uint16_t width_us, uint32_t *begins_us) {
     return true;
 }
 
-void hal_trigger_rest(void) {
+void hal_trigger_off(void) {
     TCCR1A = 0;
     PORTB &= (uint8_t)~_BV(TRIGGER);
     TIMSK1 &= (uint8_t)~_BV(OCIE1A);
@@ -321,14 +321,14 @@ void hal_trigger_rest(void) {
 
 ISR(TIMER1_COMPA_vect) {
     if (!trigger_ticks) {
-        hal_trigger_rest();
+        hal_trigger_off();
         return;
     }
     TCCR1A = _BV(COM1A1);
     OCR1A += trigger_ticks;
-    /* Too late for a short pulse: end it here, otherwise it lasts until the timer wraps around. */
+    /* If this is too late for a short pulse, end it here; otherwise it lasts until the timer wraps around. */
     if (OCR1A - TCNT1 > trigger_ticks) {
-        hal_trigger_rest();
+        hal_trigger_off();
     }
     trigger_ticks = 0;
 }

@@ -11,7 +11,7 @@
 #define BYTE_NS (10ULL * 1000000000ULL / BAUD)
 #define I2C_BYTE_NS 22500ULL /* nine bits at 400 kHz */
 #define QUEUE 8192U          /* bytes to the board, and events from it */
-#define TRANSMITTER 128U     /* like on the microcontroller */
+#define TRANSMITTER 128U     /* as on the microcontroller */
 #define WATCHDOG_NS 120000000ULL
 #define PASSES 3             /* of the main loop after an event: enough to do all its work */
 
@@ -36,7 +36,7 @@ struct board {
     uint8_t readable[64];
     uint8_t readable_head, readable_count, overruns;
     uint32_t frame_us;
-    uint64_t line_free; /* time at which the last queued byte will be sent */
+    uint64_t sent_until; /* end of the last queued byte */
 
     uint64_t i2c_ends;
     enum hal_i2c_result i2c_result, i2c_pending;
@@ -48,7 +48,7 @@ struct board {
     int32_t light, relay;
 };
 
-/* The running board: the core supports only one, like on the microcontroller. */
+/* The running board. The core supports only one, as on the microcontroller. */
 static struct board *here;
 
 static void emit(struct board *b, uint64_t ns, int32_t event, int32_t value) {
@@ -103,7 +103,7 @@ uint8_t hal_uart_overruns(void) {
 }
 
 bool hal_uart_write(const uint8_t *bytes, uint8_t length) {
-    uint64_t start = here->line_free > here->now ? here->line_free : here->now;
+    uint64_t start = here->sent_until > here->now ? here->sent_until : here->now;
     if ((start - here->now) / BYTE_NS + length > TRANSMITTER) {
         return false;
     }
@@ -111,12 +111,12 @@ bool hal_uart_write(const uint8_t *bytes, uint8_t length) {
         start += BYTE_NS;
         emit(here, start, BOARD_BYTE, bytes[i]);
     }
-    here->line_free = start;
+    here->sent_until = start;
     return true;
 }
 
 uint16_t hal_uart_backlog_us(void) {
-    return here->line_free > here->now ? (uint16_t)((here->line_free - here->now) / 1000) : 0;
+    return here->sent_until > here->now ? (uint16_t)((here->sent_until - here->now) / 1000) : 0;
 }
 
 void hal_i2c_start(uint8_t address, const uint8_t *write, uint8_t write_length, uint8_t *read, uint8_t read_length) {
@@ -130,21 +130,21 @@ void hal_i2c_start(uint8_t address, const uint8_t *write, uint8_t write_length, 
     if (b->stuck) {
         return;
     }
-    bool well = true;
+    bool acknowledged = true;
     if (write_length) {
         ns += I2C_BYTE_NS;
         memcpy(bytes, write, write_length);
-        well = b->outside.i2c(ns, BOARD_I2C_START_WRITE, &at, 1) == 1;
-        if (well) {
+        acknowledged = b->outside.i2c(ns, BOARD_I2C_START_WRITE, &at, 1) == 1;
+        if (acknowledged) {
             ns += I2C_BYTE_NS * write_length;
-            well = b->outside.i2c(ns, BOARD_I2C_WRITE, bytes, write_length) == write_length;
+            acknowledged = b->outside.i2c(ns, BOARD_I2C_WRITE, bytes, write_length) == write_length;
         }
     }
-    if (well && read_length) {
+    if (acknowledged && read_length) {
         ns += I2C_BYTE_NS;
         at = address;
-        well = b->outside.i2c(ns, BOARD_I2C_START_READ, &at, 1) == 1;
-        if (well) {
+        acknowledged = b->outside.i2c(ns, BOARD_I2C_START_READ, &at, 1) == 1;
+        if (acknowledged) {
             b->outside.i2c(ns, BOARD_I2C_READ, read, read_length);
             ns += I2C_BYTE_NS * read_length;
         }
@@ -152,7 +152,7 @@ void hal_i2c_start(uint8_t address, const uint8_t *write, uint8_t write_length, 
     b->outside.i2c(ns, BOARD_I2C_STOP, &at, 0);
     b->next_edge = b->outside.edge(b->now); /* the write may have switched the signal on or off */
     b->i2c_ends = ns;
-    b->i2c_pending = well ? HAL_I2C_DONE : HAL_I2C_NACK;
+    b->i2c_pending = acknowledged ? HAL_I2C_DONE : HAL_I2C_NACK;
 }
 
 enum hal_i2c_result hal_i2c_result(void) {
@@ -204,7 +204,7 @@ bool hal_trigger(uint16_t width_us, uint32_t *begins_us) {
     return true;
 }
 
-void hal_trigger_rest(void) {
+void hal_trigger_off(void) {
     here->trigger_ends = BOARD_NEVER;
     set_trigger(here, false);
 }
@@ -237,7 +237,7 @@ static void start(struct board *b, uint8_t cause) {
     b->next_tick = b->now + TICK_NS;
     b->fed = b->now;
     b->readable_count = b->overruns = 0;
-    b->line_free = b->now;
+    b->sent_until = b->now;
     b->i2c_result = HAL_I2C_DONE;
     b->i2c_ends = BOARD_NEVER;
     b->trigger_ends = BOARD_NEVER;
@@ -269,7 +269,7 @@ void board_reset(struct board *b, uint8_t cause) {
     here = b;
     hal_light(0); /* pins become inputs, and external resistors pull them to their inactive levels */
     hal_relay(false);
-    hal_trigger_rest();
+    hal_trigger_off();
     emit(b, b->now, BOARD_RESET, cause);
     start(b, cause);
 }
@@ -331,7 +331,7 @@ void board_run(struct board *b, uint64_t until) {
         }
         b->now = next > b->now ? next : b->now;
         if (b->trigger_ends <= b->now) {
-            hal_trigger_rest();
+            hal_trigger_off();
         }
         if (b->next_edge <= b->now) {
             b->edges++;

@@ -15,7 +15,7 @@ enum board_i2c { BOARD_I2C_START_WRITE, BOARD_I2C_START_READ, BOARD_I2C_WRITE, B
 /* The surroundings of a running board. */
 struct board_outside {
     /* One step of a transfer at `ns`. START: data[0] is the address; returns 1 if it is acknowledged. WRITE: returns
-     * the number of acknowledged bytes. READ: fills data. */
+     * the number of acknowledged bytes. READ: writes the bytes to data. */
     int32_t (*i2c)(uint64_t ns, int32_t operation, uint8_t *data, int32_t length);
     /* Time of the next data-ready edge after `ns`, or BOARD_NEVER. */
     uint64_t (*edge)(uint64_t ns);
@@ -23,8 +23,8 @@ struct board_outside {
 
 enum board_event { BOARD_BYTE, BOARD_LIGHT, BOARD_RELAY, BOARD_TRIGGER, BOARD_RESET };
 
-/* An output of the board at `ns`: a byte whose stop bit ends then, a duty in 1/255, or a level. After BOARD_RESET (with
- * its cause), bytes that would have ended later are lost. */
+/* An output of the board at `ns`: a byte whose stop bit ends then, a duty in 1/255, or a level. BOARD_RESET has the
+ * cause; bytes that would have ended after it are lost. */
 struct board_output {
     uint64_t ns;
     int32_t event;
@@ -46,7 +46,7 @@ uint32_t board_take(struct board *board, struct board_output *outputs, uint32_t 
 /* Receive `byte` from the host; its stop bit ends at `ns`, not earlier than the end of the last `board_run`. */
 void board_receive(struct board *board, uint64_t ns, uint8_t byte);
 
-/* Take effect immediately. `stuck`: a sensor holds SDA low for this number of clock pulses; 255: forever; 0: no more. */
+/* These take effect immediately. A sensor holds SDA low for `clocks` clock pulses; 255: forever; 0: not. */
 void board_set_estop(struct board *board, bool open);
 void board_set_stuck(struct board *board, uint8_t clocks);
 
@@ -56,7 +56,7 @@ void board_reset(struct board *board, uint8_t cause);
 /* Simulate a program that hangs: interrupts continue, the main loop does not. */
 void board_hang(struct board *board, bool hangs);
 
-/* Identifies the interface. */
+/* Return the version of this interface. */
 uint32_t board_abi(void);
 #define BOARD_ABI 1
 

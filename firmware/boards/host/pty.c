@@ -2,7 +2,7 @@
  *
  *     head-pty            prints the port to open, then each change of an output with its time in seconds
  *
- * Commands on its standard input, one in each line: `estop open`, `estop closed`, `spin DEGREES_PER_SECOND`, `reset`.
+ * Commands on its standard input, one on each line: `estop open`, `estop closed`, `spin DEGREES_PER_SECOND`, `reset`.
  * An MPU-6050 without noise is on its bus. */
 #define _GNU_SOURCE
 #include <fcntl.h>
@@ -20,7 +20,7 @@
 #define STEP_MS 1
 #define BYTE_NS (10ULL * 1000000000ULL / BAUD)
 
-/* -- a still MPU-6050: registers, FIFO, data-ready pulses ---------------------------------------------------------- */
+/* -- an MPU-6050 without noise: registers, FIFO, data-ready pulses ------------------------------------------------- */
 
 enum { SMPLRT_DIV = 0x19, CONFIG, GYRO_CONFIG, FIFO_EN = 0x23, INT_ENABLE = 0x38, ACCEL = 0x3B };
 enum { USER_CTRL = 0x6A, PWR_MGMT_1 = 0x6B, FIFO_COUNTH = 0x72, FIFO_R_W = 0x74, WHO_AM_I = 0x75, FIFO = 1024 };
@@ -143,7 +143,7 @@ static int open_terminal(void) {
     }
     cfmakeraw(&raw);
     tcsetattr(master, TCSANOW, &raw);
-    /* Stays open, so that the port exists between two programs that use it. */
+    /* This end stays open, so that the port also exists while no program uses it. */
     if (open(ptsname(master), O_RDWR | O_NOCTTY) < 0) {
         perror(ptsname(master));
         exit(1);
@@ -151,7 +151,7 @@ static int open_terminal(void) {
     return master;
 }
 
-static bool obey(struct board *board, char *line) {
+static bool run_command(struct board *board, char *line) {
     double dps;
     if (!strncmp(line, "estop ", 6)) {
         board_set_estop(board, !strncmp(line + 6, "open", 4));
@@ -192,15 +192,15 @@ int main(void) {
     setvbuf(stdout, NULL, _IOLBF, 0);
     printf("%s\n", ptsname(master));
     struct pollfd fds[] = {{.fd = master, .events = POLLIN}, {.fd = STDIN_FILENO, .events = POLLIN}};
-    uint64_t start = real_ns(), now = 0, line_free = 0;
+    uint64_t start = real_ns(), now = 0, received_until = 0;
     for (;;) {
         poll(fds, 2, STEP_MS);
         uint8_t bytes[256];
         ssize_t count = read(master, bytes, sizeof bytes);
         now = real_ns() - start;
-        line_free = line_free > now ? line_free : now;
+        received_until = received_until > now ? received_until : now;
         for (ssize_t i = 0; i < count; i++) {
-            board_receive(board, line_free += BYTE_NS, bytes[i]);
+            board_receive(board, received_until += BYTE_NS, bytes[i]);
         }
         board_run(board, now);
         report(master, board);
@@ -208,7 +208,7 @@ int main(void) {
             char line[80];
             if (!fgets(line, sizeof line, stdin)) {
                 fds[1].fd = -1; /* the standard input has ended */
-            } else if (!obey(board, line)) {
+            } else if (!run_command(board, line)) {
                 fprintf(stderr, "head-pty: estop open|closed, spin DPS, reset\n");
             }
         }
