@@ -71,7 +71,7 @@ def test_all_pages_work_in_a_day_at_the_bench(page, serve_process, tmp_path, vie
     # The bench: rotate, check, stop.
     page.goto(server.url)
     page.wait_for_selector("#state.good")
-    page.wait_for_selector("#lights .lit:has-text('ready')")
+    page.wait_for_selector("#states .current:has-text('ready')")
     page.fill("#angle", "90")
     page.click("#goto button")
     job_done(page, "Rotate to 90°")
@@ -124,8 +124,8 @@ def test_second_browser_watches_and_takes_over(page, chromium, serve_process):
     other.wait_for_selector("#lease:has-text('operates')")
     other.click("#job button:has-text('Pause')")
     other.wait_for_selector("#lease-dialog[open]")
-    other.click("#lease-dialog button:has-text('Ask for it')")
-    page.click("#messages button:has-text('Hand it over')")
+    other.click("#lease-dialog button:has-text('Ask for the bench')")
+    page.click("#messages button:has-text('Hand over the bench')")
     other.wait_for_selector("#lease:has-text('You operate')")
     other.click("#job button:has-text('Pause')")
     job_done(page, "Enroll lamp", "paused")
@@ -149,10 +149,10 @@ def test_server_killed_in_an_enrollment_loses_no_view(page, serve_process):
     text = page.text_content(".cards button:has-text('lamp')")
     assert int(text.split("interrupted, ")[1].split()[0]) >= shown
     page.goto(again.url)
-    page.wait_for_selector("#lights .lit")
-    if page.locator("#refer").is_visible():  # killed in a motion
-        page.click("#refer button:has-text('Set')")
-        page.wait_for_selector("#lights .lit:has-text('ready')")
+    page.wait_for_selector("#states .current")
+    if page.locator("#set-angle").is_visible():  # killed in a motion
+        page.click("#set-angle button:has-text('Set')")
+        page.wait_for_selector("#states .current:has-text('ready')")
     page.goto(f"{again.url}enroll")
     page.click("#job button:has-text('Continue')")
     job_done(page, "Enroll lamp")

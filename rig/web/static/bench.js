@@ -1,4 +1,4 @@
-import { $, API, act, h, jobTitle, on, request, showJob, start, submit } from "./rig.js";
+import { $, API, act, h, jobTitle, number, on, request, showJob, start, submit } from "./rig.js";
 
 const polar = (degrees, radius) => {
   const a = ((degrees - 90) * Math.PI) / 180;
@@ -32,21 +32,21 @@ function dial(status) {
     parts.push(needle(angle, 88, "currentColor", 4), h("circle", { r: 6, fill: "currentColor" }));
   }
   $("dial").replaceChildren(...parts);
-  const moving = status.servo && status.servo.moving ? ` at ${status.velocity_dps.toFixed(0)} °/s` : "";
-  $("dial-text").textContent = known ? `${angle.toFixed(2)}°${moving}` : "angle in doubt";
+  const moving = status.servo && status.servo.moving ? ` at ${number(status.velocity_dps, 0)} °/s` : "";
+  $("dial-text").textContent = known ? `${number(angle, 2)}°${moving}` : "angle in doubt";
 }
 
 on("status", (status) => {
   if (!status.open) return;
   if (status.limits_deg) dial(status);
-  $("lights").replaceChildren(...STATES.map((state) => h("li", { class: state === status.state ? `lit ${state}` : "", "aria-current": state === status.state }, state)));
-  const values = [["Cable budget", status.limits_deg ? `${status.limits_deg[0]}° to ${status.limits_deg[1]}°` : "–"]];
-  if (gyro !== null) values.push(["Gyro at the last rest", `${gyro.toFixed(2)}°`]);
-  if (status.servo) values.push(["Servo", `${status.servo.model}, ${status.servo.temperature_c} °C, ${status.servo.voltage_v.toFixed(1)} V, load ${status.servo.load_percent.toFixed(0)} %`]);
+  $("states").replaceChildren(...STATES.map((state) => h("li", { class: state === status.state ? `current ${state}` : "", "aria-current": state === status.state }, state)));
+  const values = [["Cable budget", status.limits_deg ? `${number(status.limits_deg[0])}° to ${number(status.limits_deg[1])}°` : "–"]];
+  if (gyro !== null) values.push(["Angle by the gyro", `${number(gyro, 2)}°`]);
+  if (status.servo) values.push(["Servo", `${status.servo.model}, ${number(status.servo.temperature_c)} °C, ${status.servo.voltage_v.toFixed(1)} V, load ${number(status.servo.load_percent, 0)} %`]);
   if (status.camera) values.push(["Camera", `${status.camera.name}, ${status.camera.width} × ${status.camera.height}`]);
   for (const finding of status.findings || []) values.push(["Note", finding]);
   $("values").replaceChildren(...values.flatMap(([name, value]) => [h("dt", {}, name), h("dd", {}, value)]));
-  $("refer").hidden = !status.doubt;
+  $("set-angle").hidden = !status.doubt;
   $("doubt").textContent = status.doubt ? `The table's angle is in doubt: ${status.doubt}.` : "";
   $("acknowledge").disabled = !status.fault;
 });
@@ -57,7 +57,7 @@ on("plan", (event) => {
   if (event.event === "moved") $("outline").replaceChildren();
 });
 
-/** Draw the found object over the picture: its outline, and its box. */
+/** Draw the outline and the box of the object over the live image. */
 function outline(found) {
   const image = $("live-image");
   if (!image.naturalWidth) return;
@@ -88,7 +88,7 @@ function findings(list) {
   const marks = { fine: "✓", warning: "!", bad: "✗" };
   $("findings-section").hidden = false;
   $("findings").replaceChildren(
-    ...list.map((one) => h("li", { class: one.level === "bad" ? "badtext" : "" }, `${marks[one.level]} ${one.topic}: ${one.finding}`, one.fix ? h("p", { class: "soft" }, `Fix: ${one.fix}`) : null)),
+    ...list.map((one) => h("li", { class: one.level === "bad" ? "error" : "" }, `${marks[one.level]} ${one.topic}: ${one.finding}`, one.fix ? h("p", { class: "soft" }, `Fix: ${one.fix}`) : null)),
   );
 }
 
@@ -106,7 +106,7 @@ $("goto").addEventListener("submit", (event) => {
   event.preventDefault();
   submit({ kind: "goto", angle_deg: Number($("angle").value) });
 });
-$("refer").addEventListener("submit", (event) => {
+$("set-angle").addEventListener("submit", (event) => {
   event.preventDefault();
   submit({ kind: "reference", revolutions: Number($("revolutions").value) });
 });

@@ -33,10 +33,10 @@ async function open(name) {
   $("new-note").value = one.note;
   $("object-export").href = `${API}/export?name=${path(one.name)}`;
   const similar = one.similar ? one.similar.objects.map((other) => `${other.name} (similarity ${other.similarity.toFixed(2)})`).join(", ") : "";
-  const taken = one.enrollments.map((e) => `${e.status}: ${e.stored_views} of ${e.planned_views} views, ${e.started_utc}${e.sessions.length ? `, bench ${e.sessions[0].bench}, ${e.sessions[0].software}` : ""}`);
+  const enrollments = one.enrollments.map((e) => `${e.status}: ${e.stored_views} of ${e.planned_views} views, ${e.started_utc}${e.sessions.length ? `, bench ${e.sessions[0].bench}, ${e.sessions[0].software}` : ""}`);
   $("object-body").replaceChildren(
-    h("p", {}, similar ? `Looks like: ${similar}` : "No other object looks like it."),
-    h("ul", { class: "list" }, ...taken.map((words) => h("li", {}, words))),
+    h("p", {}, similar ? `Similar objects: ${similar}` : "No similar object."),
+    h("ul", { class: "list" }, ...enrollments.map((words) => h("li", {}, words))),
     ring(one.views_taken),
   );
   for (const element of $("edit").elements) if (element.id !== "close") element.disabled = !canOperate();
@@ -44,7 +44,7 @@ async function open(name) {
   $("object").scrollTop = 0;
 }
 
-/** The views in a circle at their azimuths, counter-clockwise from the bottom, where the camera is. */
+/** Return the views in a circle at their azimuths, counter-clockwise from the bottom, which is the camera's side. */
 function ring(views) {
   const step = Math.max(1, Math.ceil(views.length / 24));
   const some = views.filter((_, k) => k % step === 0);

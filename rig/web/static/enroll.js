@@ -17,7 +17,7 @@ $("dry").addEventListener("click", () => {
 
 let objects = [];
 
-/** Split CSV text into rows of cells; quotes as in RFC 4180. */
+/** Return the rows of cells of a CSV text. Quotes are those of RFC 4180. */
 export function readCsv(source) {
   const head = source.split("\n", 1)[0];
   const separator = head.split(";").length > head.split(",").length ? ";" : ",";
@@ -43,7 +43,7 @@ $("file").addEventListener("change", () => act(async () => {
   const [head, ...rows] = readCsv((await $("file").files[0].text()).replace(/^\ufeff/, ""));
   const keys = (head || []).map((cell) => cell.trim().toLowerCase());
   const unknown = keys.filter((key) => !["name", "label", "note", "views"].includes(key));
-  if (!keys.includes("name") || unknown.length) throw Object.assign(new Error("The first line must have the columns name, label, note and views."), { next_step: unknown.length ? `Remove ${unknown.join(", ")}.` : "Add the column name." });
+  if (!keys.includes("name") || unknown.length) throw Object.assign(new Error("The first line of the file must name the columns: name and, optionally, label, note and views."), { next_step: unknown.length ? `Remove the columns ${unknown.join(", ")}.` : "Add the column \"name\"." });
   objects = rows.map((row) => {
     const one = {};
     keys.forEach((key, k) => { const cell = (row[k] || "").trim(); if (cell) one[key] = key === "views" ? Number(cell) : cell; });
@@ -64,14 +64,14 @@ $("tray").addEventListener("submit", (event) => {
 
 function checks(event) {
   const e = event.evidence;
-  return `view ${event.index + 1}, ${event.azimuth_deg.toFixed(0)}°: sharpness ${e.sharpness.toFixed(0)}, level ${e.mean_level.toFixed(0)}`;
+  return `view ${event.index + 1}, ${event.azimuth_deg.toFixed(0)}°: sharpness ${e.sharpness.toFixed(0)}, mean level ${e.mean_level.toFixed(0)}`;
 }
 
 on("plan", (event) => {
   if (event.job !== current) return;
   if (event.event === "started") $("thumbs").replaceChildren();
   if (event.event === "accepted") $("thumbs").append(thumb(event.job, event.picture, checks(event)));
-  if (event.event === "rejected") $("thumbs").append(h("li", { class: "badtext" }, event.text));
+  if (event.event === "rejected") $("thumbs").append(h("li", { class: "error" }, event.text));
   if (event.event === "similar_objects") $("similar").replaceChildren(...event.text.split("\n").map((words) => h("li", {}, words)));
 });
 followJobs($("job"), ["enroll", "tray", "dry-run"], (job) => {

@@ -1,4 +1,4 @@
-import { $, followJobs, h, on, start, submit, thumb } from "./rig.js";
+import { $, followJobs, h, number, on, percent, start, submit, thumb } from "./rig.js";
 
 let current = null;
 
@@ -21,7 +21,7 @@ function clear() {
 function bars(candidates) {
   const rows = candidates.slice(0, 6).flatMap((one) => {
     const share = one.probability ?? one.score;
-    const words = one.probability === null ? one.score.toFixed(3) : `${(share * 100).toFixed(1)} %`;
+    const words = one.probability === null ? number(one.score, 3) : percent(share);
     const bar = h("div", { "aria-hidden": "true" });
     bar.style.width = `${Math.max(share, 0) * 100}%`;
     return [h("span", {}, one.name), h("span", {}, bar), h("span", {}, words)];

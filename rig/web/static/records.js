@@ -1,5 +1,5 @@
 // Calibrations, runs, log and settings: each part runs on the page that has its element.
-import { $, API, act, followJobs, h, on, request, start, submit, table, whoami } from "./rig.js";
+import { $, API, act, followJobs, h, on, percent, request, start, submit, table, whoami } from "./rig.js";
 
 let next = null;
 async function more(path, add) {
@@ -35,7 +35,7 @@ if ($("runs")) {
   };
   const answers = async () => {
     const page = await request("GET", "/results?limit=50");
-    table($("answers"), ["Time (UTC)", "Sample", "Answer", "Confidence", "Views", "Operator"], page.items.map((one) => [one.time_utc.slice(0, 19).replace("T", " "), one.sample, one.outcome === "unknown" ? "unknown object" : `${one.outcome === "ambiguous" ? "ambiguous: " : ""}${one.object}${one.corrections ? " (corrected)" : ""}`, one.confidence === null ? "" : `${(one.confidence * 100).toFixed(1)} %`, one.views, one.operator]));
+    table($("answers"), ["Time (UTC)", "Sample", "Answer", "Confidence", "Views", "Operator"], page.items.map((one) => [one.time_utc.slice(0, 19).replace("T", " "), one.sample, one.outcome === "unknown" ? "unknown object" : `${one.outcome === "ambiguous" ? "ambiguous: " : ""}${one.object}${one.corrections ? " (corrected)" : ""}`, one.confidence === null ? "" : percent(one.confidence), one.views, one.operator]));
   };
   on("hello", () => act(answers));
   const add = (items) => {
@@ -59,7 +59,7 @@ if ($("log")) {
 if ($("configuration")) {
   const flat = (values, prefix = "") => Object.entries(values).flatMap(([key, value]) => (value !== null && typeof value === "object" && !Array.isArray(value) ? flat(value, `${prefix}${key}.`) : [[prefix + key, value === null ? "none" : JSON.stringify(value)]]));
   on("hello", () => act(async () => table($("configuration"), ["Key", "Value"], flat(await request("GET", "/configuration")))));
-  on("me", () => { $("you").textContent = `${whoami().name}, may ${whoami().role === "operate" ? "operate the bench" : "watch"}.`; $("logout").hidden = whoami().name === "local"; });
+  on("me", () => { $("you").textContent = `User ${whoami().name}. You may ${whoami().role === "operate" ? "operate the bench" : "only watch"}.`; $("logout").hidden = whoami().name === "local"; });
   $("logout").addEventListener("click", () => act(async () => { await request("POST", "/logout"); location.assign("/login"); }));
 }
 start();

@@ -12,7 +12,7 @@ const CLIENT = (() => {
 
 export const $ = (id) => document.getElementById(id);
 
-/** Make an element: attributes as an object (on… are listeners), children as nodes or text. */
+/** Return a new element. Attributes are an object (on… are listeners), children are nodes or text. */
 export function h(tag, attributes = {}, ...children) {
   const svg = ["svg", "path", "circle", "line", "text", "rect", "g", "image"].includes(tag);
   const element = svg ? document.createElementNS("http://www.w3.org/2000/svg", tag) : document.createElement(tag);
@@ -24,6 +24,19 @@ export function h(tag, attributes = {}, ...children) {
   return element;
 }
 
+/** Return a number as people read it, with a minus sign; without decimals, with the digits that it has. */
+export function number(value, decimals = null) {
+  const digits = decimals === null ? String(value) : value.toFixed(decimals);
+  return Number(digits) < 0 ? digits.replaceAll("-", "−") : digits.replace(/^-/, "");
+}
+
+/** Return a probability in percent; "<0.1 %" and ">99.9 %" at the ends. */
+export function percent(probability) {
+  if (probability > 0.999) return ">99.9 %";
+  return probability < 0.001 ? "<0.1 %" : `${(100 * probability).toFixed(1)} %`;
+}
+
+/** An error with the fields of the server's problem. */
 export class Problem extends Error {
   constructor(values) {
     super(values.detail || "The request failed.");
@@ -31,7 +44,7 @@ export class Problem extends Error {
   }
 }
 
-/** Send a request; return its JSON. Errors have the fields of the server's problem. */
+/** Send a request and return the JSON of its answer. Throws a Problem. */
 export async function request(method, path, body) {
   const headers = { "X-Rig-Client": CLIENT };
   const options = { method, headers, credentials: "same-origin" };
@@ -69,7 +82,7 @@ export function show(problem) {
   if (problem.code === 902) offerLease();
 }
 
-/** Run an action of the operator; show its error. */
+/** Run an action of the operator and return its result. Shows an error. */
 export async function act(action) {
   $("messages").replaceChildren();
   try {
@@ -88,15 +101,15 @@ const listeners = {};
 export function on(kind, listener) {
   (listeners[kind] ||= []).push(listener);
 }
-const tell = (kind, data) => (listeners[kind] || []).forEach((listener) => listener(data));
+const dispatch = (kind, data) => (listeners[kind] || []).forEach((listener) => listener(data));
 
-/** Listen to the server. The browser reconnects by itself, and sends the last event id. */
+/** Receive the server's events. The browser reconnects by itself and sends the last event id. */
 export function listen() {
   const source = new EventSource(`${API}/events`);
   for (const kind of ["plan", "job", "status", "lease", "stop", "catalog"]) {
-    source.addEventListener(kind, (event) => tell(kind, JSON.parse(event.data)));
+    source.addEventListener(kind, (event) => dispatch(kind, JSON.parse(event.data)));
   }
-  source.addEventListener("hello", (event) => tell("hello", JSON.parse(event.data)));
+  source.addEventListener("hello", (event) => dispatch("hello", JSON.parse(event.data)));
   source.onerror = () => {
     $("state").textContent = "No connection to the server. Trying again …";
     $("state").className = "state bad";
@@ -109,11 +122,12 @@ let me = null;
 export const whoami = () => me;
 export const canOperate = () => me !== null && me.role === "operate";
 
+/** Return the state of the bench in words, and whether it is good or bad. */
 export function stateWords(status) {
   if (!status.open) return [status.error ? `Bench not available: ${status.error.what} ${status.error.next_step}` : "Opening the bench …", "bad"];
   if (status.fault) return [`Fault ${status.fault.code}: ${status.fault.what}`, "bad"];
-  if (status.doubt) return [`The table's angle is in doubt: ${status.doubt}`, "bad"];
-  const angle = status.table_deg === null || status.table_deg === undefined ? "" : `, table at ${status.table_deg.toFixed(1)}°`;
+  if (status.doubt) return [`The table's angle is in doubt: ${status.doubt}.`, "bad"];
+  const angle = status.table_deg === null || status.table_deg === undefined ? "" : `, table at ${number(status.table_deg, 1)}°`;
   return [`${status.job ? "Working" : "Ready"}${angle}`, "good"];
 }
 
@@ -127,21 +141,21 @@ on("status", (status) => {
 on("catalog", (state) => {
   const words = [...state.reasons];
   if (state.local_copy_utc) words.unshift(`The server of the catalog does not answer. The pages and searches use the copy of ${state.local_copy_utc}.`);
-  if (state.waiting) words.push(`Waiting in the journal of the bench's computer: ${state.waiting}.`);
+  if (state.waiting) words.push(`Objects and answers in the journal of the bench's computer that the server does not have yet: ${state.waiting}.`);
   $("catalog-state").replaceChildren(...words.map((text) => h("p", {}, text)));
 });
 
 async function loadMe() {
   me = await request("GET", "/me");
   showLease(me.lease);
-  tell("me", me);
+  dispatch("me", me);
 }
 
 function showLease(lease) {
   const mine = lease.client === CLIENT && lease.holder === me.name;
   $("lease").textContent = mine ? `You operate (${me.name})` : lease.holder ? `${lease.holder} operates` : "No operator";
   $("lease-button").hidden = !canOperate();
-  $("lease-button").textContent = mine ? "Give back" : "Operate";
+  $("lease-button").textContent = mine ? "Release the bench" : "Operate";
   $("lease-button").dataset.mine = mine ? "1" : "";
 }
 
@@ -151,13 +165,13 @@ on("lease", (lease) => {
   if (lease.taken_from === `${me.name}/${CLIENT}`) show(new Problem({ detail: `${lease.holder} has taken over the bench.`, next_step: "You can watch." }));
   if (lease.asked_by && $("lease-button").dataset.mine) {
     const to = lease.asked_by;
-    const give = h("button", { onclick: () => act(() => request("POST", "/lease/hand-over", to)) }, "Hand it over");
-    $("messages").replaceChildren(h("p", {}, `${to.name} asks for the bench. `, give));
+    const handOver = h("button", { onclick: () => act(() => request("POST", "/lease/hand-over", to)) }, "Hand over the bench");
+    $("messages").replaceChildren(h("p", {}, `${to.name} asks for the bench. `, handOver));
   }
 });
 
 function offerLease() {
-  $("lease-text").textContent = "Another operator uses the bench. Taking over does not stop a running job; the other operator sees a warning.";
+  $("lease-text").textContent = "Another operator uses the bench. If you take over, a running job continues, and the other operator sees a message.";
   const dialog = $("lease-dialog");
   dialog.onclose = () => {
     if (dialog.returnValue === "ask") act(() => request("POST", "/lease/ask"));
@@ -175,18 +189,18 @@ setInterval(() => {
 
 const STOPPED = "Stopped. All jobs are cancelled.";
 const NOT_STOPPED = "The stop is requested, but the job has not ended. If the table still moves, switch off its supply.";
-const say = (words) => $("messages").replaceChildren(h("p", {}, words));
+const showMessage = (words) => $("messages").replaceChildren(h("p", {}, words));
 
-// The job may end before or after the answer to the request: the event tells.
+// The job may end before or after the answer to the request: the event reports its end.
 let stopped = true;
 on("stop", ({ ended }) => {
   stopped = ended;
-  say(ended ? STOPPED : "Stopping …");
+  showMessage(ended ? STOPPED : "Stopping …");
 });
 $("stop")?.addEventListener("click", async () => {
   stopped = false;
   const answer = await act(() => request("POST", "/stop"));
-  if (answer) say(answer.ended || stopped ? STOPPED : NOT_STOPPED);
+  if (answer) showMessage(answer.ended || stopped ? STOPPED : NOT_STOPPED);
 });
 
 // -- a job ---------------------------------------------------------------------------------------------------------------
@@ -196,16 +210,19 @@ const CHOICES = { continue: "Continue", restart: "Start again", skip: "Skip", st
 
 export function jobTitle(job) {
   const request_ = job.request;
-  const what = request_.name || (request_.angle_deg !== undefined ? `to ${request_.angle_deg}°` : "");
+  const what = request_.name || (request_.angle_deg !== undefined ? `to ${number(request_.angle_deg)}°` : "");
   return `${NAMES[request_.kind] || request_.kind} ${what}`.trim();
 }
 
+/** Return a time as people read it: "43 s", "2 min 05 s", "1 h 20 min". */
 export function duration(seconds) {
   const s = Math.round(seconds);
-  return s < 90 ? `${s} s` : `${Math.floor(s / 60)} min ${s % 60} s`;
+  if (s < 60) return `${s} s`;
+  const two = (count) => String(count).padStart(2, "0");
+  return s < 3600 ? `${Math.floor(s / 60)} min ${two(s % 60)} s` : `${Math.floor(s / 3600)} h ${two(Math.floor((s % 3600) / 60))} min`;
 }
 
-/** Fill a box with a job: progress, question, buttons, outcome. */
+/** Show a job in a box: progress, question, buttons, outcome. */
 export function showJob(box, job) {
   if (!job) return box.replaceChildren();
   const post = (what, body) => () => act(() => request("POST", `/jobs/${job.id}/${what}`, body));
@@ -229,7 +246,7 @@ export function showJob(box, job) {
     );
   }
   if (job.result_text) parts.push(...job.result_text.split("\n").map((text) => h("p", {}, text)));
-  if (job.error) parts.push(h("p", { class: "badtext" }, `Error ${job.error.code}: ${job.error.what}`), h("p", {}, `Next step: ${job.error.next_step}`));
+  if (job.error) parts.push(h("p", { class: "error" }, `Error ${job.error.code}: ${job.error.what}`), h("p", {}, `Next step: ${job.error.next_step}`));
   if (job.resume) {
     parts.push(h("div", { class: "row" }, h("button", { onclick: () => submit(job.resume) }, "Continue"), job.command && h("code", {}, job.command)));
   }
@@ -237,7 +254,7 @@ export function showJob(box, job) {
   return undefined;
 }
 
-/** Follow the newest job of some kinds in a box; call `changed` with it. */
+/** Show the newest job of these kinds in a box; call `changed` with it. */
 export function followJobs(box, kinds, changed = () => {}) {
   let shown = null;
   const take = (job) => {
@@ -269,12 +286,12 @@ export function table(element, head, rows) {
 }
 
 export async function start() {
-  await act(loadMe); // leads to the login if there is none
+  await act(loadMe); // without a valid token, the browser shows the login page
   on("hello", () => act(async () => {
     await loadMe();
     const status = await request("GET", "/status");
-    tell("status", status);
-    tell("catalog", status.catalog);
+    dispatch("status", status);
+    dispatch("catalog", status.catalog);
   }));
   listen();
 }
