@@ -322,4 +322,4 @@ def test_comparison_of_two_candidates_is_shown_with_its_picture() -> None:
         assert [attrs["alt"] for tag, attrs in page.tags if tag == "img"].count(alt) == pictures
         text = " ".join(page.texts)
         assert f"Compared with {NAMES[0]} and {NAMES[1]} pixel by pixel" in text
-        assert ("differs here" in text) == bool(pictures)
+        assert ("the differences in red" in text) == bool(pictures)
