@@ -1,9 +1,9 @@
-# Two commands matter: `make demo` and `make test`. Both set up everything in .venv, without root, and may be run again.
+# The most important commands are `make demo` and `make test`. Both set up .venv, need no root, and can be run again.
 
 PYTHON ?= python3
 BIN    := .venv/bin
 READY  := .venv/.ready
-# With several threads small matrix products wait for each other; one is faster here.
+# One thread is faster here: with several threads, small matrix products wait for each other.
 export OPENBLAS_NUM_THREADS ?= 1
 
 LIBRARY := hbr/kernels/_kernels.so
@@ -15,10 +15,10 @@ help:
 	@echo "make web    show the simulated bench in a browser"
 	@echo "make test   run the tests (two to four minutes on two idle cores)"
 	@echo "make test-nightly  run all tests, with many more cases in each"
-	@echo "make test-kills  kill the program at a hundred points of its work, and check what is left"
-	@echo "make test-web   use the pages in a real browser, and attack the server"
+	@echo "make test-kills  kill the program at a hundred points of its work, and check the stored data"
+	@echo "make test-web   test the pages in a real browser, and attack the server"
 	@echo "make kernel-test  run the program with Linux's real drivers in a virtual machine"
-	@echo "make test-servers  test catalogs on PostgreSQL and S3, Dask and bluesky with real servers"
+	@echo "make test-servers  test PostgreSQL, S3, Dask and bluesky with real servers"
 	@echo "make fuzz   attack every kind of input for about an hour (a part of test-nightly)"
 	@echo "make lint   check formatting, lint, types and import contracts"
 	@echo "make docs   build the documentation as a site in site/"
@@ -35,21 +35,21 @@ web: $(READY) $(LIBRARY)
 test: $(READY) $(LIBRARY)
 	@$(BIN)/python -m pytest -n auto --dist worksteal -rs
 
-# This selects the tests marked nightly, too; the kernel tests need the whole computer for themselves.
+# This also selects the tests marked nightly. It leaves out the kernel tests, which need the whole computer.
 test-nightly: $(READY) $(LIBRARY)
 	@$(BIN)/python -m pytest -n auto --dist worksteal -rs -m "not kernel" --hypothesis-profile=nightly
 
-# A hundred kills of the program at different points of eleven kinds of work; a thousand with KILLS=90.
+# Kill the program a hundred times at different points of eleven kinds of work, or a thousand times with KILLS=90.
 KILLS ?= 8
 test-kills: $(READY) $(LIBRARY)
 	@RIG_TEST_KILLS=$(KILLS) $(BIN)/python -m pytest -n auto --dist worksteal --timeout 3600 tests/faults/test_kill*.py
 
-# Needs Debian's chromium. The packages of these tests are large, so only this target installs them.
+# This needs Debian's chromium. The packages of these tests are large, so only this target installs them.
 test-web: $(READY) $(LIBRARY)
 	@sh .ci/install .ci/browser.lock
 	@$(BIN)/python -m pytest -rs -m "" --timeout 300 tests/browser
 
-# Installs nothing; docs/how-to/test-with-real-drivers.md says where the kernel comes from (docs/decisions/0043).
+# This installs nothing. docs/how-to/test-with-real-drivers.md explains how to get the kernel (docs/decisions/0043).
 KERNEL_FOLDER := $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/hbr-rig/kernel
 kernel-test: export RIG_TEST_KERNEL ?= $(KERNEL_FOLDER)
 kernel-test: $(READY) $(LIBRARY)
@@ -59,7 +59,7 @@ kernel-test: $(READY) $(LIBRARY)
 	    "The virtual machine needs: sudo apt-get install --no-install-recommends qemu-system-x86 busybox-static kmod udev"
 	@$(BIN)/python -m pytest -rs -m kernel -o faulthandler_timeout=300 tests/kernel
 
-# Needs Debian's postgresql. The packages of these tests are large, so only this target installs them.
+# This needs Debian's postgresql. The packages of these tests are large, so only this target installs them.
 test-servers: $(READY) $(LIBRARY)
 	@sh .ci/install .ci/servers.lock
 	@$(BIN)/python -m pytest -rs -m "" --timeout 600 tests/servers
@@ -74,7 +74,7 @@ lint: $(READY)
 	@$(BIN)/mypy
 	@$(BIN)/lint-imports
 
-# No network: the theme loads no fonts, and links to other sites are not followed.
+# This uses no network: the theme loads no fonts, and links to other sites are not followed.
 docs: $(READY)
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --clean
 	@echo "Open site/index.html. With search: python3 -m http.server --directory site"
@@ -98,8 +98,8 @@ $(READY): requirements.lock pyproject.toml
 	@sh .ci/setup "$(PYTHON)"
 	@touch $@
 
-# Compiled kernels, if there is a C compiler; NumPy does their work without (docs/decisions/0040).
-# Whether it is current, its digest of the sources says: times do not, if a file was removed.
+# Compile the kernels if there is a C compiler. Without one, NumPy is used instead (docs/decisions/0040).
+# The library contains a digest of its sources, which shows whether it is current. File times do not show a removed file.
 $(LIBRARY): FORCE | $(READY)
 	@$(BIN)/python hbr/kernels/compile.py
 

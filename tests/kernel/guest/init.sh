@@ -1,6 +1,6 @@
 #!/bin/bash
-# The first program of the virtual machine: starts what a computer with Linux runs, then the agent.
-# The kernel's command line says where the kernel's modules, Python and the project are, and the agent's TCP port.
+# The first program of the virtual machine. It starts the services of a computer with Linux, then the agent.
+# The kernel's command line has the paths of the kernel's modules, Python and the project, and the agent's TCP port.
 export PATH=/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin HOME=/root LC_ALL=C.UTF-8
 for word in $(cat /proc/cmdline); do
     case $word in rig.*) declare "${word#rig.}" ;; esac
@@ -16,7 +16,7 @@ start_devices_and_network() {
     echo "udev $(cut -d" " -f1 /proc/uptime)"; busybox hostname kernel-test
     busybox ifconfig lo 127.0.0.1 up
     if [ -x /lib/systemd/systemd-udevd ]; then /lib/systemd/systemd-udevd --daemon; else udevd --daemon; fi
-    modprobe -a virtio_net vhci-hcd i2c-dev  # nothing else that is there at the start is needed, so no `udevadm trigger`
+    modprobe -a virtio_net vhci-hcd i2c-dev  # the tests need no other devices from the start, so no `udevadm trigger`
     udevadm settle --timeout=60; echo "settled $(cut -d" " -f1 /proc/uptime)"
     for _ in {1..100}; do
         network=$(ls /sys/class/net | grep -v '^lo$' | head -1)
