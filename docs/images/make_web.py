@@ -1,4 +1,4 @@
-"""Make the pictures of the web pages: a served simulated bench, photographed by Chromium.
+"""Make the picture of the page Identify: a served simulated bench, photographed by Chromium.
 
 From the checkout, after `make test-web` has installed Playwright: .venv/bin/python docs/images/make_web.py
 """
@@ -19,8 +19,8 @@ RIG = [sys.executable, "-c", "from rig.cli.main import main; main()"]
 
 def main() -> None:
     with tempfile.TemporaryDirectory() as folder, sync_playwright() as driver:
-        given = [f"catalog.path={folder}/catalog", f"state_dir={folder}/state", "bench.sim.speed=20"]
-        given += ['bench.sim.object="mug-star"', "bench.sim.yaw_deg=70"]
+        given = [f"catalog.path={folder}/catalog", f"state_dir={folder}/state", f"calibration_dir={folder}/cal"]
+        given += ["bench.sim.speed=20", 'bench.sim.object="mug-star"', "bench.sim.yaw_deg=70"]
         words = [word for one in given for word in ("--set", one)]
         command = [*RIG, "serve", "--bench", "sim", "--seed", "1", "--port", "0", *words]
         with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as server:
@@ -35,7 +35,7 @@ def main() -> None:
 
 
 def photograph(browser: Any, url: str) -> None:
-    """Enroll some objects, identify one, and take the pictures."""
+    """Enroll some objects, identify one, and take the picture."""
     page = browser.new_page(viewport={"width": 1200, "height": 760})
     page.goto(f"{url}enroll")
     for name in ("mug-star", "mug-white", "lamp"):
@@ -47,13 +47,6 @@ def photograph(browser: Any, url: str) -> None:
     page.click("#start button")
     page.wait_for_selector("#job:has-text('Identify – done')", timeout=120_000)
     page.screenshot(path=HERE / "web-identify.png")
-    page.goto(url)
-    page.wait_for_selector("#state.good")
-    page.fill("#angle", "120")
-    page.click("#goto button")
-    page.wait_for_selector("#job:has-text('Rotate to 120° – done')", timeout=60_000)
-    page.wait_for_timeout(1500)
-    page.screenshot(path=HERE / "web-bench.png")
 
 
 if __name__ == "__main__":

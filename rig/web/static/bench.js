@@ -15,7 +15,7 @@ function dial(status) {
   for (let mark = 0; mark < 360; mark += 30) {
     const [x1, y1] = polar(mark, 90);
     const [x2, y2] = polar(mark, 96);
-    const [tx, ty] = polar(mark, 104);
+    const [tx, ty] = polar(mark, mark % 180 ? 111 : 104); // beside the tick, which otherwise looks like a minus sign
     parts.push(h("line", { x1, y1, x2, y2, stroke: "currentColor" }));
     if (mark % 90 === 0) parts.push(h("text", { x: tx, y: ty + 4 }, `${mark}`));
   }
