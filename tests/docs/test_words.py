@@ -8,8 +8,19 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-FOLDERS = ("hbr", "rig", "sim", "calibration", "examples", "benchmarks", "tests", "docs", "firmware")
-SUFFIXES = {".py", ".md", ".j2", ".toml", ".c", ".h"}
+FOLDERS = ("hbr", "rig", "sim", "calibration", "examples", "benchmarks", "tests", "docs", "firmware", ".github")
+SINGLE_FILES = (
+    "README.md",
+    "CONTRIBUTING.md",
+    "SECURITY.md",
+    "CITATION.cff",
+    "Makefile",
+    "mkdocs.yml",
+    "pyproject.toml",
+)
+SINGLE_FILES += (".pre-commit-config.yaml", ".ci/run", ".ci/setup", ".ci/install", ".ci/wheel")
+SINGLE_FILES += ("firmware/Makefile", "docs/deploy/Dockerfile", "docs/deploy/rig.service")
+SUFFIXES = {".py", ".md", ".j2", ".toml", ".c", ".h", ".js", ".css", ".sh", ".yml", ".yaml"}
 
 REFUSE = r"refus(?:e|es|ed|al|als|ing)"
 # Terms of earlier versions, as regular expressions. They match whole words, also within a name (`_` and case separate).
@@ -64,6 +75,14 @@ ALLOWED_NAMES = frozenset(
         "refused",  # a key of earlier versions
     }
 )
+COMMENTS_AND_STRINGS = re.compile(r"""/\*.*?\*/|//[^\n]*|"(?:\\.|[^"\\\n])*"|'(?:\\.|[^'\\\n])*'|`[^`]*`""", re.DOTALL)
+NAMES = {
+    **dict.fromkeys((".c", ".h"), re.compile(r"\b[A-Za-z_]\w*")),
+    ".js": re.compile(r"\b(?:const|let|var|function|class)\s+([A-Za-z_]\w*)"),
+    ".css": re.compile(r"[.#]([A-Za-z][\w-]*)"),
+    ".j2": re.compile(r"""\b(?:id|class)="([^"{]*)"""),
+}
+"""Expressions that find the names in files of other languages, by suffix."""
 EXCEPTIONS: dict[str, tuple[str, ...]] = {
     "docs/glossary.md": RETIRED,  # it lists them
     "docs/style.md": (r"anew", r"anyhow"),  # examples of what not to write
@@ -93,7 +112,7 @@ def files() -> Iterator[Path]:
         for path in sorted((ROOT / folder).rglob("*")):
             if path.suffix in SUFFIXES and "migrations" not in path.parts and "data" not in path.parts:
                 yield path
-    yield from (ROOT / name for name in ("README.md", "CONTRIBUTING.md", "SECURITY.md", "Makefile", "mkdocs.yml"))
+    yield from (ROOT / name for name in SINGLE_FILES)
 
 
 def retired_terms() -> list[str]:
@@ -122,9 +141,16 @@ def words(line: str) -> str:
     return re.sub(r"(?<=[a-z])(?=[A-Z])", " ", line).replace("_", " ")
 
 
-def named(tree: ast.AST) -> Iterator[tuple[str, int]]:
-    """Yield each name that a module defines, with its line."""
-    for node in ast.walk(tree):
+def named(content: str, suffix: str = ".py") -> Iterator[tuple[str, int]]:
+    """Yield each name that a file defines, with its line."""
+    if suffix in NAMES:
+        code = (
+            COMMENTS_AND_STRINGS.sub(lambda found: "\n" * found[0].count("\n"), content) if suffix != ".j2" else content
+        )
+        for number, line in enumerate(code.splitlines(), 1):
+            yield from ((name, number) for found in NAMES[suffix].findall(line) for name in found.split())
+        return
+    for node in ast.walk(ast.parse(content)):
         match node:
             case ast.FunctionDef(name=name) | ast.ClassDef(name=name) | ast.arg(arg=name):
                 yield name, node.lineno
@@ -137,11 +163,12 @@ def test_no_name_has_a_retired_word():
     found = [
         f"{path.relative_to(ROOT)}:{line}: {name}"
         for path in files()
-        if path.suffix == ".py" and any_of_them.search(words(content := path.read_text(encoding="utf-8")).lower())
-        for name, line in named(ast.parse(content))
+        if path.suffix in {".py", *NAMES}
+        and any_of_them.search(words(content := path.read_text(encoding="utf-8")).lower())
+        for name, line in named(content, path.suffix)
         if name not in ALLOWED_NAMES
         and not name.startswith("test_")
-        and RETIRED_NAMES & set(words(name).lower().split())
+        and RETIRED_NAMES & set(words(name).lower().replace("-", " ").split())
     ]
     assert not found, "\n".join([f"{len(found)} names with retired words:", *found])
 
@@ -157,7 +184,20 @@ def test_no_name_has_a_retired_word():
 def test_retired_phrases_and_names_are_found(text, name):
     assert any(re.search(rf"\b(?:{term})\b", text, re.IGNORECASE) for term in RETIRED)
     assert RETIRED_NAMES & set(words(name).lower().split())
-    assert [found for found, _ in named(ast.parse(f"def {name}(): ..."))] == [name]
+    assert [found for found, _ in named(f"def {name}(): ...")] == [name]
+
+
+@pytest.mark.parametrize(
+    ("suffix", "content", "names"),
+    [
+        (".c", 'int next_look = 1; /* turn */ // told\nputs("turn it");', ["int", "next_look", "puts"]),
+        (".js", "const turnTable = `turn ${by}`;\nfunction told() {}", ["turnTable", "told"]),
+        (".css", ".look-at { color: #fff; }\n#turn:hover { margin: .5rem; }", ["look-at", "fff", "turn"]),
+        (".j2", '<p id="look" class="turn quiet">Turn</p>', ["look", "turn", "quiet"]),
+    ],
+)
+def test_names_are_found_in_files_of_other_languages(suffix, content, names):
+    assert [name for name, _ in named(content, suffix)] == names
 
 
 def test_no_retired_term_is_used():
