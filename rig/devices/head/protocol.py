@@ -121,7 +121,7 @@ class Hello:
 
 @dataclass(frozen=True, slots=True)
 class Heartbeat:
-    """Heartbeat of the host; as long as its reply, so that both take the same time on the wire."""
+    """Heartbeat of the host. It has as many bytes as its reply, so that both take the same time on the wire."""
 
     ID: ClassVar[int] = 0x02
     LAYOUT: ClassVar[Struct] = Struct("<HIII")
