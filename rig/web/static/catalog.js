@@ -1,4 +1,4 @@
-import { $, API, act, canOperate, h, on, request, start } from "./rig.js";
+import { $, API, act, canOperate, counted, h, on, request, start } from "./rig.js";
 
 let next = null;
 let shown = 0;
@@ -13,12 +13,12 @@ async function load(more) {
   shown += page.items.length;
   next = page.next;
   $("more").hidden = next === null;
-  $("count").textContent = page.total === 1 ? "1 object" : `${page.total} objects`;
+  $("count").textContent = counted(page.total, "object");
   $("objects").append(...page.items.map(card));
 }
 
 function card(one) {
-  const views = one.unfinished_views !== null ? `interrupted, ${one.unfinished_views} views` : `${one.views} views`;
+  const views = one.unfinished_views !== null ? `interrupted, ${counted(one.unfinished_views, "view")}` : counted(one.views, "view");
   const image = one.picture === null ? null : h("img", { src: `${API}/views/${one.picture}/image`, alt: "", loading: "lazy" });
   const action = $("deleted").checked ? () => act(async () => { await request("POST", "/undelete", { name: one.name }); await load(false); }) : () => act(() => open(one.name));
   return h("li", {}, h("button", { onclick: action }, image, h("strong", {}, one.name), h("br"), h("span", { class: "soft" }, $("deleted").checked ? "Restore" : `${one.label ? `${one.label}, ` : ""}${views}`)));
@@ -62,7 +62,7 @@ function ring(views) {
 
 async function upload(file) {
   const done = await request("POST", "/import", file);
-  $("count").textContent = `Imported ${done.objects} objects with ${done.views} views.`;
+  $("count").textContent = `Imported ${counted(done.objects, "object")} with ${counted(done.views, "view")}.`;
   await load(false);
 }
 

@@ -1,5 +1,5 @@
 // Calibrations, runs, log and settings: each part runs on the page that has its element.
-import { $, API, act, followJobs, h, on, percent, request, start, submit, table, whoami } from "./rig.js";
+import { $, API, act, counted, followJobs, h, on, percent, request, start, submit, table, whoami } from "./rig.js";
 
 let next = null;
 async function more(path, add) {
@@ -29,7 +29,7 @@ if ($("runs")) {
       h("button", { onclick: () => act(async () => {
         $("checked").textContent = "Computing again …";
         const done = await request("POST", `/runs/${name}/check`);
-        $("checked").textContent = done.differences.length ? `${done.differences.length} numbers differ: ${done.differences.slice(0, 3).join("; ")}` : `Computed again: ${done.views} descriptors and ${done.decisions} decisions. All are as saved.`;
+        $("checked").textContent = done.differences.length ? `${counted(done.differences.length, "difference")}: ${done.differences.slice(0, 3).join("; ")}` : `Computed again: ${counted(done.views, "descriptor")} and ${counted(done.decisions, "decision")}. All are as saved.`;
       }) }, "Compute again"));
     $("replay").replaceChildren(...run.events.filter((event) => event.text).map((event) => h("li", {}, event.text)));
   };

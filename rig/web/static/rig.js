@@ -30,6 +30,9 @@ export function number(value, decimals = null) {
   return Number(digits) < 0 ? digits.replaceAll("-", "−") : digits.replace(/^-/, "");
 }
 
+/** Return "1 view", "2 views". */
+export const counted = (count, noun) => `${count} ${noun}${count === 1 ? "" : "s"}`;
+
 /** Return a probability in percent; "<0.1 %" and ">99.9 %" at the ends. */
 export function percent(probability) {
   if (probability > 0.999) return ">99.9 %";
