@@ -1,4 +1,4 @@
-"""Hit-rates of the dense filter under each perturbation alone, at three strengths."""
+"""Hit rates of the dense filter under each perturbation alone, at three strengths."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace

@@ -1,4 +1,4 @@
-"""Results of runs: hit-rates by the number of views, decisions, pose errors, and comparisons of methods."""
+"""Results of runs: hit rates by the number of views, decisions, pose errors, and comparisons of methods."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -78,7 +78,7 @@ class MethodResult:
 
 @dataclass(frozen=True)
 class Contest:
-    """A comparison of two methods on the same trials; the difference is the first hit-rate minus the second.
+    """A comparison of two methods on the same trials; the difference is the first hit rate minus the second.
 
     The interval comes from resampled objects; McNemar's exact test is for independent trials.
     """

@@ -1,4 +1,4 @@
-"""Confidence intervals of hit-rates, and tests of two methods on the same trials."""
+"""Confidence intervals of hit rates, and tests of two methods on the same trials."""
 
 from math import comb, sqrt
 from statistics import NormalDist
@@ -59,7 +59,7 @@ def mcnemar_exact(only_first: int, only_second: int) -> float:
 
 
 def bootstrap_difference(first: Hits, second: Hits, rng: np.random.Generator) -> tuple[float, float]:
-    """Return the 95 % percentile interval of the difference of two hit-rates, by resampling complete objects.
+    """Return the 95 % percentile interval of the difference of two hit rates, by resampling complete objects.
 
     The trials of one object are similar: an interval for independent trials would be too narrow.
 

@@ -1,4 +1,4 @@
-"""The figures of the paper, drawn from results: hit-rate against views (Fig. 6) and pose error by object (Fig. 5)."""
+"""The figures of the paper, drawn from results: hit rate against views (Fig. 6) and pose error by object (Fig. 5)."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -31,7 +31,7 @@ _STYLES: Final = {
 }
 _OTHERS: Final = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", INK, "#8a8f96", "#b08900")
 _BEST_10: Final = ("#b08900", False)
-_HIT_RATE: Final = Axis("hit-rate, %")
+_HIT_RATE: Final = Axis("hit rate, %")
 #: More bands than these hide each other; the tables have all intervals.
 _BANDS: Final = ("hbr", "ahbr", "dense")
 
@@ -52,7 +52,7 @@ def figures(results: dict[str, Any]) -> dict[str, Chart]:
 
 
 def hit_rate_figure(results: dict[str, Any]) -> Chart:
-    """Return the hit-rate against the number of views, with 95 % Wilson intervals, and Best 10 of HBR (Fig. 6)."""
+    """Return the hit rate against the number of views, with 95 % Wilson intervals, and Best 10 of HBR (Fig. 6)."""
     series = []
     for m, method in enumerate(results["methods"]):
         colour, dashed = _style(method["name"], m)
@@ -70,7 +70,7 @@ def hit_rate_figure(results: dict[str, Any]) -> Chart:
 
 
 def travel_figure(results: dict[str, Any]) -> Chart:
-    """Return the figure of the hit-rate against the mean rotation."""
+    """Return the figure of the hit rate against the mean rotation."""
     series = []
     for m, method in enumerate(results["methods"]):
         if method["name"] in ("single", "hbr-visual", "hbr-0", "hbr-0-orient"):
@@ -105,7 +105,7 @@ def pose_figure(results: dict[str, Any], methods: Sequence[dict[str, Any]]) -> C
 
 
 def _sweep_figure(results: dict[str, Any], methods: Sequence[dict[str, Any]], prefix: str, x_label: str) -> Chart:
-    """Return the hit-rate against a setting for several numbers of views; the setting's values have equal distances."""
+    """Return the hit rate against a setting for several numbers of views; the setting's values have equal distances."""
     values = [method["name"].removeprefix(prefix) for method in methods]
     series = []
     for i, n in enumerate(range(2, len(methods[0]["curve"]) + 1, 2)):

@@ -20,7 +20,7 @@ _Enrolled = dict[bool, Views]
 
 
 def run_matrix(plan: Plan, jobs: Jobs, advance: Callable[[str], None]) -> dict[str, Any]:
-    """Return the hit-rate of every cell after each number of views, as JSON values; equal plans give equal values.
+    """Return the hit rate of every cell after each number of views, as JSON values; equal plans give equal values.
 
     `advance` is called with the name of each object after its enrollment and after its searches.
 
@@ -62,13 +62,13 @@ def run_matrix(plan: Plan, jobs: Jobs, advance: Callable[[str], None]) -> dict[s
 
 
 def matrix_rows(results: dict[str, Any]) -> Rows:
-    """Return a table: perturbations by strengths, with the hit-rates in percent after one view and after all."""
+    """Return a table: perturbations by strengths, with the hit rates in percent after one view and after all."""
     by_kind: dict[str, dict[int, str]] = {}
     for row in results["matrix"]:
         one, last = (f"{100 * row['hit_rate'][n]:.1f}" for n in (0, -1))
         by_kind.setdefault(row["kind"], {})[row["strength"]] = f"{one} / {last}"
     views = len(results["matrix"][0]["hit_rate"])
-    heads = [f"hit-rate, %, N = 1 / {views}", "strength 1", "2", "3"]
+    heads = [f"hit rate, %, N = 1 / {views}", "strength 1", "2", "3"]
     return Rows(heads, [[kind, *(own.get(s, own.get(0, "")) for s in (1, 2, 3))] for kind, own in by_kind.items()])
 
 

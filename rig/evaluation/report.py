@@ -84,7 +84,7 @@ class Rows(NamedTuple):
 
 
 def curve_rows(results: dict[str, Any], *, interval: bool = False) -> Rows:
-    """Return hit-rates in percent by method and number of views, optionally with intervals, and Best 10."""
+    """Return hit rates in percent by method and number of views, optionally with intervals, and Best 10."""
     count = max(len(method["curve"]) for method in results["methods"])
     rows = []
     for method in results["methods"]:
@@ -96,7 +96,7 @@ def curve_rows(results: dict[str, Any], *, interval: bool = False) -> Rows:
             ]
         best10 = f"{100 * method['curve'][-1]['best10_rate']:.1f}"
         rows.append([method["label"], *cells, *[""] * (count - len(cells)), best10])
-    return Rows(["hit-rate, %, at N =", *(str(n) for n in range(1, count + 1)), "best 10"], rows)
+    return Rows(["hit rate, %, at N =", *(str(n) for n in range(1, count + 1)), "best 10"], rows)
 
 
 def decision_rows(results: dict[str, Any]) -> Rows:

@@ -17,8 +17,8 @@ from rig.evaluation.plan import Plan
 from rig.evaluation.report import contest_sentences, csv_text, curve_rows, decision_rows, evaluate
 
 _HEADINGS = {
-    "hit-rate": ("Hit-rate", "Shaded: Wilson's 95 % intervals of HBR, AHBR and Best 10, for independent trials."),
-    "travel": ("Hit-rate by degrees of rotation", "The same points by the sum of the rotations before them."),
+    "hit-rate": ("Hit rate", "Shaded: Wilson's 95 % intervals of HBR, AHBR and Best 10, for independent trials."),
+    "travel": ("Hit rate by degrees of rotation", "The same points by the sum of the rotations before them."),
     "pose": (
         "Pose",
         "Trials that found the object. Symmetry-aware: error to the nearest orientation in which the object is as "
@@ -92,12 +92,12 @@ def _page(results: dict[str, Any], drawn: Mapping[str, Chart]) -> str:
         contests=contest_sentences(results),
         figures=[(*_HEADINGS[name], Markup(figure.svg())) for name, figure in drawn.items()],
         tables=[
-            ("Hit-rates", "Percent, with Wilson's 95 % interval; best 10 after all views.", *curves),
+            ("Hit rates", "Percent, with Wilson's 95 % interval; best 10 after all views.", *curves),
             (
                 "Decisions and poses",
                 f"A search of the paper ends when the best object leads by {stopping['margin']:g} per view, one "
                 "with the dense filter by the stopping rule calibrated on enrolled views; both end after all views. "
-                "Columns: number of views (mean, 95th percentile), hit-rate, share of unknown, mean sum of rotations; "
+                "Columns: number of views (mean, 95th percentile), hit rate, share of unknown, mean sum of rotations; "
                 "pose error after all views in the trials that found the object (median and RMSE, then symmetry-aware, "
                 "then the median of objects without symmetry); median time of the last step.",
                 *decisions,
