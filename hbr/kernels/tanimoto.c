@@ -40,9 +40,8 @@ EXPORT void hbr_tanimoto(const uint8_t *a, int64_t stride_a, int64_t count_a, co
 }
 
 /* Store the `kept` rows with the largest coefficients, best first; of equal ones, the first. */
-FOR_EVERY_PROCESSOR
-EXPORT void hbr_tanimoto_top(const uint8_t *asked, const uint8_t *rows, int64_t stride, int64_t length,
-                             const int32_t *squares, int64_t count, int64_t kept, int64_t *best, double *similar) {
+PART void top(const uint8_t *asked, const uint8_t *rows, int64_t stride, int64_t length, const int32_t *squares,
+              int64_t count, int64_t kept, int64_t *best, double *similar) {
     int16_t query[LONGEST];
     const int32_t square = expanded(asked, length, query);
     int64_t found = 0;
@@ -57,4 +56,12 @@ EXPORT void hbr_tanimoto_top(const uint8_t *asked, const uint8_t *rows, int64_t 
         similar[k] = value;
         best[k] = i;
     }
+}
+
+FOR_EVERY_PROCESSOR
+EXPORT void hbr_tanimoto_top(const uint8_t *asked, const uint8_t *rows, int64_t stride, int64_t length,
+                             const int32_t *squares, int64_t count, int64_t kept, int64_t *best, double *similar) {
+    /* A length that the compiler knows saves the loop's overhead for each row; 144 is the length of CEDD. */
+    if (length == 144) top(asked, rows, stride, 144, squares, count, kept, best, similar);
+    else top(asked, rows, stride, length, squares, count, kept, best, similar);
 }
