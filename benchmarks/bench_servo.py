@@ -1,7 +1,7 @@
 """Time of reading a servo's status by the rig's driver, compared with the SDK's read of the same registers.
 
-The port is in memory, so that a transaction needs only processor time: with the simulated servo, and with an answer
-that is repeated from memory, which measures only driver and SDK. Run: python -m benchmarks.bench_servo
+The port is in memory, so that a transaction needs only processor time: with the simulated servo, and with answers
+that are repeated from memory, which measures only driver and SDK. Run: python -m benchmarks.bench_servo
 """
 
 import time
@@ -27,15 +27,16 @@ FIRST, SIZE = TABLE["Moving"].address, TABLE["Present Temperature"].address + 1 
 
 
 class RepeatingSerial(SimSerial):
-    """A simulated port that repeats one answer after `record`."""
+    """A simulated port that repeats recorded answers after `record`."""
 
-    def record(self, answer: bytes) -> None:
-        self._answer, self._left = answer, b""
+    def record(self, answers: dict[bytes, bytes]) -> None:
+        """Answer each of these requests from memory from now on."""
+        self._answers, self._left = answers, b""
         self.read, self.write = self._play, self._again  # type: ignore[method-assign]
         self.reset_input_buffer = lambda: None  # type: ignore[method-assign]
 
     def _again(self, data: bytes, /) -> int:
-        self._left = self._answer
+        self._left = self._answers[data]
         return len(data)
 
     def _play(self, size: int = 1) -> bytes:
@@ -55,23 +56,31 @@ def best_us(calls: list[Callable[[], object]]) -> list[float]:
     return best
 
 
-def opened() -> tuple[RegisterServo, RepeatingSerial, list[Frame]]:
-    """Return a driver of a simulated servo, its port, and the frames on the bus."""
+def opened() -> tuple[RegisterServo, RepeatingSerial, ServoBus]:
+    """Return a driver of a simulated servo, its port, and the bus between them."""
     world = World(noise=NoiseModel.none())
     bus = ServoBus(world.clock)
     bus.attach(XSeriesServo(world, baudrate=BAUD))
-    wire = RepeatingSerial(bus, BAUD, READ_SLICE_S)
-    servo = open_servo(wire, ServoConfig(baud=BAUD), world.clock)
+    port = RepeatingSerial(bus, BAUD, READ_SLICE_S)
+    servo = open_servo(port, ServoConfig(baud=BAUD), world.clock)
     servo.prepare(write=True)
+    return servo, port, bus
+
+
+def answers_of(bus: ServoBus, calls: list[Callable[[], object]]) -> dict[bytes, bytes]:
+    """Return the servo's answer to each request of these calls. The driver alternates between two requests."""
     frames: list[Frame] = []
     bus.taps.append(frames.append)
-    servo.read_state()
+    for call in calls * 4:
+        call()
     bus.taps.clear()
-    return servo, wire, frames
+    requests = [frame.data for frame in frames if frame.source is Source.HOST]
+    answers = [frame.data for frame in frames if frame.source is Source.DEVICE]
+    return dict(zip(requests, answers, strict=True))
 
 
-def bare_read(servo: RegisterServo, wire: SimSerial) -> Callable[[], None]:
-    port, sdk = ClockedPort(wire, servo.bus.port.clock), Protocol2PacketHandler()
+def bare_read(servo: RegisterServo, serial: SimSerial) -> Callable[[], None]:
+    port, sdk = ClockedPort(serial, servo.bus.port.clock), Protocol2PacketHandler()
 
     def read() -> None:
         _, result, _ = sdk.readTxRx(port, 1, FIRST, SIZE)
@@ -82,10 +91,11 @@ def bare_read(servo: RegisterServo, wire: SimSerial) -> Callable[[], None]:
 
 def main() -> None:
     for name, repeated in (("simulated servo", False), ("repeated answer", True)):
-        servo, wire, frames = opened()
+        servo, serial, bus = opened()
+        calls = [servo.read_state, bare_read(servo, serial)]
         if repeated:
-            wire.record(next(frame.data for frame in frames if frame.source is Source.DEVICE))
-        driver_us, bare_us = best_us([servo.read_state, bare_read(servo, wire)])
+            serial.record(answers_of(bus, calls))
+        driver_us, bare_us = best_us(calls)
         ratio = driver_us / bare_us
         limit = "" if repeated else f" (at most {LIMIT})"
         print(
