@@ -70,6 +70,9 @@ def main() -> None:
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
     first, last = (int(number) for number in arguments.objects.split("-"))
+    if not arguments.folder.is_dir():
+        print(f"Not measured: the segmentation needs photographs, and {arguments.folder} does not exist.")
+        return
     dataset = load_coil(arguments.folder).subset(first, last)
     size = read_photograph(dataset.objects[0].photographs[0].path).shape[1::-1]
     protocol = Protocol(trials=arguments.trials, max_views=4, enrolled=18)

@@ -64,7 +64,7 @@ def main() -> None:
     parser.add_argument("--queries", type=int, default=2, help="of each object")
     given = parser.parse_args()
     if not given.folder.is_dir():
-        print(f"{given.folder} does not exist: the comparison with SIFT needs photographs")
+        print(f"Not measured: the comparison with SIFT needs photographs, and {given.folder} does not exist.")
         return
     cv2.setNumThreads(1)
     first, last = map(int, given.objects.split("-"))
