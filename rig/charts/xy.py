@@ -228,6 +228,10 @@ def _scale(axes: "Axes", axis: Axis, which: str) -> None:
     set_limits((high, low) if axis.falling else (low, high))
 
 
+def _two_decimals(number: re.Match[str]) -> str:
+    return f"{float(number[0]):.2f}".rstrip("0").rstrip(".")
+
+
 def _compact(svg: str, label: str, *, themed: bool) -> str:
     """Return Matplotlib's SVG with an alternative text, free to scale, without what a page does not need."""
     svg = svg[svg.index("<svg") :]
@@ -235,7 +239,7 @@ def _compact(svg: str, label: str, *, themed: bool) -> str:
     body = svg[svg.index(">") + 1 :]
     body = re.sub(r"<metadata>.*?</metadata>|<!--.*?-->", "", body, flags=re.DOTALL)
     body = re.sub(r'<g id="[a-z_0-9.]+"', "<g", body)  # ids would repeat on a page of several charts
-    body = re.sub(r"-?\d+\.\d{3,}", lambda m: f"{float(m[0]):.2f}".rstrip("0").rstrip("."), body)
+    body = re.sub(r"<[^>]*>", lambda tag: re.sub(r"-?\d+\.\d{3,}", _two_decimals, tag[0]), body)  # not in the texts
     body = re.sub(r"\s*\n\s*", " ", body)
     body = re.sub(r"font: ([^;\"]*?)'DejaVu Sans'[^;\"]*", r"font: \1system-ui, 'DejaVu Sans', sans-serif", body)
     if themed:

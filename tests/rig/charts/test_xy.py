@@ -74,6 +74,13 @@ def test_svg_scales_has_a_label_and_equal_bytes_for_equal_charts() -> None:
     assert again.svg() == CHART.svg()
 
 
+def test_numbers_in_titles_and_at_ticks_keep_their_decimals() -> None:
+    axis = Axis("score", ticks=(0.0025, 0.005, 0.0075))
+    chart = Chart("noise gn:0.012", Axis("view"), axis, [Series("σ = 0.125", (1, 2), (0.0025, 0.0075))])
+    texts = [text.strip() for text in re.findall(r">([^<>]+)<", chart.svg())]
+    assert {"noise gn:0.012", "σ = 0.125", "0.0025", "0.005", "0.0075"} <= set(texts)
+
+
 def test_two_charts_of_a_page_share_no_ids() -> None:
     other = Chart("another", CHART.x, CHART.y, (Series("", [5], [6], LIMIT),))
     ids = [set(re.findall(r' id="([^"]+)"', chart.svg())) for chart in (CHART, other)]
