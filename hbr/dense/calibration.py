@@ -3,7 +3,7 @@
 `leave_one_out` searches for every object, `fit_stopping_rule` sets the thresholds from these searches, and
 `fit_open_set` fits the open-set score to changes of the bench (`hbr.dense.shifted_searches`).
 
-Decisions: docs/decisions/0026, docs/decisions/0049, docs/decisions/0062, docs/decisions/0064.
+Decisions: docs/decisions/0026, docs/decisions/0049, docs/decisions/0059, docs/decisions/0060.
 """
 
 from collections.abc import Callable, Iterable, Sequence

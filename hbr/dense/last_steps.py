@@ -2,7 +2,7 @@
 
 The bench takes the same two steps one by one, because each of them is an event (`rig.search.local_step`).
 
-Decisions: docs/decisions/0058, docs/decisions/0062.
+Decisions: docs/decisions/0057, docs/decisions/0059.
 """
 
 from collections.abc import Callable, Sequence

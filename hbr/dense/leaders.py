@@ -2,7 +2,7 @@
 
 The bench, its replay and `rig eval` take this step in the same way.
 
-Decision: docs/decisions/0058.
+Decision: docs/decisions/0057.
 """
 
 from collections.abc import Callable, Sequence

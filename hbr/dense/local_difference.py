@@ -11,7 +11,7 @@ for enrolled views in place of the views of the search; each is left out of the 
 scores show whether the objects can be distinguished from these sides, and how much a score scatters. Cantelli's
 inequality bounds the error rate.
 
-Decision: docs/decisions/0058.
+Decision: docs/decisions/0057.
 """
 
 from collections.abc import Sequence

@@ -3,7 +3,7 @@
 The fit compares logarithms of the brightness and of two ratios of the colours, minus their medians: another exposure or
 another colour of the light only adds a constant to them.
 
-Decision: docs/decisions/0062.
+Decision: docs/decisions/0059.
 """
 
 from dataclasses import dataclass

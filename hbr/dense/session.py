@@ -1,6 +1,6 @@
 """One search by the dense filter: views in; belief, decision and next best view out.
 
-Decision: docs/decisions/0055.
+Decision: docs/decisions/0054.
 """
 
 from collections.abc import Sequence

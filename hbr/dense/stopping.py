@@ -2,7 +2,7 @@
 
 `hbr.dense.calibration` sets the thresholds, and `StoppingRule.decide` applies them after each view of a search.
 
-Decisions: docs/decisions/0026, docs/decisions/0064.
+Decisions: docs/decisions/0026, docs/decisions/0060.
 """
 
 from dataclasses import dataclass, field, replace

@@ -5,7 +5,7 @@ scale, although its details do not fit. For each view, the enrolled views at the
 The fit is the share of the view's contrast that they explain, in colours that light hardly changes. The fit of the
 leader, and its difference from the fit of the next candidates, are added to the open-set score with weights.
 
-Decisions: docs/decisions/0062, docs/decisions/0064.
+Decisions: docs/decisions/0059, docs/decisions/0060.
 """
 
 from collections.abc import Callable, Sequence

@@ -1,6 +1,6 @@
 """The bench for bluesky (extra ``bluesky``): devices for a RunEngine, and enroll and identify as plans.
 
-Decision: docs/decisions/0053.
+Decision: docs/decisions/0052.
 """
 
 from rig.bluesky.devices import BenchDevices, CameraDevice, FlyScan, ImuDevice, TableDevice

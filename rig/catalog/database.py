@@ -1,6 +1,6 @@
 """The interface of a catalog's database, with two engines: `rig.catalog.sqlite_database` and `rig.catalog.postgres`.
 
-Decision: docs/decisions/0051.
+Decision: docs/decisions/0050.
 """
 
 from abc import ABC, abstractmethod

@@ -3,7 +3,7 @@
 The server stores the key of an enrollment in its log, in the transaction of the delivery, so that nothing is delivered
 twice. If the name of an object is taken, the object stays in the journal until the operator decides.
 
-Decision: docs/decisions/0052.
+Decision: docs/decisions/0051.
 """
 
 import fcntl

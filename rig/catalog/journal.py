@@ -4,7 +4,7 @@ Therefore an enrollment needs no server while it takes its views. A server that 
 Each enrollment has a key. With it the delivery (`rig.catalog.delivery`) finds out whether the server has the enrollment
 already.
 
-Decision: docs/decisions/0052.
+Decision: docs/decisions/0051.
 """
 
 import secrets

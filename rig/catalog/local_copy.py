@@ -3,7 +3,7 @@
 It is an SQLite catalog: the rows of the objects in use with their ids and digests, and the newest empty-table image.
 A search reads it when the server does not answer, and says how old it is.
 
-Decision: docs/decisions/0052.
+Decision: docs/decisions/0051.
 """
 
 import json

@@ -3,7 +3,7 @@
 The tables are those of SQLite. A table ``catalog_properties`` holds what SQLite keeps outside of tables: the kind and
 the version of the database, its id, and the last ids of the append-only tables.
 
-Decision: docs/decisions/0051.
+Decision: docs/decisions/0050.
 """
 
 import uuid

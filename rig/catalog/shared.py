@@ -2,7 +2,7 @@
 
 Commands and the web server open their catalogs here, so that each of them works without the server.
 
-Decision: docs/decisions/0052.
+Decision: docs/decisions/0051.
 """
 
 import threading

@@ -1,6 +1,6 @@
 """The stored views of an enrollment, segmented and described together, as a search segments its views.
 
-Decision: docs/decisions/0054.
+Decision: docs/decisions/0053.
 """
 
 from collections.abc import Hashable, Iterable, Mapping, Sequence

@@ -1,6 +1,6 @@
 """Results of a long job, stored so that the job can continue after an interruption.
 
-Decision: docs/decisions/0065.
+Decision: docs/decisions/0061.
 """
 
 import json

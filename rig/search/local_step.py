@@ -1,6 +1,6 @@
 """The last steps of a doubtful search: the leader is verified, and two leaders are compared, pixel by pixel.
 
-Decisions: docs/decisions/0058, docs/decisions/0062.
+Decisions: docs/decisions/0057, docs/decisions/0059.
 """
 
 from collections.abc import Callable, Sequence

@@ -62,7 +62,7 @@ UNKNOWN_OBJECTS = ("radio", "clock")  # objects that are put on the table but no
 COUNT_OF_FOLDER = 20  # default number of objects of a folder to enroll
 
 VIEWS = 36
-"""Views of each object, unless they are configured. Decision: docs/decisions/0061."""
+"""Views of each object, unless they are configured. Decision: docs/decisions/0058."""
 
 GOOD_SHARE = 0.8
 """Share of right answers below which the demo fails; of two very similar objects, an answer can be wrong."""

@@ -81,11 +81,11 @@ def test_links_out_of_docs_are_rewritten_for_the_site():
     assert copied == {"examples/tray.csv"}
 
 
-def test_decisions_have_numbers_of_their_own_and_are_listed():
+def test_decisions_have_numbers_without_gaps_and_are_listed():
     paths = sorted(DOCS.glob("decisions/0*.md"))
     index = (DOCS / "decisions" / "README.md").read_text(encoding="utf-8")
     numbers = [int(path.name[:4]) for path in paths]
-    assert len(set(numbers)) == len(numbers)
+    assert numbers == list(range(1, len(numbers) + 1))
     for number, path in zip(numbers, paths, strict=True):
         text = path.read_text(encoding="utf-8")
         assert text.startswith(f"# {number:04} ")
