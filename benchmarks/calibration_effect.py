@@ -146,7 +146,7 @@ def main() -> None:
     arguments.add_argument("--orientation", choices=("encoder", "imu"), action="append")
     given = arguments.parse_args()
     print(
-        "| errors | angle by | bench | correct | unknown recognized | enrolled unknown | pose within 15° | RMSE "
+        "| errors | angle by | bench | correct | unknown recognised | enrolled unknown | pose within 15° | RMSE "
         "| table angle, RMS | views |"
     )
     print("|---|---|---|---|---|---|---|---|---|---|")

@@ -30,6 +30,7 @@ from calibration.procedure import Ask, Evaluation, Measured, Procedure, Progress
 from rig.bench import Bench
 from rig.calibrations import CalibrationResult, RejectionCode
 from rig.charts.xy import MEASURED, MODEL, Axis, Chart, Series
+from rig.core.phrases import filled
 from rig.motion.trajectory import SLIP_DEG
 from rig.motion.turntable import Flight, Turntable
 from rig.views.description import within
@@ -62,7 +63,7 @@ def plot(result: CalibrationResult) -> Chart | None:
         Axis("speed, °/s"),
         Axis("angle, °"),
         [
-            Series(f"{slope * 1e3:.2f} ms", ends, [slope * e for e in ends], MODEL, False, True),
+            Series(filled("{:.2f} ms", slope * 1e3), ends, [slope * e for e in ends], MODEL, False, True),
             Series("frames", rates, ahead, MEASURED),
         ],
     )

@@ -23,6 +23,7 @@ from pydantic import (
 from rig.calibrations.rejection import Rejection, stored_rejection
 from rig.core.errors import ConfigError, UsageError, os_errors_as
 from rig.core.files import read, write
+from rig.core.phrases import filled, number
 
 MAX_FILE_BYTES = 10_000_000
 
@@ -38,9 +39,10 @@ class Estimate:
     def __str__(self) -> str:
         """Return value and uncertainty to two digits of the uncertainty."""
         if not self.uncertainty > 0:
-            return f"{self.value:.6g} ± {self.uncertainty:g} {self.unit}".rstrip()
+            return filled("{:.6g} ± {:g} {}", self.value, self.uncertainty, self.unit).rstrip()
         decimals = max(1 - floor(log10(self.uncertainty)), 0)
-        return f"{self.value:.{decimals}f} ± {self.uncertainty:.{decimals}f} {self.unit}".rstrip()
+        value, uncertainty = (number(one, f".{decimals}f") for one in (self.value, self.uncertainty))
+        return f"{value} ± {uncertainty} {self.unit}".rstrip()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -6,7 +6,7 @@ from typing import Final
 
 from rig.charts import svg
 from rig.charts.compass import CENTRE, RIM, SIZE, polar, rim
-from rig.core.phrases import azimuth_words, percent_words, short
+from rig.core.phrases import azimuth_words, filled, percent_words, short
 from rig.events.events import Weighed
 
 _INNER: Final = 34.0
@@ -116,8 +116,8 @@ def _reasons(weighed: Weighed, chosen: int, candidates: Sequence[str]) -> tuple[
 
 def _words(weighed: Weighed, i: int, azimuth_deg: float) -> str:
     similarity = "" if weighed.similarity is None else f"; similarity of the candidates {weighed.similarity[i]:.2f}"
-    confusion, cost = f"{weighed.confusion[i]:.2f}", f"{weighed.cost[i]:.2f}"
-    return f"to {azimuth_words(azimuth_deg)}°: log confusion {confusion}, motion {cost}{similarity}"
+    words = "to {}°: log confusion {:.2f}, motion {:.2f}{}"
+    return filled(words, azimuth_words(azimuth_deg), weighed.confusion[i], weighed.cost[i], similarity)
 
 
 def _radii(values: Sequence[float]) -> list[float]:

@@ -14,6 +14,8 @@ from io import BytesIO, StringIO
 from math import ceil, floor, log10
 from typing import TYPE_CHECKING, Final
 
+from rig.core.phrases import filled
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
@@ -128,7 +130,7 @@ class Chart:
     @property
     def label(self) -> str:
         """Alternative text: title, axes, and the last value of each labelled series."""
-        ends = ", ".join(f"{s.label} {s.y[-1]:.4g}" for s in self.series if s.label and len(s.y))
+        ends = ", ".join(filled("{} {:.4g}", s.label, s.y[-1]) for s in self.series if s.label and len(s.y))
         return f"{self.title}. {self.y.label} against {self.x.label}. Last values: {ends}"
 
     def svg(self, *, themed: bool = False) -> str:

@@ -60,7 +60,7 @@ class FindingCode(Enum):
     WRONG_DATE = "the date is wrong: {utc:%Y-%m-%d %H:%M} UTC: stored data would have a wrong date"
     NOT_SYNCHRONIZED = "{utc:%Y-%m-%d %H:%M} UTC, but no time server has been reached since this computer started"
     NO_TIME_SERVER = "{utc:%Y-%m-%d %H:%M} UTC, no time server that is known here"
-    SYNCHRONIZED = "{utc:%Y-%m-%d %H:%M} UTC, synchronized by a time server"
+    SYNCHRONIZED = "{utc:%Y-%m-%d %H:%M} UTC, synchronised by a time server"
     # servo
     SUPPLY_SWITCHED = "not checked: the rig head's relay switches its supply on only while a program runs"
     SERVO = "{model}, firmware {firmware}, id {id} at {baud} baud, {port}"

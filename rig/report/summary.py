@@ -41,7 +41,7 @@ def totals(
         items.append(SummaryItem("found", f"{right}/{len(known)}", "enrolled objects identified correctly"))
     if unknown:
         right = sum(record.correct is True for record in unknown)
-        items.append(SummaryItem("unknown objects recognized", f"{right}/{len(unknown)}", "objects never enrolled"))
+        items.append(SummaryItem("unknown objects recognised", f"{right}/{len(unknown)}", "objects never enrolled"))
     if answered:
         views_taken = [record.answer.views for record in answered if record.answer]
         travelled = [record.answer.travelled_deg for record in answered if record.answer]

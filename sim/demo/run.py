@@ -197,7 +197,7 @@ def run_demo(
     totals = result.as_dict()
     summary = (
         f"{totals['found']} of {totals['of']} enrolled objects found again and "
-        f"{totals['unknown_recognised']} of {totals['of_unknown']} unknown objects recognized, on the simulated bench."
+        f"{totals['unknown_recognised']} of {totals['of_unknown']} unknown objects recognised, on the simulated bench."
     )
     write_report(result.report, render_report("Demo of the rig", summary, enrollments, trials, meta=meta))
     if not settings.json:
@@ -330,7 +330,7 @@ def _print_totals(result: DemoResult) -> None:
     error = totals["median_pose_error_deg"]
     print(
         f"\n{totals['found']} of {totals['of']} enrolled objects found again, "
-        f"{totals['unknown_recognised']} of {totals['of_unknown']} unknown objects recognized.\n"
+        f"{totals['unknown_recognised']} of {totals['of_unknown']} unknown objects recognised.\n"
         f"{totals['enrolled']} objects enrolled with {totals['views_enrolled']} views. "
         f"{totals['mean_views']:.1f} views per search, {totals['travelled_deg']:.0f}° of rotation in all, "
         f"median pose error {'–' if error is None else f'{error:.1f}°'}.\n"

@@ -9,7 +9,7 @@ from rig.cli.ui.command import command
 from rig.cli.ui.exit_codes import EXIT_DECLINED
 from rig.cli.ui.prompts import ask_yes_no
 from rig.cli.ui.settings import Settings
-from rig.core.phrases import angle_words, budget_words, signed
+from rig.core.phrases import angle_words, budget_words, number, signed
 
 if TYPE_CHECKING:
     from rig.core.errors import RigError
@@ -266,7 +266,7 @@ def _short(value: object) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, float):
-        return f"{value:.4g}"
+        return number(value, ".4g")
     if isinstance(value, dict):
         return "(" + ", ".join(f"{key} {_short(inner)}" for key, inner in value.items()) + ")"
     return str(value) if value not in ((), []) else "none"

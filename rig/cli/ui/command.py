@@ -52,7 +52,7 @@ SeedOption = Annotated[
     int | None, typer.Option("--seed", min=0, metavar="N", help="Seed of the simulated bench.", rich_help_panel=COMMON)
 ]
 NoColorOption = Annotated[
-    bool, typer.Option("--no-color", help="Print without colors, as with NO_COLOR=1.", rich_help_panel=COMMON)
+    bool, typer.Option("--no-color", help="Print without colours, as with NO_COLOR=1.", rich_help_panel=COMMON)
 ]
 JsonOption = Annotated[
     bool, typer.Option("--json", help="Print JSON on stdout and text on stderr.", rich_help_panel=COMMON)
@@ -112,7 +112,7 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
 
 
 def without_color() -> None:
-    """Print without colors from now on, in this program and in those that it starts."""
+    """Print without colours from now on, in this program and in those that it starts."""
     os.environ["NO_COLOR"] = "1"
 
 

@@ -41,7 +41,7 @@ def in_json(tmp_path_factory):
     return demo(*SMALL, "--seed", "3", "--json", "--out", str(out)), out
 
 
-def test_demo_enrolls_and_finds_objects_and_recognizes_unknown_ones(small):
+def test_demo_enrolls_and_finds_objects_and_recognises_unknown_ones(small):
     done, _ = small
     assert done.exit_code in (0, 6)  # with so few views an answer can be wrong: exit code 6
     text = done.stdout
@@ -132,7 +132,7 @@ def test_photographs_are_enrolled_and_found(tmp_path):
 
 
 @pytest.mark.nightly
-def test_default_demo_finds_all_objects_and_recognizes_both_unknown_ones(tmp_path):
+def test_default_demo_finds_all_objects_and_recognises_both_unknown_ones(tmp_path):
     done = demo("--json", "--out", str(tmp_path))
     totals = json.loads(done.stdout.splitlines()[-1])
     assert totals["views_enrolled"] == 16 * 36

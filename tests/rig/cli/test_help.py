@@ -103,7 +103,7 @@ def test_no_color_works_at_any_position(arguments):
     environment.pop("NO_COLOR", None)
     done = subprocess.run([*RIG, *arguments], env=environment, capture_output=True, text=True)
     text = done.stdout + done.stderr
-    assert "\x1b[3" not in text  # no color; bold and dim are allowed
+    assert "\x1b[3" not in text  # no colour; bold and dim are allowed
 
 
 def test_terminal_without_unicode_shows_question_marks(tmp_path):

@@ -199,7 +199,7 @@ def test_network_disk_and_read_only_folder_are_reported(monkeypatch, disk, code,
     assert fixed_by in problem.fix
 
 
-def test_unsynchronized_clock_is_a_warning_and_wrong_date_is_bad():
+def test_unsynchronised_clock_is_a_warning_and_wrong_date_is_bad():
     with unopened(plugged=False) as bench:
         assert bench.problem("clock").code is FindingCode.NO_TIME_SERVER
         bench.computer.keeps_time(synchronised=False)

@@ -97,7 +97,7 @@ def test_page_shows_the_content_of_the_records() -> None:
         ["4", "mug-white", "mug-white", "✓ correct", "2", "90°", "–", "0.910", "+0.100"],
     ]
     assert "found 2/3" in page.text
-    assert "unknown objects recognized 1/1" in page.text
+    assert "unknown objects recognised 1/1" in page.text
     assert "S_left 0.41 < S_right 0.66" in page.text
     assert len([a for a in page.all("svg") if "Camera positions" in a["aria-label"]]) == 4
     assert len([a for a in page.all("svg") if "Scores per view" in a["aria-label"]]) == 4

@@ -142,7 +142,7 @@ class TestIdentification:
         assert found == {
             "objects enrolled": "2",
             "found": "2/3",
-            "unknown objects recognized": "1/2",
+            "unknown objects recognised": "1/2",
             "views to an answer": "2.2",
             "rotation": "96°",
             "pose error": "2.0°",

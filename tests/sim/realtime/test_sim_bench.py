@@ -125,7 +125,7 @@ def test_benches_have_their_own_folders_and_clean_them(start):
         send_command(one, "status")
 
 
-def test_bench_recognizes_the_state_of_a_killed_program(start):
+def test_bench_recognises_the_state_of_a_killed_program(start):
     folder = start("bench", "servo.id=7", "table.limits_deg=[-500, 500]")
     send_command(folder, "quit")
     until(lambda: {path.name for path in folder.iterdir()} == LEFT)
