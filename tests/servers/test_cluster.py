@@ -24,7 +24,7 @@ from rig.core.processes import map_in_processes
 from sim.clock import VirtualClock
 from tests.programs import Program
 from tests.rig.catalog.catalog_samples import finished, true_fill
-from tests.rig.cli.test_evaluate import drawing
+from tests.rig.cli.objects.test_evaluate import drawing
 
 distributed = pytest.importorskip("distributed", reason="Dask is not installed (make test-servers)")
 

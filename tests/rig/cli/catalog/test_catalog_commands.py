@@ -25,8 +25,8 @@ from rig.catalog.exchange import read_folder
 from rig.cli.main import app
 from tests.rig.cli.noise_photographs import photographs
 
-SAMPLE = Path(__file__).parents[1] / "catalog" / "data" / "catalog-v1"
-COIL = Path(os.environ.get("RIG_TEST_DATA", Path(__file__).parents[3] / ".." / "shared" / "data")) / "coil-100"
+SAMPLE = Path(__file__).parents[2] / "catalog" / "data" / "catalog-v1"
+COIL = Path(os.environ.get("RIG_TEST_DATA", Path(__file__).parents[4] / ".." / "shared" / "data")) / "coil-100"
 
 Rig = Callable[..., Result]
 
