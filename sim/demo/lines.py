@@ -9,17 +9,23 @@ from rig.events.lines import line
 from rig.events.wording import share_words
 
 
+def _row(view: object, azimuth: str, rotation: tuple[str, str, str], similarity: tuple[str, str], rest: str) -> str:
+    asked, encoder, imu = rotation
+    first, second = similarity
+    return f"{view:>4}{azimuth:>9}{asked:>8}{encoder:>11}{imu:>18}{first:>12}{second:>11}  {rest}"
+
+
+def _heading(first: str, second: str, candidates: str) -> str:
+    groups = f"{'camera':>13}   {'rotation of the table'}{'similarity of candidates':>36}"
+    names = _row("view", "azimuth", ("asked", "encoder", "IMU"), (first, second), f"{'next view':<12}{candidates}")
+    return f"{groups}\n{names}"
+
+
 class MoveLines:
     """Converts the events of `rig.plans.identify` to lines; a line is complete when the next view is decided."""
 
-    HEADING: ClassVar = (
-        "      camera     rotation of the table                   similarity of candidates\n"
-        "view  azimuth    asked    encoder               IMU        left    right  next view   candidates, score"
-    )
-    DENSE_HEADING: ClassVar = (
-        "      camera     rotation of the table                   similarity of candidates\n"
-        "view  azimuth    asked    encoder               IMU     at next    overall next view   candidates, confidence"
-    )
+    HEADING: ClassVar = _heading("left", "right", "candidates, score")
+    DENSE_HEADING: ClassVar = _heading("at next", "overall", "candidates, confidence")
 
     def __init__(self) -> None:
         self._asked_deg: float | None = None
@@ -52,24 +58,22 @@ class MoveLines:
     def _line(self, decided: Decided | None) -> str:
         assert self._move is not None  # every view follows a Moved event
         move = self._move
-        if self._asked_deg is None:
-            rotated = f"{'–':>8}{'–':>11}{'–':>18}"
-        else:
+        rotation = "–", "–", "–"
+        if self._asked_deg is not None:
             imu = "no value"
             if move.rotation_imu_deg is not None and move.imu_sigma_deg is not None:
                 imu = f"{signed(move.rotation_imu_deg, 2)} ± {move.imu_sigma_deg:.2f}°"
-            rotated = f"{signed(self._asked_deg, 1):>7}°{signed(move.rotation_encoder_deg, 2):>10}°{imu:>18}"
-        similarity = f"{'–':>12}{'–':>9}  "
+            rotation = f"{signed(self._asked_deg, 1)}°", f"{signed(move.rotation_encoder_deg, 2)}°", imu
+        similarity = "–", "–"
         if decided and decided.s_left is not None and decided.s_right is not None:
             left, right = distinct(decided.s_left, decided.s_right, decimals=3)
-            similarity = f"{left:>12}{right:>9}  "
+            similarity = left, right
         if decided and decided.weighed is not None and decided.weighed.similarity is not None:
             weighed = decided.weighed.similarity
             there = weighed[decided.weighed.rotations_deg.index(decided.rotation_deg)]
-            similarity = f"{there:>11.2f}{f'{min(weighed):.2f}–{max(weighed):.2f}':>11} "
+            similarity = f"{there:.2f}", f"{min(weighed):.2f}–{max(weighed):.2f}"
         goes = f"{decided.side:<5} {abs(decided.rotation_deg):3.0f}°" if decided else "–"
         leading = ", ".join(f"{c.name} {share_words(c, self._decision) or f'{c.score:.3f}'}" for c in self._leading)
         note = "" if move.agrees else "  encoder and IMU differ"
-        return (
-            f"{move.index + 1:4d}{azimuth_words(self._azimuth_deg):>8}°{rotated}{similarity}{goes:<11} {leading}{note}"
-        )
+        azimuth = f"{azimuth_words(self._azimuth_deg)}°"
+        return _row(move.index + 1, azimuth, rotation, similarity, f"{goes:<12}{leading}{note}")

@@ -60,6 +60,17 @@ def test_demo_enrolls_and_finds_objects_and_recognises_unknown_ones(small):
     assert "2 objects enrolled with 8 views" in text
 
 
+def test_values_of_the_first_search_end_below_their_headings(small):
+    lines = small[0].stdout.splitlines()
+    at = next(n for n, line in enumerate(lines) if line.startswith("view  azimuth"))
+    headings = [lines[at].index(name) + len(name) for name in ("view", "azimuth", "asked", "encoder", "IMU")]
+    rows = [line for line in lines[at + 1 :] if re.match(r" +\d+ +[\d.]+° ", line)]
+    assert rows
+    for row in rows:
+        values = re.finditer(r"[\d.+−]+ ± [\d.]+°|\S+", row)
+        assert [value.end() for value, _ in zip(values, headings, strict=False)] == headings
+
+
 def test_demo_leaves_only_the_report(small):
     _, out = small
     assert [path.name for path in out.iterdir()] == ["report.html"]
