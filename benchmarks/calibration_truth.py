@@ -32,6 +32,7 @@ from calibration.procedures import (
 )
 from rig.calibrations import CalibrationResult
 from rig.config import load_config
+from rig.core.phrases import in_unit
 from rig.motion.turntable import Turntable
 from rig.views.charuco_board import Board
 from sim.bench import ShelfOperator, open_sim_bench
@@ -231,8 +232,9 @@ def main() -> None:
         for key, pairs in errors.items():
             error, sigma = np.array(pairs).T
             z = error / sigma
+            middle, stated = (in_unit(f"{np.median(one):.2g}", units[key]) for one in (np.abs(error), sigma))
             print(
-                f"| {name} | {key} | {np.median(np.abs(error)):.2g} {units[key]} | {np.median(sigma):.2g} {units[key]} "
+                f"| {name} | {key} | {middle} | {stated} "
                 f"| {np.sqrt((z**2).mean()):.2f} | {(np.abs(z) < 1.96).sum()}/{z.size} |",
                 flush=True,
             )

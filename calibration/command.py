@@ -233,7 +233,7 @@ def report(
         store, calibrations = stored_results(bench)
         notes = [error.what for error in store.unreadable]
         write_page(out, calibrations, store.history(), bench=bench.name, now_utc=bench.clock.utc(), notes=notes)
-    settings.say(str(out), {"file": str(out), "calibrations": [s.result.name for s in calibrations]})
+    settings.say(f"Report: {out}", {"file": str(out), "calibrations": [s.result.name for s in calibrations]})
 
 
 @app.command("show")

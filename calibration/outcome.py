@@ -2,6 +2,8 @@
 
 from typing import TYPE_CHECKING, Any
 
+from rig.core.phrases import in_unit
+
 if TYPE_CHECKING:
     from rig.bench import Bench
     from rig.calibrations import BenchCalibration, CalibrationResult, CalibrationStore
@@ -40,8 +42,8 @@ def outcome_text(result: "CalibrationResult") -> str:
     """Return the outcome of a calibration: its values, or the reasons why it did not pass and the next step."""
     residual = ""
     if result.residual is not None and result.limit is not None:
-        unit = result.residual_unit
-        residual = f" (worst residual {result.residual:.3g} {unit}, limit {result.limit:.3g} {unit})"
+        worst, limit = (in_unit(f"{one:.3g}", result.residual_unit) for one in (result.residual, result.limit))
+        residual = f" (worst residual {worst}, limit {limit})"
     lines = [f"{'PASS' if result.passed else 'FAIL'} {result.name}{residual}"]
     lines += [f"  {name} = {estimate}" for name, estimate in result.estimates.items()]
     lines += [f"  sets {key} = {plain_value(value)}" for key, value in result.settings.items()]

@@ -158,8 +158,7 @@ class RejectionCode(Enum):
         "both are near 1, or use a grey card."
     )
     EXPOSURE_NOT_LOCKED = (
-        "The exposure time is not locked, so that the middle of an exposure changes. Set camera.exposure_us to a "
-        "number."
+        "The exposure time is not locked, so the middle of an exposure changes. Set camera.exposure_us to a number."
     )
     STAMPS_UNUSABLE = (
         "The camera's time stamps cannot be used: they repeat, go backwards, or are not of the computer's clock. Take "

@@ -23,7 +23,7 @@ from pydantic import (
 from rig.calibrations.rejection import Rejection, stored_rejection
 from rig.core.errors import ConfigError, UsageError, os_errors_as
 from rig.core.files import read, write
-from rig.core.phrases import filled, number
+from rig.core.phrases import filled, in_unit, number
 
 MAX_FILE_BYTES = 10_000_000
 
@@ -39,10 +39,10 @@ class Estimate:
     def __str__(self) -> str:
         """Return value and uncertainty to two digits of the uncertainty."""
         if not self.uncertainty > 0:
-            return filled("{:.6g} ± {:g} {}", self.value, self.uncertainty, self.unit).rstrip()
+            return in_unit(filled("{:.6g} ± {:g}", self.value, self.uncertainty), self.unit)
         decimals = max(1 - floor(log10(self.uncertainty)), 0)
         value, uncertainty = (number(one, f".{decimals}f") for one in (self.value, self.uncertainty))
-        return f"{value} ± {uncertainty} {self.unit}".rstrip()
+        return in_unit(f"{value} ± {uncertainty}", self.unit)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

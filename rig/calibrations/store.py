@@ -11,6 +11,7 @@ from typing import Any
 from rig.calibrations.result import CalibrationResult
 from rig.config import RigConfig
 from rig.core.errors import ConfigError, UsageError, os_errors_as
+from rig.core.phrases import counted
 
 CALIBRATIONS = "calibrations"
 """The key in a bench's conditions that names the results in force."""
@@ -44,14 +45,15 @@ class BenchCalibration:
 
     def __str__(self) -> str:
         """Return the status in words."""
-        name, age = self.result.name, f"{self.result.name} was calibrated {self.age_days:.0f} days ago"
+        name, days = self.result.name, round(self.age_days)
+        age = f"{name} was calibrated " + (f"{counted(days, 'day')} ago" if days else "today")
         match self.status:
             case CalibrationStatus.FAILED:
                 return f"{name} never passed: {self.result.rejections[0]}"
             case CalibrationStatus.OTHER_DEVICE:
                 return f"{name} was calibrated on another device: {'; '.join(self.changes)}"
             case CalibrationStatus.EXPIRED:
-                return f"{age}; it is valid for {self.result.valid_days:.0f} days"
+                return f"{age}; it is valid for {counted(round(self.result.valid_days or 0), 'day')}"
             case _:
                 return age
 

@@ -13,6 +13,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from rig.config.toml_file import Key, stated
+from rig.core.phrases import in_unit
 
 _UNITS = {"baud": "bit/s", "width": "px", "height": "px", "fps": "frames/s", "roi": "px"}
 _UNIT_SUFFIXES = {
@@ -88,7 +89,7 @@ def setting_line(info: KeyInfo, value: Any, origin: str) -> str:
 
 def _with_unit(allowed: str, unit: str) -> str:
     """Return allowed values with their unit: ``a number from 1 to 5 s, or none``."""
-    return f"{allowed.removesuffix(_OR_NONE)} {unit}{_OR_NONE * allowed.endswith(_OR_NONE)}" if unit else allowed
+    return in_unit(allowed.removesuffix(_OR_NONE), unit) + _OR_NONE * allowed.endswith(_OR_NONE)
 
 
 def unit(name: str) -> str:

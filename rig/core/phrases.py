@@ -92,6 +92,12 @@ def number(value: float, form: str) -> str:
     return words.replace("-", "−").replace("%", " %")
 
 
+def in_unit(words: str, unit: str) -> str:
+    """Return words with a unit: "12 mm", "70°", "a list of numbers °"; "1.5" without one."""
+    degrees = words[-1:].isdigit() and (unit == "°" or unit.startswith("° "))
+    return f"{words}{unit}" if degrees else f"{words} {unit}".rstrip()
+
+
 def filled(template: str, *values: object, **named: object) -> str:
     """Return a template of `str.format` with its values; numbers with a format are written by `number`."""
     return _FILLER.vformat(template, values, named)

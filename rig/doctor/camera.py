@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from rig.bench.hardware import camera_settings, store_focus
 from rig.core.clock import seconds_between
+from rig.devices.camera import CameraLocks
 from rig.devices.opencv_camera import OpenCvCamera
 from rig.devices.v4l2 import choose_mode
 from rig.doctor.context import DoctorContext
@@ -26,6 +27,20 @@ from rig.doctor.flicker import (
 from rig.safety.saved_state import FileStore
 from rig.views.capture import ImageQuality, rejection_text
 
+_SETTINGS = {
+    "exposure": "exposure_100us",
+    "white balance": "white_balance_k",
+    "gain": "gain",
+    "focus": "focus",
+    "sharpness": "sharpness",
+    "backlight compensation": "backlight_compensation",
+    "power-line frequency": "power_line_frequency",
+    "frame rate": "dynamic_frame_rate",
+}
+"""The camera's setting for each name in words."""
+_MAINS = {0.0: "off", 1.0: "50 Hz", 2.0: "60 Hz", 3.0: "automatic"}
+"""Values of V4L2_CID_POWER_LINE_FREQUENCY (Linux, `v4l2-controls.h`)."""
+_RATE = {True: "varies with the light", False: "constant"}
 QUICK, SPACED, SPACING_S = 5, 6, 0.17
 """Consecutive frames, which show the frame rate, and frames spread over a second, which show flicker."""
 MAX_AGE_S = 0.25
@@ -122,27 +137,36 @@ def _locks(context: DoctorContext, source: OpenCvCamera) -> Iterator[Finding]:
     if not_locked:
         yield warning("camera", FindingCode.NOT_LOCKED, fix, settings=not_locked)
     rejected = {one.setting for one in source.rejected_settings}
-    read_back = (
-        ("exposure", "exposure_100us", None if locks.exposure_us is None else f"{locks.exposure_us / 1e3:g} ms"),
-        ("white balance", "white_balance_k", None if locks.white_balance_k is None else f"{locks.white_balance_k:g} K"),
-        ("gain", "gain", _text(locks.gain)),
-        ("focus", "focus", _text(locks.focus)),
-        ("sharpness", "sharpness", _text(locks.sharpness)),
-        ("backlight compensation", "backlight_compensation", _text(locks.backlight_compensation)),
-        ("power-line frequency", "power_line_frequency", _text(locks.power_line_frequency)),
-        ("frame rate", "dynamic_frame_rate", None if locks.dynamic_frame_rate is None else "constant"),
-    )
     locked = [
         f"{name} {value}"
-        for name, setting, value in read_back
-        if value is not None and name not in not_locked and setting not in rejected
+        for name, value in lock_words(locks).items()
+        if name not in not_locked and _SETTINGS[name] not in rejected
     ]
     if locked:
         yield fine("camera", FindingCode.LOCKED, settings=locked)
 
 
+def lock_words(locks: CameraLocks) -> dict[str, str]:
+    """Return the settings that the camera reports, by name: "exposure": "10 ms"."""
+    words = {
+        "exposure": None if locks.exposure_us is None else f"{locks.exposure_us / 1e3:g} ms",
+        "white balance": None if locks.white_balance_k is None else f"{locks.white_balance_k:g} K",
+        "gain": _text(locks.gain),
+        "focus": _text(locks.focus),
+        "sharpness": _text(locks.sharpness),
+        "backlight compensation": _text(locks.backlight_compensation),
+        "power-line frequency": _mains(locks.power_line_frequency),
+        "frame rate": None if locks.dynamic_frame_rate is None else _RATE[locks.dynamic_frame_rate],
+    }
+    return {name: value for name, value in words.items() if value is not None}
+
+
 def _text(value: float | None) -> str | None:
     return None if value is None else f"{value:g}"
+
+
+def _mains(value: float | None) -> str | None:
+    return None if value is None else _MAINS.get(value, f"{value:g}")
 
 
 def _frames(context: DoctorContext, source: OpenCvCamera) -> Iterator[Finding]:

@@ -49,7 +49,7 @@ def exposure_s(config: RigConfig) -> float:
     """Return the locked exposure time; raise `UsageError` if it is not locked."""
     if config.camera.exposure_us is None:
         raise UsageError(
-            "The exposure time of the camera is not locked, so that the smear of views in motion is not known.",
+            "The exposure time of the camera is not locked, so the smear of views in motion is not known.",
             next_step="Set camera.exposure_us to a number and run rig calibrate camera-time, or take views at rest.",
         )
     return config.camera.exposure_us * 1e-6
@@ -82,7 +82,7 @@ def require_camera_time(config: RigConfig) -> None:
     exposure_s(config)
     if config.camera_time.offset_ms is None:
         raise UsageError(
-            "The time of the camera's frames is not calibrated, so that their angles in motion are not known.",
+            "The time of the camera's frames is not calibrated, so their angles in motion are not known.",
             next_step="Run rig calibrate camera-time, or take the views at rest.",
         )
 

@@ -44,7 +44,7 @@ def photograph_table(bench: Bench, *, anyway: bool = False) -> Generator[Event, 
     TableNotEmpty
         Something rotates with the table, or the surroundings moved. The previous image stays.
     UsageError
-        The camera moves around the object, so that every view has another background; or the object cannot be removed.
+        The camera moves around the object, so every view has another background; or the object cannot be removed.
     StateNotStored
         The image cannot be stored.
     ViewRejected, LimitExceeded, MotionTimeout, DeviceFault, DeviceSilent
@@ -52,7 +52,7 @@ def photograph_table(bench: Bench, *, anyway: bool = False) -> Generator[Event, 
     """
     if bench.config.table.carries == "camera":
         raise UsageError(
-            "The camera moves around the object, so that every view has another background.",
+            "The camera moves around the object, so every view has another background.",
             next_step="Use a plain background. This bench needs no empty-table image.",
         )
     if isinstance(bench.operator, TableClearer) and not bench.operator.clear():

@@ -12,7 +12,7 @@ _TEXT: Final = {
     IssueCode.TABLE_SIZE: "the empty-table image has another size than the frames",
     IssueCode.TABLE_DIFFERS: "the surroundings do not look like the empty-table image",
     IssueCode.BACKDROP_EXPOSURE: "the backdrop is too dark or overexposed to measure its colour",
-    IssueCode.BACKDROP_COLOURS: "the backdrop has several colours, so that none can be taken for grey",
+    IssueCode.BACKDROP_COLOURS: "the backdrop has several colours, so none can be taken for grey",
     IssueCode.BACKDROP_COLOURFUL: "the backdrop is not grey",
     IssueCode.BACKDROP_LEVEL: "the backdrop is too dark or too bright to correct the exposure",
     IssueCode.BACKGROUND_NOT_PLAIN: "the background is not plain",

@@ -42,7 +42,7 @@ class TableProblem(Issue):
 
 
 _TEXTS: Mapping[str, str] = {
-    TableProblemCode.CAMERA_MOVES: "the camera moves around the object, so that every view has another background",
+    TableProblemCode.CAMERA_MOVES: "the camera moves around the object, so every view has another background",
     TableProblemCode.MISSING: "there is no empty-table image yet",
     TableProblemCode.UNREADABLE: "the empty-table image is not usable: {detail}",
     TableProblemCode.OTHER_SIZE: "the empty-table image has {image_px[0]} x {image_px[1]} pixels, "

@@ -9,7 +9,7 @@ from rig.cli.ui.command import command
 from rig.cli.ui.exit_codes import EXIT_DECLINED
 from rig.cli.ui.prompts import ask_yes_no
 from rig.cli.ui.settings import Settings
-from rig.core.phrases import angle_words, budget_words, number, signed
+from rig.core.phrases import angle_words, budget_words, signed
 
 if TYPE_CHECKING:
     from rig.core.errors import RigError
@@ -194,13 +194,12 @@ def _status_without_servo(settings: Settings, missing: "RigError") -> NoReturn:
 
 
 def _print_devices(report: Mapping[str, Any]) -> None:
+    from rig.cli.bench.device_words import device_lines
+
     for device in ("servo", "imu", "head", "camera"):
-        values = report.get(device, {})
-        if error := values.get("error"):
-            print(f"{device:8s} error {error['code']}: {error['what']} {error['next_step']}")
-        elif values:
-            shown = (f"{key} {_short(value)}" for key, value in values.items() if key != "time_ns")
-            print(f"{device:8s} {', '.join(shown)}")
+        if values := report.get(device, {}):
+            for n, line in enumerate(device_lines(device, values)):
+                print(f"{'' if n else device:8s} {line}")
 
 
 def _exit_if_missing(report: Mapping[str, Any]) -> None:
@@ -258,15 +257,3 @@ def _state_text(safety: "Safety") -> str:
         fault = safety.fault
         return f"{safety.state} {fault.code} since {fault.utc}: {fault.what} {fault.next_step}"
     return f"{safety.state}: {safety.doubt} (`rig home --help`)" if safety.doubt else str(safety.state)
-
-
-def _short(value: object) -> str:
-    if value is None:
-        return "–"
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    if isinstance(value, float):
-        return number(value, ".4g")
-    if isinstance(value, dict):
-        return "(" + ", ".join(f"{key} {_short(inner)}" for key, inner in value.items()) + ")"
-    return str(value) if value not in ((), []) else "none"

@@ -138,12 +138,12 @@ def _print_object(details: "ObjectDetails", folder: str, *, full: bool) -> None:
     if segmentation := SegmentationSummary.of(view.record.segmentation for view in details.views).text:
         print(segmentation)
     print(f"images in {folder.rstrip('/')}/{details.views[0].image.rpartition('/')[0]}")
-    print("view  azimuth  encoder      IMU   sharpness")
+    print("view  azimuth   encoder       IMU  sharpness")
     for view in details.views:
         record = view.record
         print(
-            f"{record.index:4d}  {record.azimuth_deg:6.2f}°  {_number(record.encoder_deg, 7, 2)}  "
-            f"{_number(record.imu_deg, 8, 2)}  {_number(record.evidence.get('sharpness'), 8, 1)}"
+            f"{record.index:4d}  {record.azimuth_deg:6.2f}°  {_number(record.encoder_deg, 7, 2)}°  "
+            f"{_number(record.imu_deg, 7, 2)}°  {_number(record.evidence.get('sharpness'), 9, 1)}"
         )
 
 

@@ -1,6 +1,7 @@
 """The commands on a small catalog, and signals sent to real processes."""
 
 import json
+import re
 import shlex
 import signal
 from pathlib import Path
@@ -151,8 +152,9 @@ def test_status_reports_the_devices(rig):
     assert result["camera"]["locks"]["auto_exposure"] is False
     assert result["table_deg"] == pytest.approx(0, abs=0.3)
     text = rig("status").stdout
-    assert "moving no" in text
-    assert "gain 0" in text
+    assert re.search(r"servo    XL430-W250, id 1, firmware \d+\n +shaft at [\d.]+°, at rest, load 0 %, 12", text)
+    assert re.search(r"imu      MPU-6050 at address 0x68, \d+ °C\n", text)
+    assert re.search(r"camera   camera 0 \(.*\), 320x240 at .*\n +exposure 10 ms, .* gain 0", text)
 
 
 @pytest.mark.parametrize("device", ["servo", "imu", "camera"])

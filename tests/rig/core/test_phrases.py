@@ -8,7 +8,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rig.core.phrases import angle_words, budget_words, distinct, filled, number, percent, percent_words, signed
+from rig.core.phrases import (
+    angle_words,
+    budget_words,
+    distinct,
+    filled,
+    in_unit,
+    number,
+    percent,
+    percent_words,
+    signed,
+)
 
 ROOT = Path(__file__).parents[3]
 
@@ -66,3 +76,18 @@ def test_no_text_has_a_percent_sign_without_a_space() -> None:
         if isinstance(node, ast.FormattedValue) and node.format_spec and ast.unparse(node.format_spec).endswith("%'")
     ]
     assert not found
+
+
+@pytest.mark.parametrize(
+    ("words", "unit", "expected"),
+    [
+        ("12", "mm", "12 mm"),
+        ("70", "°", "70°"),
+        ("1.5 ± 0.2", "° of tilt", "1.5 ± 0.2° of tilt"),
+        ("−3.6", "°/s", "−3.6 °/s"),
+        ("[a number, a number]", "°", "[a number, a number] °"),
+        ("0.5", "", "0.5"),
+    ],
+)
+def test_degrees_follow_a_number_without_a_space(words: str, unit: str, expected: str) -> None:
+    assert in_unit(words, unit) == expected

@@ -146,7 +146,7 @@ def test_show_reports_calibrations_and_the_overridden_values(rig, tmp_path):
     assert f"{scale}, overrides 1.0 (default)" in text
     assert f"--set, overrides 0.3 (rig.toml line 4), 0.2 ({backlash}), 0.5 (default)" in text
     assert f"#   {intrinsics}: intrinsics 812.00 ± 0.50 px" in text
-    assert "#   not in force: table.axis was calibrated 2 days ago; it is valid for 1 days" in text
+    assert "#   not in force: table.axis was calibrated 2 days ago; it is valid for 1 day" in text
     changed = rig("config", "show", "--changed", "imu").stdout
     assert "scale = 1.02" in changed
     assert "intrinsics" not in changed
