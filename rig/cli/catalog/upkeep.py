@@ -14,6 +14,7 @@ from rig.cli.ui.complete import object_names
 from rig.cli.ui.jobs import confirm, print_table, run_job, size_words
 from rig.cli.ui.models import descriptor_name
 from rig.cli.ui.settings import Settings
+from rig.core.phrases import angle_words
 
 JobsOption = Annotated[int | None, typer.Option(min=1, help="Number of processes (default: one per core).")]
 EXIT_CATALOG = 7
@@ -282,11 +283,21 @@ def log(
             entry.user,
             entry.action,
             entry.object_name or "",
-            ", ".join(f"{key} {_short(value)}" for key, value in entry.details.items()),
+            ", ".join(filter(None, (_detail(key, value) for key, value in entry.details.items()))),
         )
         for entry in entries
     ]
     print_table(("time (UTC)", "user", "action", "object", "details"), rows)
+
+
+def _detail(key: str, value: Any) -> str:
+    """Return a detail of the log in words: "enrollment 3", "to 90.0°", "replace"; empty if there is nothing to say."""
+    name = key.removesuffix("_deg").removesuffix("_id").replace("_", " ")
+    if value is None or isinstance(value, bool):
+        return name if value else ""
+    if key.endswith("_deg") and isinstance(value, int | float):
+        return f"{name} {angle_words(value)}"
+    return f"{name} {_short(value)}"
 
 
 def _short(value: Any) -> str:

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import sqlite3
 import subprocess
@@ -121,6 +122,7 @@ def test_log_has_moves_and_rejected_moves(two: Rig) -> None:
     moves = [json.loads(line)["details"] for line in two("log", "--json").stdout.splitlines()][1:]
     assert moves[0] == {"to_deg": 30.0}
     assert "cable" in moves[1]["ended"]
+    assert re.search(r" moved +to 30\.0°$", two("log").stdout, re.MULTILINE)
 
 
 def test_verify_repairs_and_sets_the_exit_code(two: Rig) -> None:
