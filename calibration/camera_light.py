@@ -31,6 +31,8 @@ CARD = "grey-card"
 BOARD = "calibration-board upright"
 PAIRS = 24
 """Frames of the scene at rest."""
+HANDS_S = 1.0
+"""Time from the operator's answer to the first frame: the bench is quiet again, and no frame shows the former scene."""
 CARD_FRAMES, CARD_SECONDS = 40, 240.0
 BINS = 24
 MIN_PIXELS = 50
@@ -141,6 +143,7 @@ class CameraNoise(Procedure):
             pictures.BOARD_UPRIGHT,
         )
         bench.operator.place(BOARD)
+        bench.clock.sleep(HANDS_S)
         frames = [bench.camera.capture(bench.clock.now_ns()).image_bgr for _ in range(PAIRS)]
         yield Progress(1.0, f"{PAIRS} frames of the scene at rest")
         yield sharpness([ImageQuality.of(frame, bench.config.view).sharpness for frame in frames])
@@ -159,6 +162,7 @@ class CameraCard(Procedure):
             pictures.CARD,
         )
         bench.operator.place(CARD)
+        bench.clock.sleep(HANDS_S)
         locks = bench.camera.read_locks()
         levels, seconds, blocks = [], [], []
         start_ns = bench.clock.now_ns()

@@ -59,7 +59,7 @@ def plot(result: CalibrationResult) -> Chart | None:
     slope = result.evidence["stamp_to_middle_ms"] * 1e-3
     ends = [min(rates), max(rates)]
     return Chart(
-        "What frames show, ahead of the angle at their time stamps",
+        "Angle at the middle row of a frame, minus the angle at its time stamp",
         Axis("speed, °/s"),
         Axis("angle, °"),
         [

@@ -87,7 +87,10 @@ def bands_of(passes: Sequence[Pass]) -> list[tuple[slice, float]]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fit:
-    """Times of the middle row and of each band, and the angles of frames minus those at their stamps (n,)."""
+    """Times of the middle row and of each band.
+
+    ``ahead_deg`` (n,) is the angle that the middle row of each frame shows, minus the angle at the frame's stamp.
+    """
 
     middle_s: float
     middle_sigma_s: float
@@ -170,7 +173,6 @@ def fit(passes: Sequence[Pass], bands: Sequence[tuple[slice, float]]) -> Fit | N
     seen = total > 0
     mean = np.bincount(number, precise * residual)[seen] / total[seen]
     rate = np.bincount(number, precise * rates)[seen] / total[seen]
-    at = np.bincount(number, precise * centre[band])[seen] / total[seen]
     spread_deg = max(1.4826 * float(np.median(np.abs(mean))), 1e-4)
     variance = np.square(mean / np.maximum(1, np.abs(mean) / (2.5 * spread_deg)))  # a frame may have no usable rows
     line = np.column_stack([np.ones_like(rate), np.square(rate)])
@@ -187,5 +189,5 @@ def fit(passes: Sequence[Pass], bands: Sequence[tuple[slice, float]]) -> Fit | N
         sqrt(max(float(rest), 0.0)),
         [float(value) + slope for value, slope in zip(times_s, slopes, strict=True)],
         rate,
-        mean + (values[0] + values[1] * at) * rate,
+        mean + values[0] * rate,
     )

@@ -40,14 +40,19 @@ def as_json(result: "CalibrationResult") -> dict[str, Any]:
 
 def outcome_text(result: "CalibrationResult") -> str:
     """Return the outcome of a calibration: its values, or the reasons why it did not pass and the next step."""
-    residual = ""
-    if result.residual is not None and result.limit is not None:
-        worst, limit = (in_unit(f"{one:.3g}", result.residual_unit) for one in (result.residual, result.limit))
-        residual = f" (worst residual {worst}, limit {limit})"
+    residual = f" (worst residual {residual_words(result)})" if result.limit is not None else ""
     lines = [f"{'PASS' if result.passed else 'FAIL'} {result.name}{residual}"]
     lines += [f"  {name} = {estimate}" for name, estimate in result.estimates.items()]
     lines += [f"  sets {key} = {plain_value(value)}" for key, value in result.settings.items()]
     return "\n".join([*lines, *(f"  {rejection}" for rejection in result.rejections)])
+
+
+def residual_words(result: "CalibrationResult") -> str:
+    """Return the worst residual of the fit with its limit: "0.014°, limit 0.15°"; empty without one."""
+    if result.residual is None:
+        return ""
+    limit = "" if result.limit is None else f", limit {in_unit(f'{result.limit:.3g}', result.residual_unit)}"
+    return f"{in_unit(f'{result.residual:.3g}', result.residual_unit)}{limit}"
 
 
 def plain_value(value: Any) -> str:

@@ -1,20 +1,37 @@
 """Write all calibrations of a bench to one self-contained page, each with its plots."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from markupsafe import Markup
 
+from calibration.outcome import plain_value, residual_words
 from calibration.procedures import PROCEDURES
 from rig.calibrations import BenchCalibration, CalibrationResult, CalibrationStatus
 from rig.charts.xy import Chart
 from rig.core.errors import UsageError, os_errors_as
 from rig.core.files import write
+from rig.core.phrases import filled
 from rig.core.templates import environment
 
 PLOTS = {name: procedure.plots for procedure in PROCEDURES for name in procedure.names}
+
+
+_FORMS: Final = {
+    "model": "{}",
+    "name": "{}",
+    "device": "{}",
+    "bus_id": "id {}",
+    "bus_address": "address 0x{:02x}",
+    "range_dps": "range {:g} °/s",
+    "width": "{} pixels wide",
+    "height": "{} pixels high",
+    "fps": "{:g} frames/s",
+}
+_HIDDEN: Final = ("model_number", "who_am_i", "gyro_noise_dps_rthz")
+"""How the values of a device are written, and values that its model implies."""
 
 
 class _Shown(NamedTuple):
@@ -26,6 +43,8 @@ class _Shown(NamedTuple):
     rejections: Sequence[str]
     pictures: Sequence[Markup]
     devices: Sequence[tuple[str, str]]
+    residual: str
+    settings: Sequence[str]
 
 
 def plots(result: CalibrationResult) -> list[Chart]:
@@ -94,8 +113,13 @@ def _shown(calibration: BenchCalibration, history: Sequence[CalibrationResult]) 
         # Trusted markup: the SVG escapes its texts.
         [Markup(figure.svg(themed=True)) for figure in plots(result)],
         [(part, _words(identity)) for part, identity in result.device.items() if part in ("servo", "imu", "camera")],
+        residual_words(result),
+        [f"{key} = {plain_value(value)}" for key, value in result.settings.items()],
     )
 
 
-def _words(identity: Any) -> str:
-    return ", ".join(f"{key} {value}" for key, value in identity.items() if value not in (None, ""))
+def _words(identity: Mapping[str, Any]) -> str:
+    """Return what a device is: "xl430_w250, id 1, firmware 46"."""
+    known = {key: value for key, value in identity.items() if value not in (None, "") and key not in _HIDDEN}
+    forms = {key: _FORMS.get(key, f"{key.replace('_', ' ')} {{}}") for key in known}
+    return ", ".join(filled(forms[key], value) for key, value in known.items())

@@ -27,6 +27,8 @@ MEASURED, MODEL, LIMIT, OTHER = "#0072b2", "#d55e00", "#b3261e", "#009e73"
 _THEME: Final = {INK: "--ink", SOFT: "--soft", GRID: "--rule", PAPER: "--card"}
 """Colours that a page replaces by those of its style sheet, which has a dark mode."""
 _DPI: Final = 100
+_MARGIN: Final = 0.04
+"""Share of an axis between its ends and the data."""
 _STYLE: Final = {
     "axes.axisbelow": True,
     "axes.edgecolor": GRID,
@@ -227,6 +229,12 @@ def _scale(axes: "Axes", axis: Axis, which: str) -> None:
     else:
         ruler.set_major_locator(MaxNLocator(7, integer=axis.whole, steps=[1, 2, 5, 10]))
     low, high = min((low, *axis.span)), max((high, *axis.span))
+    if axis.span and not axis.log:
+        # Matplotlib's margin is a share of the data's range, which may be a small part of the axis.
+        first, last = sorted(axes.dataLim.intervalx if which == "x" else axes.dataLim.intervaly)
+        margin = _MARGIN * (high - low)
+        low = low if low in axis.span else min(low, first - margin)
+        high = high if high in axis.span else max(high, last + margin)
     set_limits((high, low) if axis.falling else (low, high))
 
 

@@ -138,6 +138,15 @@ def test_lens_out_of_focus_is_rejected():
     assert codes(sharpness([4.0, 4.1, 3.9])) == [RejectionCode.NOT_SHARP]
 
 
+@pytest.mark.parametrize("seed", range(6))
+def test_first_frame_of_the_card_shows_the_card(simulated, monkeypatch, seed):
+    monkeypatch.setattr(camera_light, "CARD_FRAMES", 4)
+    s = simulated(noise=NoiseModel(), seed=seed)
+    results = [event for event in camera_light.CameraCard().live(s.bench) if isinstance(event, CalibrationResult)]
+    grey = np.mean(results[-1].evidence["levels_bgr"], axis=1)
+    assert grey[0] == pytest.approx(np.median(grey), rel=0.05)
+
+
 def test_simulated_camera_is_found(simulated, monkeypatch):
     monkeypatch.setattr(camera_light, "CARD_FRAMES", 12)
     true = NoiseModel(full_well_e=6000.0, read_noise_e=20.0, vignetting=0.2, light_flicker=0.006)

@@ -44,6 +44,14 @@ def test_legend_beside_a_wide_chart_is_below_its_title() -> None:
     assert legend.y1 < title.y0
 
 
+def test_points_far_from_the_included_value_keep_a_margin() -> None:
+    chart = Chart("t", Axis("frame"), Axis("level", span=(0.0,)), (Series("s", [1, 2, 3], [1360.0, 1355.0, 1358.0]),))
+    top = min(y for _, y in markers(chart))
+    frame = re.search(r'<clipPath id="[^"]*"> <rect x="[\d.]+" y="([\d.]+)"', chart.svg())
+    assert frame
+    assert top - float(frame[1]) > 5
+
+
 def test_falling_axis_grows_downwards() -> None:
     chart = Chart("rows", Axis("x"), Axis("y", falling=True), (Series("", [1, 2], [1, 2]),))
     first, second = markers(chart)
