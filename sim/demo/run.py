@@ -166,7 +166,7 @@ def run_demo(
             model = load_model(catalog, descriptor=None if chosen is None else descriptor_for(chosen))
         if change is not None:
             operator.change_bench(change)
-            _photograph(bench, operator)
+            _photograph(bench, operator, marked=True)
             model = replace(model, camera=())  # a real bench rejects a search with other settings of the camera
         trials = [
             _identify(
@@ -235,10 +235,10 @@ def _folder_within(out: Path) -> "tempfile.TemporaryDirectory[str]":
         return tempfile.TemporaryDirectory(prefix=".catalog-", dir=out)
 
 
-def _photograph(bench: Bench, operator: ShelfOperator) -> None:
-    """Take the empty-table image, if the operator can clear the table."""
+def _photograph(bench: Bench, operator: ShelfOperator, *, marked: bool = False) -> None:
+    """Take the empty-table image, if the operator can clear the table; a ``marked`` table may have rotating marks."""
     if operator.clear():
-        for _ in photograph_table(bench):
+        for _ in photograph_table(bench, anyway=marked):
             pass
 
 

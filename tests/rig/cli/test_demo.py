@@ -148,3 +148,10 @@ def test_default_demo_finds_all_objects_and_recognises_both_unknown_ones(tmp_pat
     totals = json.loads(done.stdout.splitlines()[-1])
     assert totals["views_enrolled"] == 16 * 36
     assert (totals["found"], totals["unknown_recognised"]) == (totals["of"], totals["of_unknown"]) == (16, 2)
+
+
+def test_marks_on_the_changed_platter_do_not_end_the_demo(tmp_path):
+    done = demo(*SMALL, "--change", "hard", "--out", str(tmp_path))
+    assert done.exit_code in (0, 6)
+    assert "Error" not in done.output
+    assert "2 objects enrolled" in done.stdout
