@@ -174,10 +174,10 @@ def contests(runs: Runs, methods: Sequence[Method], rng: np.random.Generator) ->
     return tuple(answers)
 
 
-def pose_rmse_by_object(runs: Runs, method: int, *, alike: bool) -> FloatArray:
+def pose_rmse_by_object(runs: Runs, method: int, *, similar: bool) -> FloatArray:
     """Return each object's RMS pose error after all views, from the trials that found it; nan if there are none."""
     last = _steps(runs, method)[-1]
-    errors = (runs.alike_error_deg if alike else runs.pose_error_deg)[method, ..., last]
+    errors = (runs.alike_error_deg if similar else runs.pose_error_deg)[method, ..., last]
     hits = runs.rank[method, ..., last] == 1
     total = np.where(hits, errors, 0.0) ** 2
     count = hits.sum(axis=1)
@@ -200,7 +200,7 @@ def _point(runs: Runs, method: int, n: int) -> Point:
     found = rank == 1
     hits, best10, trials = int(found.sum()), int(((rank >= 1) & (rank <= _BEST)).sum()), rank.size
     errors = runs.pose_error_deg[method, ..., n][found]
-    alike = runs.alike_error_deg[method, ..., n][found]
+    similar = runs.alike_error_deg[method, ..., n][found]
     return Point(
         int(n) + 1,
         trials,
@@ -213,8 +213,8 @@ def _point(runs: Runs, method: int, n: int) -> Point:
         float(runs.travelled_deg[method, ..., n].mean()),
         _median(errors),
         _rms(errors),
-        _median(alike),
-        _rms(alike),
+        _median(similar),
+        _rms(similar),
         _median(errors[runs.period_deg[method, ..., n][found] == 360]),
     )
 

@@ -130,7 +130,7 @@ class _Trials:
         segmented_by: Sequence[str] = (),
     ) -> None:
         self._same_bench = same_bench
-        self._alike_bench = [like_enrollment(method, same_bench) for method in segmented_by or [""] * len(queries)]
+        self._bench_of_query = [like_enrollment(method, same_bench) for method in segmented_by or [""] * len(queries)]
         self._photographs = photographs
         self._object, self._queries, self._views = object_index, queries, views
         self._protocol, self._rule, self._now_ns = protocol, rule, now_ns
@@ -150,7 +150,7 @@ class _Trials:
         self._ring = np.argsort(self._azimuth_deg, kind="stable")
         own = views.descriptors[self._rows]
         compared = descriptor(views.descriptor)
-        self._alike = _similar_views(compared.similarity(own, own), self._ring)
+        self._neighbourhood = _similar_views(compared.similarity(own, own), self._ring)
         symmetric = symmetry(views, object_index, similarity=compared.similarity)
         self._period_deg = np.nan if symmetric is None else symmetric.period_deg
         similar = compared.similarity(queries, views.descriptors)
@@ -240,8 +240,8 @@ class _Trials:
                 for i, angle_deg in zip(seen[:-1], measured_deg, strict=False):
                     session.add(self._queries[i], angle_deg)
             start_ns = self._now_ns()
-            alike = self._alike_bench[seen[-1]]
-            decision = session.add(self._queries[seen[-1]], measured_deg[-1], same_bench=alike)
+            same_bench = self._bench_of_query[seen[-1]]
+            decision = session.add(self._queries[seen[-1]], measured_deg[-1], same_bench=same_bench)
             following = self._next_dense(method, draws, seen, session) if n + 1 < last else seen[-1]
             runs.step_ns[*at, n] = self._now_ns() - start_ns
             ranking = session.belief.ranking()
@@ -367,7 +367,7 @@ class _Trials:
         if len(place):
             away_deg = np.abs(wrap180(pose_deg[place[0]] - self._azimuth_deg))
             runs.pose_error_deg[at] = away_deg[seen[-1]]
-            runs.alike_error_deg[at] = away_deg[self._alike[seen[-1]]].min()
+            runs.alike_error_deg[at] = away_deg[self._neighbourhood[seen[-1]]].min()
 
     def _record_margin(
         self, ranking: Ranking, seen: list[int], keep: NDArray[np.bool_], runs: Runs, at: tuple[int, int, int, int]
@@ -390,6 +390,6 @@ def _similar_views(similar: FloatArray, ring: IndexArray) -> NDArray[np.bool_]:
     before, after = np.empty_like(ring), np.empty_like(ring)
     before[ring], after[ring] = np.roll(ring, 1), np.roll(ring, -1)
     rows = np.arange(len(ring))
-    alike: NDArray[np.bool_] = similar >= np.minimum(similar[rows, before], similar[rows, after])[:, None]
-    alike[rows, rows] = True  # a view without texture and colour has similarity 0 to itself
-    return alike
+    found: NDArray[np.bool_] = similar >= np.minimum(similar[rows, before], similar[rows, after])[:, None]
+    found[rows, rows] = True  # a view without texture and colour has similarity 0 to itself
+    return found

@@ -94,7 +94,7 @@ def pose_figure(results: dict[str, Any], methods: Sequence[dict[str, Any]]) -> C
         colour, _ = _style(method["name"], m)
         for key, dashed, words in (
             ("pose_rmse_deg_by_object", True, "plain"),
-            ("alike_rmse_deg_by_object", False, "alike"),
+            ("alike_rmse_deg_by_object", False, "similar"),
         ):
             errors = sorted(error for error in method[key] if error is not None)
             places = range(1, len(errors) + 1)

@@ -42,8 +42,8 @@ def evaluate(
                 "label": result.method.label,
                 "curve": [asdict(point) for point in result.curve],
                 "stopping": asdict(result.stopping),
-                "pose_rmse_deg_by_object": _plain(pose_rmse_by_object(runs, m, alike=False)),
-                "alike_rmse_deg_by_object": _plain(pose_rmse_by_object(runs, m, alike=True)),
+                "pose_rmse_deg_by_object": _plain(pose_rmse_by_object(runs, m, similar=False)),
+                "alike_rmse_deg_by_object": _plain(pose_rmse_by_object(runs, m, similar=True)),
             }
             for m, result in enumerate(methods)
         ],

@@ -32,8 +32,8 @@ def test_only_hits_have_pose_errors() -> None:
     ((point,),) = (result.curve for result in method_results(runs, PAIR[:1], 0.0, min_views=1))
     assert (point.pose_error_median_deg, point.alike_error_median_deg) == (35, 5)
     assert point.pose_error_rmse_deg == pytest.approx((30**2 / 2 + 40**2 / 2) ** 0.5)
-    np.testing.assert_array_equal(pose_rmse_by_object(runs, 0, alike=False), [30, 40, np.nan])
-    np.testing.assert_array_equal(pose_rmse_by_object(runs, 0, alike=True), [0, 10, np.nan])
+    np.testing.assert_array_equal(pose_rmse_by_object(runs, 0, similar=False), [30, 40, np.nan])
+    np.testing.assert_array_equal(pose_rmse_by_object(runs, 0, similar=True), [0, 10, np.nan])
 
 
 def test_no_hit_has_no_pose_error() -> None:
