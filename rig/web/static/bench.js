@@ -1,7 +1,8 @@
 import { $, API, act, h, jobTitle, number, on, request, showJob, start, submit } from "./rig.js";
 
+/** Return a point of the dial: 0° is at the top, angles grow counter-clockwise, as the table's do seen from above. */
 const polar = (degrees, radius) => {
-  const a = ((degrees - 90) * Math.PI) / 180;
+  const a = ((-degrees - 90) * Math.PI) / 180;
   return [Math.cos(a) * radius, Math.sin(a) * radius];
 };
 const STATES = ["disconnected", "connected", "unreferenced", "ready", "moving", "stopped", "fault"];
@@ -23,7 +24,7 @@ function dial(status) {
     const used = Math.min(Math.abs(angle) / Math.max(Math.abs(angle < 0 ? low : high), 1), 1);
     const circumference = 2 * Math.PI * 72;
     parts.push(h("circle", { r: 72, fill: "none", stroke: "var(--line)", "stroke-width": 10 }));
-    parts.push(h("circle", { r: 72, fill: "none", stroke: used > 0.9 ? "var(--red)" : "var(--blue)", "stroke-width": 10, "stroke-dasharray": `${circumference * used} ${circumference}`, transform: `rotate(-90) scale(${angle < 0 ? "1 -1" : "1 1"})` }));
+    parts.push(h("circle", { r: 72, fill: "none", stroke: used > 0.9 ? "var(--red)" : "var(--blue)", "stroke-width": 10, "stroke-dasharray": `${circumference * used} ${circumference}`, transform: `rotate(-90) scale(${angle < 0 ? "1 1" : "1 -1"})` }));
     const needle = (degrees, radius, colour, width) => {
       const [x2, y2] = polar(degrees, radius);
       return h("line", { x1: 0, y1: 0, x2, y2, stroke: colour, "stroke-width": width, "stroke-linecap": "round" });
@@ -42,7 +43,7 @@ on("status", (status) => {
   $("states").replaceChildren(...STATES.map((state) => h("li", { class: state === status.state ? `current ${state}` : "", "aria-current": state === status.state }, state)));
   const values = [["Cable budget", status.limits_deg ? `${number(status.limits_deg[0])}° to ${number(status.limits_deg[1])}°` : "–"]];
   if (gyro !== null) values.push(["Angle by the gyro", `${number(gyro, 2)}°`]);
-  if (status.servo) values.push(["Servo", `${status.servo.model}, ${number(status.servo.temperature_c)} °C, ${status.servo.voltage_v.toFixed(1)} V, load ${number(status.servo.load_percent, 0)} %`]);
+  if (status.servo) values.push(["Servo", `${status.servo.model.replaceAll("_", "-").toUpperCase()}, ${number(status.servo.temperature_c)} °C, ${status.servo.voltage_v.toFixed(1)} V, load ${number(status.servo.load_percent, 0)} %`]);
   if (status.camera) values.push(["Camera", `${status.camera.name}, ${status.camera.width} × ${status.camera.height}`]);
   for (const finding of status.findings || []) values.push(["Note", finding]);
   $("values").replaceChildren(...values.flatMap(([name, value]) => [h("dt", {}, name), h("dd", {}, value)]));
