@@ -24,7 +24,7 @@ def _servo(values: Mapping[str, Any]) -> list[str]:
     return [
         f"{model}, id {values['bus_id']}, firmware {values['firmware']}",
         filled(state, values["position_deg"], motion, *(values[key] for key in keys), errors),
-        f"bus: {_counts(values['line'])}",
+        f"bus: {_counts(values['bus'])}",
     ]
 
 
@@ -43,7 +43,7 @@ def _head(values: Mapping[str, Any]) -> list[str]:
         f"sensor {values['sensor']}",
     )
     timing = "clock drift {:.1f} ppm, time uncertainty {:.1f} µs"
-    counts = dict(values["line"])
+    counts = dict(values["connection"])
     timed = filled(timing, counts.pop("drift_ppm"), counts.pop("time_uncertainty_us"))
     return [", ".join(state), f"connection: {_counts(counts)}, {timed}"]
 

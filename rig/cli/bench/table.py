@@ -131,7 +131,7 @@ def status(settings: Settings) -> None:
             "doubt": str(safety.doubt) if safety.doubt else None,
             "table_deg": table_deg,
             "limits_deg": list(config.limits_deg),
-            "servo": {**plain(bench.servo.identity), **plain(state), "line": dict(bench.servo.bus_statistics)},
+            "servo": {**plain(bench.servo.identity), **plain(state), "bus": dict(bench.servo.bus_statistics)},
             "imu": _read(lambda: {**plain(bench.imu.identity), "temperature_c": bench.imu.temperature_c()}),
             **({"head": bench.head.report()} if bench.head else {}),
             "camera": _read(
@@ -139,6 +139,9 @@ def status(settings: Settings) -> None:
             ),
         }
         report["findings"] = list(bench.findings)  # opening the camera adds some
+        for device, key in (("servo", "bus"), ("head", "connection")):
+            if device in report:
+                report[device]["line"] = report[device][key]  # the former key, until version 0.3
     if settings.json:
         settings.print_json(report)
     else:

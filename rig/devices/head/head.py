@@ -255,7 +255,7 @@ class RigHead:
             "estop_open": status.estop_open,
             "relay_closed": status.relay_closed,
             "sensor": status.imu_status.name.lower(),
-            "line": self.health(),
+            "connection": self.health(),
         }
 
     def health(self) -> dict[str, float]:
