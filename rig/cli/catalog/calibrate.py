@@ -9,6 +9,7 @@ import typer
 
 from rig.cli.ui.cluster import ClusterOption, jobs_of
 from rig.cli.ui.command import command
+from rig.cli.ui.exit_codes import EXIT_INTERRUPTED
 from rig.cli.ui.settings import Settings
 
 if TYPE_CHECKING:
@@ -133,7 +134,7 @@ def _interruptible(unfinished: "UnfinishedJob") -> "Iterator[None]":
             else "nothing changed."
         )
         print(f"Interrupted; {kept}", file=sys.stderr)
-        raise
+        raise typer.Exit(EXIT_INTERRUPTED) from None
 
 
 def _lines(found: "CalibratedRule", objects: int, seconds: float) -> list[str]:

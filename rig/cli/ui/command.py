@@ -100,7 +100,8 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
             discard(sys.stdout)
             raise typer.Exit(EXIT_BY_SIGNAL + signal.SIGPIPE) from None
         except KeyboardInterrupt:
-            print("Interrupted. If the command has moved the table, its torque is off now.", file=sys.stderr)
+            torque = " If the command has moved the table, its torque is off now." if settings.opened else ""
+            print(f"Interrupted.{torque}", file=sys.stderr)
             raise typer.Exit(EXIT_INTERRUPTED) from None
 
     run.__signature__ = inspect.Signature([context, *own, *shared])  # type: ignore[attr-defined]

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import typer
 
-from rig.cli.ui.exit_codes import EXIT_DECLINED
+from rig.cli.ui.exit_codes import EXIT_DECLINED, EXIT_INTERRUPTED
 from rig.cli.ui.settings import Settings
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ def run_job(title: str, job: "Generator[JobProgress, None, _T]", *, interrupted:
             return finished(job, show)
     except KeyboardInterrupt:
         print(interrupted if isinstance(interrupted, str) else interrupted(), file=sys.stderr)
-        raise
+        raise typer.Exit(EXIT_INTERRUPTED) from None
     finally:
         job.close()
 

@@ -34,6 +34,8 @@ class Settings:
     seed: int | None = None
     json: bool = False
     _loaded: dict[str, "RigConfig"] = field(default_factory=dict, repr=False, compare=False)
+    opened: list[str] = field(default_factory=list, repr=False, compare=False)
+    """Benches that the command has opened."""
 
     def merged(
         self, bench: str | None, config: Path | None, overrides: list[str] | None, seed: int | None, json: bool
@@ -76,6 +78,7 @@ class Settings:
         """
         from rig.bench import open_bench
 
+        self.opened.append(self.bench_name)
         bench = open_bench(self.bench_name, self.load(), seed=self.seed, devices=devices)
         for finding in (*bench.safety.findings, *(bench.calibration_findings if tell else ())):
             print(f"Note: {finding}.", file=sys.stderr)

@@ -33,6 +33,7 @@ def test_interrupted_check_continues_if_asked_to(two: Rig, monkeypatch: pytest.M
         stopped = two("catalog", "verify")
     assert stopped.exit_code == 130
     assert "Interrupted; nothing was changed. To continue: rig catalog verify --resume" in stopped.stderr
+    assert "torque" not in stopped.stderr
     seen = interrupt(monkeypatch, "rig.catalog.verify", 99)
     done = two("catalog", "verify", "--resume")
     assert done.exit_code == 0, done.output
