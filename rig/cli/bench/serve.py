@@ -88,6 +88,7 @@ def serve(
     if settings.bench_name == "sim" and "speed" not in settings.load().bench.get("sim", {}):
         settings = settings.merged(None, None, ["bench.sim.speed=1"], None, False)  # people watch it
     arguments = tuple(settings.arguments())
+    settings.opened.append(settings.bench_name)
     run_server(settings.bench_name, settings.load(), settings.seed, arguments, listening, tokens, _announced)
 
 
