@@ -6,8 +6,10 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import suppress
+from http.client import HTTPException
 from importlib.util import find_spec
 from pathlib import Path
+from urllib.request import urlopen
 
 import numpy as np
 import pytest
@@ -34,21 +36,33 @@ class S3Server:
     """A server of S3 with one bucket."""
 
     def __init__(self) -> None:
-        with socket.socket() as free:
-            free.bind(("127.0.0.1", 0))
-            self.port = free.getsockname()[1]
         self.process: subprocess.Popen[bytes] | None = None
-        self.start()
+        for _ in range(5):  # another program can take the free port before the server does
+            with socket.socket() as free:
+                free.bind(("127.0.0.1", 0))
+                self.port = free.getsockname()[1]
+            if self._is_started():
+                return
+        raise AssertionError("the S3 server did not start")
 
     def start(self) -> None:
+        assert self._is_started(), "the S3 server did not start"
+
+    def _is_started(self) -> bool:
+        """Start the server; return whether it answers, and not another program at its port."""
         command = [sys.executable, "-m", "moto.server", "-H", "127.0.0.1", "-p", str(self.port)]
         self.process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         for _ in range(600):
-            with suppress(OSError), socket.create_connection(("127.0.0.1", self.port), 1):
-                return
+            with (
+                suppress(OSError, HTTPException),
+                urlopen(f"http://127.0.0.1:{self.port}/moto-api/data.json", timeout=10) as answer,
+            ):
+                return bool(answer.status == 200)
             with suppress(subprocess.TimeoutExpired):
                 self.process.wait(0.1)
-        raise AssertionError("the S3 server did not start")
+                break  # it has ended
+        self.stop()
+        return False
 
     def stop(self) -> None:
         if self.process is not None:
@@ -73,9 +87,11 @@ def s3() -> Iterator[S3Server]:
             patch.setenv(name, value)
         import s3fs
 
-        s3fs.S3FileSystem().mkdir("rig")
-        yield running
-    running.stop()
+        try:
+            s3fs.S3FileSystem().mkdir("rig")
+            yield running
+        finally:
+            running.stop()
 
 
 def in_s3(postgres: PostgresServer, folder: Path) -> CatalogPlace:
