@@ -14,6 +14,8 @@ _ARROW_PX: Final = 9.0
 _INNERMOST: Final = 58.0
 _OUTERMOST: Final = 140.0
 _ARC_STEP_DEG: Final = 4.0
+_MOST_ARC_STEPS: Final = 5_000
+"""A damaged record can have any rotation."""
 _LABEL_PX: Final = (46.0, 17.0)
 _LABEL_SPOTS: Final = (0.5, 0.4, 0.6, 0.3, 0.7, 0.2, 0.8)
 _LABEL_ASIDE_PX: Final = (22.0, -22.0)
@@ -92,7 +94,7 @@ def _radii(n: int) -> list[float]:
 def _arc(start: tuple[float, float], end: tuple[float, float]) -> list[Point]:
     """Return the points of the spiral between two (radius, azimuth), both included."""
     (r0, a0), (r1, a1) = start, end
-    steps = max(2, ceil(abs(a1 - a0) / _ARC_STEP_DEG))
+    steps = min(max(2, ceil(abs(a1 - a0) / _ARC_STEP_DEG)), _MOST_ARC_STEPS)
     return [polar(r0 + (r1 - r0) * i / steps, a0 + (a1 - a0) * i / steps) for i in range(steps + 1)]
 
 

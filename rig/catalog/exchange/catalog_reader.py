@@ -3,9 +3,11 @@
 from collections.abc import Collection, Generator, Iterator, Sequence
 from pathlib import Path
 
+from pydantic import ValidationError
 from sqlalchemy import Connection, select
 
 from rig.catalog.catalog import Catalog
+from rig.catalog.columns import FIX
 from rig.catalog.exchange.batch import (
     BundledDescriptor,
     Enrollment,
@@ -21,6 +23,7 @@ from rig.catalog.queries import find, packed_descriptors
 from rig.catalog.rows import measured
 from rig.catalog.schema import enrollments, objects, sessions, views
 from rig.catalog.seal import check_loaded
+from rig.core.errors import CatalogDamaged
 from rig.views import image_files as images
 
 
@@ -109,16 +112,27 @@ def _views(
     for row in connection.execute(select(views).where(of_enrollment).order_by(views.c.view_index)).all():
         exported = (folder / f"{row.view_index:03d}{Path(row.image).suffix}").as_posix()
         files[exported] = store.file(row.image)
-        yield View(
-            index=row.view_index,
-            session=session_ids.index(row.session_id),
-            captured_utc=row.captured_utc,
-            image=exported,
-            image_sha256=row.image_sha256,
-            image_bytes=row.image_bytes,
-            descriptors=tuple(
-                BundledDescriptor(name=one.name, version=one.version, settings=one.settings, packed=one.packed.hex())
-                for one in packed[row.id]
-            ),
-            **measured(row),
-        )
+        try:
+            view = View(
+                index=row.view_index,
+                session=session_ids.index(row.session_id),
+                captured_utc=row.captured_utc,
+                image=exported,
+                image_sha256=row.image_sha256,
+                image_bytes=row.image_bytes,
+                descriptors=tuple(
+                    BundledDescriptor(
+                        name=one.name, version=one.version, settings=one.settings, packed=one.packed.hex()
+                    )
+                    for one in packed[row.id]
+                ),
+                **measured(row),
+            )
+        except ValidationError as error:
+            reason = error.errors()[0]["msg"]
+            raise CatalogDamaged(
+                f"The catalog is damaged: the row of the view {exported} has impossible values.",
+                next_step=FIX,
+                evidence={"reason": reason},
+            ) from error
+        yield view

@@ -328,3 +328,7 @@ class TestDecisionChart:
             assert "only one object is likely" in svg
             assert not having(svg, "similarity")
             assert "nan" not in svg
+
+
+def test_path_with_an_impossible_rotation_stays_small() -> None:
+    assert len(polar_path(0.0, [PathStep(16_949_387.0)], scale="azimuth")) < 200_000
