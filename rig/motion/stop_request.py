@@ -3,15 +3,16 @@
 import os
 import signal
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import dataclass
 
 from rig.bench import open_servo
 from rig.config import RigConfig
 from rig.core.clock import Clock, seconds_between
-from rig.core.errors import BenchBusy, StateNotStored, TorqueStaysOn
+from rig.core.errors import BenchBusy, DeviceSilent, StateNotStored, TorqueStaysOn
 from rig.safety.bench_lock import holder
-from rig.safety.saved_state import FileStore, Holder, LatchedFault
+from rig.safety.saved_state import SERVER_FOLDER, FileStore, Holder, LatchedFault
+from rig.safety.stop_channel import StopAnswer, StopRequest
 
 REACTION_S = 2.0
 """How long a program may take to notice the request: many rounds of its control loop, and a long exposure."""
@@ -43,24 +44,27 @@ def stop(name: str, config: RigConfig, clock: Clock, *, seed: int | None = None)
     BenchBusy
         The program that uses the bench does not react.
     DeviceNotFound, DeviceMismatch, DeviceSilent
-        No program uses the bench, and the servo cannot be reached.
+        The servo cannot be reached, or does not answer the program that uses the bench.
     TorqueStaysOn
         The servo does not switch its torque off; the fault is latched.
     """
     path = config.state_path(name)
-    who, signalled = holder(path), False
+    server = holder(path / SERVER_FOLDER)
+    who, signalled, answer = holder(path) or server, False, None
+    request = StopRequest(path)
+    if request.connection is not None:
+        with closing(request):
+            answer = request.wait(clock, REACTION_S)
     if who is not None:
-        store = FileStore(path)
-        with suppress(StateNotStored):  # full disk: the signal remains
-            store.request_stop()
-        if not store.stop_requested() or not _wait(
-            clock, REACTION_S, lambda: not store.stop_requested() or holder(path) is None
-        ):
-            # It is not in its control loop: it waits for its next object, computes, or hangs.
+        if answer is None:  # it is not in its control loop: it waits for its next object, computes, or hangs
             signalled = who.pid > 0 and _signal(who)
-        if not _wait(clock, END_S, lambda: holder(path) is None) and (store.stop_requested() or signalled):
-            raise _not_reacting(who, config)
-        if holder(path) is not None:
+        elif server is not None and answer is not StopAnswer.ENDED:  # a server stays, at rest
+            if answer is StopAnswer.NOT_CONFIRMED:
+                raise _not_confirmed()
+            return StopReport(who, signalled=False, ended=False, torque_was_on=None)
+        if not _wait(clock, END_S, lambda: holder(path) is None and holder(path / SERVER_FOLDER) is None):
+            if answer is None or signalled:
+                raise _not_reacting(who, config)
             return StopReport(who, signalled, ended=False, torque_was_on=None)
     with open_servo(name, config, seed=seed) as servo:
         torque = servo.read_condition().torque
@@ -88,6 +92,13 @@ def _wait(clock: Clock, seconds: float, done: Callable[[], bool]) -> bool:
             return False
         clock.sleep(POLL_S)
     return True
+
+
+def _not_confirmed() -> DeviceSilent:
+    return DeviceSilent(
+        "The server has ended its jobs, but the servo does not answer it: whether the torque is off is not known.",
+        next_step="If the table still moves, switch off the servo's supply. Then check the servo's cable.",
+    )
 
 
 def _not_reacting(who: Holder, config: RigConfig) -> BenchBusy:

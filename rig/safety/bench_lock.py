@@ -19,7 +19,6 @@ from rig.core.files import no_follow
 from rig.safety.saved_state import (
     SERVER_FILE,
     SERVER_FOLDER,
-    FileStore,
     Holder,
     ServerAddress,
     make_folder,
@@ -42,6 +41,9 @@ class BenchLock:
     """
 
     def __init__(self, path: Path, clock: Clock) -> None:
+        # A server keeps the bench even while it cannot open it: a request to stop must reach its queue.
+        if (server := holder(path / SERVER_FOLDER)) is not None and server.pid != os.getpid():
+            raise busy(path, server)
         with storing(path / "lock"):
             make_folder(path)
             self._file: TextIO = open(path / "lock", "a+", encoding="utf-8", opener=no_follow)  # noqa: SIM115
@@ -52,7 +54,6 @@ class BenchLock:
                 self._file.close()
                 raise busy(path, holder(path))
             clock.sleep(0.02)  # another program may be reading who holds the lock
-        FileStore(path).clear_stop()  # an old request, meant for an earlier program
         mine = Holder(
             pid=os.getpid(),
             command=this_command(),

@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from rig.core import files
 from rig.core.clock import Clock
 from rig.core.errors import MotionStopped, RigError, StateNotStored, os_errors_as
-from rig.core.files import no_follow
+from rig.safety.stop_channel import StopAnswer, StopListener, StopRequest, listen
 
 VERSION = 3
 """Version 1 has neither the settings of the table nor the file of the latched fault; version 2 has no checksum."""
@@ -153,6 +153,9 @@ class StateStore(Protocol):
     def latch(self, fault: LatchedFault | None) -> None:
         """Store the latched fault, even on a full disk if a state was saved before; None removes it."""
 
+    def listen(self) -> None:
+        """Receive requests to stop from now on. Raises `StateNotStored`."""
+
     def stop_requested(self) -> bool:
         """Return whether the operator requested a stop; called in each round of the control loop."""
 
@@ -160,7 +163,10 @@ class StateStore(Protocol):
         """Request a stop from the program that uses the bench; may be called from any thread."""
 
     def clear_stop(self) -> None:
-        """Remove the request: it was carried out, or it is old."""
+        """Take the requests as carried out: the torque is off. Who waits for an answer gets it."""
+
+    def stop_listening(self) -> None:
+        """Receive no more requests to stop."""
 
     def read_file(self, name: str) -> bytes | None:
         """Return the file ``name`` that was stored beside the state; None if there is none."""
@@ -189,6 +195,9 @@ class MemoryStore:
     def latch(self, fault: LatchedFault | None) -> None:
         self.state = self.state.model_copy(update={"fault": fault})
 
+    def listen(self) -> None:
+        self.stop = False
+
     def stop_requested(self) -> bool:
         return self.stop
 
@@ -197,6 +206,9 @@ class MemoryStore:
 
     def clear_stop(self) -> None:
         self.stop = False
+
+    def stop_listening(self) -> None:
+        """Do nothing."""
 
     def read_file(self, name: str) -> bytes | None:
         return self.files.get(name)
@@ -209,17 +221,18 @@ class MemoryStore:
 
 
 class FileStore:
-    """State in the folder ``path``: ``state.json``, the file ``latch`` with the latched fault, and the file ``stop``.
+    """State in the folder ``path``: ``state.json``, and the file ``latch`` with the latched fault.
 
     ``latch`` has a fixed size and is written in place, so a full disk does not lose a fault. It is filled with spaces
-    if there is no fault. `request_stop` creates ``stop``. A file beside the folder shows that the bench has been
-    used: if the folder was emptied or deleted, that is not a new bench.
+    if there is no fault. A file beside the folder shows that the bench has been used: if the folder was emptied or
+    deleted, that is not a new bench. Requests to stop come through the socket of `rig.safety.stop_channel`.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self._file = path / "state.json"
-        self._stop = path / "stop"
+        self._stops: StopListener | None = None
+        self._heard = 0
         self._latch = path / "latch"
         self._used = path.with_name(f"{path.name}.used")
 
@@ -296,16 +309,29 @@ class FileStore:
                     self._used, f"This bench has been used. Its state is in the folder {self.path.name}.\n".encode()
                 )
 
+    def listen(self) -> None:
+        if self._stops is None:
+            self._stops = listen(self.path)
+        self._heard = self._stops.count()  # older requests were meant for an earlier program
+
     def stop_requested(self) -> bool:
-        return self._stop.exists()
+        return self._stops is not None and self._stops.count() != self._heard
 
     def clear_stop(self) -> None:
-        self._stop.unlink(missing_ok=True)
+        if self._stops is not None:
+            self._heard = self._stops.count()
+            self._stops.answer(StopAnswer.TORQUE_OFF)
 
     def request_stop(self) -> None:
-        with storing(self._stop):
-            make_folder(self.path)
-            os.close(no_follow(str(self._stop), os.O_WRONLY | os.O_CREAT))
+        if self._stops is not None:
+            self._stops.add()
+        else:
+            StopRequest(self.path).close()
+
+    def stop_listening(self) -> None:
+        if self._stops is not None:
+            self._stops.close()
+            self._stops = None
 
     def read_file(self, name: str) -> bytes | None:
         step = "Give yourself permission to read the file, or delete it."

@@ -130,6 +130,7 @@ class Safety:
         DeviceSilent
             The servo does not answer.
         """
+        self._store.listen()
         condition = self._servo.read_condition()
         findings = [f"the bench's stored state is lost: {self._record.damage}"] if self._record.damage else []
         if condition.torque:
@@ -257,6 +258,7 @@ class Safety:
     def end_session(self, ended: SessionEnd) -> None:
         """Store how this program ends its session, so that the next one knows that it did not crash."""
         end_session(self._store, ended)
+        self._store.stop_listening()
 
     def released(self) -> None:
         """Store the angle at which the table rests without torque, and clear a request to stop."""
@@ -430,6 +432,6 @@ def _watchdog_finding(condition: ServoCondition, last: SavedSession | None) -> s
 
 def _stopped() -> MotionStopped:
     return MotionStopped(
-        "`rig stop` stopped the table; its torque is off.",
+        "STOP or `rig stop` stopped the table; its torque is off.",
         next_step="Run the command again when the table may move; continue an enrollment with --resume.",
     )

@@ -9,6 +9,7 @@ import json
 import secrets
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import timedelta
 from enum import StrEnum
@@ -18,7 +19,15 @@ from typing import Any, Final
 from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from rig.core.clock import Clock, seconds_between
-from rig.core.errors import ConfigError, LeaseHeld, LoginRequired, StateNotStored, TooManyLogins, os_errors_as
+from rig.core.errors import (
+    ConfigError,
+    JobRejected,
+    LeaseHeld,
+    LoginRequired,
+    StateNotStored,
+    TooManyLogins,
+    os_errors_as,
+)
 from rig.core.files import read, write
 
 TOKENS: Final = "tokens.json"
@@ -31,8 +40,9 @@ LEASE_S: Final = 45.0
 """Time after which a lease that is not renewed is free, because the operator's browser was closed."""
 FREE_ATTEMPTS: Final = 5
 WINDOW_S: Final = 60.0
-"""After `FREE_ATTEMPTS` wrong tokens within this time from one address, logins from it are rejected for a while."""
+"""After `FREE_ATTEMPTS` wrong tokens within this time from one address, further wrong ones get another answer."""
 MAX_ADDRESSES: Final = 10_000
+MAX_ASKED: Final = 100
 
 
 class Role(StrEnum):
@@ -63,22 +73,28 @@ class Person:
     client: str = ""
 
     @property
-    def key(self) -> str:
-        return f"{self.name}/{self.client}"
+    def key(self) -> tuple[str, str]:
+        return self.name, self.client
+
+    def as_json(self) -> dict[str, str]:
+        return {"name": self.name, "client": self.client}
 
 
 LOCAL: Final = "local"
-"""Name of all users of this computer, if the server listens to this computer only."""
+"""Name of all users of this computer, if they need no token."""
 
 _STORED: Final = TypeAdapter(list[StoredToken])
 
 
 class Tokens:
-    """The tokens of a server, in a file that only its user can read."""
+    """The tokens of a server, in a file that only its user can read. While it is damaged, the last good ones count."""
 
     def __init__(self, folder: Path, clock: Clock) -> None:
         self._file = folder / TOKENS
         self._clock = clock
+        self._known: list[StoredToken] = []
+        self._read_at: tuple[int, int, int] | None = None
+        self._damage: ConfigError | None = None
 
     def new(self, name: str, role: Role, days: float | None = None) -> str:
         """Make a token, store its hash, and return it; a token of the same name is replaced.
@@ -92,6 +108,11 @@ class Tokens:
         """
         token = PREFIX + secrets.token_urlsafe(32)
         now = self._clock.utc()
+        if not name.isprintable() or name.strip() != name or name.casefold() == LOCAL:
+            raise ConfigError(
+                f"{name!r} cannot be the name of a token.",
+                next_step=f"Use characters that can be printed, without outer spaces, and another name than {LOCAL}.",
+            )
         try:
             stored = StoredToken(
                 name=name,
@@ -117,25 +138,47 @@ class Tokens:
 
     def stored(self) -> list[StoredToken]:
         """Return the stored tokens. Raises `ConfigError` if their file is damaged."""
-        try:
-            return _STORED.validate_json(read(self._file, max_bytes=MAX_BYTES))
-        except FileNotFoundError:
-            return []
-        except (OSError, ValidationError) as error:
-            raise ConfigError(
-                f"The tokens in {self._file} cannot be read.",
-                next_step="Delete the file, and make new tokens with rig serve --new-token NAME.",
-            ) from error
+        self._read()
+        if self._damage is not None:
+            raise self._damage
+        return self._known
 
-    def check(self, token: str) -> StoredToken | None:
-        """Return the token that was given; None if it is unknown or has expired."""
-        digest, found = _hash(token), None
-        for stored in self.stored():
-            if hmac.compare_digest(digest, stored.sha256):
+    def valid(self, sha256: str) -> StoredToken | None:
+        """Return the token with this hash; None if it is unknown or has expired.
+
+        Raises
+        ------
+        ConfigError
+            The file is damaged, and the token is not one of the last good ones.
+        """
+        self._read()
+        found = None
+        for stored in self._known:
+            if hmac.compare_digest(sha256, stored.sha256):
                 found = stored
+        if found is None and self._damage is not None:
+            raise self._damage
         if found is None or (found.expires_utc is not None and found.expires_utc <= self._clock.utc()):
             return None
         return found
+
+    def _read(self) -> None:
+        """Read the file if it has changed."""
+        try:
+            status = self._file.stat()
+            signature = (status.st_ino, status.st_mtime_ns, status.st_size)
+            if signature != self._read_at:
+                self._known = _STORED.validate_json(read(self._file, max_bytes=MAX_BYTES))
+                self._read_at, self._damage = signature, None
+        except FileNotFoundError:
+            self._known, self._read_at, self._damage = [], None, None
+        except (OSError, ValidationError) as error:
+            self._read_at = None
+            self._damage = ConfigError(
+                f"The tokens in {self._file} cannot be read.",
+                next_step="Delete the file, and make new tokens with rig serve --new-token NAME.",
+                evidence={"reason": str(error)},
+            )
 
     def _store(self, tokens: list[StoredToken]) -> None:
         content = json.dumps([token.model_dump(mode="json") for token in tokens], indent=1).encode()
@@ -188,22 +231,21 @@ class Sessions:
         now_ns = self.clock.now_ns()
         if hmac.compare_digest(token.encode(errors="replace"), self.local_token.encode()):
             return StoredToken(name=LOCAL, role=Role.WATCH, sha256=_hash(token), created_utc=self.clock.utc())
+        stored = self.tokens.valid(_hash(token))
+        if stored is not None:
+            return stored  # right tokens are never locked out: their owner may have to stop the table
         with self._lock:
             recent = [at for at in self._failures.get(address, []) if seconds_between(at, now_ns) < WINDOW_S]
             if len(recent) >= FREE_ATTEMPTS:
                 raise TooManyLogins(
                     "Too many wrong tokens came from this address.", next_step=f"Wait {WINDOW_S:.0f} s, then try again."
                 )
-        stored = self.tokens.check(token)
-        if stored is None:
-            with self._lock:
-                if len(self._failures) >= MAX_ADDRESSES:
-                    self._failures.clear()
-                self._failures[address] = [*recent, now_ns]
-            raise LoginRequired(
-                "The token is unknown or has expired.", next_step="Make a new one: rig serve --new-token NAME"
-            )
-        return stored
+            if len(self._failures) >= MAX_ADDRESSES:
+                self._failures.clear()
+            self._failures[address] = [*recent, now_ns]
+        raise LoginRequired(
+            "The token is unknown or has expired.", next_step="Make a new one: rig serve --new-token NAME"
+        )
 
     def find(self, secret: str) -> Person | None:
         """Return the person of a session; None if it has ended or its token was removed."""
@@ -211,12 +253,9 @@ class Sessions:
             session = self._sessions.get(secret)
         if session is None or seconds_between(session.since_ns, self.clock.now_ns()) > SESSION_S:
             return None
-        if not any(
-            stored.sha256 == session.sha256 and (stored.expires_utc is None or stored.expires_utc > self.clock.utc())
-            for stored in self.tokens.stored()
-        ):
-            return None
-        return session.person
+        with suppress(ConfigError):  # the file is damaged
+            return session.person if self.tokens.valid(session.sha256) is not None else None
+        return None
 
     def logout(self, secret: str) -> None:
         with self._lock:
@@ -231,6 +270,7 @@ class Lease:
     changed: Callable[[dict[str, Any]], None]
     _holder: Person | None = None
     _until_ns: int = 0
+    _asked: dict[tuple[str, str], Person] = field(default_factory=dict)
     _lock: threading.RLock = field(default_factory=threading.RLock)
 
     @property
@@ -256,27 +296,38 @@ class Lease:
                     next_step="Wait, ask for it, or take it over. The other operator is then warned.",
                     evidence={"holder": before.name},
                 )
+            if before is None or before.key != person.key:
+                self._asked.clear()
             self._holder = person
             self._until_ns = self.clock.now_ns() + round(LEASE_S * 1e9)
         if before is None or before.key != person.key:
-            self.changed(self.as_json(taken_from=before.key if before else None))
+            self.changed(self.as_json(taken_from=before))
 
     def ask(self, person: Person) -> None:
         """Ask the operator who has the lease to hand it over."""
-        self.changed({**self.as_json(), "asked_by": {"name": person.name, "client": person.client}})
+        with self._lock:
+            self._asked[person.key] = person
+            while len(self._asked) > MAX_ASKED:
+                del self._asked[next(iter(self._asked))]
+        self.changed({**self.as_json(), "asked_by": person.as_json()})
 
-    def hand_over(self, person: Person, to: Person) -> None:
+    def hand_over(self, person: Person, name: str, client: str) -> None:
         """Give the lease to another operator who asked for it.
 
         Raises
         ------
         LeaseHeld
             ``person`` does not have it.
+        JobRejected
+            No operator of that name asked for it.
         """
         with self._lock:
             holder = self.holder
             if holder is None or holder.key != person.key:
                 raise LeaseHeld("You do not have the lease.", next_step="Take it first.")
+            to = self._asked.get((name, client))
+            if to is None:
+                raise JobRejected(f"{name} has not asked for the bench.", next_step="Wait until another operator asks for it.")
             self._holder = None
             self.take(to)
 
@@ -286,14 +337,14 @@ class Lease:
             if self._holder is None or self._holder.key != person.key:
                 return
             self._holder = None
-        self.changed(self.as_json(taken_from=None))
+        self.changed(self.as_json())
 
-    def as_json(self, taken_from: str | None = None) -> dict[str, Any]:
+    def as_json(self, taken_from: Person | None = None) -> dict[str, Any]:
         holder = self.holder
         return {
             "holder": holder.name if holder else None,
             "client": holder.client if holder else None,
-            "taken_from": taken_from,
+            "taken_from": None if taken_from is None else taken_from.as_json(),
             "seconds": LEASE_S,
         }
 

@@ -5,7 +5,6 @@ from typing import Any
 
 from fastapi import APIRouter, Request, Response
 
-from rig.web.access import Person, Role
 from rig.web.server import COOKIE, HandOverBody, LeaseBody, LoginBody, Server, Watcher, require_operate
 
 
@@ -13,7 +12,7 @@ def add_access(api: APIRouter, server: Server) -> None:
     @api.get("/health", tags=["server"])
     def health() -> dict[str, Any]:
         """Return whether the server works; needs no login."""
-        status = server.worker.status
+        status = server.remote.status
         return {"status": "ok", "version": version("hbr-rig"), "bench_open": bool(status.get("open"))}
 
     @api.post("/login", tags=["access"])
@@ -25,8 +24,9 @@ def add_access(api: APIRouter, server: Server) -> None:
 
     @api.post("/logout", tags=["access"])
     def logout(request: Request, response: Response) -> dict[str, Any]:
-        """Log out."""
+        """Log out. The open streams of this login end."""
         server.sessions.logout(request.cookies.get(COOKIE, ""))
+        server.hub.wake()
         response.delete_cookie(COOKIE, path="/")
         return {}
 
@@ -59,7 +59,7 @@ def add_access(api: APIRouter, server: Server) -> None:
     @api.post("/lease/hand-over", tags=["access"])
     def hand_over(body: HandOverBody, person: Watcher) -> dict[str, Any]:
         """Give the lease to an operator who asked for it."""
-        server.lease.hand_over(person, Person(body.name, Role.OPERATE, body.client))
+        server.lease.hand_over(person, body.name, body.client)
         return server.lease.as_json()
 
     @api.delete("/lease", tags=["access"])

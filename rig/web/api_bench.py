@@ -1,57 +1,108 @@
 """The REST API: state, STOP, events, pictures, jobs."""
 
+import asyncio
+import json
+from contextlib import aclosing
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Header, Query, Request, Response
+from fastapi import APIRouter, Header, Query, Request, Response, WebSocket, WebSocketDisconnect
 from fastapi.responses import StreamingResponse
 
-from rig.core.errors import JobNotFound
-from rig.web.picture import BOUNDARY
+from rig.core.errors import JobNotFound, TooManyListeners
+from rig.web.hub import MAX_LISTENERS
 from rig.web.problems import problem
+from rig.web.remote_bench import BOUNDARY
 from rig.web.requests import Job, JobRequest
 from rig.web.server import AnswerBody, Limit, OperatorPerson, Server, Watcher, page_of
+
+MAX_VIEWERS = 50
 
 
 def add_bench(api: APIRouter, server: Server) -> None:
     @api.get("/status", tags=["bench"])
     def status(_person: Watcher) -> dict[str, Any]:
         """Return the state of the bench, as of the last second."""
-        problem_now = server.queue.problem or server.damage
-        return {
-            **server.worker.status,
-            "bench": server.bench,
-            "server": {"viewers": server.picture.viewers, "listeners": server.hub.listeners},
-            "catalog": server.catalog.state,
-            "problem": problem(problem_now) if problem_now else None,
-        }
+        return _status(server)
 
     @api.post("/stop", tags=["bench"])
-    def stop(_person: Watcher) -> dict[str, Any]:
-        """Stop the table, and cancel all jobs. Needs no lease. The answer says whether the running job has ended."""
-        return {"ended": server.worker.stop(), "status": server.worker.status}
+    async def stop(_person: Watcher) -> dict[str, Any]:
+        """Stop the table, and cancel all jobs. Needs no lease. The answer says whether the bench has confirmed it."""
+        return {**await server.remote.stop(), "status": server.remote.status}
 
     @api.get("/events", tags=["bench"], response_class=StreamingResponse)
     async def events(
-        _person: Watcher, last_event_id: Annotated[str | None, Header(max_length=64)] = None
+        request: Request, _person: Watcher, last_event_id: Annotated[str | None, Header(max_length=64)] = None
     ) -> StreamingResponse:
         """Send events: plan, job, status, lease, stop. `Last-Event-ID` continues after a lost connection."""
+        _check_number(server.hub.listeners, MAX_LISTENERS)
         headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
-        return StreamingResponse(server.hub.stream(last_event_id), media_type="text/event-stream", headers=headers)
+        stream = server.hub.stream(last_event_id, lambda: server.still_allowed(request))
+        return StreamingResponse(stream, media_type="text/event-stream", headers=headers)
+
+    @api.websocket("/socket")
+    async def socket(socket: WebSocket) -> None:
+        """Send the events to a page, and take its STOP: the connection is open already, and no other can occupy it."""
+        if not server.still_allowed(socket) or server.hub.listeners >= MAX_LISTENERS:
+            await socket.close(1008)
+            return
+        await socket.accept()
+        sending = asyncio.ensure_future(_send_events(server, socket))
+        try:
+            while not sending.done():
+                received = await socket.receive_json()
+                if isinstance(received, dict) and "stop" in received and server.still_allowed(socket):
+                    done = await server.remote.stop()
+                    await socket.send_json({"kind": "stopped", "data": {**done, "stop": received["stop"]}})
+        except (WebSocketDisconnect, RuntimeError, ValueError):  # it is closed, or what came is not JSON
+            pass
+        finally:
+            sending.cancel()
 
     @api.get("/picture", tags=["bench"], response_class=Response)
-    def picture(_person: Watcher) -> Response:
-        """Return the newest frame of the camera as JPEG."""
-        server.picture.want()
-        found = server.picture.jpeg()
-        if found is None:
+    async def picture(_person: Watcher) -> Response:
+        """Return the newest frame of the camera as JPEG; the header X-Rig-Picture-Age has its age in seconds."""
+        _, content, age_s = await server.remote.picture()
+        if not content:
             raise JobNotFound("The camera has given no frame yet.", next_step="Try again in a second.")
-        return Response(found[1], media_type="image/jpeg", headers={"Cache-Control": "no-store"})
+        headers = {"Cache-Control": "no-store", "X-Rig-Picture-Age": f"{age_s or 0.0:.2f}"}
+        return Response(content, media_type="image/jpeg", headers=headers)
 
     @api.get("/live", tags=["bench"], response_class=StreamingResponse)
-    async def live(_person: Watcher) -> StreamingResponse:
+    async def live(request: Request, _person: Watcher) -> StreamingResponse:
         """Send the camera's frames as MJPEG."""
+        _check_number(server.remote.viewers, MAX_VIEWERS)
         kind = f"multipart/x-mixed-replace; boundary={BOUNDARY}"
-        return StreamingResponse(server.picture.stream(), media_type=kind, headers={"Cache-Control": "no-store"})
+        pictures = server.remote.pictures(lambda: server.still_allowed(request))
+        return StreamingResponse(pictures, media_type=kind, headers={"Cache-Control": "no-store"})
+
+
+def _status(server: Server) -> dict[str, Any]:
+    return {
+        **server.remote.status,
+        "bench": server.bench,
+        "server": {"viewers": server.remote.viewers, "listeners": server.hub.listeners},
+        "catalog": server.catalog.state,
+        "problem": server.remote.status.get("problem") or (problem(server.damage) if server.damage else None),
+    }
+
+
+async def _send_events(server: Server, socket: WebSocket) -> None:
+    """Send the hub's messages to a page until it has gone or may not listen any more."""
+    last = socket.query_params.get("last")
+    async with aclosing(server.hub.messages(last, lambda: server.still_allowed(socket))) as messages:
+        async for message in messages:
+            if message is not None:
+                head = json.dumps({"kind": message.kind, "id": server.hub.id_of(message)})
+                await socket.send_text(f'{head[:-1]}, "data": {message.data}}}')
+    await socket.close(1008)
+
+
+def _check_number(present: int, most: int) -> None:
+    if present >= most:
+        raise TooManyListeners(
+            f"{present} streams of this kind are open already.",
+            next_step="Close some pages or programs, then try again.",
+        )
 
 
 def add_jobs(api: APIRouter, server: Server) -> None:
@@ -60,43 +111,40 @@ def add_jobs(api: APIRouter, server: Server) -> None:
         request: Request, _person: Watcher, limit: Limit = 50, after: Annotated[str | None, Query(max_length=32)] = None
     ) -> Response:
         """List the jobs, the newest first."""
-        found = [job.model_dump(mode="json") for job in server.queue.jobs()]
-        return page_of(request, found, "id", limit, after)
+        return page_of(request, server.remote.jobs(), "id", limit, after)
 
     @api.post("/jobs", tags=["jobs"], status_code=201)
     def submit(body: JobRequest, person: OperatorPerson) -> Job:
         """Add a job to the queue."""
-        return server.queue.submit(body, person.name)
+        return server.remote.submit(body, person.name)
 
     @api.get("/jobs/{job_id}", tags=["jobs"])
     def job(job_id: str, _person: Watcher) -> Job:
         """Return a job."""
-        return server.queue.job(job_id)
+        return server.remote.job(job_id)
 
     @api.post("/jobs/{job_id}/cancel", tags=["jobs"])
     def cancel(job_id: str, _person: OperatorPerson) -> Job:
         """Cancel a job. A running one ends at its next step; views that were taken stay stored."""
-        return server.queue.cancel(job_id)
+        return server.remote.cancel(job_id)
 
     @api.post("/jobs/{job_id}/pause", tags=["jobs"])
     def pause(job_id: str, _person: OperatorPerson) -> Job:
         """Pause a job after its present view; the table holds its angle."""
-        return server.queue.pause(job_id)
+        return server.remote.pause(job_id)
 
     @api.post("/jobs/{job_id}/resume", tags=["jobs"])
     def resume(job_id: str, _person: OperatorPerson) -> Job:
         """Resume a paused job."""
-        return server.queue.resume(job_id)
+        return server.remote.resume(job_id)
 
     @api.post("/jobs/{job_id}/answer", tags=["jobs"])
     def answer(job_id: str, body: AnswerBody, _person: OperatorPerson) -> Job:
         """Answer the question of a job."""
-        return server.queue.answer(job_id, body.choice)
+        return server.remote.answer(job_id, body.choice)
 
     @api.get("/jobs/{job_id}/views/{number}", tags=["jobs"], response_class=Response)
     def view(job_id: str, number: int, _person: Watcher) -> Response:
         """Return a picture of a recent job as JPEG, the first with number 0."""
-        found = server.worker.view(job_id, number)
-        if found is None:
-            raise JobNotFound("There is no such picture (any more).", next_step="The catalog has all enrolled views.")
+        found = server.remote.view(job_id, number)
         return Response(found, media_type="image/jpeg", headers={"Cache-Control": "private, max-age=3600"})

@@ -17,7 +17,18 @@ from rig.catalog.prepared import prepared_views
 from rig.events.events import plain
 from rig.plans.similar_objects import similar_objects
 from rig.web.picture import jpeg
-from rig.web.server import API, Limit, NameBody, ObjectBody, OperatorPerson, Server, Watcher, page_of, time_text
+from rig.web.server import (
+    API,
+    Limit,
+    NameBody,
+    ObjectBody,
+    OperatorPerson,
+    Server,
+    Watcher,
+    long_work,
+    page_of,
+    time_text,
+)
 
 THUMB_PX: Final = 256
 UPLOAD: Final = f"{API}/import"
@@ -132,18 +143,22 @@ def add_catalog(api: APIRouter, server: Server) -> None:
             with path.open("wb") as file:
                 async for chunk in request.stream():
                     await to_thread.run_sync(file.write, chunk)
-            return await to_thread.run_sync(_import, server, path, on_conflict)
+            return await long_work(lambda: _import(server, path, on_conflict))
 
     @api.get("/export", tags=["catalog"], response_class=FileResponse)
-    def export(
+    async def export(
         _person: Watcher, name: Annotated[list[str] | None, Query(description="default: all objects")] = None
     ) -> FileResponse:
         """Return a bundle with objects."""
         folder = TemporaryDirectory(prefix="rig-export-")
         path = Path(folder.name) / "catalog.rigcat.zip"
-        try:
+
+        def write() -> None:
             with server.catalog.open_to_read() as catalog:
                 write_bundle(path, read_objects(catalog, name or [one.name for one in catalog.objects()]))
+
+        try:
+            await long_work(write)
         except BaseException:
             folder.cleanup()
             raise

@@ -13,9 +13,9 @@ from rig.catalog.records import Outcome
 from rig.catalog.results import ResultFilter, correct, find_result, find_results
 from rig.core.errors import JobNotFound
 from rig.events.events import plain
-from rig.search.replay import check
+from rig.search.replay import Check, check
 from rig.search.saved_run import SavedRun, load_run
-from rig.web.server import CorrectionBody, Limit, OperatorPerson, Server, Watcher, page_of, time_text
+from rig.web.server import CorrectionBody, Limit, OperatorPerson, Server, Watcher, long_work, page_of, time_text
 from rig.web.work import calibrations
 
 RUN_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
@@ -55,18 +55,22 @@ def add_records(api: APIRouter, server: Server) -> None:
         }
 
     @api.get("/runs/{name}/report", tags=["runs"], response_class=HTMLResponse)
-    def report(name: str, _person: Watcher) -> HTMLResponse:
+    async def report(name: str, _person: Watcher) -> HTMLResponse:
         """Return the report of a saved run as a page."""
         from rig.report.run_report import run_report
 
-        return HTMLResponse(run_report(load(name)))
+        return HTMLResponse(await long_work(lambda: run_report(load(name))))
 
     @api.post("/runs/{name}/check", tags=["runs"])
-    def check_run(name: str, _person: Watcher) -> dict[str, Any]:
+    async def check_run(name: str, _person: Watcher) -> dict[str, Any]:
         """Compute every decision of a saved run again from its images."""
-        saved = load(name)
-        with saved.damage():
-            found = check(saved)
+
+        def checked() -> Check:
+            saved = load(name)
+            with saved.damage():
+                return check(saved)
+
+        found = await long_work(checked)
         return {**plain(found), "differences": [str(difference) for difference in found.differences]}
 
     @api.get("/results", tags=["results"])

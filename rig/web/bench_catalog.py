@@ -52,7 +52,7 @@ class BenchCatalog:
         create = not self.place.may_exist()
         catalog = open_or_copy(self.place, self._clock, create=create, attempts=self._attempts)
         copied = catalog.copied_utc
-        self._become({"local_copy_utc": None if copied is None else f"{copied:%Y-%m-%d %H:%M:%S} UTC"})
+        self.become({"local_copy_utc": None if copied is None else f"{copied:%Y-%m-%d %H:%M:%S} UTC"})
         return catalog
 
     def open_to_change(self) -> Catalog:
@@ -77,9 +77,10 @@ class BenchCatalog:
         return BackgroundDelivery(self.place, self._clock, self._report, changed=self._show)
 
     def _show(self, state: JournalState) -> None:
-        self._become({"waiting": state.waiting, "reasons": list(state.reasons)})
+        self.become({"waiting": state.waiting, "reasons": list(state.reasons)})
 
-    def _become(self, values: dict[str, Any]) -> None:
+    def become(self, values: dict[str, Any]) -> None:
+        """Take changes of the state, and report them."""
         state = {**self.state, **values}
         if state != self.state:
             self.state = state

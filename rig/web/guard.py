@@ -1,9 +1,14 @@
-"""Protects the server before a request reaches the application: host, origin, sizes and slow clients."""
+"""Protects the server before a request reaches the application: host, origin, sizes, slow and silent clients.
+
+Every new connection must get through, because it may bring a STOP. So none is rejected because of their number: if there
+are too many, the least useful one is closed.
+"""
 
 import asyncio
 from collections.abc import Awaitable, Callable, MutableMapping
 from typing import Any, Final
 from urllib.parse import urlsplit
+from weakref import WeakKeyDictionary
 
 from starlette.exceptions import HTTPException
 from uvicorn.protocols.http.h11_impl import H11Protocol, RequestResponseCycle
@@ -16,10 +21,14 @@ App = Callable[[Scope, Receive, Send], Awaitable[None]]
 
 MAX_BODY_BYTES: Final = 1_000_000
 """Largest size of a request, except an upload."""
-CHUNK_TIMEOUT_S: Final = 20.0
-"""Time after which a client that sends no more of its body is disconnected."""
+BODY_TIMEOUT_S: Final = 20.0
+"""Time that a body may take in addition to its size at `MIN_RATE`; then the client is disconnected."""
+MIN_RATE: Final = 20_000
+"""Slowest speed at which a body may come, in bytes a second."""
 HEADER_TIMEOUT_S: Final = 10.0
 """Time after which a client that has not sent a whole request head is disconnected."""
+MAX_CONNECTIONS: Final = 400
+"""Open connections: 200 listeners and as many other requests."""
 _CHANGES: Final = {"POST", "PUT", "PATCH", "DELETE"}
 _HEADERS: Final = [
     (
@@ -55,11 +64,16 @@ class Guard:
         self._max_upload_bytes = max_upload_bytes
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http":
-            if scope["type"] == "lifespan":
-                await self._app(scope, receive, send)
-            return  # there are no web sockets
+        if scope["type"] == "lifespan":
+            await self._app(scope, receive, send)
+            return
         headers = {name.decode("latin-1"): value.decode("latin-1") for name, value in scope["headers"]}
+        if scope["type"] == "websocket":
+            if self._rejection("GET", scope["path"], headers) is not None:
+                await send({"type": "websocket.close", "code": 1008})
+            else:
+                await self._app(scope, receive, send)
+            return
         rejection = self._rejection(scope["method"], scope["path"], headers)
         if rejection is not None:
             await _reject(send, *rejection)
@@ -71,6 +85,8 @@ class Guard:
             return
         received = 0
         complete = False
+        loop = asyncio.get_running_loop()
+        began_s = loop.time()
 
         async def limited() -> Message:
             """Receive the body; its errors are raised in the application, which answers them like its other errors."""
@@ -78,7 +94,8 @@ class Guard:
             if complete:  # the next message is the end of the connection
                 return await receive()
             try:
-                message = await asyncio.wait_for(receive(), CHUNK_TIMEOUT_S)
+                async with asyncio.timeout_at(began_s + BODY_TIMEOUT_S + received / MIN_RATE):
+                    message = await receive()
             except TimeoutError as error:
                 raise HTTPException(408, "The request came too slowly.") from error
             if message["type"] == "http.request":
@@ -103,7 +120,7 @@ class Guard:
         site = headers.get("sec-fetch-site", "none")
         navigates = method == "GET" and headers.get("sec-fetch-mode") == "navigate" and not path.startswith("/api/")
         origin = headers.get("origin")
-        foreign = origin is not None and urlsplit(origin).netloc.lower() != host.lower()
+        foreign = origin is not None and _origin_host(origin) != host.lower()
         if foreign or (site not in ("none", "same-origin") and not navigates):
             return 403, "The request comes from another web site.", "Open the page of the bench itself."
         if method in _CHANGES and path != self._upload_path and headers.get("content-length", "0") != "0":
@@ -120,6 +137,14 @@ def _host_name(host: str) -> str:
         return ""
 
 
+def _origin_host(origin: str) -> str:
+    """Return the host and port of an origin; "" if it is not an address."""
+    try:
+        return urlsplit(origin).netloc.lower()
+    except ValueError:
+        return ""
+
+
 async def _reject(send: Send, status: int, what: str, next_step: str) -> None:
     from rig.web.problems import problem_body
 
@@ -129,16 +154,51 @@ async def _reject(send: Send, status: int, what: str, next_step: str) -> None:
     await send({"type": "http.response.body", "body": body})
 
 
+_silent: Final[WeakKeyDictionary["PatientProtocol", None]] = WeakKeyDictionary()
+"""Connections without a request that is being answered, the oldest first."""
+
+
 class PatientProtocol(H11Protocol):
-    """HTTP/1.1 that disconnects clients that do not complete the head of a request in time ("slow loris")."""
+    """HTTP/1.1 that closes connections of clients that do not complete the head of a request in time ("slow loris").
+
+    If there are more than `MAX_CONNECTIONS`, it closes one for each new one: the one that has been silent for the
+    longest time or, if each has a request, any other.
+    """
 
     def connection_made(self, transport: Any) -> None:
         super().connection_made(transport)
         self._head_timer = self.loop.call_later(HEADER_TIMEOUT_S, self._check_head)
+        _silent[self] = None
+        if len(self.connections) > MAX_CONNECTIONS:
+            self._make_room()
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._head_timer.cancel()
+        _silent.pop(self, None)
         super().connection_lost(exc)
+
+    def handle_events(self) -> None:
+        super().handle_events()
+        if self._answers():
+            _silent.pop(self, None)
+
+    def on_response_complete(self) -> None:
+        super().on_response_complete()
+        _silent[self] = None
+
+    def handle_websocket_upgrade(self, event: Any) -> None:
+        self._head_timer.cancel()
+        _silent.pop(self, None)
+        super().handle_websocket_upgrade(event)
+
+    def _answers(self) -> bool:
+        """Return whether a whole request has come and its answer has not ended."""
+        cycle: RequestResponseCycle | None = self.cycle
+        return cycle is not None and not cycle.response_complete and not cycle.more_body
+
+    def _make_room(self) -> None:
+        others = (one for group in (_silent, self.connections) for one in group if one is not self)
+        next(others).transport.abort()
 
     def _check_head(self) -> None:
         cycle: RequestResponseCycle | None = self.cycle

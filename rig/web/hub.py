@@ -1,4 +1,4 @@
-"""Distributes messages from the program's bench thread to any number of listeners.
+"""Distributes messages of the bench to any number of listeners.
 
 A listener has only a position in the hub's ring of messages. A listener that does not read costs no memory, and cannot
 delay the bench.
@@ -8,14 +8,20 @@ import asyncio
 import json
 import threading
 from collections import deque
-from collections.abc import AsyncIterator
+from collections.abc import AsyncGenerator, Callable
+from contextlib import aclosing
 from dataclasses import dataclass
 from typing import Any, Final
 
 CAPACITY: Final = 20_000
 """Messages that can be sent again after a lost connection: about 200 enrollments of 72 views."""
+MAX_SIZE: Final = 64_000_000
+"""Characters of all messages that can be sent again: a job with a long tray is a long message."""
 HEARTBEAT_S: Final = 10.0
 """A comment is sent after this time without messages, so that both ends notice a lost connection."""
+CHECK_S: Final = 1.0
+"""Time between two checks whether a listener may still listen."""
+MAX_LISTENERS: Final = 200
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,6 +48,7 @@ class Hub:
         self._epoch = epoch
         self._messages: deque[Message] = deque(maxlen=capacity)
         self._last = 0
+        self._size = 0
         self._lock = threading.Lock()
         self._loop: asyncio.AbstractEventLoop | None = None
         self._changed: asyncio.Event | None = None
@@ -53,7 +60,12 @@ class Hub:
         text = json.dumps(data, ensure_ascii=False, allow_nan=False, default=str)
         with self._lock:
             self._last += 1
+            if len(self._messages) == self._messages.maxlen:
+                self._size -= len(self._messages.popleft().data)
             self._messages.append(Message(self._last, kind, text))
+            self._size += len(text)
+            while self._size > MAX_SIZE and len(self._messages) > 1:
+                self._size -= len(self._messages.popleft().data)
         if self._loop is not None:
             try:
                 self._loop.call_soon_threadsafe(self._wake)
@@ -83,37 +95,63 @@ class Hub:
             return self._last, True
         return int(number), False
 
-    async def stream(self, last_event_id: str | None = None) -> AsyncIterator[str]:
-        """Yield server-sent events after ``last_event_id``, until the hub is closed.
+    async def messages(
+        self, last_event_id: str | None = None, still_allowed: Callable[[], bool] = lambda: True
+    ) -> AsyncGenerator[Message | None, None]:
+        """Yield the messages after ``last_event_id``, until the hub is closed or the listener is not allowed any more.
 
-        The first event is ``hello``. Its data say whether messages were lost since ``last_event_id``: the listener must
-        then load the present state again.
+        The first message is ``hello``. Its data say whether messages were lost since ``last_event_id``: the listener
+        must then load the present state again. None is a sign of life after some time without messages.
         """
         self._loop = asyncio.get_running_loop()
         self._changed = self._changed or asyncio.Event()
         number, lost = self.position(last_event_id)
         self.listeners += 1
+        silent_s = 0.0
         try:
             yield self._hello(number, lost)
-            while not self._closed:
+            while not self._closed and still_allowed():
                 changed = self._changed
                 messages, lost = self.since(number)
                 if lost:
                     number = messages[0].number - 1
                     yield self._hello(number, lost)
                 for message in messages:
-                    number = message.number
-                    yield f"id: {self._epoch}-{number}\nevent: {message.kind}\ndata: {message.data}\n\n"
+                    number, silent_s = message.number, 0.0
+                    yield message
                 if not messages:
                     try:
-                        await asyncio.wait_for(changed.wait(), HEARTBEAT_S)
+                        await asyncio.wait_for(changed.wait(), CHECK_S)
                     except TimeoutError:
-                        yield ": no news\n\n"
+                        silent_s += CHECK_S
+                    if silent_s >= HEARTBEAT_S:
+                        silent_s = 0.0
+                        yield None
         finally:
             self.listeners -= 1
 
-    def _hello(self, number: int, lost: bool) -> str:
-        return f"id: {self._epoch}-{number}\nevent: hello\ndata: {json.dumps({'lost': lost})}\n\n"
+    async def stream(
+        self, last_event_id: str | None = None, still_allowed: Callable[[], bool] = lambda: True
+    ) -> AsyncGenerator[str, None]:
+        """Yield `messages` as server-sent events."""
+        async with aclosing(self.messages(last_event_id, still_allowed)) as messages:
+            async for message in messages:
+                if message is None:
+                    yield ": no news\n\n"
+                else:
+                    yield f"id: {self.id_of(message)}\nevent: {message.kind}\ndata: {message.data}\n\n"
+
+    def id_of(self, message: Message) -> str:
+        """Return the id after which a listener can continue."""
+        return f"{self._epoch}-{message.number}"
+
+    def wake(self) -> None:
+        """Let all listeners check at once whether they may still listen."""
+        if self._loop is not None:
+            self._loop.call_soon_threadsafe(self._wake)
+
+    def _hello(self, number: int, lost: bool) -> Message:
+        return Message(number, "hello", json.dumps({"lost": lost}))
 
     def _wake(self) -> None:
         if self._changed is not None:

@@ -18,8 +18,12 @@ from rig.web.requests import Choice, EnrollRequest, IdentifyRequest, Job, JobReq
 FILE: Final = "jobs.json"
 STORED: Final = 200
 """Largest number of stored jobs."""
+STORED_BYTES: Final = 2_000_000
+"""Largest size of the stored jobs that have ended; the oldest are dropped."""
 MAX_QUEUED: Final = 50
-MAX_BYTES: Final = 50_000_000
+MAX_QUEUED_BYTES: Final = 4_000_000
+MAX_BYTES: Final = 20_000_000
+"""Largest size of the file: the waiting jobs and their continuations, a running one, and those that have ended."""
 
 
 class JobQueue:
@@ -35,10 +39,17 @@ class JobQueue:
         Called with each job that has changed.
     rig_arguments
         Arguments that let a command of the terminal use the same bench.
+    stops
+        Returns the number of stops so far. A job that was submitted before a stop never starts.
     """
 
     def __init__(
-        self, folder: Path, clock: Clock, changed: Callable[[Job], None], rig_arguments: tuple[str, ...] = ()
+        self,
+        folder: Path,
+        clock: Clock,
+        changed: Callable[[Job], None],
+        rig_arguments: tuple[str, ...] = (),
+        stops: Callable[[], int] = lambda: 0,
     ) -> None:
         self._file = folder / FILE
         self._clock = clock
@@ -50,6 +61,10 @@ class JobQueue:
         self._cancelled: set[str] = set()
         self._pausing: set[str] = set()
         self._answers: dict[str, Choice] = {}
+        self._texts: dict[str, str] = {}
+        self._stops = stops
+        self.heeded = stops()
+        """Number of stops that have cancelled the jobs before them."""
         self.problem: RigError | None = None
         self._load()
 
@@ -69,12 +84,17 @@ class JobQueue:
         Raises
         ------
         JobRejected
-            Too many jobs wait.
+            Too many jobs wait, or too large ones.
         """
         with self._lock:
-            if sum(job.state is JobState.QUEUED for job in self._jobs.values()) >= MAX_QUEUED:
+            self.heed_stops()
+            waiting = [job for job in self._jobs.values() if job.state is JobState.QUEUED]
+            size = len(request.model_dump_json()) + sum(len(self._texts[job.id]) for job in waiting)
+            if len(waiting) >= MAX_QUEUED or size > MAX_QUEUED_BYTES:
                 raise JobRejected(
-                    f"{MAX_QUEUED} jobs wait already.", next_step="Wait until some have ended, or cancel some."
+                    f"{len(waiting)} jobs wait already.",
+                    next_step="Wait until some have ended, or cancel some.",
+                    evidence={"jobs": len(waiting), "largest_number": MAX_QUEUED, "bytes": size},
                 )
             job = Job(
                 id=secrets.token_hex(6),
@@ -84,8 +104,6 @@ class JobQueue:
                 operator=operator,
             )
             self._jobs[job.id] = job
-            for old in [job for job in self._jobs.values() if job.state.ended][: len(self._jobs) - STORED]:
-                del self._jobs[old.id]
             self._store(job)
             self._arrived.notify_all()
             return job.model_copy()
@@ -99,11 +117,22 @@ class JobQueue:
             self._cancelled.add(job_id)
             return job.model_copy()
 
-    def cancel_all(self) -> None:
-        """Cancel the running job and all that wait."""
+    def heed_stops(self) -> bool:
+        """Cancel the running job and all that wait, if there was a stop since the last call; return whether."""
         with self._lock:
-            for job in [job for job in self._jobs.values() if not job.state.ended]:
-                self.cancel(job.id)
+            stops = self._stops()
+            if stops == self.heeded:
+                return False
+            self.heeded = stops
+            self._cancelled |= {job.id for job in self._jobs.values() if not job.state.ended}
+            self._end_waiting(JobState.CANCELLED)
+            return True
+
+    def hold(self) -> None:
+        """Pause the running job and interrupt those that wait, because no page can show them any more."""
+        with self._lock:
+            self._pausing |= {job.id for job in self._jobs.values() if job.state is JobState.RUNNING}
+            self._end_waiting(JobState.INTERRUPTED)
 
     def pause(self, job_id: str) -> Job:
         """Pause a running job at its next view. Raises `JobNotFound`, `JobRejected`."""
@@ -138,22 +167,24 @@ class JobQueue:
     def next(self, timeout_s: float = 0.0) -> Job | None:
         """Return the oldest job that waits, now running; None if there is none within the time."""
         with self._lock:
+            self.heed_stops()
             waiting = self._oldest()
             if waiting is None and timeout_s > 0:
                 self._arrived.wait(timeout_s)
+                self.heed_stops()
                 waiting = self._oldest()
             if waiting is not None:
                 waiting.state, waiting.started_utc = JobState.RUNNING, self._now()
                 self._store(waiting)
             return waiting
 
+    # These two are asked during a motion, so they do not wait for the lock: another thread may be storing jobs.
+
     def is_cancelled(self, job: Job) -> bool:
-        with self._lock:
-            return job.id in self._cancelled
+        return job.id in self._cancelled
 
     def is_paused(self, job: Job) -> bool:
-        with self._lock:
-            return job.id in self._pausing
+        return job.id in self._pausing
 
     def ask(self, job: Job, question: Question | None) -> None:
         """Show a question, or with None remove it."""
@@ -187,12 +218,25 @@ class JobQueue:
     # -- inside -------------------------------------------------------------------------------------------------------
 
     def _end(self, job: Job, state: JobState) -> Job:
+        self._mark_ended(job, state)
+        self._store(job)
+        return job
+
+    def _mark_ended(self, job: Job, state: JobState) -> None:
         job.state, job.ended_utc, job.question = state, self._now(), None
         self._cancelled.discard(job.id)
         self._pausing.discard(job.id)
         self._answers.pop(job.id, None)
-        self._store(job)
-        return job
+
+    def _end_waiting(self, state: JobState) -> None:
+        """End all jobs that wait, and store them together."""
+        waiting = [job for job in self._jobs.values() if job.state is JobState.QUEUED]
+        for job in waiting:
+            if state is JobState.INTERRUPTED:
+                self._offer_to_continue(job)
+            self._mark_ended(job, state)
+        if waiting:
+            self._store(*waiting)
 
     def _offer_to_continue(self, job: Job) -> None:
         """Set the request and the command that continue the work of a job that ended early."""
@@ -227,8 +271,12 @@ class JobQueue:
     def _now(self) -> str:
         return self._clock.utc().isoformat(timespec="seconds").replace("+00:00", "Z")
 
-    def _store(self, job: Job) -> None:
-        content = json.dumps([one.model_dump(mode="json") for one in self._jobs.values()], ensure_ascii=False).encode()
+    def _store(self, *changed: Job) -> None:
+        """Store all jobs, and report those that have changed."""
+        for job in changed:
+            self._texts[job.id] = job.model_dump_json()
+        self._drop_old()
+        content = f"[{','.join(self._texts.values())}]".encode()
         step = "Make room on the disk. The bench works, but the list of jobs does not survive the server."
         try:
             with os_errors_as(StateNotStored, f"The jobs cannot be stored in {self._file}.", next_step=step):
@@ -237,7 +285,18 @@ class JobQueue:
             self.problem = None
         except StateNotStored as error:  # a full disk must not stop the bench
             self.problem = error
-        self._changed(job.model_copy())
+        for job in changed:
+            self._changed(job.model_copy())
+
+    def _drop_old(self) -> None:
+        """Drop the oldest jobs that have ended, beyond `STORED` and `STORED_BYTES`; the newest of them stays."""
+        ended = [job for job in self._jobs.values() if job.state.ended]
+        size = sum(len(self._texts[job.id]) for job in ended)
+        for job in ended[:-1]:
+            if len(self._jobs) <= STORED and size <= STORED_BYTES:
+                break
+            size -= len(self._texts.pop(job.id))
+            del self._jobs[job.id]
 
     def _load(self) -> None:
         try:
@@ -253,6 +312,8 @@ class JobQueue:
             return
         for job in jobs:
             self._jobs[job.id] = job
+            self._texts[job.id] = job.model_dump_json()
+        for job in jobs:
             if not job.state.ended:
                 self._offer_to_continue(job)
                 self._end(job, JobState.INTERRUPTED)

@@ -20,7 +20,7 @@ class _Numbers(Collector):
         self._server = server
 
     def collect(self) -> Iterator[Metric]:
-        server, status = self._server, self._server.worker.status
+        server, status, numbers = self._server, self._server.remote.status, self._server.remote.numbers()
         yield GaugeMetricFamily("rig_bench_open", "Whether the bench is open.", float(bool(status.get("open"))))
         yield GaugeMetricFamily("rig_fault_latched", "Whether a fault is latched.", float(bool(status.get("fault"))))
         if (angle_deg := status.get("table_deg")) is not None:
@@ -28,19 +28,19 @@ class _Numbers(Collector):
         if servo := status.get("servo"):
             yield GaugeMetricFamily("rig_servo_temperature_celsius", "Temperature.", servo["temperature_c"])
             yield GaugeMetricFamily("rig_servo_volts", "Supply voltage.", servo["voltage_v"])
-        yield GaugeMetricFamily("rig_viewers", "Open live pictures.", server.picture.viewers)
+        yield GaugeMetricFamily("rig_viewers", "Open live pictures.", server.remote.viewers)
         yield GaugeMetricFamily("rig_event_listeners", "Open streams of events.", server.hub.listeners)
-        jobs = server.queue.jobs()
+        jobs = server.remote.jobs()
         waiting = GaugeMetricFamily("rig_jobs", "Jobs by state.", labels=["state"])
         for state in JobState:
-            waiting.add_metric([state.value], sum(job.state is state for job in jobs))
+            waiting.add_metric([state.value], sum(job["state"] == state for job in jobs))
         yield waiting
         ended = CounterMetricFamily("rig_jobs_ended", "Jobs ended since the server started.", labels=["state"])
-        for name, number in server.worker.jobs_ended.items():
+        for name, number in numbers["jobs_ended"].items():
             ended.add_metric([name], number)
         yield ended
-        yield CounterMetricFamily("rig_stops", "Presses of STOP since the server started.", server.worker.stops)
-        intervals = sorted(server.worker.intervals_s)
+        yield CounterMetricFamily("rig_stops", "Presses of STOP since the server started.", numbers["stops"])
+        intervals = sorted(numbers["intervals_s"])
         if intervals:
             polls = GaugeMetricFamily(
                 "rig_servo_poll_seconds", "Time between two readings of the servo in motion.", labels=["quantile"]

@@ -1,8 +1,7 @@
 """The live picture: the newest frame of the camera, encoded once for all viewers."""
 
-import asyncio
 import threading
-from collections.abc import AsyncIterator, Callable
+from collections.abc import Callable
 from typing import Final
 
 import cv2
@@ -14,9 +13,6 @@ from rig.devices.camera import Camera, CameraIdentity, CameraLocks, Frame
 
 JPEG_QUALITY: Final = 80
 MAX_SIDE_PX: Final = 1280
-BOUNDARY: Final = "frame"
-VIEWER_GONE_S: Final = 30.0
-"""A stream of pictures sends the last one again after this time, to notice a viewer that is gone."""
 
 
 class LivePicture:
@@ -30,10 +26,8 @@ class LivePicture:
         """Number of the newest frame, from 1; 0 if there is none."""
         self._encoded: tuple[int, bytes] | None = None
         self._encoding = threading.Lock()
-        self._shown_ns = clock.now_ns()
-        self.closed = False
-        self.viewers = 0
-        self.wanted_until_ns = 0
+        self._shown_ns: int | None = None
+        self._wanted_until_ns = 0
 
     def show(self, image_bgr: NDArray[np.uint8]) -> None:
         """Replace the picture, from the bench's thread; the array must not be changed afterwards."""
@@ -44,15 +38,16 @@ class LivePicture:
 
     def want(self) -> None:
         """Ask for pictures from an idle camera for the next five seconds."""
-        self.wanted_until_ns = self._clock.now_ns() + 5_000_000_000
+        self._wanted_until_ns = self._clock.now_ns() + 5_000_000_000
 
     @property
     def wanted(self) -> bool:
-        return self.viewers > 0 or self._clock.now_ns() < self.wanted_until_ns
+        return self._clock.now_ns() < self._wanted_until_ns
 
     @property
-    def age_s(self) -> float:
-        return seconds_between(self._shown_ns, self._clock.now_ns())
+    def age_s(self) -> float | None:
+        """Age of the newest frame in seconds; None if there is none."""
+        return None if self._shown_ns is None else seconds_between(self._shown_ns, self._clock.now_ns())
 
     def jpeg(self) -> tuple[int, bytes] | None:
         """Return the number of the newest frame and the frame as JPEG; None if there is none yet."""
@@ -64,25 +59,6 @@ class LivePicture:
             if self._encoded is None or self._encoded[0] != number:
                 self._encoded = (number, jpeg(image))
             return self._encoded
-
-    async def stream(self) -> AsyncIterator[bytes]:
-        """Yield the parts of a ``multipart/x-mixed-replace`` response, each frame at most once."""
-        self.viewers += 1
-        sent = -1
-        waited_s = 0.0
-        try:
-            while not self.closed:
-                if self.number != sent or waited_s > VIEWER_GONE_S:
-                    found = await asyncio.to_thread(self.jpeg)
-                    if found is not None:
-                        sent, content = found
-                        waited_s = 0.0
-                        head = f"--{BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(content)}\r\n\r\n"
-                        yield head.encode() + content + b"\r\n"
-                await asyncio.sleep(0.05)
-                waited_s += 0.05
-        finally:
-            self.viewers -= 1
 
 
 def jpeg(image_bgr: NDArray[np.uint8], max_side_px: int = MAX_SIDE_PX) -> bytes:

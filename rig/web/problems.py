@@ -14,6 +14,7 @@ from rig.core.errors import (
     ObjectExists,
     ObjectNotFound,
     RigError,
+    TooManyListeners,
     TooManyLogins,
 )
 
@@ -23,6 +24,7 @@ _STATUS: Final[dict[type[RigError], int]] = {
     LoginRequired: 401,
     Forbidden: 403,
     TooManyLogins: 429,
+    TooManyListeners: 503,
     LeaseHeld: 423,
     JobNotFound: 404,
     JobRejected: 409,

@@ -1,57 +1,39 @@
-"""Runs a server: the bench in the main thread, the web in another."""
+"""Runs a server: the bench in this process, the web in another.
+
+The web process shares neither the interpreter nor the threads of the control loop. If it ends, the present move ends,
+the job pauses, and another web process starts. If this process ends, the web process ends too, and the servo's watchdog
+stops the table.
+
+Decision: docs/decisions/0062.
+"""
 
 import os
 import secrets
 import socket
+import subprocess
 import sys
 import threading
+from collections import deque
 from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext, suppress
-from dataclasses import dataclass
-from functools import partial
-from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
-import uvicorn
-
-from rig.bench import Bench, open_bench
-from rig.catalog.background import BackgroundCheck
 from rig.config import RigConfig
-from rig.core.clock import SystemClock
-from rig.core.errors import RigError, UsageError, os_errors_as
+from rig.core.clock import SystemClock, seconds_between
+from rig.core.errors import RigError, UsageError, WebEnded, os_errors_as
 from rig.core.files import write
 from rig.safety.bench_lock import BenchLock
 from rig.safety.saved_state import SERVER_FILE, SERVER_FOLDER, ServerAddress
-from rig.web.access import Lease, Sessions, Tokens
-from rig.web.api_catalog import UPLOAD
-from rig.web.app import create_app
-from rig.web.bench_catalog import BenchCatalog
-from rig.web.guard import Guard, PatientProtocol
-from rig.web.hub import Hub
-from rig.web.jobs import JobQueue
-from rig.web.picture import LivePicture
-from rig.web.requests import Job
-from rig.web.server import Server
-from rig.web.work import WorkFactory, doctor_findings
-from rig.web.worker import BenchWorker
+from rig.web.bench_side import BenchSide
+from rig.web.link import Link, Message, error_of
+from rig.web.setup import Listening, Setup, print_note
 
-MAX_CONNECTIONS: Final = 400
-"""Open connections: 200 listeners and as many other requests."""
-START_S: Final = 10.0
-RUNS: Final = "runs"
-
-
-@dataclass(frozen=True, slots=True)
-class Listening:
-    """The address at which a server listens, and its allowed clients."""
-
-    host: str
-    port: int
-    other_hosts: tuple[str, ...]
-    certfile: Path | None
-    keyfile: Path | None
-    needs_login: bool
-    max_upload_bytes: int
+START_S: Final = 30.0
+END_S: Final = 6.0
+SILENT_S: Final = 30.0
+"""Time without a sign of life after which a web process counts as hanging, and is ended."""
+MAX_STARTS: Final = 3
+STARTS_WITHIN_S: Final = 60.0
+"""After `MAX_STARTS` web processes within this time, the server ends."""
 
 
 def run_server(
@@ -60,7 +42,6 @@ def run_server(
     seed: int | None,
     arguments: tuple[str, ...],
     listening: Listening,
-    tokens: Tokens,
     ready: Callable[[str], None],
 ) -> None:
     """Serve a bench until a signal ends the program; the torque is off on return.
@@ -71,128 +52,166 @@ def run_server(
         The bench to open.
     arguments
         Arguments of `rig` that select the same bench.
-    listening, tokens
-        The address at which to listen, and the tokens of those who may log in.
+    listening
+        The address at which to listen.
     ready
         Called with the address of the page when the server answers.
 
     Raises
     ------
     UsageError
-        The address cannot be used.
+        The address or the certificate cannot be used.
     BenchBusy
         Another server uses the bench.
+    WebEnded
+        The web process ends again and again.
     """
     clock = SystemClock()
-    folder = config.state_path(bench) / SERVER_FOLDER
+    token = secrets.token_urlsafe(32)
+    setup = Setup(
+        bench=bench, config=config, seed=seed, arguments=arguments, listening=listening, local_token=f"rig_{token}"
+    )
+    folder = setup.state_folder / SERVER_FOLDER
     lock = BenchLock(folder, clock)  # one server for each bench
     try:
-        server = make_server(bench, config, seed, arguments, listening, tokens, clock, folder)
-        hosts = {"localhost", "127.0.0.1", "::1", listening.host.strip("[]"), *listening.other_hosts}
-        guard = Guard(create_app(server), hosts=hosts, upload_path=UPLOAD, max_upload_bytes=listening.max_upload_bytes)
+        side = BenchSide(setup, folder, clock, print_note)
         with _socket(listening) as connection:
-            web = _Web(_uvicorn_config(guard, listening))
-            thread = threading.Thread(target=web.run, args=([connection],), name="web", daemon=True)
-            thread.start()
+            web = WebProcess(side, setup, connection, clock)
             try:
-                web.answers.wait(START_S)
-                scheme = "https" if listening.certfile else "http"
-                host = f"[{listening.host}]" if ":" in listening.host.strip("[]") else listening.host
-                url = f"{scheme}://{host}:{connection.getsockname()[1]}/"
+                web.start()
                 address = ServerAddress(
                     pid=os.getpid(),
-                    url=url,
-                    token=server.sessions.local_token,
+                    url=_url(listening, connection),
+                    token=setup.local_token,
                     certificate=str(listening.certfile.absolute()) if listening.certfile else None,
                 )
                 write(folder / SERVER_FILE, address.model_dump_json().encode(), mode=0o600)
-                ready(url)
-                with checked_catalog(server), server.catalog.background_delivery():
-                    server.worker.run()
+                ready(address.url)
+                side.worker.run()
+                if web.failure is not None:
+                    raise web.failure
             finally:
                 (folder / SERVER_FILE).unlink(missing_ok=True)
-                server.hub.close()
-                server.picture.closed = True
-                web.should_exit = True
-                thread.join(START_S)
+                web.close()
+                side.close()
     finally:
         lock.close()
 
 
-def checked_catalog(server: Server) -> AbstractContextManager[object]:
-    """Return a check of the catalog during the work of a ``with`` block; damage is on stderr and in the status."""
-    place = server.config.catalog_place(server.bench)
-    if not place.may_exist():
-        return nullcontext()
+class WebProcess:
+    """The web process of a server; it is started again if it ends.
 
-    def report(damage: RigError) -> None:
-        server.damage = damage
-        print_note(f"{damage.what} Next step: {damage.next_step}")
+    Parameters
+    ----------
+    side
+        The bench, whose calls it makes.
+    setup
+        What the process must know.
+    connection
+        The listening socket, which outlives the process: requests wait in it for the next one.
+    clock
+        The computer's clock.
+    """
 
-    return BackgroundCheck(place, server.clock, report)
+    def __init__(self, side: BenchSide, setup: Setup, connection: socket.socket, clock: SystemClock) -> None:
+        self._side = side
+        self._setup = setup
+        self._connection = connection
+        self._clock = clock
+        self._starts: deque[int] = deque(maxlen=MAX_STARTS)
+        self._process: subprocess.Popen[bytes] | None = None
+        self._link: Link | None = None
+        self._answers = threading.Event()
+        self._ended = threading.Event()
+        self._alive_ns = 0
+        self._closed = threading.Event()
+        self._watcher = threading.Thread(target=self._watch, name="web-watch", daemon=True)
+        self.failure: RigError | None = None
+
+    def start(self) -> None:
+        """Start the process and return when it answers. Raises `UsageError`, `WebEnded`."""
+        self._spawn()
+        if not self._answers.wait(START_S) or self._ended.is_set():
+            raise self.failure or WebEnded("The web process does not start.", next_step="Look at its messages above.")
+        self._watcher.start()
+
+    def close(self) -> None:
+        """End the process; a second call does nothing."""
+        self._closed.set()
+        self._ended.set()
+        if self._watcher.ident is not None:
+            self._watcher.join()
+        self._end()
+
+    def _spawn(self) -> None:
+        self._starts.append(self._clock.now_ns())
+        self._alive_ns = self._clock.now_ns()
+        self._ended.clear()
+        ours, theirs = socket.socketpair()
+        with theirs:
+            descriptors = (theirs.fileno(), self._connection.fileno())
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", "rig.web.front", *map(str, descriptors)],
+                pass_fds=descriptors,
+                stdin=subprocess.DEVNULL,
+                start_new_session=True,  # Ctrl+C of the terminal is for this process only
+            )
+        self._link = Link(ours, self._received, self._lost)
+        self._link.start()
+        self._link.send({"setup": self._setup.model_dump(mode="json")})
+        self._side.connect(self._link)
+
+    def _received(self, message: Message, content: bytes) -> None:
+        if "alive" in message:
+            self._alive_ns = self._clock.now_ns()
+            self._answers.set()
+        elif "failed" in message:
+            self.failure = error_of(message["failed"])
+        else:
+            self._side.received(message, content)
+
+    def _lost(self) -> None:
+        self._ended.set()
+        self._answers.set()
+
+    def _watch(self) -> None:
+        """Start another process after the end of one, or after its silence."""
+        while not self._closed.is_set():
+            silent_s = seconds_between(self._alive_ns, self._clock.now_ns())
+            if not self._ended.wait(1.0) and silent_s < SILENT_S:
+                continue
+            if self._closed.is_set():
+                return
+            self._side.queue.hold()
+            self._end()
+            full = len(self._starts) == MAX_STARTS
+            if full and seconds_between(self._starts[0], self._clock.now_ns()) < STARTS_WITHIN_S:
+                self.failure = WebEnded(
+                    f"The web process has ended {MAX_STARTS} times within a minute. The running job has stopped.",
+                    next_step="Look at the messages above, and start rig serve again.",
+                )
+                self._side.worker.end()
+                return
+            print_note("The web process has ended. The running job pauses, and another web process starts.")
+            self._spawn()
+
+    def _end(self) -> None:
+        if self._link is not None:
+            self._link.close()
+            self._link = None
+        if self._process is not None:
+            try:
+                self._process.wait(END_S)
+            except subprocess.TimeoutExpired:
+                self._process.kill()
+                self._process.wait()
+            self._process = None
 
 
-def print_note(text: str) -> None:
-    """Print a note on stderr, unless it is closed."""
-    with suppress(OSError):
-        print(f"Note: {text}", file=sys.stderr, flush=True)
-
-
-class _Web(uvicorn.Server):
-    """Uvicorn in a thread: signals belong to the main thread, which owns the bench."""
-
-    def __init__(self, config: uvicorn.Config) -> None:
-        super().__init__(config)
-        self.answers = threading.Event()
-
-    def install_signal_handlers(self) -> None:
-        """Install no signal handlers."""
-
-    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        await super().startup(sockets)
-        self.answers.set()
-
-
-def make_server(
-    bench: str,
-    config: RigConfig,
-    seed: int | None,
-    arguments: tuple[str, ...],
-    listening: Listening,
-    tokens: Tokens,
-    clock: SystemClock,
-    folder: Path,
-) -> Server:
-    """Return the parts of a server, connected to each other; nothing is open and nothing listens yet."""
-    hub = Hub(secrets.token_hex(4))
-    picture = LivePicture(clock)
-
-    def changed(job: Job) -> None:
-        hub.publish("job", job.model_dump(mode="json"))
-
-    def opened() -> Bench:
-        return open_bench(bench, config, seed=seed)
-
-    catalog = BenchCatalog(config.catalog_place(bench), clock, partial(hub.publish, "catalog"), print_note)
-    queue = JobQueue(folder, clock, changed, arguments)
-    runs = config.catalog_path(bench) / RUNS
-    factory = WorkFactory(catalog, runs, lambda: doctor_findings(bench, config, seed, arguments), seed or 0)
-    worker = BenchWorker(opened, queue, hub, picture, factory, clock)
-    return Server(
-        bench=bench,
-        config=config,
-        clock=clock,
-        worker=worker,
-        queue=queue,
-        hub=hub,
-        picture=picture,
-        sessions=Sessions(tokens, clock),
-        lease=Lease(clock, partial(hub.publish, "lease")),
-        runs=runs,
-        catalog=catalog,
-        needs_login=listening.needs_login,
-        secure_cookies=listening.certfile is not None,
-    )
+def _url(listening: Listening, connection: socket.socket) -> str:
+    scheme = "https" if listening.certfile else "http"
+    host = f"[{listening.host}]" if ":" in listening.host.strip("[]") else listening.host
+    return f"{scheme}://{host}:{connection.getsockname()[1]}/"
 
 
 def _socket(listening: Listening) -> socket.socket:
@@ -201,25 +220,3 @@ def _socket(listening: Listening) -> socket.socket:
     with os_errors_as(UsageError, f"The server cannot listen to {host}, port {listening.port}.", next_step=step):
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         return socket.create_server((host, listening.port), family=family, backlog=128)
-
-
-def _uvicorn_config(app: Any, listening: Listening) -> uvicorn.Config:
-    step = "Check the files of --certfile and --keyfile."
-    with os_errors_as(UsageError, "The certificate cannot be used.", next_step=step):
-        config = uvicorn.Config(
-            app,
-            http=PatientProtocol,
-            ws="none",
-            lifespan="off",
-            log_level="warning",
-            access_log=False,
-            server_header=False,
-            limit_concurrency=MAX_CONNECTIONS,
-            timeout_keep_alive=15,
-            timeout_graceful_shutdown=2,
-            ssl_certfile=listening.certfile,
-            ssl_keyfile=listening.keyfile,
-            proxy_headers=False,
-        )
-        config.load()
-    return config

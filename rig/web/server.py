@@ -1,14 +1,21 @@
 """Code that the parts of the web application share: the server, the sender of a request, and pages of lists."""
 
+import asyncio
 import hashlib
 import json
+import os
+import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, Final, TypeVar
 
 from fastapi import Depends, Query, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
+from starlette.requests import HTTPConnection
 
 from rig.config import RigConfig
 from rig.core.clock import SystemClock
@@ -16,10 +23,8 @@ from rig.core.errors import Forbidden, LoginRequired, RigError, UsageError
 from rig.web.access import LOCAL, Lease, Person, Role, Sessions
 from rig.web.bench_catalog import BenchCatalog
 from rig.web.hub import Hub
-from rig.web.jobs import JobQueue
-from rig.web.picture import LivePicture
+from rig.web.remote_bench import RemoteBench
 from rig.web.requests import Choice
-from rig.web.worker import BenchWorker
 
 COOKIE: Final = "rig-session"
 API: Final = "/api/v1"
@@ -32,8 +37,10 @@ class Server:
 
     Attributes
     ----------
+    remote
+        The bench, which another process owns.
     needs_login
-        Whether requests need a token: always, unless the server listens to this computer only.
+        Whether requests need a token.
     catalog
         The bench's catalog.
     damage
@@ -43,10 +50,8 @@ class Server:
     bench: str
     config: RigConfig
     clock: SystemClock
-    worker: BenchWorker
-    queue: JobQueue
+    remote: RemoteBench
     hub: Hub
-    picture: LivePicture
     sessions: Sessions
     lease: Lease
     runs: Path
@@ -55,9 +60,18 @@ class Server:
     secure_cookies: bool = False
     damage: RigError | None = None
 
-    def person(self, request: Request) -> Person | None:
-        """Return the sender of a request; None if it is not known. Raises `LoginRequired`, `TooManyLogins`."""
-        client = request.headers.get("x-rig-client", "")[:64]
+    def person(self, request: HTTPConnection) -> Person | None:
+        """Return the sender of a request; None if it is not known.
+
+        Raises
+        ------
+        LoginRequired, TooManyLogins
+            Its token is wrong.
+        ConfigError
+            The file of the tokens is damaged.
+        """
+        # A browser cannot set headers of a web socket, so its page sends the client in the address.
+        client = (request.headers.get("x-rig-client") or request.query_params.get("client", ""))[:64]
         scheme, _, token = request.headers.get("authorization", "").partition(" ")
         if scheme.lower() == "bearer":
             stored = self.sessions.verify(token.strip(), request.client.host if request.client else "")
@@ -67,6 +81,13 @@ class Server:
             if found is not None:
                 return Person(found.name, found.role, client)
         return None if self.needs_login else Person(LOCAL, Role.OPERATE, client)
+
+    def still_allowed(self, request: HTTPConnection) -> bool:
+        """Return whether the sender of a request that is still open may go on: the token may have been removed."""
+        try:
+            return self.person(request) is not None
+        except RigError:
+            return False
 
 
 class Body(BaseModel):
@@ -135,7 +156,10 @@ class Problem(BaseModel):
     evidence: dict[str, Any] | None = None
 
 
-def watcher(request: Request) -> Person:
+# These two wait for nothing. As coroutines they need no thread, which a long request could occupy.
+
+
+async def watcher(request: Request) -> Person:
     """Return the sender of the request. Raises `LoginRequired`."""
     server: Server = request.app.state.server
     person = server.person(request)
@@ -144,7 +168,7 @@ def watcher(request: Request) -> Person:
     return person
 
 
-def operator(request: Request, person: Annotated[Person, Depends(watcher)]) -> Person:
+async def operator(request: Request, person: Annotated[Person, Depends(watcher)]) -> Person:
     """Return the operator who sends the request, and renew the lease. Raises `Forbidden`, `LeaseHeld`."""
     server: Server = request.app.state.server
     require_operate(person)
@@ -158,6 +182,23 @@ def require_operate(person: Person) -> None:
             f"The token {person.name} may only watch.",
             next_step="Use a token with the role operate: rig serve --new-token NAME --role operate",
         )
+
+
+Result = TypeVar("Result")
+
+
+def _step_back() -> None:
+    with suppress(OSError, AttributeError):  # not every system has priorities of threads
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 10)
+
+
+_LONG_WORK: Final = ThreadPoolExecutor(2, thread_name_prefix="long", initializer=_step_back)
+"""Exports, imports, reports and checks: few at a time and at low priority, because STOP shares the interpreter."""
+
+
+async def long_work(work: Callable[[], Result]) -> Result:
+    """Return the result of work that takes seconds; other requests are answered in the meantime."""
+    return await asyncio.get_running_loop().run_in_executor(_LONG_WORK, work)
 
 
 Watcher = Annotated[Person, Depends(watcher)]

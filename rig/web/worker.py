@@ -13,16 +13,17 @@ from typing import Any, Final
 
 from rig.bench import Bench
 from rig.core.clock import SystemClock, seconds_between
-from rig.core.errors import DeviceMismatch, DeviceNotFound, DeviceSilent, RigError
+from rig.core.errors import DeviceMismatch, DeviceNotFound, DeviceSilent, MotionStopped, RigError
 from rig.devices.servo import ServoState
 from rig.events.events import Accepted, Decided, Event, Started, event_dict, plain
 from rig.events.lines import line
 from rig.motion.motion_model import MotionModel
 from rig.plans.estimate import TimeLeft
-from rig.web.hub import Hub
+from rig.safety.stop_channel import StopAnswer, StopListener
 from rig.web.jobs import JobQueue
 from rig.web.outline import Outliner
 from rig.web.picture import LivePicture, ObservedCamera, jpeg
+from rig.web.problems import problem
 from rig.web.requests import Choice, Job, JobState, Progress, Question
 
 IDLE_S: Final = 0.05
@@ -77,10 +78,16 @@ class BenchWorker:
     ----------
     open_bench
         Opens the bench.
-    queue, hub, picture
-        The source of the jobs, and the receivers of their events and frames.
+    queue
+        The source of the jobs.
+    publish
+        Sends a message to the listeners: its kind, and its JSON values. It must not wait.
+    picture
+        Receives the camera's frames.
     work
         Returns the work of a job.
+    stops
+        Receives the requests to stop.
     clock
         The computer's clock.
     """
@@ -89,21 +96,24 @@ class BenchWorker:
         self,
         open_bench: Callable[[], Bench],
         queue: JobQueue,
-        hub: Hub,
+        publish: Callable[[str, Any], None],
         picture: LivePicture,
         work: Callable[[Job], Work],
+        stops: StopListener,
         clock: SystemClock,
     ) -> None:
         self._open_bench = open_bench
         self._queue = queue
-        self._hub = hub
+        self._publish = publish
         self._picture = picture
         self._work = work
         self._clock = clock
         self._held = _Open()
         self._job: Job | None = None
         self._ended = threading.Event()
-        self._stop_asked = threading.Event()
+        self._stops = stops
+        self._stops_before = stops.count()
+        """Number of stops before the present job: a further one stops it."""
         self._views: dict[str, list[bytes]] = {}
         self._left: TimeLeft | None = None
         self._outline: Outliner | None = None
@@ -111,7 +121,6 @@ class BenchWorker:
         self._polled_ns: int | None = None
         self.intervals_s: deque[float] = deque(maxlen=INTERVALS)
         self.jobs_ended: dict[str, int] = {}
-        self.stops = 0
 
     @property
     def status(self) -> dict[str, Any]:
@@ -126,27 +135,6 @@ class BenchWorker:
     def end(self) -> None:
         """Make `run` return after the present step."""
         self._ended.set()
-
-    def stop(self, wait_s: float = 2.0) -> bool:
-        """Stop the table at once and cancel all jobs; return whether no job runs any more.
-
-        May be called from any thread. The control loop of the motion notices the request in its next round. The
-        listeners get an event at the request, and one when the running job has ended.
-        """
-        self.stops += 1
-        self._queue.cancel_all()
-        self._hub.publish("stop", {"ended": False})
-        self._stop_asked.set()
-        bench = self._held.bench
-        if self._job is not None and bench is not None:
-            bench.state.request_stop()
-        start_ns = self._clock.now_ns()
-        while self._job is not None and seconds_between(start_ns, self._clock.now_ns()) < wait_s:
-            self._clock.sleep(0.01)
-        ended = self._job is None
-        if ended:
-            self._report_stop()
-        return ended
 
     def run(self) -> None:
         """Run jobs until `end` is called; then close the bench."""
@@ -164,6 +152,7 @@ class BenchWorker:
 
     def _run(self, job: Job) -> None:
         self._job = job
+        self._stops_before = self._queue.heeded
         self._views[job.id] = []
         self._left = self._outline = None
         for old in list(self._views)[:-JOBS_WITH_PICTURES]:
@@ -171,6 +160,8 @@ class BenchWorker:
         self._polled_ns = None
         state, error = JobState.FAILED, None
         try:
+            if self._held.bench is not None:
+                self._held.bench.state.clear_stop()  # of an earlier job; `_check_stop` looks for those of this one
             work = self._work(job)
             work(self._context(job))
             state = JobState.DONE
@@ -178,28 +169,48 @@ class BenchWorker:
             state = JobState.CANCELLED
         except RigError as failure:
             error = failure
-            if self._queue.is_cancelled(job):
+            if self._stopped() or self._queue.is_cancelled(job):
                 state = JobState.CANCELLED  # the operator asked for the stop of the motion
         except BaseException:
             self._queue.end(job, JobState.INTERRUPTED)
             raise
         finally:
             self._job = None
+        self._answer_stop()
         if isinstance(error, _LOST):
             self._held.error = error
             self._close()
-        elif self._held.bench is not None:
-            self._held.bench.state.clear_stop()
         self._queue.end(job, state, error)
         self.jobs_ended[state.value] = self.jobs_ended.get(state.value, 0) + 1
-        self._report_stop()
         self._read_status()
 
-    def _report_stop(self) -> None:
-        """Report to the listeners once that no job runs any more after a stop."""
-        if self._stop_asked.is_set():
-            self._stop_asked.clear()
-            self._hub.publish("stop", {"ended": True})
+    def _stopped(self) -> bool:
+        """Return whether STOP was pressed since the present job began."""
+        return self._stops.count() != self._stops_before
+
+    def _check_stop(self) -> None:
+        """Raise `MotionStopped` after a STOP; called in each round of the control loop."""
+        if self._stopped():
+            raise MotionStopped("STOP was pressed.", next_step="Start the job again when the table may move.")
+
+    def _answer_stop(self) -> None:
+        """After a STOP: switch the torque off, tell it to those who wait, and cancel all jobs.
+
+        Nothing is stored before the answer.
+        """
+        if not self._stopped():
+            return
+        self._stops_before = self._stops.count()
+        self._publish("stop", {"ended": False})
+        answer, bench = StopAnswer.NOT_CONFIRMED, self._held.bench
+        if bench is not None:
+            with suppress(RigError):
+                bench.servo.torque_off()
+                bench.state.clear_stop()
+                answer = StopAnswer.TORQUE_OFF
+        self._stops.answer(answer)
+        self._queue.heed_stops()
+        self._publish("stop", {"ended": True, "torque_off": answer is StopAnswer.TORQUE_OFF})
 
     def _context(self, job: Job) -> Context:
         return Context(
@@ -232,17 +243,17 @@ class BenchWorker:
                 left_s = None if self._left is None else self._left.seconds
                 job.progress = job.progress.model_copy(update={"done": job.progress.done + 1, "seconds_left": left_s})
         text = line(event)
-        self._hub.publish("plan", {"job": job.id, "text": text, **plain(values)})
+        self._publish("plan", {"job": job.id, "text": text, **plain(values)})
         if isinstance(event, Started | Accepted):
             self._queue.update(job, durable=job.views == 1)
         self._check(job, can_pause=isinstance(event, Accepted | Decided))
 
     def _note(self, job: Job, text: str) -> None:
-        self._hub.publish("plan", {"job": job.id, "event": "note", "text": text})
+        self._publish("plan", {"job": job.id, "event": "note", "text": text})
         self._check(job, can_pause=False)
 
     def _check(self, job: Job, *, can_pause: bool) -> None:
-        if self._queue.is_cancelled(job) or self._bench().state.stop_requested():
+        if self._stopped() or self._queue.is_cancelled(job):
             raise JobCancelled
         if not (can_pause and self._queue.is_paused(job)):
             return
@@ -262,7 +273,7 @@ class BenchWorker:
 
     def _wait(self, job: Job) -> None:
         """Wait a little for the operator, with a live picture."""
-        if self._queue.is_cancelled(job) or self._ended.is_set() or self._bench().state.stop_requested():
+        if self._stopped() or self._queue.is_cancelled(job) or self._ended.is_set():
             raise JobCancelled
         self._clock.sleep(IDLE_S)
         self._show_picture()
@@ -281,6 +292,7 @@ class BenchWorker:
                 raise
             bench.camera = ObservedCamera(bench.camera, self._picture.show)
             bench.safety.observers.append(self._observe)
+            bench.safety.monitors.append(self._check_stop)
             held.bench, held.error = bench, None
             self._read_status()
         return held.bench
@@ -292,6 +304,7 @@ class BenchWorker:
                 bench.close()
 
     def _idle(self) -> None:
+        self._answer_stop()
         held, now_ns = self._held, self._clock.now_ns()
         if held.bench is None:
             if held.tried_ns == 0 or seconds_between(held.tried_ns, now_ns) > REOPEN_S:
@@ -299,16 +312,16 @@ class BenchWorker:
                     self._bench()
             return
         held.bench.clock.sleep(IDLE_S)
-        if held.bench.state.stop_requested():  # by rig stop; nothing moves
-            held.bench.state.clear_stop()
         if seconds_between(self._status_ns, now_ns) >= IDLE_STATUS_S:
             self._read_status()
         self._show_picture()
 
     def _show_picture(self) -> None:
         """Take a frame for the viewers, at most at the camera's rate."""
-        bench = self._held.bench
-        if bench is None or not self._picture.wanted or self._picture.age_s < 1.0 / max(bench.camera.identity.fps, 1.0):
+        bench, age_s = self._held.bench, self._picture.age_s
+        if bench is None or not self._picture.wanted:
+            return
+        if age_s is not None and age_s < 1.0 / max(bench.camera.identity.fps, 1.0):
             return
         try:
             bench.camera.capture(bench.clock.now_ns())
@@ -344,6 +357,8 @@ class BenchWorker:
         self._status_ns = self._clock.now_ns()
         values: dict[str, Any] = {"open": bench is not None, "job": self._job.id if self._job else None}
         values["error"] = plain(held.error.as_dict()) if held.error is not None and bench is None else None
+        values["picture_age_s"] = self._picture.age_s
+        values["problem"] = None if (found := self._queue.problem) is None else problem(found)
         if bench is not None:
             safety, config = bench.safety, bench.config
             values |= {
@@ -371,4 +386,4 @@ class BenchWorker:
                 },
             }
         held.status = values
-        self._hub.publish("status", values)
+        self._publish("status", values)

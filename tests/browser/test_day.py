@@ -93,7 +93,7 @@ def test_stop_button_above_an_open_dialog_stops_the_table(page, serve_process):
     page.wait_for_selector("#thumbs img", timeout=WAIT_MS)
     page.goto(f"{server.url}catalog")
     page.click("#stop")
-    page.wait_for_selector("#messages:has-text('Stopped')", timeout=WAIT_MS)
+    page.wait_for_selector("#stop-state:has-text('Stopped')", timeout=WAIT_MS)
     page.goto(f"{server.url}enroll")
     job_done(page, "Enroll lamp", "cancelled")
     page.click("#job button:has-text('Continue')")
@@ -211,6 +211,6 @@ def test_search_in_motion_shows_its_frames_and_stop_ends_it_during_the_rotation(
     page.click("#start button:has-text('Identify')")
     page.wait_for_selector("#answer:has-text('Searching …')", timeout=WAIT_MS)
     page.click("#stop")
-    page.wait_for_selector("#messages:has-text('Stopped')", timeout=WAIT_MS)
+    page.wait_for_selector("#stop-state:has-text('Stopped')", timeout=WAIT_MS)
     job_done(page, "Identify", "cancelled")
     assert page.locator("#answer.found").count() == 0

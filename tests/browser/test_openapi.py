@@ -6,10 +6,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 
 from rig.config import load_config
-from rig.core.clock import SystemClock
-from rig.web.access import Tokens
 from rig.web.app import create_app
-from rig.web.run import Listening, make_server
+from rig.web.setup import Listening, Setup
+from tests.rig.web.conftest import connected
 
 schemathesis = pytest.importorskip("schemathesis", reason="Schemathesis is missing: make test-web installs it")
 
@@ -23,10 +22,9 @@ def schema(tmp_path_factory: pytest.TempPathFactory):
     """The API's description; no bench runs behind it, so jobs stay in the queue."""
     folder: Path = tmp_path_factory.mktemp("api")
     config = load_config(None, [f"catalog.path={folder}/catalog", f"state_dir={folder}/state"])
-    listening = Listening("127.0.0.1", 0, (), None, None, needs_login=False, max_upload_bytes=1_000_000)
-    tokens = Tokens(folder, SystemClock())
-    server = make_server("sim", config, 1, (), listening, tokens, SystemClock(), folder / "web")
-    return schemathesis.openapi.from_asgi("/api/v1/openapi.json", create_app(server))
+    _, server, disconnect = connected(Setup(bench="sim", config=config, listening=Listening(host="127.0.0.1", port=0)))
+    yield schemathesis.openapi.from_asgi("/api/v1/openapi.json", create_app(server))
+    disconnect()
 
 
 def test_no_request_causes_a_server_error(schema):

@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from rig.web.access import Tokens
 
 DEFAULT_PORT = 8420
-MAX_UPLOAD_BYTES = 500_000_000
 
 
 @command
@@ -34,6 +33,9 @@ def serve(
         Path | None, typer.Option(metavar="FILE", help="TLS certificate chain, PEM. Needs --keyfile.")
     ] = None,
     keyfile: Annotated[Path | None, typer.Option(metavar="FILE", help="Private key of the certificate, PEM.")] = None,
+    login: Annotated[
+        bool, typer.Option("--login", help="Require a token on this computer, too: it has several users.")
+    ] = False,
     new_token: Annotated[
         str | None, typer.Option("--new-token", metavar="NAME", help="Make a token, print it once, and stop.")
     ] = None,
@@ -63,7 +65,8 @@ def serve(
     from rig.core.clock import SystemClock
     from rig.safety.saved_state import SERVER_FOLDER
     from rig.web.access import Role, Tokens
-    from rig.web.run import Listening, run_server
+    from rig.web.run import run_server
+    from rig.web.setup import Listening
 
     folder = settings.load().state_path(settings.bench_name) / SERVER_FOLDER
     tokens = Tokens(folder, SystemClock())
@@ -81,15 +84,29 @@ def serve(
         return
     if (certfile is None) != (keyfile is None):
         raise UsageError("TLS needs a certificate and its key.", next_step="Give --certfile and --keyfile.")
-    needs_login = not is_loopback(host)
+    needs_login = login or not is_loopback(host)
     if needs_login:
         _require_tokens(tokens, host)
-    listening = Listening(host, port, tuple(allow_host or ()), certfile, keyfile, needs_login, MAX_UPLOAD_BYTES)
+    listening = Listening(
+        host=host,
+        port=port,
+        other_hosts=tuple(allow_host or ()),
+        certfile=certfile,
+        keyfile=keyfile,
+        needs_login=needs_login,
+    )
     if settings.bench_name == "sim" and "speed" not in settings.load().bench.get("sim", {}):
         settings = settings.merged(None, None, ["bench.sim.speed=1"], None, False)  # people watch it
     arguments = tuple(settings.arguments())
     settings.opened.append(settings.bench_name)
-    run_server(settings.bench_name, settings.load(), settings.seed, arguments, listening, tokens, _announced)
+
+    def announce(url: str) -> None:
+        print(f"The bench is at {url}. Stop with Ctrl+C.", file=sys.stderr, flush=True)
+        if not needs_login:
+            text = "Every user of this computer can operate the bench there. With --login, each needs a token."
+            print(text, file=sys.stderr, flush=True)
+
+    run_server(settings.bench_name, settings.load(), settings.seed, arguments, listening, announce)
 
 
 def is_loopback(host: str) -> bool:
@@ -105,10 +122,6 @@ def is_loopback(host: str) -> bool:
 def _require_tokens(tokens: "Tokens", host: str) -> None:
     if not tokens.stored():
         raise UsageError(
-            f"Other computers can reach {host}, so everybody needs a token, and there is none.",
+            f"Everybody at {host} needs a token, and there is none.",
             next_step="Make one first: rig serve --new-token NAME --role operate",
         )
-
-
-def _announced(url: str) -> None:
-    print(f"The bench is at {url}. Stop with Ctrl+C.", file=sys.stderr, flush=True)

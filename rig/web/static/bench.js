@@ -1,4 +1,4 @@
-import { $, API, act, h, jobTitle, number, on, request, showJob, start, submit } from "./rig.js";
+import { $, API, act, duration, h, jobTitle, number, on, request, showJob, start, submit } from "./rig.js";
 
 /** Return a point of the dial: 0° is at the top, angles grow counter-clockwise, as the table's do seen from above. */
 const polar = (degrees, radius) => {
@@ -115,5 +115,34 @@ $("here").addEventListener("click", () => submit({ kind: "reference", here: true
 for (const [id, kind] of [["home", "home"], ["empty", "empty-table"], ["acknowledge", "acknowledge"], ["doctor", "doctor"]]) {
   $(id).addEventListener("click", () => submit({ kind }));
 }
-$("live-image").addEventListener("error", () => setTimeout(() => { $("live-image").src = `${API}/live?${Date.now()}`; }, 2000));
+
+// The live image: one short request after the other. An endless one would occupy one of the browser's few connections.
+
+const PICTURE_MS = 120;
+const STALE_S = 3;
+
+async function showPicture() {
+  if (document.hidden) return;
+  let age = null;
+  try {
+    const answer = await fetch(`${API}/picture`, { cache: "no-store" });
+    if (answer.ok) {
+      age = Number(answer.headers.get("X-Rig-Picture-Age"));
+      const before = $("live-image").src;
+      $("live-image").src = URL.createObjectURL(await answer.blob());
+      if (before.startsWith("blob:")) URL.revokeObjectURL(before);
+    }
+  } catch {
+    // the line of the state says that the server does not answer
+  }
+  const stale = age === null || age > STALE_S;
+  $("live").classList.toggle("stale", stale);
+  $("live-age").hidden = !stale;
+  $("live-age").textContent = age === null ? "No image from the camera." : `This image is ${duration(age)} old. The camera gives no new one.`;
+}
+async function showPictures() {
+  await showPicture();
+  setTimeout(showPictures, document.hidden ? 1000 : PICTURE_MS);
+}
+showPictures();
 start();

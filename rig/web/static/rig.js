@@ -106,18 +106,43 @@ export function on(kind, listener) {
 }
 const dispatch = (kind, data) => (listeners[kind] || []).forEach((listener) => listener(data));
 
-/** Receive the server's events. The browser reconnects by itself and sends the last event id. */
+let socket = null;
+let lastId = null;
+let stopAnswered = () => {};
+const RECONNECT_MS = 1500;
+
+/**
+ * Receive the server's events, and hold a connection on which STOP is sent. It is a web socket, because a browser opens
+ * only six other connections to a server, for all its tabs together. A page that is left closes it.
+ */
 export function listen() {
-  const source = new EventSource(`${API}/events`);
-  for (const kind of ["plan", "job", "status", "lease", "stop", "catalog"]) {
-    source.addEventListener(kind, (event) => dispatch(kind, JSON.parse(event.data)));
-  }
-  source.addEventListener("hello", (event) => dispatch("hello", JSON.parse(event.data)));
-  source.onerror = () => {
+  if (socket) return;
+  const after = lastId === null ? "" : `&last=${encodeURIComponent(lastId)}`;
+  const mine = new WebSocket(`${location.origin.replace(/^http/, "ws")}${API}/socket?client=${CLIENT}${after}`);
+  socket = mine;
+  mine.onmessage = ({ data }) => {
+    const message = JSON.parse(data);
+    if (message.kind === "stopped") return stopAnswered(message.data);
+    lastId = message.id;
+    return dispatch(message.kind, message.data);
+  };
+  mine.onclose = () => {
+    if (socket !== mine) return; // this page was left
+    socket = null;
     $("state").textContent = "No connection to the server. Trying again …";
     $("state").className = "state bad";
+    setTimeout(listen, RECONNECT_MS);
+    request("GET", "/me").catch(() => {}); // without a valid token, the browser shows the login page
   };
 }
+addEventListener("pagehide", () => {
+  const mine = socket;
+  socket = null;
+  mine?.close();
+});
+addEventListener("pageshow", (event) => {
+  if (event.persisted) listen();
+});
 
 // -- state, lease, STOP -------------------------------------------------------------------------------------------------
 
@@ -165,7 +190,7 @@ function showLease(lease) {
 on("lease", (lease) => {
   if (me === null) return;
   showLease(lease);
-  if (lease.taken_from === `${me.name}/${CLIENT}`) show(new Problem({ detail: `${lease.holder} has taken over the bench.`, next_step: "You can watch." }));
+  if (lease.taken_from && lease.taken_from.name === me.name && lease.taken_from.client === CLIENT) show(new Problem({ detail: `${lease.holder} has taken over the bench.`, next_step: "You can watch." }));
   if (lease.asked_by && $("lease-button").dataset.mine) {
     const to = lease.asked_by;
     const handOver = h("button", { onclick: () => act(() => request("POST", "/lease/hand-over", to)) }, "Hand over the bench");
@@ -190,20 +215,55 @@ setInterval(() => {
   if ($("lease-button")?.dataset.mine) request("POST", "/lease", {}).catch(() => {});
 }, 15000);
 
-const STOPPED = "Stopped. All jobs are cancelled.";
-const NOT_STOPPED = "The stop is requested, but the job has not ended. If the table still moves, switch off its supply.";
-const showMessage = (words) => $("messages").replaceChildren(h("p", {}, words));
+// STOP. The page says what the bench has confirmed; without that it warns after a second.
 
-// The job may end before or after the answer to the request: the event reports its end.
-let stopped = true;
-on("stop", ({ ended }) => {
-  stopped = ended;
-  showMessage(ended ? STOPPED : "Stopping …");
+const WARN_MS = 1000;
+const SECOND_WAY_MS = 300;
+const FIRST_AID = "NOT STOPPED: switch off the supply of the servo.";
+let pressedAt = null;
+
+function showStop(words, kind) {
+  $("stop-state").replaceChildren(h("p", { class: kind }, words));
+}
+
+function showStopped() {
+  const seconds = pressedAt === null ? "" : ` after ${((performance.now() - pressedAt) / 1000).toFixed(1)} s`;
+  pressedAt = null;
+  showStop(`Stopped${seconds}. The bench confirms that the torque is off. All jobs are cancelled.`, "confirmed");
+}
+
+/** Take an answer to STOP. If it came too early to confirm the stop, an event confirms it later. */
+function takeAnswer(answer) {
+  if (answer.ended) showStopped();
+  else if (pressedAt !== null && answer.answer === "not-confirmed") showStop(`${FIRST_AID} The servo does not answer.`, "failed");
+}
+
+async function stopByRequest() {
+  try {
+    const answer = await fetch(`${API}/stop`, { method: "POST", headers: { "X-Rig-Client": CLIENT }, credentials: "same-origin", keepalive: true });
+    const values = await answer.json();
+    if (answer.ok) takeAnswer(values);
+    else showStop(`${FIRST_AID} ${values.detail}`, "failed");
+  } catch {
+    if (pressedAt !== null) showStop(`${FIRST_AID} The server does not answer.`, "failed");
+  }
+}
+
+$("stop")?.addEventListener("click", () => {
+  const mine = performance.now();
+  pressedAt = mine;
+  showStop("Stopping …", "");
+  stopAnswered = takeAnswer;
+  const open = socket !== null && socket.readyState === WebSocket.OPEN;
+  if (open) socket.send(JSON.stringify({ stop: mine }));
+  setTimeout(() => { if (pressedAt === mine) stopByRequest(); }, open ? SECOND_WAY_MS : 0);
+  setTimeout(() => { if (pressedAt === mine) showStop(FIRST_AID, "failed"); }, WARN_MS);
 });
-$("stop")?.addEventListener("click", async () => {
-  stopped = false;
-  const answer = await act(() => request("POST", "/stop"));
-  if (answer) showMessage(answer.ended || stopped ? STOPPED : NOT_STOPPED);
+
+on("stop", ({ ended, torque_off: torqueOff }) => {
+  if (ended && torqueOff) showStopped();
+  else if (ended) showStop(`${FIRST_AID} The servo does not answer.`, "failed");
+  else if (pressedAt === null) showStop("Stopping …", "");
 });
 
 // -- a job ---------------------------------------------------------------------------------------------------------------

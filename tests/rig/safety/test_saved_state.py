@@ -264,7 +264,7 @@ def test_no_file_is_written_through_a_link(tmp_path, name):
         lambda store: store.save(BenchState(table=TABLE)),
         lambda store: store.latch(STALLED),
         FileStore.request_stop,
-        FileStore.clear_stop,
+        FileStore.listen,
     ):
         with suppress(StateNotStored):
             write(FileStore(bench))
@@ -272,19 +272,10 @@ def test_no_file_is_written_through_a_link(tmp_path, name):
     (bench / name).unlink(missing_ok=True)
     (bench / name).symlink_to(tmp_path / "nowhere")
     with suppress(StateNotStored):
-        FileStore(bench).request_stop()
+        FileStore(bench).listen()
     with suppress(StateNotStored):
         BenchLock(bench, SystemClock()).close()
     assert not (tmp_path / "nowhere").exists()
-
-
-def test_old_stop_request_does_not_stop_the_next_program(tmp_path):
-    store = FileStore(tmp_path)
-    store.request_stop()
-    assert store.stop_requested()
-    lock = BenchLock(tmp_path, SystemClock())
-    assert not store.stop_requested()
-    lock.close()
 
 
 def test_each_bench_has_its_own_folder(tmp_path, monkeypatch):

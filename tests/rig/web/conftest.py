@@ -1,5 +1,9 @@
-"""A server in this process: the real application and bench thread, on the simulated bench with its virtual clock."""
+"""A server in this process: the real application and bench thread, on the simulated bench with its virtual clock.
 
+Its two halves are connected as the two processes of `rig serve` are.
+"""
+
+import socket
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -15,12 +19,11 @@ from fastapi.testclient import TestClient
 
 from rig.config import load_config
 from rig.core.clock import SystemClock
-from rig.web.access import Tokens
-from rig.web.api_catalog import UPLOAD
-from rig.web.app import create_app
-from rig.web.guard import Guard
-from rig.web.run import Listening, make_server
+from rig.web.bench_side import BenchSide
+from rig.web.front import guarded, make_server
+from rig.web.link import Link
 from rig.web.server import Server
+from rig.web.setup import Listening, Setup
 from tests.small import SMALL
 
 ENDED = ("done", "failed", "cancelled", "interrupted")
@@ -30,6 +33,7 @@ ENDED = ("done", "failed", "cancelled", "interrupted")
 class Served:
     """A running server and a client."""
 
+    side: BenchSide
     server: Server
     client: TestClient
     folder: Path
@@ -43,38 +47,60 @@ class Served:
     def wait(self, job_id: str, *states: str) -> dict[str, Any]:
         """Return a job when it has one of the states; by default when it has ended."""
         for _ in range(6000):
-            state = self.server.queue.job(job_id).state  # asking the server takes more computing than the job
+            state = self.side.queue.job(job_id).state  # asking the server takes more computing than the job
             if state in (states or ENDED):
                 return self.client.get(f"/api/v1/jobs/{job_id}").json()
-            assert state not in ENDED, self.server.queue.job(job_id)
+            assert state not in ENDED, self.side.queue.job(job_id)
             threading.Event().wait(0.01)
         pytest.fail(f"the job is still {state}")
+
+
+def connected(setup: Setup) -> tuple[BenchSide, Server, Callable[[], None]]:
+    """Return the two halves of a server, and a function that ends them; the worker does not run yet."""
+    side = BenchSide(setup, setup.state_folder / "web", SystemClock(), lambda _text: None)
+    server = make_server(setup, SystemClock())
+    ours, theirs = socket.socketpair()
+    bench_link, web_link = Link(ours, side.received), Link(theirs, server.remote.received)
+    server.remote.calls.link = web_link
+    bench_link.start()
+    web_link.start()
+    side.connect(bench_link)
+
+    def disconnect() -> None:
+        for link in (web_link, bench_link):
+            link.close()
+        side.close()
+
+    return side, server, disconnect
 
 
 @contextmanager
 def starting(folder: Path) -> Iterator[Callable[..., Served]]:
     """Yield a function that starts a server with its data in a folder."""
-    running: list[tuple[Served, threading.Thread]] = []
+    running: list[tuple[Served, Callable[[], None]]] = []
 
     def start(*settings: str, needs_login: bool = False) -> Served:
         folders = [f"catalog.path='{folder}/catalog'", f"state_dir='{folder}/state'"]
         config = load_config(None, [*folders, f"calibration_dir='{folder}/cal'", *SMALL, *settings])
-        web = config.state_path("sim") / "web"
-        listening = Listening("127.0.0.1", 0, (), None, None, needs_login, 2_000_000)
-        tokens = Tokens(web, SystemClock())
-        server = make_server("sim", config, 1, ("--bench", "sim"), listening, tokens, SystemClock(), web)
-        guard = Guard(create_app(server), hosts={"127.0.0.1"}, upload_path=UPLOAD, max_upload_bytes=2_000_000)
-        client = TestClient(guard, base_url="http://127.0.0.1", client=("127.0.0.1", 50000))
-        thread = threading.Thread(target=server.worker.run, daemon=True)
+        listening = Listening(host="127.0.0.1", port=0, needs_login=needs_login, max_upload_bytes=2_000_000)
+        setup = Setup(bench="sim", config=config, seed=1, arguments=("--bench", "sim"), listening=listening)
+        side, server, disconnect = connected(setup)
+        client = TestClient(guarded(server, listening), base_url="http://127.0.0.1", client=("127.0.0.1", 50000))
+        thread = threading.Thread(target=side.worker.run, daemon=True)
         thread.start()
-        running.append((Served(server, client, folder), thread))
+
+        def end() -> None:
+            side.worker.end()
+            thread.join(20)
+            disconnect()
+            assert not thread.is_alive()
+
+        running.append((Served(side, server, client, folder), end))
         return running[-1][0]
 
     yield start
-    for served, thread in running:
-        served.server.worker.end()
-        thread.join(20)
-        assert not thread.is_alive()
+    for _, end in running:
+        end()
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
-from rig.core.errors import ConfigError, LeaseHeld, LoginRequired, TooManyLogins
+from rig.core.errors import ConfigError, JobRejected, LeaseHeld, LoginRequired, TooManyLogins
 from rig.web.access import FREE_ATTEMPTS, LEASE_S, SESSION_S, Lease, Person, Role, Sessions, Tokens
 from sim.clock import VirtualClock
 
@@ -53,10 +53,13 @@ def test_logins_are_limited_for_each_address(sessions, clock):
         with pytest.raises(LoginRequired):
             sessions.login("rig_wrong", "10.0.0.1")
     with pytest.raises(TooManyLogins):
-        sessions.login(token, "10.0.0.1")
-    sessions.login(token, "10.0.0.2")
+        sessions.login("rig_wrong", "10.0.0.1")
+    sessions.login(token, "10.0.0.1")  # right tokens are never locked out
+    with pytest.raises(LoginRequired):
+        sessions.login("rig_wrong", "10.0.0.2")
     clock.sleep(61)
-    sessions.login(token, "10.0.0.1")
+    with pytest.raises(LoginRequired):
+        sessions.login("rig_wrong", "10.0.0.1")
 
 
 @pytest.mark.parametrize("content", [b"", b"[", b"{}", b'[{"name": "x"}]', b"\xff\xfe"])
@@ -64,6 +67,53 @@ def test_damaged_tokens_are_reported_and_allow_no_login(tmp_path, sessions, cont
     (tmp_path / "tokens.json").write_bytes(content)
     with pytest.raises(ConfigError):
         sessions.login("rig_x", "10.0.0.1")
+
+
+def test_damaged_tokens_change_nothing_for_those_who_have_one(tmp_path, sessions, clock):
+    token = sessions.tokens.new("tablet", Role.OPERATE, days=1)
+    secret, person = sessions.login(token, "10.0.0.1")
+    (tmp_path / "tokens.json").write_bytes(b"[")
+    assert sessions.find(secret) == person
+    assert sessions.verify(token, "10.0.0.1").name == "tablet"
+    with pytest.raises(ConfigError, match="cannot be read"):
+        sessions.verify("rig_wrong", "10.0.0.1")
+    clock.sleep(SESSION_S / 2)
+    assert sessions.find(secret) == person
+    clock.sleep(86400)
+    assert sessions.find(secret) is None  # it has expired all the same
+    (tmp_path / "tokens.json").unlink()
+    with pytest.raises(LoginRequired):
+        sessions.verify(token, "10.0.0.1")
+
+
+@pytest.mark.parametrize(
+    "name", ["a\x07b", "a\nb", "\u202eadmin", "\u200bx", " a", "a ", "", "x" * 51, "local", "LOCAL"]
+)
+def test_name_of_a_token_can_be_read_and_is_not_that_of_the_computer(sessions, name):
+    with pytest.raises(ConfigError):
+        sessions.tokens.new(name, Role.WATCH)
+
+
+def test_lease_is_handed_over_only_to_an_operator_who_asked(clock):
+    lease = Lease(clock, lambda _values: None)
+    anna, ben = Person("anna", Role.OPERATE, "1"), Person("ben", Role.OPERATE, "2")
+    lease.take(anna)
+    with pytest.raises(JobRejected):
+        lease.hand_over(anna, ben.name, ben.client)
+    lease.ask(ben)
+    with pytest.raises(JobRejected):
+        lease.hand_over(anna, "ben", "3")
+    lease.hand_over(anna, ben.name, ben.client)
+    assert lease.holder == ben
+    with pytest.raises(JobRejected):
+        lease.hand_over(ben, anna.name, anna.client)  # each request counts once
+
+
+def test_name_with_a_slash_is_not_another_persons_key():
+    lease = Lease(VirtualClock(), lambda _values: None)
+    lease.take(Person("tablet", Role.OPERATE, "1/2"))
+    with pytest.raises(LeaseHeld):
+        lease.take(Person("tablet/1", Role.OPERATE, "2"))
 
 
 class LeaseMachine(RuleBasedStateMachine):
@@ -75,6 +125,7 @@ class LeaseMachine(RuleBasedStateMachine):
         self.events = []
         self.lease = Lease(self.clock, self.events.append)
         self.holder, self.until = None, 0.0
+        self.asked = set()
 
     people = st.sampled_from(
         [Person("a", Role.OPERATE, "1"), Person("a", Role.OPERATE, "2"), Person("b", Role.OPERATE)]
@@ -93,8 +144,9 @@ class LeaseMachine(RuleBasedStateMachine):
             return
         self.lease.take(person, force=force)
         if self.holder != person:
+            self.asked.clear()
             assert self.events[-1]["client"] == person.client
-            assert self.events[-1]["taken_from"] == (self.holder.key if self.holder else None)
+            assert self.events[-1]["taken_from"] == (self.holder.as_json() if self.holder else None)
         self.holder, self.until = person, self.clock.now_ns() * 1e-9 + LEASE_S
 
     @rule(person=people)
@@ -104,14 +156,21 @@ class LeaseMachine(RuleBasedStateMachine):
         if self.holder == person:
             self.holder = None
 
+    @rule(person=people)
+    def ask(self, person):
+        self._expire()
+        self.lease.ask(person)
+        self.asked.add(person)
+
     @rule(person=people, to=people)
     def hand_over(self, person, to):
         self._expire()
-        if self.holder != person:
-            with pytest.raises(LeaseHeld):
-                self.lease.hand_over(person, to)
+        if self.holder != person or to not in self.asked:
+            with pytest.raises(JobRejected if self.holder == person else LeaseHeld):
+                self.lease.hand_over(person, to.name, to.client)
             return
-        self.lease.hand_over(person, to)
+        self.lease.hand_over(person, to.name, to.client)
+        self.asked.clear()
         self.holder, self.until = to, self.clock.now_ns() * 1e-9 + LEASE_S
 
     @rule(seconds=st.floats(0.1, 60))

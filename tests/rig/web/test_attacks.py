@@ -3,7 +3,7 @@
 import pytest
 
 from rig.web.access import Role
-from rig.web.run import checked_catalog
+from rig.web.front import checked_catalog
 
 API = "/api/v1"
 

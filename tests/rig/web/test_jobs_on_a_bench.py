@@ -12,6 +12,7 @@ from rig.bench import Bench, open_bench
 from rig.catalog import Catalog
 from rig.core.clock import SystemClock
 from rig.devices.servo import ServoState
+from rig.safety.stop_channel import StopAnswer, StopRequest
 from tests.rig.web.conftest import Served
 
 
@@ -42,20 +43,21 @@ def halted(monkeypatch) -> Halted:
         bench.safety.observers.append(observe)
         return bench
 
-    monkeypatch.setattr("rig.web.run.open_bench", opened)
+    monkeypatch.setattr("rig.web.bench_side.open_bench", opened)
     return halt
 
 
 def request_after_views(served: Served, requests: dict[int, str]) -> None:
     """Send a request about the running job right after its view of a number, before the job does anything else."""
-    publish, left = served.server.hub.publish, dict(requests)
+    worker, left = served.side.worker, dict(requests)
+    publish = worker._publish
 
     def published(kind: str, data: Any) -> None:
         publish(kind, data)
         if kind == "plan" and data["event"] == "accepted" and (request := left.pop(data["picture"] + 1, None)):
             assert served.client.post(f"/api/v1/jobs/{data['job']}/{request}").status_code == 200
 
-    served.server.hub.publish = published
+    worker._publish = published
 
 
 def test_enrolled_object_is_identified_and_its_run_is_saved(serve):
@@ -136,15 +138,22 @@ def test_listeners_learn_when_a_job_ends_after_the_answer_to_a_stop(serve, halte
     served = serve()
     job = served.client.post("/api/v1/jobs", json={"kind": "goto", "angle_deg": 350}).json()
     assert halted.reached.wait(60.0)
-    worker, hub = served.server.worker, served.server.hub
     with halted.lock:
-        assert not worker.stop(wait_s=0.0)
+        request = StopRequest(served.server.config.state_path("sim"))
+        assert request.answer() is None
     assert served.wait(job["id"])["state"] == "cancelled"
-    stops = [message.data for message in hub.since(0)[0] if message.kind == "stop"]
-    while len(stops) < 2:
+    assert request.answer() is StopAnswer.TORQUE_OFF
+    request.close()
+    assert stops_of(served, 2) == [{"ended": False}, {"ended": True, "torque_off": True}]
+
+
+def stops_of(served: Served, number: int) -> list[dict[str, Any]]:
+    """Return the events about stops when there are as many."""
+    while True:
+        found = [json.loads(one.data) for one in served.server.hub.since(0)[0] if one.kind == "stop"]
+        if len(found) >= number:
+            return found
         SystemClock().sleep(0.005)
-        stops = [message.data for message in hub.since(0)[0] if message.kind == "stop"]
-    assert stops == ['{"ended": false}', '{"ended": true}']
 
 
 def test_fault_is_latched_shown_and_acknowledged(serve):
@@ -208,7 +217,7 @@ def test_job_of_a_killed_server_is_interrupted_and_its_views_are_found_again(ser
     file = tmp_path / "state" / "sim" / "web" / "jobs.json"
     jobs = json.loads(file.read_text())
     jobs[0] |= {"state": "running", "ended_utc": None, "result": None, "views": 3}
-    served.server.worker.end()
+    served.side.worker.end()
     file.write_text(json.dumps(jobs))
     again = serve()
     (job,) = again.client.get("/api/v1/jobs").json()["items"]

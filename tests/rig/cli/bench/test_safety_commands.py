@@ -203,8 +203,8 @@ def unwind(number, frame):
 if {handler!r}:
     signal.signal(signal.SIGTERM, unwind)
 lock = BenchLock(Path({str(tmp_path / "sim")!r}), SystemClock())
-print("held", flush=True)
 try:
+    print("held", flush=True)
     time.sleep(60)
 finally:
     print("torque off", flush=True)

@@ -1,0 +1,192 @@
+"""The web process of a server: pages, REST API, events, exports. It owns no device.
+
+`rig.web.run` starts it as ``python -m rig.web.front LINK SOCKET``, with the numbers of two inherited descriptors.
+"""
+
+import asyncio
+import os
+import resource
+import secrets
+import signal
+import socket
+import sys
+import threading
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from typing import Any, Final
+
+import uvicorn
+from anyio import to_thread
+
+from rig.catalog.background import BackgroundCheck
+from rig.core.clock import SystemClock
+from rig.core.errors import RigError, UsageError, os_errors_as
+from rig.safety.saved_state import SERVER_FOLDER
+from rig.web.access import Lease, Sessions, Tokens
+from rig.web.api_catalog import UPLOAD
+from rig.web.app import create_app
+from rig.web.bench_catalog import BenchCatalog
+from rig.web.guard import Guard, PatientProtocol
+from rig.web.hub import Hub
+from rig.web.link import Link, Message, error_values
+from rig.web.remote_bench import RemoteBench
+from rig.web.server import Server
+from rig.web.setup import Listening, Setup, print_note
+
+MAX_FILES: Final = 65_536
+THREADS: Final = 8
+"""Threads for short requests. With more, STOP would wait longer for its turn of the interpreter."""
+SWITCH_S: Final = 0.001
+"""Time after which a thread hands the interpreter to the next one: a fifth of the usual time, for the same reason."""
+SIGN_OF_LIFE_S: Final = 1.0
+END_S: Final = 4.0
+
+
+def make_server(setup: Setup, clock: SystemClock) -> Server:
+    """Return the parts of a server; nothing listens yet, and `Server.remote` is not connected to the bench."""
+    hub = Hub(secrets.token_hex(4))
+    place = setup.config.catalog_place(setup.bench)
+    catalog = BenchCatalog(place, clock, lambda state: hub.publish("catalog", state), print_note)
+
+    def received(kind: str, data: Any) -> None:
+        if kind == "catalog":
+            catalog.become(data)  # which publishes it
+        else:
+            hub.publish(kind, data)
+
+    return Server(
+        bench=setup.bench,
+        config=setup.config,
+        clock=clock,
+        remote=RemoteBench(setup.state_folder, clock, received),
+        hub=hub,
+        sessions=Sessions(Tokens(setup.state_folder / SERVER_FOLDER, clock), clock, setup.local_token),
+        lease=Lease(clock, lambda values: hub.publish("lease", values)),
+        runs=setup.runs,
+        catalog=catalog,
+        needs_login=setup.listening.needs_login,
+        secure_cookies=setup.listening.certfile is not None,
+    )
+
+
+def checked_catalog(server: Server) -> AbstractContextManager[object]:
+    """Return a check of the catalog during the work of a ``with`` block; damage is on stderr and in the status."""
+    place = server.config.catalog_place(server.bench)
+    if not place.may_exist():
+        return nullcontext()
+
+    def report(damage: RigError) -> None:
+        server.damage = damage
+        print_note(f"{damage.what} Next step: {damage.next_step}")
+
+    return BackgroundCheck(place, server.clock, report)
+
+
+def guarded(server: Server, listening: Listening) -> Guard:
+    """Return the application of a server behind its guard."""
+    hosts = {"localhost", "127.0.0.1", "::1", listening.host.strip("[]"), *listening.other_hosts}
+    return Guard(create_app(server), hosts=hosts, upload_path=UPLOAD, max_upload_bytes=listening.max_upload_bytes)
+
+
+class _Web(uvicorn.Server):
+    """Uvicorn that tells the bench's process that it answers, and then once a second that it lives."""
+
+    def __init__(self, config: uvicorn.Config, tell: Callable[[Message], None]) -> None:
+        super().__init__(config)
+        self._tell = tell
+        self._living: asyncio.Task[None] | None = None
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        to_thread.current_default_thread_limiter().total_tokens = THREADS
+        asyncio.get_running_loop().set_exception_handler(_log)
+        await super().startup(sockets)
+        self._living = asyncio.create_task(self._live())
+
+    async def _live(self) -> None:
+        while True:
+            self._tell({"alive": True})
+            await asyncio.sleep(SIGN_OF_LIFE_S)
+
+
+def _log(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+    """Log an error of the event loop, except that no file can be opened: asyncio repeats this many times a second."""
+    if context.get("message") != "socket.accept() out of system resource":
+        loop.default_exception_handler(context)
+
+
+def uvicorn_config(app: Any, listening: Listening) -> uvicorn.Config:
+    """Return the configuration of uvicorn. Raises `UsageError` if the certificate cannot be used."""
+    step = "Check the files of --certfile and --keyfile."
+    with os_errors_as(UsageError, "The certificate cannot be used.", next_step=step):
+        config = uvicorn.Config(
+            app,
+            http=PatientProtocol,
+            ws="websockets-sansio",
+            ws_max_size=10_000,
+            ws_ping_interval=10.0,
+            ws_ping_timeout=10.0,
+            lifespan="off",
+            log_level="error",
+            access_log=False,
+            server_header=False,
+            timeout_keep_alive=15,
+            timeout_graceful_shutdown=2,
+            ssl_certfile=listening.certfile,
+            ssl_keyfile=listening.keyfile,
+            proxy_headers=False,
+        )
+        config.load()
+    return config
+
+
+def main(link_descriptor: int, socket_descriptor: int) -> None:
+    """Serve until the bench's process ends the link, or a signal comes."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl+C is for the process that owns the bench
+    _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(
+        resource.RLIMIT_NOFILE, (MAX_FILES if hard == resource.RLIM_INFINITY else min(hard, MAX_FILES), hard)
+    )
+    sys.setswitchinterval(SWITCH_S)
+    first = threading.Event()
+    setups: list[Setup] = []
+    parts: list[tuple[Server, _Web]] = []
+
+    def received(message: Message, content: bytes) -> None:
+        if "setup" in message:
+            setups.append(Setup.model_validate(message["setup"]))
+            first.set()
+            ready.wait()
+        elif parts:
+            parts[0][0].remote.received(message, content)
+
+    def ended() -> None:
+        first.set()
+        if not parts:
+            os._exit(0)
+        server, web = parts[0]
+        web.should_exit = True
+        server.remote.closed = True
+        server.hub.close()
+        threading.Timer(END_S, os._exit, (0,)).start()  # a long export, for example
+
+    ready = threading.Event()
+    link = Link(socket.socket(fileno=link_descriptor), received, ended)
+    link.start()
+    first.wait()
+    setup = setups[0]
+    server = make_server(setup, SystemClock())
+    server.remote.calls.link = link
+    try:
+        web = _Web(uvicorn_config(guarded(server, setup.listening), setup.listening), link.send)
+    except RigError as error:
+        link.send({"failed": error_values(error)})
+        ready.set()
+        raise SystemExit(1) from error
+    parts.append((server, web))
+    ready.set()
+    with checked_catalog(server), server.catalog.background_delivery():
+        web.run([socket.socket(fileno=socket_descriptor)])
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]), int(sys.argv[2]))

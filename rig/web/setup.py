@@ -1,0 +1,56 @@
+"""What the two processes of a server must know."""
+
+import sys
+from contextlib import suppress
+from pathlib import Path
+
+from pydantic import BaseModel, ConfigDict
+
+from rig.config import RigConfig
+
+
+class Listening(BaseModel):
+    """The address at which a server listens, and its allowed clients."""
+
+    model_config = ConfigDict(frozen=True)
+
+    host: str
+    port: int
+    other_hosts: tuple[str, ...] = ()
+    certfile: Path | None = None
+    keyfile: Path | None = None
+    needs_login: bool = False
+    max_upload_bytes: int = 500_000_000
+
+
+class Setup(BaseModel):
+    """The bench that is served and how to open it, and the address of the server.
+
+    ``arguments`` are the arguments of `rig` that select the same bench. ``local_token`` lets commands of the same user
+    on this computer watch.
+    """
+
+    model_config = ConfigDict(frozen=True)
+
+    bench: str
+    config: RigConfig
+    seed: int | None = None
+    arguments: tuple[str, ...] = ()
+    listening: Listening
+    local_token: str = ""
+
+    @property
+    def state_folder(self) -> Path:
+        """Folder of the bench's state, with the stop channel."""
+        return self.config.state_path(self.bench)
+
+    @property
+    def runs(self) -> Path:
+        """Folder of the saved runs."""
+        return self.config.catalog_path(self.bench) / "runs"
+
+
+def print_note(text: str) -> None:
+    """Print a note on stderr, unless it is closed."""
+    with suppress(OSError):
+        print(f"Note: {text}", file=sys.stderr, flush=True)
