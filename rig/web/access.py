@@ -327,7 +327,9 @@ class Lease:
                 raise LeaseHeld("You do not have the lease.", next_step="Take it first.")
             to = self._asked.get((name, client))
             if to is None:
-                raise JobRejected(f"{name} has not asked for the bench.", next_step="Wait until another operator asks for it.")
+                raise JobRejected(
+                    f"{name} has not asked for the bench.", next_step="Wait until another operator asks for it."
+                )
             self._holder = None
             self.take(to)
 

@@ -1,7 +1,7 @@
 """Protects the server before a request reaches the application: host, origin, sizes, slow and silent clients.
 
-Every new connection must get through, because it may bring a STOP. So none is rejected because of their number: if there
-are too many, the least useful one is closed.
+Every new connection must get through, because it may bring a STOP. So none is rejected because of their number: if
+there are too many, the least useful one is closed.
 """
 
 import asyncio

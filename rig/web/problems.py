@@ -6,6 +6,7 @@ from typing import Any, Final
 from rig.core.errors import (
     BenchBusy,
     CatalogBusy,
+    ConfigError,
     Forbidden,
     JobNotFound,
     JobRejected,
@@ -32,6 +33,7 @@ _STATUS: Final[dict[type[RigError], int]] = {
     ObjectExists: 409,
     BenchBusy: 409,
     CatalogBusy: 503,
+    ConfigError: 503,
 }
 _BY_HUNDRED: Final = {1: 500, 2: 422, 3: 500, 4: 503, 5: 409, 6: 422, 7: 409, 8: 404, 9: 409}
 

@@ -120,29 +120,28 @@ for (const [id, kind] of [["home", "home"], ["empty", "empty-table"], ["acknowle
 
 const PICTURE_MS = 120;
 const STALE_S = 3;
+let takenAt = null;
 
-async function showPicture() {
-  if (document.hidden) return;
-  let age = null;
-  try {
-    const answer = await fetch(`${API}/picture`, { cache: "no-store" });
-    if (answer.ok) {
-      age = Number(answer.headers.get("X-Rig-Picture-Age"));
-      const before = $("live-image").src;
-      $("live-image").src = URL.createObjectURL(await answer.blob());
-      if (before.startsWith("blob:")) URL.revokeObjectURL(before);
-    }
-  } catch {
-    // the line of the state says that the server does not answer
-  }
+async function fetchPicture() {
+  const answer = await fetch(`${API}/picture`, { cache: "no-store" });
+  if (!answer.ok) return;
+  takenAt = performance.now() - 1000 * Number(answer.headers.get("X-Rig-Picture-Age"));
+  const before = $("live-image").src;
+  $("live-image").src = URL.createObjectURL(await answer.blob());
+  if (before.startsWith("blob:")) URL.revokeObjectURL(before);
+}
+async function fetchPictures() {
+  if (!document.hidden) await fetchPicture().catch(() => {}); // the line of the state says that the server does not answer
+  setTimeout(fetchPictures, document.hidden ? 1000 : PICTURE_MS);
+}
+fetchPictures();
+
+/** Mark an old picture: the camera may be unplugged, or the bench may not answer. */
+setInterval(() => {
+  const age = takenAt === null ? null : (performance.now() - takenAt) / 1000;
   const stale = age === null || age > STALE_S;
   $("live").classList.toggle("stale", stale);
   $("live-age").hidden = !stale;
-  $("live-age").textContent = age === null ? "No image from the camera." : `This image is ${duration(age)} old. The camera gives no new one.`;
-}
-async function showPictures() {
-  await showPicture();
-  setTimeout(showPictures, document.hidden ? 1000 : PICTURE_MS);
-}
-showPictures();
+  $("live-age").textContent = age === null ? "No image from the camera yet." : `This image is ${duration(age)} old: no new one comes.`;
+}, 500);
 start();
