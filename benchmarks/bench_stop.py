@@ -1,0 +1,299 @@
+"""Time from STOP to torque off, by the servo's own log, in the situations in which STOP could be late.
+
+The servo is simulated in real time by another process, which logs each instruction that switches its torque. All
+processes use the same monotonic clock. ``--load 8`` runs eight busy processes beside each measurement but the first.
+"""
+
+import argparse
+import json
+import random
+import re
+import shutil
+import socket
+import statistics
+import subprocess
+import sys
+import tempfile
+import threading
+import urllib.request
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+from urllib.parse import urlsplit
+
+from rig.core.clock import SystemClock
+from rig.safety.stop_channel import StopRequest
+
+RIG = [sys.executable, "-c", "from rig.cli.main import main; main()"]
+LOGGING_BENCH = """
+import os, sys, time
+try:
+    os.nice(-15)  # a real servo does not share the computer's cores
+except PermissionError:
+    pass
+from sim.servo.device import XSeriesServo
+log, usual = open(sys.argv.pop(1), "a", buffering=1), XSeriesServo._on_torque_enable
+def logged(servo):
+    log.write(f"{time.monotonic_ns()} {servo.memory['Torque Enable']}\\n")
+    usual(servo)
+XSeriesServo._on_torque_enable = logged
+from rig.cli.main import main
+main()
+"""
+CLOCK = SystemClock()
+PAGES = ("settings", "identify", "catalog", "calibrations", "runs", "log")
+VIEWS = 36
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--runs", type=int, default=100, help="stops in each situation")
+    parser.add_argument("--load", type=int, default=8, help="busy processes")
+    parser.add_argument("--only", help="situations whose names contain this text")
+    parser.add_argument("--out", type=Path, help="JSON file to write")
+    options = parser.parse_args()
+    rows: dict[str, list[float]] = {}
+    with tempfile.TemporaryDirectory() as folder, served(Path(folder)) as bench:
+        for name, situation in SITUATIONS.items():
+            if options.only and options.only not in name:
+                continue
+            with ExitStack() as held:
+                if "idle" not in name:
+                    held.enter_context(busy(options.load))
+                stop = situation(bench, held)
+                rows[name] = [bench.measure(stop) for _ in range(options.runs)]
+            print(f"{name:60s} {words(rows[name])}", flush=True)
+    if options.out:
+        options.out.write_text(json.dumps(rows))
+
+
+def words(seconds: list[float]) -> str:
+    return f"median {statistics.median(seconds):.3f} s, worst {max(seconds):.3f} s of {len(seconds)}"
+
+
+@contextmanager
+def busy(number: int) -> Iterator[None]:
+    loops = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(number)]
+    try:
+        yield
+    finally:
+        for loop in loops:
+            loop.kill()
+            loop.wait()
+
+
+class ServedBench:
+    """A served bench whose servo has a log."""
+
+    def __init__(self, folder: Path, url: str, token: str) -> None:
+        self.folder = folder
+        self.url = url
+        self.token = token
+        self.state = folder / "state" / "sim-bench"
+
+    def call(self, path: str, body: object = None, token: str | None = None) -> dict:
+        data = None if body is None else json.dumps(body).encode()
+        headers = {"Content-Type": "application/json", "Authorization": f"Bearer {token or self.token}"}
+        request = urllib.request.Request(f"{self.url}api/v1/{path}", data, headers)
+        with urllib.request.urlopen(request, timeout=60) as answer:
+            return json.load(answer)
+
+    def torque_off_ns(self, after_ns: int) -> int:
+        """Return when the torque went off after a time, as the servo's log has it."""
+        while True:
+            for line in (self.folder / "torque.log").read_text().splitlines():
+                at_ns, value = map(int, line.split())
+                if at_ns > after_ns and value == 0:
+                    return at_ns
+            CLOCK.sleep(0.02)
+
+    def measure(self, stop: Callable[[], int]) -> float:
+        """Rotate the table, stop it, and return the seconds until its torque was off."""
+        while (status := self.call("status")).get("job") or not status["open"]:
+            CLOCK.sleep(0.05)
+        target_deg = -350 if (status.get("table_deg") or 0.0) > 0 else 350
+        self.call("jobs", {"kind": "goto", "angle_deg": target_deg})
+        while not self.call("status").get("servo", {}).get("moving"):
+            CLOCK.sleep(0.05)
+        CLOCK.sleep(random.uniform(0.3, 0.8))
+        began_ns = stop()
+        return (self.torque_off_ns(began_ns) - began_ns) * 1e-9
+
+
+@contextmanager
+def served(folder: Path) -> Iterator[ServedBench]:
+    home = folder / "bench"
+    log = folder / "bench" / "torque.log"
+    simulated = subprocess.Popen(
+        [sys.executable, "-c", LOGGING_BENCH, str(folder / "torque.log"), "sim-bench", "--folder", str(home)],
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert simulated.stdout is not None
+    simulated.stdout.readline()
+    log.symlink_to(folder / "torque.log")
+    base = ["--config", str(home / "rig.toml"), "--set", f"catalog.path={folder}/catalog"]
+    subprocess.run([*RIG, "sim-bench", "put", "lamp", "--folder", str(home)], check=True, capture_output=True)
+    made = subprocess.run(
+        [*RIG, "serve", *base, "--new-token", "operator", "--role", "operate"],
+        check=True,
+        capture_output=True,
+        text=True,
+    )
+    token = made.stdout.strip()
+    server = subprocess.Popen([*RIG, "serve", *base, "--port", "0", "--login"], stderr=subprocess.PIPE, text=True)
+    assert server.stderr is not None
+    url = next(found.group() for line in server.stderr if (found := re.search(r"http://\S+/", line)))
+    threading.Thread(target=server.stderr.read, daemon=True).start()
+    bench = ServedBench(home, url, token)
+    try:
+        for request in ({"kind": "reference", "here": True}, {"kind": "enroll", "name": "lamp", "views": VIEWS}):
+            job = bench.call("jobs", request)
+            while (job := bench.call(f"jobs/{job['id']}"))["state"] not in ("done", "failed"):
+                CLOCK.sleep(0.2)
+            assert job["state"] == "done", job["error"]
+        yield bench
+    finally:
+        for process in (server, simulated):
+            process.terminate()
+            process.wait(30)
+
+
+# -- situations: each prepares itself, and returns a function that stops and returns when it did -----------------------
+
+Stop = Callable[[], int]
+
+
+def by_request(bench: ServedBench, _held: ExitStack) -> Stop:
+    def stop() -> int:
+        began_ns = CLOCK.now_ns()
+        bench.call("stop", {})
+        return began_ns
+
+    return stop
+
+
+def in_browser(bench: ServedBench, held: ExitStack, tabs: int = 1) -> Stop:
+    """One tab that has shown six pages, with the back/forward cache; or several tabs of the page Bench."""
+    from playwright.sync_api import sync_playwright
+
+    driver = held.enter_context(sync_playwright())
+    browser = driver.chromium.launch(
+        executable_path=shutil.which("chromium"),
+        args=["--no-sandbox", "--disable-gpu", "--disable-background-networking"],
+        ignore_default_args=["--disable-back-forward-cache"],
+    )
+    held.callback(browser.close)
+    context = browser.new_context()
+    page = context.new_page()
+    page.goto(f"{bench.url}login")
+    page.fill("#token", bench.token)
+    page.click("#login button")
+    page.wait_for_selector("#state.good", timeout=60_000)
+    if tabs == 1:
+        for name in PAGES:
+            page.goto(f"{bench.url}{name}")
+            page.wait_for_selector("#state.good", timeout=60_000)
+    else:
+        for _ in range(tabs):
+            page = context.new_page()
+            page.goto(bench.url)
+            page.wait_for_selector("#state.good", timeout=60_000)
+
+    def stop() -> int:
+        began_ns = CLOCK.now_ns()
+        page.evaluate("document.getElementById('stop').click()")
+        return began_ns
+
+    return stop
+
+
+def by_rig_stop(bench: ServedBench, _held: ExitStack) -> Stop:
+    """What `rig stop` sends after its own start, beside a queue."""
+
+    def stop() -> int:
+        for _ in range(5):
+            bench.call("jobs", {"kind": "home"})
+        began_ns = CLOCK.now_ns()
+        StopRequest(bench.state).close()
+        return began_ns
+
+    return stop
+
+
+def with_queue(bench: ServedBench, held: ExitStack) -> Stop:
+    """As many trays of 1,000 objects as may wait."""
+    tray = {"kind": "tray", "objects": [{"name": f"object-{k}", "note": "x" * 60} for k in range(1000)]}
+    request = by_request(bench, held)
+
+    def stop() -> int:
+        with suppress(OSError):
+            for _ in range(50):
+                bench.call("jobs", tray)
+        return request()
+
+    return stop
+
+
+def beside_exports(bench: ServedBench, held: ExitStack) -> Stop:
+    """45 exports at a time, one after the other."""
+    over = threading.Event()
+    held.callback(over.set)
+
+    def export() -> None:
+        while not over.is_set():
+            with suppress(OSError):
+                headers = {"Authorization": f"Bearer {bench.token}"}
+                request = urllib.request.Request(f"{bench.url}api/v1/export", headers=headers)
+                with urllib.request.urlopen(request, timeout=300) as answer:
+                    while answer.read(1 << 16) and not over.is_set():
+                        pass
+
+    for _ in range(45):
+        threading.Thread(target=export, daemon=True).start()
+    return by_request(bench, held)
+
+
+def beside_strangers(bench: ServedBench, held: ExitStack) -> Stop:
+    """450 connections that send nothing; those that the server has closed are opened again before each stop."""
+    place = urlsplit(bench.url)
+    silent: list[socket.socket] = []
+    held.callback(lambda: [one.close() for one in silent])
+    request = by_request(bench, held)
+
+    def stop() -> int:
+        for one in silent:
+            one.close()
+        silent[:] = [socket.create_connection((place.hostname, place.port), timeout=30) for _ in range(450)]
+        return request()
+
+    return stop
+
+
+def after_wrong_tokens(bench: ServedBench, held: ExitStack) -> Stop:
+    request = by_request(bench, held)
+
+    def stop() -> int:
+        for _ in range(6):
+            with suppress(OSError):
+                bench.call("stop", {}, token="rig_wrong")
+        return request()
+
+    return stop
+
+
+SITUATIONS: dict[str, Callable[[ServedBench, ExitStack], Stop]] = {
+    "idle: request": by_request,
+    "idle: page": in_browser,
+    "1a page, after six pages with the back/forward cache": in_browser,
+    "1b page, one of six tabs": lambda bench, held: in_browser(bench, held, 6),
+    "2 rig stop beside a queue": by_rig_stop,
+    "3 request, with long trays that wait": with_queue,
+    "4 request, beside 45 exports": beside_exports,
+    "5 request, beside 450 silent connections": beside_strangers,
+    "6 request, after wrong tokens": after_wrong_tokens,
+}
+
+
+if __name__ == "__main__":
+    main()
