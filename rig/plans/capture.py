@@ -88,7 +88,7 @@ def check_camera(bench: Bench, settings: Collection[Mapping[str, Any]]) -> None:
 
 
 def check_object(bench: Bench, image_bgr: NDArray[np.uint8], empty_table: NDArray[np.uint8] | None) -> None:
-    """Check that the first view shows more than the empty table; without an empty-table image nothing is known.
+    """Check that the first view shows more than the empty table; without an empty-table image, more than one colour.
 
     Raises
     ------
@@ -97,7 +97,7 @@ def check_object(bench: Bench, image_bgr: NDArray[np.uint8], empty_table: NDArra
     """
     if is_empty_table(image_bgr, empty_table, bench.config.view):
         raise NoObject(
-            "No object is on the table: the camera sees what it saw for the empty-table image.",
+            "No object is on the table: nothing in the image differs from the background.",
             next_step="Put the object on the table, where the camera sees it, and repeat. If it is there already, take "
             f"it off and take a new empty-table image: {COMMAND}",
         )

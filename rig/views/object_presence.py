@@ -110,12 +110,14 @@ class TableWatcher:
 
 
 def is_empty_table(image_bgr: NDArray[np.uint8], empty_table_bgr: NDArray[np.uint8] | None, config: ViewConfig) -> bool:
-    """Return whether a frame shows the empty table, in any light. False without an empty-table image of its size.
+    """Return whether a frame shows the empty table, in any light.
 
-    Nothing may differ: no speck by the segmentation's own measures, and no cells that `TableWatcher` would notice.
+    Nothing may differ from the empty-table image: no speck by the segmentation's own measures, and no cells that
+    `TableWatcher` would notice. Without an image of the frame's size, the whole frame must have one colour.
     """
     if empty_table_bgr is None or empty_table_bgr.shape != image_bgr.shape:
-        return False
+        cells = shrunk(image_bgr, config)
+        return changed_cells(np.zeros_like(cells), cells) == 0
     frame, empty = (Frame(within(one, config.roi)) for one in (image_bgr, empty_table_bgr))
     found = frame.difference(hbr.Background(empty.image))
     if not found.reliable or cv2.erode((found.certain | found.possible).astype(np.uint8), SPECK).any():

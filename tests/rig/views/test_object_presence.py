@@ -97,6 +97,10 @@ def test_empty_table_is_recognised_in_any_light_but_only_with_its_image(simulate
         assert is_empty_table(frame(s), empty, config)
     assert not is_empty_table(frame(s), None, config)
     assert not is_empty_table(frame(s), empty[:-1], config)
+    s.operator.devices.camera.backdrop[:] = 120
+    assert is_empty_table(frame(s), None, config)  # the whole frame has one colour
+    put(s, "dice")()
+    assert not is_empty_table(frame(s), None, config)
     another = np.random.default_rng(0).integers(0, 256, empty.shape, np.uint8)
     assert not is_empty_table(frame(s), another, config)
 
