@@ -180,11 +180,11 @@ class ArcSession(DenseSession):
         if self.decisions == 1 or decision.reason is StopReason.BELOW_OPEN_SET_THRESHOLD:
             return decision
         enough = sides.queries > 1  # as at rest: an object that is not found by its first view is found by two
-        probability = belief.posterior(self.rule.beta).sum(axis=1)
-        best = int(probability.argmax())
-        confidence = float(probability[best])
+        probabilities = belief.posterior(self.rule.beta).sum(axis=1)
+        best = int(probabilities.argmax())
+        probability = float(probabilities[best])
         outcome, reason = Outcome.CONTINUE, StopReason.NOT_CONFIDENT
-        if enough and confidence >= self._min_confidence:
+        if enough and probability >= self._min_confidence:
             outcome, reason = Outcome.FOUND, StopReason.CONFIDENT
             if not (self._reliable or last):
                 outcome, reason = Outcome.CONTINUE, StopReason.BADLY_SEGMENTED
@@ -195,7 +195,7 @@ class ArcSession(DenseSession):
             outcome=outcome,
             reason=reason,
             object_index=int(belief.index.object_index[best]),
-            confidence=confidence,
+            probability=probability,
             min_confidence=self._min_confidence,
         )
 

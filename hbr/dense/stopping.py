@@ -54,8 +54,9 @@ class StopDecision:
         What to do, and why.
     object_index : int
         The leading candidate, for every outcome.
-    confidence, min_confidence : float
-        Its probability among the enrolled objects, and the probability that ends a search.
+    probability, min_confidence : float
+        Its probability among the enrolled objects, and the probability that ends a search. It is the confidence of an
+        answer only if the object is found.
     open_set_score, open_set_threshold : float
         A number that is high for enrolled objects, and the score below which an object is unknown; with a threshold of
         -inf no object is unknown.
@@ -64,7 +65,7 @@ class StopDecision:
     outcome: Outcome
     reason: StopReason
     object_index: int
-    confidence: float
+    probability: float
     min_confidence: float
     open_set_score: float
     open_set_threshold: float
@@ -201,8 +202,8 @@ class StoppingRule:
         whether the bench is that of the enrollment; None: not known. On the same bench, an object with enough
         confidence is also found if it reaches all leave-one-out thresholds, which are for an unchanged bench.
         """
-        probability = belief.posterior(self.beta).sum(axis=1)
-        best = int(probability.argmax())
+        probabilities = belief.posterior(self.beta).sum(axis=1)
+        best = int(probabilities.argmax())
         known = {True: self.same_bench_thresholds, False: self.changed_bench_thresholds, None: ()}[same_bench]
         thresholds = known or self.open_set_thresholds
         calibrated = len(thresholds)
@@ -211,14 +212,14 @@ class StoppingRule:
         score = self._open_set_score(belief, n)
         early = decisions < min(calibrated, max_views)
         threshold = max(thresholds) if early else thresholds[n]
-        confidence = float(probability[best])
+        probability = float(probabilities[best])
         unknown_below = min(threshold, self.unknown_thresholds[n]) if self.unknown_thresholds else threshold
         if score < threshold:
             outcome = Outcome.CONTINUE if early else Outcome.UNKNOWN
             reason = StopReason.BELOW_OPEN_SET_THRESHOLD
             if not early and score >= unknown_below:
                 outcome = Outcome.CONTINUE if decisions < max_views else Outcome.AMBIGUOUS
-        elif confidence >= self.min_confidence:
+        elif probability >= self.min_confidence:
             outcome, reason = Outcome.FOUND, StopReason.CONFIDENT
         elif decisions < max_views:
             outcome, reason = Outcome.CONTINUE, StopReason.NOT_CONFIDENT
@@ -227,14 +228,14 @@ class StoppingRule:
         if not reliable and outcome is not Outcome.CONTINUE and decisions < max_views:
             outcome, reason = Outcome.CONTINUE, StopReason.BADLY_SEGMENTED
         object_index = int(belief.index.object_index[best])
-        decision = StopDecision(outcome, reason, object_index, confidence, self.min_confidence, score, threshold)
+        decision = StopDecision(outcome, reason, object_index, probability, self.min_confidence, score, threshold)
         if same_bench and reliable and score < threshold and decisions <= calibrated:
             return self._found_on_same_bench(belief, n, decision)
         return decision
 
     def _found_on_same_bench(self, belief: Belief, n: int, decision: StopDecision) -> StopDecision:
         """Return the decision by the leave-one-out score, which is for an unchanged bench."""
-        if not self.leave_one_out_thresholds or decision.confidence < self.min_confidence:
+        if not self.leave_one_out_thresholds or decision.probability < self.min_confidence:
             return decision
         leading, score = self._leave_one_out_score(belief, n)
         threshold = max(self.leave_one_out_thresholds)

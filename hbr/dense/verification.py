@@ -67,7 +67,7 @@ class Verification:
         """Return the decision that replaces the given one; log-odds of at least ``least`` find the object."""
         score = self.score(decision.open_set_score)
         outcome = Outcome.UNKNOWN if score < UNKNOWN_BELOW else Outcome.AMBIGUOUS
-        if score >= least and decision.confidence >= decision.min_confidence:
+        if score >= least and decision.probability >= decision.min_confidence:
             outcome = Outcome.FOUND
         return replace(decision, outcome=outcome, reason=StopReason.PIXEL_FIT)
 

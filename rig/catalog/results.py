@@ -100,18 +100,21 @@ class Result:
         return self.corrections[-1].corrected if self.corrections else self.answered
 
     def as_row(self) -> dict[str, Any]:
-        """Return the result as one row of a table. The rotation is left out if another object was named since."""
+        """Return the result as one row of a table.
+
+        Rotation and confidence are those of the answer: they are left out if a correction names another object.
+        """
         last = self.corrections[-1] if self.corrections else None
         same = self.current[:2] == self.answered[:2]
-        numbers = {name: _number(self.details, name) for name in ("confidence", "score", "margin")}
-        pose = {name: _number(self.details, name) if same else None for name in _POSE}
+        own = {name: _number(self.details, name) if same else None for name in _OF_ITS_OBJECT}
+        numbers = {name: _number(self.details, name) for name in ("score", "margin")}
         return {
             "result": self.id,
             "time_utc": self.time_utc,
             "sample": self.current.sample,
             "outcome": self.current.outcome.value,
             "object": self.current.object_name,
-            **pose,
+            **own,
             **numbers,
             "views": len(self.azimuths_deg),
             "operator": self.operator,
@@ -132,7 +135,7 @@ class Result:
         }
 
 
-_POSE: Final = ("yaw_deg", "yaw_sigma_deg", "period_deg")
+_OF_ITS_OBJECT: Final = ("yaw_deg", "yaw_sigma_deg", "period_deg", "confidence")
 
 
 @dataclass(frozen=True, slots=True)

@@ -248,6 +248,10 @@ class TableNotEmpty(RigError, code=603, title="table not empty"):
     """Something is on the table, which should be empty."""
 
 
+class NoObject(RigError, code=606, title="no object"):
+    """The table is empty, so there is nothing to enroll or to identify."""
+
+
 class CatalogError(RigError, code=700, title="catalog"):
     """The catalog cannot do what was requested."""
 

@@ -373,8 +373,9 @@ class Identified:
 
     ``reason`` is why the search ended; ``note`` is the explanation of a user's own strategy, or of an earlier version.
     The paper's search compares the score with ``min_score`` and the margin with ``min_margin``; the dense search
-    compares the confidence with ``min_confidence`` and the open-set score with ``open_set_threshold``, None if no
-    object is called unknown.
+    compares the probability of the first candidate with ``min_confidence`` and the open-set score with
+    ``open_set_threshold``, None if no object is called unknown. That probability is the ``confidence`` if the object
+    was found; otherwise it is None, and the probabilities of the ``candidates`` are shares among the enrolled objects.
     """
 
     name: str | None

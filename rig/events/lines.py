@@ -127,7 +127,8 @@ def _leader(one: Candidate, ranked: Ranked) -> str:
 
 def _frame_words(used: FrameUsed) -> str:
     """Return the state of a search in motion after a frame, in words."""
-    best = f"{used.name} {percent_words(used.probability)}{_ENOUGH[used.outcome]}"
+    share = "" if used.outcome is Outcome.UNKNOWN else f" {percent_words(used.probability)}"
+    best = f"{used.name}{share}{_ENOUGH[used.outcome]}"
     where = f"azimuth {azimuth_words(used.azimuth_deg)}°, {used.seconds:.1f} s"
     rejected = f" ({counted(used.rejected, 'frame')} rejected)" if used.rejected else ""
     return f"in motion: {best}; view {used.index + 1}, {where}{rejected}"

@@ -71,25 +71,25 @@ def _side_words(side: str, s_left: float, s_right: float, candidates: int) -> st
 
 def stop_words(decision: StopDecision, views: int) -> str:
     """Return what the stopping rule decided after ``views`` views, and why."""
-    confidence, least = percent_words(decision.confidence), percent_words(decision.min_confidence)
+    share, least = percent_words(decision.probability), percent_words(decision.min_confidence)
     above = decision.open_set_score - decision.open_set_threshold
     match decision.reason:
         case StopReason.CONFIDENT:
             known = f", and the open-set score is {abs(above):.3f} above its threshold"
-            return f"the confidence {confidence} reaches {least}{known if isfinite(above) else ''}"
+            return f"the confidence {share} reaches {least}{known if isfinite(above) else ''}"
         case StopReason.UNCHANGED_BENCH:
             known = f"and the open-set score is {above:.3f} above the threshold of an unchanged bench"
-            return f"the confidence {confidence} reaches {least}, {known}"
+            return f"the confidence {share} reaches {least}, {known}"
         case StopReason.BADLY_SEGMENTED:
             return "the background is not known yet; another view shows it"
         case StopReason.NOT_CONFIDENT:
-            return f"not confident yet: {confidence}, and {least} ends the search"
+            return f"not confident yet: {share}, and {least} ends the search"
         case StopReason.BELOW_OPEN_SET_THRESHOLD if decision.outcome is Outcome.CONTINUE:
             return f"the open-set score is still {abs(above):.3f} below its threshold"
         case StopReason.BELOW_OPEN_SET_THRESHOLD:
             return f"no enrolled object is similar enough: the open-set score is {abs(above):.3f} below its threshold"
         case _:
-            return f"the best candidate after {counted(views, 'view')}, with a confidence of {confidence} below {least}"
+            return f"the best candidate after {counted(views, 'view')}, with a probability of {share} below {least}"
 
 
 def verification_words(verified: Verified) -> str:
@@ -132,11 +132,12 @@ def reason_words(answer: Identified) -> str:
             return "the views fit two enrolled objects up to noise, and do not tell which one it is"
         case StopReason.CUSTOM | StopReason.EARLIER_VERSION:
             return answer.note
-        case StopReason.MAX_VIEWS if answer.confidence is None:
+        case StopReason.MAX_VIEWS if answer.min_confidence is None:
             return f"the search took all {counted(answer.views, 'view')} that are allowed"
-    numbers = (answer.confidence, answer.min_confidence, answer.open_set_score, answer.open_set_threshold)
-    confidence, least, score, threshold = (nan if number is None else number for number in numbers)
-    return stop_words(StopDecision(answer.outcome, answer.reason, 0, confidence, least, score, threshold), answer.views)
+    share = answer.candidates[0].probability if answer.confidence is None else answer.confidence
+    numbers = (share, answer.min_confidence, answer.open_set_score, answer.open_set_threshold)
+    share, least, score, threshold = (nan if number is None else number for number in numbers)
+    return stop_words(StopDecision(answer.outcome, answer.reason, 0, share, least, score, threshold), answer.views)
 
 
 def share_words(one: Candidate, decision: StopDecision | None) -> str:
@@ -233,7 +234,10 @@ def _one_of(answer: Identified) -> str:
 
 def answer_lines(answer: Identified) -> list[str]:
     """Return the result, and why the search ended."""
-    return [result_words(answer), sentence(reason_words(answer))]
+    reason = sentence(reason_words(answer))
+    if answer.outcome is Outcome.UNKNOWN and answer.candidates[0].probability is not None:
+        reason += " Percentages of candidates are shares among the enrolled objects."
+    return [result_words(answer), reason]
 
 
 def answer_words(answer: Identified) -> str:

@@ -4,8 +4,11 @@ from collections.abc import Collection, Generator, Mapping
 from dataclasses import asdict
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from rig.bench import Bench
-from rig.core.errors import CameraSettingsDiffer, ViewRejected
+from rig.core.errors import CameraSettingsDiffer, NoObject, ViewRejected
 from rig.events.events import Accepted, Event, Moved, Note, NoteCode, Ranked, Rejected, Unwinding, Warned
 from rig.motion.move import Move
 from rig.motion.turntable import Turntable
@@ -14,7 +17,8 @@ from rig.search.session import Search
 from rig.search.strategies import Finish, Rotate
 from rig.views.capture import Attempt, RejectReason, Viewer, rejection_text
 from rig.views.description import DescribedView
-from rig.views.empty_table import store_table_problem
+from rig.views.empty_table import COMMAND, store_table_problem
+from rig.views.object_presence import is_empty_table
 
 
 def moved(index: int, move: Move) -> Moved:
@@ -81,6 +85,22 @@ def check_camera(bench: Bench, settings: Collection[Mapping[str, Any]]) -> None:
         next_step=f"Set it as it was: {', '.join(commands)}. {again}" if commands else f"Lock the camera. {again}",
         evidence={key: f"{now[key]} now, {value} at the enrollment" for key, value in nearest.items()},
     )
+
+
+def check_object(bench: Bench, image_bgr: NDArray[np.uint8], empty_table: NDArray[np.uint8] | None) -> None:
+    """Check that the first view shows more than the empty table; without an empty-table image, more than one colour.
+
+    Raises
+    ------
+    NoObject
+        It shows the empty table.
+    """
+    if is_empty_table(image_bgr, empty_table, bench.config.view):
+        raise NoObject(
+            "No object is on the table: nothing in the image differs from the background.",
+            next_step="Put the object on the table, where the camera sees it, and repeat. If it is there already, take "
+            f"it off and take a new empty-table image: {COMMAND}",
+        )
 
 
 def warn_of_table(bench: Bench, index: int, view: DescribedView) -> Generator[Event, None, None]:

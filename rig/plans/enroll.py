@@ -22,7 +22,7 @@ from rig.events.events import Accepted, Enrolled, Event, Started, plain
 from rig.motion.move import Move
 from rig.motion.scan_speed import require_camera_time, takes_in_motion
 from rig.motion.turntable import Turntable
-from rig.plans.capture import announced, capture, check_camera, moved, warn_of_table
+from rig.plans.capture import announced, capture, check_camera, check_object, moved, warn_of_table
 from rig.plans.estimate import even_azimuths, table_angles
 from rig.plans.fly import fly_views, park
 from rig.views.capture import Viewer, image_similarity
@@ -69,6 +69,8 @@ def enroll(
     RotationDisagreement
         Encoder and gyro differ by more than their uncertainty, or the gyro has no value: no view is stored at an
         uncertain angle.
+    NoObject
+        The first view shows the empty table: nothing is stored.
     ObjectMoved
         The object is not where it was for the first view of this session: the enrollment is abandoned.
     ViewRejected, LimitExceeded, MotionTimeout, DeviceFault, DeviceSilent
@@ -204,6 +206,8 @@ def _step_views(
         imu.add(move)
         attempt = yield from capture(index, viewer, table, move.settled_ns)
         retakes += attempt.number - 1
+        if first is None:
+            check_object(bench, attempt.image_bgr, describe.empty_table)
         described = describe(attempt.image_bgr)
         record = ViewRecord(
             index=index,

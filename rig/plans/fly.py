@@ -26,7 +26,7 @@ from rig.motion.move import Move
 from rig.motion.scan_speed import require_camera_time, scan_speed
 from rig.motion.trajectory import TrajectoryRecorder
 from rig.motion.turntable import Flight, Turntable
-from rig.plans.capture import announced, capture, moved, warn_of_table
+from rig.plans.capture import announced, capture, check_object, moved, warn_of_table
 from rig.views.capture import Attempt, Viewer
 from rig.views.description import DescribedView, ViewDescriber
 from rig.views.image_files import Encoder
@@ -101,6 +101,8 @@ def fly_views(
         The camera's time is not calibrated.
     LimitExceeded
         The cable budget does not allow a revolution.
+    NoObject
+        The table is empty.
     RotationDisagreement
         Encoder and gyro disagree: no view of the revolution is stored.
     """
@@ -124,6 +126,7 @@ def fly_views(
     if abs(table.rest_deg - start_deg) > config.table.tolerance_deg:
         yield moved(0, (yield from announced(0, table, start_deg)))
     before = yield from capture(0, viewer, table, bench.clock.now_ns())
+    check_object(bench, before.image_bgr, describe.empty_table)
     yield ScanStarted(speed.dps, speed.limit, speed.value, start_deg, end_deg)
     recorder = table.recorder()
     scan = Scan(bench, table, FrameStream(bench.camera, bench.clock), recorder, angles_deg)

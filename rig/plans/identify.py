@@ -4,6 +4,7 @@ Decision: docs/decisions/0002.
 """
 
 from collections.abc import Callable, Generator
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +18,17 @@ from rig.core.errors import CatalogError, RigError
 from rig.events.events import Event, FrameUsed, Identified, Note, NoteCode, Started, Warned
 from rig.motion.scan_speed import can_fly, require_camera_time
 from rig.motion.turntable import Turntable
-from rig.plans.capture import accepted, add_view, announced, capture, check_camera, moved, unwind, warn_of_table
+from rig.plans.capture import (
+    accepted,
+    add_view,
+    announced,
+    capture,
+    check_camera,
+    check_object,
+    moved,
+    unwind,
+    warn_of_table,
+)
 from rig.plans.identify_moving import decided as decided_event
 from rig.plans.identify_moving import search_in_motion
 from rig.search.local_step import compare_leaders, verify_leader
@@ -26,6 +37,7 @@ from rig.search.session import SHOWN, ArcSearch, Search, begin_search
 from rig.search.strategies import AnyStrategy, Finish
 from rig.views.capture import Viewer
 from rig.views.description import SearchDescriber
+from rig.views.empty_table import empty_table_status
 
 
 def identify(
@@ -61,7 +73,8 @@ def identify(
     top
         The number of candidates that the events name.
     empty_table : uint8 array (H, W, 3), optional
-        The empty-table image for the segmentation; by default the one from `rig.search.model.empty_table_for`.
+        The empty-table image for the segmentation; by default the one from `rig.search.model.empty_table_for`. With
+        this image, or with the bench's own, an empty table is noticed.
     live
         Called with the event of each frame of a search in motion while the table rotates; the plan yields these events
         when it has stopped. It must return at once.
@@ -74,6 +87,8 @@ def identify(
         All objects were enrolled with other settings of the camera.
     UsageError
         There is no such strategy, or the model is not for it.
+    NoObject
+        The first view shows the empty table.
     ViewRejected, MotionTimeout, DeviceFault, DeviceSilent
         See `rig.views.capture` and `rig.motion.turntable`.
     """
@@ -90,6 +105,8 @@ def identify(
     if empty_table is None and isinstance(model, Model):
         empty_table, more = empty_table_for(bench, model)
         notes += more
+    own = empty_table_status(bench).table if empty_table is None else None
+    check = partial(check_object, bench, empty_table=empty_table if own is None else own.image_bgr)
     moving = isinstance(search, ArcSearch)
     bench_image = model.bench_image if isinstance(model, Model) else None
     if bench.config.table.carries == "camera":
@@ -97,6 +114,7 @@ def identify(
     describe = SearchDescriber(
         bench.config.view, search.descriptor, empty_table, revise=not moving, bench_image=bench_image
     )
+    bench.operator.place(None)
     yield Started(
         "identify",
         None,
@@ -107,10 +125,11 @@ def identify(
         descriptor=search.descriptor,
         notes=notes,
     )
-    bench.operator.place(None)
     started_ns = bench.clock.now_ns()
     if isinstance(search, ArcSearch):
-        found = yield from search_in_motion(bench, search, viewer, describe, top=top, started_ns=started_ns, live=live)
+        found = yield from search_in_motion(
+            bench, search, viewer, describe, check=check, top=top, started_ns=started_ns, live=live
+        )
         answer = search.answer(found.ranked, found.end, travelled_deg=found.travelled_deg, seconds=found.seconds)
         answer = yield from _compared(search, answer, describe, model)
         yield answer
@@ -131,6 +150,8 @@ def identify(
             azimuth_deg = float(wrap360(orientation_deg))
             described = describe(captured.image_bgr)
             yield accepted(number, azimuth_deg, captured, described)
+            if number == 0:
+                check(captured.image_bgr)
             yield from warn_of_table(bench, number, described)
             # Decide: rank the candidates, then rotate or finish.
             ranked, step = add_view(search, described, azimuth_deg, table.rest_deg)

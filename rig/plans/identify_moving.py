@@ -11,6 +11,9 @@ from collections.abc import Callable, Generator
 from dataclasses import dataclass, field
 from typing import Final
 
+import numpy as np
+from numpy.typing import NDArray
+
 from hbr import StopReason
 from hbr.core.angles import wrap360
 from rig.bench import Bench
@@ -133,14 +136,16 @@ def search_in_motion(
     viewer: Viewer,
     describe: ViewDescriber,
     *,
+    check: Callable[[NDArray[np.uint8]], None],
     top: int,
     started_ns: int,
     live: Callable[[FrameUsed], object],
 ) -> Generator[Event, None, Found]:
     """Search along arcs until the stopping rule ends the search; the frames of an arc become events at its end.
 
-    ``live`` gets the event of each frame while the table still rotates. It must return at once, because it is called in
-    the control loop. Raises what `rig.plans.identify.identify` raises.
+    ``check`` gets the first view, and raises an error if it shows no object. ``live`` gets the event of each frame
+    while the table still rotates. It must return at once, because it is called in the control loop. Raises what
+    `rig.plans.identify.identify` raises.
     """
     config = bench.config
     sign = config.table.orientation_sign
@@ -159,6 +164,8 @@ def search_in_motion(
             azimuth_deg = float(wrap360(sign * table.rest_deg))
             described = describe(captured.image_bgr)
             yield accepted(number, azimuth_deg, captured, described)
+            if number == 0:
+                check(captured.image_bgr)
             yield from warn_of_table(bench, number, described)
             ranked, step = add_view(search, described, azimuth_deg, table.rest_deg)
             ended_ns = bench.clock.now_ns()

@@ -14,7 +14,7 @@ from rig.catalog.results import Answer, NewResult, record
 from rig.config.catalog_place import CatalogPlace
 from rig.core.clock import Clock
 from rig.core.errors import CatalogUnavailable, RigError
-from rig.events.events import Accepted, Event, Identified, Note, NoteCode, Recorded, Started, Warned, event_dict
+from rig.events.events import Accepted, Event, Failed, Identified, Note, NoteCode, Recorded, Started, Warned, event_dict
 
 
 class ResultRecorder:
@@ -40,7 +40,7 @@ class ResultRecorder:
     Attributes
     ----------
     sample
-        The sample on the table, None if it has no name. Change it before each object.
+        The sample on the table, None if it has no name. It is for one object: give it before each answer.
     """
 
     def __init__(
@@ -77,6 +77,9 @@ class ResultRecorder:
                         self._azimuths_deg.append(event.azimuth_deg)
                     case Identified():
                         yield self._record(event)
+                        self.sample = None
+                    case Failed():
+                        self.sample = None
                     case _:
                         pass
         finally:

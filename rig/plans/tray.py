@@ -11,7 +11,15 @@ from typing import Final, Protocol
 
 from rig.bench import Bench
 from rig.catalog import Catalog, ObjectSummary, clean_name
-from rig.core.errors import ObjectNotFound, RigError, RotationDisagreement, UsageError, ViewRejected, os_errors_as
+from rig.core.errors import (
+    NoObject,
+    ObjectNotFound,
+    RigError,
+    RotationDisagreement,
+    UsageError,
+    ViewRejected,
+    os_errors_as,
+)
 from rig.core.files import read
 from rig.events.events import Event, Item, SkipReason
 from rig.motion.scan_speed import takes_in_motion
@@ -22,7 +30,7 @@ MAX_FILE_BYTES: Final = 1_000_000
 MIN_VIEWS, MAX_VIEWS = 4, 720
 """Limits of the number of views, as for `enroll.views` of the configuration."""
 
-OBJECT_ERRORS: Final = (ViewRejected, RotationDisagreement, ObjectNotFound)
+OBJECT_ERRORS: Final = (NoObject, ViewRejected, RotationDisagreement, ObjectNotFound)
 """Errors that concern one object: the tray can continue with the next one. Any other error ends the tray."""
 
 

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 import hbr
 from rig.bench import Bench
-from rig.core.errors import ViewRejected
+from rig.core.errors import NoObject, ViewRejected
 from rig.events.events import Event, Failed, FrameUsed, Waiting, WaitReason
 from rig.motion.turntable import Turntable
 from rig.plans.capture import moved
@@ -30,8 +30,8 @@ def watch(
     """Identify one object after the other, until closed; yields a `Waiting` before the events of each.
 
     The operator brings the objects, or the plan waits for them (`rig.views.object_presence.TableWatcher`). After each
-    answer the table returns to its start angle and unwinds its cable. If no view of an object is acceptable, the plan
-    yields `Failed` and waits for the next object; any other error ends the plan.
+    answer the table returns to its start angle and unwinds its cable. If no view of an object is acceptable, or no
+    object is on the table, the plan yields `Failed` and waits for the next object; any other error ends the plan.
 
     Parameters
     ----------
@@ -45,7 +45,7 @@ def watch(
     Raises
     ------
     RigError
-        As `identify`, except for `ViewRejected`.
+        As `identify`, except for `NoObject` and `ViewRejected`.
     """
     with Turntable(bench) as table:
         home_deg = table.rest_deg
@@ -58,7 +58,7 @@ def watch(
                 bench, model(), strategy=strategy, seed=seed, top=top, empty_table=empty_table, live=live
             )
             views = answer.views
-        except ViewRejected as error:
+        except (NoObject, ViewRejected) as error:
             yield Failed(**{key: error.as_dict()[key] for key in ("error", "code", "what", "evidence", "next_step")})
             views = 0
         with Turntable(bench) as table:

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from statistics import fmean, median
 from typing import NamedTuple
 
-from hbr import Outcome
 from rig.core.phrases import counted, listed, percent_words
 from rig.events.events import SimilarObjects
 from rig.events.wording import outcome_words, similar_object_words
@@ -118,11 +117,7 @@ def _answer_items(record: IdentificationRecord) -> list[SummaryItem]:
         return []
     return [
         SummaryItem("answer", outcome_words(answer)),
-        *(
-            [SummaryItem("confidence", percent_words(answer.confidence))]
-            if answer.confidence is not None and answer.outcome is not Outcome.UNKNOWN
-            else []
-        ),
+        *([] if answer.confidence is None else [SummaryItem("confidence", percent_words(answer.confidence))]),
         SummaryItem("score", f"{answer.score:.3f}", f"per view; margin {answer.margin:.3f}"),
         SummaryItem("views", f"{answer.views}"),
         SummaryItem("rotation", f"{answer.travelled_deg:.0f}°"),

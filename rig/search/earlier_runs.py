@@ -76,7 +76,7 @@ def _identified(event: dict[str, Any]) -> dict[str, Any]:
         "yaw_set_deg": [event["yaw_deg"]],
         "reason": StopReason.EARLIER_VERSION,
         "note": event["reason"],
-        "confidence": event.get("probability"),
+        "confidence": event.get("probability") if outcome is Outcome.FOUND else None,
         "open_set_score": event.get("familiarity"),
         "open_set_threshold": event.get("min_familiarity"),
     }

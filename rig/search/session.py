@@ -320,7 +320,7 @@ class DenseSearch(Search):
             reason=answer.reason if self._verification is None else decision.reason,
             possible=self._possible(decision),
             **self.pose_fields(decision.object_index),
-            confidence=decision.confidence,
+            confidence=decision.probability if decision.outcome is hbr.Outcome.FOUND else None,
             min_confidence=decision.min_confidence,
             open_set_score=decision.open_set_score,
             open_set_threshold=threshold if isfinite(threshold) else None,
@@ -368,7 +368,7 @@ class ArcSearch(DenseSearch):
         """Return the event of the last frame; ``number`` counts the views from 0."""
         present = self._arc.present
         name = self._arc.belief.index.views.object_names[present.object_index]
-        return FrameUsed(number, azimuth_deg, seconds, rejected, name, present.confidence, present.outcome)
+        return FrameUsed(number, azimuth_deg, seconds, rejected, name, present.probability, present.outcome)
 
     def _decide(self, ranked: Ranked, table_deg: float) -> Rotate | Finish:  # noqa: ARG002
         if self._step is None or self.is_new_decision:

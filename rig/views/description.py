@@ -131,7 +131,7 @@ class ViewDescriber:
         self.region = config.roi
         self._descriptors = [hbr.descriptor(name) for name in names]
         self._segments = any(not one.whole_image for one in self._descriptors)
-        self._table = empty_table if self._segments else None
+        self.empty_table = empty_table if self._segments else None
         self._background: hbr.Background | None = None
         self._low: list[float] = []
         self._reported = False
@@ -190,13 +190,13 @@ class ViewDescriber:
 
     def _prepared_table(self, image_bgr: NDArray[np.uint8]) -> tuple[hbr.Background | None, tuple[Issue, ...]]:
         """Return the empty-table image of the region, and the issue if it has another size than the frame."""
-        if self._table is None:
+        if self.empty_table is None:
             return None, ()
-        if self._table.shape != image_bgr.shape:
-            sizes = {"table_px": list(self._table.shape[1::-1]), "frame_px": list(image_bgr.shape[1::-1])}
+        if self.empty_table.shape != image_bgr.shape:
+            sizes = {"table_px": list(self.empty_table.shape[1::-1]), "frame_px": list(image_bgr.shape[1::-1])}
             return None, (Issue(IssueCode.TABLE_SIZE, sizes),)
         if self._background is None:
-            self._background = hbr.Background(within(self._table, self.region))
+            self._background = hbr.Background(within(self.empty_table, self.region))
         return self._background, ()
 
 

@@ -1,4 +1,4 @@
-"""Detects by the camera that the next object is on the table, for benches without an operator at the keyboard.
+"""Detects by the camera whether an object is on the table, and when the next one is there.
 
 Decision: docs/decisions/0019.
 """
@@ -9,6 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+import hbr
+from hbr.segmentation.frame import Frame
 from rig.bench import Bench
 from rig.config import ViewConfig
 from rig.core.clock import seconds_between
@@ -20,6 +22,9 @@ STEP_LEVELS: Final = 8.0
 """A cell has changed if its level changed by more than this, after the change of the whole image is subtracted."""
 CELLS: Final = 6
 """Smallest number of changed cells of `GRID`² that are an object: for example 2 cm in an image of 40 cm."""
+
+SPECK: Final = np.ones((3, 3), np.uint8)
+"""Smaller groups of pixels are noise, in images of 128 pixels: an object of 3 % of the image's width is larger."""
 
 Cells = NDArray[np.float32]
 
@@ -77,6 +82,24 @@ class TableWatcher:
                     return
             before = now
 
+    def wait_until_still(self) -> None:
+        """Wait until nothing moves before the camera, for example after the operator has scanned a barcode.
+
+        Raises
+        ------
+        DeviceSilent
+            The camera gives no frame.
+        """
+        clock = self._bench.clock
+        before = self._capture()
+        still_since_ns = clock.now_ns()
+        while seconds_between(still_since_ns, clock.now_ns()) < self._still_s:
+            clock.sleep(self._poll_s)
+            now = self._capture()
+            if changed(before, now):
+                still_since_ns = clock.now_ns()
+            before = now
+
     def clear(self) -> bool:
         """Return whether the table is empty: it must be until `place` has waited for the first object."""
         return self._empty is None
@@ -86,9 +109,30 @@ class TableWatcher:
         return shrunk(frame.image_bgr, self._bench.config.view)
 
 
+def is_empty_table(image_bgr: NDArray[np.uint8], empty_table_bgr: NDArray[np.uint8] | None, config: ViewConfig) -> bool:
+    """Return whether a frame shows the empty table, in any light.
+
+    Nothing may differ from the empty-table image: no speck by the segmentation's own measures, and no cells that
+    `TableWatcher` would notice. Without an image of the frame's size, the whole frame must have one colour.
+    """
+    if empty_table_bgr is None or empty_table_bgr.shape != image_bgr.shape:
+        cells = shrunk(image_bgr, config)
+        return changed_cells(np.zeros_like(cells), cells) == 0
+    frame, empty = (Frame(within(one, config.roi)) for one in (image_bgr, empty_table_bgr))
+    found = frame.difference(hbr.Background(empty.image))
+    if not found.reliable or cv2.erode((found.certain | found.possible).astype(np.uint8), SPECK).any():
+        return False
+    corrected = frame.small * np.exp(found.correction.over(*frame.small.shape[:2]))
+    return not changed(_cells(empty.small), _cells(corrected))
+
+
 def shrunk(image_bgr: NDArray[np.uint8], config: ViewConfig) -> Cells:
     """Return the region of interest of a frame as cells, float32 (`GRID`, `GRID`, 3)."""
-    return cv2.resize(within(image_bgr, config.roi), (GRID, GRID), interpolation=cv2.INTER_AREA).astype(np.float32)
+    return _cells(within(image_bgr, config.roi))
+
+
+def _cells(image: NDArray[np.uint8] | NDArray[np.float32]) -> Cells:
+    return cv2.resize(image, (GRID, GRID), interpolation=cv2.INTER_AREA).astype(np.float32)
 
 
 def changed_cells(a: Cells, b: Cells) -> int:

@@ -1,9 +1,9 @@
 """The requests to the bench: one model for each kind of job."""
 
 from enum import StrEnum
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import AliasChoices, BaseModel, ConfigDict, Field
+from pydantic import AliasChoices, BaseModel, ConfigDict, Field, model_validator
 
 
 class _Request(BaseModel):
@@ -54,7 +54,7 @@ class DryRunRequest(_Request):
 
 
 class IdentifyRequest(_Request):
-    """Identify the object on the table."""
+    """Identify the object on the table. With ``watch`` there is no ``sample``, because it names one object."""
 
     kind: Literal["identify"] = "identify"
     max_views: Annotated[int | None, Field(ge=1, le=72, description="default: identify.max_views")] = None
@@ -63,6 +63,15 @@ class IdentifyRequest(_Request):
     sample: Annotated[
         str | None, Field(max_length=100, description="sample on the table, recorded with the answer")
     ] = None
+
+    @model_validator(mode="after")
+    def _sample_of_one_object(self) -> Self:
+        if self.watch and self.sample is not None:
+            raise ValueError(
+                "sample names one object, and watch identifies several; leave out one of them. At the terminal, "
+                "rig identify --watch --scan asks for the sample of each object"
+            )
+        return self
 
 
 class EmptyTableRequest(_Request):

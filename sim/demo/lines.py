@@ -25,7 +25,7 @@ class MoveLines:
     """Converts the events of `rig.plans.identify` to lines; a line is complete when the next view is decided."""
 
     HEADING: ClassVar = _heading("left", "right", "candidates, score")
-    DENSE_HEADING: ClassVar = _heading("at next", "overall", "candidates, confidence")
+    DENSE_HEADING: ClassVar = _heading("at next", "overall", "candidates, probability")
 
     def __init__(self) -> None:
         self._asked_deg: float | None = None

@@ -114,6 +114,34 @@ def test_watch_mode_names_one_object_after_the_other(page, serve_process):
     job_done(page, "Identify", "cancelled")
 
 
+def test_page_of_a_search_says_what_its_numbers_mean(page, serve_process):
+    server = serve_process("bench.sim.speed=50", 'bench.sim.object="radio"')
+    for name in ("lamp", "mug-star"):
+        enroll(page, server, name, 6)
+        job_done(page, f"Enroll {name}")
+    page.goto(f"{server.url}identify")
+    page.check("#watch")
+    assert page.is_disabled("#sample")
+    assert page.is_visible("#sample-why:has-text('A sample names one object')")
+    page.uncheck("#watch")
+    assert page.is_enabled("#sample")
+    assert page.is_hidden("#sample-why")
+    page.click("#start button:has-text('Identify')")
+    page.wait_for_selector("#answer.unknown:has-text('Unknown object')", timeout=WAIT_MS)
+    page.wait_for_selector(
+        "#shares:has-text('Shares among the enrolled objects. The object on the table is none of them.')"
+    )
+    # An empty table is no object, and no unknown one.
+    error = {"what": "No object is on the table.", "next_step": "Put the object on the table.", "code": 606}
+    script = "async (error) => (await import('/static/identify.js')).noAnswer(error)"
+    page.evaluate(script, error)
+    assert page.text_content("#answer") == "No object on the table"
+    page.goto(f"{server.url}runs")
+    cells = page.locator("#answers tbody td")
+    cells.first.wait_for()
+    assert [cells.nth(k).text_content() for k in (2, 3)] == ["unknown object", ""]
+
+
 def test_second_browser_watches_and_takes_over(page, chromium, serve_process):
     server = serve_process("bench.sim.speed=4")
     enroll(page, server, "lamp", 24)

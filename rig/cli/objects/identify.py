@@ -46,13 +46,18 @@ def identify(
         str | None, typer.Option(metavar="ID", help="Sample on the table, to be recorded with the answer.")
     ] = None,
     scan: Annotated[
-        bool, typer.Option("--scan", help="Ask for the sample before each search: scan its barcode, or type it.")
+        bool,
+        typer.Option(
+            "--scan", help="Ask for the sample before each search, with --watch for each object: scan it, or type it."
+        ),
     ] = False,
     operator: Annotated[
         str | None, typer.Option(metavar="NAME", help="Who works at the bench (default: the user's account).")
     ] = None,
 ) -> None:
-    """Identify the object on the table. The exit code is 0 if it is found, 8 if it is unknown, 10 if it is ambiguous.
+    """Identify the object on the table.
+
+    The exit code is 0 if it is found, 6 if the table is empty, 8 if it is unknown, 10 if it is ambiguous.
 
     Put the object on the table in any orientation. The default strategy, dense, rotates to the next best view. It
     stops by the stopping rule, which rig catalog calibrate measures. If the catalog has no descriptors for dense, the
@@ -73,7 +78,7 @@ def identify(
     from rig.cli.ui.present import console
     from rig.cli.ui.prompts import ask_sample
     from rig.core.clock import SystemClock
-    from rig.events.events import FrameUsed, Identified, Recorded, Waiting, event_dict
+    from rig.events.events import FrameUsed, Identified, Recorded, Started, Waiting, event_dict
     from rig.events.lines import line
     from rig.plans.identify import identify as identify_one
     from rig.plans.record import ResultRecorder
@@ -144,13 +149,15 @@ def identify(
             try:
                 with RunSaver(folder, bench, model) as saver:
                     for event in events:
+                        if scan and watch and isinstance(event, Started):  # the object is on the table
+                            recorder.sample = ask_sample()
+                            if isinstance(bench.operator, TableWatcher):
+                                bench.operator.wait_until_still()
                         saver.add(event)
                         if not isinstance(event, FrameUsed):  # shown during the revolution
                             show(event)
                         if isinstance(event, Identified):
                             answer = event
-                        elif isinstance(event, Waiting) and scan:
-                            recorder.sample = ask_sample()
             finally:
                 events.close()
     if answer is None or answer.outcome is Outcome.UNKNOWN:

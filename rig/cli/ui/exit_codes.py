@@ -15,7 +15,7 @@ EXIT_CODES: Final = {
     3: "The configuration has a mistake.",
     4: "A device does not answer, or it reports a fault.",
     5: "Motion or safety: the table did not start, or it was stopped.",
-    EXIT_QUALITY: "Quality: a view, a calibration, a replay or a demo is not good enough.",
+    EXIT_QUALITY: "No object is on the table; or a view, a calibration, a replay or a demo is not good enough.",
     7: "The catalog cannot do this, or it is damaged.",
     EXIT_UNKNOWN: "The object is unknown.",
     9: "Another program uses the bench or the catalog.",

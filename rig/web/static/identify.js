@@ -4,8 +4,15 @@ let current = null;
 
 $("start").addEventListener("submit", (event) => {
   event.preventDefault();
-  submit({ kind: "identify", watch: $("watch").checked, sample: $("sample").value || null, max_views: $("max-views").value ? Number($("max-views").value) : null });
+  submit({ kind: "identify", watch: $("watch").checked, sample: $("sample").disabled ? null : $("sample").value || null, max_views: $("max-views").value ? Number($("max-views").value) : null });
 });
+
+function oneSample() {
+  $("sample").disabled = $("watch").checked;
+  $("sample-why").hidden = !$("watch").checked;
+}
+$("watch").addEventListener("change", oneSample);
+oneSample(); // a browser that reloads the page can keep the tick
 
 function answer(words, kind, detail) {
   $("answer").textContent = words;
@@ -13,12 +20,17 @@ function answer(words, kind, detail) {
   $("answer-detail").textContent = detail;
 }
 
+/** Show an error. Code 606: the table is empty. */
+export function noAnswer(error) {
+  answer(error.code === 606 ? "No object on the table" : "No answer", "unknown", `${error.what} ${error.next_step}`);
+}
+
 function clear() {
-  for (const id of ["thumbs", "steps", "candidates"]) $(id).replaceChildren();
+  for (const id of ["thumbs", "steps", "candidates", "shares"]) $(id).replaceChildren();
   answer("Searching …", "", "");
 }
 
-function bars(candidates) {
+function bars(candidates, unknown = false) {
   const rows = candidates.slice(0, 6).flatMap((one) => {
     const share = one.probability ?? one.score;
     const words = one.probability === null ? number(one.score, 3) : percent(share);
@@ -27,6 +39,8 @@ function bars(candidates) {
     return [h("span", {}, one.name), h("span", {}, bar), h("span", {}, words)];
   });
   $("candidates").replaceChildren(h("div", { class: "bar-chart" }, ...rows));
+  const meaning = candidates[0].probability === null ? "Score per view." : "Shares among the enrolled objects.";
+  $("shares").textContent = unknown ? `${meaning} The object on the table is none of them.` : meaning;
 }
 
 export function result(event) {
@@ -34,6 +48,7 @@ export function result(event) {
   if (event.outcome === "found") answer(event.name, "found", lines[0]);
   else if (event.outcome === "ambiguous") answer(event.possible.join(" or "), "ambiguous", lines[0]);
   else answer("Unknown object", "unknown", lines[0]);
+  bars(event.candidates, event.outcome === "unknown");
 }
 
 on("plan", (event) => {
@@ -44,7 +59,7 @@ on("plan", (event) => {
   if (event.event === "accepted") $("thumbs").append(thumb(event.job, event.picture, `view ${event.index + 1}, ${event.azimuth_deg.toFixed(0)}°`));
   if (event.event === "ranked") bars(event.candidates);
   if (event.event === "identified") result(event);
-  if (event.event === "failed") answer("No answer", "unknown", `${event.what} ${event.next_step}`);
+  if (event.event === "failed") noAnswer(event);
   if (event.text) for (const words of event.text.split("\n")) $("steps").append(h("li", {}, words.trim()));
 });
 followJobs($("job"), ["identify"], (job) => {
@@ -55,7 +70,7 @@ followJobs($("job"), ["identify"], (job) => {
     if (job.state === "queued") answer("Waiting for the bench …", "", "");
   }
   if (job.result && job.result.event === "identified" && !job.request.watch) result({ ...job.result, text: job.result_text });
-  if (job.state === "failed") answer("No answer", "unknown", `${job.error.what} ${job.error.next_step}`);
+  if (job.state === "failed") noAnswer(job.error);
   if (["cancelled", "interrupted"].includes(job.state)) answer("Stopped", "", "");
 });
 start();

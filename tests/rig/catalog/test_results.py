@@ -95,7 +95,7 @@ def test_correction_keeps_the_answer_and_is_in_the_log(catalog: Catalog) -> None
         (result.user, "it was neither"),
     ]
     row = result.as_row()
-    assert (row["object"], row["answered_object"], row["yaw_deg"]) == (None, "mug", None)
+    assert (row["object"], row["answered_object"], row["yaw_deg"], row["confidence"]) == (None, "mug", None, None)
     assert numbers(catalog, outcome=Outcome.UNKNOWN) == [1, 3]
     entries = catalog.log()[-5:]
     assert [(entry.action, entry.object_name, entry.details["result"]) for entry in entries] == [

@@ -10,6 +10,7 @@ from rig.events.compared import Compared, ComparedView
 from rig.events.events import (
     Candidate,
     Decided,
+    FrameUsed,
     Identified,
     Moved,
     RotationReason,
@@ -76,7 +77,7 @@ def test_dense_decisions_name_the_two_candidates() -> None:
         (
             Outcome.AMBIGUOUS,
             StopReason.MAX_VIEWS,
-            "the best candidate after 3 views, with a confidence of 97.0 %",
+            "the best candidate after 3 views, with a probability of 97.0 %",
         ),
         (Outcome.CONTINUE, StopReason.BADLY_SEGMENTED, "the background is not known yet; another view shows it"),
         (Outcome.CONTINUE, StopReason.NOT_CONFIDENT, "not confident yet: 97.0 %, and 95.0 % ends the search"),
@@ -128,6 +129,23 @@ def test_end_of_a_search_has_a_reason() -> None:
     dense = replace(known, confidence=0.6, min_confidence=0.95, open_set_score=1.0, open_set_threshold=None)
     assert reason_words(replace(dense, reason=StopReason.MAX_VIEWS)).startswith("the best candidate after 4 views")
     assert reason_words(replace(dense, reason=StopReason.CONFIDENT)) == "the confidence 60.0 % reaches 95.0 %"
+    likely = tuple(replace(one, probability=0.4) for one in dense.candidates)
+    doubtful = replace(
+        dense, outcome=Outcome.AMBIGUOUS, reason=StopReason.MAX_VIEWS, confidence=None, candidates=likely
+    )
+    assert reason_words(doubtful).endswith("with a probability of 40.0 % below 95.0 %")
+
+
+def test_shares_of_candidates_are_no_confidence_in_an_unknown_object() -> None:
+    unknown = identified(None).answer
+    assert isinstance(unknown, Identified)
+    assert "Percentages" not in answer_words(unknown)  # the paper's search has none
+    likely = tuple(replace(one, probability=0.997) for one in unknown.candidates)
+    dense = replace(unknown, candidates=likely, reason=StopReason.BELOW_OPEN_SET_THRESHOLD)
+    assert answer_words(dense).endswith("Percentages of candidates are shares among the enrolled objects.")
+    frame = FrameUsed(3, 30.0, 1.0, 0, "mug-white", 0.997, Outcome.UNKNOWN)
+    assert line(frame).startswith("  in motion: mug-white, resembles no enrolled object enough; view 4")
+    assert "mug-white 99.7 %, enough" in line(replace(frame, outcome=Outcome.FOUND))
 
 
 def test_comparison_is_put_into_words() -> None:

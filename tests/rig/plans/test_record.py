@@ -46,6 +46,14 @@ def test_each_answer_is_recorded_with_its_sample_and_its_first_image(recorder, t
             assert result.provenance.devices["camera"]
 
 
+def test_sample_is_recorded_for_one_object_only(recorder):
+    recorder.sample = "S-1"
+    assert [event for event in stream(recorder, times=2) if isinstance(event, Recorded)] == [
+        Recorded(1, "S-1"),
+        Recorded(2, None),
+    ]
+
+
 def test_answer_is_reported_on_a_full_disk(recorder, monkeypatch):
     def fail(_: int) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rig.catalog import Catalog
-from rig.core.errors import ObjectNotFound, RotationDisagreement, UsageError, ViewRejected
+from rig.core.errors import NoObject, ObjectNotFound, RotationDisagreement, UsageError, ViewRejected
 from rig.events.events import Accepted, Enrolled, Item
 from rig.plans.enroll import enroll
 from rig.plans.tray import OBJECT_ERRORS, TrayDecision, TrayItem, enroll_tray, read_tray
@@ -197,7 +197,7 @@ def test_object_that_fails_is_skipped_or_ends_the_tray(simulated, catalog):
     assert actions(events) == [("nonsense", "enroll"), ("nonsense", "skip"), ("dice", "enroll")]
     with pytest.raises(ObjectNotFound):
         list(enroll_tray(s.bench, catalog, items("nonsense"), views=4))
-    assert {ViewRejected, RotationDisagreement, ObjectNotFound} == set(OBJECT_ERRORS)
+    assert {NoObject, ViewRejected, RotationDisagreement, ObjectNotFound} == set(OBJECT_ERRORS)
 
 
 def test_views_label_and_note_of_the_list_are_used(simulated, catalog):

@@ -156,7 +156,7 @@ def searching_densely(
         yaw_sigma_deg=2.0,
         yaw_set_deg=(30.0,),
         period_deg=360.0,
-        confidence=probability[0],
+        confidence=None if answer is None else probability[0],
         min_confidence=0.95,
         open_set_score=1.02,
         open_set_threshold=0.95,

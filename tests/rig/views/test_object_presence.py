@@ -1,5 +1,6 @@
 """Waiting for the next object with the camera."""
 
+import numpy as np
 import pytest
 
 import hbr
@@ -8,7 +9,7 @@ from rig.core.errors import DeviceSilent
 from rig.events.events import Failed, Identified, Waiting
 from rig.plans.enroll import enroll
 from rig.plans.watch import watch
-from rig.views.object_presence import TableWatcher
+from rig.views.object_presence import TableWatcher, is_empty_table
 from sim.objects.shelf import shelf
 
 
@@ -81,6 +82,46 @@ def test_unplugged_camera_ends_the_waiting(simulated):
     at(s, 5.0, s.operator.devices.camera.unplug)
     with pytest.raises(DeviceSilent):
         TableWatcher(s.bench).place(None)
+
+
+def frame(s):
+    s.bench.clock.sleep(0.2)
+    return s.bench.camera.capture(s.bench.clock.now_ns()).image_bgr
+
+
+def test_empty_table_is_recognised_in_any_light_but_only_with_its_image(simulated):
+    s = simulated()
+    config, empty = s.bench.config.view, frame(s)
+    for light in ((1.0, 1.0, 1.0), (0.7, 0.7, 0.7), (1.3, 1.3, 1.3), (1.1, 1.0, 0.9)):
+        s.world.change(light=light)
+        assert is_empty_table(frame(s), empty, config)
+    assert not is_empty_table(frame(s), None, config)
+    assert not is_empty_table(frame(s), empty[:-1], config)
+    s.operator.devices.camera.backdrop[:] = 120
+    assert is_empty_table(frame(s), None, config)  # the whole frame has one colour
+    put(s, "dice")()
+    assert not is_empty_table(frame(s), None, config)
+    another = np.random.default_rng(0).integers(0, 256, empty.shape, np.uint8)
+    assert not is_empty_table(frame(s), another, config)
+
+
+def test_no_object_is_taken_for_an_empty_table(simulated):
+    s = simulated()
+    config, empty = s.bench.config.view, frame(s)
+    without = frame(s).astype(np.float32)
+    for number, name in enumerate(shelf()):
+        put(s, name, 31.0 * number)()
+        seen = frame(s)
+        faint = without + 0.15 * (seen.astype(np.float32) - empty)  # an object with a seventh of the contrast
+        assert not is_empty_table(seen, empty, config), name
+        assert not is_empty_table(np.clip(faint, 0, 255).astype(np.uint8), empty, config), name
+    small = without.copy()
+    small[120:127, 150:157] += 25.0  # 7 mm
+    assert not is_empty_table(np.clip(small, 0, 255).astype(np.uint8), empty, config)
+    pale = without.copy()
+    pale[60:180, 90:210] *= 1.2
+    pale[60:180, 90:210] += 2.0
+    assert not is_empty_table(np.clip(pale, 0, 255).astype(np.uint8), empty, config)
 
 
 def test_watch_identifies_objects_and_continues_after_a_failure(simulated, tmp_path):

@@ -13,6 +13,7 @@ from rig.catalog import Catalog
 from rig.core.clock import SystemClock
 from rig.devices.servo import ServoState
 from rig.safety.stop_channel import StopAnswer, StopRequest
+from sim.bench import ShelfOperator
 from tests.rig.web.conftest import Served
 
 
@@ -81,6 +82,29 @@ def test_enrolled_object_is_identified_and_its_run_is_saved(serve):
     fixed = {"object": "lamp", "reason": "read the label"}
     assert served.client.post(f"/api/v1/results/{answer['id']}/correct", json=fixed).json()["object"] == "lamp"
     assert served.client.get("/api/v1/results?object=mug-white").json()["total"] == 0
+
+
+def test_sample_is_not_accepted_for_several_objects(serve):
+    served = serve()
+    request = {"kind": "identify", "watch": True, "sample": "S-1"}
+    answer = served.client.post("/api/v1/jobs", json=request)
+    assert answer.status_code == 422
+    (mistake,) = answer.json()["evidence"]["mistakes"]
+    assert "sample names one object" in mistake
+    assert "rig identify --watch --scan" in mistake
+    assert served.client.get("/api/v1/jobs").json()["items"] == []
+
+
+def test_empty_table_is_neither_enrolled_nor_unknown(serve, monkeypatch):
+    served = serve()
+    assert served.run(kind="enroll", name="lamp", views=4)["state"] == "done"
+    monkeypatch.setattr(ShelfOperator, "place", lambda self, _: self.world.put(None))
+    for request in ({"kind": "identify", "sample": "S-1"}, {"kind": "enroll", "name": "nothing", "views": 4}):
+        job = served.run(**request)
+        assert (job["state"], job["error"]["code"], job["result"]) == ("failed", 606, None)
+        assert job["error"]["next_step"].startswith("Put the object on the table")
+    assert served.client.get("/api/v1/results").json()["items"] == []
+    assert [one["name"] for one in served.client.get("/api/v1/objects").json()["items"]] == ["lamp"]
 
 
 def test_name_in_use_is_rejected_before_the_table_moves(serve):

@@ -1,5 +1,6 @@
 """`rig identify`: strategies, stopping rules, recorded results, and an object that comes while it waits."""
 
+import csv
 import json
 import re
 import shutil
@@ -14,10 +15,11 @@ from typer.testing import CliRunner
 
 from rig.catalog import Catalog
 from rig.cli.main import app
-from rig.cli.ui.exit_codes import EXIT_AMBIGUOUS
+from rig.cli.ui.exit_codes import EXIT_AMBIGUOUS, EXIT_QUALITY, EXIT_UNKNOWN
 from rig.core.clock import SystemClock
 from rig.search.current_model import CurrentModel
 from rig.views.object_presence import TableWatcher
+from sim.bench import ShelfOperator
 from sim.objects.shelf import shelf
 
 
@@ -61,6 +63,42 @@ def test_each_search_of_watch_asks_for_the_sample(enrolled, monkeypatch):
     assert "cannot be printed" in done.stderr
     listed = in_json(CliRunner().invoke(app, ["results", "list", "--json", "--sample", "S-2"]))
     assert [one["operator"] for one in listed] == ["A. Silva"]
+
+
+def test_sample_of_watch_is_that_of_the_object_on_the_table(rig, with_operator, monkeypatch):
+    """The operator scans the object that is on the table, not the one that was there before."""
+    on_table = []
+
+    class Comes(TableWatcher):
+        def place(self, name):
+            (world,) = with_operator
+            if len(on_table) == 2:
+                raise KeyboardInterrupt
+            coming = ("lamp", "dice")[len(on_table)]
+
+            def put() -> None:
+                on_table.append(coming)
+                world.put(shelf()[coming], 33.0)
+
+            world.clock.call_at(world.clock.now_ns() + 3 * 10**9, put)
+            super().place(name)
+
+    def scan() -> str | None:
+        (world,) = with_operator
+        scanned_ns.append(world.clock.now_ns())
+        return f"S-{on_table[-1]}" if on_table else None
+
+    scanned_ns: list[int] = []
+    monkeypatch.setattr("rig.views.object_presence.TableWatcher", Comes)
+    monkeypatch.setattr("rig.cli.ui.prompts.ask_sample", scan)
+    done = rig("identify", "--watch", "--scan", "--json")
+    assert done.exit_code == 130, done.output
+    events = in_json(done)
+    exposed_ns = [event["evidence"]["exposed_ns"] for event in events if event["event"] == "accepted"]
+    assert exposed_ns[0] - scanned_ns[0] > 10**9  # the hand with the scanner must be away
+    recorded = [event["result"] for event in events if event["event"] == "recorded"]
+    listed = {row["result"]: row for row in in_json(rig("results", "list", "--json"))}
+    assert [(listed[n]["object"], listed[n]["sample"]) for n in recorded] == [("lamp", "S-lamp"), ("dice", "S-dice")]
 
 
 def test_sample_is_rejected_if_it_cannot_be_recorded(rig):
@@ -228,7 +266,9 @@ def test_ambiguous_object_ends_with_exit_code_10(rig):
         done = rig(*words, "--json", "--save-run", "runs/ambiguous")
         answer = json.loads(done.stdout.splitlines()[-2])
         assert done.exit_code == EXIT_AMBIGUOUS
-        assert (answer["outcome"], answer["name"]) == ("ambiguous", "dice")
+        assert (answer["outcome"], answer["name"], answer["confidence"]) == ("ambiguous", "dice", None)
+        assert {one["name"] for one in answer["candidates"] if one["probability"] > 0} == set(answer["possible"])
+        assert in_json(rig("results", "list", "--json"))[-1]["confidence"] is None
         assert answer["possible"] == [one["name"] for one in answer["candidates"]]
         assert "\nAmbiguous: dice" in rig("replay", "runs/ambiguous").stdout
         assert rig("replay", "runs/ambiguous", "--check").exit_code == 0
@@ -236,3 +276,45 @@ def test_ambiguous_object_ends_with_exit_code_10(rig):
         assert "Search: dice or " in Path("runs/ambiguous/report.html").read_text(encoding="utf-8")
     finally:
         path.unlink()
+
+
+def test_unknown_object_has_no_confidence_anywhere(rig):
+    done = rig("identify", "--json", "--save-run", "runs/unknown", "--set", "bench.sim.object=radio")
+    assert done.exit_code == EXIT_UNKNOWN
+    events = in_json(done)
+    assert (
+        max(one["probability"] for event in events if event["event"] == "ranked" for one in event["candidates"]) > 0.7
+    )
+    row = in_json(rig("results", "list", "--json", "--outcome", "unknown"))[-1]
+    assert rig("results", "export", "all.csv", "--outcome", "unknown").exit_code == 0
+    with Path("all.csv").open(newline="") as table:
+        (exported,) = csv.DictReader(table)
+    saved = Path("runs/unknown/events.jsonl").read_text(encoding="utf-8")
+    confidences = [
+        *re.findall(r'"confidence": ([^,}]+)', done.stdout + saved),
+        row["confidence"],
+        exported["confidence"],
+    ]
+    assert confidences == ["null", "null", None, ""]
+    assert rig("report", "runs/unknown").exit_code == 0
+    page = Path("runs/unknown/report.html").read_text(encoding="utf-8")
+    shown = [rig("results", "show", str(row["result"])).stdout, rig("replay", "runs/unknown").stdout, page]
+    assert not any("confiden" in text for text in shown)
+    assert "shares among the enrolled objects" in shown[1]
+    assert "shares among the enrolled objects" in page
+
+
+def test_empty_table_is_no_object_with_an_exit_code_of_its_own(rig, monkeypatch):
+    before = rig("results", "list", "--json").stdout
+    monkeypatch.setattr(ShelfOperator, "place", lambda self, _: self.world.put(None))
+    for words in (["identify", "--sample", "S-1"], ["identify", "--strategy", "ahbr"], ["enroll", "nothing"]):
+        done = rig(*words, "--json", "--set", "state_dir=state")  # with the image of the first command
+        assert done.exit_code == EXIT_QUALITY
+        error = in_json(done)[-1]
+        assert (error["error"], error["code"]) == ("no object", 606)
+        assert error["next_step"].startswith("Put the object on the table")
+    assert rig("results", "list", "--json").stdout == before
+    assert "nothing" not in rig("catalog", "list").stdout
+    assert rig("identify", "--save-run", "runs/empty").exit_code == EXIT_QUALITY
+    assert rig("replay", "runs/empty", "--check").exit_code == 0
+    assert rig("report", "runs/empty").exit_code == 0

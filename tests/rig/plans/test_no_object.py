@@ -1,0 +1,145 @@
+"""An empty table is no object: nothing is enrolled, and no answer is given."""
+
+import pytest
+
+import hbr
+from rig.bench import ObjectAlreadyPlaced
+from rig.catalog import Catalog
+from rig.core.errors import NoObject
+from rig.events.events import Accepted, Failed, Identified, Ranked, ScanStarted, Started, Waiting
+from rig.plans.enroll import enroll
+from rig.plans.identify import identify
+from rig.plans.photograph_table import photograph_table
+from rig.plans.tray import TrayDecision, enroll_tray
+from rig.plans.watch import watch
+from rig.search.model import load_model
+from sim.bench import ShelfOperator, open_sim_bench
+from sim.objects.shelf import shelf
+from sim.world import World
+from tests.rig.motion.times import SMALL, camera_time
+from tests.rig.plans.test_tray_list import Scripted, items
+
+
+@pytest.fixture(scope="module")
+def models(tmp_path_factory):
+    """The models of two enrolled objects for the dense search and for the paper's."""
+    world = World(seed=5)
+    with (
+        open_sim_bench(camera_time(world, *SMALL), ShelfOperator(world, shelf())) as bench,
+        Catalog.open(tmp_path_factory.mktemp("models"), clock=bench.clock) as catalog,
+    ):
+        list(photograph_table(bench))
+        for name in ("lamp", "toy-car"):
+            list(enroll(bench, catalog, name, views=6))
+        yield load_model(catalog), load_model(catalog, descriptor="cedd")
+
+
+@pytest.fixture
+def model(models):
+    return models[0]
+
+
+@pytest.fixture
+def world():
+    return World(seed=5)
+
+
+@pytest.fixture
+def bench(world):
+    """A bench with a calibrated camera time and an empty-table image. Its operator puts no object on the table."""
+    with open_sim_bench(camera_time(world, *SMALL), ShelfOperator(world, shelf())) as bench:
+        list(photograph_table(bench))
+        bench.operator = ObjectAlreadyPlaced()
+        yield bench
+
+
+@pytest.fixture
+def catalog(bench, tmp_path):
+    with Catalog.open(tmp_path / "catalog", clock=bench.clock) as catalog:
+        yield catalog
+
+
+def until_no_object(plan):
+    """Return the events of a plan that ends because the table is empty."""
+    events = []
+    with pytest.raises(NoObject, match="No object is on the table") as caught:
+        events.extend(plan)
+    assert caught.value.next_step.startswith("Put the object on the table")
+    return events
+
+
+@pytest.mark.parametrize("strategy", ["dense", "arc", "ahbr"])
+def test_empty_table_gives_no_answer(bench, models, world, strategy):
+    world.change(light=(0.8, 0.8, 0.9))
+    events = until_no_object(identify(bench, models[strategy == "ahbr"], strategy=strategy))
+    assert len([event for event in events if isinstance(event, Accepted)]) == 1
+    assert not any(isinstance(event, Ranked) for event in events)
+    assert not bench.servo.read_condition().torque
+
+
+def test_empty_table_is_noticed_by_the_image_of_the_enrollment(bench, model, world):
+    assert model.empty_table is not None
+    bench.state.store_file("empty-table.json", b"{")
+    until_no_object(identify(bench, model))
+
+
+def test_without_an_empty_table_image_an_empty_table_is_unknown(simulated, models):
+    s = simulated()
+    s.bench.operator = ObjectAlreadyPlaced()
+    *_, answer = identify(s.bench, models[1])
+    assert answer.outcome is hbr.Outcome.UNKNOWN
+
+
+@pytest.mark.parametrize("fly", [False, True])
+def test_empty_table_is_not_enrolled(bench, catalog, fly):
+    events = until_no_object(enroll(bench, catalog, "nothing", views=6, fly=fly))
+    assert not any(isinstance(event, Accepted | ScanStarted) for event in events)
+    assert catalog.objects() == []
+    assert list(catalog.path.rglob("*.png")) == []
+
+
+def test_views_are_not_continued_on_an_empty_table(bench, catalog, world):
+    world.put(shelf()["lamp"])
+    plan = enroll(bench, catalog, "lamp", views=6)
+    while not isinstance(next(plan), Accepted):
+        pass
+    plan.close()
+    world.put(None)
+    until_no_object(enroll(bench, catalog, "lamp", resume=True))
+    assert catalog.resumable("lamp").present == (0,)
+    world.put(shelf()["lamp"])
+    list(enroll(bench, catalog, "lamp", resume=True))
+
+
+def test_operator_of_a_tray_can_put_the_object_on_the_table_and_try_again(bench, catalog, world):
+    class Forgetful(Scripted):
+        def decide_after_error(self, item, error):
+            world.put(shelf()["lamp"])
+            return super().decide_after_error(item, error)
+
+    operator = Forgetful(problem=[TrayDecision.PROCEED])
+    list(enroll_tray(bench, catalog, items("lamp"), views=6, operator=operator, fly=False))
+    assert operator.troubles == [("lamp", NoObject)]
+    assert [one.name for one in catalog.objects()] == ["lamp"]
+
+
+def test_watch_reports_an_empty_table_and_waits_for_the_next_object(bench, model, world):
+    answers = []
+    for event in watch(bench, lambda: model, strategy="dense"):
+        if isinstance(event, Waiting) and answers:
+            world.put(shelf()["lamp"])
+        if isinstance(event, Failed | Identified):
+            answers.append(event.code if isinstance(event, Failed) else event.name)
+            if len(answers) == 2:
+                break
+    assert answers == [606, "lamp"]
+
+
+def test_object_is_on_the_table_when_the_search_starts(bench, model, world):
+    class Comes:
+        def place(self, name):
+            world.put(shelf()["toy-car"])
+
+    bench.operator = Comes()
+    assert isinstance(next(identify(bench, model)), Started)
+    assert world.scene.object is shelf()["toy-car"]
