@@ -13,6 +13,7 @@ from rig.catalog import Catalog
 from rig.core.clock import SystemClock
 from rig.devices.servo import ServoState
 from rig.safety.stop_channel import StopAnswer, StopRequest
+from rig.web.work import doctor_findings
 from sim.bench import ShelfOperator
 from tests.rig.web.conftest import Served
 
@@ -268,3 +269,20 @@ def test_events_continue_after_the_last_one_that_was_received(serve):
     assert [one["picture"] for one in accepted] == [0, 1, 2, 3]
     while threading.active_count() > threads:  # those of requests end soon; one that stays runs into the timeout
         SystemClock().sleep(0.005)
+
+
+def test_doctor_finds_the_bench_closed_at_each_check(serve, monkeypatch):
+    """A bench that is open again holds its port and its camera, and the doctor would report them as in use."""
+    closed = []
+
+    def watched(*arguments: Any) -> Any:
+        for finding in doctor_findings(*arguments):
+            closed.append(served.side.worker._held.bench is None)
+            yield finding
+
+    monkeypatch.setattr("rig.web.bench_side.doctor_findings", watched)
+    served = serve()
+    assert served.run(kind="doctor")["state"] == "done"
+    assert len(closed) > 5
+    assert all(closed)
+    assert served.run(kind="home")["state"] == "done"  # and it is opened again afterwards

@@ -1,0 +1,59 @@
+"""`rig serve`: who may operate the bench, and what it says about that."""
+
+import pytest
+from typer.testing import CliRunner
+
+from rig.cli.main import app
+from rig.config import load_config
+from rig.web.setup import Listening, Setup
+
+
+@pytest.fixture
+def serve(tmp_path, monkeypatch):
+    """Run `rig serve`; a server that would start is returned instead."""
+    started: list[Listening] = []
+
+    def run_server(_bench, _config, _seed, _arguments, listening, ready):
+        started.append(listening)
+        ready("http://127.0.0.1:1/")
+
+    monkeypatch.setattr("rig.web.run.run_server", run_server)
+
+    def run(*words: str):
+        done = CliRunner().invoke(app, ["serve", "--bench", "sim", "--set", f"state_dir={str(tmp_path)!r}", *words])
+        return done, started[-1] if started else None
+
+    return run
+
+
+def test_server_says_that_every_user_of_the_computer_can_operate(serve):
+    done, listening = serve()
+    assert not listening.needs_login
+    assert "Every user of this computer can operate the bench" in done.stderr
+    assert "--login" in done.stderr
+
+
+def test_login_asks_for_a_token_on_this_computer_too(serve):
+    done, listening = serve("--login")
+    assert (done.exit_code, listening) == (2, None)
+    assert "rig serve --new-token NAME" in done.stderr
+    assert serve("--new-token", "anna", "--role", "operate")[0].exit_code == 0
+    done, listening = serve("--login")
+    assert listening.needs_login
+    assert "Every user" not in done.stderr
+
+
+@pytest.mark.parametrize("name", ["local", "a\x1b[31m", "\u202egnp"])
+def test_name_of_a_token_that_misleads_is_rejected(serve, name):
+    done, _ = serve("--new-token", name)
+    assert done.exit_code == 3
+    assert "cannot be the name of a token" in done.stderr
+
+
+def test_web_process_gets_the_same_configuration():
+    config = load_config(
+        None,
+        ["catalog.url='postgresql://user:secret@host/rig'", "catalog.images='/images'", "table.limits_deg=[-90,90]"],
+    )
+    setup = Setup(bench="sim", config=config, seed=3, listening=Listening(host="127.0.0.1", port=0), local_token="t")
+    assert Setup.model_validate_json(setup.model_dump_json()) == setup
