@@ -53,7 +53,7 @@ def test_name_of_a_token_that_misleads_is_rejected(serve, name):
 def test_web_process_gets_the_same_configuration():
     config = load_config(
         None,
-        ["catalog.url='postgresql://user:secret@host/rig'", "catalog.images='/images'", "table.limits_deg=[-90,90]"],
+        ["catalog.url='postgresql://user:secret@host/rig'", "catalog.images='/images'", "table.limits_deg=[-200,370]"],
     )
     setup = Setup(bench="sim", config=config, seed=3, listening=Listening(host="127.0.0.1", port=0), local_token="t")
     assert Setup.model_validate_json(setup.model_dump_json()) == setup
