@@ -260,6 +260,9 @@ $("stop")?.addEventListener("click", () => {
   setTimeout(() => { if (pressedAt === mine) showStop(FIRST_AID, "failed"); }, WARN_MS);
 });
 
+on("job", (job) => {
+  if (job.state === "running" && $("stop-state").querySelector(".confirmed")) $("stop-state").replaceChildren();
+});
 on("stop", ({ ended, torque_off: torqueOff }) => {
   if (ended && torqueOff) showStopped();
   else if (ended) showStop(`${FIRST_AID} The servo does not answer.`, "failed");
