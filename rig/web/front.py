@@ -20,7 +20,7 @@ from anyio import to_thread
 
 from rig.catalog.background import BackgroundCheck
 from rig.core.clock import SystemClock
-from rig.core.errors import RigError, UsageError, os_errors_as
+from rig.core.errors import RigError
 from rig.safety.saved_state import SERVER_FOLDER
 from rig.web.access import Lease, Sessions, Tokens
 from rig.web.api_catalog import UPLOAD
@@ -28,7 +28,7 @@ from rig.web.app import create_app
 from rig.web.bench_catalog import BenchCatalog
 from rig.web.guard import Guard, PatientProtocol
 from rig.web.hub import Hub
-from rig.web.link import Link, Message, error_values
+from rig.web.link import Link, Message
 from rig.web.remote_bench import RemoteBench
 from rig.web.server import Server
 from rig.web.setup import Listening, Setup, print_note
@@ -115,27 +115,25 @@ def _log(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
 
 
 def uvicorn_config(app: Any, listening: Listening) -> uvicorn.Config:
-    """Return the configuration of uvicorn. Raises `UsageError` if the certificate cannot be used."""
-    step = "Check the files of --certfile and --keyfile."
-    with os_errors_as(UsageError, "The certificate cannot be used.", next_step=step):
-        config = uvicorn.Config(
-            app,
-            http=PatientProtocol,
-            ws="websockets-sansio",
-            ws_max_size=10_000,
-            ws_ping_interval=10.0,
-            ws_ping_timeout=10.0,
-            lifespan="off",
-            log_level="error",
-            access_log=False,
-            server_header=False,
-            timeout_keep_alive=15,
-            timeout_graceful_shutdown=2,
-            ssl_certfile=listening.certfile,
-            ssl_keyfile=listening.keyfile,
-            proxy_headers=False,
-        )
-        config.load()
+    """Return the configuration of uvicorn."""
+    config = uvicorn.Config(
+        app,
+        http=PatientProtocol,
+        ws="websockets-sansio",
+        ws_max_size=10_000,
+        ws_ping_interval=10.0,
+        ws_ping_timeout=10.0,
+        lifespan="off",
+        log_level="error",
+        access_log=False,
+        server_header=False,
+        timeout_keep_alive=15,
+        timeout_graceful_shutdown=2,
+        ssl_certfile=listening.certfile,
+        ssl_keyfile=listening.keyfile,
+        proxy_headers=False,
+    )
+    config.load()
     return config
 
 
@@ -176,12 +174,7 @@ def main(link_descriptor: int, socket_descriptor: int) -> None:
     setup = setups[0]
     server = make_server(setup, SystemClock())
     server.remote.calls.link = link
-    try:
-        web = _Web(uvicorn_config(guarded(server, setup.listening), setup.listening), link.send)
-    except RigError as error:
-        link.send({"failed": error_values(error)})
-        ready.set()
-        raise SystemExit(1) from error
+    web = _Web(uvicorn_config(guarded(server, setup.listening), setup.listening), link.send)
     parts.append((server, web))
     ready.set()
     with checked_catalog(server), server.catalog.background_delivery():

@@ -10,6 +10,7 @@ Decision: docs/decisions/0062.
 import os
 import secrets
 import socket
+import ssl
 import subprocess
 import sys
 import threading
@@ -24,7 +25,7 @@ from rig.core.files import write
 from rig.safety.bench_lock import BenchLock
 from rig.safety.saved_state import SERVER_FILE, SERVER_FOLDER, ServerAddress
 from rig.web.bench_side import BenchSide
-from rig.web.link import Link, Message, error_of
+from rig.web.link import Link, Message
 from rig.web.setup import Listening, Setup, print_note
 
 START_S: Final = 30.0
@@ -67,6 +68,7 @@ def run_server(
         The web process ends again and again.
     """
     clock = SystemClock()
+    _check_certificate(listening)
     token = secrets.token_urlsafe(32)
     setup = Setup(
         bench=bench, config=config, seed=seed, arguments=arguments, listening=listening, local_token=f"rig_{token}"
@@ -129,10 +131,10 @@ class WebProcess:
         self.failure: RigError | None = None
 
     def start(self) -> None:
-        """Start the process and return when it answers. Raises `UsageError`, `WebEnded`."""
+        """Start the process and return when it answers. Raises `WebEnded`."""
         self._spawn()
         if not self._answers.wait(START_S) or self._ended.is_set():
-            raise self.failure or WebEnded("The web process does not start.", next_step="Look at its messages above.")
+            raise WebEnded("The web process does not start.", next_step="Look at its messages above.")
         self._watcher.start()
 
     def close(self) -> None:
@@ -165,8 +167,6 @@ class WebProcess:
         if "alive" in message:
             self._alive_ns = self._clock.now_ns()
             self._answers.set()
-        elif "failed" in message:
-            self.failure = error_of(message["failed"])
         else:
             self._side.received(message, content)
 
@@ -206,6 +206,14 @@ class WebProcess:
                 self._process.kill()
                 self._process.wait()
             self._process = None
+
+
+def _check_certificate(listening: Listening) -> None:
+    step = "Check the files of --certfile and --keyfile: PEM, and the key without a passphrase."
+    if listening.certfile is not None:
+        with os_errors_as(UsageError, "The certificate cannot be used.", next_step=step):
+            context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
+            context.load_cert_chain(listening.certfile, listening.keyfile, password=lambda: "")
 
 
 def _url(listening: Listening, connection: socket.socket) -> str:

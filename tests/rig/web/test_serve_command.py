@@ -50,6 +50,16 @@ def test_name_of_a_token_that_misleads_is_rejected(serve, name):
     assert "cannot be the name of a token" in done.stderr
 
 
+@pytest.mark.parametrize("content", [None, "no certificate"])
+def test_certificate_that_cannot_be_used_is_reported_before_the_server_starts(tmp_path, content):
+    if content is not None:
+        (tmp_path / "bench.pem").write_text(content)
+    files = ("--certfile", str(tmp_path / "bench.pem"), "--keyfile", str(tmp_path / "bench.pem"))
+    done = CliRunner().invoke(app, ["serve", "--bench", "sim", "--set", f"state_dir={str(tmp_path)!r}", *files])
+    assert done.exit_code == 2
+    assert "The certificate cannot be used" in done.stderr
+
+
 def test_web_process_gets_the_same_configuration():
     config = load_config(
         None,
