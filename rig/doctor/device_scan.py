@@ -12,6 +12,7 @@ import serial
 
 from rig.bench.computer import DeviceFile, SerialPort
 from rig.config import CameraConfig
+from rig.config.servos import USE_ANOTHER
 from rig.config.toml_file import Key
 from rig.core.errors import DeviceNotFound, RigError
 from rig.devices.head.opening import open_head
@@ -148,8 +149,13 @@ class DeviceScan:
 
     def _found(self, context: DoctorContext, port: SerialPort, scan: BaudScan) -> Iterator[Finding]:
         for found in scan.servos:
-            self.servos.append((port, found))
             place = {"port": port.path, "id": found.bus_id, "baud": found.baud}
+            if found.obstacle:
+                yield warning(
+                    "servo", FindingCode.SERVO_NOT_DRIVEN, USE_ANOTHER, found=found, reason=found.obstacle, **place
+                )
+                continue
+            self.servos.append((port, found))
             yield fine("servo", FindingCode.SERVO_FOUND, found=found, **place)
         if scan.duplicate_ids:
             self.duplicate_ids = True
@@ -225,12 +231,12 @@ def ribbon_camera(name: str, number: int) -> Finding:
 
 def servo_settings(port: SerialPort, servo: FoundServo) -> dict[Key, Any]:
     """Return the settings of this servo, by key."""
-    keys: dict[Key, Any] = {
+    return {
         ("servo", "port"): port.stable or port.path,
         ("servo", "baud"): servo.baud,
         ("servo", "id"): servo.bus_id,
+        ("servo", "model"): servo.model,
     }
-    return keys | ({("servo", "model"): servo.model} if servo.model else {})
 
 
 def imu_settings(found: FoundImu) -> dict[Key, Any]:
