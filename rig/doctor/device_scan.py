@@ -3,7 +3,6 @@
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ from rig.core.errors import DeviceNotFound, RigError
 from rig.devices.head.opening import open_head
 from rig.devices.head.protocol import BAUD
 from rig.devices.opencv_capture import modes_of
-from rig.devices.picamera2_capture import INSTALL
+from rig.devices.picamera2_capture import import_picamera2
 from rig.devices.v4l2 import VideoMode, choose_mode
 from rig.doctor.bus_scan import (
     BAUD_RATES,
@@ -224,8 +223,11 @@ class DeviceScan:
 def ribbon_camera(name: str, number: int) -> Finding:
     """Return how a camera on the ribbon cable of a Raspberry Pi is reached."""
     place = {"name": name, "number": number}
-    if find_spec("picamera2") is None:
-        return warning("camera", FindingCode.RIBBON_CAMERA_UNREACHABLE, INSTALL, **place)
+    try:
+        import_picamera2()
+    except DeviceNotFound as error:
+        parameters = place | {"what": error.what.rstrip("."), **error.evidence}
+        return warning("camera", FindingCode.RIBBON_CAMERA_UNREACHABLE, error.next_step, **parameters)
     return fine("camera", FindingCode.RIBBON_CAMERA, **place)
 
 

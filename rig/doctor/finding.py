@@ -158,7 +158,7 @@ class FindingCode(Enum):
     NO_IMU_FOUND = "no IMU answers on any I2C bus"
     NO_CAMERA = "no camera"
     RIBBON_CAMERA = "{name} on the ribbon cable: camera.source is picamera2:{number}"
-    RIBBON_CAMERA_UNREACHABLE = "{name} on the ribbon cable: it needs picamera2, which this Python does not have"
+    RIBBON_CAMERA_UNREACHABLE = "{name} on the ribbon cable: {what}: {reason}"
 
 
 @dataclass(frozen=True, slots=True)
