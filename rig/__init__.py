@@ -1,10 +1,10 @@
 """The controller of a turntable rig: open a bench, enroll objects, identify them."""
 
-from typing import TYPE_CHECKING, Any
-
-from rig.core.moved import keep_old_paths
-
+# This module imports nothing, so that the program `rig` handles Ctrl+C as early as possible (`rig.cli.start`).
+TYPE_CHECKING = False
 if TYPE_CHECKING:
+    from typing import Any
+
     from rig.bench import Bench, open_bench
     from rig.catalog import Catalog
     from rig.plans.enroll import enroll
@@ -24,10 +24,8 @@ _HOMES = {
     "photograph_table": "rig.plans.photograph_table",
 }
 
-keep_old_paths()
 
-
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> "Any":
     """Import a public name when it is first used: `rig --help` must not load numpy, cv2 and sqlalchemy."""
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -32,7 +32,7 @@ from rig.cli.ui.settings import Settings
 from rig.cli.ui.terminal import checked_output, discard
 from rig.core.control_characters import neutral
 from rig.core.errors import OutputFailed, RigError, UsageError
-from rig.core.signals import EXIT_BY_SIGNAL
+from rig.core.signals import EXIT_BY_SIGNAL, handle_signals
 
 GROUP = "rig.commands"
 _WANTS_JSON = "rig.wants_json"
@@ -56,6 +56,7 @@ class _Commands(TyperGroup):
         return context
 
     def invoke(self, ctx: Any) -> Any:
+        handle_signals()  # from here on, a signal unwinds the stack; until here the program was at its start
         with _usage_error(json=ctx.meta[_WANTS_JSON]):
             return super().invoke(ctx)
 

@@ -6,6 +6,7 @@ from pydantic import Field, ValidationInfo, field_validator
 
 from rig.config.imus import imu_kind
 from rig.config.section import Section
+from rig.config.servos import driven
 
 
 class ServoConfig(Section):
@@ -14,7 +15,11 @@ class ServoConfig(Section):
     port: str = Field("/dev/ttyUSB0", description="serial port of the U2D2 or another adapter")
     baud: int = Field(57600, ge=9600, le=4_500_000, description="baud rate; the servo's factory setting is 57600")
     id: int = Field(1, ge=0, le=252, description="id on the bus")
-    model: str = Field("xl430_w250", description="model as in the SDK's control tables, ax_12a, or one of a plug-in")
+    model: str = Field(
+        "xl430_w250",
+        description="model of the X or MX (2.0) series as in the SDK's control tables, ax_12a, or one of a plug-in; "
+        "`rig find` names yours",
+    )
     gear_ratio: float = Field(
         1.0,
         ge=0.001,
@@ -27,6 +32,11 @@ class ServoConfig(Section):
     write_settings: bool = Field(
         False, description="write EEPROM settings that differ from the ones that the rig needs"
     )
+
+    @field_validator("model")
+    @classmethod
+    def _model_with_a_driver(cls, model: str) -> str:
+        return driven(model)
 
 
 class ImuConfig(Section):

@@ -5,8 +5,9 @@ Decision: docs/decisions/0033.
 
 import atexit
 import signal
+import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Final
@@ -15,6 +16,8 @@ from rig.core.clock import SystemClock
 
 EXIT_BY_SIGNAL: Final = 128
 """Plus the number of the signal: the exit code of a program that a signal ended, as in shells."""
+AGAIN_S: Final = 0.001
+"""Time after which a signal comes again that Python has dropped, because it came in a callback such as `__del__`."""
 HOLD_S: Final = 2.0
 """How long signals wait for a clean-up, and for the stack to unwind. Then the next signal interrupts again."""
 
@@ -28,7 +31,7 @@ ENDING: Final = tuple(
 )
 """Signals that end a program by default, and that a program can handle."""
 
-_IGNORED_BY_SHELLS: Final = (signal.SIGINT, signal.SIGQUIT)
+_ALWAYS: Final = (signal.SIGINT, signal.SIGQUIT)
 
 
 @dataclass(slots=True)
@@ -37,6 +40,8 @@ class _State:
     held_ns: int = 0
     waiting: int | None = None
     raised_ns: int | None = None
+    raised: int = 0
+    report_dropped: Callable[["sys.UnraisableHookArgs"], None] = sys.__unraisablehook__
 
 
 _state = _State()
@@ -46,15 +51,16 @@ _clock = SystemClock()
 def handle_signals() -> None:
     """Have each signal in `ENDING` unwind the stack, so that every open device is closed (torque off).
 
-    A shell without job control starts background jobs with SIGINT and SIGQUIT ignored, and their children inherit that.
-    These two are handled all the same, because a stop must reach a moving table. Other ignored signals stay ignored,
-    such as SIGHUP, which `nohup` ignores.
+    SIGINT and SIGQUIT are handled in any case, because a stop must reach a moving table: a shell without job control
+    starts background jobs with both ignored, and their children inherit that. Other ignored signals stay ignored, such
+    as SIGHUP, which `nohup` ignores.
     """
     _state.raised_ns = None
+    if sys.unraisablehook is not _raise_again:
+        _state.report_dropped, sys.unraisablehook = sys.unraisablehook, _raise_again
     atexit.register(_ignore_signals)  # a second registration has no further effect
     for number in ENDING:
-        found = signal.getsignal(number)
-        if found is signal.SIG_DFL or (number in _IGNORED_BY_SHELLS and found in (signal.SIG_IGN, _python_default)):
+        if number in _ALWAYS or signal.getsignal(number) is signal.SIG_DFL:
             signal.signal(number, _end)
 
 
@@ -103,6 +109,16 @@ def _end(number: int, _frame: object) -> None:
     # else the stack unwinds already
 
 
+def _raise_again(dropped: "sys.UnraisableHookArgs") -> None:
+    """Send a signal again whose exception Python has dropped; otherwise the program would continue."""
+    if _state.raised_ns is not None and isinstance(dropped.exc_value, KeyboardInterrupt | SystemExit):
+        _state.raised_ns = None
+        main_thread = threading.main_thread().ident
+        threading.Timer(AGAIN_S, signal.pthread_kill, (main_thread, _state.raised)).start()
+    else:
+        _state.report_dropped(dropped)
+
+
 def _raise(number: int) -> None:
-    _state.raised_ns = _clock.now_ns()
+    _state.raised_ns, _state.raised = _clock.now_ns(), number
     raise KeyboardInterrupt if number == signal.SIGINT else SystemExit(EXIT_BY_SIGNAL + number)

@@ -9,6 +9,7 @@ Decision: docs/decisions/0045.
 
 import importlib
 import re
+import sys
 from collections.abc import Mapping
 from math import log10
 from typing import Any, Final
@@ -23,6 +24,11 @@ from rig.devices import v4l2
 INSTALL: Final = (
     "Install it: `sudo apt install -y python3-picamera2`, and make the Python environment with access to it: "
     "`python3 -m venv --system-site-packages ~/rig-env`."
+)
+REPAIR: Final = (
+    f"On Raspberry Pi OS 12 (bookworm): `{sys.executable} -m pip install --ignore-installed --no-deps simplejpeg`, "
+    "because the system's simplejpeg needs NumPy 1, and this Python has NumPy 2. On Raspberry Pi OS 13 (trixie), or if "
+    "that does not help: `sudo apt install --reinstall -y python3-picamera2 python3-libcamera python3-simplejpeg`."
 )
 _SOURCE: Final = re.compile(r"picamera2(?::(\d+))?")
 _FRAME_WAIT_S: Final = 3.0
@@ -41,21 +47,27 @@ def camera_number(source: object) -> int | None:
 def camera_id(number: int) -> str | None:
     """Return the identity of a camera: its sensor and its connector; None without the camera or picamera2."""
     try:
-        cameras = _library().Picamera2.global_camera_info()
+        cameras = import_picamera2().Picamera2.global_camera_info()
     except DeviceNotFound:
         return None
     return next((f"{one['Model']} at {one['Id']}" for one in cameras if one.get("Num") == number), None)
 
 
-def _library() -> Any:
-    """Return the module picamera2. Raises `DeviceNotFound` if it is not installed."""
+def import_picamera2() -> Any:
+    """Return the module picamera2. Raises `DeviceNotFound` if it is not installed, or cannot be imported."""
     try:
         return importlib.import_module("picamera2")
-    except ImportError as error:
+    except ModuleNotFoundError as error:
         raise DeviceNotFound(
             "The camera of the Raspberry Pi needs picamera2, which this Python does not have.",
             next_step=INSTALL,
             evidence={"reason": str(error)},
+        ) from error
+    except Exception as error:  # a package below it can raise anything, for example ValueError for another NumPy
+        raise DeviceNotFound(
+            "The camera of the Raspberry Pi needs picamera2, which is installed, but cannot be imported.",
+            next_step=REPAIR,
+            evidence={"reason": f"{type(error).__name__}: {error}"},
         ) from error
 
 
@@ -74,11 +86,11 @@ class Picamera2Capture:
     Raises
     ------
     DeviceNotFound
-        picamera2 is not installed, there is no such camera, or another program uses it.
+        picamera2 is not installed or cannot be imported, there is no such camera, or another program uses it.
     """
 
     def __init__(self, number: int) -> None:
-        library = _library()
+        library = import_picamera2()
         cameras = library.Picamera2.global_camera_info()
         if not any(one.get("Num") == number for one in cameras):
             raise DeviceNotFound(

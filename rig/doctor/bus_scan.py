@@ -16,7 +16,7 @@ from rig.core.clock import Clock
 from rig.core.errors import DeviceSilent, RequestRejected
 from rig.devices.dynamixel.bus import DynamixelBus
 from rig.devices.dynamixel.port import BusBabble, ClockedPort, SerialConnection
-from rig.devices.dynamixel.registers import model_of
+from rig.devices.dynamixel.registers import model_of, obstacle
 from rig.devices.i2c import NO_DEVICE, STUCK, unbind_command
 from rig.doctor.finding import Finding, FindingCode, bad
 
@@ -33,7 +33,7 @@ _STATUS = (120, 27)  # realtime Tick to Present Temperature: two servos with the
 
 @dataclass(frozen=True, slots=True)
 class FoundServo:
-    """A servo that answered; ``model`` is None if there is no control table for its number."""
+    """A servo that answered; ``model`` is None for an unknown number, ``obstacle`` empty if the rig can drive it."""
 
     bus_id: int
     baud: int
@@ -41,6 +41,10 @@ class FoundServo:
     model: str | None
     model_number: int
     firmware: int
+
+    @property
+    def obstacle(self) -> str:
+        return obstacle(self.model_number)
 
     def __str__(self) -> str:
         name = self.model.replace("_", "-").upper() if self.model else f"unknown model {self.model_number}"

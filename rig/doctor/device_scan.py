@@ -3,7 +3,6 @@
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +11,13 @@ import serial
 
 from rig.bench.computer import DeviceFile, SerialPort
 from rig.config import CameraConfig
+from rig.config.servos import USE_ANOTHER
 from rig.config.toml_file import Key
 from rig.core.errors import DeviceNotFound, RigError
 from rig.devices.head.opening import open_head
 from rig.devices.head.protocol import BAUD
 from rig.devices.opencv_capture import modes_of
-from rig.devices.picamera2_capture import INSTALL
+from rig.devices.picamera2_capture import import_picamera2
 from rig.devices.v4l2 import VideoMode, choose_mode
 from rig.doctor.bus_scan import (
     BAUD_RATES,
@@ -148,8 +148,13 @@ class DeviceScan:
 
     def _found(self, context: DoctorContext, port: SerialPort, scan: BaudScan) -> Iterator[Finding]:
         for found in scan.servos:
-            self.servos.append((port, found))
             place = {"port": port.path, "id": found.bus_id, "baud": found.baud}
+            if found.obstacle:
+                yield warning(
+                    "servo", FindingCode.SERVO_NOT_DRIVEN, USE_ANOTHER, found=found, reason=found.obstacle, **place
+                )
+                continue
+            self.servos.append((port, found))
             yield fine("servo", FindingCode.SERVO_FOUND, found=found, **place)
         if scan.duplicate_ids:
             self.duplicate_ids = True
@@ -218,19 +223,22 @@ class DeviceScan:
 def ribbon_camera(name: str, number: int) -> Finding:
     """Return how a camera on the ribbon cable of a Raspberry Pi is reached."""
     place = {"name": name, "number": number}
-    if find_spec("picamera2") is None:
-        return warning("camera", FindingCode.RIBBON_CAMERA_UNREACHABLE, INSTALL, **place)
+    try:
+        import_picamera2()
+    except DeviceNotFound as error:
+        parameters = place | {"what": error.what.rstrip("."), **error.evidence}
+        return warning("camera", FindingCode.RIBBON_CAMERA_UNREACHABLE, error.next_step, **parameters)
     return fine("camera", FindingCode.RIBBON_CAMERA, **place)
 
 
 def servo_settings(port: SerialPort, servo: FoundServo) -> dict[Key, Any]:
     """Return the settings of this servo, by key."""
-    keys: dict[Key, Any] = {
+    return {
         ("servo", "port"): port.stable or port.path,
         ("servo", "baud"): servo.baud,
         ("servo", "id"): servo.bus_id,
+        ("servo", "model"): servo.model,
     }
-    return keys | ({("servo", "model"): servo.model} if servo.model else {})
 
 
 def imu_settings(found: FoundImu) -> dict[Key, Any]:

@@ -152,12 +152,13 @@ class FindingCode(Enum):
     PORT_FAILED = "{port} failed: {reason}"
     NOTHING_ON_PORT = "{port} ({name}): no servo and no rig head answer at any baud rate"
     SERVO_FOUND = "{port}: {found}"
+    SERVO_NOT_DRIVEN = "{port}: {found}: the rig cannot drive it: {reason}"
     IMU_FOUND = "{found}"
     NO_I2C = "no I2C bus"
     NO_IMU_FOUND = "no IMU answers on any I2C bus"
     NO_CAMERA = "no camera"
     RIBBON_CAMERA = "{name} on the ribbon cable: camera.source is picamera2:{number}"
-    RIBBON_CAMERA_UNREACHABLE = "{name} on the ribbon cable: it needs picamera2, which this Python does not have"
+    RIBBON_CAMERA_UNREACHABLE = "{name} on the ribbon cable: {what}: {reason}"
 
 
 @dataclass(frozen=True, slots=True)

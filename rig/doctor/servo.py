@@ -5,12 +5,20 @@ from contextlib import ExitStack
 from typing import Any
 
 from rig.config import ServoConfig
+from rig.config.servos import USE_ANOTHER
 from rig.core.clock import seconds_between
 from rig.core.errors import DeviceMismatch, DeviceNotFound, DeviceSilent
 from rig.devices.dynamixel.opening import open_servo
 from rig.devices.dynamixel.port import SerialConnection
 from rig.devices.dynamixel.register_servo import RegisterServo
-from rig.devices.dynamixel.registers import DynamixelModel, control_table, protocol_of, servo_plugin
+from rig.devices.dynamixel.registers import (
+    DynamixelModel,
+    control_table,
+    model_of,
+    obstacle,
+    protocol_of,
+    servo_plugin,
+)
 from rig.devices.servo import Servo
 from rig.doctor.bus_scan import BAUD_RATES, BAUD_RATES_1, BaudScan, FoundServo, scan_servos, without_echoes
 from rig.doctor.context import DoctorContext
@@ -47,7 +55,9 @@ def servo(context: DoctorContext) -> Iterator[Finding | str]:
             yield from [of_error("servo", error)] if foreign else _scan_rates(context, wire)
             return
         except DeviceMismatch as error:
-            yield of_error("servo", error, context.set("servo.model", error.evidence["got"]))
+            number = error.evidence.get("model_number")  # another maker's driver may not report it
+            model = None if number is None or obstacle(number) else model_of(number)
+            yield of_error("servo", error, context.set("servo.model", model) if model else "")
             return
         except DeviceSilent as error:
             yield from () if foreign else _others_on_bus(context, wire)
@@ -85,7 +95,7 @@ def _scan_rates(context: DoctorContext, wire: SerialConnection) -> Iterator[Find
     if not there:
         yield bad("servo", FindingCode.NO_SERVO, POWER + context.rig("doctor"), **_place(config))
         return
-    fix = context.rig("setup") if len(there) > 1 else _change_config(context, config, there[0])
+    fix = context.rig("setup") if len(there) > 1 else _use(context, config, there[0])
     yield bad("servo", FindingCode.OTHER_SERVOS, fix, found=there, **_place(config))
 
 
@@ -93,12 +103,14 @@ def _place(config: ServoConfig) -> dict[str, Any]:
     return {"id": config.id, "baud": config.baud, "port": config.port}
 
 
-def _change_config(context: DoctorContext, config: ServoConfig, there: FoundServo) -> str:
-    """Return the command that changes the configuration to the servo found."""
+def _use(context: DoctorContext, config: ServoConfig, there: FoundServo) -> str:
+    """Return the command that changes the configuration to the servo found, if the rig can drive it."""
+    if there.obstacle:
+        return USE_ANOTHER
     differing = {
         "servo.id": (config.id, there.bus_id),
         "servo.baud": (config.baud, there.baud),
-        "servo.model": (config.model, there.model or config.model),
+        "servo.model": (config.model, there.model),
     }
     changes = [context.set(key, now) for key, (was, now) in differing.items() if was != now]
     return changes[0] if len(changes) == 1 else context.rig("setup")

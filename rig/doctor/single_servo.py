@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import serial
 
-from rig.core.errors import DeviceMismatch, DeviceNotFound, DeviceSilent, RequestRejected, SeveralServos, UsageError
+from rig.core.errors import DeviceNotFound, DeviceSilent, RequestRejected, SeveralServos, UsageError
 from rig.devices.dynamixel.bus import DynamixelBus
 from rig.devices.dynamixel.port import ClockedPort, SerialConnection
-from rig.devices.dynamixel.registers import ControlTable, control_table
+from rig.devices.dynamixel.registers import ControlTable, control_table, require_driven
 from rig.doctor.bus_scan import BAUD_RATES, BAUD_RATES_1, BaudScan, FoundServo, scan_servos, without_echoes
 from rig.doctor.context import DoctorContext
 from rig.doctor.register_meaning import baud_codes
@@ -28,7 +28,7 @@ class SingleServo:
     SeveralServos
         Several servos answer, or two have the same id.
     DeviceMismatch
-        There is no control table for its model.
+        The rig cannot drive its model.
     """
 
     def __init__(
@@ -37,12 +37,8 @@ class SingleServo:
         self._wire = wire
         self._clock = context.computer.clock
         self.found = _find_only_servo(context, wire, progress)
-        if self.found.model is None:
-            raise DeviceMismatch(
-                f"There is no control table for this servo: model number {self.found.model_number}.",
-                next_step="Use another servo, or set this one up with the manufacturer's program.",
-                evidence={"model_number": self.found.model_number},
-            )
+        require_driven(self.found.model_number, self.found.bus_id)
+        assert self.found.model is not None
         wire.baudrate = self.found.baud
         self.bus = DynamixelBus(ClockedPort(wire, self._clock), protocol=self.found.protocol)
         self.table: ControlTable = control_table(self.found.model, self.found.firmware)

@@ -18,7 +18,7 @@ from hbr import StopReason
 from hbr.core.angles import wrap360
 from rig.bench import Bench
 from rig.core.clock import seconds_between
-from rig.core.errors import RigError
+from rig.core.errors import MotionStopped, RigError
 from rig.events.events import Decided, Event, FrameUsed, Ranked, Rejected
 from rig.motion.flight_views import FlightFrameCheck
 from rig.motion.scan_speed import scan_speed
@@ -71,9 +71,9 @@ class _ArcFrames:
     ranked: Ranked
     step: Rotate | Finish
     goal_deg: float
+    events: list[Event]
     ended_ns: int | None = None
     rejected_in_a_row: int = 0
-    events: list[Event] = field(default_factory=list)
     stamps_ns: list[int] = field(default_factory=list)
 
     def each(self) -> float | None:
@@ -145,8 +145,35 @@ def search_in_motion(
 
     ``check`` gets the first view, and raises an error if it shows no object. ``live`` gets the event of each frame
     while the table still rotates. It must return at once, because it is called in the control loop. Raises what
-    `rig.plans.identify.identify` raises.
+    `rig.plans.identify.identify` raises. After a fault in an arc, the events of its frames come when the torque is off,
+    because the consumer of events may pause. After a stop they do not come.
     """
+    left: list[Event] = []
+    try:
+        found = yield from _search(
+            bench, search, viewer, describe, left, top=top, started_ns=started_ns, check=check, live=live
+        )
+    except MotionStopped:
+        raise
+    except Exception:
+        yield from left
+        raise
+    return found
+
+
+def _search(
+    bench: Bench,
+    search: ArcSearch,
+    viewer: Viewer,
+    describe: ViewDescriber,
+    left: list[Event],
+    *,
+    check: Callable[[NDArray[np.uint8]], None],
+    top: int,
+    started_ns: int,
+    live: Callable[[FrameUsed], object],
+) -> Generator[Event, None, Found]:
+    """Search; ``left`` receives the events of an arc that have not been yielded."""
     config = bench.config
     sign = config.table.orientation_sign
     speed = scan_speed(config, fps=config.camera.fps, gyro_range_dps=bench.imu.range_dps, spacing_deg=None)
@@ -196,12 +223,12 @@ def search_in_motion(
                 ranked,
                 step,
                 goal_deg,
+                left,
             )
             reach_deg = max(low_deg, table.rest_deg - 360.0), min(high_deg, table.rest_deg + 360.0)
-            try:
-                move = table.fly(goal_deg, Flight(arc_frames.each, reach_deg, recorder, speed.dps, quiet=False))
-            finally:
-                yield from arc_frames.events
+            move = table.fly(goal_deg, Flight(arc_frames.each, reach_deg, recorder, speed.dps, quiet=False))
+            yield from left
+            left.clear()
             number, rejected, ranked, step = arc_frames.number, arc_frames.rejected, arc_frames.ranked, arc_frames.step
             travelled_deg += abs(move.rotation_deg)
             yield moved(number, move)

@@ -204,10 +204,13 @@ class Safety:
         ------
         NotReady
             The table may not move in this state.
+        MotionStopped
+            The operator requested a stop before this motion, for example while the plan paused; nothing moved.
         StateNotStored
             The path cannot be stored; nothing moved.
         """
         self.require_ready()
+        self.check_stop_request()
         motion = Motion()
         path = [self.angle_reference.to_servo(angle) for angle in ends_deg]
         self._record.save_position(path_deg=(min(path), max(path)))

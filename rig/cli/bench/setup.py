@@ -104,7 +104,11 @@ class Dialogue:
 
         scan = DeviceScan()
         self._scan(scan)
-        while not scan.servos and not scan.duplicate_ids and self._search_again("No servo was found."):
+        while (
+            not scan.servos
+            and not scan.duplicate_ids
+            and self._search_again("No servo that the rig can drive was found.")
+        ):
             scan = DeviceScan()
             self._scan(scan)
         computer = self.context.computer

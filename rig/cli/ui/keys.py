@@ -13,6 +13,8 @@ from typing import Any, Final, Self
 
 PAUSE_KEYS: Final = b"p "
 HINT: Final = "p: pause"
+WAIT_S: Final = 0.1
+"""Longest wait for a key: Python handles a signal that came just before a wait only after it."""
 
 
 class Pause(AbstractContextManager["Pause"]):
@@ -63,8 +65,8 @@ class Pause(AbstractContextManager["Pause"]):
         if self._pressed():
             show("Paused. The table holds its angle. p: resume, Ctrl+C: stop")
             try:
-                while os.read(sys.stdin.fileno(), 1) not in (bytes([key]) for key in PAUSE_KEYS):
-                    pass
+                while self._terminal is not None and not self._pressed():
+                    select.select([sys.stdin], [], [], WAIT_S)
             finally:
                 show("")
 

@@ -8,7 +8,7 @@ from rig.core.errors import DeviceFault, DeviceMismatch, DeviceNotFound, DeviceS
 from rig.devices.dynamixel import settings
 from rig.devices.dynamixel.bus import DynamixelBus
 from rig.devices.dynamixel.guardian import Guardian
-from rig.devices.dynamixel.registers import Block, ControlTable, control_table, model_of
+from rig.devices.dynamixel.registers import Block, ControlTable, control_table, model_of, require_driven
 from rig.devices.dynamixel.settings import ServoMode, SettingDifference
 from rig.devices.servo import MotionProfile, ServoCondition, ServoIdentity, ServoLimits, ServoState
 
@@ -45,7 +45,7 @@ class RegisterServo(ABC):
     DeviceNotFound
         No servo answers at ``bus_id``.
     DeviceMismatch
-        Another model answers.
+        Another model answers. The rig may be unable to drive it.
     """
 
     deg_per_count: float
@@ -79,8 +79,9 @@ class RegisterServo(ABC):
                 "configuration. An AX-12A uses another protocol than the other models.",
                 evidence=silent.evidence,
             ) from silent
-        found = model_of(number) or f"unknown model {number}"
+        found = model_of(number)
         if found != model:
+            require_driven(number, bus_id)
             raise DeviceMismatch(
                 f"The servo at id {bus_id} is not the configured model.",
                 next_step=f'Set servo.model = "{found}" if this is the right servo; else connect the right one.',

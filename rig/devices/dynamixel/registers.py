@@ -6,15 +6,12 @@ The tables for Protocol 2.0 come from the SDK's `.model` files, the one of the A
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
-from importlib.resources import files
 from struct import Struct
 from typing import Any, Self
 
-from rig.core.errors import ConfigError
+from rig.config.servos import USE_ANOTHER, differences, model_file_exists, model_registers, sdk_models
+from rig.core.errors import ConfigError, DeviceMismatch
 from rig.core.plugins import plugins
-
-_FOLDER = "control_table"
-_PACKAGE = "dynamixel_easy_sdk"
 
 # The signed registers of the e-manual's control tables: the .model files mark the sign of few registers.
 _SIGNED = frozenset(
@@ -33,8 +30,6 @@ _SIGNED = frozenset(
         "Position Trajectory",
     }
 )
-# Names that differ between the .model files and the e-manual.
-_RENAMED = {"Secondary(Shadow) ID": "Secondary ID", "BUS Watchdog": "Bus Watchdog"}
 # A register that is missing in the .model files: (address, size, name), and its first firmware by model.
 _STARTUP = (60, 1, "Startup Configuration")
 _STARTUP_FIRMWARE = {"xl330": 46, "xc330": 46, "x": 45}
@@ -170,19 +165,10 @@ class Block:
         return dict(zip(self.names, self.layout.unpack(image), strict=True))
 
 
-def _rows(file_name: str, section: str) -> list[list[str]]:
-    """Return the tab-separated rows below ``[section]`` without their heading."""
-    text = files(_PACKAGE).joinpath(_FOLDER, file_name).read_text(encoding="utf-8")
-    body = text.partition(f"[{section}]")[2] if section else text
-    lines = body.partition("\n[")[0].strip().splitlines()[1:]
-    return [line.split("\t") for line in lines if line.strip()]
-
-
 @cache
 def model_numbers() -> Mapping[int, str]:
     """Return the models of the SDK and the AX-12A by their Model Number."""
-    known = {int(number): name.strip().removesuffix(".model") for number, name in _rows("dynamixel.model", "")}
-    return {**known, AX_12A.number: AX_12A.name}
+    return {**sdk_models(), AX_12A.number: AX_12A.name}
 
 
 def servo_plugin(model: str) -> Any:
@@ -204,6 +190,23 @@ def model_of(number: int) -> str | None:
         return known
     rows = (row for _, row in plugins(GROUP) if isinstance(row, DynamixelModel))
     return next((row.name for row in rows if row.number == number), None)
+
+
+def obstacle(number: int) -> str:
+    """Return why the rig cannot drive the servo with this Model Number; empty if it can."""
+    model = model_of(number)
+    return f"{number} is the number of no known model" if model is None else "; ".join(differences(model))
+
+
+def require_driven(number: int, bus_id: int) -> None:
+    """Raise `DeviceMismatch` if the rig cannot drive the servo with this Model Number."""
+    if reason := obstacle(number):
+        model = model_of(number) or "unknown model"
+        raise DeviceMismatch(
+            f"The rig cannot drive the servo at id {bus_id} ({model}).",
+            next_step=f"{USE_ANOTHER}.",
+            evidence={"got": model, "model_number": number, "reason": reason},
+        )
 
 
 def number_of(model: str) -> int:
@@ -230,26 +233,27 @@ def control_table(model: str, firmware: int | None = None) -> ControlTable:
     Raises
     ------
     ConfigError
-        The model does not exist.
+        The model does not exist, or the driver does not fit it.
     """
     if (row := _row(model)) is not None:
         signed = _SIGNED if row.protocol == 2 else frozenset()
         listed = (Register(name, address, size, name in signed) for address, size, name in row.registers)
         return ControlTable(model, {register.name: register for register in listed}, row.ram_start)
-    known = sorted(model_numbers().values())
+    known = sorted(name for name in model_numbers().values() if not differences(name))
     if model not in known:
+        reasons = {"reasons": list(differences(model))} if differences(model) else {}
         raise ConfigError(
-            f"There is no Dynamixel model {model!r}.",
+            f"The rig cannot drive a {model}." if reasons else f"There is no Dynamixel model {model!r}.",
             next_step="Set servo.model to one of the listed models.",
-            evidence={"models": known},
+            evidence={**reasons, "models": known},
         )
     name = model
-    if firmware is not None and firmware >= 52 and files(_PACKAGE).joinpath(_FOLDER, f"{model}_fw52.model").is_file():
+    if firmware is not None and firmware >= 52 and model_file_exists(f"{model}_fw52"):
         name = f"{model}_fw52"
-    registers = {}
-    for place, width, label in _rows(f"{name}.model", "control table"):
-        label = _RENAMED.get(label, label)
-        registers[label] = Register(label, int(place), int(width), label in _SIGNED)
+    registers = {
+        label: Register(label, address, size, label in _SIGNED)
+        for label, (address, size) in model_registers(name).items()
+    }
     since = next((version for prefix, version in _STARTUP_FIRMWARE.items() if model.startswith(prefix)), None)
     if firmware is not None and since is not None and firmware >= since:
         address, size, label = _STARTUP

@@ -1,7 +1,7 @@
 """A camera on the ribbon cable of a Raspberry Pi: the same locks, true time stamps, and errors for missing parts."""
 
 import sys
-from importlib.machinery import ModuleSpec
+from types import ModuleType
 
 import cv2
 import numpy as np
@@ -147,12 +147,53 @@ def test_sensor_on_the_ribbon_cable_is_recognised_and_not_opened(receiver, monke
         files.write("sys/class/video4linux/v4l-subdev1/name", "dw9807 10-000c\n")
         assert bench.context.computer.cameras() == []
         assert bench.context.computer.ribbon_cameras() == ["imx708"]
-        monkeypatch.setattr("rig.doctor.device_scan.find_spec", lambda _: None)
+        monkeypatch.setitem(sys.modules, "picamera2", None)
         scan = DeviceScan()
         (found,) = scan.find_cameras(bench.context)
         assert (found.code, found.parameters["name"]) == (FindingCode.RIBBON_CAMERA_UNREACHABLE, "imx708")
         assert "python3-picamera2" in found.fix
-        monkeypatch.setattr("rig.doctor.device_scan.find_spec", lambda name: ModuleSpec(name, None))
+        monkeypatch.setitem(sys.modules, "picamera2", ModuleType("picamera2"))
         (found,) = scan.find_cameras(bench.context)
         assert (found.code, found.parameters["number"]) == (FindingCode.RIBBON_CAMERA, 0)
         assert proposed_settings(DeviceScan(ribbons=[0])) == {("camera", "source"): "picamera2:0"}
+
+
+@pytest.mark.parametrize(
+    ("statement", "reason", "fix"),
+    [
+        (
+            "raise ValueError('numpy.dtype size changed, may indicate binary incompatibility')",
+            "ValueError: numpy.dtype size changed, may indicate binary incompatibility",
+            "pip install --ignore-installed --no-deps simplejpeg",
+        ),
+        (
+            "raise OSError('libcamera.so: no such file')",
+            "OSError: libcamera.so: no such file",
+            "apt install --reinstall",
+        ),
+        ("raise RuntimeError('no camera manager')", "RuntimeError: no camera manager", "apt install --reinstall"),
+        ("raise ImportError('DLL load failed')", "ImportError: DLL load failed", "apt install --reinstall"),
+        ("import no_libcamera", "No module named 'no_libcamera'", "apt install -y python3-picamera2"),
+    ],
+)
+def test_any_failure_of_the_import_is_an_error_and_a_finding_with_its_fix(
+    statement, reason, fix, monkeypatch, tmp_path
+):
+    (tmp_path / "picamera2.py").write_text(statement, encoding="utf-8")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "picamera2", raising=False)
+    with pytest.raises(DeviceNotFound, match="needs picamera2") as caught:
+        open_capture("picamera2")
+    assert caught.value.evidence == {"reason": reason}
+    assert fix in caught.value.next_step
+    assert Computer().camera_device("picamera2") is None
+    with unopened("camera.source=picamera2", plugged=False) as bench:
+        bench.computer.camera(0, "rp1-cfe-csi2_ch0")
+        bench.computer.write("sys/class/video4linux/v4l-subdev0/name", "imx708 10-001a\n")
+        (found,) = DeviceScan().find_cameras(bench.context)  # rig find
+        assert (found.code, found.parameters["reason"]) == (FindingCode.RIBBON_CAMERA_UNREACHABLE, reason)
+        assert fix in found.fix
+        monkeypatch.setattr(bench.context.computer, "open_capture", open_capture)
+        problem = bench.problem("camera")  # rig doctor
+        assert (problem.code, problem.parameters["reason"]) == (FindingCode.ERROR, reason)
+        assert fix in problem.fix

@@ -17,6 +17,7 @@ from rig.events.lines import line
 from rig.motion.scan_speed import SpeedLimit
 from rig.plans.estimate import dry_run
 from rig.plans.tray import TrayItem, enroll_tray
+from rig.safety.saved_state import StateStore
 from rig.views.stream import after_middle_row_ns
 from sim.bench import ShelfOperator, open_sim_bench
 from sim.faults import Fault
@@ -35,11 +36,17 @@ FAST = ("table.velocity_dps=200", "view.max_smear_px=9")
 
 @contextmanager
 def flying(
-    folder: Path, *settings: str, seed: int = 4, faults: tuple[str, ...] = (), **noise: float
+    folder: Path,
+    *settings: str,
+    seed: int = 4,
+    faults: tuple[str, ...] = (),
+    state: StateStore | None = None,
+    **noise: float,
 ) -> Iterator[tuple[Bench, Catalog, World]]:
     world = World(seed=seed, noise=NoiseModel(**noise))
     config = camera_time(world, *SMALL, *settings)
     operator = ShelfOperator(world, {"block": BLOCK, "lamp": BLOCK})
+    operator.state = state or operator.state
     with (
         open_sim_bench(config, operator, faults=[Fault.parse(one) for one in faults]) as bench,
         Catalog.open(folder / "catalog", clock=bench.clock) as catalog,

@@ -1,7 +1,9 @@
 """Searches in motion: they end during the rotation, can be replayed, and use no faulty frame as evidence."""
 
+import signal
 from collections.abc import Iterator
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +12,7 @@ import pytest
 import hbr
 from rig import Catalog, enroll, identify, load_model
 from rig.bench import Bench
-from rig.core.errors import RigError, UsageError
+from rig.core.errors import MotionStopped, RigError, Stalled, UsageError
 from rig.events.events import Accepted, Decided, FrameUsed, Identified, Moved, Ranked
 from rig.report.run_report import run_report
 from rig.search.model import Model
@@ -95,6 +97,64 @@ def test_arc_stays_within_the_cable_budget_and_waits_for_a_pause(model: Model) -
     assert paused
     assert len(angles_deg) >= 6
     assert 20 < max(np.abs(angles_deg)) < 31  # an arc without a cable budget is longer
+
+
+@pytest.mark.parametrize(
+    ("how", "kind"), [("Ctrl+C", KeyboardInterrupt), ("rig stop", MotionStopped), ("jam", Stalled)]
+)
+def test_stop_in_an_arc_after_a_pause_switches_the_torque_off_before_anything_else(
+    model: Model, how: str, kind: type[BaseException], tmp_path: Path
+) -> None:
+    """The consumer of events may pause at each of them, so no event comes while the torque is on."""
+    world = World(seed=2)
+    angles_deg: list[float] = []
+    frames: list[FrameUsed] = []
+    late_events: list[bool] = []
+    with moving(world, "table.limits_deg=[-30, 30]", "table.mode=pan") as bench:
+        operator = bench.operator
+        assert isinstance(operator, ShelfOperator)
+        assert operator.devices is not None
+        servo, store = operator.devices.servo, operator.state
+
+        def stop_at_the_third_frame(frame: FrameUsed) -> None:
+            frames.append(frame)
+            if len(frames) == 3:
+                {
+                    "Ctrl+C": partial(signal.raise_signal, signal.SIGINT),
+                    "rig stop": store.request_stop,
+                    "jam": servo.jam,
+                }[how]()
+
+        def watch() -> None:
+            angles_deg.append(world.table_deg())
+            world.clock.call_at(world.clock.now_ns() + 10_000_000, watch)
+
+        events = identify(bench, model, live=stop_at_the_third_frame)
+        with pytest.raises(kind):
+            for event in events:
+                if isinstance(event, Decided) and not frames:
+                    world.clock.sleep(20.0)  # the operator pauses before the arc
+                    watch()
+                    assert (servo.memory["Torque Enable"], servo.memory["Bus Watchdog"]) == (1, 0)
+                elif len(frames) >= 3:
+                    late_events.append(bool(servo.memory["Torque Enable"]))
+        assert len(frames) >= 3
+        assert not any(late_events)
+        assert (servo.memory["Torque Enable"], servo.memory["Bus Watchdog"]) == (0, 0)
+        rest_deg = world.table_deg()
+        world.clock.sleep(1.0)
+        assert world.table_deg() == pytest.approx(rest_deg, abs=0.05)
+        assert -30.5 < min(angles_deg) < max(angles_deg) < 30.5
+        stored = store.load()
+        assert stored.table is not None
+        assert stored.table.path_deg is None
+        assert stored.table.position_deg == pytest.approx(servo.memory["Present Position"] * 360 / 4096, abs=0.1)
+        assert not store.stop_requested()
+        if how == "jam":
+            assert stored.fault is not None
+            return
+        *_, answer = identify(bench, model)
+        assert isinstance(answer, Identified)
 
 
 def test_guessed_view_does_not_end_the_search(model: Model, monkeypatch: pytest.MonkeyPatch) -> None:

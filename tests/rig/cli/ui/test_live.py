@@ -16,6 +16,7 @@ from rich.console import Console
 
 from hbr import Outcome
 from rig.catalog import ObjectSummary
+from rig.cli.ui.keys import Pause
 from rig.cli.ui.live import EnrollView, IdentifyView, LiveView
 from rig.cli.ui.operator_prompts import OperatorPrompts
 from rig.config import load_config
@@ -295,6 +296,34 @@ def test_ctrl_c_during_a_pause_stores_the_views_and_prints_how_to_continue(keybo
     keyboard.until("rig enroll dice --resume")
     assert keyboard.end() == 130
     assert termios.tcgetattr(keyboard.slave) == keyboard.before
+
+
+def test_pause_notices_a_signal_that_came_just_before_it_waits_for_a_key(monkeypatch):
+    master, slave = pty.openpty()
+    waits: list[float | None] = []
+    really_select, really_read = select.select, os.read
+
+    def wait(files, writable, failed, seconds=None):
+        waits.append(seconds)
+        if len(waits) > 6:
+            raise KeyboardInterrupt  # the handler runs after a wait
+        return really_select(files, writable, failed, 0)
+
+    def read(file, size):
+        assert really_select([file], [], [], 0)[0], "it would wait for ever"
+        return really_read(file, size)
+
+    with os.fdopen(slave) as terminal:
+        monkeypatch.setattr("sys.stdin", terminal)
+        with Pause(keys=True) as pause, pytest.raises(KeyboardInterrupt):
+            os.write(master, b"p")
+            monkeypatch.setattr(select, "select", wait)
+            monkeypatch.setattr(os, "read", read)
+            pause.point(lambda _: None)
+        monkeypatch.undo()
+    os.close(master)
+    assert max(seconds for seconds in waits if seconds is not None) <= 0.5
+    assert None not in waits
 
 
 def test_sigtstp_pauses_between_two_views_and_sigcont_resumes(folder):

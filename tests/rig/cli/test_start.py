@@ -1,0 +1,135 @@
+"""Ctrl+C while the program starts and while it ends: exit code 130 or that of the command, and never a traceback."""
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+RIG = Path(sys.executable).with_name("rig")
+SITE = """
+import atexit, os, signal, sys, threading
+
+def interrupt(*_):
+    os.kill(os.getpid(), signal.SIGINT)
+
+class Finder:
+    def find_spec(self, name, path=None, target=None):
+        if name == moment:
+            sys.meta_path.remove(self)
+            interrupt()
+
+moment = os.environ["RIG_TEST_MOMENT"]
+if moment == "atexit":
+    atexit.register(interrupt)
+elif moment == "threads":
+    shutdown = threading._shutdown
+    threading._shutdown = lambda: (interrupt(), shutdown())
+else:
+    sys.meta_path.insert(0, Finder())
+"""
+"""Python imports this at its start. It sends SIGINT when a module is to be imported, or at a moment of the end."""
+
+
+def interrupted(
+    folder: Path, moment: str, *words: str, handler: object = signal.SIG_DFL
+) -> subprocess.CompletedProcess:
+    (folder / "sitecustomize.py").write_text(SITE, encoding="utf-8")
+    return subprocess.run(
+        [RIG, *words],
+        env={**os.environ, "PYTHONPATH": str(folder), "RIG_TEST_MOMENT": moment},
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, handler),
+    )
+
+
+@pytest.mark.parametrize(
+    ("moment", "words"),
+    [
+        ("rig.cli.main", "--version"),
+        ("typer", "--version"),
+        ("rig.core.signals", "goto 90 --bench sim"),
+        ("rig.cli.objects.runs", "goto 90 --bench sim"),
+        ("rich.markup", "--help"),
+        ("rig.bench", "goto 90 --bench sim"),  # the command has begun
+        ("numpy", "goto 90 --bench sim"),
+        ("cv2", "goto 90 --bench sim"),
+    ],
+)
+def test_ctrl_c_at_the_start_ends_the_program_without_a_traceback(moment, words, tmp_path):
+    done = interrupted(tmp_path, moment, *words.split())
+    assert done.returncode == 130
+    assert "Traceback" not in done.stderr
+    assert "°" not in done.stdout  # the table has not moved
+
+
+@pytest.mark.parametrize("moment", ["atexit", "threads"])
+@pytest.mark.parametrize("words", ["--version", "config path"])
+def test_ctrl_c_at_the_end_keeps_the_exit_code_and_prints_no_traceback(moment, words, tmp_path):
+    done = interrupted(tmp_path, moment, *words.split())
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout
+
+
+def test_ignored_ctrl_c_stays_ignored_until_a_command_begins(tmp_path):
+    done = interrupted(tmp_path, "typer", "config", "path", handler=signal.SIG_IGN)
+    assert (done.returncode, done.stderr) == (0, "")
+    done = interrupted(tmp_path, "platformdirs", "config", "path", handler=signal.SIG_IGN)
+    assert (done.returncode, done.stderr) == (130, "Interrupted.\n")
+
+
+PLAIN = """
+@app.command("new")
+def new():
+    try:
+        interrupt()
+    finally:
+        print("closed")
+"""
+SET_NAME = """
+@app.command("new")
+@command
+def new(settings):
+    class Part:
+        def __set_name__(self, owner, name): interrupt()
+    class Whole:
+        part = Part()
+"""
+DEL = """
+@app.command("new")
+@command
+def new(settings):
+    class Part:
+        def __del__(self): interrupt()
+    Part()
+    threading.Event().wait(60)
+"""
+
+
+@pytest.mark.parametrize(
+    ("command", "output", "errors"),
+    [
+        pytest.param(PLAIN, "closed\n", "", id="command-of-a-package"),
+        pytest.param(SET_NAME, "", "Interrupted.\n", id="python-3.11-makes-another-exception-of-it"),
+        pytest.param(DEL, "", "Interrupted.\n", id="python-drops-the-exception"),
+    ],
+)
+def test_ctrl_c_unwinds_each_command(command, output, errors):
+    code = f"""
+import os, signal, sys, threading
+from rig.cli.main import app
+from rig.cli.start import main
+from rig.cli.ui.command import command
+
+def interrupt():
+    os.kill(os.getpid(), signal.SIGINT)
+{command}
+sys.argv = ["rig", "new"]
+main()
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=50)
+    assert (done.returncode, done.stdout, done.stderr) == (130, output, errors)
