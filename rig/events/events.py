@@ -58,6 +58,7 @@ class RotationReason(StrEnum):
     ONE_CANDIDATE = "one-candidate"
     SEPARATES_CANDIDATES = "separates-candidates"
     NEW_SIDE = "new-side"
+    SEVERAL_POSES = "several-poses"
     EVEN_STEPS = "even-steps"
     RANDOM = "random"
     CUSTOM = "custom"
@@ -219,8 +220,8 @@ class Weighed:
 
     ``rotations_deg`` are the camera's, positive to the left. ``confusion`` is the logarithm of the probability that two
     objects are still confused after each rotation, ``cost`` the cost of its motion in the same unit. The rotation with
-    the lowest sum was chosen. ``similarity`` is the similarity of the two candidates after each rotation; None if no
-    second object is likely.
+    the lowest sum was chosen. ``similarity`` is the similarity of the two candidates after each rotation; None if it
+    compares no two candidates.
     """
 
     rotations_deg: tuple[float, ...]

@@ -48,8 +48,12 @@ def rotation_words(decided: Decided) -> str:
             )
         case RotationReason.SEPARATES_CANDIDATES if len(decided.candidates) >= 2:
             return f"the frames on the way distinguish {decided.candidates[0]} from {decided.candidates[1]}"
-        case RotationReason.ONE_CANDIDATE | RotationReason.NEW_SIDE:
+        case RotationReason.ONE_CANDIDATE:
+            return "there is no second candidate to compare with, so a new side is viewed"
+        case RotationReason.NEW_SIDE:
             return "no second object is likely, so a new side is viewed"
+        case RotationReason.SEVERAL_POSES:
+            return "the leading candidate fits in several poses, so a new side is viewed"
         case RotationReason.EVEN_STEPS:
             return "the views are taken in even steps"
         case RotationReason.RANDOM:

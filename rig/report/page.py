@@ -258,6 +258,7 @@ def _decisions(record: IdentificationRecord) -> list[Markup]:
                 seen_deg[event.index],
                 event.weighed,
                 event.rotation_deg,
+                reason=event.reason,
                 candidates=event.candidates,
                 seen_deg=[azimuth_deg for index, azimuth_deg in seen_deg.items() if index <= event.index],
                 number=event.index + 1,

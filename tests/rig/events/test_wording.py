@@ -48,7 +48,7 @@ def test_decisions_give_the_rotation_and_its_reason() -> None:
     )
     tie = decided("left", 90.0, 0.5, 0.5, "a", "b")
     assert "equally similar on both sides: S_left 0.50 = S_right 0.50" in decision_words(tie)
-    assert "no second object is likely" in decision_words(decided("left", 90.0, 0.0, 0.0, "mug"))
+    assert "there is no second candidate to compare with" in decision_words(decided("left", 90.0, 0.0, 0.0, "mug"))
     for reason, words in ((RotationReason.RANDOM, "random"), (RotationReason.EVEN_STEPS, "even steps")):
         assert words in decision_words(replace(first, reason=reason))
     for reason in (RotationReason.CUSTOM, RotationReason.EARLIER_VERSION):
@@ -62,6 +62,10 @@ def test_dense_decisions_name_the_two_candidates() -> None:
     assert decision_words(found) == "left 90.0°: distinguishes a from b, similarity 0.50 there (0.50–0.95 all around)."
     alone = replace(found, candidates=(), reason=RotationReason.NEW_SIDE)
     assert decision_words(alone) == "left 90.0°: no second object is likely, so a new side is viewed."
+    several = replace(alone, reason=RotationReason.SEVERAL_POSES)
+    assert decision_words(several) == (
+        "left 90.0°: the leading candidate fits in several poses, so a new side is viewed."
+    )
 
 
 @pytest.mark.parametrize(
