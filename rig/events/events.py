@@ -289,12 +289,15 @@ class Item:
 class SimilarObject:
     """An enrolled object that looks the same from some sides.
 
-    ``arcs_deg`` are those sides, azimuths from and to, counter-clockwise; ``share`` is their share of the views;
-    ``similarity`` is the largest of any two views.
+    ``arcs_deg`` are those sides, azimuths from and to, counter-clockwise, and ``differs_deg`` the others;
+    ``other_differs_deg`` are the sides of the enrolled object that look like none of the new one. ``share`` is the
+    share of the new object's views that look the same; ``similarity`` is the largest of any two views.
     """
 
     name: str
     arcs_deg: tuple[tuple[float, float], ...]
+    differs_deg: tuple[tuple[float, float], ...]
+    other_differs_deg: tuple[tuple[float, float], ...]
     share: float
     similarity: float
 
