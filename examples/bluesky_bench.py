@@ -4,6 +4,7 @@ The documents of each run have the provenance of the bench. To store them, subsc
 `bluesky_tiled_plugins.TiledWriter`.
 """
 
+import sys
 import tempfile
 from typing import Any
 
@@ -14,8 +15,7 @@ def main() -> None:
     try:
         from bluesky import RunEngine, plans
     except ImportError:
-        print("This example needs bluesky: pip install 'hbr-rig[bluesky]'")
-        return
+        sys.exit("This example needs bluesky. Install it: pip install 'hbr-rig[bluesky]'")
     from rig.bluesky import BenchDevices, enroll, identify
 
     def show(name: str, document: dict[str, Any]) -> None:

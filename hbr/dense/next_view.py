@@ -38,8 +38,8 @@ class NextBestView:
     orientation_deg : float
         The orientation after it, from the zero of the queries' orientations, in [0, 360).
     pair : (int, int) or None
-        The two objects that it separates most: index of each in the views' names, the likelier first. None if only
-        one object is left.
+        The two objects that it separates most: index of each in the views' names, the likelier first. None if the
+        strongest hypotheses are all of one object.
     rotations_deg, confusion, cost : float64 arrays (a,)
         All rotations that were weighed; the logarithm of the probability that two objects are still confused after
         each; the cost of the motion, in the same unit.

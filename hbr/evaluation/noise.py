@@ -9,6 +9,7 @@ import numpy as np
 from hbr.core.arrays import FloatArray, ImageArray
 
 GN_VARIANCE: Final = 0.012
+"""Variance of ``gn``, as `imnoise` takes it. The paper calls 0.012 a standard deviation: that is ``gn:0.000144``."""
 MB_LENGTH_PX: Final = 15.0
 MB_ANGLE_DEG: Final = 20.0
 

@@ -151,7 +151,7 @@ class _Trials:
         own = views.descriptors[self._rows]
         compared = descriptor(views.descriptor)
         self._neighbourhood = _similar_views(compared.similarity(own, own), self._ring)
-        symmetric = symmetry(views, object_index, similarity=compared.similarity)
+        symmetric = symmetry(views, object_index)
         self._period_deg = np.nan if symmetric is None else symmetric.period_deg
         similar = compared.similarity(queries, views.descriptors)
         similar[:, ~self._enrolled] = -np.inf

@@ -1,8 +1,6 @@
 """Rotational symmetry of enrolled objects, and objects that can be confused. Computed from the enrolled views."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Final
 
 import numpy as np
@@ -10,10 +8,10 @@ from numpy.typing import NDArray
 
 from hbr.core.angles import wrap180, wrap360
 from hbr.core.arrays import FloatArray, IndexArray, LevelArray
-from hbr.descriptors.tanimoto import tanimoto
+from hbr.descriptors import Descriptor, descriptor
 from hbr.model.views import Views
 
-Similarity = Callable[[LevelArray, LevelArray], FloatArray]
+Arcs = tuple[tuple[float, float], ...]
 
 SLACK: Final = 0.01
 """Largest difference of similarities that count as equal, because two frames of the same view differ by this much."""
@@ -53,19 +51,25 @@ class SimilarObject:
         The other object.
     arcs_deg
         Ranges of azimuth, from and to, counter-clockwise, at which the object looks like the other one; in [0, 360).
+    differs_deg
+        The other ranges: the object looks like no view of the other one there.
+    other_differs_deg
+        Ranges of azimuth of the other object at which it looks like no view of this one.
     share
-        Share of the object's views in these ranges that look like the other one.
+        Share of the object's views that look like the other one.
     similarity
         The largest similarity of a view of one to a view of the other.
     """
 
     object_index: int
-    arcs_deg: tuple[tuple[float, float], ...]
+    arcs_deg: Arcs
+    differs_deg: Arcs
+    other_differs_deg: Arcs
     share: float
     similarity: float
 
 
-def symmetry(views: Views, object_index: int, *, similarity: Similarity = tanimoto) -> Symmetry | None:
+def symmetry(views: Views, object_index: int) -> Symmetry | None:
     """Return an object's rotational symmetry, by the similarity of its own views.
 
     A rotation is a period if views that far apart are as similar as neighbours are, and views in between are less
@@ -77,8 +81,6 @@ def symmetry(views: Views, object_index: int, *, similarity: Similarity = tanimo
         The model set.
     object_index : int
         The object.
-    similarity : callable
-        Similarity of rows of descriptors, such as `hbr.tanimoto`.
 
     Returns
     -------
@@ -89,7 +91,7 @@ def symmetry(views: Views, object_index: int, *, similarity: Similarity = tanimo
     count = len(descriptors)
     if count < _MIN_VIEWS:
         return None
-    pairwise = similarity(descriptors, descriptors)
+    pairwise = descriptor(views.descriptor).similarity(descriptors, descriptors)
     step_deg = 360.0 / count
     mean = np.array([_mean_at(pairwise, azimuth_deg, k * step_deg) for k in range(1, count // 2 + 1)])
     neighbours, floor = float(mean[0]), float(mean[0]) - SLACK
@@ -110,7 +112,7 @@ def symmetry(views: Views, object_index: int, *, similarity: Similarity = tanimo
     return Symmetry(360.0, neighbours, float(mean[int(mean.argmin()) :].max()))
 
 
-def similar_objects(views: Views, object_index: int, *, similarity: Similarity = tanimoto) -> tuple[SimilarObject, ...]:
+def similar_objects(views: Views, object_index: int, most: int) -> tuple[SimilarObject, ...]:
     """Find the objects that an object can be confused with, and from which sides.
 
     A view looks like another object if one of that object's views is as similar to it as the more similar one of its
@@ -119,32 +121,41 @@ def similar_objects(views: Views, object_index: int, *, similarity: Similarity =
     Returns
     -------
     tuple of SimilarObject
-        The object with the largest share first. Empty if the object has fewer than three views.
+        At most ``most``, the object with the largest share first. Empty if the object has fewer than three views.
     """
     descriptors, azimuth_deg = _ring(views, object_index)
     others = np.setdiff1d(views.object_index, [object_index])
     if len(descriptors) < 3 or not len(others):
         return ()
-    own = similarity(descriptors, descriptors)
-    before, after = np.diagonal(np.roll(own, 1, axis=1)), np.diagonal(np.roll(own, -1, axis=1))
-    enough = np.maximum(before, after) - SLACK
+    kind = descriptor(views.descriptor)
     parts = []
     for start in range(0, len(others), _AT_ONCE):
         rows, begin = views.of_each(others[start : start + _AT_ONCE])
-        parts.append(np.maximum.reduceat(similarity(descriptors, views.levels(rows)), begin, axis=1))
+        parts.append(np.maximum.reduceat(kind.similarity(descriptors, views.levels(rows)), begin, axis=1))
     reach = np.concatenate(parts, axis=1)
-    confused = reach >= enough[:, None]
-    found = [
-        SimilarObject(
-            object_index=int(other),
+    confused = reach >= _enough(kind, descriptors)[:, None]
+    share, similarity = confused.mean(axis=0), reach.max(axis=0)
+    found = []
+    for column in np.lexsort((others, -similarity, -share))[: min(most, int((share > 0).sum()))].tolist():
+        theirs, their_azimuth_deg = _ring(views, int(others[column]))
+        unlike = kind.similarity(theirs, descriptors).max(axis=1) < _enough(kind, theirs)
+        one = SimilarObject(
+            object_index=int(others[column]),
             arcs_deg=_arcs(azimuth_deg, confused[:, column]),
-            share=float(confused[:, column].mean()),
-            similarity=float(reach[:, column].max()),
+            differs_deg=_arcs(azimuth_deg, ~confused[:, column]),
+            other_differs_deg=_arcs(their_azimuth_deg, unlike),
+            share=float(share[column]),
+            similarity=float(similarity[column]),
         )
-        for column, other in enumerate(others)
-        if confused[:, column].any()
-    ]
-    return tuple(sorted(found, key=lambda one: (-one.share, -one.similarity, one.object_index)))
+        found.append(one)
+    return tuple(found)
+
+
+def _enough(kind: Descriptor, descriptors: LevelArray) -> FloatArray:
+    """Return the similarity from which each view, in their order around the object, looks like another object."""
+    own = kind.similarity(descriptors, descriptors)
+    before, after = np.diagonal(np.roll(own, 1, axis=1)), np.diagonal(np.roll(own, -1, axis=1))
+    return np.maximum(before, after) - SLACK
 
 
 def _ring(views: Views, object_index: int) -> tuple[LevelArray, FloatArray]:
@@ -161,18 +172,12 @@ def _mean_at(pairwise: FloatArray, azimuth_deg: FloatArray, shift_deg: float) ->
     return float(pairwise[np.arange(len(partner)), partner].mean())
 
 
-def _arcs(azimuth_deg: FloatArray, confused: NDArray[np.bool_]) -> tuple[tuple[float, float], ...]:
-    """Return the ranges of azimuth in which ``confused`` is true; a single view that differs does not split them."""
-    count = len(confused)
-    if confused.all():
+def _arcs(azimuth_deg: FloatArray, held: NDArray[np.bool_]) -> Arcs:
+    """Return the ranges of azimuth in which ``held`` is true for every view."""
+    if held.all():
         return ((0.0, 360.0),)
-    held = np.flatnonzero(confused)
-    # a gap of more than one view between confused views separates two ranges
-    starts = [b for a, b in pairwise([*held.tolist(), int(held[0]) + count]) if b - a > 2]
-    if not starts:
-        return ((0.0, 360.0),)
-    arcs = []
-    for start, end in pairwise([*starts, starts[0] + count]):
-        last = max(h for h in (*held.tolist(), *(held + count).tolist()) if h < end)
-        arcs.append((wrap360(float(azimuth_deg[start % count])), wrap360(float(azimuth_deg[last % count]))))
-    return tuple(sorted(arcs))
+    begins, ends = held & ~np.roll(held, 1), held & ~np.roll(held, -1)
+    first, last = (wrap360(azimuth_deg[at]).tolist() for at in (begins, ends))
+    if held[0] and held[-1]:  # the last range leads past 0°
+        last = [*last[1:], last[0]]
+    return tuple(zip(first, last, strict=True))

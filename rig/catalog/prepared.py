@@ -36,7 +36,7 @@ from rig.catalog.schema import enrollments, objects
 from rig.catalog.seal import check_loaded
 from rig.core.errors import CatalogError, DescriptorOutdated
 from rig.core.files import json_values, no_follow, open_new, read, write
-from rig.views.description import PAPER_DESCRIPTOR
+from rig.views.description import BENCH_DESCRIPTOR, PAPER_DESCRIPTOR
 
 FORMAT: Final = "hbr-rig prepared views"
 VERSION: Final = 1
@@ -122,6 +122,14 @@ def prepared_views(
             progress(at)
 
     return finished(load_views(catalog, descriptor), show)
+
+
+def searched_views(*catalogs: Catalog, progress: Callable[[JobProgress], None] | None = None) -> list[hbr.Views]:
+    """Return the views of catalogs by the bench's own descriptor if all their objects have it, else by the paper's."""
+    try:
+        return [prepared_views(one, BENCH_DESCRIPTOR, progress) for one in catalogs]
+    except DescriptorOutdated:
+        return [prepared_views(one, PAPER_DESCRIPTOR, progress) for one in catalogs]
 
 
 def _wanted(catalog: Catalog) -> list[_Wanted]:

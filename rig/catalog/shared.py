@@ -19,7 +19,7 @@ from rig.catalog.delivery import Delivery, deliver
 from rig.catalog.jobs import JobProgress
 from rig.catalog.journal import Journal, waiting
 from rig.catalog.local_copy import open_or_copy
-from rig.catalog.prepared import prepared_views
+from rig.catalog.prepared import searched_views
 from rig.config.catalog_place import CatalogPlace
 from rig.core.clock import Clock
 from rig.core.errors import RigError
@@ -79,16 +79,15 @@ def comparable_views(
 
     For an object of a journal, the others are those of the server or of its local copy, if there is one.
     """
-    views = prepared_views(catalog, progress=progress)
     if not isinstance(catalog, Journal):
-        return views
-    own = views.select(views.object_index == views.object_names.index(name))
-    own = hbr.Views.of_object(name, own.descriptors, own.azimuth_deg, own.descriptor)
+        return searched_views(catalog, progress=progress)[0]
     try:
         with open_or_copy(catalog.server, catalog.clock) as shared:
-            others = prepared_views(shared)
+            views, others = searched_views(catalog, shared, progress=progress)
     except RigError:  # no server, and no copy yet
-        return views
+        return searched_views(catalog, progress=progress)[0]
+    own = views.select(views.object_index == views.object_names.index(name))
+    own = hbr.Views.of_object(name, own.descriptors, own.azimuth_deg, own.descriptor)
     kept = others.select(np.array([one != name for one in others.object_names], bool)[others.object_index])
     return hbr.Views.concatenate([own, kept])
 

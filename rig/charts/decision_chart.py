@@ -7,7 +7,7 @@ from typing import Final
 from rig.charts import svg
 from rig.charts.compass import CENTRE, RIM, SIZE, polar, rim
 from rig.core.phrases import azimuth_words, filled, percent_words, short
-from rig.events.events import Weighed
+from rig.events.events import RotationReason, Weighed
 
 _INNER: Final = 34.0
 _OUTER: Final = 118.0
@@ -24,6 +24,7 @@ def decision_chart(
     weighed: Weighed,
     rotation_deg: float,
     *,
+    reason: RotationReason,
     candidates: Sequence[str] = (),
     seen_deg: Sequence[float] = (),
     number: int = 1,
@@ -38,8 +39,10 @@ def decision_chart(
         All possible rotations.
     rotation_deg
         The chosen rotation of the camera around the object.
+    reason
+        Why it was chosen.
     candidates
-        The two objects that it separates; empty if only one object is likely.
+        The two objects that it separates, or none.
     seen_deg
         Azimuths of the views so far.
     number
@@ -76,7 +79,7 @@ def decision_chart(
         parts.append(svg.text(str(k + 1), (x, y + 4), "stop-number"))
     side = "left" if rotation_deg >= 0 else "right"
     chosen_words = f"{side} {abs(rotation_deg):.0f}°, to {azimuth_words(azimuth_deg[chosen])}°"
-    why, numbers = _reasons(weighed, chosen, candidates)
+    why, numbers = _reasons(weighed, chosen, reason, candidates)
     columns = ([(f"view {number} → {number + 1}", "small"), (chosen_words, "step-name"), *why], numbers)
     listed = [
         svg.text(words, (4 + _COLUMN * column, _LIST_TOP + _ROW * row), class_, anchor="start")
@@ -88,16 +91,20 @@ def decision_chart(
     return svg.drawing(SIZE, height, label, [*parts, *listed])
 
 
+_ALONE: Final = {
+    RotationReason.NEW_SIDE: ("only one object is likely:", "a new side improves its pose"),
+    RotationReason.SEVERAL_POSES: ("the leading candidate", "fits in several poses:", "a new side improves its pose"),
+}
+
 _Lines = list[tuple[str, str]]
 """Lines of text with their classes."""
 
 
-def _reasons(weighed: Weighed, chosen: int, candidates: Sequence[str]) -> tuple[_Lines, _Lines]:
+def _reasons(weighed: Weighed, chosen: int, reason: RotationReason, candidates: Sequence[str]) -> tuple[_Lines, _Lines]:
     """Return lines of text with the purpose of the rotation and the numbers for it."""
     cost = [("cost of the motion", "small"), (f"{weighed.cost[chosen]:.2f}, at most {max(weighed.cost):.2f}", "small")]
-    if len(candidates) < 2 or weighed.similarity is None:
-        return [("only one object is likely:", "small"), ("a new side improves its pose", "small")], cost
-    least, most = min(weighed.similarity), max(weighed.similarity)
+    if len(candidates) < 2:
+        return [(words, "small") for words in _ALONE.get(reason, ())], cost
     left, worst = (percent_words(min(1.0, exp(value))) for value in (weighed.confusion[chosen], max(weighed.confusion)))
     why = [
         ("separates", "small"),
@@ -105,9 +112,14 @@ def _reasons(weighed: Weighed, chosen: int, candidates: Sequence[str]) -> tuple[
         ("and", "small"),
         (short(candidates[1], _LETTERS), "step-name"),
     ]
-    numbers = [
-        (f"similarity there {weighed.similarity[chosen]:.2f}", "small"),
-        (f"({least:.2f} to {most:.2f} all around)", "small"),
+    numbers = []
+    if weighed.similarity is not None:
+        least, most = min(weighed.similarity), max(weighed.similarity)
+        numbers = [
+            (f"similarity there {weighed.similarity[chosen]:.2f}", "small"),
+            (f"({least:.2f} to {most:.2f} all around)", "small"),
+        ]
+    numbers += [
         ("chance of confusion left", "small"),
         (f"{left} there, {worst} at worst", "small"),
     ]

@@ -22,6 +22,8 @@ class RigError(Exception):
         What the operator does now: an imperative.
     evidence
         The numbers that led to the error, with units in the keys.
+    afterwards
+        What the operator does when a latched fault is acknowledged.
     """
 
     code: ClassVar[int] = 100
@@ -35,20 +37,38 @@ class RigError(Exception):
         if latches is not None:
             cls.latches = latches
 
-    def __init__(self, what: str, *, next_step: str, evidence: Evidence | None = None) -> None:
+    def __init__(self, what: str, *, next_step: str, evidence: Evidence | None = None, afterwards: str = "") -> None:
         super().__init__(what)
         self.what = what
-        self.next_step = next_step
         self.evidence: dict[str, Any] = dict(evidence or {})
+        self._next_step, self._acknowledge, self._afterwards = next_step, "", afterwards
+        self._reboot = False
+
+    @property
+    def next_step(self) -> str:
+        """What the operator does now; of a latched fault, how it is acknowledged, too."""
+        return " ".join(filter(None, (self._next_step, self._acknowledge, self._afterwards)))
 
     @property
     def exit_code(self) -> int:
         return self.code // 100
 
-    def ask_to_acknowledge(self, *, reboot: bool = False) -> Self:
-        """Add `rig acknowledge` to the next step, once; with ``reboot`` if only a restart clears the fault."""
-        if "rig acknowledge" not in self.next_step:
-            self.next_step += f" Then run `rig acknowledge{' --reboot' * reboot}`."
+    def ask_to_acknowledge(self, *, reboot: bool = False, outlasts_program: bool = True) -> Self:
+        """Add to the next step how the latched fault is acknowledged.
+
+        Parameters
+        ----------
+        reboot
+            Only a restart of the servo clears the fault. A later call does not take this back.
+        outlasts_program
+            Whether the fault stays latched when the program ends, so that a command can acknowledge it.
+        """
+        self._reboot |= reboot
+        self._acknowledge = (
+            f"Then run `rig acknowledge{' --reboot' * self._reboot}`."
+            if outlasts_program
+            else "Then start the program again: this bench keeps the fault only while its program runs."
+        )
         return self
 
     def as_dict(self) -> dict[str, Any]:

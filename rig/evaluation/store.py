@@ -2,8 +2,10 @@
 
 import io
 import json
+import re
 from collections.abc import Mapping
 from dataclasses import asdict
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
@@ -14,7 +16,21 @@ from hbr.evaluation.protocol import Runs
 from rig.core import files
 from rig.core.errors import UsageError
 
+FOLDER = Path("rig-eval")
+"""The folder of all evaluations without a folder of their own choice."""
 _MAX_SETTINGS = 10_000_000
+_MAX_NAME = 60
+
+
+def own_folder(name: str, settings: Mapping[str, Any]) -> Path:
+    """Return the folder of the evaluation with these settings, JSON values; ``name`` is for readers.
+
+    Evaluations with other settings have other folders. The same settings have the same one, so that the evaluation can
+    continue there.
+    """
+    digest = sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:8]
+    words = re.sub(r"[^\w.+-]+", "-", name).strip("-.")[-_MAX_NAME:]
+    return FOLDER / f"{words}-{digest}"
 
 
 class Store:

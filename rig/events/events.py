@@ -58,6 +58,7 @@ class RotationReason(StrEnum):
     ONE_CANDIDATE = "one-candidate"
     SEPARATES_CANDIDATES = "separates-candidates"
     NEW_SIDE = "new-side"
+    SEVERAL_POSES = "several-poses"
     EVEN_STEPS = "even-steps"
     RANDOM = "random"
     CUSTOM = "custom"
@@ -219,8 +220,8 @@ class Weighed:
 
     ``rotations_deg`` are the camera's, positive to the left. ``confusion`` is the logarithm of the probability that two
     objects are still confused after each rotation, ``cost`` the cost of its motion in the same unit. The rotation with
-    the lowest sum was chosen. ``similarity`` is the similarity of the two candidates after each rotation; None if no
-    second object is likely.
+    the lowest sum was chosen. ``similarity`` is the similarity of the two candidates after each rotation; None if it
+    compares no two candidates.
     """
 
     rotations_deg: tuple[float, ...]
@@ -288,12 +289,15 @@ class Item:
 class SimilarObject:
     """An enrolled object that looks the same from some sides.
 
-    ``arcs_deg`` are those sides, azimuths from and to, counter-clockwise; ``share`` is their share of the views;
-    ``similarity`` is the largest of any two views.
+    ``arcs_deg`` are those sides, azimuths from and to, counter-clockwise, and ``differs_deg`` the others;
+    ``other_differs_deg`` are the sides of the enrolled object that look like none of the new one. ``share`` is the
+    share of the new object's views that look the same; ``similarity`` is the largest of any two views.
     """
 
     name: str
     arcs_deg: tuple[tuple[float, float], ...]
+    differs_deg: tuple[tuple[float, float], ...]
+    other_differs_deg: tuple[tuple[float, float], ...]
     share: float
     similarity: float
 

@@ -1,5 +1,6 @@
 """Steps and answers of a search in words: the same on the terminal and in the report."""
 
+from collections.abc import Sequence
 from math import ceil, isfinite, nan
 from typing import Final
 
@@ -21,6 +22,8 @@ from rig.motion.scan_speed import SpeedLimit
 
 NAMED = 5
 """Objects that an ambiguous answer names."""
+ARCS_NAMED = 3
+"""Ranges of azimuth that are named."""
 
 
 def decision_words(decided: Decided) -> str:
@@ -48,8 +51,12 @@ def rotation_words(decided: Decided) -> str:
             )
         case RotationReason.SEPARATES_CANDIDATES if len(decided.candidates) >= 2:
             return f"the frames on the way distinguish {decided.candidates[0]} from {decided.candidates[1]}"
-        case RotationReason.ONE_CANDIDATE | RotationReason.NEW_SIDE:
+        case RotationReason.ONE_CANDIDATE:
+            return "there is no second candidate to compare with, so a new side is viewed"
+        case RotationReason.NEW_SIDE:
             return "no second object is likely, so a new side is viewed"
+        case RotationReason.SEVERAL_POSES:
+            return "the leading candidate fits in several poses, so a new side is viewed"
         case RotationReason.EVEN_STEPS:
             return "the views are taken in even steps"
         case RotationReason.RANDOM:
@@ -259,11 +266,21 @@ def symmetry_words(similar: SimilarObjects) -> str:
 
 
 def similar_object_words(one: SimilarObject) -> str:
-    """Return a similar object and the azimuths of the similar views: "mug-03 from 120–200°"."""
-    if one.arcs_deg == ((0.0, 360.0),):
+    """Return a similar object and the azimuths of the similar views: "mug-03 from 120–200°", "... from all sides"."""
+    own, theirs, same = map(_arcs_words, (one.differs_deg, one.other_differs_deg, one.arcs_deg))
+    if not one.differs_deg and not one.other_differs_deg:
         return f"{one.name} from all sides"
-    arcs = [f"{a:.0f}°" if a == b else f"{a:.0f}–{b:.0f}°" for a, b in one.arcs_deg]
-    return f"{one.name} {'at' if all(a == b for a, b in one.arcs_deg) else 'from'} {joined(arcs)}"
+    if not one.differs_deg:
+        return f"{one.name}, which looks different {f'at {theirs}' if theirs else 'from some sides'}"
+    if one.share > 0.5:
+        return f"{one.name} from {f'all sides but {own}' if own else 'most sides'}"
+    return f"{one.name} from {same or 'some sides'}"
+
+
+def _arcs_words(arcs_deg: Sequence[tuple[float, float]]) -> str:
+    """Return ranges of azimuth: "120–200° and 300°"; empty for more ranges than a reader can use."""
+    ends = [(f"{round(a) % 360}", f"{round(b) % 360}") for a, b in arcs_deg]
+    return joined([f"{a}°" if a == b else f"{a}–{b}°" for a, b in ends]) if len(ends) <= ARCS_NAMED else ""
 
 
 def similar_objects_words(similar: SimilarObjects) -> list[str]:

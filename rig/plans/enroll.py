@@ -299,8 +299,8 @@ def _disagreement(move: Move) -> RotationDisagreement:
     return RotationDisagreement(
         f"The servo rotated {angle_words(move.rotation_encoder_deg, 2)}, but the platter "
         f"{angle_words(move.gyro.angle_deg, 2)}.",
-        next_step="Tighten the platter, run `rig acknowledge`, and enroll the object again with --replace. Views from "
-        "before and after a slip do not fit together.",
+        next_step="Tighten the platter.",
+        afterwards="Enroll the object again with --replace: views from before and after a slip do not fit together.",
         evidence={
             "difference_deg": round(move.agreement.difference_deg, 3),
             "bound_deg": round(move.agreement.bound_deg, 3),

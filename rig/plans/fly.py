@@ -215,8 +215,9 @@ def _disagreement(bench: Bench, move: Move, residual_deg: float | None) -> Rotat
         what += f", and on the way they differed by up to {residual_deg:.2f}°"
     error = RotationDisagreement(
         f"{what}. No view of this revolution is stored.",
-        next_step="Tighten the platter, and enroll the object again with --replace. If the gyro lost samples, check "
-        "the IMU's cable and continue with --resume.",
+        next_step="Tighten the platter.",
+        afterwards="Enroll the object again with --replace. If the gyro lost samples, check the IMU's cable and "
+        "continue with --resume.",
         evidence={
             "table_deg": round(move.encoder_deg, 2),
             "residual_deg": None if residual_deg is None else round(residual_deg, 3),

@@ -29,7 +29,14 @@ def similar_objects(views: Views, name: str) -> SimilarObjects:
         neighbour_similarity=own.neighbours if own else None,
         period_similarity=own.similarity if own else None,
         objects=tuple(
-            SimilarObject(views.object_names[one.object_index], one.arcs_deg, one.share, one.similarity)
-            for one in symmetry.similar_objects(views, number)[:SHOWN]
+            SimilarObject(
+                name=views.object_names[one.object_index],
+                arcs_deg=one.arcs_deg,
+                differs_deg=one.differs_deg,
+                other_differs_deg=one.other_differs_deg,
+                share=one.share,
+                similarity=one.similarity,
+            )
+            for one in symmetry.similar_objects(views, number, SHOWN)
         ),
     )

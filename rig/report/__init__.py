@@ -2,14 +2,17 @@
 
 from rig.report.contact_sheet import contact_sheet, thumbnail
 from rig.report.page import Meta, render_report, write_report
-from rig.report.records import EnrollmentRecord, IdentificationRecord, Truth
+from rig.report.records import Correctness, EnrollmentRecord, IdentificationRecord, Truth
+from rig.report.summary import count_of
 
 __all__ = [
+    "Correctness",
     "EnrollmentRecord",
     "IdentificationRecord",
     "Meta",
     "Truth",
     "contact_sheet",
+    "count_of",
     "render_report",
     "thumbnail",
     "write_report",

@@ -12,7 +12,6 @@ import cv2
 from jinja2 import Template
 from markupsafe import Markup
 
-from hbr import Outcome
 from hbr.core.angles import wrap360
 from rig.charts.azimuth_ring import RingView, azimuth_ring
 from rig.charts.decision_chart import decision_chart
@@ -36,7 +35,7 @@ from rig.events.wording import (
 )
 from rig.report.arc_figure import ArcFigure, arc_figure
 from rig.report.contact_sheet import Image, contact_sheet, thumbnail
-from rig.report.records import TILE, EnrollmentRecord, IdentificationRecord
+from rig.report.records import TILE, Correctness, EnrollmentRecord, IdentificationRecord
 from rig.report.summary import SummaryItem, enrollment_items, totals
 
 JPEG_QUALITY: Final = 84
@@ -151,8 +150,7 @@ class _Retrieval(NamedTuple):
     stamp: str
     truth: str
     answer: str
-    correct: bool | None
-    ambiguous: bool
+    correctness: Correctness | None
     views: str
     travelled: str
     pose_error: str
@@ -208,8 +206,7 @@ def _retrieval(number: int, record: IdentificationRecord, *, unfold: bool) -> _R
         stamp=_data_uri(thumbnail(views[0].picture_bgr, _STAMP)) if views else "",
         truth=_truth(record),
         answer=outcome_words(answer) if answer else "no answer",
-        correct=record.correct,
-        ambiguous=answer is not None and answer.outcome is Outcome.AMBIGUOUS,
+        correctness=record.correctness,
         views=f"{answer.views if answer else len(views)}",
         travelled=f"{answer.travelled_deg:.0f}°" if answer else "–",
         pose_error="–" if error_deg is None else f"{error_deg:.1f}°",
@@ -226,7 +223,7 @@ def _retrieval(number: int, record: IdentificationRecord, *, unfold: bool) -> _R
         verification="" if record.verified is None else sentence(verification_words(record.verified)),
         comparison="" if compared is None else sentence(comparison_words(compared)),
         frames=_frames(record),
-        unfold=unfold or record.correct is False,
+        unfold=unfold or record.correctness is Correctness.WRONG,
     )
 
 
@@ -261,6 +258,7 @@ def _decisions(record: IdentificationRecord) -> list[Markup]:
                 seen_deg[event.index],
                 event.weighed,
                 event.rotation_deg,
+                reason=event.reason,
                 candidates=event.candidates,
                 seen_deg=[azimuth_deg for index, azimuth_deg in seen_deg.items() if index <= event.index],
                 number=event.index + 1,

@@ -5,9 +5,11 @@ A record has thumbnails instead of images, so that a long run needs little memor
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from enum import StrEnum
 from itertools import pairwise
 from typing import Any, Final
 
+from hbr import Outcome
 from hbr.core.angles import wrap180
 from rig.catalog import ViewRecord
 from rig.charts.polar_path import PathStep
@@ -149,6 +151,17 @@ class Truth:
     description: str = ""
 
 
+class Correctness(StrEnum):
+    """What an answer is, compared with the object that is really on the table.
+
+    RIGHT: the object was found under its name, or an object that was never enrolled was called unknown.
+    """
+
+    RIGHT = "right"
+    AMBIGUOUS = "ambiguous"
+    WRONG = "wrong"
+
+
 class IdentificationRecord:
     """One search, collected event by event.
 
@@ -199,17 +212,23 @@ class IdentificationRecord:
                 pass
 
     @property
-    def correct(self) -> bool | None:
-        """Whether the answer is correct; None if the answer or the truth is missing."""
+    def correctness(self) -> Correctness | None:
+        """The answer compared with the truth; None if one of them is missing."""
         if self.truth is None or self.answer is None:
             return None
-        return self.answer.name == self.truth.name
+        match self.answer.outcome:
+            case Outcome.AMBIGUOUS:  # such an answer has a name, too: that of the leading candidate
+                return Correctness.AMBIGUOUS
+            case Outcome.FOUND:
+                return Correctness.RIGHT if self.answer.name == self.truth.name else Correctness.WRONG
+            case _:
+                return Correctness.RIGHT if self.truth.name is None else Correctness.WRONG
 
     @property
     def pose_error_deg(self) -> float | None:
         """Distance of the answer's yaw from the true one, modulo the object's symmetry; None if it is not defined."""
         truth, answer = self.truth, self.answer
-        if truth is None or answer is None or answer.name is None or not self.correct:
+        if truth is None or answer is None or answer.name is None or self.correctness is not Correctness.RIGHT:
             return None
         if truth.yaw_deg is None or truth.symmetry_deg <= 0 or not answer.yaw_set_deg:
             return None

@@ -7,7 +7,7 @@ from typing import NamedTuple
 from rig.core.phrases import counted, listed, percent_words
 from rig.events.events import SimilarObjects
 from rig.events.wording import outcome_words, similar_object_words
-from rig.report.records import EnrollmentRecord, IdentificationRecord
+from rig.report.records import Correctness, EnrollmentRecord, IdentificationRecord
 
 
 class SummaryItem(NamedTuple):
@@ -16,6 +16,11 @@ class SummaryItem(NamedTuple):
     label: str
     value: str
     note: str = ""
+
+
+def count_of(correctness: Correctness, records: Sequence[IdentificationRecord]) -> int:
+    """Return the number of searches with this correctness."""
+    return sum(record.correctness is correctness for record in records)
 
 
 def totals(
@@ -36,10 +41,11 @@ def totals(
     known = [record for record in answered if record.truth and record.truth.name is not None]
     unknown = [record for record in answered if record.truth and record.truth.name is None]
     if known:
-        right = sum(record.correct is True for record in known)
+        right, ambiguous = (count_of(one, known) for one in (Correctness.RIGHT, Correctness.AMBIGUOUS))
         items.append(SummaryItem("found", f"{right}/{len(known)}", "enrolled objects identified correctly"))
+        items.append(SummaryItem("ambiguous", f"{ambiguous}/{len(known)}", "may be one of several enrolled objects"))
     if unknown:
-        right = sum(record.correct is True for record in unknown)
+        right = count_of(Correctness.RIGHT, unknown)
         items.append(SummaryItem("unknown objects recognised", f"{right}/{len(unknown)}", "objects never enrolled"))
     if answered:
         views_taken = [record.answer.views for record in answered if record.answer]

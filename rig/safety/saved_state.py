@@ -10,7 +10,7 @@ import sys
 from contextlib import AbstractContextManager, suppress
 from enum import StrEnum
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
@@ -145,6 +145,9 @@ class StateStore(Protocol):
     the file exists but cannot be read.
     """
 
+    outlasts_program: ClassVar[bool]
+    """Whether the next program finds the state: a latched fault then stays latched until it is acknowledged."""
+
     def load(self) -> BenchState: ...
 
     def save(self, state: BenchState) -> None:
@@ -180,6 +183,8 @@ class StateStore(Protocol):
 
 class MemoryStore:
     """State that ends with its program, for a simulated bench."""
+
+    outlasts_program: ClassVar[bool] = False
 
     def __init__(self) -> None:
         self.state = BenchState()
@@ -227,6 +232,8 @@ class FileStore:
     if there is no fault. A file beside the folder shows that the bench has been used: if the folder was emptied or
     deleted, that is not a new bench. Requests to stop come through the socket of `rig.safety.stop_channel`.
     """
+
+    outlasts_program: ClassVar[bool] = True
 
     def __init__(self, path: Path) -> None:
         self.path = path

@@ -273,11 +273,12 @@ class Safety:
     def latch(self, error: RigError) -> None:
         """Latch a fault: nothing moves until it is acknowledged. An earlier fault stays."""
         self._apply(StateEvent.LATCH)
-        error.ask_to_acknowledge()
+        error.ask_to_acknowledge(outlasts_program=self._store.outlasts_program)
         if self.fault is None:
             try:
                 self._record.save_fault(LatchedFault.of(error, self._clock.utc().isoformat(timespec="seconds")))
             except StateNotStored as not_stored:
+                error.ask_to_acknowledge(outlasts_program=False)
                 error.add_note(f"The fault is latched in this program only. {not_stored.what}")
 
     def acknowledge(self, *, reboot: bool = False) -> TableState:
@@ -311,7 +312,7 @@ class Safety:
         else:
             self._servo.verify()
         if cause := find_servo_fault(self._servo.read_state(), self._config.safety, self._servo.limits, again=True):
-            raise cause
+            raise cause.ask_to_acknowledge(outlasts_program=self._store.outlasts_program)
         for check in self.acknowledge_checks:
             check()
         if self.state is TableState.FAULT:

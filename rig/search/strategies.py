@@ -35,6 +35,9 @@ GROUP: Final = "rig.strategies"
 ROTATION_STEP_DEG: Final = 5.0
 """Step between the rotations that the dense search weighs."""
 
+ALONE: Final = 0.95
+"""Probability of the leading candidate from which no second object is likely."""
+
 _REVISIT_DEG: Final = 10.0
 _DRAWS: Final = 20
 
@@ -325,9 +328,14 @@ class Arc:
 
 def _rotate(state: DenseSearchState, best: NextBestView | NextArc, similarity: NDArray[np.float64] | None) -> Rotate:
     names = state.session.belief.index.views.object_names
+    if best.pair is not None:
+        reason = RotationReason.SEPARATES_CANDIDATES
+    else:  # the strongest hypotheses are poses of one object, but the others together may be as likely
+        leading = state.session.belief.posterior(state.session.rule.beta).sum(axis=1).max()
+        reason = RotationReason.NEW_SIDE if leading >= ALONE else RotationReason.SEVERAL_POSES
     return Rotate(
         best.rotation_deg,
-        RotationReason.NEW_SIDE if best.pair is None else RotationReason.SEPARATES_CANDIDATES,
+        reason,
         candidates=() if best.pair is None else tuple(names[i] for i in best.pair),
         weighed=Weighed(
             tuple(best.rotations_deg.tolist()),

@@ -13,7 +13,7 @@ from rig.catalog import ObjectSummary
 from rig.catalog.edit import delete, deleted_objects, rename, set_texts, undelete
 from rig.catalog.exchange import Conflict, import_objects, plan_import, read_bundle, read_objects, write_bundle
 from rig.catalog.jobs import finished
-from rig.catalog.prepared import prepared_views
+from rig.catalog.prepared import searched_views
 from rig.events.events import plain
 from rig.plans.similar_objects import similar_objects
 from rig.web.picture import jpeg
@@ -61,7 +61,7 @@ def add_catalog(api: APIRouter, server: Server) -> None:
         """Return an object with its enrollments and views."""
         with server.catalog.open_to_read() as catalog:
             found = catalog.object(name)
-            similar = similar_objects(prepared_views(catalog), found.summary.name) if found.views else None
+            similar = similar_objects(searched_views(catalog)[0], found.summary.name) if found.views else None
         return {
             **_summary(found.summary),
             "enrollments": [

@@ -14,6 +14,7 @@ from typing import Any
 
 from rich.table import Table
 
+from hbr import Outcome
 from rig.bench import Bench
 from rig.catalog import Catalog
 from rig.cli.ui.present import Progress, console
@@ -27,7 +28,16 @@ from rig.events.lines import line
 from rig.plans.enroll import enroll
 from rig.plans.identify import identify
 from rig.plans.photograph_table import photograph_table
-from rig.report import EnrollmentRecord, IdentificationRecord, Meta, Truth, render_report, write_report
+from rig.report import (
+    Correctness,
+    EnrollmentRecord,
+    IdentificationRecord,
+    Meta,
+    Truth,
+    count_of,
+    render_report,
+    write_report,
+)
 from rig.search.model import Model, load_model
 from rig.search.strategies import AnyStrategy, descriptor_for, strategy_for
 from rig.search.strategies import strategy as strategy_named
@@ -85,7 +95,7 @@ class DemoResult:
 
     @property
     def good(self) -> bool:
-        return sum(bool(trial.correct) for trial in self.trials) >= GOOD_SHARE * len(self.trials)
+        return count_of(Correctness.RIGHT, self.trials) >= GOOD_SHARE * len(self.trials)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the totals and every trial as plain data."""
@@ -99,9 +109,10 @@ class DemoResult:
             "change": None if self.change is None else asdict(self.change),
             "enrolled": len(self.enrollments),
             "views_enrolled": sum(len(record.views) for record in self.enrollments),
-            "found": sum(bool(trial.correct) for trial in known),
+            "found": count_of(Correctness.RIGHT, known),
+            "ambiguous": count_of(Correctness.AMBIGUOUS, known),
             "of": len(known),
-            "unknown_recognised": sum(bool(trial.correct) for trial in unknown),
+            "unknown_recognised": count_of(Correctness.RIGHT, unknown),
             "of_unknown": len(unknown),
             "mean_views": statistics.fmean(answer.views for answer in answers),
             "travelled_deg": sum(answer.travelled_deg for answer in answers),
@@ -195,10 +206,7 @@ def run_demo(
         date=begun,
     )
     totals = result.as_dict()
-    summary = (
-        f"{totals['found']} of {totals['of']} enrolled objects found again and "
-        f"{totals['unknown_recognised']} of {totals['of_unknown']} unknown objects recognised, on the simulated bench."
-    )
+    summary = f"{_counts(totals)}, on the simulated bench."
     write_report(result.report, render_report("Demo of the rig", summary, enrollments, trials, meta=meta))
     if not settings.json:
         _print_totals(result)
@@ -298,14 +306,25 @@ def _trial(trial: IdentificationRecord) -> dict[str, Any]:
     return {
         "object": trial.truth.description,
         "enrolled": trial.truth.name is not None,
-        "found_as": trial.answer.name,
-        "right": trial.correct,
+        "outcome": trial.answer.outcome,
+        "possible": list(trial.answer.possible),
+        "correctness": trial.correctness,
         "views": trial.answer.views,
         "travelled_deg": trial.answer.travelled_deg,
         "pose_error_deg": trial.pose_error_deg,
         "score": trial.answer.score,
         "margin": trial.answer.margin,
     }
+
+
+def _counts(totals: Mapping[str, Any]) -> str:
+    return (
+        f"{totals['found']} of {totals['of']} enrolled objects found again, {totals['ambiguous']} ambiguous; "
+        f"{totals['unknown_recognised']} of {totals['of_unknown']} unknown objects recognised"
+    )
+
+
+_MARKS = {Correctness.RIGHT: "✓", Correctness.AMBIGUOUS: "?", Correctness.WRONG: "✗"}
 
 
 def _print_totals(result: DemoResult) -> None:
@@ -316,9 +335,9 @@ def _print_totals(result: DemoResult) -> None:
     for trial in totals["trials"]:
         error = trial["pose_error_deg"]
         table.add_row(
-            "✓" if trial["right"] else "✗",
+            _MARKS[trial["correctness"]],
             trial["object"] if trial["enrolled"] else f"{trial['object']} (not enrolled)",
-            trial["found_as"] or "unknown",
+            trial["possible"][0] if trial["outcome"] is Outcome.FOUND else trial["outcome"],
             str(trial["views"]),
             f"{trial['travelled_deg']:.0f}°",
             "–" if error is None else f"{error:.1f}°",
@@ -329,8 +348,7 @@ def _print_totals(result: DemoResult) -> None:
     console().print(table)
     error = totals["median_pose_error_deg"]
     print(
-        f"\n{totals['found']} of {totals['of']} enrolled objects found again, "
-        f"{totals['unknown_recognised']} of {totals['of_unknown']} unknown objects recognised.\n"
+        f"\n{_counts(totals)}.\n"
         f"{totals['enrolled']} objects enrolled with {totals['views_enrolled']} views. "
         f"{totals['mean_views']:.1f} views per search, {totals['travelled_deg']:.0f}° of rotation in all, "
         f"median pose error {'–' if error is None else f'{error:.1f}°'}.\n"

@@ -14,8 +14,8 @@ EXAMPLES = Path(__file__).parents[2] / "examples"
 SMALL = "[camera]\nwidth = 320\nheight = 240\n[view]\nroi = [40, 0, 240, 240]\n"  # takes less computing
 
 
-def run(script: str, *arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
-    code = f"import runpy; runpy.run_path({script!r}, run_name='__main__')"
+def run(script: str, *arguments: str, cwd: Path, before: str = "") -> subprocess.CompletedProcess[str]:
+    code = f"{before}\nimport runpy; runpy.run_path({script!r}, run_name='__main__')"
     program = Program(*arguments, code=code, folder=cwd)
     output, errors = program.communicate()
     return subprocess.CompletedProcess(script, program.wait(), output, errors)
@@ -72,3 +72,11 @@ def test_custom_strategies_find_the_same_objects_as_the_default(tmp_path):
     found = re.findall(r"^([\w-]+) +(\S+) +found as (\S+) +(\d) views", done.stdout, re.M)
     assert [strategy for strategy, *_ in found] == ["dense"] * 3 + ["golden"] * 3 + ["far-side"] * 3
     assert all(shown == answer for _, shown, answer, _ in found), done.stdout
+
+
+def test_bluesky_example_fails_without_bluesky(tmp_path):
+    missing = "import sys; sys.modules['bluesky'] = None"
+    done = run(str(EXAMPLES / "bluesky_bench.py"), cwd=tmp_path, before=missing)
+    assert done.returncode == 1
+    assert done.stdout == ""
+    assert done.stderr == "This example needs bluesky. Install it: pip install 'hbr-rig[bluesky]'\n"

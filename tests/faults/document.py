@@ -51,6 +51,8 @@ You can produce the faults on any simulated bench: `rig demo --fault jam@move3+2
 `NAME:PARAMETER=VALUE@TIME`. The time is `12s`, `move3` or `view10`, optionally with a duration: `12s+2s`. Moves and
 views are counted from 0.
 
+The messages are those of a bench that stores its state. The simulated bench stores it only in `state_dir`.
+
 `python tests/faults/document.py` writes this page. A test compares it with measurements.
 
 """

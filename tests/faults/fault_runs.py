@@ -22,6 +22,7 @@ from rig.core.errors import RigError
 from rig.events.events import Accepted, Enrolled, Event, Identified
 from rig.plans.enroll import enroll
 from rig.plans.identify import identify
+from rig.safety.saved_state import MemoryStore
 from sim.bench import ShelfOperator, open_sim_bench
 from sim.devices import SimDevices
 from sim.faults import Fault, Faults
@@ -46,6 +47,12 @@ STILL_S = 1.0
 
 def objects() -> dict[str, Coded]:
     return {name: Coded(shelf()[name]) for name in KNOWN}
+
+
+class LastingState(MemoryStore):
+    """The state of benches that are opened one after the other, as if each had a program of its own."""
+
+    outlasts_program = True
 
 
 @dataclass
@@ -87,7 +94,9 @@ def new_rig(folder: Path, *settings: str, seed: int = 7) -> Iterator[Rig]:
     settings = (*SMALL, *settings)
     config = load_config(None, settings)
     with SimDevices.connected(config, world) as devices:
-        rig = Rig(devices, ShelfOperator(world, objects()), folder, settings)
+        operator = ShelfOperator(world, objects())
+        operator.state = LastingState()
+        rig = Rig(devices, operator, folder, settings)
         try:
             yield rig
         finally:

@@ -132,7 +132,10 @@ def evaluate(
     ] = None,
     jobs: Annotated[int | None, typer.Option(min=1, help="Number of processes (default: one per core).")] = None,
     cluster: ClusterOption = None,
-    out: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder for the results.")] = Path("rig-eval"),
+    out: Annotated[
+        Path | None,
+        typer.Option(metavar="FOLDER", help="Folder for the results (default: one in rig-eval for these settings)."),
+    ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Continue with the results in the folder.")] = False,
 ) -> None:
     """Measure retrieval on a folder of photographs in the layout of COIL-100, or on the catalog.
@@ -150,7 +153,7 @@ def evaluate(
     from rig.evaluation.plan import Plan
     from rig.evaluation.report import contest_sentences, curve_rows, decision_rows
     from rig.evaluation.run import enrolled_views, run_plan
-    from rig.evaluation.store import Store
+    from rig.evaluation.store import Store, own_folder
     from rig.evaluation.write import write_results
 
     workers = jobs_of(jobs, cluster) or os.cpu_count() or 1
@@ -197,6 +200,7 @@ def evaluate(
         if matrix:
             _matrix(settings, plan, workers, out)
             return
+        out = out or own_folder(f"{dataset.name}-{plan.condition.noise}", plan.settings())
         store = Store(out / "runs", plan.settings(), resume=resume)
 
         def started(progress: Progress, event: str) -> Callable[[str], None]:
@@ -218,10 +222,8 @@ def evaluate(
             str(error), next_step="Correct the options or the data set, then continue with --resume."
         ) from error
     except KeyboardInterrupt:
-        print(
-            f"\nInterrupted. The finished objects are stored in {out}. To continue, repeat the command with --resume.",
-            file=sys.stderr,
-        )
+        stored = f" The finished objects are stored in {out}. To continue, repeat the command with --resume."
+        print(f"\nInterrupted.{'' if out is None else stored}", file=sys.stderr)
         raise typer.Exit(EXIT_INTERRUPTED) from None
 
     rule = settings.load().identify
@@ -249,10 +251,13 @@ def _bench_change(
     enrolled: int,
     report: str | None,
     jobs: "Jobs",
-    out: Path,
+    out: Path | None,
 ) -> None:
+    from dataclasses import asdict
+
     from hbr.evaluation.changes import Changes
     from rig.evaluation.changes import change_rows, run_changes
+    from rig.evaluation.store import own_folder
 
     if kind not in ("mild", "hard"):
         raise ValueError(f"bench change {kind!r} is unknown; use mild or hard")
@@ -260,25 +265,31 @@ def _bench_change(
     reported = None if report is None else [item.name for item in dataset.subset(*_range(report)).objects]
     with _progress(dataset) as advance:
         results = run_changes(dataset, changes, jobs, advance, reported)
+    names = [item.name for item in dataset.objects]
+    out = out or own_folder(f"{dataset.name}-{kind}-change", asdict(changes) | {"objects": names, "reported": reported})
     _write(settings, results, change_rows(results), out / "bench_change.json", ".")
 
 
-def _matrix(settings: Settings, plan: "Plan", jobs: "Jobs", out: Path) -> None:
+def _matrix(settings: Settings, plan: "Plan", jobs: "Jobs", out: Path | None) -> None:
     from rig.evaluation.matrix import matrix_rows, run_matrix
+    from rig.evaluation.store import own_folder
 
     if plan.protocol.enrolled is None:
         raise ValueError("--matrix needs views that are not enrolled for its queries; give --enrolled 18 or fewer")
     with _progress(plan.dataset) as advance:
         results = run_matrix(plan, jobs, advance)
+    out = out or own_folder(f"{plan.dataset.name}-matrix", plan.settings())
     _write(settings, results, matrix_rows(results), out / "matrix.json", ", with Wilson's intervals.")
 
 
-def _unknown_objects(settings: Settings, plan: "Plan", count: int, jobs: "Jobs", out: Path) -> None:
+def _unknown_objects(settings: Settings, plan: "Plan", count: int, jobs: "Jobs", out: Path | None) -> None:
     from rig.evaluation.run import enrolled_views
+    from rig.evaluation.store import own_folder
     from rig.evaluation.unknown_objects import run_unknown_objects, unknown_object_rows
 
     with _progress(plan.dataset) as advance:
         results = run_unknown_objects(plan, enrolled_views(plan, jobs, advance), count, _DRAWS, jobs, advance)
+    out = out or own_folder(f"{plan.dataset.name}-leave-out-{count}", plan.settings())
     _write(settings, results, unknown_object_rows(results), out / "unknown_objects.json", ", with Wilson's intervals.")
 
 

@@ -194,13 +194,15 @@ def rejection(name: str, message: Request, reason: int) -> RequestRejected:
     """Return the error for a request that the head at ``name`` rejected."""
     words = _REASONS.get(reason, f"unknown reason {reason}")
     what = type(message).__name__.lower()
-    return RequestRejected(
+    latched = reason in (Rejection.FAULT_LATCHED, Rejection.CAUSE_PERSISTS)
+    error = RequestRejected(
         f"The rig head at {name} rejected the request '{what}': {words}.",
-        next_step="Remove the cause of the fault, then run `rig acknowledge`."
-        if reason in (Rejection.FAULT_LATCHED, Rejection.CAUSE_PERSISTS)
+        next_step="Remove the cause of the fault."
+        if latched
         else "Flash the firmware of this program: make -C firmware flash.",
         evidence={"request": what, "rejection": reason},
     )
+    return error.ask_to_acknowledge() if latched else error
 
 
 def _parse(frame: Frame) -> Answer | None:

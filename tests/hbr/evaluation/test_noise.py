@@ -57,7 +57,7 @@ def test_gaussian_noise_has_the_variance_of_intensities_and_is_clipped() -> None
 @pytest.mark.parametrize("text", ["none", "gn:0.012", "mb:15:20", "gn:0.05+mb:9:45", "gn:0.012+mb:15:20"])
 def test_noise_is_read_from_its_own_text(text: str) -> None:
     assert str(Noise.parse(text)) == text
-    assert Noise.parse("gn+mb") == Noise(0.012, 15, 20)  # the short forms have the values of the paper
+    assert Noise.parse("gn+mb") == Noise(0.012, 15, 20)  # the numbers of the paper
     assert str(Noise.parse("mb:7")) == "mb:7:20"
 
 

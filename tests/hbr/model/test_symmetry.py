@@ -63,7 +63,7 @@ def test_arc_of_a_partly_equal_object_is_found_to_two_steps(start, length):
     mine, other = ring(36), ring(36, seed=1)
     same = (start + np.arange(length)) % COUNT
     other[same] = mine[same]
-    (twin,) = similar_objects(views_of(mine, other), 0)
+    (twin,) = similar_objects(views_of(mine, other), 0, 3)
     assert twin.object_index == 1
     assert twin.similarity == 1.0
     assert length / COUNT <= twin.share <= (length + 4) / COUNT
@@ -75,34 +75,37 @@ def test_arc_of_a_partly_equal_object_is_found_to_two_steps(start, length):
 def test_most_similar_objects_come_first_and_others_are_left_out():
     mine, half, other_object = ring(36), ring(36, seed=1), ring(36, seed=2)
     half[:18] = mine[:18]
-    found = similar_objects(views_of(mine, other_object, half, mine), 0)
+    found = similar_objects(views_of(mine, other_object, half, mine), 0, 3)
     assert [one.object_index for one in found] == [3, 2]
+    assert similar_objects(views_of(mine, other_object, half, mine), 0, 1) == found[:1]
     assert found[0].arcs_deg == ((0.0, 360.0),)
-    assert similar_objects(views_of(mine), 0) == ()
-    assert similar_objects(views_of(mine[:2], mine), 0) == ()
+    assert found[0].differs_deg == found[0].other_differs_deg == ()
+    assert similar_objects(views_of(mine), 0, 3) == ()
+    assert similar_objects(views_of(mine[:2], mine), 0, 3) == ()
 
 
-def test_two_views_that_differ_split_an_arc_but_one_does_not():
-    confused = np.zeros(COUNT, bool)
-    confused[[3, 4, 6, 7, 10]] = True
-    assert _arcs(np.arange(COUNT) * STEP_DEG, confused) == ((30.0, 70.0), (100.0, 100.0))
+def test_a_different_side_of_either_object_is_named():
+    """Two objects that differ on one side only; each looks like the other one from all other sides."""
+    plain = np.tile(np.arange(144, dtype=np.uint8) % 8, (COUNT, 1))
+    marked = plain.copy()
+    marked[4:7] = 7 - marked[4:7]
+    (seen,) = similar_objects(views_of(marked, plain), 0, 3)
+    assert (seen.differs_deg, seen.other_differs_deg) == (((40.0, 60.0),), ())
+    assert seen.arcs_deg == ((70.0, 30.0),)
+    (other,) = similar_objects(views_of(marked, plain), 1, 3)
+    assert (other.share, other.arcs_deg, other.differs_deg) == (1.0, ((0.0, 360.0),), ())
+    assert other.other_differs_deg == ((40.0, 60.0),)
 
 
-@given(st.lists(st.booleans(), min_size=3, max_size=40).filter(any))
-def test_arcs_contain_every_confused_view_and_end_at_one(held):
-    confused = np.array(held)
-    azimuth_deg = np.arange(len(confused)) * 360.0 / len(confused)
-    covered = np.zeros(len(confused), bool)
-    for begin_deg, end_deg in _arcs(azimuth_deg, confused):
-        if (begin_deg, end_deg) == (0.0, 360.0):
-            covered[:] = True
-            continue
-        begin, end = round(begin_deg / 360 * len(confused)), round(end_deg / 360 * len(confused))
-        assert confused[begin]
-        assert confused[end]
-        rows = (begin + np.arange((end - begin) % len(confused) + 1)) % len(confused)
+@given(st.lists(st.booleans(), min_size=3, max_size=40))
+def test_arcs_contain_exactly_the_views_that_are_held(marks):
+    held = np.array(marks)
+    azimuth_deg = np.arange(len(held)) * 360.0 / len(held)
+    arcs = _arcs(azimuth_deg, held)
+    covered = np.zeros(len(held), bool)
+    for begin_deg, end_deg in () if held.all() else arcs:
+        begin, end = round(begin_deg / 360 * len(held)), round(end_deg / 360 * len(held))
+        rows = (begin + np.arange((end - begin) % len(held) + 1)) % len(held)
         assert not covered[rows].any()
         covered[rows] = True
-    assert covered[confused].all()
-    gaps = covered & ~confused  # single views at most
-    assert not (gaps & np.roll(gaps, 1)).any() or covered.all()
+    assert arcs == ((0.0, 360.0),) if held.all() else (covered == held).all()

@@ -15,11 +15,11 @@ import hbr
 from rig.catalog import Catalog, prepared
 from rig.catalog.edit import delete, rename
 from rig.catalog.jobs import JobProgress, finished
-from rig.catalog.prepared import load_views
+from rig.catalog.prepared import load_views, searched_views
 from rig.core.errors import CatalogDamaged, DescriptorOutdated
 from rig.search.model import load_model
 from sim.clock import VirtualClock
-from tests.rig.catalog.catalog_samples import PROVENANCE, image, plan, record, without_waiting
+from tests.rig.catalog.catalog_samples import PROVENANCE, fill, image, plan, record, without_waiting
 
 KIND = "edges+colours"
 OBJECTS = 6
@@ -207,3 +207,12 @@ def test_views_without_the_descriptor_are_reported_for_the_whole_catalog(path: P
         with pytest.raises(DescriptorOutdated, match=f"{4 * OBJECTS} of {4 * OBJECTS + 1} views") as error:
             load(catalog)
         assert error.value.evidence["objects"] == 1
+
+
+def test_views_are_compared_by_the_descriptor_that_all_objects_have(path: Path, tmp_path: Path) -> None:
+    with opened(path) as catalog, opened(tmp_path / "plain") as plain:
+        fill(plain, "photographed", 4)
+        assert [views.descriptor for views in searched_views(catalog)] == [KIND]
+        both = searched_views(catalog, plain)
+        assert [views.descriptor for views in both] == ["cedd", "cedd"]
+        assert [len(views.object_names) for views in both] == [OBJECTS, 1]

@@ -14,7 +14,7 @@ from rig.charts.decision_chart import decision_chart
 from rig.charts.polar_path import PathStep, polar_path
 from rig.charts.score_chart import score_chart
 from rig.charts.svg import number
-from rig.events.events import Weighed
+from rig.events.events import RotationReason, Weighed
 from tests.fuzzing import examples
 
 ANGLE = st.floats(-720, 720)
@@ -49,15 +49,20 @@ def words(elements: list[ET.Element]) -> list[str]:
     return ["".join(e.itertext()) for e in elements]
 
 
+SEPARATES = RotationReason.SEPARATES_CANDIDATES
+WEIGHED = Weighed((60.0, -60.0), (-2.0, -1.0), (0.1, 0.2), (0.5, 0.7))
+
+
 @pytest.mark.parametrize(
     "svg",
     [
         polar_path(0, [PathStep(40, 1, 2)] * 7, scale="azimuth on the table"),
         score_chart([{"a" * 60: 0.9, "b": 0.8}] * 8, min_score=0.5),
-        decision_chart(0, Weighed((60.0, -60.0), (-2.0, -1.0), (0.1, 0.2), (0.5, 0.7)), 60, candidates=("a" * 60, "b")),
+        decision_chart(0, WEIGHED, 60, reason=SEPARATES, candidates=("a" * 60, "b")),
+        decision_chart(0, WEIGHED, 60, reason=RotationReason.SEVERAL_POSES),
         azimuth_ring([RingView(0, 10.0)]),
     ],
-    ids=["path", "scores", "decision", "ring"],
+    ids=["path", "scores", "decision", "decision for one", "ring"],
 )
 def test_charts_are_readable_at_the_width_of_a_phone(svg: str) -> None:
     root = ET.fromstring(svg)
@@ -307,7 +312,9 @@ class TestDecisionChart:
     def test_chosen_rotation_is_innermost_at_its_azimuth(self, here: float, chosen: float, seen: list[float]) -> None:
         away = tuple(abs(rotate - chosen) for rotate in ROTATIONS)
         weighed = Weighed(ROTATIONS, tuple(-9 + a for a in away), tuple(abs(t) / 100 for t in ROTATIONS), away)
-        svg = decision_chart(here, weighed, chosen, candidates=("a", HOSTILE), seen_deg=seen, number=len(seen))
+        svg = decision_chart(
+            here, weighed, chosen, reason=SEPARATES, candidates=("a", HOSTILE), seen_deg=seen, number=len(seen)
+        )
         goal, *others = having(svg, "stop", "last")
         assert not others
         x, y = centre(goal)
@@ -324,10 +331,21 @@ class TestDecisionChart:
     def test_single_object_and_equal_values_are_drawn(self) -> None:
         for revolutions in ((5.0,), (-5.0, 5.0), ROTATIONS):
             even = (0.0,) * len(revolutions)
-            svg = decision_chart(0.0, Weighed(revolutions, even, even), revolutions[0])
+            svg = decision_chart(0.0, Weighed(revolutions, even, even), revolutions[0], reason=RotationReason.NEW_SIDE)
             assert "only one object is likely" in svg
             assert not having(svg, "similarity")
             assert "nan" not in svg
+
+    def test_one_object_is_called_likely_only_for_that_reason(self) -> None:
+        weighed = Weighed((-5.0, 5.0), (-1.0, -2.0), (0.1, 0.1))
+        several = decision_chart(0.0, weighed, 5.0, reason=RotationReason.SEVERAL_POSES)
+        assert "fits in several poses" in several
+        # In motion, two candidates are compared without their similarity.
+        moving = decision_chart(0.0, weighed, 5.0, reason=SEPARATES, candidates=("a", "b"))
+        assert {"separates", "a", "b", "13.5 % there, 36.8 % at worst"} <= set(words(having(moving, "small"))) | set(
+            words(having(moving, "step-name"))
+        )
+        assert "object is likely" not in several + moving
 
 
 def test_path_with_an_impossible_rotation_stays_small() -> None:

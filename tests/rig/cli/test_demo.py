@@ -92,7 +92,24 @@ def test_json_is_one_object_with_every_trial(in_json):
     result = json.loads(in_json[0].stdout)
     assert result["enrolled"] == 2
     assert len(result["trials"]) == 4
-    assert result["found"] == sum(t["right"] for t in result["trials"] if t["enrolled"])
+    known = [trial for trial in result["trials"] if trial["enrolled"]]
+    for correctness, count in (("right", "found"), ("ambiguous", "ambiguous")):
+        assert result[count] == sum(trial["correctness"] == correctness for trial in known)
+
+
+def test_ambiguous_answers_are_a_count_of_their_own(small, in_json):
+    """After two views, each of the two mugs may still be the other one."""
+    result = json.loads(in_json[0].stdout)
+    assert [trial["possible"] for trial in result["trials"][:2]] == [
+        ["mug-white", "mug-star"],
+        ["mug-star", "mug-white"],
+    ]
+    assert (result["found"], result["ambiguous"], result["of"]) == (0, 2, 2)
+    assert result["median_pose_error_deg"] is None
+    text = small[0].stdout
+    assert "0 of 2 enrolled objects found again, 2 ambiguous; 2 of 2 unknown objects recognised." in text
+    assert re.findall(r"^\?  (\S+) +ambiguous ", text, re.MULTILINE) == ["mug-white", "mug-star"]
+    assert "0 of 2 enrolled objects found again, 2 ambiguous;" in (small[1] / "report.html").read_text(encoding="utf-8")
 
 
 def test_json_names_the_change_of_the_bench(in_json, tmp_path):

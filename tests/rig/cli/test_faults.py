@@ -43,6 +43,19 @@ def test_fault_ends_the_demo_with_its_exit_code_and_next_step(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("stored", [False, True])
+def test_a_jam_asks_for_an_acknowledgement_only_where_a_fault_stays_latched(stored, tmp_path):
+    """The simulated bench forgets its state with its program, unless it has a folder for it."""
+    bench = ("--bench", "sim", *(("--set", f"state_dir={tmp_path}") if stored else ()))
+    jammed = rig("goto", "40", *bench, "--set", 'bench.sim.faults=["jam"]')
+    assert jammed.exit_code == 5
+    assert ("rig acknowledge" in jammed.stderr) == stored
+    assert ("start the program again" in jammed.stderr) != stored
+    assert rig("goto", "40", *bench).exit_code == (5 if stored else 0)  # as the next step says
+    acknowledged = json.loads(rig("acknowledge", *bench, "--json").stdout)["acknowledged"]
+    assert (acknowledged is not None) == stored
+
+
 def test_changed_bench_is_searched_with_the_faults_of_file_command_line_and_configuration(tmp_path):
     (tmp_path / "faults.toml").write_text('faults = ["crc_flip@1s+3s"]')
     done = rig(

@@ -27,6 +27,7 @@ from rig.events.wording import (
     outcome_words,
     reason_words,
     share_words,
+    similar_object_words,
     similar_objects_words,
     stop_words,
 )
@@ -49,7 +50,7 @@ def test_decisions_give_the_rotation_and_its_reason() -> None:
     )
     tie = decided("left", 90.0, 0.5, 0.5, "a", "b")
     assert "equally similar on both sides: S_left 0.50 = S_right 0.50" in decision_words(tie)
-    assert "no second object is likely" in decision_words(decided("left", 90.0, 0.0, 0.0, "mug"))
+    assert "there is no second candidate to compare with" in decision_words(decided("left", 90.0, 0.0, 0.0, "mug"))
     for reason, words in ((RotationReason.RANDOM, "random"), (RotationReason.EVEN_STEPS, "even steps")):
         assert words in decision_words(replace(first, reason=reason))
     for reason in (RotationReason.CUSTOM, RotationReason.EARLIER_VERSION):
@@ -63,6 +64,10 @@ def test_dense_decisions_name_the_two_candidates() -> None:
     assert decision_words(found) == "left 90.0°: distinguishes a from b, similarity 0.50 there (0.50–0.95 all around)."
     alone = replace(found, candidates=(), reason=RotationReason.NEW_SIDE)
     assert decision_words(alone) == "left 90.0°: no second object is likely, so a new side is viewed."
+    several = replace(alone, reason=RotationReason.SEVERAL_POSES)
+    assert decision_words(several) == (
+        "left 90.0°: the leading candidate fits in several poses, so a new side is viewed."
+    )
 
 
 @pytest.mark.parametrize(
@@ -158,7 +163,8 @@ def test_comparison_is_put_into_words() -> None:
 
 
 def test_similar_objects_are_put_into_words() -> None:
-    mug = SimilarObjects("mug", 180.0, 0.95, 0.96, (SimilarObject("cup", ((120.0, 200.0), (300.0, 300.0)), 0.2, 0.99),))
+    cup = SimilarObject("cup", ((120.0, 200.0), (300.0, 300.0)), ((210.0, 290.0), (310.0, 110.0)), (), 0.2, 0.99)
+    mug = SimilarObjects("mug", 180.0, 0.95, 0.96, (cup,))
     assert similar_objects_words(mug) == [
         "looks the same every 180° (similarity 0.960, of neighbouring views 0.950): its pose is known up to that angle",
         "looks like cup from 120–200° and 300° (similarity up to 0.990)",
@@ -166,6 +172,28 @@ def test_similar_objects_are_put_into_words() -> None:
     vase = replace(mug, period_deg=0.0, objects=())
     assert similar_objects_words(vase)[0].startswith("looks the same from all sides")
     assert similar_objects_words(replace(vase, period_deg=None)) == ["looks like no other enrolled object"]
+
+
+AT_HOME, ALL, MANY = ((359.7, 0.3),), ((0.0, 360.0),), tuple((float(a), a + 10.0) for a in (0, 30, 60, 90))
+
+
+@pytest.mark.parametrize(
+    ("differs", "other_differs", "share", "words"),
+    [
+        ((), (), 1.0, "cup from all sides"),
+        (AT_HOME, (), 0.9, "cup from all sides but 0°"),
+        (((350.0, 10.0), (90.0, 90.0)), AT_HOME, 0.9, "cup from all sides but 350–10° and 90°"),
+        (MANY, (), 0.9, "cup from most sides"),
+        ((), AT_HOME, 1.0, "cup, which looks different at 0°"),
+        ((), MANY, 1.0, "cup, which looks different from some sides"),
+        (MANY, (), 0.5, "cup from some sides"),
+    ],
+)
+def test_only_objects_without_a_different_side_look_the_same_from_all_sides(
+    differs: tuple, other_differs: tuple, share: float, words: str
+) -> None:
+    arcs = MANY if share == 0.5 else ALL
+    assert similar_object_words(SimilarObject("cup", arcs, differs, other_differs, share, 0.99)) == words
 
 
 def test_move_is_put_into_words() -> None:

@@ -129,6 +129,7 @@ def test_ambiguous_answer_is_neither_correct_nor_wrong() -> None:
     record.answer = replace(record.answer, outcome=Outcome.AMBIGUOUS, possible=NAMES[:2])
     page = Page(render_report("t", "s", [], [record, record], meta=Meta()))
     assert page.tables[0][1][2:4] == ["mug-white or mug-star", "? ambiguous"]
+    assert "found 0/2 enrolled objects identified correctly ambiguous 2/2" in page.text
 
 
 def test_azimuths_are_relative_to_the_enrollment_of_a_found_object() -> None:

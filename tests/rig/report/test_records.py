@@ -7,12 +7,21 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from hbr import Outcome
 from rig.events.events import Accepted, Moved, Rejected, Started
-from rig.report import EnrollmentRecord, IdentificationRecord, Truth
+from rig.report import Correctness, EnrollmentRecord, IdentificationRecord, Truth
 from rig.report.records import FRAME, TILE
 from rig.report.summary import enrollment_items, totals
 from rig.views.capture import RejectReason
 from tests.rig.report.report_samples import enrolled, enrolling, evidence, identified, identifying, moved
+
+
+def ambiguous(truth: Truth) -> IdentificationRecord:
+    """Return a search for one of two objects; as always, the answer's name is that of the leading candidate."""
+    record = identified("mug-white", (90.0,), truth=truth)
+    assert record.answer is not None
+    record.answer = replace(record.answer, outcome=Outcome.AMBIGUOUS, possible=("mug-white", "mug-star"))
+    return record
 
 
 def by_label(pairs: list) -> dict[str, str]:
@@ -85,25 +94,31 @@ class TestIdentification:
         assert {view.picture_bgr.shape for view in identified(shape=(480, 640)).views} == {(FRAME[1], FRAME[0], 3)}
 
     @pytest.mark.parametrize(
-        ("answer", "truth", "correct"),
+        ("answer", "truth", "correctness"),
         [
-            ("mug-white", Truth("mug-white"), True),
-            ("mug-white", Truth("mug-star"), False),
-            ("mug-white", Truth(None), False),
-            (None, Truth("mug-white"), False),
-            (None, Truth(None), True),
+            ("mug-white", Truth("mug-white"), Correctness.RIGHT),
+            ("mug-white", Truth("mug-star"), Correctness.WRONG),
+            ("mug-white", Truth(None), Correctness.WRONG),
+            (None, Truth("mug-white"), Correctness.WRONG),
+            (None, Truth(None), Correctness.RIGHT),
             ("mug-white", None, None),
         ],
     )
-    def test_answer_is_correct_if_it_equals_the_truth(
-        self, answer: str | None, truth: Truth | None, correct: bool | None
+    def test_answer_is_right_if_it_equals_the_truth(
+        self, answer: str | None, truth: Truth | None, correctness: Correctness | None
     ) -> None:
-        assert identified(answer, truth=truth).correct is correct
+        assert identified(answer, truth=truth).correctness is correctness
+
+    @pytest.mark.parametrize("truth", [Truth("mug-white", 30.0), Truth("mug-star", 30.0), Truth(None)])
+    def test_ambiguous_answer_is_not_found_whatever_its_first_name(self, truth: Truth) -> None:
+        record = ambiguous(truth)
+        assert record.correctness is Correctness.AMBIGUOUS
+        assert record.pose_error_deg is None
 
     def test_search_without_answer_is_neither_correct_nor_wrong(self) -> None:
         record = IdentificationRecord(truth=Truth("mug-white", 10.0))
         record.add(Started("identify", None, 8, {}))
-        assert record.correct is None
+        assert record.correctness is None
         assert record.pose_error_deg is None
         assert record.steps == []
 
@@ -137,14 +152,16 @@ class TestIdentification:
             identified("mug-white", (90.0,), truth=Truth("teapot", 0.0)),
             identified(None, (90.0,), truth=Truth(None)),
             identified("lamp", (90.0,), truth=Truth(None)),
+            ambiguous(Truth("mug-white", 30.0)),
         ]
         found = by_label(totals([enrolled(), enrolled()], records))
         assert found == {
             "objects enrolled": "2",
-            "found": "2/3",
+            "found": "2/4",
+            "ambiguous": "1/4",
             "unknown objects recognised": "1/2",
             "views to an answer": "2.2",
-            "rotation": "96°",
+            "rotation": "95°",
             "pose error": "2.0°",
         }
 

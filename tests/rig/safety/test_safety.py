@@ -16,6 +16,7 @@ from rig.core.errors import (
     FaultLatched,
     MotionStopped,
     NotReady,
+    Overheated,
     RigError,
     Stalled,
     StateNotStored,
@@ -24,7 +25,7 @@ from rig.core.errors import (
 )
 from rig.devices.servo import ServoCondition, ServoIdentity, ServoLimits, ServoState
 from rig.safety.angle_reference import AngleFinding
-from rig.safety.saved_state import BenchState, LatchedFault, MemoryStore
+from rig.safety.saved_state import BenchState, FileStore, LatchedFault, MemoryStore, StateStore
 from rig.safety.state_machine import TRANSITIONS, StateEvent
 from rig.safety.supervisor import Safety, TableState
 from sim.clock import VirtualClock
@@ -309,6 +310,25 @@ def test_nothing_moves_if_the_state_cannot_be_stored():
     safety.latch(stalled)  # the fault is latched even if the disk is full
     assert safety.state is TableState.FAULT
     assert "in this program only" in stalled.__notes__[0]
+    assert stalled.next_step.endswith(
+        "Then start the program again: this bench keeps the fault only while its program runs."
+    )
+
+
+def test_a_fault_is_acknowledged_by_a_command_only_if_its_latch_outlasts_the_program(tmp_path):
+    def latched(store: StateStore) -> str:
+        error = Overheated("It is hot.", next_step="Wait.", afterwards="Start again.").ask_to_acknowledge(reboot=True)
+        safety = Safety(Shaft(), RigConfig(), VirtualClock(), store)
+        safety.latch(error)
+        with pytest.raises(FaultLatched) as rejected:
+            safety.require_ready()
+        assert rejected.value.next_step == error.next_step
+        return error.next_step
+
+    assert latched(FileStore(tmp_path)) == "Wait. Then run `rig acknowledge --reboot`. Start again."
+    in_memory = latched(MemoryStore())
+    assert in_memory.startswith("Wait. Then start the program again: ")
+    assert "rig acknowledge" not in in_memory
 
 
 def test_motion_without_arrival_counts_as_interrupted():

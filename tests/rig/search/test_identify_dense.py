@@ -111,7 +111,7 @@ def test_decisions_name_their_candidates_and_stay_within_the_cable_budget(simula
     for event in decided:
         assert -180 <= event.target_deg <= 185
         separates = event.reason is RotationReason.SEPARATES_CANDIDATES
-        assert separates or event.reason is RotationReason.NEW_SIDE
+        assert separates or event.reason in (RotationReason.NEW_SIDE, RotationReason.SEVERAL_POSES)
         assert len(event.candidates) == (2 if separates else 0)
         weighed = event.weighed
         assert weighed is not None
@@ -123,6 +123,23 @@ def test_decisions_name_their_candidates_and_stay_within_the_cable_budget(simula
         assert probability == sorted(probability, reverse=True)
         assert sum(probability) == pytest.approx(1)
         assert ranked.decision is not None
+
+
+@pytest.mark.parametrize(
+    ("name", "reason"), [("bottle-green", RotationReason.SEVERAL_POSES), ("bowl-hoops", RotationReason.NEW_SIDE)]
+)
+def test_a_new_side_is_viewed_for_one_object_only_if_no_second_one_is_likely(simulated, shelf, name, reason):
+    """All strong hypotheses may be poses of one round object while a second object has 41 %."""
+    s = simulated()
+    s.operator.yaw_deg = 0.0
+    events, _ = search(s, shelf, name)
+    ranked = [event for event in events if isinstance(event, Ranked)]
+    decided = [event for event in events if isinstance(event, Decided) and not event.candidates]
+    assert reason in {event.reason for event in decided}
+    for event in decided:
+        leading = ranked[event.index].candidates[0].probability
+        assert leading is not None
+        assert (leading >= 0.95) == (event.reason is RotationReason.NEW_SIDE)
 
 
 def test_watch_finds_objects_enrolled_meanwhile(simulated, tmp_path):

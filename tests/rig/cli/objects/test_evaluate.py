@@ -2,6 +2,8 @@
 
 import csv
 import json
+import os
+import re
 import shutil
 from pathlib import Path
 
@@ -15,6 +17,7 @@ from rig.catalog import Catalog, Provenance, ViewRecord
 from rig.cli.objects.evaluate import evaluate
 from rig.cli.ui.settings import Settings
 from rig.core.clock import SystemClock
+from rig.evaluation.report import Rows
 from tests.programs import server
 
 app = typer.Typer()
@@ -296,3 +299,48 @@ def test_bench_change_searches_for_each_object_also_as_if_it_were_not_enrolled(
     for name, searches in found["searches"].items():
         assert len(searches) == 4
         assert {len(one["leaders"]) for one in searches} == {4}, name
+
+
+def test_evaluations_with_other_settings_have_other_folders(
+    photographs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for noise in ("mb:5", "gn:0.01"):
+        done = run(photographs, *QUICK, "--noise", noise)
+        assert done.exit_code == 0, done.output
+        assert "Written: rig-eval/" in done.stderr
+    first, second = sorted(Path("rig-eval").iterdir())
+    assert (first.name[:-9], second.name[:-9]) == ("photographs0-gn-0.01", "photographs0-mb-5-20")
+    again = run(photographs, *QUICK, "--noise", "mb:5")
+    assert again.exit_code == 2
+    assert f"{second}/runs already contains runs" in again.stderr
+    assert run(photographs, *QUICK, "--noise", "mb:5", "--resume", "--report", "3-4").exit_code == 0
+    assert results(second)["reported"] == [3, 4]
+
+
+def test_commands_of_the_results_run_one_after_the_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each command of the page ends with results of its own; nothing is computed here."""
+    monkeypatch.chdir(tmp_path)
+    Path("coil-100").mkdir()
+    one = tmp_path / "view.png"
+    assert cv2.imwrite(str(one), drawing(1, 0))
+    for number in range(1, 101):
+        for angle in range(0, 360, 5):
+            os.link(one, f"coil-100/obj{number}__{angle}.png")
+    monkeypatch.setattr("rig.evaluation.run.enrolled_views", lambda *_: None)
+    monkeypatch.setattr("rig.evaluation.run.run_plan", lambda *_: None)
+    for computed in ("matrix.run_matrix", "changes.run_changes", "unknown_objects.run_unknown_objects"):
+        monkeypatch.setattr(f"rig.evaluation.{computed}", lambda *_: {})
+    for table in ("matrix.matrix_rows", "changes.change_rows", "unknown_objects.unknown_object_rows"):
+        monkeypatch.setattr(f"rig.evaluation.{table}", lambda _: Rows([], []))
+    for table in ("curve_rows", "decision_rows"):
+        monkeypatch.setattr(f"rig.evaluation.report.{table}", lambda _: Rows([], []))
+    monkeypatch.setattr("rig.evaluation.report.contest_sentences", lambda _: [])
+    monkeypatch.setattr("rig.evaluation.write.write_results", lambda *_: {})
+    page = (Path(__file__).parents[4] / "docs/results.md").read_text(encoding="utf-8")
+    commands = [words for words in re.findall(r"^rig eval (.+)$", page, re.MULTILINE) if words.startswith("coil-100 ")]
+    assert len(commands) > 30
+    for words in commands:
+        done = run(*words.split())
+        assert done.exit_code == 0, (words, done.output)
+    assert len(list(Path("rig-eval").iterdir())) == len(commands)

@@ -42,7 +42,9 @@ from tests.programs import Program
 from tests.rig.report.report_samples import enrolling, identifying, searching_densely
 
 ESCAPE = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
-SIMILAR = SimilarObjects("mug-white", 180.0, 0.95, 0.96, (SimilarObject("mug-03", ((120.0, 200.0),), 0.2, 0.99),))
+SIMILAR = SimilarObjects(
+    "mug-white", 180.0, 0.95, 0.96, (SimilarObject("mug-03", ((120.0, 200.0),), ((210.0, 110.0),), (), 0.2, 0.99),)
+)
 
 
 def enrolled_with_similar_objects() -> list[Event]:
