@@ -18,6 +18,7 @@ from rig.core import files
 from rig.core.clock import Clock
 from rig.core.errors import MotionStopped, RigError, StateNotStored, os_errors_as
 from rig.core.files import no_follow
+from rig.core.masking import masked
 
 VERSION = 3
 """Version 1 has neither the settings of the table nor the file of the latched fault; version 2 has no checksum."""
@@ -351,7 +352,8 @@ def _store_session(store: StateStore, session: SavedSession) -> None:
 
 
 def this_command() -> str:
-    command = " ".join([Path(sys.argv[0]).name, *sys.argv[1:]])
+    """Return the command line, without passwords: other persons see it."""
+    command = " ".join(map(masked, [Path(sys.argv[0]).name, *sys.argv[1:]]))
     return command.encode(errors="replace").decode()  # arguments may have bytes that are not UTF-8
 
 
