@@ -89,7 +89,7 @@ bench: $(READY) $(LIBRARY)
 lock:
 	uv pip compile --universal --python-version 3.11 --generate-hashes --extra dev --upgrade \
 	    --no-header --no-emit-index-url pyproject.toml -o requirements.lock
-	for tool in uv:uv cyclonedx-bom:sbom 'playwright schemathesis axe-playwright-python:browser' \
+	for tool in uv:uv setuptools:backend cyclonedx-bom:sbom 'playwright schemathesis axe-playwright-python:browser' \
 	    'SQLAlchemy>=2.1 psycopg[binary] s3fs moto[server] distributed bluesky bluesky-tiled-plugins tiled[client,server]:servers'; do \
 	    echo $${tool%:*} | tr ' ' '\n' | uv pip compile - --universal --python-version 3.11 \
 	    --generate-hashes --upgrade --no-header --no-emit-index-url -o .ci/$${tool#*:}.lock; done
