@@ -559,3 +559,20 @@ def test_invalid_values_end_in_an_error(root: Path, tmp_path: Path, statement: s
                 reader(catalog, tmp_path)
         except RigError:
             continue
+
+
+@pytest.mark.parametrize(
+    "edit",
+    [
+        "sessions SET empty_table_image_sha256 = '0'",
+        "sessions SET empty_table_image_bytes = -1",
+        "enrollments SET finished_utc = NULL",
+        "views SET image_sha256 = '0'",
+        "views SET session_id = (SELECT max(id) FROM sessions)",
+    ],
+)
+def test_values_that_an_import_rejects_are_not_exported(root: Path, edit: str) -> None:
+    sql(root, "PRAGMA ignore_check_constraints = ON", f"UPDATE {edit}")
+    seal_as_the_sender(root)
+    with opened(root) as catalog, pytest.raises(CatalogDamaged, match="impossible values"):
+        list(read_objects(catalog))
