@@ -19,7 +19,7 @@ help:
 	@echo "make test-web   test the pages in a real browser, and attack the server"
 	@echo "make kernel-test  run the program with Linux's real drivers in a virtual machine"
 	@echo "make test-servers  test PostgreSQL, S3, Dask and bluesky with real servers"
-	@echo "make fuzz   attack every kind of input for about an hour (a part of test-nightly)"
+	@echo "make fuzz   attack every kind of input for about 45 minutes (a part of test-nightly)"
 	@echo "make lint   check formatting, lint, types and import contracts"
 	@echo "make docs   build the documentation as a site in site/"
 	@echo "make wheel  build wheel and sdist in dist/, and try the wheel in an empty environment"
@@ -89,7 +89,7 @@ bench: $(READY) $(LIBRARY)
 lock:
 	uv pip compile --universal --python-version 3.11 --generate-hashes --extra dev --upgrade \
 	    --no-header --no-emit-index-url pyproject.toml -o requirements.lock
-	for tool in uv:uv cyclonedx-bom:sbom 'playwright schemathesis axe-playwright-python:browser' \
+	for tool in uv:uv setuptools:backend cyclonedx-bom:sbom 'playwright schemathesis axe-playwright-python:browser' \
 	    'SQLAlchemy>=2.1 psycopg[binary] s3fs moto[server] distributed bluesky bluesky-tiled-plugins tiled[client,server]:servers'; do \
 	    echo $${tool%:*} | tr ' ' '\n' | uv pip compile - --universal --python-version 3.11 \
 	    --generate-hashes --upgrade --no-header --no-emit-index-url -o .ci/$${tool#*:}.lock; done

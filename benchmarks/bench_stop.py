@@ -254,7 +254,7 @@ def beside_exports(bench: ServedBench, held: ExitStack) -> Stop:
     return by_request(bench, held)
 
 
-def beside_strangers(bench: ServedBench, held: ExitStack) -> Stop:
+def beside_silent_connections(bench: ServedBench, held: ExitStack) -> Stop:
     """450 connections that send nothing; those that the server has closed are opened again before each stop."""
     place = urlsplit(bench.url)
     silent: list[socket.socket] = []
@@ -290,7 +290,7 @@ SITUATIONS: dict[str, Callable[[ServedBench, ExitStack], Stop]] = {
     "2 rig stop beside a queue": by_rig_stop,
     "3 request, with long trays that wait": with_queue,
     "4 request, beside 45 exports": beside_exports,
-    "5 request, beside 450 silent connections": beside_strangers,
+    "5 request, beside 450 silent connections": beside_silent_connections,
     "6 request, after wrong tokens": after_wrong_tokens,
 }
 

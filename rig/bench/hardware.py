@@ -17,6 +17,7 @@ from rig.config import RigConfig, Section
 from rig.config.imus import imu_kind
 from rig.core.clock import Clock, SystemClock
 from rig.core.errors import ConfigError, DeviceMismatch, RigError, StateNotStored
+from rig.core.masking import masked
 from rig.core.phrases import angle_range
 from rig.devices.camera import Camera
 from rig.devices.dynamixel.guardian import Guardian
@@ -152,7 +153,7 @@ def assemble(
                     source,
                     clock=clock,
                     settings=camera_settings(config, state, device),
-                    name=f"camera {config.camera.source}",
+                    name=f"camera {masked(config.camera.source)}",
                     device=device,
                     reopen=reopen_camera,
                     node=camera_node,

@@ -6,7 +6,7 @@ Decision: docs/decisions/0016.
 import os
 import pwd
 import socket
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from enum import StrEnum
 from typing import Any
@@ -18,6 +18,7 @@ from rig.catalog.records import JsonObject, as_json, this_software
 from rig.catalog.schema import audit
 from rig.catalog.seal import seal_appended
 from rig.core.clock import Clock
+from rig.core.masking import masked
 
 
 class Action(StrEnum):
@@ -84,7 +85,7 @@ def entries(connection: Connection, since: datetime | None = None, object_name: 
         wanted = wanted.where(audit.c.time_utc >= since)
     if object_name is not None:
         wanted = wanted.where(audit.c.object_name == object_name)
-    return [AuditEntry(*row) for row in connection.execute(wanted)]
+    return [replace(AuditEntry(*row), details=masked(row.details)) for row in connection.execute(wanted)]
 
 
 def author() -> dict[str, str]:

@@ -1,7 +1,6 @@
 """Migrate a catalog of an earlier version, with a backup."""
 
 import sqlite3
-import stat
 from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
@@ -13,10 +12,10 @@ from sqlalchemy import Connection, NullPool, create_engine
 from rig.catalog import audit, migrations
 from rig.catalog.columns import FIX
 from rig.catalog.failures import absent, catalog_errors
-from rig.catalog.places import check_folder, image_file
+from rig.catalog.places import file_mode, image_file
 from rig.catalog.schema import SCHEMA_VERSION
 from rig.catalog.sqlite_database import check_schema, connect, database_exists, version_of
-from rig.config.catalog_place import DATABASE_NAME, CatalogPlace
+from rig.config.catalog_place import CatalogPlace
 from rig.core.clock import Clock
 from rig.core.errors import CatalogDamaged
 from rig.core.files import open_new, sync_file, sync_folder
@@ -55,16 +54,12 @@ def migrate(path: str | PathLike[str] | CatalogPlace, *, clock: Clock, busy_time
     with catalog_errors(root, busy_timeout_s):
         if not database_exists(root):
             raise absent(root)
-        check_folder(root)
-        file = root / DATABASE_NAME
-        engine = create_engine(
-            "sqlite://", creator=partial(connect, f"{file.as_uri()}?mode=rw", busy_timeout_s), poolclass=NullPool
-        )
+        engine = create_engine("sqlite://", creator=partial(connect, root, "rw", busy_timeout_s), poolclass=NullPool)
         with engine.connect() as connection:
             connection.exec_driver_sql("PRAGMA foreign_keys = OFF")  # the steps replace tables that others refer to
             connection.exec_driver_sql("BEGIN IMMEDIATE")
             try:
-                done = _migrate(connection, root, file, clock)
+                done = _migrate(connection, root, clock)
             except BaseException:
                 connection.exec_driver_sql("ROLLBACK")
                 raise
@@ -72,7 +67,7 @@ def migrate(path: str | PathLike[str] | CatalogPlace, *, clock: Clock, busy_time
     return done
 
 
-def _migrate(connection: Connection, root: Path, file: Path, clock: Clock) -> Migration:
+def _migrate(connection: Connection, root: Path, clock: Clock) -> Migration:
     before = version_of(connection, root)
     check_schema(connection, root, before)
     if before == SCHEMA_VERSION:
@@ -80,7 +75,7 @@ def _migrate(connection: Connection, root: Path, file: Path, clock: Clock) -> Mi
     for name in connection.exec_driver_sql("SELECT image FROM views").scalars():
         image_file(root, name)
     backup = root / f"catalog-v{before}-{clock.utc():%Y%m%dT%H%M%SZ}.sqlite"
-    _back_up(file, backup)
+    _back_up(root, backup)
     try:
         _run_steps(connection, before)
     except (ValueError, TypeError, LookupError, AttributeError, RecursionError) as error:
@@ -100,10 +95,10 @@ def _migrate(connection: Connection, root: Path, file: Path, clock: Clock) -> Mi
     return Migration(before, SCHEMA_VERSION, backup)
 
 
-def _back_up(file: Path, backup: Path) -> None:
+def _back_up(root: Path, backup: Path) -> None:
     part = backup.with_suffix(".part")
-    open_new(part, mode=stat.S_IMODE(file.stat().st_mode)).close()
-    with closing(sqlite3.connect(file)) as source, closing(sqlite3.connect(part)) as target:
+    open_new(part, mode=file_mode(root)).close()
+    with closing(connect(root, "ro", busy_timeout_s=5)) as source, closing(sqlite3.connect(part)) as target:
         source.backup(target)
     sync_file(part)
     part.replace(backup)

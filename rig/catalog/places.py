@@ -4,6 +4,7 @@ A catalog may come from an untrusted sender: its records and its folder can cont
 """
 
 import os
+import shlex
 import stat
 from collections.abc import Iterator
 from contextlib import suppress
@@ -13,7 +14,7 @@ from typing import Final
 from rig.catalog.columns import FIX, image_path
 from rig.config.catalog_place import DATABASE_NAME
 from rig.core.errors import CatalogDamaged
-from rig.core.files import make_folder
+from rig.core.files import make_folder, open_regular
 from rig.views.image_files import IMAGE_FOLDER
 
 LOST: Final = "lost+found"
@@ -25,17 +26,64 @@ INCOMING: Final = "incoming"
 PREPARED: Final = "prepared"
 """Folder of the prepared views (`rig.catalog.prepared`)."""
 
-_OWN: Final = (
-    *(f"{DATABASE_NAME}{suffix}" for suffix in ("", "-wal", "-shm", "-journal")),
-    *(IMAGE_FOLDER, LOST, INCOMING, PREPARED),
-)
+_OWN: Final = (DATABASE_NAME, IMAGE_FOLDER, LOST, INCOMING, PREPARED)
+_BESIDE: Final = tuple(f"{DATABASE_NAME}-{suffix}" for suffix in ("wal", "shm", "journal"))
+"""Files that SQLite itself writes beside the database."""
+
+_NAMES_ANOTHER_FILE: Final = bytes.fromhex("d9d505f920a163d7")
+"""Last bytes of a rollback journal with a super-journal record (https://sqlite.org/fileformat.html, section 3)."""
 
 
 def check_folder(root: Path) -> None:
-    """Raise `CatalogDamaged` if something of the catalog in the folder ``root`` is a link."""
+    """Check the folder of a catalog before SQLite opens a file in it.
+
+    Raises
+    ------
+    CatalogDamaged
+        Something of the catalog in the folder ``root`` is a link; a file that belongs to SQLite has a second name or is
+        a pipe or a device; or there is a rollback journal, which this program does not use.
+    """
     for name in _OWN:
         if (root / name).is_symlink():
             raise _leads_out(root / name)
+    for name in _BESIDE:
+        with suppress(FileNotFoundError):
+            found = (root / name).lstat()
+            if not stat.S_ISREG(found.st_mode) or found.st_nlink > 1:
+                raise _leads_out(root / name)
+    _check_rollback_journal(root)
+
+
+def _check_rollback_journal(root: Path) -> None:
+    """Raise `CatalogDamaged` if there is a rollback journal.
+
+    SQLite plays it back before this program can look at anything. A journal with a super-journal record names any other
+    file, and SQLite then deletes that file. This program leaves no such journal after a kill: it writes with a
+    write-ahead log only (`SqliteDatabase`).
+
+    The log itself (``-wal``) and its index (``-shm``) remain after a kill, and need no such check. They name no file.
+    The log contains pages of the database, which are checked like the database itself. The first program that opens
+    the database empties the index.
+    """
+    journal = root / f"{DATABASE_NAME}-journal"
+    try:
+        # SQLite does not lock this file. The locks on the database would be lost if the database were opened here.
+        with open_regular(journal) as file:
+            size = file.seek(0, os.SEEK_END)
+            file.seek(max(size - len(_NAMES_ANOTHER_FILE), 0))
+            names_a_file = file.read() == _NAMES_ANOTHER_FILE
+    except FileNotFoundError:
+        return
+    if size:
+        finish = f"sqlite3 {shlex.quote(str(root / DATABASE_NAME))} 'PRAGMA integrity_check'"
+        raise CatalogDamaged(
+            f"{os.fspath(journal)!r} is a journal of another program"
+            f"{', and SQLite would delete the file that it names' * names_a_file}. Nothing was opened or changed.",
+            next_step=FIX
+            if names_a_file
+            else f"{FIX} If you killed another program that changed the catalog, finish its change: {finish}",
+            evidence={"bytes": size},
+        )
 
 
 def image_file(root: Path, name: str) -> Path:

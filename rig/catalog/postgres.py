@@ -294,6 +294,8 @@ def _engine(place: CatalogPlace, busy_timeout_s: float) -> Any:
         url = make_url(place.url)
         if url.drivername not in ("postgresql", "postgresql+psycopg"):
             raise ArgumentError("another kind of database")
+        if place.url.partition("?")[0].count("@") > 1:  # the driver's errors would show a part of the password
+            raise ArgumentError("an @ in the password")
         given = url.query.get("options", "")
         return create_engine(
             url.difference_update_query(["options"]),
@@ -307,7 +309,7 @@ def _engine(place: CatalogPlace, busy_timeout_s: float) -> Any:
                 "tcp_user_timeout": 15_000,
             },
         )
-    except ArgumentError as error:
+    except (ArgumentError, ValueError) as error:
         raise ConfigError(
             f"catalog.url = {str(place)!r} is not the URL of a PostgreSQL database.",
             next_step="Give postgresql+psycopg://USER@HOST/DATABASE; the password belongs in ~/.pgpass.",

@@ -85,12 +85,17 @@ class SqliteDatabase(Database):
             parent = next(parent for parent in self.root.parents if parent.exists())
             make_folder(self.root, within=parent, mode=0o700)
             self._create()
-        check_folder(self.root)
         with self.read() as connection:
             self.version = version_of(connection, self.root)
             if self.version < (READABLE_VERSION if self._read_only else SCHEMA_VERSION):
                 raise self.outdated()
             check_schema(connection, self.root, self.version)
+            journal = connection.exec_driver_sql("PRAGMA journal_mode").scalar()
+        if journal != "wal" and not self._read_only:
+            # Another program has changed the mode, for example for a backup. A kill would leave a rollback journal, and
+            # `check_folder` rejects any.
+            with closing(self._connect()) as changing:
+                changing.execute("PRAGMA journal_mode = WAL")
 
     def damage(self, connection: Connection) -> list[str]:
         messages = connection.exec_driver_sql("PRAGMA integrity_check(20)").scalars().all()
@@ -116,7 +121,7 @@ class SqliteDatabase(Database):
         mode = "rw"
         if self._read_only:
             mode = "ro" if self._is_shareable() else "ro&immutable=1"
-        connection = connect(f"{self._file.as_uri()}?mode={mode}", self._busy_timeout_s)
+        connection = connect(self.root, mode, self._busy_timeout_s)
         try:
             connection.execute("PRAGMA foreign_keys = ON")
         except BaseException:
@@ -157,13 +162,31 @@ class SqliteDatabase(Database):
                 made.replace(self._file)
 
 
-def connect(uri: str, busy_timeout_s: float) -> sqlite3.Connection:
-    """Open a database that may come from an untrusted sender.
+def connect(root: Path, mode: str, busy_timeout_s: float) -> sqlite3.Connection:
+    """Open the database in a folder that may come from an untrusted sender.
 
-    Nothing in its schema may call functions with side effects. Where Python can (from 3.12), SQLite's defensive mode
-    also rejects statements that could damage the file.
+    The folder is checked first: SQLite plays a journal back before it reads the database. Nothing in its schema may
+    call functions with side effects. Where Python can (from 3.12), SQLite's defensive mode also rejects statements that
+    could damage the file.
+
+    Parameters
+    ----------
+    mode
+        ``rw`` or ``ro``, with further parameters of SQLite's URIs.
+
+    Raises
+    ------
+    CatalogDamaged
+        As for `check_folder`.
     """
-    connection = sqlite3.connect(uri, uri=True, timeout=busy_timeout_s, isolation_level=None, check_same_thread=False)
+    check_folder(root)
+    connection = sqlite3.connect(
+        f"{(root / DATABASE_NAME).as_uri()}?mode={mode}",
+        uri=True,
+        timeout=busy_timeout_s,
+        isolation_level=None,
+        check_same_thread=False,
+    )
     try:
         if sys.version_info >= (3, 12):
             connection.setconfig(sqlite3.SQLITE_DBCONFIG_DEFENSIVE, True)

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from rig.core.masking import masked
+
 DATABASE_NAME: Final = "catalog.sqlite"
 
 
@@ -46,8 +48,4 @@ class CatalogPlace:
         return self.url is not None or self.database_file.exists()
 
     def __str__(self) -> str:
-        if self.url is None:
-            return str(self.path)
-        before, at, host = self.url.rpartition("@")
-        user = before.rpartition("//")[2].partition(":")[0]
-        return f"{before.partition('//')[0]}//{user}@{host}" if at else self.url
+        return str(self.path) if self.url is None else str(masked(self.url))

@@ -8,11 +8,13 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, ClassVar, Self
 
+from rig.core.masking import masked
+
 Evidence = Mapping[str, Any]
 
 
 class RigError(Exception):
-    """Base of every error that the rig raises on purpose.
+    """Base of every error that the rig raises on purpose. Its texts and its evidence are `masked`.
 
     Parameters
     ----------
@@ -38,10 +40,11 @@ class RigError(Exception):
             cls.latches = latches
 
     def __init__(self, what: str, *, next_step: str, evidence: Evidence | None = None, afterwards: str = "") -> None:
+        what = masked(what)
         super().__init__(what)
-        self.what = what
-        self.evidence: dict[str, Any] = dict(evidence or {})
-        self._next_step, self._acknowledge, self._afterwards = next_step, "", afterwards
+        self.what: str = what
+        self.evidence: dict[str, Any] = masked(evidence or {})
+        self._next_step, self._acknowledge, self._afterwards = masked(next_step), "", afterwards
         self._reboot = False
 
     @property

@@ -6,6 +6,7 @@ from enum import Enum, StrEnum, unique
 from typing import Any
 
 from rig.core.errors import RigError
+from rig.core.masking import masked
 from rig.core.phrases import filled
 
 
@@ -187,6 +188,10 @@ class Finding:
     parameters: Mapping[str, Any] = field(default_factory=dict)
     fix: str = ""
     exit_code: int = 0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "parameters", masked(self.parameters))
+        object.__setattr__(self, "fix", masked(self.fix))
 
     def as_dict(self) -> dict[str, Any]:
         """Return the finding as `--json` prints it."""

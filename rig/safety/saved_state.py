@@ -17,6 +17,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from rig.core import files
 from rig.core.clock import Clock
 from rig.core.errors import MotionStopped, RigError, StateNotStored, os_errors_as
+from rig.core.masking import masked
 from rig.safety.stop_channel import StopAnswer, StopListener, StopRequest, listen
 
 VERSION = 3
@@ -384,7 +385,8 @@ def _store_session(store: StateStore, session: SavedSession) -> None:
 
 
 def this_command() -> str:
-    command = " ".join([Path(sys.argv[0]).name, *sys.argv[1:]])
+    """Return the command line, without passwords: other persons see it."""
+    command = " ".join(map(masked, [Path(sys.argv[0]).name, *sys.argv[1:]]))
     return command.encode(errors="replace").decode()  # arguments may have bytes that are not UTF-8
 
 

@@ -12,6 +12,7 @@ from rig.catalog.exchange.results_table import plain_row
 from rig.catalog.records import Outcome
 from rig.catalog.results import ResultFilter, correct, find_result, find_results
 from rig.core.errors import JobNotFound
+from rig.core.masking import masked
 from rig.events.events import plain
 from rig.search.replay import Check, check
 from rig.search.saved_run import SavedRun, load_run
@@ -125,8 +126,8 @@ def add_records(api: APIRouter, server: Server) -> None:
 
     @api.get("/configuration", tags=["bench"])
     def configuration(_person: Watcher) -> dict[str, Any]:
-        """Return the configuration in force."""
-        values: dict[str, Any] = server.config.model_dump(mode="json")
+        """Return the configuration in force, without passwords."""
+        values: dict[str, Any] = masked(server.config.model_dump(mode="json"))
         return values
 
     @api.get("/log", tags=["bench"])

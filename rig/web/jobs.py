@@ -13,6 +13,7 @@ from pydantic import ValidationError
 from rig.core.clock import Clock
 from rig.core.errors import JobNotFound, JobRejected, RigError, StateNotStored, os_errors_as
 from rig.core.files import read, write
+from rig.core.masking import masked
 from rig.web.requests import Choice, EnrollRequest, IdentifyRequest, Job, JobRequest, JobState, Question, TrayRequest
 
 FILE: Final = "jobs.json"
@@ -54,7 +55,7 @@ class JobQueue:
         self._file = folder / FILE
         self._clock = clock
         self._changed = changed
-        self._arguments = rig_arguments
+        self._arguments: tuple[str, ...] = masked(rig_arguments)  # everybody who watches sees the command
         self._lock = threading.RLock()
         self._arrived = threading.Condition(self._lock)
         self._jobs: dict[str, Job] = {}

@@ -1,4 +1,4 @@
-"""STOP of a server process: in a browser as people use it, beside strangers and exports, and with one process."""
+"""STOP of a server process: in a browser as people use it, beside exports and silent connections, and of one process."""
 
 import json
 import os
@@ -191,7 +191,7 @@ def test_rig_stop_also_cancels_the_queue_of_the_server(serve_process):
     assert call(server, f"jobs/{second}")["state"] == "cancelled"
 
 
-def test_stop_beside_exports_of_a_stranger(serve_process):
+def test_stop_beside_exports(serve_process):
     server = serve_process("bench.sim.speed=1000")
     for name in ("lamp", "mug-star", "mug-white", "dice", "teapot", "toy-car"):
         job = call(server, "jobs", {"kind": "enroll", "name": name, "views": 36})["id"]

@@ -122,3 +122,16 @@ def test_commands_of_the_attacks_select_tests():
         expression = words[words.index("-k") + 1] if "-k" in words else ""
         for name in set(re.findall(r"\w+", expression)) - {"or"}:
             assert re.search(rf"(def test|class Test|test_)\w*{name}", text), (command, name)
+
+
+@pytest.mark.parametrize("file", ["docs/deploy/Dockerfile", ".ci/setup", ".ci/install"])
+def test_every_download_has_a_hash(file):
+    """A build without isolation downloads no build backend."""
+    text = (ROOT / file).read_text(encoding="utf-8").replace("\\\n", " ")
+    commands = re.findall(r"\bpip\S* (?:install|sync|wheel|download)\b[^;&\n]*|-m build\b[^;&\n]*", text)
+    assert commands
+    for command in commands:
+        builds = "-m build" in command or "requirements.lock" in command or "--no-deps" in command
+        assert "--no-isolation" in command or "--no-build-isolation" in command or not builds, command
+        downloads = "-m build" not in command and "--no-deps" not in command
+        assert "--require-hashes" in command or "--no-index" in command or not downloads, command

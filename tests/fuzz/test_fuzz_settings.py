@@ -110,6 +110,8 @@ OPTIONS = [
 @example("home", ["--revolutions", "99999999"])
 @example("home", ["--here", "--revolutions", "-99999999", "--json"])
 @example("replay", ["/dev/zero", "--json"])
+@example("import", ["9" * 256])
+@example("eval", ["--json", "9/" * 2100])
 @example("status", ["--seed", "9" * 4000])
 def test_any_arguments_end_with_a_documented_exit_code(commands, command, arguments):
     commands.fresh()

@@ -47,7 +47,8 @@ def in_utc(time: datetime) -> datetime:
 
 
 Time = Annotated[AwareDatetime, AfterValidator(in_utc)]
-Integer = Annotated[int, Field(strict=True)]
+Integer = Annotated[int, Field(strict=True, lt=2**31)]
+"""An integer that every database can store."""
 
 MAX_VIEWS = 10_000
 """Most views of one enrollment: one every 0.036°."""
@@ -102,7 +103,7 @@ class View(_Part):
     imu_deg: Degrees | None = None
     imu_sigma_deg: Annotated[float, Field(ge=0, allow_inf_nan=False)] | None = None
     captured_utc: Time | None = None
-    captured_ns: Annotated[Integer, Field(ge=-(2**63), lt=2**63)] | None = None
+    captured_ns: Annotated[int, Field(strict=True, ge=-(2**63), lt=2**63)] | None = None
     image: str
     image_sha256: Sha256 | None = None
     image_bytes: Annotated[Integer, Field(ge=1)] | None = None

@@ -1,6 +1,7 @@
 """Read objects from a catalog, one after the other, with everything that is stored of them."""
 
 from collections.abc import Collection, Generator, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 from pydantic import ValidationError
@@ -59,18 +60,22 @@ def read_objects(catalog: Catalog, names: Collection[str] = ()) -> Generator[Exp
             ).all():
                 folder = images.folder(number, row.name, next(enrollment_numbers))
                 by_id = _sessions(connection, enrollment.id, folder, store, files)
-                found.append(
-                    Enrollment(
-                        status=enrollment.status,
-                        started_utc=enrollment.started_utc,
-                        finished_utc=enrollment.finished_utc,
-                        planned_azimuth_deg=tuple(enrollment.planned_azimuth_deg),
-                        sessions=tuple(by_id.values()),
-                        views=tuple(_views(connection, enrollment.id, list(by_id), folder, store, files)),
+                own = tuple(_views(connection, enrollment.id, list(by_id), folder, store, files))
+                with _checked(f"the enrollment {folder}"):
+                    found.append(
+                        Enrollment(
+                            status=enrollment.status,
+                            started_utc=enrollment.started_utc,
+                            finished_utc=enrollment.finished_utc,
+                            planned_azimuth_deg=tuple(enrollment.planned_azimuth_deg),
+                            sessions=tuple(by_id.values()),
+                            views=own,
+                        )
                     )
-                )
             texts = {"name": row.name, "label": row.label, "note": row.note}
-            yield Object(**texts, created_utc=row.created_utc, enrollments=tuple(found)), files
+            with _checked(f"the object {row.name!r}"):
+                item = Object(**texts, created_utc=row.created_utc, enrollments=tuple(found))
+            yield item, files
 
 
 def read_catalog(catalog: Catalog) -> ImportBatch:
@@ -95,7 +100,8 @@ def _sessions(
             exported = (folder / f"empty-{number:03d}{Path(row.empty_table_image).suffix}").as_posix()
             files[exported] = store.file(row.empty_table_image)
         columns = {name: getattr(row, name) for name in Session.model_fields}
-        found[row.id] = Session(**(columns | {"empty_table_image": exported}))
+        with _checked(f"session {number} of {folder}"):
+            found[row.id] = Session(**(columns | {"empty_table_image": exported}))
     return found
 
 
@@ -112,7 +118,7 @@ def _views(
     for row in connection.execute(select(views).where(of_enrollment).order_by(views.c.view_index)).all():
         exported = (folder / f"{row.view_index:03d}{Path(row.image).suffix}").as_posix()
         files[exported] = store.file(row.image)
-        try:
+        with _checked(f"the view {exported}"):
             view = View(
                 index=row.view_index,
                 session=session_ids.index(row.session_id),
@@ -128,11 +134,16 @@ def _views(
                 ),
                 **measured(row),
             )
-        except ValidationError as error:
-            reason = error.errors()[0]["msg"]
-            raise CatalogDamaged(
-                f"The catalog is damaged: the row of the view {exported} has impossible values.",
-                next_step=FIX,
-                evidence={"reason": reason},
-            ) from error
         yield view
+
+
+@contextmanager
+def _checked(what: str) -> Iterator[None]:
+    """Raise `CatalogDamaged` for values that no program stored and that an import would not accept."""
+    try:
+        yield
+    except ValueError as error:
+        reason = error.errors()[0]["msg"] if isinstance(error, ValidationError) else str(error)
+        raise CatalogDamaged(
+            f"The catalog is damaged: {what} has impossible values.", next_step=FIX, evidence={"reason": reason}
+        ) from error

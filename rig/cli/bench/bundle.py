@@ -2,8 +2,6 @@
 
 import json
 import platform
-import re
-from collections.abc import Mapping
 from importlib.metadata import distributions
 from io import BytesIO
 from pathlib import Path
@@ -13,23 +11,17 @@ from zipfile import ZIP_DEFLATED, ZipFile
 from rig.cli.bench.snapshot import take, write_new
 from rig.cli.ui.settings import Settings
 from rig.core.errors import RigError
+from rig.core.masking import masked
 
 if TYPE_CHECKING:
     from rig.doctor.finding import Finding
-
-HIDDEN = "***"
-_NAMES = r"[\w.-]*(?:password|passwd|token|secret|signature|credential|key)"
-_SECRET_NAME = re.compile(_NAMES, re.IGNORECASE)
-_IN_URL = re.compile(r"(://[^\s/:@\"']*):[^\s\"']*@")
-_IN_QUERY = re.compile(rf"([?&;]{_NAMES}=)[^&;\s\"']+", re.IGNORECASE)
-_IN_TOML = re.compile(rf"([\"']?\b{_NAMES}[\"']?\s*=\s*)(?:\"[^\"\n]*\"|'[^'\n]*'|[^\s,}}\]]+)", re.IGNORECASE)
 
 
 def write_bundle(settings: Settings, file: Path, findings: "list[Finding]", *, picture: bool) -> None:
     """Write findings, log, configuration and versions into a ZIP file, and with ``picture`` one image of the camera.
 
-    Passwords and tokens are replaced by `HIDDEN`, also those in URLs. What cannot be read is left out; the list
-    ``missing`` in ``versions.json`` has the reason.
+    Passwords and tokens are masked. What cannot be read is left out; the list ``missing`` in ``versions.json`` has the
+    reason.
 
     Raises
     ------
@@ -57,7 +49,7 @@ def write_bundle(settings: Settings, file: Path, findings: "list[Finding]", *, p
         "log.json": log,
     }
     if path := settings.config or default_path():
-        parts["rig.toml"] = lambda: _IN_TOML.sub(rf'\1"{HIDDEN}"', _hidden(path.read_text("utf-8"))).encode()
+        parts["rig.toml"] = lambda: str(masked(path.read_text("utf-8"))).encode()
     if picture:
         parts["camera.png"] = lambda: encode(take(settings)[0].image_bgr)
     for name, read in parts.items():
@@ -76,18 +68,4 @@ def write_bundle(settings: Settings, file: Path, findings: "list[Finding]", *, p
 
 
 def _json(value: Any) -> bytes:
-    return json.dumps(_hidden(value), indent=1, default=str).encode()
-
-
-def _hidden(value: Any) -> Any:
-    """Return a value with `HIDDEN` in the place of passwords and tokens."""
-    if isinstance(value, Mapping):
-        return {
-            key: HIDDEN if item and isinstance(item, str) and _SECRET_NAME.fullmatch(str(key)) else _hidden(item)
-            for key, item in value.items()
-        }
-    if isinstance(value, list | tuple):
-        return [_hidden(item) for item in value]
-    if isinstance(value, str):
-        return _IN_URL.sub(rf"\1:{HIDDEN}@", _IN_QUERY.sub(rf"\1{HIDDEN}", value))
-    return value
+    return json.dumps(masked(value), indent=1, default=str).encode()

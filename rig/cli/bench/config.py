@@ -9,6 +9,7 @@ from rig.cli.ui.command import command
 from rig.cli.ui.complete import config_keys
 from rig.cli.ui.settings import Settings
 from rig.core.errors import ConfigError, UsageError
+from rig.core.masking import masked
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -72,7 +73,7 @@ def show(
 
     every = list(_keys(applied, options))
     rows = [
-        (info, value, layers.below(info))
+        (info, _masked(info, value), [(origin, _masked(info, other)) for origin, other in layers.below(info)])
         for info, value in every
         if is_wanted(info.name) and not (changed and value == info.default)
     ]
@@ -176,11 +177,15 @@ def set_(
     new = with_values(old, {tuple(key.split(".")): parsed(value)})
     if new != old:
         save(target, new)
-    changed = changed_lines(old, new)
+    changed = masked(changed_lines(old, new))
     text = (
         "\n".join([f"{target}:", *changed]) if new != old else f"{target}: no change, the key has this value already."
     )
     settings.say(text, {"path": target, "key": key, "changed": changed})
+
+
+def _masked(info: "KeyInfo", value: Any) -> Any:
+    return masked({info.name: value})[info.name]
 
 
 def _checked(settings: Settings) -> "tuple[Values, RigConfig, dict[str, BaseModel]]":

@@ -3,13 +3,14 @@
 This module imports none of numpy, cv2, scipy and sqlalchemy: `rig --help` must start at once.
 """
 
+import errno
 import functools
 import inspect
 import os
 import signal
 import sys
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -19,7 +20,7 @@ from rig.cli.ui.complete import bench_names
 from rig.cli.ui.exit_codes import EXIT_INTERRUPTED
 from rig.cli.ui.settings import Settings
 from rig.cli.ui.terminal import discard, guarded_output
-from rig.core.errors import OutputFailed, RigError
+from rig.core.errors import OutputFailed, RigError, UsageError
 from rig.core.signals import EXIT_BY_SIGNAL, handle_signals
 
 COMMON: str = "Common options"
@@ -91,7 +92,8 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
         try:
             with guarded_output():
                 try:
-                    function(settings, **values)
+                    with _long_names_are_usage_errors():
+                        function(settings, **values)
                     sys.stdout.flush()
                 except RigError as error:
                     show_error(error, settings)
@@ -114,6 +116,21 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
     # Typer prints single line breaks of a docstring as they are; let it wrap paragraphs to the terminal instead.
     run.__doc__ = "\n\n".join(" ".join(part.split()) for part in (function.__doc__ or "").split("\n\n"))
     return run
+
+
+@contextmanager
+def _long_names_are_usage_errors() -> Iterator[None]:
+    """Raise `UsageError` for a path that the system does not take. Every question about such a file raises an error."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno != errno.ENAMETOOLONG:
+            raise
+        raise UsageError(
+            "The name of a file or of a folder is too long for this computer.",
+            next_step="Give a shorter path.",
+            evidence={"bytes": len(os.fsencode(error.filename or "")), "name": f"{str(error.filename)[:60]}…"},
+        ) from error
 
 
 def without_color() -> None:

@@ -1,5 +1,6 @@
 """Shell completion of names; it offers nothing if something is wrong."""
 
+import os
 from contextlib import closing, suppress
 from importlib.metadata import entry_points
 
@@ -20,7 +21,9 @@ def object_names(ctx: typer.Context, incomplete: str) -> list[str]:
         place = settings.load().catalog_place(settings.bench_name)
         # A server may take long to answer, so its names are those of the last search on this computer.
         path = place.database_file if place.url is None else place.copy_folder / DATABASE_NAME
-        # sqlite3 directly: importing SQLAlchemy takes too long for completion.
+        # sqlite3 directly: importing SQLAlchemy, and with it the check of the folder, takes too long for completion.
+        if os.path.lexists(f"{path}-journal"):
+            return []
         with closing(sqlite3.connect(f"{path.as_uri()}?mode=ro", uri=True, timeout=0.2)) as database:
             rows = database.execute(
                 "SELECT name FROM objects WHERE substr(name, 1, ?) = ? AND deleted_utc IS NULL ORDER BY name",

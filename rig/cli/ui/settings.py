@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rig.core.errors import RigError
+from rig.core.masking import masked
 
 if TYPE_CHECKING:
     from collections.abc import Collection
@@ -60,10 +61,10 @@ class Settings:
         return self._loaded["config"]
 
     def arguments(self) -> list[str]:
-        """Return the arguments that pass these settings to another command."""
+        """Return the arguments that pass these settings to another command, to be shown: without passwords."""
         words = [] if self.bench is None else ["--bench", self.bench]
         words += [] if self.config is None else ["--config", str(self.config)]
-        words += [word for override in self.overrides for word in ("--set", override)]
+        words += [word for override in self.overrides for word in ("--set", masked(override))]
         words += [] if self.seed is None else ["--seed", str(self.seed)]
         return [*words, "--json"] if self.json else words
 

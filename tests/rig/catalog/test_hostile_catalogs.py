@@ -2,9 +2,11 @@
 
 import os
 import random
+import shlex
 import shutil
 import sqlite3
 import stat
+import struct
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
@@ -13,6 +15,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from typer.testing import Result
 
 from rig.catalog import Action, Catalog, migrate
 from rig.catalog.edit import delete
@@ -38,6 +41,7 @@ from tests.rig.catalog.catalog_samples import (
     true_fill,
     without_waiting,
 )
+from tests.rig.cli.noise_photographs import photographs
 
 pytestmark = pytest.mark.sqlite
 
@@ -148,6 +152,124 @@ def test_links_in_the_folder_are_rejected(root: Path, tmp_path: Path, outside: P
         collect_garbage(catalog, old=True)
     assert outside.exists()
     assert other.is_file() or any(other.iterdir())
+
+
+@pytest.mark.parametrize("suffix", ["wal", "shm", "journal"])
+@pytest.mark.parametrize("kind", ["pipe", "hard link", "folder"])
+def test_files_of_sqlite_are_regular_files_with_one_name(root: Path, outside: Path, suffix: str, kind: str) -> None:
+    file = root / f"catalog.sqlite-{suffix}"
+    match kind:
+        case "pipe":
+            os.mkfifo(file)
+        case "hard link":
+            file.hardlink_to(outside)
+        case _:
+            file.mkdir()
+    with pytest.raises(CatalogDamaged, match="leads to another place"):
+        opened(root)
+
+
+def rollback_journal(database: Path, *, names: Path | None) -> bytes:
+    """Return a journal that SQLite plays back. It changes no page, and ``names`` a file that SQLite then deletes."""
+    magic = bytes.fromhex("d9d505f920a163d7")
+    content = database.read_bytes()
+    page_size = int.from_bytes(content[16:18], "big")
+    page = content[:page_size]
+    checksum = sum(page[at] for at in range(page_size - 200, 0, -200))
+    header = magic + struct.pack(">5I", 1, 0, len(content) // page_size, 512, page_size)
+    made = header.ljust(512, b"\0") + struct.pack(">I", 1) + page + struct.pack(">I", checksum)
+    if names is None:
+        return made
+    name = os.fsencode(names)
+    return made + struct.pack(">I", 2**30 // page_size + 1) + name + struct.pack(">2I", len(name), sum(name)) + magic
+
+
+COMMANDS = (
+    *("catalog gc --yes", "catalog verify --repair --jobs 1", "catalog delete mug --yes", "catalog rename mug cup"),
+    *("catalog redescribe --again --jobs 1", "catalog migrate", "catalog label mug lab", "import photographs --jobs 1"),
+    *("enroll cup --views 4", "catalog merge other --jobs 1", "export a.zip", "catalog list", "identify"),
+)
+
+
+@pytest.mark.parametrize("mode", ["wal", "delete"])
+@pytest.mark.parametrize("command", COMMANDS)
+def test_journal_that_names_a_file_is_not_played_back(
+    root: Path, tmp_path: Path, rig: Callable[..., Result], command: str, mode: str
+) -> None:
+    sql(root, f"PRAGMA journal_mode = {mode}")
+    precious = tmp_path / "precious.txt"
+    precious.write_bytes(SECRET)
+    photographs(tmp_path / "photographs", "vase")
+    if "other" in command:
+        root = root.rename(tmp_path / "other")
+    (root / "catalog.sqlite-journal").write_bytes(rollback_journal(root / "catalog.sqlite", names=precious))
+    before = content(root)
+    result = rig(*command.split())
+    assert result.exit_code == 7
+    assert "SQLite would delete the file" in result.stderr
+    assert "rig export" in result.stderr
+    assert precious.read_bytes() == SECRET
+    assert content(root) == before
+
+
+def test_empty_database_with_a_journal_is_not_used(root: Path, outside: Path) -> None:
+    (root / "catalog.sqlite-journal").write_bytes(rollback_journal(root / "catalog.sqlite", names=outside))
+    (root / "catalog.sqlite").write_bytes(b"")
+    with pytest.raises(CatalogDamaged, match="journal of another program"):
+        Catalog.open(root, clock=VirtualClock())
+
+
+@pytest.mark.parametrize("mode", ["wal", "delete"])
+def test_journal_of_another_program_is_not_played_back_unasked(root: Path, tmp_path: Path, mode: str) -> None:
+    """The other program was killed while it changed the catalog; the next step finishes its change."""
+    expected = reported(root)
+    sql(root, "PRAGMA journal_mode = delete")
+    with closing(sqlite3.connect(root / "catalog.sqlite", isolation_level=None)) as connection:
+        for statement in (
+            "PRAGMA cache_size = 1",
+            "BEGIN",
+            "UPDATE views SET azimuth_deg = 1",
+            "DELETE FROM descriptors",
+        ):
+            connection.execute(statement)
+        killed = Path(shutil.copytree(root, tmp_path / "folder"))
+    if mode == "wal":
+        sql(root, "PRAGMA journal_mode = wal")
+        (root / "catalog.sqlite-journal").write_bytes(rollback_journal(root / "catalog.sqlite", names=None))
+        killed = root
+    before = content(killed)
+    for read_only in (True, False):
+        with pytest.raises(CatalogDamaged, match="another program"):
+            Catalog.open(killed, clock=VirtualClock(), read_only=read_only)
+    with pytest.raises(CatalogDamaged, match="another program") as error:
+        migrate(killed, clock=VirtualClock())
+    assert content(killed) == before
+    program, file, statement = shlex.split(error.value.next_step.partition("finish its change: ")[2])
+    assert program == "sqlite3"
+    with closing(sqlite3.connect(file)) as connection:
+        connection.execute(statement).fetchall()
+    assert reported(killed) == expected
+
+
+def test_catalog_that_is_opened_for_writing_has_a_write_ahead_log(root: Path) -> None:
+    sql(root, "PRAGMA journal_mode = delete")
+    with Catalog.open(root, clock=VirtualClock(), read_only=True) as catalog:
+        (finding,) = finished(verify(catalog, jobs=1)).findings
+        assert finding.details == {"setting": "journal", "found": "delete", "stored": "wal"}
+    with opened(root) as catalog:
+        assert finished(verify(catalog, jobs=1)).findings == ()
+    assert (root / "catalog.sqlite").read_bytes()[18:20] == b"\2\2"
+
+
+def test_completion_reads_no_catalog_with_a_journal(root: Path, rig: Callable[..., Result]) -> None:
+    def completed() -> str:
+        return rig(
+            env={"_RIG_COMPLETE": "complete_bash", "COMP_WORDS": "rig catalog show m", "COMP_CWORD": "3"}
+        ).stdout.strip()
+
+    assert completed() == "mug"
+    os.mkfifo(root / "catalog.sqlite-journal")
+    assert completed() == ""
 
 
 @pytest.mark.parametrize("name", ["incoming/link", "lost+found/link"])
@@ -437,3 +559,20 @@ def test_invalid_values_end_in_an_error(root: Path, tmp_path: Path, statement: s
                 reader(catalog, tmp_path)
         except RigError:
             continue
+
+
+@pytest.mark.parametrize(
+    "edit",
+    [
+        "sessions SET empty_table_image_sha256 = '0'",
+        "sessions SET empty_table_image_bytes = -1",
+        "enrollments SET finished_utc = NULL",
+        "views SET image_sha256 = '0'",
+        "views SET session_id = (SELECT max(id) FROM sessions)",
+    ],
+)
+def test_values_that_an_import_rejects_are_not_exported(root: Path, edit: str) -> None:
+    sql(root, "PRAGMA ignore_check_constraints = ON", f"UPDATE {edit}")
+    seal_as_the_sender(root)
+    with opened(root) as catalog, pytest.raises(CatalogDamaged, match="impossible values"):
+        list(read_objects(catalog))

@@ -4,6 +4,8 @@ import json
 import re
 import shlex
 import signal
+import sys
+from contextlib import closing
 from pathlib import Path
 from zipfile import ZipFile
 
@@ -11,8 +13,10 @@ import cv2
 import numpy as np
 import pytest
 
-from rig.catalog import Catalog
+from rig.catalog import Action, Catalog
+from rig.cli.ui.settings import Settings
 from rig.core.clock import SystemClock
+from rig.safety.bench_lock import BenchLock
 from tests.programs import Program, stopping_after_view
 
 SMALL = (
@@ -226,6 +230,49 @@ users = [{{ name = "ada", password = "{secret}" }}]
         assert "w@rd" not in text, (name, text[max(text.index("w@rd") - 300, 0) :][:400])
     assert "ada:***@host.invalid/rig" in texts["rig.toml"]
     assert json.loads(texts["configuration.json"])["bench"]["other"]["api_token"] == "***"
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        *("config show", "config show catalog.url --json", "config set camera.source 7", "config check", "log"),
+        *("doctor", "doctor --json", "status --json", "catalog list", "catalog list --json", "identify", "enroll mug"),
+        "catalog list --set catalog.url=postgresql://ada:w0rd@host.invalid:port/rig",
+        "config show catalog --set catalog.url=postgresql://ada:w0rd@host.invalid/rig",
+        "config check --set servo.baud=a://b:w0rd@c",
+        "config set catalog.url postgresql://ada:w0rd@other.invalid/rig",
+        "config set catalog.images s3://ada:w0rd@bucket",
+        "config set catalog.password w0rd",
+    ],
+)
+def test_passwords_are_shown_nowhere(rig, words):
+    Path("rig.toml").write_text(
+        """
+default_bench = "sim"
+[camera]
+source = "rtsp://me:w0rd@10.0.0.9/live?token=w0rd&size=2"
+[catalog]
+url = "postgresql+psycopg://ada:w0rd@host.invalid/rig"
+"""
+    )
+    done = rig(*words.split())
+    assert done.output
+    assert "w0rd" not in done.output, done.output
+
+
+def test_log_and_users_of_the_bench_hide_passwords(rig, tmp_path, monkeypatch):
+    url = "postgresql://ada:w0rd@host.invalid/rig"
+    with Catalog.open(tmp_path / "catalog", clock=SystemClock()) as catalog:
+        catalog.note(Action.COPIED, origin=url, digest="a1")
+    texts = [rig("log").output, rig("log", "--json").output]
+    assert all("ada:***@host.invalid" in text for text in texts)
+    monkeypatch.setattr(sys, "argv", ["rig", "jog", "--set", f"catalog.url={url}"])
+    with closing(BenchLock(tmp_path / "state" / "hardware", SystemClock())):
+        options = ("--bench", "hardware", "--set", "state_dir=state")
+        texts += [rig(*words, *options).output for words in (["goto", "20"], ["doctor", "--json"])]
+    assert "rig jog --set catalog.url=postgresql://ada:***@host.invalid" in texts[2]
+    assert not [text for text in texts if "w0rd" in text]
+    assert "w0rd" not in str(Settings().merged(None, None, [f"catalog.url={url}"], None, False).arguments())
 
 
 def test_table_rotates_without_a_camera(rig):

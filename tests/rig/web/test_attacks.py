@@ -45,6 +45,15 @@ def test_other_computers_need_a_token_and_its_role_decides(serve):
     assert client.get(f"{API}/me").status_code == 401
 
 
+def test_persons_who_watch_see_no_password(serve):
+    served = serve("catalog.url=postgresql+psycopg://ada:w0rd@host.invalid/rig", needs_login=True)
+    watch = {"Authorization": f"Bearer {served.server.sessions.tokens.new('tablet', Role.WATCH)}"}
+    answer = served.client.get(f"{API}/configuration", headers=watch)
+    assert answer.json()["catalog"]["url"] == "postgresql+psycopg://ada:***@host.invalid/rig"
+    for path in ("configuration", "status", "objects", "log", "jobs", "results", "me"):
+        assert "w0rd" not in served.client.get(f"{API}/{path}", headers=watch).text, path
+
+
 def test_second_operator_needs_the_lease(serve):
     client = serve().client
     first, second = {"X-Rig-Client": "1"}, {"X-Rig-Client": "2"}

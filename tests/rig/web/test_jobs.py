@@ -70,3 +70,13 @@ def test_stop_is_stored_once_for_all_jobs(tmp_path, monkeypatch):
     assert [{job["state"] for job in jobs} for jobs in written] == [{"cancelled"}]
     assert queue.next() is None
     assert queue.submit(HomeRequest(), "anna").id == queue.next().id
+
+
+def test_command_that_continues_a_job_shows_no_password(tmp_path):
+    arguments = ("--set", "catalog.url=postgresql://anna:secret@host/rig")
+    queue = JobQueue(tmp_path, VirtualClock(), lambda _job: None, arguments)
+    queue.submit(EnrollRequest(name="lamp"), "anna")
+    queue.hold()
+    assert "rig enroll lamp" in queue.jobs()[0].command
+    assert "secret" not in queue.jobs()[0].command
+    assert b"secret" not in (tmp_path / "jobs.json").read_bytes()

@@ -121,6 +121,8 @@ class TestHostileBundles:
             (lambda line: view_of(line)["descriptors"][0].update(settings={"region": "evil"}), "settings"),
             (lambda line: view_of(line)["descriptors"][0].update(settings={"region": [0, 0, 99, 99]}), "region"),
             (lambda line: view_of(line)["descriptors"][0].update(version=True), "version"),
+            (lambda line: view_of(line)["descriptors"][0].update(version=2**31), "version"),
+            (lambda line: view_of(line)["descriptors"][0].update(version=2**70), "version"),
             (lambda line: view_of(line).update(captured_utc="9999-12-31T23:59:59-14:00"), "calendar"),
             (lambda line: line.update(created_utc="0001-01-01T00:00:00+14:00"), "calendar"),
             (lambda line: view_of(line).update(segmentation={"issues": 5}), "segmentation"),
