@@ -1,4 +1,4 @@
-"""STOP of a server process: in a browser as people use it, beside exports and silent connections, and of one process."""
+"""STOP of a server process: in a browser as people use it, and beside exports and silent connections."""
 
 import json
 import os
