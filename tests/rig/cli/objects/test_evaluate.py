@@ -310,7 +310,10 @@ def test_evaluations_with_other_settings_have_other_folders(
         assert done.exit_code == 0, done.output
         assert "Written: rig-eval/" in done.stderr
     first, second = sorted(Path("rig-eval").iterdir())
-    assert (first.name[:-9], second.name[:-9]) == ("photographs0-gn-0.01", "photographs0-mb-5-20")
+    assert (first.name[:-9], second.name[:-9]) == (
+        f"{photographs.name}-gn-0.01",
+        f"{photographs.name}-mb-5-20",
+    )
     again = run(photographs, *QUICK, "--noise", "mb:5")
     assert again.exit_code == 2
     assert f"{second}/runs already contains runs" in again.stderr
