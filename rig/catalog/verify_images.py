@@ -10,7 +10,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import null, select
+from sqlalchemy import func, null, select
 
 from hbr.descriptors import descriptor
 from rig.catalog.catalog import Catalog
@@ -149,7 +149,9 @@ def stored_images(catalog: Catalog) -> tuple[list[Item], int]:
         items += [
             Item(*row)
             for row in connection.execute(
-                select(null(), sessions.c.id, *owner, *empty_table, sessions.c.empty_table_image_bytes)
+                select(
+                    null(), sessions.c.id, *owner, *empty_table, func.coalesce(sessions.c.empty_table_image_bytes, 0)
+                )
                 .select_from(objects)
                 .join(enrollments)
                 .join(sessions, sessions.c.enrollment_id == enrollments.c.id)
@@ -157,7 +159,7 @@ def stored_images(catalog: Catalog) -> tuple[list[Item], int]:
             )
         ]
         if catalog.database.has_results:
-            image = (results.c.image, results.c.image_sha256, results.c.image_bytes)
+            image = (results.c.image, results.c.image_sha256, func.coalesce(results.c.image_bytes, 0))
             recorded = select(-results.c.id, *image).where(results.c.image.is_not(None))
             items += [Item(None, None, "", *row) for row in connection.execute(recorded)]
     return items, count

@@ -576,3 +576,23 @@ def test_values_that_an_import_rejects_are_not_exported(root: Path, edit: str) -
     seal_as_the_sender(root)
     with opened(root) as catalog, pytest.raises(CatalogDamaged, match="impossible values"):
         list(read_objects(catalog))
+
+
+def test_images_without_their_size_are_reported(root: Path) -> None:
+    with opened(root) as catalog:
+        record_result(catalog, new_result(), image(1))
+    triggers = ("results_no_update", "results_no_delete")
+    with closing(sqlite3.connect(root / "catalog.sqlite", isolation_level=None)) as connection:
+        sources = [
+            connection.execute("SELECT sql FROM sqlite_master WHERE name = ?", (one,)).fetchone()[0] for one in triggers
+        ]
+        for statement in (
+            *(f"DROP TRIGGER {one}" for one in triggers),
+            "UPDATE results SET image_bytes = NULL",
+            "UPDATE sessions SET empty_table_image_bytes = NULL",
+            *sources,
+        ):
+            connection.execute(statement)
+    with opened(root) as catalog:
+        problems = {one.problem for one in finished(verify(catalog, jobs=1)).findings}
+    assert problems == {"result changed", "enrollment changed"}
