@@ -29,6 +29,7 @@ from rig.web.bench_catalog import BenchCatalog
 from rig.web.guard import Guard, PatientProtocol
 from rig.web.hub import Hub
 from rig.web.link import Link, Message
+from rig.web.priority import WEB, set_priority
 from rig.web.remote_bench import RemoteBench
 from rig.web.server import Server
 from rig.web.setup import Listening, Setup, print_note
@@ -144,6 +145,7 @@ def main(link_descriptor: int, socket_descriptor: int) -> None:
     resource.setrlimit(
         resource.RLIMIT_NOFILE, (MAX_FILES if hard == resource.RLIM_INFINITY else min(hard, MAX_FILES), hard)
     )
+    set_priority(WEB)
     sys.setswitchinterval(SWITCH_S)
     first = threading.Event()
     setups: list[Setup] = []

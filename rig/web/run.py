@@ -26,6 +26,7 @@ from rig.safety.bench_lock import BenchLock
 from rig.safety.saved_state import SERVER_FILE, SERVER_FOLDER, ServerAddress
 from rig.web.bench_side import BenchSide
 from rig.web.link import Link, Message
+from rig.web.priority import BENCH, set_priority
 from rig.web.setup import Listening, Setup, print_note
 
 START_S: Final = 30.0
@@ -68,6 +69,7 @@ def run_server(
         The web process ends again and again.
     """
     clock = SystemClock()
+    set_priority(BENCH)
     _check_certificate(listening)
     token = secrets.token_urlsafe(32)
     setup = Setup(

@@ -3,11 +3,8 @@
 import asyncio
 import hashlib
 import json
-import os
-import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -23,6 +20,7 @@ from rig.core.errors import Forbidden, LoginRequired, RigError, UsageError
 from rig.web.access import LOCAL, Lease, Person, Role, Sessions
 from rig.web.bench_catalog import BenchCatalog
 from rig.web.hub import Hub
+from rig.web.priority import LOW, set_priority
 from rig.web.remote_bench import RemoteBench
 from rig.web.requests import Choice
 
@@ -187,12 +185,7 @@ def require_operate(person: Person) -> None:
 Result = TypeVar("Result")
 
 
-def _step_back() -> None:
-    with suppress(OSError, AttributeError):  # not every system has priorities of threads
-        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 10)
-
-
-_LONG_WORK: Final = ThreadPoolExecutor(2, thread_name_prefix="long", initializer=_step_back)
+_LONG_WORK: Final = ThreadPoolExecutor(2, thread_name_prefix="long", initializer=lambda: set_priority(LOW))
 """Exports, imports, reports and checks: few at a time and at low priority, because STOP shares the interpreter."""
 
 

@@ -118,7 +118,7 @@ for (const [id, kind] of [["home", "home"], ["empty", "empty-table"], ["acknowle
 
 // The live image: one short request after the other. An endless one would occupy one of the browser's few connections.
 
-const PICTURE_MS = 120;
+const PICTURE_MS = 200;
 const STALE_S = 3;
 let takenAt = null;
 
