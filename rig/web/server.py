@@ -20,7 +20,6 @@ from rig.core.errors import Forbidden, LoginRequired, RigError, UsageError
 from rig.web.access import LOCAL, Lease, Person, Role, Sessions
 from rig.web.bench_catalog import BenchCatalog
 from rig.web.hub import Hub
-from rig.web.priority import LOW, set_priority
 from rig.web.remote_bench import RemoteBench
 from rig.web.requests import Choice
 
@@ -185,8 +184,11 @@ def require_operate(person: Person) -> None:
 Result = TypeVar("Result")
 
 
-_LONG_WORK: Final = ThreadPoolExecutor(2, thread_name_prefix="long", initializer=lambda: set_priority(LOW))
-"""Exports, imports, reports and checks: few at a time and at low priority, because STOP shares the interpreter."""
+_LONG_WORK: Final = ThreadPoolExecutor(2, thread_name_prefix="long")
+"""Exports, imports, reports and checks: few at a time, because STOP shares the interpreter.
+
+They have no lower priority: while such a thread waits for its turn of the processor, it may hold the interpreter.
+"""
 
 
 async def long_work(work: Callable[[], Result]) -> Result:
