@@ -1,11 +1,13 @@
 """The REST API: objects, views, import and export."""
 
+import asyncio
+from collections.abc import AsyncIterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated, Any, Final
 
 from fastapi import APIRouter, Query, Request, Response
-from fastapi.responses import FileResponse
+from fastapi.responses import StreamingResponse
 from pydantic import Field
 from starlette.background import BackgroundTask
 
@@ -32,9 +34,32 @@ from rig.web.server import (
 
 THUMB_PX: Final = 256
 UPLOAD: Final = f"{API}/import"
+CHUNK_BYTES: Final = 65_536
+BYTES_PER_S: Final = 30_000_000
+
+
+class _Download:
+    """Sends files at `BYTES_PER_S` for all receivers together, so that STOP does not wait behind their data."""
+
+    def __init__(self) -> None:
+        self._next_s = 0.0
+
+    async def stream(self, path: Path) -> AsyncIterator[bytes]:
+        """Yield the content of a file."""
+        from anyio import open_file
+
+        loop = asyncio.get_running_loop()
+        async with await open_file(path, "rb") as file:
+            while chunk := await file.read(CHUNK_BYTES):
+                begin_s = max(loop.time(), self._next_s)
+                self._next_s = begin_s + len(chunk) / BYTES_PER_S
+                await asyncio.sleep(begin_s - loop.time())
+                yield chunk
 
 
 def add_catalog(api: APIRouter, server: Server) -> None:
+    download = _Download()
+
     @api.get("/objects", tags=["catalog"])
     def objects(
         request: Request,
@@ -145,10 +170,10 @@ def add_catalog(api: APIRouter, server: Server) -> None:
                     await to_thread.run_sync(file.write, chunk)
             return await long_work(lambda: _import(server, path, on_conflict))
 
-    @api.get("/export", tags=["catalog"], response_class=FileResponse)
+    @api.get("/export", tags=["catalog"], response_class=StreamingResponse)
     async def export(
         _person: Watcher, name: Annotated[list[str] | None, Query(description="default: all objects")] = None
-    ) -> FileResponse:
+    ) -> StreamingResponse:
         """Return a bundle with objects."""
         folder = TemporaryDirectory(prefix="rig-export-")
         path = Path(folder.name) / "catalog.rigcat.zip"
@@ -162,8 +187,15 @@ def add_catalog(api: APIRouter, server: Server) -> None:
         except BaseException:
             folder.cleanup()
             raise
-        return FileResponse(
-            path, media_type="application/zip", filename="catalog.rigcat.zip", background=BackgroundTask(folder.cleanup)
+        headers = {
+            "Content-Length": str(path.stat().st_size),
+            "Content-Disposition": 'attachment; filename="catalog.rigcat.zip"',
+        }
+        return StreamingResponse(
+            download.stream(path),
+            media_type="application/zip",
+            headers=headers,
+            background=BackgroundTask(folder.cleanup),
         )
 
 
