@@ -1,6 +1,7 @@
 """Defects of dynamixel-sdk 4.1, one test for each: the rig is not affected."""
 
 import os
+import re
 import threading
 import time
 from contextlib import suppress
@@ -13,7 +14,7 @@ import numpy as np
 import pytest
 import serial
 from dynamixel_sdk import COMM_SUCCESS, PortHandler, Protocol2PacketHandler
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 import rig.devices
@@ -135,13 +136,15 @@ def test_alert_bit_does_not_invalidate_data() -> None:
 
 @fuzz_settings(0.3)
 @given(data=tricky)
+@example(data=b"\xff\xff\xff\xff\xfd\xfd")  # without its stuffed headers, the rest would look like a header
 def test_header_in_data_is_stuffed(data: bytes) -> None:
     bus, wire = scripted_bus()
     Packets2().send(bus.port, 1, WRITE, b"\x54\0" + data)
     (packet,) = PacketParser().feed(wire.written[0])
     assert packet.intact
     assert packet.parameters == b"\x54\0" + data
-    assert b"\xff\xff\xfd" not in wire.written[0][3:].replace(b"\xff\xff\xfd\xfd", b"")
+    after_header = wire.written[0][4:-2]  # the CRC is not stuffed
+    assert not re.search(rb"\xff\xff\xfd(?!\xfd)", after_header)
 
 
 def test_sdk_does_not_stuff() -> None:
