@@ -35,9 +35,10 @@ web: $(READY) $(LIBRARY)
 test: $(READY) $(LIBRARY)
 	@$(BIN)/python -m pytest -n auto --dist worksteal -rs
 
-# This also selects the tests marked nightly. It leaves out the kernel tests, which need the whole computer.
+# This also selects the tests marked nightly. It leaves out the kernel tests, which need the whole computer. With so many
+# cases, one test may take minutes, so the limit that ends a test that hangs is longer.
 test-nightly: $(READY) $(LIBRARY)
-	@$(BIN)/python -m pytest -n auto --dist worksteal -rs -m "not kernel" --hypothesis-profile=nightly
+	@$(BIN)/python -m pytest -n auto --dist worksteal -rs -m "not kernel" --timeout 1800 --hypothesis-profile=nightly
 
 # Kill the program a hundred times at different points of eleven kinds of work, or a thousand times with KILLS=90.
 KILLS ?= 8

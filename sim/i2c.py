@@ -333,6 +333,11 @@ class RoutedFile:
             self._fd = None
 
 
+def open_files() -> int:
+    """Return the number of simulated I2C buses that are open."""
+    return len(_routed)
+
+
 def _file_key(fd: int) -> _FileKey:
     status = os.fstat(fd)
     return status.st_dev, status.st_ino

@@ -65,9 +65,12 @@ def _from_pieces(start_s: float, position: float, velocity: float, pieces: list[
         if duration <= 0:
             continue
         rotation = -v / a if a and v else 0.0
-        for d in (rotation, duration - rotation) if 0 < rotation < duration else (duration,):
+        if 0 < rotation < duration:
             rows.append((t, x, v, a))
-            t, x, v = t + d, x + v * d + 0.5 * a * d * d, v + a * d
+            t, x, v = t + rotation, x + 0.5 * v * rotation, 0.0  # not a rounded speed in the former direction
+            duration -= rotation
+        rows.append((t, x, v, a))
+        t, x, v = t + duration, x + v * duration + 0.5 * a * duration * duration, v + a * duration
     rows.append((t, x, v, 0.0))
     columns = np.array(rows, dtype=np.float64).T
     return Trajectory(*(np.ascontiguousarray(c) for c in columns))

@@ -24,6 +24,7 @@ from rig.cli.main import app
 from rig.config import load_config
 from rig.config.values import APP
 from sim.bench import ShelfOperator, open_sim_bench
+from sim.i2c import open_files
 from sim.noise import NoiseModel
 from sim.objects.shelf import shelf
 from sim.world import World
@@ -106,6 +107,14 @@ def _nobodys_home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
         for folder in ("CONFIG", "DATA", "STATE", "CACHE"):
             patch.setenv(f"XDG_{folder}_HOME", str(home / folder.lower()))
         yield
+
+
+@pytest.fixture(autouse=True)
+def _buses_are_closed() -> Iterator[None]:
+    """Find simulated I2C buses that a test leaves open: each one holds a file descriptor until the process ends."""
+    before = open_files()
+    yield
+    assert open_files() <= before, "a simulated I2C bus is still open: close it, or use it in a with block"
 
 
 @pytest.fixture

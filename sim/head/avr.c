@@ -369,11 +369,12 @@ uint32_t board_take(struct board *b, struct board_output *outputs, uint32_t room
 
 /* -- running ------------------------------------------------------------------------------------------------------- */
 
-static avr_cycle_count_t nothing(struct avr_t *avr, avr_cycle_count_t when, void *param) {
+/* Due again in the next cycle. If it were due once, in the very cycle in which the firmware begins to sleep, simavr would
+ * sleep on to its next timer. */
+static avr_cycle_count_t end_of_run(struct avr_t *avr, avr_cycle_count_t when, void *param) {
     (void)avr;
-    (void)when;
     (void)param;
-    return 0;
+    return when + 1;
 }
 
 static uint64_t earliest(uint64_t a, uint64_t b) {
@@ -385,7 +386,7 @@ static void run_to(struct board *b, uint64_t cycle) {
     avr_t *avr = b->avr;
     if (cycle_now(b) < cycle) {
         /* The timer ends a sleep or a burst of instructions at this cycle. */
-        avr_cycle_timer_register(avr, cycle - cycle_now(b), nothing, b);
+        avr_cycle_timer_register(avr, cycle - cycle_now(b), end_of_run, b);
     }
     while (cycle_now(b) < cycle) {
         b->last = avr->cycle;
@@ -395,6 +396,7 @@ static void run_to(struct board *b, uint64_t cycle) {
             return;
         }
     }
+    avr_cycle_timer_cancel(avr, end_of_run, b);
 }
 
 void board_run(struct board *b, uint64_t ns) {

@@ -54,9 +54,10 @@ _G = 9.80665
 class SimBno055:
     """The sensor on the platter; an `sim.i2c.I2cDevice`.
 
-    Interface to the world: `inertial` (bias, gain and vertical of this part), `temperature_c`, `chip_id`,
-    `power_cycle`, `run_clock`, `fail` (the fusion stops with an error), and `distortions`: each receives words like
-    those of the MPU-6050, int16 (n, 7), and returns those that the fusion uses.
+    Interface to the world: `inertial` (bias, gain and vertical of this part), `yaw_deg` (the rotation that its fusion
+    has measured up to the last reading), `temperature_c`, `chip_id`, `power_cycle`, `run_clock`, `fail` (the fusion
+    stops with an error), and `distortions`: each receives words like those of the MPU-6050, int16 (n, 7), and returns
+    those that the fusion uses.
     """
 
     def __init__(self, world: World, *, address: int = 0x28, chip_id: int = 0xA0) -> None:
@@ -89,7 +90,7 @@ class SimBno055:
         self._silent_until_ns = self._clock.now_ns() + round(SILENT_S * 1e9)
         self._pointer, self._pointed = 0, True
         self._switching_until_ns = 0
-        self._yaw_deg = 0.0
+        self.yaw_deg = 0.0
         self._bias_dps: Floats = np.zeros(3)
         self._recent: Floats = np.empty((0, 3))
         self._begin()
@@ -182,7 +183,7 @@ class SimBno055:
         cuts = range(begun - begun % CHECK_TICKS + CHECK_TICKS, due + 1, CHECK_TICKS)
         parts = np.split(gyro, [cut - begun for cut in cuts])
         for i, part in enumerate(parts):
-            self._yaw_deg += float(((part - self._bias_dps) @ up).sum()) * TICK_NS * 1e-9
+            self.yaw_deg += float(((part - self._bias_dps) @ up).sum()) * TICK_NS * 1e-9
             self._recent = np.concatenate([self._recent, part])[-REST_TICKS:]
             if i < len(cuts):
                 self._learn_bias()
@@ -218,7 +219,7 @@ class SimBno055:
         gravity = self.inertial.up * (1000.0 if units & 0x01 else _G * 100.0)
         rate = rate_dps * (radians(1.0) * 900.0 if units & 0x02 else 16.0)
         angle = 900.0 * radians(1.0) if units & 0x04 else 16.0
-        heading_deg = -self._yaw_deg % 360.0  # a clockwise rotation increases it
+        heading_deg = -self.yaw_deg % 360.0  # a clockwise rotation increases it
         words = np.zeros(22)
         words[0:3], words[6:9], words[9] = force, rate, heading_deg * angle
         words[12:16] = self._quaternion() * 2**14
@@ -231,6 +232,6 @@ class SimBno055:
         x, y, z = self.inertial.up
         half = np.array([1.0 + z, y, -x, 0.0])  # rotates the sensor's vertical to the world's
         tilt = half / np.linalg.norm(half)
-        c, s = cos(self._yaw_deg * pi / 360), sin(self._yaw_deg * pi / 360)
+        c, s = cos(self.yaw_deg * pi / 360), sin(self.yaw_deg * pi / 360)
         w, i, j, k = tilt
         return np.array([c * w - s * k, c * i - s * j, c * j + s * i, c * k + s * w])

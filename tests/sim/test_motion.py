@@ -4,7 +4,7 @@ from math import sqrt
 
 import numpy as np
 import pytest
-from hypothesis import assume, given
+from hypothesis import assume, example, given
 from hypothesis import strategies as st
 
 from sim.motion import Platter, Trajectory, dragged, rest, to_position, to_velocity
@@ -31,6 +31,11 @@ def trajectories(draw: st.DrawFn) -> Trajectory:
         t += draw(st.floats(0.01, 5.0))
         x, v = (float(value) for value in path.at(t))
     return path
+
+
+def inner_knots(path: Trajectory, step_s: float) -> np.ndarray:
+    """Return the times between pieces that are later than the beginning by a step; before it, nothing moves."""
+    return path.start_s[1:][path.start_s[1:] - step_s >= path.start_s[0]]
 
 
 def samples(path: Trajectory, n: int = 400, beyond_s: float = 1.0) -> np.ndarray:
@@ -81,14 +86,14 @@ def test_move_from_rest_takes_the_closed_forms_time(x: float, goal: float, v_max
 @quick
 @given(trajectories())
 def test_position_and_velocity_are_continuous_and_pieces_monotone(path: Trajectory) -> None:
-    knots = path.start_s[1:]
     step = 1e-7
+    knots = inner_knots(path, step)
     before, after = path.at(knots - step), path.at(knots)
     scale = 1e-6 + step * 4_000
     assert np.abs(after[0] - before[0] - before[1] * step).max(initial=0) <= 1e-6
     assert np.abs(after[1] - before[1]).max(initial=0) <= scale
     # The platter relies on it: within a piece the shaft does not turn back.
-    v, a = path.velocity_dps[: len(knots)], path.acceleration_dps2[: len(knots)]
+    v, a = path.velocity_dps[:-1], path.acceleration_dps2[:-1]
     assert np.all(v * (v + a * np.diff(path.start_s)) >= -1e-6)
 
 
@@ -212,8 +217,11 @@ def test_vibration_continues_from_piece_to_piece_and_from_motion_to_motion(
     def deflection(followed: Platter, times: np.ndarray) -> np.ndarray:
         return followed.at(times) - followed.shaft.at(times)[0]
 
+    # With the deflection's acceleration d'', its mean speeds over h before and after a knot differ by h * max|d''| at
+    # most. A change of the shaft's acceleration by c changes d'' by 1.02 c at most, and this decays. The first path has
+    # at most six changes of 4,000 °/s², the second one of 300 °/s²: the difference is below 0.3 °/s.
     for followed in (first, second):
-        knots = followed.shaft.start_s[1:]
+        knots = inner_knots(followed.shaft, h)
         before = (deflection(followed, knots) - deflection(followed, knots - h)) / h
         after = (deflection(followed, knots + h) - deflection(followed, knots)) / h
         assert after == pytest.approx(before, abs=0.5)
@@ -260,6 +268,7 @@ def test_move_interrupted_by_another_leaves_no_jump(
 
 @quick
 @given(trajectories(), st.floats(0, 3), st.floats(-1, 1), st.floats(-1, 1))
+@example(to_velocity(1.0, -0.9, -1.0, 15.0, 103.0), 1.0, 0.0, 0.0)  # its speed at the standstill is rounded
 def test_dragged_shaft_stays_within_the_error_that_overcomes_friction(
     path: Trajectory, half: float, load: float, start: float
 ) -> None:

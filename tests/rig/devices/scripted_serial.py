@@ -13,6 +13,7 @@ class ScriptedSerial:
     def __init__(self, clock: VirtualClock, answers: Iterable[bytes]) -> None:
         self.baudrate = 1_000_000
         self.written: list[bytes] = []
+        self.written_ns: list[int] = []
         self._clock = clock
         self._answers: Iterator[bytes] = iter(answers)
         self._waiting = bytearray()
@@ -31,6 +32,7 @@ class ScriptedSerial:
 
     def write(self, data: bytes, /) -> int:
         self.written.append(bytes(data))
+        self.written_ns.append(self._clock.now_ns())
         self._waiting += next(self._answers, b"")
         return len(data)
 

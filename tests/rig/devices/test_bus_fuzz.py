@@ -94,7 +94,11 @@ def intact(stream: bytes, protocol: int) -> list[bytes]:
 @fuzz_settings()
 @given(data=st.data(), value=st.integers(0, 0xFFFF_FFFF))
 def test_read_block_was_sent_by_the_device(protocol: int, data: st.DataObject, value: int) -> None:
-    """Four bytes, three attempts: the value of an intact packet with four parameters, a rejection, or silence."""
+    """Four bytes, three attempts: the value of an intact packet with four parameters, a rejection, or silence.
+
+    The value is that of the reading which the driver dates by `sampled_ns`. One that follows only confirms it, and may
+    differ: of the damaged packets, one in 256 passes the checksum of Protocol 1.0.
+    """
     block = value.to_bytes(4, "little")
     # The driver asks for one byte more each time an answer is owed, from one address lower.
     sent = [b"\x55" * extra + block for extra in range(3)]
@@ -106,7 +110,7 @@ def test_read_block_was_sent_by_the_device(protocol: int, data: st.DataObject, v
     except (DeviceSilent, RequestRejected):
         pass
     else:
-        attempt = len(wire.written) - 1
+        attempt = sum(sent_ns <= bus.sampled_ns for sent_ns in wire.written_ns) - 1
         assert got in [parameters[attempt:] for parameters in intact(answers[attempt], protocol)]
     assert clock.now_ns() < ANSWER_S * 1e9
     assert not bus.port.is_using

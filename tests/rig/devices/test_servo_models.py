@@ -25,7 +25,9 @@ from tests.fuzzing import examples
 
 
 def parts_of(*overrides: str, noise: NoiseModel | None = None) -> SimDevices:
-    return SimDevices.connected(load_config(None, overrides), World(noise=noise or NoiseModel.none()))
+    """Return simulated devices with the IMU's bus closed: only the servo is used."""
+    with SimDevices.connected(load_config(None, overrides), World(noise=noise or NoiseModel.none())) as devices:
+        return devices
 
 
 def servo_of(devices: SimDevices, *overrides: str, write: bool = True) -> RegisterServo:
