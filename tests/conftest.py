@@ -109,9 +109,9 @@ def _nobodys_home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
         yield
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture(autouse=True, scope="module")
 def _buses_are_closed() -> Iterator[None]:
-    """Find simulated I2C buses that a test leaves open: each one holds a file descriptor until the process ends."""
+    """Find simulated I2C buses that a module leaves open: each one holds a file descriptor until the process ends."""
     before = open_files()
     yield
     assert open_files() <= before, "a simulated I2C bus is still open: close it, or use it in a with block"
