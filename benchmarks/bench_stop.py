@@ -75,6 +75,7 @@ def main() -> None:
                 stop = situation(bench, held)
                 rows[name] = [bench.measure(stop) for _ in range(options.runs)]
             print(f"{name:60s} {words(rows[name])}", flush=True)
+        print(f"Motions that failed to start, and were started again: {bench.failed_starts}")
     if options.out:
         options.out.write_text(json.dumps(rows))
 
@@ -109,6 +110,7 @@ class ServedBench:
         self.url = url
         self.token = token
         self.state = folder / "state" / "sim-bench"
+        self.failed_starts = 0
 
     def call(self, path: str, body: object = None, token: str | None = None) -> dict:
         data = None if body is None else json.dumps(body).encode()
@@ -131,8 +133,11 @@ class ServedBench:
         while (status := self.call("status")).get("job") or not status["open"]:
             CLOCK.sleep(0.05)
         target_deg = -350 if (status.get("table_deg") or 0.0) > 0 else 350
-        self.call("jobs", {"kind": "goto", "angle_deg": target_deg})
+        job = self.call("jobs", {"kind": "goto", "angle_deg": target_deg})
         while not self.call("status").get("servo", {}).get("moving"):
+            if self.call(f"jobs/{job['id']}")["state"] == "failed":  # the simulated bus was too slow at this load
+                self.failed_starts += 1
+                return self.measure(stop)
             CLOCK.sleep(0.05)
         CLOCK.sleep(random.uniform(0.3, 0.8))
         began_ns = stop()
