@@ -10,6 +10,9 @@ WEB: Final = -5
 
 
 def set_priority(nice: int) -> None:
-    """Give this process a priority; without the right to it, nothing changes. Called before threads start."""
+    """Give the calling thread, and those that it starts, a priority; without the right to it, nothing changes.
+
+    All threads of an interpreter need the same one: while a thread waits for the processor, it may hold the interpreter.
+    """
     with suppress(OSError, AttributeError):
         os.setpriority(os.PRIO_PROCESS, 0, nice)

@@ -69,7 +69,6 @@ def run_server(
         The web process ends again and again.
     """
     clock = SystemClock()
-    set_priority(BENCH)
     _check_certificate(listening)
     token = secrets.token_urlsafe(32)
     setup = Setup(
@@ -77,6 +76,7 @@ def run_server(
     )
     folder = setup.state_folder / SERVER_FOLDER
     lock = BenchLock(folder, clock)  # one server for each bench
+    set_priority(BENCH)
     try:
         side = BenchSide(setup, folder, clock, print_note)
         with _socket(listening) as connection:

@@ -185,10 +185,7 @@ Result = TypeVar("Result")
 
 
 _LONG_WORK: Final = ThreadPoolExecutor(2, thread_name_prefix="long")
-"""Exports, imports, reports and checks: few at a time, because STOP shares the interpreter.
-
-They have no lower priority: while such a thread waits for its turn of the processor, it may hold the interpreter.
-"""
+"""Exports, imports, reports and checks: few at a time, because STOP shares the interpreter."""
 
 
 async def long_work(work: Callable[[], Result]) -> Result:
