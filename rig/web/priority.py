@@ -12,7 +12,7 @@ WEB: Final = -5
 def set_priority(nice: int) -> None:
     """Give the calling thread, and those that it starts, a priority; without the right to it, nothing changes.
 
-    All threads of an interpreter need the same one: while a thread waits for the processor, it may hold the interpreter.
+    All threads of an interpreter need the same one: a thread that waits for the processor may hold the interpreter.
     """
     with suppress(OSError, AttributeError):
         os.setpriority(os.PRIO_PROCESS, 0, nice)
