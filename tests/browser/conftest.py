@@ -62,20 +62,31 @@ def serve_process(tmp_path: Path) -> Iterator[Callable[..., ServerProcess]]:
 
 
 @pytest.fixture(scope="session")
-def chromium() -> Iterator[Any]:
-    """A headless Chromium of the system."""
+def launch() -> Iterator[Callable[..., Any]]:
+    """Return a function that starts a headless Chromium of the system, with options of the test driver."""
     playwright = pytest.importorskip("playwright.sync_api", reason="Playwright is missing: make test-web installs it")
     if CHROMIUM is None:
         pytest.skip("Chromium is missing: apt-get install chromium")
     # The path of a socket has at most 107 characters, and the folder of the tests of one process takes most of them.
     with playwright.sync_playwright() as driver, TemporaryDirectory(dir="/tmp", ignore_cleanup_errors=True) as short:
-        browser = driver.chromium.launch(
-            executable_path=CHROMIUM,
-            env={**os.environ, "TMPDIR": short},
-            args=["--no-sandbox", "--disable-gpu", "--disable-background-networking", "--disable-component-update"],
-        )
-        yield browser
-        browser.close()
+
+        def start(**options: Any) -> Any:
+            return driver.chromium.launch(
+                executable_path=CHROMIUM,
+                env={**os.environ, "TMPDIR": short},
+                args=["--no-sandbox", "--disable-gpu", "--disable-background-networking", "--disable-component-update"],
+                **options,
+            )
+
+        yield start
+
+
+@pytest.fixture(scope="session")
+def chromium(launch: Callable[..., Any]) -> Iterator[Any]:
+    """A Chromium as the test driver starts it."""
+    browser = launch()
+    yield browser
+    browser.close()
 
 
 @pytest.fixture

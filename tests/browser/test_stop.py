@@ -2,17 +2,15 @@
 
 import json
 import os
-import shutil
 import signal
 import socket
 import subprocess
 import threading
 import urllib.error
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, suppress
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -23,7 +21,6 @@ from tests.browser.conftest import RIG
 
 pytestmark = pytest.mark.nightly  # make test-web runs them
 CLOCK = SystemClock()
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 PAGES = ("settings", "identify", "catalog", "calibrations", "runs", "log")
 WAIT_MS = 30_000
 SLOW = ("bench.sim.speed=1", "table.velocity_dps=20")
@@ -31,20 +28,11 @@ SLOW = ("bench.sim.speed=1", "table.velocity_dps=20")
 
 
 @pytest.fixture
-def browser() -> Iterator[Any]:
+def browser(launch: Callable[..., Any]) -> Iterator[Any]:
     """A Chromium with its back/forward cache, which the test driver switches off by default."""
-    playwright = pytest.importorskip("playwright.sync_api", reason="Playwright is missing: make test-web installs it")
-    if CHROMIUM is None:
-        pytest.skip("Chromium is missing: apt-get install chromium")
-    with playwright.sync_playwright() as driver, TemporaryDirectory(dir="/tmp", ignore_cleanup_errors=True) as short:
-        browser = driver.chromium.launch(
-            executable_path=CHROMIUM,
-            env={**os.environ, "TMPDIR": short},
-            args=["--no-sandbox", "--disable-gpu", "--disable-background-networking", "--disable-component-update"],
-            ignore_default_args=["--disable-back-forward-cache"],
-        )
-        yield browser
-        browser.close()
+    browser = launch(ignore_default_args=["--disable-back-forward-cache"])
+    yield browser
+    browser.close()
 
 
 def call(server: Any, path: str, body: Any = None, method: str | None = None) -> Any:
