@@ -14,7 +14,7 @@ help:
 	@echo "make demo   enroll and find objects on the simulated bench, and write rig-demo/report.html"
 	@echo "make web    show the simulated bench in a browser"
 	@echo "make test   run the tests (two to four minutes on two idle cores)"
-	@echo "make test-nightly  run all tests, with many more cases in each (25 minutes on two cores, then those of make fuzz)"
+	@echo "make test-nightly  run all tests, with many more cases in each (25 minutes on two cores, and those of make fuzz)"
 	@echo "make test-kills  kill the program at a hundred points of its work, and check the stored data"
 	@echo "make test-web   test the pages in a real browser, and attack the server"
 	@echo "make kernel-test  run the program with Linux's real drivers in a virtual machine"
