@@ -155,7 +155,7 @@ class WebProcess:
         with theirs:
             descriptors = (theirs.fileno(), self._connection.fileno())
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "rig.web.front", *map(str, descriptors)],
+                [sys.executable, "-P", "-m", "rig.web.front", *map(str, descriptors)],
                 pass_fds=descriptors,
                 stdin=subprocess.DEVNULL,
                 start_new_session=True,  # Ctrl+C of the terminal is for this process only
