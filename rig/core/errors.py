@@ -327,13 +327,9 @@ class JobRejected(RigError, code=903, title="job rejected"):
     """The job cannot do that in its state, or too many jobs wait."""
 
 
-class TooManyLogins(RigError, code=904, title="too many logins"):
-    """Too many wrong tokens came from one address."""
-
-
-class TooManyListeners(RigError, code=905, title="too many listeners"):
+class TooManyListeners(RigError, code=904, title="too many listeners"):
     """Too many streams of events or pictures of the server are open."""
 
 
-class WebEnded(RigError, code=906, title="web process"):
+class WebEnded(RigError, code=905, title="web process"):
     """The process that answers the web ends again and again."""

@@ -99,12 +99,6 @@ class StopListener:
         with self._lock:
             self._requests += 1
 
-    @property
-    def waits(self) -> bool:
-        """Whether a program waits for an answer."""
-        with self._lock:
-            return bool(self._waiting)
-
     def answer(self, answer: StopAnswer) -> None:
         """Answer all who wait, after the stop was carried out."""
         with self._lock:

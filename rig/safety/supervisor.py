@@ -162,7 +162,7 @@ class Safety:
         """
         if self._store.stop_requested():
             self._store.clear_stop()
-            raise _stopped()
+            raise stopped()
         if self.state in (TableState.CONNECTED, TableState.UNREFERENCED, TableState.READY):
             try:
                 self._check_angle()
@@ -255,7 +255,7 @@ class Safety:
         Called in each round of the control loop.
         """
         if self._store.stop_requested():
-            raise _stopped()
+            raise stopped()
         self._run_monitors()
 
     def end_session(self, ended: SessionEnd) -> None:
@@ -434,7 +434,8 @@ def _watchdog_finding(condition: ServoCondition, last: SavedSession | None) -> s
     return f"the servo's watchdog was still armed: {program} was killed during a motion"
 
 
-def _stopped() -> MotionStopped:
+def stopped() -> MotionStopped:
+    """Return the error of a motion that the operator stopped."""
     return MotionStopped(
         "STOP or `rig stop` stopped the table; its torque is off.",
         next_step="Run the command again when the table may move; continue an enrollment with --resume.",

@@ -25,7 +25,6 @@ from rig.core.errors import (
     LeaseHeld,
     LoginRequired,
     StateNotStored,
-    TooManyLogins,
     os_errors_as,
 )
 from rig.core.files import read, write
@@ -38,10 +37,6 @@ SESSION_S: Final = 12 * 3600.0
 MAX_SESSIONS: Final = 1000
 LEASE_S: Final = 45.0
 """Time after which a lease that is not renewed is free, because the operator's browser was closed."""
-FREE_ATTEMPTS: Final = 5
-WINDOW_S: Final = 60.0
-"""After `FREE_ATTEMPTS` wrong tokens within this time from one address, further wrong ones get another answer."""
-MAX_ADDRESSES: Final = 10_000
 MAX_ASKED: Final = 100
 
 
@@ -197,27 +192,18 @@ class _Session:
 
 @dataclass(slots=True)
 class Sessions:
-    """Logins of browsers, and wrong tokens by address, in memory: after a restart, all users log in again."""
+    """Logins of browsers, in memory: after a restart, all users log in again."""
 
     tokens: Tokens
     clock: Clock
     local_token: str = field(default_factory=lambda: PREFIX + secrets.token_urlsafe(32), repr=False)
     """Lets commands of the same user on this computer watch; it ends with the server."""
     _sessions: dict[str, _Session] = field(default_factory=dict)
-    _failures: dict[str, list[int]] = field(default_factory=dict)
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
-    def login(self, token: str, address: str) -> tuple[str, Person]:
-        """Return the secret of a new session and its person.
-
-        Raises
-        ------
-        LoginRequired
-            The token is unknown or has expired.
-        TooManyLogins
-            Too many wrong tokens came from this address.
-        """
-        stored = self.verify(token, address)
+    def login(self, token: str) -> tuple[str, Person]:
+        """Return the secret of a new session and its person; errors as `verify`."""
+        stored = self.verify(token)
         secret = secrets.token_urlsafe(32)
         person = Person(stored.name, stored.role)
         with self._lock:
@@ -226,26 +212,26 @@ class Sessions:
             self._sessions[secret] = _Session(person, stored.sha256, self.clock.now_ns())
         return secret, person
 
-    def verify(self, token: str, address: str) -> StoredToken:
-        """Return the token that was given; errors as `login`."""
-        now_ns = self.clock.now_ns()
+    def verify(self, token: str) -> StoredToken:
+        """Return the token that was given.
+
+        Wrong tokens lock no one out: a token cannot be guessed, and its owner may have to stop the table.
+
+        Raises
+        ------
+        LoginRequired
+            The token is unknown or has expired.
+        ConfigError
+            The file of the tokens is damaged.
+        """
         if hmac.compare_digest(token.encode(errors="replace"), self.local_token.encode()):
             return StoredToken(name=LOCAL, role=Role.WATCH, sha256=_hash(token), created_utc=self.clock.utc())
         stored = self.tokens.valid(_hash(token))
-        if stored is not None:
-            return stored  # right tokens are never locked out: their owner may have to stop the table
-        with self._lock:
-            recent = [at for at in self._failures.get(address, []) if seconds_between(at, now_ns) < WINDOW_S]
-            if len(recent) >= FREE_ATTEMPTS:
-                raise TooManyLogins(
-                    "Too many wrong tokens came from this address.", next_step=f"Wait {WINDOW_S:.0f} s, then try again."
-                )
-            if len(self._failures) >= MAX_ADDRESSES:
-                self._failures.clear()
-            self._failures[address] = [*recent, now_ns]
-        raise LoginRequired(
-            "The token is unknown or has expired.", next_step="Make a new one: rig serve --new-token NAME"
-        )
+        if stored is None:
+            raise LoginRequired(
+                "The token is unknown or has expired.", next_step="Make a new one: rig serve --new-token NAME"
+            )
+        return stored
 
     def find(self, secret: str) -> Person | None:
         """Return the person of a session; None if it has ended or its token was removed."""

@@ -16,9 +16,9 @@ def add_access(api: APIRouter, server: Server) -> None:
         return {"status": "ok", "version": version("hbr-rig"), "bench_open": bool(status.get("open"))}
 
     @api.post("/login", tags=["access"])
-    def login(body: LoginBody, request: Request, response: Response) -> dict[str, Any]:
+    def login(body: LoginBody, response: Response) -> dict[str, Any]:
         """Log in with a token; the answer sets a cookie."""
-        secret, person = server.sessions.login(body.token, request.client.host if request.client else "")
+        secret, person = server.sessions.login(body.token)
         response.set_cookie(COOKIE, secret, httponly=True, samesite="strict", secure=server.secure_cookies, path="/")
         return {"name": person.name, "role": person.role}
 

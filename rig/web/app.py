@@ -32,7 +32,6 @@ _ERRORS: Final[dict[int | str, dict[str, Any]]] = {
         (421, "Wrong host name"),
         (422, "Not valid"),
         (423, "Another operator has the lease"),
-        (429, "Too many logins"),
         (503, "The bench or the catalog is not available"),
     )
 }
@@ -59,8 +58,7 @@ def create_app(server: Server) -> FastAPI:
 
     @app.exception_handler(RigError)
     async def rig_error(_request: Request, error: RigError) -> JSONResponse:
-        headers = {"Retry-After": "60"} if status_of(error) == 429 else None
-        return JSONResponse(problem(error), status_of(error), headers=headers, media_type=MEDIA_TYPE)
+        return JSONResponse(problem(error), status_of(error), media_type=MEDIA_TYPE)
 
     @app.exception_handler(RequestValidationError)
     async def not_valid(_request: Request, error: RequestValidationError) -> Response:

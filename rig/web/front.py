@@ -1,6 +1,7 @@
 """The web process of a server: pages, REST API, events, exports. It owns no device.
 
-`rig.web.run` starts it as ``python -m rig.web.front LINK SOCKET``, with the numbers of two inherited descriptors.
+`rig.web.run` starts it as ``python -m rig.web.front LINK SOCKET``, with the numbers of two inherited descriptors, and
+the set-up as JSON on standard input.
 """
 
 import asyncio
@@ -147,38 +148,19 @@ def main(link_descriptor: int, socket_descriptor: int) -> None:
     )
     set_priority(WEB)
     sys.setswitchinterval(SWITCH_S)
-    first = threading.Event()
-    setups: list[Setup] = []
-    parts: list[tuple[Server, _Web]] = []
-
-    def received(message: Message, content: bytes) -> None:
-        if "setup" in message:
-            setups.append(Setup.model_validate(message["setup"]))
-            first.set()
-            ready.wait()
-        elif parts:
-            parts[0][0].remote.received(message, content)
+    setup = Setup.model_validate_json(sys.stdin.buffer.read())
+    server = make_server(setup, SystemClock())
 
     def ended() -> None:
-        first.set()
-        if not parts:
-            os._exit(0)
-        server, web = parts[0]
         web.should_exit = True
         server.remote.closed = True
         server.hub.close()
         threading.Timer(END_S, os._exit, (0,)).start()  # a long export, for example
 
-    ready = threading.Event()
-    link = Link(socket.socket(fileno=link_descriptor), received, ended)
-    link.start()
-    first.wait()
-    setup = setups[0]
-    server = make_server(setup, SystemClock())
-    server.remote.calls.link = link
+    link = Link(socket.socket(fileno=link_descriptor), server.remote.received, ended)
     web = _Web(uvicorn_config(guarded(server, setup.listening), setup.listening), link.send)
-    parts.append((server, web))
-    ready.set()
+    server.remote.calls.link = link
+    link.start()
     with checked_catalog(server), server.catalog.background_delivery():
         web.run([socket.socket(fileno=socket_descriptor)])
 

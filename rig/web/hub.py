@@ -66,11 +66,7 @@ class Hub:
             self._size += len(text)
             while self._size > MAX_SIZE and len(self._messages) > 1:
                 self._size -= len(self._messages.popleft().data)
-        if self._loop is not None:
-            try:
-                self._loop.call_soon_threadsafe(self._wake)
-            except RuntimeError:  # the loop is closed: the server ends
-                self._loop = None
+        self.wake()
 
     def close(self) -> None:
         """End all streams."""
@@ -146,9 +142,12 @@ class Hub:
         return f"{self._epoch}-{message.number}"
 
     def wake(self) -> None:
-        """Let all listeners check at once whether they may still listen."""
+        """Let all listeners look at once for messages, and whether they may still listen."""
         if self._loop is not None:
-            self._loop.call_soon_threadsafe(self._wake)
+            try:
+                self._loop.call_soon_threadsafe(self._wake)
+            except RuntimeError:  # the loop is closed: the server ends
+                self._loop = None
 
     def _hello(self, number: int, lost: bool) -> Message:
         return Message(number, "hello", json.dumps({"lost": lost}))

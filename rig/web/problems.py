@@ -16,7 +16,6 @@ from rig.core.errors import (
     ObjectNotFound,
     RigError,
     TooManyListeners,
-    TooManyLogins,
 )
 
 MEDIA_TYPE: Final = "application/problem+json"
@@ -24,7 +23,6 @@ MEDIA_TYPE: Final = "application/problem+json"
 _STATUS: Final[dict[type[RigError], int]] = {
     LoginRequired: 401,
     Forbidden: 403,
-    TooManyLogins: 429,
     TooManyListeners: 503,
     LeaseHeld: 423,
     JobNotFound: 404,

@@ -16,6 +16,7 @@ import sys
 import threading
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Final
 
 from rig.config import RigConfig
@@ -157,12 +158,14 @@ class WebProcess:
             self._process = subprocess.Popen(
                 [sys.executable, "-P", "-m", "rig.web.front", *map(str, descriptors)],
                 pass_fds=descriptors,
-                stdin=subprocess.DEVNULL,
+                stdin=subprocess.PIPE,
                 start_new_session=True,  # Ctrl+C of the terminal is for this process only
             )
+        assert self._process.stdin is not None
+        with suppress(BrokenPipeError), self._process.stdin as standard_input:  # the process has ended already
+            standard_input.write(self._setup.model_dump_json().encode())
         self._link = Link(ours, self._received, self._lost)
         self._link.start()
-        self._link.send({"setup": self._setup.model_dump(mode="json")})
         self._side.connect(self._link)
 
     def _received(self, message: Message, content: bytes) -> None:

@@ -62,7 +62,7 @@ class Server:
 
         Raises
         ------
-        LoginRequired, TooManyLogins
+        LoginRequired
             Its token is wrong.
         ConfigError
             The file of the tokens is damaged.
@@ -71,7 +71,7 @@ class Server:
         client = (request.headers.get("x-rig-client") or request.query_params.get("client", ""))[:64]
         scheme, _, token = request.headers.get("authorization", "").partition(" ")
         if scheme.lower() == "bearer":
-            stored = self.sessions.verify(token.strip(), request.client.host if request.client else "")
+            stored = self.sessions.verify(token.strip())
             return Person(stored.name, stored.role, client)
         if cookie := request.cookies.get(COOKIE):
             found = self.sessions.find(cookie)

@@ -13,13 +13,14 @@ from typing import Any, Final
 
 from rig.bench import Bench
 from rig.core.clock import SystemClock, seconds_between
-from rig.core.errors import DeviceMismatch, DeviceNotFound, DeviceSilent, MotionStopped, RigError
+from rig.core.errors import DeviceMismatch, DeviceNotFound, DeviceSilent, RigError
 from rig.devices.servo import ServoState
 from rig.events.events import Accepted, Decided, Event, Started, event_dict, plain
 from rig.events.lines import line
 from rig.motion.motion_model import MotionModel
 from rig.plans.estimate import TimeLeft
 from rig.safety.stop_channel import StopAnswer, StopListener
+from rig.safety.supervisor import stopped
 from rig.web.jobs import JobQueue
 from rig.web.outline import Outliner
 from rig.web.picture import LivePicture, ObservedCamera, jpeg
@@ -191,7 +192,7 @@ class BenchWorker:
     def _check_stop(self) -> None:
         """Raise `MotionStopped` after a STOP; called in each round of the control loop."""
         if self._stopped():
-            raise MotionStopped("STOP was pressed.", next_step="Start the job again when the table may move.")
+            raise stopped()
 
     def _answer_stop(self) -> None:
         """After a STOP: switch the torque off, tell it to those who wait, and cancel all jobs.

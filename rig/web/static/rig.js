@@ -108,7 +108,6 @@ const dispatch = (kind, data) => (listeners[kind] || []).forEach((listener) => l
 
 let socket = null;
 let lastId = null;
-let stopAnswered = () => {};
 const RECONNECT_MS = 1500;
 
 /**
@@ -122,7 +121,7 @@ export function listen() {
   socket = mine;
   mine.onmessage = ({ data }) => {
     const message = JSON.parse(data);
-    if (message.kind === "stopped") return stopAnswered(message.data);
+    if (message.kind === "stopped") return takeAnswer(message.data);
     lastId = message.id;
     return dispatch(message.kind, message.data);
   };
@@ -253,7 +252,6 @@ $("stop")?.addEventListener("click", () => {
   const mine = performance.now();
   pressedAt = mine;
   showStop("Stopping …", "");
-  stopAnswered = takeAnswer;
   const open = socket !== null && socket.readyState === WebSocket.OPEN;
   if (open) socket.send(JSON.stringify({ stop: mine }));
   setTimeout(() => { if (pressedAt === mine) stopByRequest(); }, open ? SECOND_WAY_MS : 0);
