@@ -235,7 +235,7 @@ class DenseIndex:
     def _ring(self) -> tuple[IndexArray, FloatArray, Floats]:
         """Two revolutions of every object's views in rows, the ends of their arcs, and the penalty at these ends.
 
-        They begin at -180°, so that a copy of each view is within 180° of any azimuth.
+        They begin at -180°.
         """
         first_deg = np.where(self.azimuth_deg < 180, self.azimuth_deg, self.azimuth_deg - 360)
         first_deg = np.where(self.left_out, np.inf, first_deg)
@@ -287,6 +287,10 @@ class DenseIndex:
         np.maximum.accumulate((own[:, 1:] - penalty)[:, ::-1], axis=1, out=behind[:, -2::-1])
         best: Floats = np.maximum(before.ravel()[nearest] - slope_at, behind.ravel()[nearest] + slope_at)
         np.maximum(best, own.ravel()[nearest], out=best)
+        # a third revolution: beside a gap, the nearest end of an arc may belong to a view that is up to 270° away
+        count, revolution = self._segments.lengths[:, None], np.float32(slope * 360)
+        np.maximum(best, before[place, count] - revolution - slope_at, out=best)
+        np.maximum(best, behind[place, count - 1] - revolution + slope_at, out=best)
         return np.roll(best, -int(whole), axis=1)
 
     def _raised(self, similar: FloatArray) -> Floats:

@@ -41,6 +41,7 @@ EXPORT void hbr_support(const int64_t *rows, const int64_t *begin, const int64_t
     double *ring_deg = scratch, *end_deg = ring_deg + room;
     float *own = (float *)(end_deg + room), *penalty = own + room, *before = penalty + room, *behind = before + room;
     const float none = -__builtin_inff();
+    const float revolution = (float)(slope * 360);
     double seen_deg[BINS];
     float slope_at[BINS], best[BINS];
     int64_t nearest[BINS], ready = 0; /* number of views for which the arcs are known; 0 if unknown */
@@ -90,6 +91,10 @@ EXPORT void hbr_support(const int64_t *rows, const int64_t *begin, const int64_t
             const int64_t at = nearest[b];
             best[b] = larger(larger(before[at] - slope_at[b], behind[at] + slope_at[b]), own[at]);
         }
+        one_before -= revolution; /* the third revolution */
+        two_behind -= revolution;
+        for (int b = 0; b < BINS; b++)
+            best[b] = larger(best[b], larger(one_before - slope_at[b], two_behind + slope_at[b]));
         for (int64_t b = whole; b < BINS; b++) support[b - whole] = best[b];
         for (int64_t b = 0; b < whole; b++) support[BINS - whole + b] = best[b];
     }

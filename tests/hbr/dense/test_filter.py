@@ -54,6 +54,7 @@ def written_out(queries: np.ndarray, angles: list[float], views: Views, omega: f
     st.sampled_from([1.0, 2.5, 4.0]),
     st.lists(st.floats(-720, 720), min_size=1, max_size=3),
 )
+@example(seed=149003, omega=0.5, power=1.0, angles=[0.0])  # views at 135°, 145° and 146°, whose arc ends at 321°
 def test_support_follows_the_formula_at_every_azimuth_of_every_object(
     seed: int, omega: float, power: float, angles: list[float]
 ) -> None:
