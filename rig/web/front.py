@@ -30,7 +30,7 @@ from rig.web.bench_catalog import BenchCatalog
 from rig.web.guard import Guard, PatientProtocol
 from rig.web.hub import Hub
 from rig.web.link import Link, Message
-from rig.web.priority import WEB, set_priority
+from rig.web.priority import WEB, set_priority, shorten_pauses
 from rig.web.remote_bench import RemoteBench
 from rig.web.server import Server
 from rig.web.setup import Listening, Setup, print_note
@@ -161,6 +161,7 @@ def main(link_descriptor: int, socket_descriptor: int) -> None:
     web = _Web(uvicorn_config(guarded(server, setup.listening), setup.listening), link.send)
     server.remote.calls.link = link
     link.start()
+    shorten_pauses()
     with checked_catalog(server), server.catalog.background_delivery():
         web.run([socket.socket(fileno=socket_descriptor)])
 

@@ -27,7 +27,7 @@ from rig.safety.bench_lock import BenchLock
 from rig.safety.saved_state import SERVER_FILE, SERVER_FOLDER, ServerAddress
 from rig.web.bench_side import BenchSide
 from rig.web.link import Link, Message
-from rig.web.priority import BENCH, set_priority
+from rig.web.priority import BENCH, set_priority, shorten_pauses
 from rig.web.setup import Listening, Setup, print_note
 
 START_S: Final = 30.0
@@ -92,6 +92,7 @@ def run_server(
                 )
                 write(folder / SERVER_FILE, address.model_dump_json().encode(), mode=0o600)
                 ready(address.url)
+                shorten_pauses()
                 side.worker.run()
                 if web.failure is not None:
                     raise web.failure
