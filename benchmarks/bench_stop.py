@@ -258,8 +258,8 @@ def by_rig_stop(bench: ServedBench, _held: ExitStack) -> Stop:
 
 
 def with_queue(bench: ServedBench, held: ExitStack) -> Stop:
-    """As many trays of 1,000 objects as may wait."""
-    tray = {"kind": "tray", "objects": [{"name": f"object-{k}", "note": "x" * 60} for k in range(1000)]}
+    """As many trays of 200 objects as may wait."""
+    tray = {"kind": "tray", "objects": [{"name": f"object-{k}", "note": "x" * 60} for k in range(200)]}
     request = by_request(bench, held)
 
     def stop() -> int:
