@@ -1,0 +1,15 @@
+"""Every golden session prints what is stored."""
+
+from pathlib import Path
+
+import pytest
+
+from tests.golden.sessions import differences, expected, played, sessions
+
+
+@pytest.mark.parametrize("name", sessions())
+def test_session_prints_what_is_stored(name: str, tmp_path: Path) -> None:
+    if any("job" in step for step in sessions()[name]["steps"]):
+        pytest.importorskip("fastapi", reason="the extra hbr-rig[web] is not installed")
+    found = list(differences(expected(name), played(name, tmp_path)))
+    assert not found, "\n".join(found[:20])
