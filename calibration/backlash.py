@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibration.legs import COVERAGE, Leg, fit, reasons, reject_slipped_leg, stored_valid
+from calibration.legs import COVERAGE, Leg, fit, reasons, reject_slipped_leg
 from calibration.procedure import (
     Evaluation,
     Measured,
@@ -48,7 +48,7 @@ def plot(result: CalibrationResult) -> Chart | None:
     if "backlash" not in result.estimates:
         return None
     backlash, ratio = result.estimates["backlash"], result.estimates["ratio"].value
-    legs = [(i + 1, leg) for i, leg in enumerate(result.evidence["legs"]) if stored_valid(leg)]
+    legs = [(i + 1, leg) for i, leg in enumerate(result.evidence["legs"]) if not leg["invalid"]]
     lost = [(leg["encoder_deg"] - ratio * leg["gyro_deg"]) * np.sign(leg["encoder_deg"]) for _, leg in legs]
     ends = [legs[0][0], legs[-1][0]]
     low, high = backlash.value - 2 * backlash.uncertainty, backlash.value + 2 * backlash.uncertainty

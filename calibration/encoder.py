@@ -16,7 +16,7 @@ from math import ceil, floor
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.legs import COVERAGE, Leg, fit, reasons, reject_slipped_leg, stored_valid
+from calibration.legs import COVERAGE, Leg, fit, reasons, reject_slipped_leg
 from calibration.procedure import Evaluation, Measured, Procedure, require_at_least, returning, too_little_room
 from rig.bench import Bench
 from rig.calibrations import CalibrationResult, RejectionCode
@@ -49,7 +49,7 @@ def plot(result: CalibrationResult) -> Chart | None:
     if not result.estimates:
         return None
     revolution_deg = result.evidence["turn_deg"]
-    steps = [step for step in result.evidence["steps"] if stored_valid(step["leg"])]
+    steps = [step for step in result.evidence["steps"] if not step["leg"]["invalid"]]
     values = np.array([result.estimates[name].value for name in NAMES])
     sigma = np.array([result.estimates[name].uncertainty for name in NAMES])
     phi = np.linspace(0.0, revolution_deg, 121)

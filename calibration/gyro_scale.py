@@ -18,7 +18,7 @@ from math import ceil, floor, hypot, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.legs import COVERAGE, Leg, fit, reasons, reject_slipped_leg, stored_valid
+from calibration.legs import COVERAGE, Leg, fit, reasons, reject_slipped_leg
 from calibration.procedure import Evaluation, Measured, Procedure, require_at_least, returning, too_little_room
 from rig.bench import Bench
 from rig.calibrations import CalibrationResult, RejectionCode
@@ -42,7 +42,7 @@ MAX_UNCERTAINTY = 0.001
 
 def plot(result: CalibrationResult) -> Chart | None:
     """Return a chart of the ratio of encoder to gyro for each leg, and of the scale."""
-    legs = [(i + 1, leg) for i, leg in enumerate(result.evidence["legs"]) if stored_valid(leg) and leg["gyro_deg"]]
+    legs = [(i + 1, leg) for i, leg in enumerate(result.evidence["legs"]) if not leg["invalid"] and leg["gyro_deg"]]
     if not legs or not result.estimates:
         return None
     scale = result.estimates["scale"]

@@ -1,9 +1,8 @@
 """Legs: rotations between two rests by encoder and gyro, from which several calibrations are fitted."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import sqrt
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,11 +40,6 @@ class Leg:
         return cls(
             move.rotation_encoder_deg, gyro.angle_deg / imu.scale, sqrt(max(noise, 0.0)) / imu.scale, gyro.reason
         )
-
-
-def stored_valid(leg: Mapping[str, Any]) -> bool:
-    """Return whether a leg in the evidence of a result is valid; version 1.x called the reason ``trouble``."""
-    return not leg.get("invalid", leg.get("trouble"))
 
 
 def reasons(legs: Sequence[Leg]) -> list[str]:

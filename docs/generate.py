@@ -220,7 +220,7 @@ def modules() -> tuple[str, ...]:
     for package in PACKAGES:
         for path in sorted((ROOT / package).rglob("*.py")):
             parts = path.relative_to(ROOT).with_suffix("").parts
-            if "migrations" not in parts and parts[-1] != "__main__":
+            if parts[-1] != "__main__":
                 found.append(".".join(parts[:-1] if parts[-1] == "__init__" else parts))
     return tuple(found)
 

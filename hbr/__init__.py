@@ -1,8 +1,5 @@
 """Retrieval: arrays in, decisions out."""
 
-from typing import Any
-from warnings import warn
-
 from hbr.dense.calibration import CalibratedRule, calibrate_stopping_rule, fit_stopping_rule
 from hbr.dense.filter import Belief, update_belief
 from hbr.dense.index import DenseIndex
@@ -65,30 +62,3 @@ __all__ = [
     "unpack_rows",
     "update_belief",
 ]
-
-#: Names of version 0.1 and what replaces them; they go with version 0.3.
-_RENAMED = {
-    "Look": "NextBestView",
-    "Rules": "StoppingRule",
-    "Sighting": "Segmentation",
-    "Verdict": "StopDecision",
-    "believe": "update_belief",
-    "familiar_score": "open_set_threshold",
-    "judge": "StoppingRule.decide",
-    "lead": "score_margin",
-    "next_look": "next_best_view",
-    "rehearse": "leave_one_out",
-    "rules": "fit_stopping_rule",
-    "sight": "segment",
-}
-
-
-def __getattr__(name: str) -> Any:
-    """Return what replaces a name of version 0.1, with a `DeprecationWarning`."""
-    if name not in _RENAMED:
-        raise AttributeError(f"module 'hbr' has no attribute {name!r}")
-    new = _RENAMED[name]
-    warn(f"hbr.{name} is now hbr.{new}; the old name goes with version 0.3", DeprecationWarning, stacklevel=2)
-    if name == "judge":
-        return lambda belief, by, **options: by.decide(belief, **options)
-    return globals()[new]

@@ -53,7 +53,7 @@ def last_steps(
     verification = None
     if is_doubtful(rule, decision, belief.queries, belief.index.views.descriptor):
         verification = verify(belief, decision.object_index, segmentations, leader_views)
-        decision = verification.decided(decision, found_from(rule, same_bench))
+        decision = verification.decided(decision, found_from(same_bench))
     comparison = compare_leaders(
         belief,
         decision.outcome,

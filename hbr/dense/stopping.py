@@ -41,7 +41,6 @@ class StopReason(StrEnum):
     PIXEL_FIT = "pixel-fit"
     UNCHANGED_BENCH = "unchanged-bench"
     CUSTOM = "custom"
-    EARLIER_VERSION = "earlier-version"
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +81,6 @@ class LimitationCode(StrEnum):
     UNKNOWN_NOT_MEASURED = "unknown-not-measured"
     ONE_OBJECT = "one-object"
     SINGLE_VIEWS = "single-views"
-    EARLIER_VERSION = "earlier-version"
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +95,7 @@ class Limitation:
         ``sampled``: ``searched`` of ``objects``. ``false-reject-rate``: ``rate`` asked for, ``searches`` done and
         ``needed``, ``reached`` rate. ``error-rate`` and ``similar-objects``: ``rate``, ``searches``, ``needed``,
         ``min_confidence``, and ``wrong`` of ``ended`` searches. ``false-accept-rate``: ``rate``, and ``accepted`` of
-        ``searches`` for left-out objects. ``earlier-version``: ``text``.
+        ``searches`` for left-out objects.
     """
 
     code: LimitationCode
@@ -160,8 +158,7 @@ class StoppingRule:
         one that is known to be the same.
     leave_one_out_thresholds : tuple of float
         With weights: scores of `hbr.dense.leave_one_out.open_set_score` after 1, 2, ... views. On an unchanged bench,
-        few enrolled objects score less, and an object that reaches the highest of them is found. Rules of earlier
-        versions have none; they ignore the bench.
+        few enrolled objects score less, and an object that reaches the highest of them is found.
     rates : tuple of ShiftRates
         Measured rates under changes of the bench.
     """

@@ -98,9 +98,9 @@ def is_doubtful(rule: StoppingRule, decision: StopDecision, views: int, kind: st
     return _HOPELESS < decision.open_set_score < max(rule.open_set_thresholds)
 
 
-def found_from(rule: StoppingRule, same_bench: bool | None) -> float:
-    """Return the log-odds from which an object is found. Rules of earlier versions ignore the bench."""
-    return FOUND_FROM_SAME_BENCH if same_bench and rule.leave_one_out_thresholds else FOUND_FROM
+def found_from(same_bench: bool | None) -> float:
+    """Return the log-odds from which an object is found."""
+    return FOUND_FROM_SAME_BENCH if same_bench else FOUND_FROM
 
 
 def verify(

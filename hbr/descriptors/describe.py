@@ -1,14 +1,12 @@
 """Description of an image by any descriptor."""
 
 from hbr.core.arrays import ImageArray, LevelArray
-from hbr.core.deprecation import renamed_keyword
 from hbr.descriptors import Descriptor
 from hbr.descriptors import descriptor as descriptor_of
 from hbr.descriptors.cedd import describe as describe_by_cedd
 from hbr.segmentation import Background, Box, segment
 
 
-@renamed_keyword("reference", "empty_table")
 def describe(
     image_bgr: ImageArray,
     *,

@@ -1,7 +1,6 @@
 """Embedding of the object by a neural network, from a model file that the user provides."""
 
 import re
-import zlib
 from hashlib import sha256
 from pathlib import Path
 from typing import Final
@@ -17,7 +16,7 @@ from hbr.segmentation import Segmentation, segment
 
 #: The name of such a descriptor is this prefix and the SHA-256 of the model file.
 PREFIX: Final = "onnx:"
-#: The name of a model; earlier versions named the path of the file instead.
+#: The name of a model.
 MODEL_NAME: Final = re.compile(PREFIX + "[0-9a-f]{64}")
 #: Reading and running a larger model would need more than 1 GiB.
 MAX_MODEL_BYTES: Final = 256_000_000
@@ -51,7 +50,6 @@ class Embedding(Descriptor):
         self.path = path
         content = read_model(path)
         self._digest = sha256(content).hexdigest()
-        self._checksum = zlib.crc32(content)
         self._net = opened(path, content)
         self._length = output(self._net, np.zeros((8, 8, 3), np.uint8)).size
         if self._length < 2:
@@ -63,8 +61,8 @@ class Embedding(Descriptor):
 
     @property
     def version(self) -> int:
-        """CRC-32 of the model's content, by which earlier versions checked it."""
-        return self._checksum
+        """Always 1: another model has another name."""
+        return 1
 
     @property
     def length(self) -> int:

@@ -92,7 +92,7 @@ def load_layer(path: Path, content: bytes, own: Descriptor) -> LayerEmbedding:
         raise ValueError(f"{path} is no descriptor that fit_layer has written: {error}") from error
     parts: tuple[Descriptor, ...] = (own, layer) if share else (layer,)
     weights = (share, 1 - share) if share else (1.0,)
-    return LayerEmbedding(PREFIX + sha256(content).hexdigest(), zlib.crc32(content), parts, weights, path)
+    return LayerEmbedding(PREFIX + sha256(content).hexdigest(), 1, parts, weights, path)
 
 
 def fit_layer(

@@ -52,8 +52,6 @@ class IssueCode(StrEnum):
     """The grey patch has several grey levels."""
     PATCH_EXPOSURE = "grey-patch-exposure"
     """The grey patch is overexposed or too dark."""
-    OTHER = "other"
-    """An issue in the words of another program: ``text``."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hbr.core.arrays import ImageArray
-from hbr.core.deprecation import renamed_keyword
 from hbr.segmentation.background import Background, Difference, Illumination, Mask
 from hbr.segmentation.cut_out import Box, Found, Segmentation
 from hbr.segmentation.evidence import Issue, IssueCode, Method
@@ -30,7 +29,6 @@ _SAME_BOX: Final = 0.85
 MOST_HYPOTHESES: Final = 5
 
 
-@renamed_keyword("reference", "empty_table")
 def segment(
     image_bgr: ImageArray | Frame,
     *,

@@ -254,8 +254,6 @@ class RejectionCode(Enum):
         "The first and the last placement are less similar than consecutive ones, by {drift:.3f}: the light drifts. "
         "Let the lamps warm up, lock the camera, and calibrate again."
     )
-    TEXT = "{text}"
-    """A result of version 1.x, which stored the words."""
 
 
 def _known(code: RejectionCode | str) -> RejectionCode:
@@ -282,11 +280,6 @@ class Rejection:
             for key, value in self.values.items()
         }
         return filled(self.code.value, **shown)
-
-
-def stored_rejection(value: Any) -> Any:
-    """Return a rejection as stored; version 1.x stored it as a sentence."""
-    return {"code": RejectionCode.TEXT, "values": {"text": value}} if isinstance(value, str) else value
 
 
 def rejection(code: RejectionCode, values: Mapping[str, Any]) -> Rejection:

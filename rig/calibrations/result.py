@@ -6,21 +6,18 @@ from datetime import UTC, datetime, timedelta
 from importlib.metadata import version
 from math import floor, log10
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Self
+from typing import Any, ClassVar, Self
 
 from pydantic import (
-    AliasChoices,
     AwareDatetime,
-    BeforeValidator,
     ConfigDict,
-    Field,
     FiniteFloat,
     PositiveFloat,
     TypeAdapter,
     ValidationError,
 )
 
-from rig.calibrations.rejection import Rejection, stored_rejection
+from rig.calibrations.rejection import Rejection
 from rig.core.errors import ConfigError, UsageError, os_errors_as
 from rig.core.files import read, write
 from rig.core.phrases import filled, in_unit, number
@@ -83,10 +80,7 @@ class CalibrationResult:
     residual: FiniteFloat | None
     limit: FiniteFloat | None
     residual_unit: str
-    rejections: Annotated[
-        tuple[Annotated[Rejection, BeforeValidator(stored_rejection)], ...],
-        Field(validation_alias=AliasChoices("rejections", "refusals")),  # the name in earlier files
-    ]
+    rejections: tuple[Rejection, ...]
     when_utc: AwareDatetime
     device: Mapping[str, Any]
     evidence: Mapping[str, Any]
@@ -129,7 +123,7 @@ class CalibrationResult:
 
     @classmethod
     def from_file(cls, path: Path) -> Self:
-        """Read a result that `to_file` wrote, in this version or an earlier one.
+        """Read a result that `to_file` wrote.
 
         Raises
         ------

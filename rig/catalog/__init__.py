@@ -3,7 +3,6 @@
 from rig.catalog.audit import Action, AuditEntry
 from rig.catalog.catalog import Catalog
 from rig.catalog.enrollment import Enrollment
-from rig.catalog.migrate import Migration, migrate
 from rig.catalog.queries import ModelSet
 from rig.catalog.records import (
     EnrollmentStatus,
@@ -24,7 +23,6 @@ __all__ = [
     "Enrollment",
     "EnrollmentStatus",
     "EnrollmentSummary",
-    "Migration",
     "ModelSet",
     "ObjectDetails",
     "ObjectSummary",
@@ -33,5 +31,4 @@ __all__ = [
     "StoredView",
     "ViewRecord",
     "clean_name",
-    "migrate",
 ]

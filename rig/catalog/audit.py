@@ -36,7 +36,6 @@ class Action(StrEnum):
     DELETED = "deleted"
     UNDELETED = "undeleted"
     IMPORTED = "imported"
-    MIGRATED = "migrated"
     ROW_REMOVED = "orphaned row removed"
     REPAIRED = "verified and repaired"
     GARBAGE_COLLECTED = "collected garbage"

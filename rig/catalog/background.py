@@ -14,7 +14,7 @@ from sqlalchemy import Connection, Table, select
 
 from rig.catalog.catalog import Catalog
 from rig.catalog.columns import FIX
-from rig.catalog.schema import audit, corrections, enrollments, objects, results
+from rig.catalog.schema import APPEND_ONLY, enrollments, objects
 from rig.catalog.seal import appended_digests, damage_of
 from rig.config.catalog_place import CatalogPlace
 from rig.core.clock import Clock, seconds_between
@@ -84,7 +84,7 @@ def _portions(catalog: Catalog) -> Iterator[CatalogDamaged | None]:
         with database.read() as connection:
             damage = damage_of(connection, (), [enrollment_id])
         yield damage
-    for table in (audit, *((results, corrections) if database.has_results else ())):
+    for table in APPEND_ONLY:
         after: int | None = 0
         while after is not None:
             with database.read() as connection:

@@ -105,9 +105,7 @@ class Catalog(AbstractContextManager["Catalog"]):
         Raises
         ------
         CatalogError
-            There is no catalog, it is damaged or of a newer version, or the system denies access.
-        CatalogOutdated
-            The catalog was written by an earlier version of the program (`rig catalog migrate`).
+            There is no catalog, it is damaged or of another version of the program, or the system denies access.
         CatalogBusy
             Another process locks the catalog for longer than the timeout.
         CatalogUnavailable

@@ -13,7 +13,7 @@ from rig.catalog.catalog import Catalog
 from rig.catalog.jobs import JobProgress
 from rig.catalog.postgres import LOST_READER_S, limit_idle, set_property
 from rig.catalog.rows import copied_columns, insert_copies
-from rig.catalog.schema import APPEND_ONLY, METADATA, SCHEMA_VERSION, objects, results, sessions, views
+from rig.catalog.schema import APPEND_ONLY, METADATA, objects, results, sessions, views
 from rig.catalog.seal import appended_digests, damage_of, enrollment_digests, object_digests
 from rig.core.errors import CatalogDamaged, CatalogError
 from rig.views import image_files as images
@@ -41,15 +41,11 @@ def copy_catalog(source: Catalog, target: Catalog) -> Generator[JobProgress, Non
 
     Raises
     ------
-    CatalogOutdated
-        The source must be migrated first.
     CatalogError, CatalogBusy
         The target is not empty, or one of them cannot be used.
     CatalogDamaged
         Something in the source is not as it was stored.
     """
-    if source.database.version < SCHEMA_VERSION:
-        raise source.database.outdated()
     with source.database.read() as reading:
         damage = damage_of(reading, None, None)
         if damage is not None:

@@ -10,10 +10,11 @@ from typing import Any
 
 from sqlalchemy import Connection, Table, insert, text
 
+from rig.catalog.columns import damaged
 from rig.catalog.image_store import ImageStore
-from rig.catalog.schema import RESULTS_VERSION, SCHEMA_VERSION
+from rig.catalog.schema import SCHEMA_VERSION
 from rig.config.catalog_place import CatalogPlace
-from rig.core.errors import CatalogError, CatalogOutdated
+from rig.core.errors import CatalogError
 
 
 class Database(ABC):
@@ -25,23 +26,15 @@ class Database(ABC):
         Where the catalog is.
     images
         The store of the images.
-    version
-        Version of the tables. A catalog of `READABLE_VERSION` or later can be read without a migration.
     """
 
     place: CatalogPlace
     images: ImageStore
-    version: int
 
     @property
     def root(self) -> Path:
         """Folder of the catalog on this computer."""
         return self.place.path
-
-    @property
-    def has_results(self) -> bool:
-        """Whether the catalog has tables for results."""
-        return self.version >= RESULTS_VERSION
 
     @abstractmethod
     def close(self) -> None:
@@ -94,24 +87,26 @@ class Database(ABC):
         """Return the error for a change of a catalog that is open for reading."""
         return CatalogError(f"The catalog {self.place} is open for reading only.", next_step="Open it for writing.")
 
-    def outdated(self) -> CatalogOutdated:
-        """Return the error for a catalog that must be migrated first."""
-        return CatalogOutdated(
-            f"The catalog {self.place} was written by an earlier program: its schema has version {self.version}, "
-            f"this program works with {SCHEMA_VERSION}.",
-            next_step="Migrate it (a backup is made): rig catalog migrate",
-            evidence={"found": self.version, "known": SCHEMA_VERSION},
+
+def check_version(place: CatalogPlace, version: int) -> None:
+    """Check the version of a catalog's tables.
+
+    Raises
+    ------
+    CatalogError
+        Another version of the program wrote the catalog.
+    CatalogDamaged
+        No program has written such a version.
+    """
+    if version < 1:
+        raise damaged("the version of its schema", version)
+    if version != SCHEMA_VERSION:
+        raise CatalogError(
+            f"The catalog {place} was written by another version of the program: its schema has version {version}, "
+            f"this program knows {SCHEMA_VERSION}.",
+            next_step="Use the version of hbr-rig that wrote it, or another catalog.",
+            evidence={"found": version, "known": SCHEMA_VERSION},
         )
-
-
-def newer(place: CatalogPlace, version: int) -> CatalogError:
-    """Return the error for a catalog of a version that this program does not know."""
-    return CatalogError(
-        f"The catalog {place} was written by a newer program: its schema has version {version}, "
-        f"this program knows {SCHEMA_VERSION}.",
-        next_step="Update hbr-rig on this computer.",
-        evidence={"found": version, "known": SCHEMA_VERSION},
-    )
 
 
 def insert_row(connection: Connection, table: Table, **values: object) -> int:

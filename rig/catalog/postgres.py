@@ -7,7 +7,7 @@ Decision: docs/decisions/0050.
 """
 
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from typing import Any, Final
 
@@ -15,22 +15,17 @@ from sqlalchemy import Column, Connection, MetaData, QueuePool, Table, Text, cre
 from sqlalchemy.engine import make_url
 from sqlalchemy.exc import ArgumentError
 
-from rig.catalog import audit
 from rig.catalog.columns import damaged
-from rig.catalog.database import Database, newer
+from rig.catalog.database import Database, check_version
 from rig.catalog.failures import server_errors
 from rig.catalog.image_store import open_store
-from rig.catalog.schema import APPEND_ONLY, METADATA, READABLE_VERSION, SCHEMA_VERSION
+from rig.catalog.schema import APPEND_ONLY, METADATA, SCHEMA_VERSION
 from rig.config.catalog_place import CatalogPlace
-from rig.core.clock import Clock
 from rig.core.errors import CatalogError, CatalogUnavailable, ConfigError, ExtraMissing
 from rig.core.files import make_folder
 
 CHANNEL: Final = "hbr_rig_catalog"
 """Channel of the notifications about changes; the payload is the id of the catalog."""
-
-FIRST_VERSION: Final = 4
-"""The first version of the schema that a server could have. The steps before it are for SQLite."""
 
 APPLICATION: Final = "hbr-rig catalog"
 
@@ -91,7 +86,7 @@ class PostgresDatabase(Database):
     @contextmanager
     def read(self) -> Iterator[Connection]:
         with self.catalog_errors(), self._reading.begin() as connection:
-            self._check_version(connection)
+            _check_version(properties(connection), self.place)
             yield connection
 
     @contextmanager
@@ -101,7 +96,7 @@ class PostgresDatabase(Database):
         with self.catalog_errors(), self._writing.begin() as connection:
             # The transaction sees what was committed before it got the lock: each query has a snapshot of its own.
             lock_catalog(connection, enrollment_id)
-            self._check_version(connection)
+            _check_version(properties(connection), self.place)
             yield connection
             connection.execute(select(func.pg_notify(CHANNEL, self.id)))
 
@@ -120,9 +115,7 @@ class PostgresDatabase(Database):
         if found.get("application") != APPLICATION:
             raise CatalogError(f"{self.place} is the database of another program.", next_step="Check catalog.url.")
         self.id = found["id"]
-        self.version = _version(found, self.place)
-        if self.version < (READABLE_VERSION if self._read_only else SCHEMA_VERSION):
-            raise self.outdated()
+        _check_version(found, self.place)
         self._check_mark()
 
     def _check_mark(self) -> None:
@@ -157,15 +150,6 @@ class PostgresDatabase(Database):
             first |= {table.name: "0" for table in APPEND_ONLY}
             rows = [{"key": key, "value": value} for key, value in first.items()]
             connection.execute(_PROPERTIES.insert(), rows)
-
-    def _check_version(self, connection: Connection) -> None:
-        """Check that no other program has migrated the catalog since it was opened."""
-        found = _version(properties(connection), self.place)
-        if found != self.version:
-            raise CatalogError(
-                f"The catalog {self.place} was migrated to version {found} while this program used it.",
-                next_step="Start the program again; update hbr-rig if it reports a newer version.",
-            )
 
     def may_have_changed(self) -> bool:
         """Return whether the server has sent a notification; True without a connection: the next query reports it."""
@@ -211,27 +195,6 @@ class PostgresDatabase(Database):
         return sum(sizes)
 
 
-def migrate_server(
-    place: CatalogPlace, clock: Clock, run_steps: Callable[[Connection, int], None], busy_timeout_s: float
-) -> tuple[int, int]:
-    """Migrate a catalog to the version of this program in one transaction; return the versions before and after."""
-    engine = _engine(place, busy_timeout_s)
-    try:
-        with server_errors(place, busy_timeout_s), engine.begin() as connection:
-            if not _has_tables(connection):
-                raise _absent(place)
-            lock_catalog(connection)
-            before = _version(properties(connection), place)
-            if before < SCHEMA_VERSION:
-                limit_idle(connection, LOST_READER_S)  # a step may compute for long
-                run_steps(connection, before)
-                set_property(connection, "version", str(SCHEMA_VERSION))
-                audit.append(connection, clock, audit.Action.MIGRATED, before=before, after=SCHEMA_VERSION)
-        return before, SCHEMA_VERSION
-    finally:
-        engine.dispose()
-
-
 def _absent(place: CatalogPlace) -> CatalogError:
     return CatalogError(
         f"The database {place} has no catalog.",
@@ -274,16 +237,12 @@ def _has_tables(connection: Connection) -> bool:
     return bool(connection.execute(text(found), {"name": _PROPERTIES.name}).scalar())
 
 
-def _version(found: dict[str, str], place: CatalogPlace) -> int:
+def _check_version(found: dict[str, str], place: CatalogPlace) -> None:
     try:
         version = int(found["version"])
     except (KeyError, ValueError) as error:
         raise damaged("the version of its schema", found.get("version")) from error
-    if version < FIRST_VERSION:
-        raise damaged("the version of its schema", version)
-    if version > SCHEMA_VERSION:
-        raise newer(place, version)
-    return version
+    check_version(place, version)
 
 
 def _engine(place: CatalogPlace, busy_timeout_s: float) -> Any:

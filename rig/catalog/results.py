@@ -226,13 +226,7 @@ def record(catalog: Catalog, new: NewResult, image_bgr: NDArray[np.uint8] | None
 
 
 def find_results(catalog: Catalog, wanted: ResultFilter = ResultFilter()) -> list[Result]:
-    """Return results with their corrections, oldest first.
-
-    Raises
-    ------
-    CatalogOutdated
-        The catalog is of an earlier version and has no results.
-    """
+    """Return results with their corrections, oldest first."""
     conditions = [results.c.bench == wanted.bench] if wanted.bench is not None else []
     conditions += [results.c.time_utc >= wanted.since] if wanted.since is not None else []
     conditions += [results.c.time_utc < wanted.before] if wanted.before is not None else []
@@ -247,7 +241,7 @@ def find_results(catalog: Catalog, wanted: ResultFilter = ResultFilter()) -> lis
         if value is not None
     ]
     with catalog.database.read() as connection:
-        return [result for result in _load(catalog, connection, *conditions) if wanted.accepts(result)]
+        return [result for result in _load(connection, *conditions) if wanted.accepts(result)]
 
 
 def find_result(catalog: Catalog, result_id: int) -> Result:
@@ -257,11 +251,9 @@ def find_result(catalog: Catalog, result_id: int) -> Result:
     ------
     CatalogError
         There is no result of this number.
-    CatalogOutdated
-        The catalog is of an earlier version and has no results.
     """
     with catalog.database.read() as connection:
-        return _find(catalog, connection, result_id)
+        return _find(connection, result_id)
 
 
 def correct(
@@ -304,7 +296,7 @@ def correct(
     if unknown and object_name is not None:
         raise UsageError("--object and --unknown are both given.", next_step="Give one of them.")
     with catalog.database.write() as connection:
-        now = before = _find(catalog, connection, result_id).current
+        now = before = _find(connection, result_id).current
         if object_name is not None:
             now = now._replace(outcome=Outcome.FOUND, object_name=find(connection, object_name)[1])
         if unknown:
@@ -356,16 +348,14 @@ def _write_image(catalog: Catalog, result_id: int, png: bytes) -> str:
     return path
 
 
-def _find(catalog: Catalog, connection: Connection, result_id: int) -> Result:
-    found = _load(catalog, connection, results.c.id == result_id)
+def _find(connection: Connection, result_id: int) -> Result:
+    found = _load(connection, results.c.id == result_id)
     if not found:
         raise CatalogError(f"There is no result {result_id} in the catalog.", next_step="List them: rig results list")
     return found[0]
 
 
-def _load(catalog: Catalog, connection: Connection, *conditions: ColumnElement[bool]) -> list[Result]:
-    if not catalog.database.has_results:
-        raise catalog.database.outdated()
+def _load(connection: Connection, *conditions: ColumnElement[bool]) -> list[Result]:
     corrected = defaultdict(list)
     for row in connection.execute(select(corrections).order_by(corrections.c.id)):
         check_complete(row, corrections)

@@ -42,18 +42,12 @@ from rig.catalog.records import MAX_NAME_LENGTH, EnrollmentStatus
 APPLICATION_ID: Final = 0x48425247
 """``HBRG``: marks the SQLite file as a catalog (`PRAGMA application_id`)."""
 
-SCHEMA_VERSION: Final = 4
-"""Version of the tables below (`PRAGMA user_version`). `rig.catalog.migrations` has a step for each version."""
-
-READABLE_VERSION: Final = 3
-"""The first version that can be read without a migration. Version 4 only adds the tables of `RESULTS_VERSION`."""
-
-RESULTS_VERSION: Final = 4
-"""The first version with results."""
+SCHEMA_VERSION: Final = 1
+"""Version of the tables below (`PRAGMA user_version`)."""
 
 
 METADATA: Final = MetaData(
-    naming_convention={  # migrations address constraints by name
+    naming_convention={
         "ix": "ix_%(table_name)s_%(column_0_N_name)s",
         "uq": "uq_%(table_name)s_%(column_0_N_name)s",
         "ck": "ck_%(table_name)s_%(constraint_name)s",
@@ -262,13 +256,6 @@ KNOWN_NAMES: Final = frozenset(
 )
 """Names in a database of this version."""
 
-EARLIER: Final = {
-    1: "5cc1e1349036d986279635bedfe0fdcd8ce6a1b65339143ae92fb792727ce570",
-    2: "f50ddb136d952675dd4df7138c4cc7abed2db9bd5c56b48267cd784db6c344b6",
-    3: "a740bd0c92c14581c5a0d705b6a7b9805d870960525f32ac6b7c2d06c6d9aeb7",
-}
-"""`schema_digest` of earlier versions."""
-
 
 def schema_digest(connection: sqlite3.Connection) -> str:
     """Return the SHA-256 of the definitions of all tables, indexes, triggers and views, without their white space."""
@@ -278,10 +265,8 @@ def schema_digest(connection: sqlite3.Connection) -> str:
 
 
 @cache
-def expected_schema(version: int) -> str | None:
-    """Return the `schema_digest` of a catalog of a version; None for an unknown version."""
-    if version != SCHEMA_VERSION:
-        return EARLIER.get(version)
+def expected_schema() -> str:
+    """Return the `schema_digest` of a new catalog."""
     with closing(sqlite3.connect(":memory:", isolation_level=None)) as connection:
         METADATA.create_all(create_engine("sqlite://", creator=lambda: connection, poolclass=StaticPool))
         return schema_digest(connection)

@@ -15,8 +15,8 @@ from typing import Any
 
 from sqlalchemy import Connection, NullPool, QueuePool, create_engine, event
 
-from rig.catalog.columns import FIX, damaged
-from rig.catalog.database import Database, newer
+from rig.catalog.columns import FIX
+from rig.catalog.database import Database, check_version
 from rig.catalog.failures import absent, catalog_errors
 from rig.catalog.image_store import open_store
 from rig.catalog.places import check_folder
@@ -24,7 +24,6 @@ from rig.catalog.schema import (
     APPLICATION_ID,
     KNOWN_NAMES,
     METADATA,
-    READABLE_VERSION,
     SCHEMA_VERSION,
     expected_schema,
     schema_digest,
@@ -86,10 +85,8 @@ class SqliteDatabase(Database):
             make_folder(self.root, within=parent, mode=0o700)
             self._create()
         with self.read() as connection:
-            self.version = version_of(connection, self.root)
-            if self.version < (READABLE_VERSION if self._read_only else SCHEMA_VERSION):
-                raise self.outdated()
-            check_schema(connection, self.root, self.version)
+            _check_kind(connection, self.root)
+            _check_schema(connection, self.root)
             journal = connection.exec_driver_sql("PRAGMA journal_mode").scalar()
         if journal != "wal" and not self._read_only:
             # Another program has changed the mode, for example for a backup. A kill would leave a rollback journal, and
@@ -206,40 +203,27 @@ def database_exists(root: Path) -> bool:
     return file.exists() and file.stat().st_size > 0
 
 
-def version_of(connection: Connection, root: Path) -> int:
-    """Return the version of a catalog's tables, this program's or an earlier one.
-
-    Raises
-    ------
-    CatalogError
-        It is the database of another program or of a newer version.
-    CatalogDamaged
-        No program has written such a version.
-    """
+def _check_kind(connection: Connection, root: Path) -> None:
+    """Check that the database is a catalog, and of this version."""
     application_id = connection.exec_driver_sql("PRAGMA application_id").scalar_one()
-    version: int = connection.exec_driver_sql("PRAGMA user_version").scalar_one()
     if application_id != APPLICATION_ID:
         raise CatalogError(
             f"{root / DATABASE_NAME} is the database of another program.", next_step="Give the folder of a catalog."
         )
-    if version > SCHEMA_VERSION:
-        raise newer(CatalogPlace(root), version)
-    if version < 1:
-        raise damaged("the version of its schema", version)
-    return version
+    check_version(CatalogPlace(root), connection.exec_driver_sql("PRAGMA user_version").scalar_one())
 
 
-def check_schema(connection: Connection, root: Path, version: int) -> None:
-    """Raise `CatalogDamaged` if a database has other tables, indexes, triggers or views than those of its version."""
+def _check_schema(connection: Connection, root: Path) -> None:
+    """Raise `CatalogDamaged` if a database has other tables, indexes, triggers or views than a new one."""
     database = connection.connection.driver_connection
     assert isinstance(database, sqlite3.Connection)
-    if schema_digest(database) != expected_schema(version):
+    if schema_digest(database) != expected_schema():
         names = sorted({str(name) for (name,) in database.execute("SELECT name FROM sqlite_master")} - KNOWN_NAMES)
         raise CatalogDamaged(
             f"The database of the catalog {root} has other tables, triggers or views than this program made; "
             "nothing was changed.",
             next_step=FIX,
-            evidence={"version": version, "unknown": names[:20]},
+            evidence={"version": SCHEMA_VERSION, "unknown": names[:20]},
         )
 
 

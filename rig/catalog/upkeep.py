@@ -16,7 +16,7 @@ from rig.catalog import audit, staging
 from rig.catalog.catalog import Catalog
 from rig.catalog.places import files_within
 from rig.catalog.records import EnrollmentStatus
-from rig.catalog.schema import descriptors, enrollments, objects, results, sessions, views
+from rig.catalog.schema import SCHEMA_VERSION, descriptors, enrollments, objects, results, sessions, views
 from rig.catalog.seal import changing_enrollments
 
 _OLD: Final = (EnrollmentStatus.SUPERSEDED, EnrollmentStatus.ABANDONED)
@@ -112,15 +112,13 @@ def statistics(catalog: Catalog) -> Statistics:
         # Count log entries and results.
         entries = len(audit.entries(connection))
         database_bytes = catalog.database.size_bytes(connection)
-        recorded, recorded_bytes = 0, 0
-        if catalog.database.has_results:
-            stored = select(func.count(), func.sum(results.c.image_bytes)).select_from(results)
-            recorded, recorded_bytes = connection.execute(stored).one()
+        stored = select(func.count(), func.sum(results.c.image_bytes)).select_from(results)
+        recorded, recorded_bytes = connection.execute(stored).one()
     counts: dict[str, int] = {}
     for (status, _), (count, _, _) in sizes.items():
         counts[status] = counts.get(status, 0) + count
     return Statistics(
-        schema_version=catalog.database.version,
+        schema_version=SCHEMA_VERSION,
         objects=in_use,
         deleted_objects=total - in_use,
         enrollments=counts,

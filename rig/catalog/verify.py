@@ -111,7 +111,7 @@ def verify(
     checked = {item: checked[item] for item in items}  # in the order of the catalog, not of the processes
 
     with catalog.database.read() as connection:
-        orphans = sorted(files - _referenced(state, connection))
+        orphans = sorted(files - _referenced(connection))
     _find_copies(state, checked, orphans)
     _report_images(state, checked)
     _report_sizes(state, checked)
@@ -191,10 +191,10 @@ def _row(connection: Connection, table: str, rowid: int | None) -> dict[str, Any
     return json.loads(json.dumps(dict(row._mapping), default=str)) if row is not None else {}
 
 
-def _referenced(state: _State, connection: Connection) -> set[str]:
+def _referenced(connection: Connection) -> set[str]:
     recorded = results.c.image.is_not(None)
     return {
-        *(connection.scalars(select(results.c.image).where(recorded)) if state.catalog.database.has_results else ()),
+        *connection.scalars(select(results.c.image).where(recorded)),
         *connection.scalars(select(views.c.image)),
         *connection.scalars(select(sessions.c.empty_table_image).where(sessions.c.empty_table_image.is_not(None))),
     }
@@ -291,7 +291,7 @@ def _report_digests(state: _State) -> None:
             for entry_id in _changed_rows(connection, audit_log, given)
         ]
         state.results = given.get(results.name, 0)
-        for table in (results, corrections) if state.catalog.database.has_results else ():
+        for table in (results, corrections):
             state.findings += [
                 Finding(Problem.RESULT_CHANGED, details={"table": table.name, "entry_id": entry_id})
                 for entry_id in _changed_rows(connection, table, given)
@@ -325,7 +325,7 @@ def _report_orphans(state: _State, orphans: Iterable[str]) -> None:
         repair = moved_to = None
         if state.repair:
             with state.catalog.database.write() as connection:
-                if name in _referenced(state, connection) or name not in store.names():
+                if name in _referenced(connection) or name not in store.names():
                     continue
                 moved_to = store.set_aside(name)
             repair = Repair.MOVED

@@ -158,10 +158,9 @@ def stored_images(catalog: Catalog) -> tuple[list[Item], int]:
                 .where(sessions.c.empty_table_image.is_not(None))
             )
         ]
-        if catalog.database.has_results:
-            image = (results.c.image, results.c.image_sha256, func.coalesce(results.c.image_bytes, 0))
-            recorded = select(-results.c.id, *image).where(results.c.image.is_not(None))
-            items += [Item(None, None, "", *row) for row in connection.execute(recorded)]
+        image = (results.c.image, results.c.image_sha256, func.coalesce(results.c.image_bytes, 0))
+        recorded = select(-results.c.id, *image).where(results.c.image.is_not(None))
+        items += [Item(None, None, "", *row) for row in connection.execute(recorded)]
     return items, count
 
 

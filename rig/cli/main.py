@@ -36,7 +36,6 @@ from rig.core.signals import EXIT_BY_SIGNAL, handle_signals
 
 GROUP = "rig.commands"
 _WANTS_JSON = "rig.wants_json"
-_FORMER_OPTIONS = {"turns": "revolutions"}
 _TYPER_USAGE_ERROR: Any = typer.BadParameter.__base__
 """Typer exports no name for it, and the module of the class depends on Typer's version."""
 
@@ -86,14 +85,6 @@ def _usage_error(*, json: bool) -> Iterator[None]:
         raise
 
 
-def _present_name(name: str) -> str:
-    """Return the present name of an option. Version 0.3 removes the former names."""
-    if name not in _FORMER_OPTIONS:
-        return name
-    print(f"--{name} is now --{_FORMER_OPTIONS[name]}; version 0.3 removes the old name.", file=sys.stderr)
-    return _FORMER_OPTIONS[name]
-
-
 app = typer.Typer(
     name="rig",
     cls=_Commands,
@@ -101,7 +92,7 @@ app = typer.Typer(
     epilog="\n".join(["Exit codes", "", *(f"{code:>3}  {meaning}" for code, meaning in EXIT_CODES.items())]),
     no_args_is_help=True,
     pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["-h", "--help"], "token_normalize_func": _present_name},
+    context_settings={"help_option_names": ["-h", "--help"]},
 )
 
 

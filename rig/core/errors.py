@@ -291,10 +291,6 @@ class DescriptorOutdated(CatalogError, code=703, title="descriptor outdated"):
     """Views lack the descriptor, or the version of it, that this program compares."""
 
 
-class CatalogOutdated(CatalogError, code=704, title="catalog outdated"):
-    """The catalog has an earlier version and must be migrated first."""
-
-
 class ImportRejected(CatalogError, code=705, title="import rejected"):
     """The import cannot be used; the catalog did not change."""
 

@@ -14,7 +14,7 @@ from rig.events.compared import Compared, Verified
 from rig.motion.scan_speed import SpeedLimit
 from rig.views.capture import ViewEvidence
 
-SCHEMA = 2
+SCHEMA = 1
 """Version of the JSON form (docs/events.md): it rises when a field is removed or changes its meaning."""
 
 _OUTSIDE = {"json": False}
@@ -34,12 +34,10 @@ class NoteCode(StrEnum):
     TABLE_DIFFERS = "table-differs"
     STOPPING_RULE_UNREADABLE = "stopping-rule-unreadable"
     STOPPING_RULE_OUTDATED = "stopping-rule-outdated"
-    STOPPING_RULE_EARLIER = "stopping-rule-earlier"
     RATES_NOT_GUARANTEED = "rates-not-guaranteed"
     NOT_RECORDED = "not-recorded"
     NOT_COMPARED = "not-compared"
     LOCAL_COPY = "local-copy"
-    EARLIER_VERSION = "earlier-version"
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +60,6 @@ class RotationReason(StrEnum):
     EVEN_STEPS = "even-steps"
     RANDOM = "random"
     CUSTOM = "custom"
-    EARLIER_VERSION = "earlier-version"
 
 
 class WaitReason(StrEnum):
@@ -236,7 +233,7 @@ class Decided:
 
     ``rotation_deg`` is the camera's around the object, positive to the left; the table rotates the other way, to
     ``target_deg``. ``s_left`` and ``s_right`` are the similarities of the ``candidates`` from each side (Eq. 6), if
-    AHBR compared the sides. ``note`` is the explanation of a user's own strategy, or of an earlier version.
+    AHBR compared the sides. ``note`` is the explanation of a user's own strategy.
     """
 
     index: int
@@ -375,7 +372,7 @@ class Identified:
     ``period_deg``; ``yaw_set_deg`` then has all equivalent rotations. ``period_deg`` is 360 without symmetry, 0 if the
     object looks the same from all sides, None if that is not known. The paper's search has no uncertainty.
 
-    ``reason`` is why the search ended; ``note`` is the explanation of a user's own strategy, or of an earlier version.
+    ``reason`` is why the search ended; ``note`` is the explanation of a user's own strategy.
     The paper's search compares the score with ``min_score`` and the margin with ``min_margin``; the dense search
     compares the probability of the first candidate with ``min_confidence`` and the open-set score with
     ``open_set_threshold``, None if no object is called unknown. That probability is the ``confidence`` if the object

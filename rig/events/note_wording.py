@@ -59,11 +59,6 @@ def note_words(note: Note) -> str:
                 f"the stopping rule is from {v['made']}, and the catalog has changed since ({changed}), so it "
                 "guarantees no error rate; to renew it: rig catalog calibrate"
             )
-        case NoteCode.STOPPING_RULE_EARLIER:
-            return (
-                f"the stopping rule is from {v['made']}, and decides as an earlier version of this program did: on an "
-                "unchanged bench it takes more views; to renew it: rig catalog calibrate"
-            )
         case NoteCode.RATES_NOT_GUARANTEED:
             accepted = f" and {percent(v['false_accept'])} of other objects accepted" if "false_accept" in v else ""
             return (
@@ -77,8 +72,6 @@ def note_words(note: Note) -> str:
             return f"the leading candidates are not compared pixel by pixel: {v['what'].rstrip('.')}"
         case NoteCode.LOCAL_COPY:
             return f"the server of the catalog cannot be used; this uses the copy of {v['copied_utc']}"
-        case NoteCode.EARLIER_VERSION:
-            return str(v["text"])
 
 
 def _problems(values: dict[str, Any]) -> str:
@@ -144,8 +137,6 @@ def limitation_words(limitation: Limitation) -> str:
                 "objects with a single view cannot be calibrated: no object is called unknown, and no rate is "
                 "guaranteed; enroll more"
             )
-        case LimitationCode.EARLIER_VERSION:
-            return str(v["text"])
 
 
 def _some(names: list[str]) -> str:

@@ -137,7 +137,7 @@ def reason_words(answer: Identified) -> str:
             return "the leading candidates were compared pixel by pixel where they differ most"
         case StopReason.LOCAL_DIFFERENCE:
             return "the views fit two enrolled objects up to noise, and do not tell which one it is"
-        case StopReason.CUSTOM | StopReason.EARLIER_VERSION:
+        case StopReason.CUSTOM:
             return answer.note
         case StopReason.MAX_VIEWS if answer.min_confidence is None:
             return f"the search took all {counted(answer.views, 'view')} that are allowed"

@@ -20,8 +20,7 @@ from rig.core.errors import MotionStopped, RigError, StateNotStored, os_errors_a
 from rig.core.masking import masked
 from rig.safety.stop_channel import StopAnswer, StopListener, StopRequest, listen
 
-VERSION = 3
-"""Version 1 has neither the settings of the table nor the file of the latched fault; version 2 has no checksum."""
+VERSION = 1
 LATCH_BYTES = 8192
 """Size of the file of the latched fault. It is written again in place, which needs no room on the disk."""
 SESSION = "session.json"
@@ -39,7 +38,7 @@ class SavedTable(_Saved):
 
     ``shift_deg`` must be added to them (revolutions that the servo lost, an angle that the operator set). ``path_deg``
     is the range of a motion that had not ended when this was stored. ``zero_deg``, ``direction`` and ``gear_ratio`` are
-    the settings that convert positions to table angles; None if an earlier version stored this.
+    the settings that convert positions to table angles.
     """
 
     model_number: int
@@ -48,9 +47,9 @@ class SavedTable(_Saved):
     position_deg: float
     shift_deg: float
     path_deg: tuple[float, float] | None = None
-    zero_deg: float | None = None
-    direction: int | None = None
-    gear_ratio: float | None = None
+    zero_deg: float
+    direction: int
+    gear_ratio: float
 
 
 class LatchedFault(_Saved):
@@ -253,9 +252,9 @@ class FileStore:
         state, fault, damage = BenchState(), None, ""
         try:
             state = BenchState.model_validate_json(self._file.read_bytes())
-            if not 1 <= state.version <= VERSION:
+            if state.version != VERSION:
                 damage = f"{self._file} has version {state.version}, but this program reads version {VERSION}"
-            elif state.checksum != (state.with_checksum().checksum if state.version >= 3 else None):
+            elif state.checksum != state.with_checksum().checksum:
                 damage = f"{self._file} is damaged: its checksum is not that of its values"
         except FileNotFoundError:
             if not self._latch.exists() and not self._used.exists():
@@ -272,14 +271,14 @@ class FileStore:
             if text.strip():
                 fault = LatchedFault.model_validate_json(text)
         except FileNotFoundError:
-            damage = damage or (f"{self._latch} is missing" if state.version > 1 else "")
+            damage = damage or f"{self._latch} is missing"
         except OSError as error:
             damage = damage or f"{self._latch} cannot be read: {error.strerror}"
         except ValidationError as error:
             damage = damage or f"{self._latch} is damaged: {error.errors(include_url=False)[0]['msg']}"
         if damage:
             return BenchState(damage=damage, fault=state.fault or fault or _fault_of_damage(damage))
-        return state.model_copy(update={"fault": state.fault or fault, "version": VERSION, "checksum": None})
+        return state.model_copy(update={"fault": state.fault or fault, "checksum": None})
 
     def latch(self, fault: LatchedFault | None) -> None:
         with storing(self._latch):

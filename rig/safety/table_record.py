@@ -68,7 +68,7 @@ class TableRecord:
     def _settings_changed(self) -> bool:
         """Return whether the same positions stood for other table angles when the state was stored."""
         saved = self._state.table
-        if saved is None or saved.gear_ratio is None:
+        if saved is None:
             return False
         return (saved.zero_deg, saved.direction) != (self._config.zero_deg, self._config.direction) or not isclose(
             saved.gear_ratio * self._servo.revolution_deg, 360.0

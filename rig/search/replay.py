@@ -12,12 +12,10 @@ from rig.search.local_step import Comparison, compare_leaders, saved_leader_view
 from rig.search.saved_run import SavedRun
 from rig.search.session import ArcSearch, DenseSearch, Search, begin_search
 from rig.search.strategies import AnyStrategy, Finish, Rotate
-from rig.views.description import SearchDescriber, ViewDescriber
+from rig.views.description import SearchDescriber
 
 TOLERANCE: Final = 1e-9
 """Largest difference of equal numbers, because another machine may sum in another order."""
-EARLIER_TOLERANCE: Final = 1e-3
-"""For runs of formats 1 to 3: similarities had errors of up to 5e-6 then, which exponents in the belief multiply."""
 
 SHOWN_CHARACTERS: Final = 60
 """Longest text of a value in the summary of a difference."""
@@ -71,10 +69,9 @@ def check(run: SavedRun, *, by: AnyStrategy | None = None) -> Check:
         The run cannot be read, or its strategy is not known.
     """
     started = run.started
-    tolerance = EARLIER_TOLERANCE if run.format_version < 4 else TOLERANCE
     found = Check(is_complete=run.error is not None and not run.is_cut)
     search: Search | None = None
-    describe: ViewDescriber | None = None
+    describe: SearchDescriber | None = None
     ranked: Ranked | None = None
     step: Rotate | Finish | None = None
     compared: Comparison | None = None
@@ -90,7 +87,8 @@ def check(run: SavedRun, *, by: AnyStrategy | None = None) -> Check:
                     search, _ = begin_search(
                         run.model, run.config, by or started.strategy, seed=started.seed or 0, top=top
                     )
-                    describe = _describer(run, moving=isinstance(search, ArcSearch))
+                    revise = not isinstance(search, ArcSearch)
+                    describe = SearchDescriber(run.config.view, run.views.descriptor, run.empty_table, revise=revise)
                 assert describe is not None
                 view = describe(event.image_bgr)
                 levels = view.levels[search.descriptor]
@@ -108,7 +106,7 @@ def check(run: SavedRun, *, by: AnyStrategy | None = None) -> Check:
                 found.views += 1
                 if event.segmentation is not None:
                     saved, again = event.segmentation, plain(view.segmentation)
-                    found.differences += _compare(found.views, "segmentation", saved, again, tolerance)
+                    found.differences += _compare(found.views, "segmentation", saved, again)
             case Ranked() if ranked is not None:
                 # The number of candidates is a setting of the run.
                 computed = replace(ranked, candidates=ranked.candidates[: len(event.candidates)])
@@ -121,7 +119,7 @@ def check(run: SavedRun, *, by: AnyStrategy | None = None) -> Check:
                 # the enrolled images are not in the run, so their measured fit is used
                 leader = search.belief.index.views.object_names.index(event.name)
                 computed = with_verification(search, Verification(leader, event.fit, event.others))
-            case Compared() if ranked is not None and search is not None and isinstance(describe, SearchDescriber):
+            case Compared() if ranked is not None and search is not None and describe is not None:
                 end = step if isinstance(step, Finish) else Finish()
                 compared = compare_leaders(
                     search, search.answer(ranked, end), describe.segmentations, saved_leader_views(event)
@@ -139,18 +137,8 @@ def check(run: SavedRun, *, by: AnyStrategy | None = None) -> Check:
                 pass
         if computed is not None:
             saved, again = plain(event), plain(computed) if not isinstance(computed, dict) else computed
-            for name in run.not_saved(event):
-                saved.pop(name, None)
-                again.pop(name, None)
-            found.differences += _compare(found.views, "", saved, again, tolerance)
+            found.differences += _compare(found.views, "", saved, again)
     return found
-
-
-def _describer(run: SavedRun, *, moving: bool) -> ViewDescriber:
-    """Return the describer of a run's views; in runs of earlier formats each view has one segmentation."""
-    if run.format_version < 5:
-        return ViewDescriber(run.config.view, (run.views.descriptor,), run.empty_table)
-    return SearchDescriber(run.config.view, run.views.descriptor, run.empty_table, revise=not moving)
 
 
 def _decided(step: Rotate | Finish | None, saved: Decided) -> Decided | dict[str, Any]:
@@ -169,16 +157,16 @@ def _decided(step: Rotate | Finish | None, saved: Decided) -> Decided | dict[str
     )
 
 
-def _compare(view: int, where: str, saved: Any, computed: Any, tolerance: float) -> Iterator[Difference]:
+def _compare(view: int, where: str, saved: Any, computed: Any) -> Iterator[Difference]:
     """Yield the differences, field by field."""
     if isinstance(saved, dict) and isinstance(computed, dict):
         for key in {**saved, **computed}:
-            yield from _compare(view, f"{where}.{key}" if where else key, saved.get(key), computed.get(key), tolerance)
+            yield from _compare(view, f"{where}.{key}" if where else key, saved.get(key), computed.get(key))
     elif isinstance(saved, list) and isinstance(computed, list) and len(saved) == len(computed):
         for number, (a, b) in enumerate(zip(saved, computed, strict=True), 1):
-            yield from _compare(view, f"{where} {number}", a, b, tolerance)
+            yield from _compare(view, f"{where} {number}", a, b)
     elif isinstance(saved, float) and isinstance(computed, float):
-        if not isclose(saved, computed, rel_tol=tolerance, abs_tol=tolerance):
+        if not isclose(saved, computed, rel_tol=TOLERANCE, abs_tol=TOLERANCE):
             yield Difference(view, where, saved, computed)
     elif saved != computed:
         yield Difference(view, where, saved, computed)

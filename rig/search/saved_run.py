@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 import hbr
 from hbr.core.validation import MIN_SIDE_PX
-from hbr.descriptors import MODEL_NAME, PREFIX, Descriptor, descriptor, loaded_models
+from hbr.descriptors import PREFIX, Descriptor, descriptor, loaded_models
 from rig.bench import Bench
 from rig.config import RigConfig
 from rig.config.values import validate
@@ -33,16 +33,13 @@ from rig.core.files import json_values, read, write
 from rig.events.compared import Compared
 from rig.events.events import Accepted, Event, Failed, Identified, Moved, Ranked, Started, event_dict
 from rig.events.reading import event_of
-from rig.search.earlier_runs import NOT_SAVED, upgraded
 from rig.search.model import Model, empty_table_for, model_of
 from rig.search.stopping_rules import FILE as STOPPING_RULE
 from rig.search.stopping_rules import read_stopping_rule, write_stopping_rule
 from rig.views import image_files as images
 
 FORMAT: Final = "hbr-rig run"
-VERSION: Final = 6
-"""Version 2 brought the dense search; version 3 stores codes instead of sentences, and terms of the glossary.
-Since version 4 similarities are the same on every computer. Version 6 brought the comparison of the two leaders."""
+VERSION: Final = 1
 EMPTY_TABLE: Final = "empty_table.png"
 LEADERS: Final = "leaders"
 DIFFERS_HERE: Final = f"{LEADERS}/differs_here.png"
@@ -232,7 +229,7 @@ class SavedRun:
         """
         for number, line in enumerate(self._lines, 1):
             try:
-                event = event_of(upgraded(line) if self.format_version < 3 else line, self._frame)
+                event = event_of(line, self._frame)
                 _check_event(event)
                 if isinstance(event, Compared):
                     event = self._with_images(event)
@@ -270,15 +267,6 @@ class SavedRun:
             raise _damaged(self.folder, "events.jsonl does not begin with the event started")
         return first
 
-    def not_saved(self, event: Event) -> tuple[str, ...]:
-        """Return the fields of an event that the run's format does not have."""
-        return NOT_SAVED.get(type(event), ()) if self.format_version < 3 else ()
-
-    @property
-    def format_version(self) -> int:
-        """The version of the run's format."""
-        return int(self.about["version"])
-
     def _with_images(self, event: Compared) -> Compared:
         picture = _image(self.folder, self.folder / DIFFERS_HERE) if event.views else None
         leaders = tuple(
@@ -301,17 +289,18 @@ def load_run(folder: Path) -> SavedRun:
     Raises
     ------
     UsageError
-        The folder contains no run, a damaged run, or one of a newer version; or the run needs a model that is not
-        loaded (`hbr.descriptors.load_model`).
+        The folder contains no run, a damaged run, or one of another version of the program; or the run needs a model
+        that is not loaded (`hbr.descriptors.load_model`).
     """
     try:
         about = _object(_bytes(folder, "run.json"), "run.json")
         if about.get("format") != FORMAT:
             raise ValueError("run.json does not belong to a saved run")
-        if about["version"] not in range(1, VERSION + 1):
+        if about["version"] != VERSION:
             raise UsageError(
-                f"The run {folder} has the format version {about['version']}; this program reads 1 to {VERSION}.",
-                next_step="Use the program that saved it, or a newer one.",
+                f"Another version of the program saved the run {folder}: it has the format version "
+                f"{about['version']}, this program reads {VERSION}.",
+                next_step="Use the version of hbr-rig that saved it.",
             )
         if not all(isinstance(about[key], str) for key in ("bench", "software", "started_utc")):
             raise TypeError("bench, software or started_utc in run.json is not text")
@@ -374,14 +363,10 @@ def _views(lines: Iterable[dict[str, Any]], kind: str) -> hbr.Views:
 def _descriptor(folder: Path, used: dict[str, Any]) -> Descriptor:
     """Return the descriptor of a run. A network is identified by its digest; the user gives the path of its file."""
     name, number = used["name"], used["version"]
-    if name.startswith(PREFIX):
-        for model in loaded_models():
-            if model.name == name or (model.version == number and not MODEL_NAME.fullmatch(name)):  # earlier: a path
-                return model
+    if name.startswith(PREFIX) and name not in {model.name for model in loaded_models()}:
         raise UsageError(
             f"The run {folder} needs the model {name}.",
             next_step="Give the ONNX file with this SHA-256: --model FILE.",
-            evidence={"CRC-32": number},
         )
     kind = descriptor(name)
     if number != kind.version:

@@ -286,7 +286,7 @@ class DenseSearch(Search):
     @property
     def found_from(self) -> float:
         """Log-odds from which a verified leader is found (`hbr.dense.verification.found_from`)."""
-        return found_from(self._session.rule, self._same_bench)
+        return found_from(self._same_bench)
 
     @property
     def is_doubtful(self) -> bool:

@@ -26,9 +26,7 @@ FILE: Final = "search_rules.json"
 """Beside ``catalog.sqlite``."""
 FORMAT: Final = "hbr-rig search rules"
 MAX_FILE_BYTES: Final = 16_000_000
-VERSION: Final = 4
-"""Version 1 stored limitations as sentences, and used other names; version 3 has the digest of packed views, version 4
-the weights of the open-set score."""
+VERSION: Final = 1
 ERROR_RATE: Final = 0.01
 FALSE_REJECT: Final = 0.02
 
@@ -85,15 +83,12 @@ class StoredRule:
         Digest of the model (`digest`).
     made_utc
         Time of the calibration, in the format of ISO 8601.
-    version
-        Of the file.
     """
 
     rule: hbr.StoppingRule
     objects: tuple[str, ...]
     sha256: str
     made_utc: str
-    version: int = VERSION
 
     def adapted(self, views: hbr.Views) -> hbr.StoppingRule:
         """Return the rule for other views; objects that it does not know have typical scores."""
@@ -106,11 +101,8 @@ class StoredRule:
         )
 
 
-def digest(index: hbr.DenseIndex, *, packed: bool = True) -> str:
-    """Return a digest of a model: its objects, their views, the descriptor's version, and the program that searches.
-
-    Versions 1 and 2 of the file have the digest of levels that are not ``packed``.
-    """
+def digest(index: hbr.DenseIndex) -> str:
+    """Return a digest of a model: its objects, their views, the descriptor's version, and the program that searches."""
     views = index.views
     kind = descriptor(views.descriptor)
     searched = [version("hbr-rig"), kind.name, kind.version, index.omega, index.power, BETA]
@@ -119,7 +111,7 @@ def digest(index: hbr.DenseIndex, *, packed: bool = True) -> str:
         found.update(np.ascontiguousarray(column).data)
     for start in range(0, len(views), _CHUNK):
         part = views.select(np.arange(start, min(start + _CHUNK, len(views))))
-        found.update(np.ascontiguousarray(part.packed() if packed else part.descriptors).data)
+        found.update(np.ascontiguousarray(part.packed()).data)
     return found.hexdigest()
 
 
@@ -136,9 +128,7 @@ def stopping_rule_of(folder: Path, index: hbr.DenseIndex) -> tuple[hbr.StoppingR
     except CatalogError as error:
         stored = None
         notes.append(Note(NoteCode.STOPPING_RULE_UNREADABLE, {"reason": error.evidence["reason"]}))
-    if stored is not None and stored.sha256 == digest(index, packed=stored.version >= 3):
-        if stored.rule.open_set is not None and not stored.rule.leave_one_out_thresholds:
-            notes.append(Note(NoteCode.STOPPING_RULE_EARLIER, {"made": stored.made_utc[:10]}))
+    if stored is not None and stored.sha256 == digest(index):
         return stored.rule, (*notes, *_not_guaranteed(stored.rule))
     if stored is None:
         found = quick_stopping_rule(index)
@@ -203,20 +193,21 @@ def write_stopping_rule(path: Path, rule: hbr.StoppingRule, index: hbr.DenseInde
 
 
 def read_stopping_rule(folder: Path) -> StoredRule | None:
-    """Read the stopping rule in a folder; None if there is none. Files of version 1 are read, too.
+    """Read the stopping rule in a folder; None if there is none.
 
     Raises
     ------
     CatalogError
-        The file is damaged, of a newer version, or cannot be read.
+        The file is damaged, of another version of the program, or cannot be read.
     """
     path = folder / FILE
     try:
         values = json_values(read(path, max_bytes=MAX_FILE_BYTES))
-        if values["format"] != FORMAT or values["version"] not in range(1, VERSION + 1):
-            raise ValueError(f"its format is {values['format']} {values['version']}")
-        if values["version"] == 1:
-            values = _from_version_1(values)
+        if values["format"] != FORMAT or values["version"] != VERSION:
+            raise ValueError(
+                f"another version of the program wrote it: its format is {values['format']} {values['version']}, "
+                f"this program reads {FORMAT} {VERSION}"
+            )
         usual = {str(name): [float(score) for score in scores] for name, scores in values["usual_scores"].items()}
         rule = hbr.StoppingRule(
             beta=float(values["beta"]),
@@ -230,14 +221,14 @@ def read_stopping_rule(folder: Path) -> StoredRule | None:
             limitations=tuple(
                 Limitation(LimitationCode(one["code"]), dict(one["values"])) for one in values["limitations"]
             ),
-            open_set=_open_set(values.get("open_set")),
-            unknown_thresholds=tuple(_value_or(threshold, -inf) for threshold in values.get("unknown_thresholds", ())),
-            changed_bench_thresholds=tuple(map(float, values.get("changed_bench_thresholds", ()))),
-            same_bench_thresholds=tuple(map(float, values.get("same_bench_thresholds", ()))),
+            open_set=_open_set(values["open_set"]),
+            unknown_thresholds=tuple(_value_or(threshold, -inf) for threshold in values["unknown_thresholds"]),
+            changed_bench_thresholds=tuple(map(float, values["changed_bench_thresholds"])),
+            same_bench_thresholds=tuple(map(float, values["same_bench_thresholds"])),
             leave_one_out_thresholds=tuple(
-                _value_or(threshold, -inf) for threshold in values.get("leave_one_out_thresholds", ())
+                _value_or(threshold, -inf) for threshold in values["leave_one_out_thresholds"]
             ),
-            rates=tuple(ShiftRates(**one) for one in values.get("rates", ())),
+            rates=tuple(ShiftRates(**one) for one in values["rates"]),
         )
         views = len(rule.open_set_thresholds)
         on_benches = rule.changed_bench_thresholds, rule.same_bench_thresholds, rule.leave_one_out_thresholds
@@ -246,9 +237,7 @@ def read_stopping_rule(folder: Path) -> StoredRule | None:
         scores = rule.usual_scores
         if scores.ndim != 2 or scores.shape[1] != len(rule.open_set_thresholds) or not np.isfinite(scores).all():
             raise ValueError("it does not have one usual score for each object and number of views")
-        return StoredRule(
-            rule, tuple(usual), str(values["model"]["sha256"]), str(values["made_utc"]), int(values["version"])
-        )
+        return StoredRule(rule, tuple(usual), str(values["model"]["sha256"]), str(values["made_utc"]))
     except FileNotFoundError:
         return None
     except (OSError, ValueError, KeyError, TypeError, AttributeError, ArithmeticError) as error:
@@ -271,19 +260,6 @@ def _open_set(values: dict[str, Any] | None) -> OpenSetModel | None:
     if not views or not (arrays["spread"] > 0).all():
         raise ValueError("its open-set score cannot be computed")
     return OpenSetModel(**arrays)
-
-
-def _from_version_1(values: dict[str, Any]) -> dict[str, Any]:
-    """Return the values of version 1 under the names of version 2; its sentences stay as they are."""
-    return {
-        **values,
-        "min_confidence": values["certainty"],
-        "usual_scores": values["usual"],
-        "open_set_thresholds": values["familiar"],
-        "limitations": [
-            {"code": LimitationCode.EARLIER_VERSION, "values": {"text": text}} for text in values["promises"]
-        ],
-    }
 
 
 def _value_or(value: float | None, otherwise: float) -> float:

@@ -4,7 +4,6 @@ Decision: docs/decisions/0028.
 """
 
 import hashlib
-import re
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass
@@ -13,7 +12,7 @@ from typing import Any, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from rig.bench import Bench
 from rig.core.errors import StateNotStored
@@ -26,8 +25,7 @@ MAX_AGE_H: Final = 12.0
 """A working day. On another day the illumination is different."""
 
 _FILE: Final = "empty-table.json"
-_VERSION: Final = 2
-_OLD_WARNING: Final = re.compile(r"(\d+) frames in a row look like the picture of the empty table over (\d+)% of .*")
+_VERSION: Final = 1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -159,8 +157,6 @@ class _Stored(BaseModel):
     image: str = Field(pattern=r"^empty-table-[0-9TZ.]+\.png$")
     sha256: str
     noticed: dict[str, Any] | None = None
-    doubt: str = Field("", exclude=True)
-    """The problem in words, in version 1."""
 
     @classmethod
     def of(cls, table: EmptyTable, png: bytes) -> Self:
@@ -174,32 +170,24 @@ class _Stored(BaseModel):
             noticed=None if table.noticed is None else table.noticed.as_json(),
         )
 
-    def upgraded(self) -> Self:
-        """Return the content in the present version."""
-        if self.version != 1:
-            return self
-        noticed = None
-        if found := _OLD_WARNING.fullmatch(self.doubt):
-            parameters = {"frames": int(found[1]), "agreement": int(found[2]) / 100}
-            noticed = TableProblem(TableProblemCode.SURROUNDINGS, parameters).as_json()
-        elif self.doubt:
-            noticed = TableProblem(TableProblemCode.OTHER, {"text": self.doubt}).as_json()
-        return self.model_copy(update={"version": _VERSION, "noticed": noticed})
+    @field_validator("noticed")
+    @classmethod
+    def _has_code(cls, noticed: dict[str, Any] | None) -> dict[str, Any] | None:
+        if noticed is not None:
+            TableProblemCode(str(noticed.get("code")))
+        return noticed
 
     def problem(self) -> TableProblem | None:
         if self.noticed is None:
             return None
         parameters = {name: value for name, value in self.noticed.items() if name != "code"}
-        try:
-            return TableProblem(TableProblemCode(str(self.noticed.get("code"))), parameters)
-        except ValueError:
-            return TableProblem(TableProblemCode.OTHER, {"text": str(self.noticed)})
+        return TableProblem(TableProblemCode(self.noticed["code"]), parameters)
 
 
 def _metadata(bench: Bench, *, quiet: bool = False) -> _Stored | None:
     try:
         text = bench.state.read_file(_FILE)
-        stored = None if text is None else _Stored.model_validate_json(text).upgraded()
+        stored = None if text is None else _Stored.model_validate_json(text)
     except StateNotStored as error:
         detail = error.what.rstrip(".")
     except ValidationError as error:
@@ -207,7 +195,7 @@ def _metadata(bench: Bench, *, quiet: bool = False) -> _Stored | None:
     else:
         if stored is None or stored.version == _VERSION:
             return stored
-        detail = f"{_FILE} has version {stored.version}, this program reads versions up to {_VERSION}"
+        detail = f"{_FILE} has version {stored.version}, this program reads version {_VERSION}"
     if quiet:
         return None
     raise _Unreadable(detail)

@@ -28,8 +28,6 @@ class TableProblemCode(StrEnum):
     """A camera setting has changed: ``name``, ``before``, ``now``."""
     SURROUNDINGS = "surroundings"
     """The border of ``frames`` frames in a row had at most this ``agreement`` with the image, 0..1."""
-    OTHER = "other"
-    """``text``, stored by version 0.1."""
 
 
 class TableProblem(Issue):
@@ -51,7 +49,6 @@ _TEXTS: Mapping[str, str] = {
     TableProblemCode.FUTURE: "its date is in the future: check the computer's clock",
     TableProblemCode.SURROUNDINGS: "{frames} frames in a row agree with it over at most {agreement:.0%} of their "
     "border. The table or its surroundings have changed, the camera was moved, or the object reaches the border",
-    TableProblemCode.OTHER: "{text}",
 }
 
 
@@ -64,8 +61,8 @@ def problem_text(problem: Mapping[str, Any]) -> str:
             return f"{name} was {_setting(before)}, is {_setting(now)}"
     try:
         return filled(_TEXTS[problem["code"]], **problem)
-    except LookupError:  # a code or a parameter of another version
-        return str(problem.get("text", problem["code"]))
+    except LookupError:  # a code or a parameter that this program does not have
+        return str(problem["code"])
 
 
 def _setting(value: float | bool) -> str:

@@ -3,7 +3,7 @@
 from enum import StrEnum
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import AliasChoices, BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 
 class _Request(BaseModel):
@@ -100,12 +100,7 @@ class ReferenceRequest(_Request):
     kind: Literal["reference"] = "reference"
     revolutions: Annotated[
         int | None,
-        Field(
-            ge=-100,
-            le=100,
-            description="revolutions that the cable is wound up",
-            validation_alias=AliasChoices("revolutions", "turns"),  # "turns" of version 0.1, until 0.3
-        ),
+        Field(ge=-100, le=100, description="revolutions that the cable is wound up"),
     ] = None
     here: bool = Field(False, description="the present angle is home, with the cable hanging free")
 

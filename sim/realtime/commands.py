@@ -72,7 +72,7 @@ class Commands:
                 return "The table is empty."
             case "objects":
                 return "\n".join([*self._operator.objects, *calibration_targets(self._operator.optics)])
-            case "rotate" | "turn":  # "turn" is the name of version 0.1; 0.3 removes it
+            case "rotate":
                 return self._rotate_by_hand(_number(_arguments(command, given, 1, 1)[0], "degrees", MAX_DEG))
             case "light":
                 factor = _number(_arguments(command, given, 1, 1)[0], "factor", MAX_LIGHT)

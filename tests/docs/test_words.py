@@ -23,7 +23,7 @@ SINGLE_FILES += ("firmware/Makefile", "docs/deploy/Dockerfile", "docs/deploy/rig
 SUFFIXES = {".py", ".md", ".j2", ".toml", ".c", ".h", ".js", ".css", ".sh", ".yml", ".yaml"}
 
 REFUSE = r"refus(?:e|es|ed|al|als|ing)"
-# Terms of earlier versions, as regular expressions. They match whole words, also within a name (`_` and case separate).
+# Terms that no file uses, as regular expressions. They match whole words, also within a name (`_` and case separate).
 RETIRED = (
     r"strangers?",
     r"(?:least_|min_)?familiar(?:ity)?|unfamiliar",
@@ -72,7 +72,6 @@ ALLOWED_NAMES = frozenset(
         "_shot",  # shot noise
         *("SINGLE_TURN_HOMING_COUNTS", "_CLEAR_MULTI_TURN"),  # names of the servo's manual
         "turning_share",  # a field of the events
-        "refused",  # a key of earlier versions
     }
 )
 COMMENTS_AND_STRINGS = re.compile(r"""/\*.*?\*/|//[^\n]*|"(?:\\.|[^"\\\n])*"|'(?:\\.|[^'\\\n])*'|`[^`]*`""", re.DOTALL)
@@ -87,20 +86,6 @@ EXCEPTIONS: dict[str, tuple[str, ...]] = {
     "docs/glossary.md": RETIRED,  # it lists them
     "docs/style.md": (r"anew", r"anyhow"),  # examples of what not to write
     "tests/docs/test_words.py": RETIRED,
-    # The names of earlier versions, where they are read or deprecated.
-    "docs/events.md": RETIRED,
-    "hbr/__init__.py": RETIRED,
-    "rig/catalog/exchange/batch.py": RETIRED,
-    "rig/catalog/exchange/bundle.py": RETIRED,
-    "rig/search/earlier_runs.py": RETIRED,
-    "rig/search/stopping_rules.py": (r"(?:least_|min_)?familiar(?:ity)?|unfamiliar", r"certainty|sureness"),
-    "tests/hbr/test_deprecated_names.py": RETIRED,
-    "tests/rig/catalog/test_migration.py": RETIRED,
-    "tests/rig/search/test_stopping_rules.py": (r"(?:least_|min_)?familiar(?:ity)?|unfamiliar", r"certainty|sureness"),
-    "rig/calibrations/result.py": (REFUSE,),  # a key of earlier files
-    "rig/catalog/exchange/plan.py": (REFUSE,),
-    "rig/views/segmentation_evidence.py": (REFUSE,),
-    "tests/rig/views/test_segmentation_evidence.py": (REFUSE,),
     "hbr/evaluation/unknown_objects.py": (r"strangers?",),  # the name of a random stream: another draws other objects
     "tests/rig/catalog/test_upkeep.py": (r"somebody|nobody|anybody",),  # a user of the operating system
 }
@@ -110,7 +95,7 @@ EXCEPTIONS: dict[str, tuple[str, ...]] = {
 def files() -> Iterator[Path]:
     for folder in FOLDERS:
         for path in sorted((ROOT / folder).rglob("*")):
-            if path.suffix in SUFFIXES and "migrations" not in path.parts and "data" not in path.parts:
+            if path.suffix in SUFFIXES and "data" not in path.parts:
                 yield path
     yield from (ROOT / name for name in SINGLE_FILES)
 

@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 from click import Command, Context
+from sqlalchemy import text
 from typer.testing import Result
 
 from rig.catalog import Catalog, edit
@@ -365,3 +366,21 @@ def test_kill_at_any_point_loses_and_doubles_nothing(place: CatalogPlace, kind: 
         found = {one.problem for one in finished(verify(shared, quick=True, jobs=1)).findings}
         assert found <= ({Problem.ORPHANED_FILE} if kind == "delivery" else set())
         assert {one.unfinished_views for one in shared.objects()} == {None}
+
+
+@pytest.mark.parametrize(
+    ("version", "error", "words"),
+    [("2", CatalogError, "another version of the program"), ("0", CatalogDamaged, "version")],
+)
+def test_catalog_of_another_version_is_not_used(
+    place: CatalogPlace, version: str, error: type[CatalogError], words: str
+) -> None:
+    with Catalog.open(place, clock=CLOCK) as catalog:
+        with catalog.database.write() as connection:
+            connection.execute(text(f"UPDATE catalog_properties SET value = '{version}' WHERE key = 'version'"))
+        for attempt in (catalog.objects, lambda: true_fill(catalog, "jar", 1, 9)):
+            with pytest.raises(error, match=words):
+                attempt()
+    for read_only in (False, True):
+        with pytest.raises(error, match=words):
+            Catalog.open(place, clock=CLOCK, read_only=read_only)

@@ -11,7 +11,6 @@ from typing import Annotated, Any, NamedTuple, Self
 
 from pydantic import (
     AfterValidator,
-    AliasChoices,
     AwareDatetime,
     BaseModel,
     ConfigDict,
@@ -30,7 +29,7 @@ from rig.catalog.records import (
     clean_name,
 )
 from rig.core.errors import RigError
-from rig.views.segmentation_evidence import check_evidence, upgrade_evidence
+from rig.views.segmentation_evidence import check_evidence
 
 Degrees = Annotated[float, Field(allow_inf_nan=False)]
 Azimuth = Annotated[float, Field(ge=0, lt=360)]
@@ -56,11 +55,6 @@ MAX_VIEWS = 10_000
 
 class _Part(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-def _renamed(name: str, old: str) -> Any:
-    """Return an optional field that bundles of version 1 have under another name."""
-    return Field(default=None, validation_alias=AliasChoices(name, old))
 
 
 class ImageSource(NamedTuple):
@@ -96,7 +90,7 @@ class View(_Part):
     """A view; ``image`` is the path of its image in the bundle, ``session`` the index of its session."""
 
     index: Annotated[Integer, Field(ge=0, lt=MAX_VIEWS)]
-    session: Annotated[Integer, Field(ge=0)] = Field(validation_alias=AliasChoices("session", "sitting"))
+    session: Annotated[Integer, Field(ge=0)]
     azimuth_deg: Azimuth
     commanded_deg: Degrees | None = None
     encoder_deg: Degrees | None = None
@@ -108,20 +102,18 @@ class View(_Part):
     image_sha256: Sha256 | None = None
     image_bytes: Annotated[Integer, Field(ge=1)] | None = None
     evidence: Json = {}
-    segmentation: Json | None = Field(default=None, validation_alias=AliasChoices("segmentation", "front_end"))
+    segmentation: Json | None = None
     descriptors: tuple[BundledDescriptor, ...] = ()
 
     @field_validator("segmentation")
     @classmethod
     def _has_codes(cls, segmentation: Json | None) -> Json | None:
-        if segmentation is None:
-            return None
         try:
-            upgraded = upgrade_evidence(segmentation)
-            check_evidence(upgraded)
+            if segmentation is not None:
+                check_evidence(segmentation)
         except TypeError as error:
             raise ValueError(str(error)) from error
-        return upgraded
+        return segmentation
 
     @model_validator(mode="after")
     def _is_whole(self) -> Self:
@@ -142,11 +134,9 @@ class Session(_Part):
     software: str
     devices: Json = {}
     conditions: Json = {}
-    empty_table_image: str | None = _renamed("empty_table_image", "reference_image")
-    empty_table_image_sha256: Sha256 | None = _renamed("empty_table_image_sha256", "reference_image_sha256")
-    empty_table_image_bytes: Annotated[int | None, Field(ge=1)] = _renamed(
-        "empty_table_image_bytes", "reference_image_bytes"
-    )
+    empty_table_image: str | None = None
+    empty_table_image_sha256: Sha256 | None = None
+    empty_table_image_bytes: Annotated[int | None, Field(ge=1)] = None
 
     @model_validator(mode="after")
     def _is_json(self) -> Self:
@@ -162,9 +152,7 @@ class Enrollment(_Part):
     started_utc: Time
     finished_utc: Time | None = None
     planned_azimuth_deg: Annotated[tuple[Azimuth, ...], Field(min_length=1, max_length=MAX_VIEWS)]
-    sessions: Annotated[tuple[Session, ...], Field(max_length=MAX_VIEWS)] = Field(
-        validation_alias=AliasChoices("sessions", "sittings")
-    )
+    sessions: Annotated[tuple[Session, ...], Field(max_length=MAX_VIEWS)]
     views: Annotated[tuple[View, ...], Field(max_length=MAX_VIEWS)]
 
     @model_validator(mode="after")

@@ -3,8 +3,6 @@
 The same objects give the same bytes: one order, and no dates but those of the objects. A reader trusts nothing in a
 bundle: it checks names against paths outside, sizes against limits, and every image against its SHA-256.
 
-Version 2 says session, empty table and segmentation for what version 1 called sitting, reference and front end.
-
 Decision: docs/decisions/0015.
 """
 
@@ -27,7 +25,7 @@ from rig.core.files import no_follow, open_new, sync_file, sync_folder
 from rig.views import image_files as images
 
 FORMAT: Final = "rigcat"
-VERSION: Final = 2
+VERSION: Final = 1
 MANIFEST: Final = "rigcat.json"
 OBJECTS: Final = "objects.jsonl"
 
@@ -267,10 +265,11 @@ def _objects(
     version = manifest.get("version")
     if type(version) is not int or version < 1:
         raise rejected(path, f"its format has version {version!r:.40}")
-    if version > VERSION:
+    if version != VERSION:
         raise ImportRejected(
-            f"{path} was written by a newer program: its format has version {version}, this program knows {VERSION}.",
-            next_step="Update hbr-rig on this computer.",
+            f"{path} was written by another version of the program: its format has version {version}, "
+            f"this program knows {VERSION}.",
+            next_step="Export the objects again, with the version of hbr-rig on this computer.",
         )
     found: list[Object] = []
     names: set[str] = set()

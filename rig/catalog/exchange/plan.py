@@ -19,10 +19,6 @@ class Conflict(StrEnum):
     SKIP = "skip"
     REPLACE = "replace"
 
-    @classmethod
-    def _missing_(cls, value: object) -> "Conflict | None":
-        return cls.REJECT if value == "refuse" else None  # its name in version 0.1
-
 
 @dataclass(frozen=True, slots=True)
 class Plan:

@@ -139,9 +139,6 @@ def status(settings: Settings) -> None:
             ),
         }
         report["findings"] = list(bench.findings)  # opening the camera adds some
-        for device, key in (("servo", "bus"), ("head", "connection")):
-            if device in report:
-                report[device]["line"] = report[device][key]  # the former key, until version 0.3
     if settings.json:
         settings.print_json(report)
     else:

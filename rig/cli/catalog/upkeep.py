@@ -1,4 +1,4 @@
-"""`rig catalog verify`, `redescribe`, `gc`, `merge` and `migrate`, and `rig log`."""
+"""`rig catalog verify`, `redescribe`, `gc` and `merge`, and `rig log`."""
 
 import sys
 from datetime import datetime, timedelta
@@ -182,25 +182,6 @@ def gc(
             found = collect_garbage(catalog, old=old)
     text = f"{'Would remove' if dry_run else 'Removed'} {words(found)}."
     settings.say("There is nothing to remove." if nothing else text, {"dry_run": dry_run, **plain(found)})
-
-
-@app.command("migrate")
-@command
-def migrate(settings: Settings) -> None:
-    """Migrate the catalog of an earlier version of the program. A backup of the database stays beside it.
-
-    Example: rig catalog migrate --bench sim
-    """
-    from rig.catalog import migrate as job
-    from rig.core.clock import SystemClock
-
-    path = settings.load().catalog_place(settings.bench_name)
-    done = job(path, clock=SystemClock())
-    text = f"{path} is up to date, version {done.after}."
-    if done.backup is not None:
-        text = f"Migrated {path} from version {done.before} to {done.after}. Backup: {done.backup}"
-    backup = None if done.backup is None else str(done.backup)
-    settings.say(text, {"catalog": str(path), "before": done.before, "after": done.after, "backup": backup})
 
 
 @app.command("copy")

@@ -190,13 +190,6 @@ def test_evidence_is_json() -> None:
     assert other["issues"][0] == {"code": "empty-table-differs", "agreement": other["agreement"]}
 
 
-def test_old_keyword_of_the_empty_table_image_is_deprecated() -> None:
-    empty = table(0)
-    for function in (segment, hbr.describe):
-        with pytest.warns(DeprecationWarning, match="'reference' is now 'empty_table'"):
-            function(with_object(empty), reference=empty)
-
-
 def test_invalid_arguments_are_rejected() -> None:
     image = with_object(table(0))
     with pytest.raises(ValueError, match="the empty-table image has 100 x 80 pixels, the frame 320 x 240"):

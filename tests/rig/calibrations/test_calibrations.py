@@ -3,7 +3,6 @@
 import json
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta, timezone
-from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -135,7 +134,7 @@ def test_newest_result_that_passed_on_these_devices_decides(tmp_path):
         # The source has another name after replugging, or the name means another camera.
         (("camera 0", "USB A"), ("camera /dev/v4l/by-id/a", "USB A"), CalibrationStatus.IN_FORCE),
         (("camera 0", "USB A"), ("camera 0", "USB B"), CalibrationStatus.OTHER_DEVICE),
-        # An earlier version stored only the name.
+        # The device of one of them is not known.
         (("camera 0",), ("camera 0", "USB A"), CalibrationStatus.IN_FORCE),
         (("camera 0",), ("camera 1", "USB A"), CalibrationStatus.OTHER_DEVICE),
         (("film.mp4", None), ("film.mp4", None), CalibrationStatus.IN_FORCE),
@@ -187,18 +186,6 @@ def test_result_applies_only_settings_that_the_configuration_leaves_open():
     assert apply_results(load_config(None, ["view.roi=none"]), [region])[0].view.roi is None
     with pytest.raises(ConfigError, match="calibrations in force"):
         apply_results(RigConfig(), [replace(RESULT, settings={"imu.scale": 7.0})])
-
-
-DATA = Path(__file__).parent / "data"
-
-
-def test_results_of_version_1_are_read():
-    passed = CalibrationResult.from_file(DATA / "version-1-passed.json")
-    assert passed.passed
-    assert list(passed.settings) == ["table.backlash_deg"]
-    rejected = CalibrationResult.from_file(DATA / "version-1-rejected.json")
-    assert [rejection.code for rejection in rejected.rejections] == [RejectionCode.TEXT]
-    assert str(rejected.rejections[0]).startswith("The gyro reads")
 
 
 @pytest.mark.parametrize("code", RejectionCode)

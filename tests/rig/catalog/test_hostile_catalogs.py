@@ -17,13 +17,12 @@ import numpy as np
 import pytest
 from typer.testing import Result
 
-from rig.catalog import Action, Catalog, migrate
+from rig.catalog import Action, Catalog
 from rig.catalog.edit import delete
 from rig.catalog.exchange import import_objects, plan_import, read_bundle, read_catalog, read_objects, write_bundle
 from rig.catalog.redescribe import redescribe
 from rig.catalog.results import correct
 from rig.catalog.results import record as record_result
-from rig.catalog.schema import SCHEMA_VERSION
 from rig.catalog.seal import seal_enrollments, seal_objects
 from rig.catalog.upkeep import collect_garbage, statistics
 from rig.catalog.verify import verify
@@ -186,7 +185,7 @@ def rollback_journal(database: Path, *, names: Path | None) -> bytes:
 
 COMMANDS = (
     *("catalog gc --yes", "catalog verify --repair --jobs 1", "catalog delete mug --yes", "catalog rename mug cup"),
-    *("catalog redescribe --again --jobs 1", "catalog migrate", "catalog label mug lab", "import photographs --jobs 1"),
+    *("catalog redescribe --again --jobs 1", "catalog label mug lab", "import photographs --jobs 1"),
     *("enroll cup --views 4", "catalog merge other --jobs 1", "export a.zip", "catalog list", "identify"),
 )
 
@@ -239,10 +238,8 @@ def test_journal_of_another_program_is_not_played_back_unasked(root: Path, tmp_p
         killed = root
     before = content(killed)
     for read_only in (True, False):
-        with pytest.raises(CatalogDamaged, match="another program"):
+        with pytest.raises(CatalogDamaged, match="another program") as error:
             Catalog.open(killed, clock=VirtualClock(), read_only=read_only)
-    with pytest.raises(CatalogDamaged, match="another program") as error:
-        migrate(killed, clock=VirtualClock())
     assert content(killed) == before
     program, file, statement = shlex.split(error.value.next_step.partition("finish its change: ")[2])
     assert program == "sqlite3"
@@ -328,24 +325,19 @@ def test_new_catalog_is_private(tmp_path: Path, umask: int) -> None:
         "ALTER TABLE views ADD COLUMN evil TEXT",
     ],
 )
-@pytest.mark.parametrize("version", [SCHEMA_VERSION, 2])
-def test_foreign_schema_is_rejected(root: Path, statement: str, version: int) -> None:
-    sql(root, statement, f"PRAGMA user_version = {version}")
+def test_foreign_schema_is_rejected(root: Path, statement: str) -> None:
+    sql(root, statement)
     before = content(root)
     with pytest.raises(CatalogDamaged, match="other tables"):
-        if version == SCHEMA_VERSION:
-            opened(root)
-        else:
-            migrate(root, clock=VirtualClock())
+        opened(root)
     assert content(root) == before
 
 
 @pytest.mark.parametrize("version", [-5, 0, -(2**31)])
 def test_impossible_version_is_rejected(root: Path, version: int) -> None:
     sql(root, f"PRAGMA user_version = {version}")
-    for attempt in (lambda: opened(root), lambda: migrate(root, clock=VirtualClock())):
-        with pytest.raises(CatalogDamaged, match="version"):
-            attempt()
+    with pytest.raises(CatalogDamaged, match="version"):
+        opened(root)
 
 
 EDITS = (

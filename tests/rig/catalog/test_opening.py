@@ -48,12 +48,13 @@ def test_new_catalog_has_application_id_and_version(enrolled: Path) -> None:
     assert {file.name for file in enrolled.iterdir()} == {"catalog.sqlite", "images"}
 
 
-def test_newer_catalog_is_rejected(enrolled: Path) -> None:
+@pytest.mark.parametrize("read_only", [False, True])
+def test_catalog_of_another_version_is_rejected(enrolled: Path, read_only: bool) -> None:
     pragma(enrolled, f"user_version = {SCHEMA_VERSION + 1}")
-    with pytest.raises(CatalogError, match="newer program") as error:
-        open_catalog(enrolled)
+    with pytest.raises(CatalogError, match="another version of the program") as error:
+        open_catalog(enrolled, read_only=read_only)
     assert error.value.evidence == {"found": SCHEMA_VERSION + 1, "known": SCHEMA_VERSION}
-    assert "Update" in error.value.next_step
+    assert "the version of hbr-rig that wrote it" in error.value.next_step
 
 
 @pytest.mark.parametrize(("create", "read_only"), [(False, False), (True, True)])

@@ -152,7 +152,6 @@ def test_status_reports_the_devices(rig):
     result = json.loads(rig("status", "--json").stdout)
     assert result["servo"]["model"] == "xl430_w250"
     assert result["servo"]["bus"]["transactions"] > 0
-    assert result["servo"]["line"] == result["servo"]["bus"]  # the former key
     assert result["imu"]["who_am_i"] == 0x68
     assert result["camera"]["width"] == 320
     assert result["camera"]["locks"]["auto_exposure"] is False

@@ -20,14 +20,12 @@ from tests.rig.report.report_samples import NOTE
         (NoteCode.EMPTY_TABLE_DOUBTED, {"problems": [{"code": "old", "hours": 72}]}, "(it is 3 days old); to take one"),
         (NoteCode.EMPTY_TABLE_MISSING, {"problems": [{"code": "missing"}]}, "no empty-table image (there is no"),
         (NoteCode.EMPTY_TABLE_OF_ENROLLMENT, {"problems": [{"code": "missing"}]}, "enrollment is used (there is no"),
-        (NoteCode.EMPTY_TABLE_CHANGED, {"problem": {"code": "other", "text": "it moved"}}, "image: it moved"),
+        (NoteCode.EMPTY_TABLE_CHANGED, {"problem": {"code": "missing"}}, "image: there is no"),
         (NoteCode.TABLE_DIFFERS, {"taken_utc": "2026-01-02"}, "does not look as it did at 2026-01-02"),
         (NoteCode.STOPPING_RULE_UNREADABLE, {"reason": "no JSON"}, "(no JSON); to renew it: rig catalog calibrate"),
         (NoteCode.STOPPING_RULE_OUTDATED, {"made": "2026-01-02", "added": 1, "removed": 2}, "1 object added, 2 obj"),
         (NoteCode.STOPPING_RULE_OUTDATED, {"made": "2026-01-02", "added": 0, "removed": 0}, "(other views, or"),
-        (NoteCode.STOPPING_RULE_EARLIER, {"made": "2026-01-02"}, "to renew it: rig catalog calibrate"),
         (NoteCode.NOT_COMPARED, {"what": "no image"}, "are not compared pixel by pixel: no image"),
-        (NoteCode.EARLIER_VERSION, {"text": "as it was"}, "as it was"),
     ],
 )
 def test_note_is_put_into_words(code: NoteCode, values: dict[str, object], words: str) -> None:
@@ -40,7 +38,7 @@ def test_warnings_have_a_next_step() -> None:
     )
     for code in (NoteCode.EMPTY_TABLE_CHANGED, NoteCode.TABLE_DIFFERS):
         assert next_step_words(Note(code)).endswith("rig empty-table")
-    assert next_step_words(Note(NoteCode.EARLIER_VERSION, {"next_step": "Wait."})) == "Wait."
+    assert next_step_words(Note(NoteCode.NOT_RECORDED, {"next_step": "Wait."})) == "Wait."
     assert wait_words(WaitReason.NEXT_OBJECT) != wait_words(WaitReason.FIRST_OBJECT)
 
 
@@ -62,7 +60,6 @@ NUMBERS = {"rate": 0.01, "searches": 24, "needed": 100, "min_confidence": 0.98, 
         (LimitationCode.UNKNOWN_NOT_MEASURED, {}, "fewer than three objects"),
         (LimitationCode.ONE_OBJECT, {}, "with one object there is no other candidate"),
         (LimitationCode.SINGLE_VIEWS, {}, "a single view"),
-        (LimitationCode.EARLIER_VERSION, {"text": "as it was"}, "as it was"),
     ],
 )
 def test_limitation_is_put_into_words(code: LimitationCode, values: dict[str, object], words: str) -> None:

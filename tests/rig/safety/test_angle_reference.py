@@ -18,6 +18,7 @@ KEPT, LOST = (ServoCondition(False, False, False, lost, ()) for lost in (False, 
 
 def saved(position_deg: float, shift_deg: float = 0.0, path_deg: tuple[float, float] | None = None, **values: int):
     known = {"model_number": 1060, "bus_id": 1, "firmware": 46, **values}
+    known |= {"zero_deg": 0, "direction": 1, "gear_ratio": 1}
     return SavedTable(position_deg=position_deg, shift_deg=shift_deg, path_deg=path_deg, **known)
 
 

@@ -13,17 +13,13 @@ import pytest
 from typer.testing import CliRunner
 
 import hbr
-from hbr.dense.stopping import LimitationCode
-from rig.catalog import Catalog
 from rig.cli.main import app
-from rig.config import load_config
 from rig.core.errors import UsageError
 from rig.events.compared import Compared
 from rig.events.events import (
     Accepted,
     Decided,
     Identified,
-    NoteCode,
     Ranked,
     Rejected,
     RotationReason,
@@ -31,52 +27,14 @@ from rig.events.events import (
     event_dict,
 )
 from rig.events.reading import event_of
-from rig.plans.enroll import enroll
-from rig.plans.identify import identify
-from rig.plans.photograph_table import photograph_table
-from rig.search.model import load_model
 from rig.search.replay import check
 from rig.search.saved_run import RunWriter, load_run
-from sim.bench import ShelfOperator, open_sim_bench
-from sim.objects.shelf import shelf
-from sim.world import World
-from tests.small import SMALL
-
-DATA = Path(__file__).parent / "data"
+from tests.rig.search.run_samples import saved_runs
 
 
 @pytest.fixture(scope="module")
 def saved(tmp_path_factory):
-    """Return the folders of runs by strategy, and the events that each run yielded."""
-    home = tmp_path_factory.mktemp("runs")
-    operator = ShelfOperator(World(seed=9), shelf())
-    runs = {}
-    settings = (*SMALL, "identify.max_views=4", "identify.margin=0.9")  # every run takes all its views
-    with (
-        open_sim_bench(load_config(None, settings), operator) as bench,
-        Catalog.open(home / "catalog", clock=bench.clock) as catalog,
-    ):
-        list(photograph_table(bench))
-        for name in ("mug-white", "mug-star", "lamp"):
-            list(enroll(bench, catalog, name, views=6))
-        index = hbr.ViewIndex(catalog.views().views)
-        for number, strategy in enumerate(("ahbr", "hbr", "sweep", "random")):
-            operator.next_object, operator.yaw_deg = "mug-star", 40.0 * number
-            with RunWriter(home / strategy, bench, index) as writer:
-                events = []
-                for event in identify(bench, index, strategy=strategy, seed=number, top=2):
-                    writer.add(event)
-                    events.append(event)
-            runs[strategy] = home / strategy, events
-        model = load_model(catalog)
-        operator.next_object, operator.yaw_deg = "mug-star", 70.0
-        with RunWriter(home / "dense", bench, model) as writer:
-            events = []
-            for event in identify(bench, model, top=2):
-                writer.add(event)
-                events.append(event)
-        runs["dense"] = home / "dense", events
-    return runs
+    return saved_runs(tmp_path_factory.mktemp("runs"))
 
 
 def changed(saved, tmp_path: Path, line: int, **values: object) -> Path:
@@ -166,28 +124,6 @@ def test_another_stopping_rule_is_noticed(saved, tmp_path):
     changed = {"open_set_thresholds": [threshold] * len(rule["open_set_thresholds"])}
     (folder / "search_rules.json").write_text(json.dumps(rule | changed))
     assert "decision.outcome" in {difference.what for difference in check(load_run(folder)).differences}
-
-
-@pytest.mark.parametrize("strategy", ["ahbr", "dense"])
-def test_runs_of_format_2_are_read_and_computed_again(strategy):
-    run = load_run(DATA / f"run-format-2-{strategy}")
-    found = check(run)
-    assert found.differences == []
-    assert found.views == found.decisions >= 2
-    started, *_, answer = run.events()
-    assert isinstance(started, Started)
-    assert isinstance(answer, Identified)
-    assert answer.reason is hbr.StopReason.EARLIER_VERSION
-    assert answer.note
-    decided = [event for event in run.events() if isinstance(event, Decided)]
-    assert decided[-1].candidates
-    assert all(event.reason is RotationReason.EARLIER_VERSION and event.note for event in decided)
-    if strategy == "dense":
-        assert answer.confidence is not None
-        assert run.model.rule is not None
-        assert {one.code for one in run.model.rule.limitations} <= {LimitationCode.EARLIER_VERSION}
-        assert {note.code for note in started.notes} <= {NoteCode.EARLIER_VERSION}
-        assert all(event.weighed is not None and event.weighed.similarity for event in decided)
 
 
 def test_every_decision_has_a_reason(saved):

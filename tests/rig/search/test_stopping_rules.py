@@ -10,7 +10,6 @@ import pytest
 import hbr
 from hbr.dense.calibration import UNCALIBRATED_MIN_CONFIDENCE
 from hbr.dense.leave_one_out import leave_one_out
-from hbr.dense.open_set import NUMBERS, OpenSetModel
 from hbr.dense.stopping import LimitationCode
 from rig.catalog import Catalog
 from rig.config import RigConfig
@@ -168,43 +167,21 @@ def test_stored_rules_are_read_as_they_were_written(tmp_path):
         assert same(stored.adapted(index.views), rule)
 
 
-def test_rule_without_leave_one_out_thresholds_decides_as_before_with_a_note(tmp_path):
-    index = shelf(18, 18, 18)
-    plain = hbr.calibrate_stopping_rule(index).rule
-    thresholds = plain.open_set_thresholds
-    numbers = np.zeros((len(thresholds), len(NUMBERS)))
-    rule = replace(
-        plain,
-        open_set=OpenSetModel(numbers, numbers + 1, numbers, numbers[:, 0]),
-        leave_one_out_thresholds=thresholds,
-    )
-    write_stopping_rule(tmp_path / FILE, rule, index, made_utc=NOW)
-    found, notes = stopping_rule_of(tmp_path, index)
-    assert found.leave_one_out_thresholds == thresholds
-    assert NoteCode.STOPPING_RULE_EARLIER not in [note.code for note in notes]
+def test_rule_of_another_version_or_without_a_value_is_calibrated_again(tmp_path):
+    index = shelf(8, 8, 8)
+    write_stopping_rule(tmp_path / FILE, hbr.calibrate_stopping_rule(index).rule, index, made_utc=NOW)
     values = json.loads((tmp_path / FILE).read_text())
-    del values["leave_one_out_thresholds"]
-    (tmp_path / FILE).write_text(json.dumps(values))
-    found, notes = stopping_rule_of(tmp_path, index)
-    assert found.leave_one_out_thresholds == ()
-    assert notes[0].code is NoteCode.STOPPING_RULE_EARLIER
-
-
-def test_rules_of_version_1_are_read(tmp_path):
-    index = shelf(18, 18, 18)
-    rule = hbr.calibrate_stopping_rule(index).rule
-    write_stopping_rule(tmp_path / FILE, rule, index, made_utc=NOW)
-    values = json.loads((tmp_path / FILE).read_text())
-    names = {"min_confidence": "certainty", "usual_scores": "usual", "open_set_thresholds": "familiar"}
-    before = {names.get(key, key): value for key, value in values.items() if key != "limitations"}
-    before |= {"version": 1, "promises": ["too few searches"]}
-    (tmp_path / FILE).write_text(json.dumps(before))
-    stored = read_stopping_rule(tmp_path)
-    assert stored is not None
-    (limitation,) = stored.rule.limitations
-    assert (limitation.code, limitation.values) == (LimitationCode.EARLIER_VERSION, {"text": "too few searches"})
-    assert stored.rule.open_set_thresholds == rule.open_set_thresholds
-    assert stopping_rule_of(tmp_path, index)[1][0].code is NoteCode.RATES_NOT_GUARANTEED
+    assert read_stopping_rule(tmp_path) is not None
+    for changed, reason in (
+        (values | {"version": values["version"] + 1}, "another version of the program wrote it"),
+        ({key: value for key, value in values.items() if key != "leave_one_out_thresholds"}, "leave_one_out"),
+    ):
+        (tmp_path / FILE).write_text(json.dumps(changed))
+        with pytest.raises(CatalogError, match="cannot be read") as caught:
+            read_stopping_rule(tmp_path)
+        assert reason in caught.value.evidence["reason"]
+        assert "rig catalog calibrate" in caught.value.next_step
+        assert stopping_rule_of(tmp_path, index)[1][0].code is NoteCode.STOPPING_RULE_UNREADABLE
 
 
 @pytest.mark.parametrize(

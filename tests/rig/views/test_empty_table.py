@@ -136,6 +136,7 @@ def test_damage_on_disk_is_reported_and_fixed_by_a_new_image(simulated: Open, tm
         (png.unlink, "is missing"),
         (lambda: metadata.write_bytes(whole[:50]), "empty-table.json is damaged"),
         (lambda: metadata.write_text(json.dumps({**json.loads(whole), "version": 9})), "has version 9"),
+        (lambda: metadata.write_text(json.dumps({**json.loads(whole), "noticed": {"code": "x"}})), "is damaged"),
     ):
         spoil()
         status = empty_table_status(s.bench)
@@ -256,27 +257,6 @@ def test_changed_surroundings_are_reported_once_and_stored(simulated: Open, tmp_
     assert empty_table_status(s.bench).problems == ()
 
 
-def test_images_of_version_1_are_read(simulated: Open) -> None:
-    s = simulated()
-    photographed(s.bench)
-    stored = json.loads(s.bench.state.read_file("empty-table.json"))
-    assert stored.pop("noticed") is None
-    warning = (
-        "3 frames in a row look like the picture of the empty table over 42% of their border at most: the table or its "
-        "surroundings have changed, the camera was moved, or the object reaches to the border"
-    )
-    for doubt, expected in (
-        (warning, (TableProblem(TableProblemCode.SURROUNDINGS, {"frames": 3, "agreement": 0.42}),)),
-        ("a scratch", (TableProblem(TableProblemCode.OTHER, {"text": "a scratch"}),)),
-        ("", ()),
-    ):
-        old = {**stored, "version": 1, "doubt": doubt}
-        s.bench.state.store_file("empty-table.json", json.dumps(old).encode())
-        status = empty_table_status(s.bench)
-        assert status.table is not None
-        assert status.problems == expected
-
-
 @pytest.mark.parametrize("code", TableProblemCode)
 def test_every_problem_has_a_text(code: TableProblemCode) -> None:
     parameters = {
@@ -286,7 +266,6 @@ def test_every_problem_has_a_text(code: TableProblemCode) -> None:
         TableProblemCode.OLD: {"hours": 100.0},
         TableProblemCode.SETTING: {"name": "autofocus", "before": True, "now": False},
         TableProblemCode.SURROUNDINGS: {"frames": 3, "agreement": 0.4},
-        TableProblemCode.OTHER: {"text": "a scratch"},
     }
     text = TableProblem(code, parameters.get(code, {})).text
     assert text != code

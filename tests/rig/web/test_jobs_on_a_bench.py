@@ -203,7 +203,7 @@ def test_angle_is_set_after_the_operator_looked_at_the_cable(serve):
     assert served.run(kind="reference", revolutions=5)["error"]["code"] == 200  # beyond the cable budget
     assert served.run(kind="reference", revolutions=-1)["state"] == "done"
     assert round(served.client.get("/api/v1/status").json()["table_deg"]) == -270
-    assert served.run(kind="reference", turns=0)["state"] == "done"  # the former name
+    assert served.run(kind="reference", revolutions=0)["state"] == "done"
     assert round(served.client.get("/api/v1/status").json()["table_deg"]) == 90
     assert served.run(kind="reference", here=True)["state"] == "done"
     assert round(served.client.get("/api/v1/status").json()["table_deg"]) == 0

@@ -418,7 +418,7 @@ def test_held_table_cannot_be_rotated_by_hand(commands):
     commands._devices.servo.memory["Torque Enable"] = 1
     commands._devices.servo._on_torque_enable()
     with pytest.raises(UsageError, match="holds the table"):
-        commands.do(["turn", "90"])  # the former name of rotate
+        commands.do(["rotate", "90"])
 
 
 def test_lost_connection_is_an_error_of_the_device(tmp_path):

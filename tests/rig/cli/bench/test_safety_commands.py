@@ -83,15 +83,6 @@ def test_angle_in_doubt_is_reported_and_resolved_by_the_operator(rig):
     assert json.loads(rig("status", "--json").stdout)["state"] == "ready"
 
 
-def test_the_former_name_of_an_option_works_and_names_the_present_one(rig):
-    rig("goto", "10")
-    done = rig("home", "--turns", "0")
-    assert done.exit_code == 0
-    assert "--turns is now --revolutions" in done.stderr
-    assert json.loads(rig("status", "--json").stdout)["table_deg"] == pytest.approx(0, abs=0.3)
-    assert "--turns" not in rig("home", "--help").stdout
-
-
 def test_home_shows_a_long_rotation_and_asks(rig):
     rig("goto", "10")
     asked = rig("home", "--revolutions", "1")  # standard input has ended: no answer

@@ -3,7 +3,6 @@
 import json
 import os
 import re
-import shutil
 import sqlite3
 import subprocess
 import sys
@@ -26,7 +25,6 @@ from rig.catalog.exchange import read_folder
 from rig.cli.main import app
 from tests.rig.cli.noise_photographs import photographs
 
-SAMPLE = Path(__file__).parents[2] / "catalog" / "data" / "catalog-v1"
 COIL = Path(os.environ.get("RIG_TEST_DATA", Path(__file__).parents[4] / ".." / "shared" / "data")) / "coil-100"
 
 Rig = Callable[..., Result]
@@ -46,7 +44,7 @@ def names(rig: Rig, *options: str) -> list[str]:
     [
         *("import", "export", "log"),
         *(f"catalog {name}" for name in ["list", "show", "rename", "label", "delete", "undelete", "stats"]),
-        *(f"catalog {name}" for name in ["verify", "redescribe", "gc", "merge", "migrate"]),
+        *(f"catalog {name}" for name in ["verify", "redescribe", "gc", "merge"]),
     ],
 )
 def test_help_of_every_command_has_an_example(rig: Rig, name: str) -> None:
@@ -222,20 +220,6 @@ def test_merge_is_all_or_nothing(two: Rig) -> None:
     assert two("import", "other").exit_code == 2  # use rig catalog merge
     assert result(two("catalog", "merge", "other", "--on-conflict", "skip", "--json"))["objects"] == 1
     assert names(two) == ["mug", "tin", "jar"]
-
-
-def test_old_catalog_is_migrated_by_one_command(rig: Rig) -> None:
-    shutil.copytree(SAMPLE / "images", "catalog/images")
-    with closing(sqlite3.connect("catalog/catalog.sqlite", isolation_level=None)) as connection:
-        connection.executescript((SAMPLE / "catalog.sql").read_text(encoding="utf-8"))
-    stopped = rig("catalog", "list")
-    assert stopped.exit_code == 7
-    assert "rig catalog migrate" in stopped.stderr
-    done = result(rig("catalog", "migrate", "--json"))
-    assert Path(done["backup"]).is_file()
-    assert names(rig) == ["mug-white", "Tässe 2", "tin"]
-    assert rig("catalog", "verify").exit_code == 0
-    assert "is up to date" in rig("catalog", "migrate").stdout
 
 
 def test_import_rejects_bad_source(rig: Rig) -> None:
