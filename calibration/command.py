@@ -3,7 +3,7 @@
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -337,21 +337,20 @@ def _results(settings: Settings, bench: "Bench", procedure: "Procedure") -> "Ite
 
     from calibration.procedure import Ask, Progress
     from rig.calibrations import CalibrationResult
-    from rig.events.events import event_dict
+    from rig.events.events import event_dict, plain
     from rig.events.lines import line
 
     required = [in_force(bench, name) for name in procedure.requires]
     with closing(procedure.live(bench, *required)) as events:
-        event: Any
         for event in events:
             if isinstance(event, CalibrationResult):
                 yield event
             elif isinstance(event, Ask):
                 _ask(event, with_picture=not settings.json)
-            elif settings.json:
-                settings.print_json(event_dict(event))
+            elif isinstance(event, Progress):
+                settings.say(event.words, {"event": "progress", **plain(event)})
             else:
-                print(event.words if isinstance(event, Progress) else line(event), flush=True)
+                settings.say(line(event), event_dict(event))
 
 
 def _ask(request: "Ask", *, with_picture: bool) -> None:

@@ -34,6 +34,13 @@ REPOSITORY_PAGES = {
 """Pages that stand in the repository outside `docs`, and where the site shows them: as a page of their own, or at the
 beginning of a page in `docs`."""
 
+CODES = {
+    "RotationReason": "reasons-of-rotations",
+    "StopReason": "reasons-of-ends",
+    "NoteCode": "codes-of-notes",
+}
+"""Headings of `docs/events.md` over the meanings of codes, by the type of the codes."""
+
 NOTE = "*This page is generated from the code.*\n\n"
 
 
@@ -195,6 +202,61 @@ def exit_codes_page() -> str:
     rows = [f"| {code} | {meaning} |" for code, meaning in EXIT_CODES.items()]
     more = "\nCodes 2 to 9 are the hundreds of an [error code](errors.md).\n"
     return "\n".join([f"# Exit codes\n\n{NOTE}| code | meaning |", "|---|---|", *rows, more])
+
+
+def events_page() -> str:
+    """Return `docs/events.md` with a table of each event, and of each part of events, from their JSON schema."""
+    from pydantic import TypeAdapter
+
+    from rig.events.events import DESCRIBED, JsonEvent
+
+    schema = TypeAdapter(JsonEvent, config=DESCRIBED).json_schema(mode="serialization")
+    objects = {name: found for name, found in schema["$defs"].items() if "properties" in found}
+    events = [objects.pop(_definition(one["$ref"])) for one in schema["oneOf"]]
+    kinds = {one["properties"]["event"]["const"]: one for one in events}
+    parts = {_snake_case(name): found for name, found in objects.items()}
+    text = (ROOT / "docs" / "events.md").read_text(encoding="utf-8")
+    for found, level, before in ((kinds, "##", "## Parts\n"), (parts, "###", "## Codes\n")):
+        headings = {f"{level} {name}": one for name, one in found.items()}
+        tables = [
+            _field_table(heading, one, schema["$defs"])
+            for heading, one in headings.items()
+            if f"{heading}\n" not in text
+        ]
+        text = text.replace(before, "\n".join([*tables, before]))
+    return text
+
+
+def _field_table(heading: str, described: dict[str, Any], definitions: dict[str, Any]) -> str:
+    lines = [f"{heading}\n", _cell(" ".join(described["description"].split())), ""]
+    lines += ["| field | type | meaning |", "|---|---|---|"]
+    for name, field in described["properties"].items():
+        if name == "event":  # the heading names it
+            continue
+        meaning = _cell(field["description"])
+        if codes := CODES.get(_definition(field.get("$ref", ""))):
+            meaning = f"[{meaning.removesuffix('.')}](#{codes})."
+        lines.append(f"| `{name}` | {_json_type(field, definitions)} | {meaning} |")
+    return "\n".join([*lines, ""])
+
+
+def _json_type(field: dict[str, Any], definitions: dict[str, Any]) -> str:
+    if "$ref" in field:
+        name = _definition(field["$ref"])
+        return _snake_case(name) if "properties" in definitions[name] else str(definitions[name]["type"])
+    if "anyOf" in field:
+        return " or ".join(_json_type(choice, definitions) for choice in field["anyOf"])
+    if field["type"] == "array":
+        return f"list of {_json_type(field.get('items') or field['prefixItems'][0], definitions)}"
+    return str(field["type"])
+
+
+def _definition(link: str) -> str:
+    return link.rpartition("/")[2]
+
+
+def _snake_case(name: str) -> str:
+    return re.sub(r"(?<!^)(?=[A-Z])", "_", name).lower()
 
 
 def public_names_page() -> str:
@@ -360,9 +422,11 @@ def on_files(files: Any, config: Any) -> Any:
 
 
 def on_page_markdown(markdown: str, page: Any, **_others: Any) -> str:
-    """Rewrite the links of the pages in `docs` that lead out of it, and put the pages of the repository before them."""
+    """Put what is generated into the pages of `docs`, and rewrite the links that lead out of it."""
     if page.file.generated_by:
         return markdown
+    if page.file.src_uri == "events.md":
+        markdown = events_page()
     shown = with_site_links(markdown, f"docs/{page.file.src_uri}")[0]
     for source, site in REPOSITORY_PAGES.items():
         if site == page.file.src_uri:

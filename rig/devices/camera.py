@@ -34,16 +34,27 @@ class CameraLocks:
     """Settings that must not change between enrollment and identification; None if the camera does not report one."""
 
     exposure_us: float | None
+    """Exposure time in microseconds."""
     gain: float | None
+    """Gain, in the camera's own unit."""
     white_balance_k: float | None
+    """Colour temperature of the white balance in kelvin."""
     auto_exposure: bool | None
+    """Whether the camera changes the exposure time by itself."""
     auto_white_balance: bool | None
+    """Whether the camera changes the white balance by itself."""
     focus: float | None = None
+    """Focus, in the camera's own unit."""
     autofocus: bool | None = None
+    """Whether the camera changes the focus by itself."""
     sharpness: float | None = None
+    """Sharpening of the image, in the camera's own unit."""
     backlight_compensation: float | None = None
+    """Backlight compensation, in the camera's own unit."""
     power_line_frequency: float | None = None
+    """Flicker filter: 0 off, 1 for 50 Hz, 2 for 60 Hz, 3 automatic."""
     dynamic_frame_rate: bool | None = None
+    """Whether the camera changes the frame rate by itself."""
 
 
 @dataclass(frozen=True, slots=True)

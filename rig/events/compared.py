@@ -1,70 +1,97 @@
 """The events of comparisons pixel by pixel: of the leading candidate with the views, and of two candidates."""
 
 from dataclasses import dataclass, field
+from typing import Annotated, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field, GetPydanticSchema
+from pydantic_core import core_schema
 
 from hbr.dense.stopping import Outcome
+
+NO_JSON: Final = GetPydanticSchema(lambda _kind, _handler: core_schema.any_schema())
+Image = Annotated[NDArray[np.uint8], NO_JSON, Field(exclude=True, default=np.empty((0, 0, 3), np.uint8))]
+"""The image of an event. It is no part of the JSON; an event that is read has an empty one."""
 
 
 @dataclass(frozen=True, slots=True)
 class Verified:
-    """The leading candidate was doubtful, and its enrolled views were compared with the views pixel by pixel.
+    """The leading candidate was doubtful, so its enrolled views were compared with the search's views pixel by pixel.
 
-    ``fit`` is the share of the views' contrast that its enrolled views explain, at most 1, and ``others`` that of the
-    next candidates. ``score`` is the log-odds from these numbers and the open-set score. With at least ``found_from``
-    the object is found, and below ``unknown_below`` it is unknown.
+    A replay does not repeat this comparison: it uses the saved ``fit`` and ``others``.
     """
 
+    event: Literal["verified"] = field(default="verified", init=False)
     index: int
+    """Index of the last view, from 0."""
     name: str
+    """Name of the leading candidate."""
     fit: float
+    """Share of the views' contrast that the enrolled views of this candidate explain, at most 1."""
     others: float
+    """Mean of the same share over the next candidates, at most 1."""
     score: float
+    """Log-odds that this candidate is the object on the table, from ``fit``, ``others`` and the open-set score."""
     found_from: float
+    """Lowest score at which the object is found, if its probability is high enough."""
     unknown_below: float
+    """Score below which the object is unknown."""
     outcome: Outcome
+    """Result of the comparison: ``found``, ``ambiguous`` or ``unknown``."""
 
 
 @dataclass(frozen=True, slots=True)
 class ComparedView:
-    """A view in which two candidates differ: ``score`` is 1 for the first one, −1 for the second one.
-
-    ``weight`` is the difference of their enrolled views there: grey levels, summed over pixels.
-    """
+    """A view that shows a difference between the two candidates."""
 
     index: int
+    """Index of the view, from 0."""
     score: float
+    """Result of this view: near 1 it shows the first candidate, near −1 the second one."""
     weight: float
+    """Difference between the enrolled views of the two candidates from this side, in grey levels, summed over all
+    pixels."""
 
 
 @dataclass(frozen=True, slots=True)
 class Compared:
     """The two leading candidates were compared pixel by pixel where their enrolled views differ most.
 
-    ``winner`` is the one that the views show; None if the comparison decides for neither. ``score`` is 1 for the first
-    one, −1 for the second one. ``expected`` are the scores of enrolled views of each, None if they were not compared.
-    ``error_bound`` is the bound of the probability of a wrong winner, at most ``max_error``. ``unexplained`` is the
-    difference that the better one leaves unexplained, as a share of the difference of both; ``misfit`` and ``apart``
-    are these two differences in grey levels of a pixel. ``views`` are those that show a difference, the clearest first;
-    ``azimuths_deg`` are the enrolled views of each.
-
-    ``picture_bgr`` has a row for each of the clearest views: the view, both enrolled views, and where these differ.
-    ``leaders`` has the crops and masks of the enrolled views, uint8 (160, 320, 3).
+    This is the last step of a search that would otherwise end as ambiguous, or as unknown although two candidates have
+    nearly the same score. A saved run contains the compared enrolled views in ``leaders/``.
     """
 
+    event: Literal["compared"] = field(default="compared", init=False)
     index: int
+    """Index of the last view, from 0."""
     names: tuple[str, str]
+    """Names of the two candidates, the likelier one first."""
     winner: str | None
+    """Name of the candidate that the views show; null if the comparison does not decide it."""
     score: float
+    """Result: near 1 the views show the first candidate, near −1 the second one."""
     expected: tuple[float, float] | None
+    """Two scores, for comparison: those of enrolled views of the first and of the second candidate, in the place of the
+    views. Null if they were not computed."""
     error_bound: float
+    """Upper bound of the probability that the winner is wrong; 1 if it is not known."""
     max_error: float
+    """Largest ``error_bound`` at which the comparison names a winner."""
     unexplained: float | None
+    """Difference between the views and the better candidate, divided by the difference between the two candidates. Null
+    if the candidates do not differ."""
     misfit: float
+    """Difference between the views and the better candidate, in grey levels per pixel."""
     apart: float
+    """Difference between the two candidates, in grey levels per pixel."""
     views: tuple[ComparedView, ...]
+    """Views that show a difference between the candidates, the clearest first."""
     azimuths_deg: tuple[tuple[float, ...], tuple[float, ...]]
-    picture_bgr: NDArray[np.uint8] | None = field(default=None, metadata={"json": False}, repr=False)
-    leaders: tuple[tuple[NDArray[np.uint8], ...], ...] = field(default=(), metadata={"json": False}, repr=False)
+    """Azimuths of the enrolled views that were used, one list for each candidate."""
+    picture_bgr: Annotated[NDArray[np.uint8] | None, NO_JSON, Field(exclude=True)] = field(default=None, repr=False)
+    """A row for each of the clearest views: the view, both enrolled views, and where these differ."""
+    leaders: Annotated[tuple[tuple[NDArray[np.uint8], ...], ...], NO_JSON, Field(exclude=True)] = field(
+        default=(), repr=False
+    )
+    """Crops and masks of the enrolled views of each candidate, uint8 (160, 320, 3)."""

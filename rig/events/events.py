@@ -1,23 +1,29 @@
-"""The events of a running plan: small frozen dataclasses, the same for the terminal, for files and for tests."""
+"""The events of a running plan: small frozen dataclasses, the same for the terminal, for files and for tests.
 
-import re
+They are also the schema of their JSON: of `--json`, of saved runs, of the REST interface and of its documents. Names,
+types and descriptions of the fields are only here.
+
+Decision: docs/decisions/0063.
+"""
+
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
 from enum import Enum, StrEnum
+from functools import cache
 from math import isfinite
-from typing import Any
+from typing import Annotated, Any, Final, Literal
 
-import numpy as np
-from numpy.typing import NDArray
+from pydantic import ConfigDict, Discriminator, Field, GetCoreSchemaHandler, TypeAdapter, ValidationError
+from pydantic_core import CoreSchema, from_json, to_json
 
 from hbr import Outcome, StopDecision, StopReason
-from rig.events.compared import Compared, Verified
+from rig.core.json_form import NumberOrNull
+from rig.events.compared import Compared, Image, Verified
 from rig.motion.scan_speed import SpeedLimit
 from rig.views.capture import ViewEvidence
 
 SCHEMA = 1
 """Version of the JSON form (docs/events.md): it rises when a field is removed or changes its meaning."""
-
-_OUTSIDE = {"json": False}
 
 
 class NoteCode(StrEnum):
@@ -45,7 +51,9 @@ class Note:
     """A note for the operator: a code, and the numbers and names for its sentence."""
 
     code: NoteCode
+    """Subject of the note."""
     values: dict[str, Any] = field(default_factory=dict)
+    """Numbers and names for the text of the note."""
 
 
 class RotationReason(StrEnum):
@@ -71,191 +79,257 @@ class WaitReason(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Started:
-    """A plan starts: ``plan`` is "enroll" or "identify", ``views`` the largest number of views.
+    """A plan starts."""
 
-    ``angles_deg`` are the table angles of an enrollment; with ``in_motion`` all views are taken in one revolution. An
-    identification has a ``strategy`` with its ``seed``, the ``descriptor`` that views are compared by, and ``notes`` on
-    how reliable its answer is.
-    """
-
-    plan: str
+    event: Literal["started"] = field(default="started", init=False)
+    plan: Literal["enroll", "identify"]
+    """Kind of plan: ``enroll`` or ``identify``."""
     name: str | None
+    """Name of the object to be enrolled; null in an identification."""
     views: int
+    """Number of views to be taken; in an identification, the setting ``identify.max_views``."""
     conditions: dict[str, Any]
+    """Conditions of the bench: its noise model (simulator) or its calibration results. In an enrollment also settings
+    and findings."""
     strategy: str | None = None
-    seed: int | None = None
+    """Strategy that chooses the views of an identification; null in an enrollment."""
+    seed: Annotated[int, Field(ge=0)] | None = None
+    """Seed of the random numbers of an identification; null in an enrollment."""
     angles_deg: tuple[float, ...] = ()
+    """Table angles of the views to be taken; empty in an identification."""
     schema: int = SCHEMA
+    """Version of this schema."""
     descriptor: str | None = None
+    """Descriptor by which an identification compares views; null in an enrollment."""
     notes: tuple[Note, ...] = ()
+    """Notes for the operator about how reliable the answer will be."""
     in_motion: bool = False
+    """Whether an enrollment takes its views in one revolution, without stopping for each view."""
 
 
 @dataclass(frozen=True, slots=True)
 class Moved:
-    """The table has rotated and is at rest.
+    """The table has rotated and is at rest."""
 
-    Angles of the table in degrees, unwrapped. ``agrees`` is whether encoder and gyro measured the same rotation within
-    ``bound_deg``; if they did not, the gyro on the platter is trusted.
-    """
-
+    event: Literal["moved"] = field(default="moved", init=False)
     index: int
+    """Index of the view, from 0."""
     commanded_deg: float
+    """Requested table angle."""
     encoder_deg: float
+    """Table angle by the encoder."""
     rotation_encoder_deg: float
+    """Rotation since the table was last at rest, by the encoder."""
     rotation_imu_deg: float | None
+    """The same rotation by the gyro; null if the gyro has no valid value."""
     imu_sigma_deg: float | None
+    """Standard uncertainty of ``rotation_imu_deg``."""
     bound_deg: float | None
+    """Largest difference between encoder and gyro that their uncertainties allow; null if they were not compared."""
     agrees: bool
+    """Whether the difference is within ``bound_deg``; true if they were not compared. If it is false, an identification
+    uses the gyro's rotation, and an enrollment ends with an error."""
     seconds: float
+    """Time from the start of the motion until the table is at rest."""
 
 
 @dataclass(frozen=True, slots=True)
 class ScanStarted:
-    """The table begins a rotation during which views are taken.
+    """The table begins the rotation during which the views are taken."""
 
-    Angles of the table in degrees, unwrapped. ``limit`` names the cause that limits the speed, and ``value`` is its
-    number: the exposure in ms, the frames per second, the table's or the gyro's speed in °/s, or the uncertainty of a
-    frame's time in ms.
-    """
-
+    event: Literal["scan_started"] = field(default="scan_started", init=False)
     speed_dps: float
+    """Speed of the table in °/s."""
     limit: SpeedLimit
+    """Cause that limits the speed: ``smear``, ``frame-rate``, ``table``, ``gyro`` or ``time``."""
     value: float
+    """Number for ``limit``: the exposure time in ms, the frames per second, the table's speed or the gyro's range in
+    °/s, or the uncertainty of a frame's time in ms."""
     from_deg: float
+    """Table angle at the beginning of the rotation."""
     to_deg: float
+    """Table angle at the end of the rotation."""
 
 
 @dataclass(frozen=True, slots=True)
 class Unwinding:
-    """The table rotates back by whole ``revolutions`` to free its cable.
+    """The table rotates back by whole revolutions to free its cable."""
 
-    Angles of the table in degrees, unwrapped; ``limits_deg`` are the limits of the cable.
-    """
-
+    event: Literal["unwinding"] = field(default="unwinding", init=False)
     index: int
+    """Index of the view, from 0."""
     from_deg: float
+    """Table angle before the rotation."""
     to_deg: float
+    """Table angle after the rotation."""
     revolutions: int
+    """Number of whole revolutions by which the table rotates back."""
     limits_deg: tuple[float, float]
+    """Limits of the cable: the lowest and the highest table angle."""
 
 
 @dataclass(frozen=True, slots=True)
 class Rejected:
-    """A frame was rejected, with the reasons."""
+    """A frame was rejected. The program takes another one, or ends with an error."""
 
+    event: Literal["rejected"] = field(default="rejected", init=False)
     index: int
+    """Index of the view, from 0."""
     attempt: int
+    """Number of the frame among those taken for this view, from 1."""
     reasons: tuple[str, ...]
+    """Codes of the reasons: ``exposed-early``, ``gyro-incomplete``, ``table-moved``, ``repeated-frame``,
+    ``locks-changed``, ``too-dark``, ``overexposed``, ``blurred``, ``noise``, ``smeared``, ``angle-uncertain``,
+    ``time-uncertain``."""
     evidence: ViewEvidence
+    """Measurements that led to the rejection."""
 
 
 @dataclass(frozen=True, slots=True)
 class Accepted:
-    """A view was taken (and, when enrolling, is durable).
+    """A view was taken. In an enrollment it is stored: it survives a power cut."""
 
-    ``segmentation`` is `hbr.Segmentation.evidence` as JSON values; None if no segmentation was made. ``same_bench``
-    is whether a search's first view shows the bench of the enrollment; None: not known.
-    """
-
+    event: Literal["accepted"] = field(default="accepted", init=False)
     index: int
+    """Index of the view, from 0; in an enrollment, its place in the plan."""
     azimuth_deg: float
+    """Azimuth of the camera around the object. In an identification, 0° is arbitrary."""
     evidence: ViewEvidence
-    image_bgr: NDArray[np.uint8] = field(metadata=_OUTSIDE, repr=False)
+    """Measurements that led to the acceptance."""
+    image_bgr: Image = field(repr=False)
     segmentation: dict[str, Any] | None = None
+    """How the program found the object in the image and corrected the illumination; ``issues`` lists the steps that
+    were not possible. Null if the view was not segmented."""
     same_bench: bool | None = None
+    """Whether the first view of an identification shows the bench as it was at the enrollment; null if this is not
+    known, and in an enrollment."""
 
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """An object with its score per view and its pose: the azimuth at which the camera sees it now.
-
-    ``probability`` is that of being the object on the table, among the enrolled ones; None if the search computes none.
-    """
+    """An enrolled object that the object on the table may be."""
 
     name: str
+    """Name of the enrolled object."""
     score: float
+    """Score per view: the Hough score, or the support in the dense search."""
     pose_deg: float
+    """Azimuth of the camera around this object at the last view, with the 0° of the object's enrollment."""
     probability: float | None = None
+    """Share of this object among the enrolled objects: its probability if the object on the table is one of them; null
+    in the paper's search."""
+
+
+class _NullThreshold:
+    """Lets the open-set threshold of a decision be null in JSON: it is -inf if no object is unknown."""
+
+    @staticmethod
+    def __get_pydantic_core_schema__(source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        schema = handler(source)
+        of_dataclass: Any = handler.resolve_ref_schema(schema)  # `hbr` does not know pydantic
+        (threshold,) = (one for one in of_dataclass["schema"]["fields"] if one["name"] == "open_set_threshold")
+        threshold["schema"] = handler.generate_schema(NumberOrNull)
+        return schema
 
 
 @dataclass(frozen=True, slots=True)
 class Ranked:
-    """The candidates after a view, the best first.
+    """The candidates were ranked after a view."""
 
-    ``margin`` is the smallest lead of the first one over any other enrolled object, in score per view; it may be
-    negative. ``decision`` is the stopping rule's decision in the dense search.
-    """
-
+    event: Literal["ranked"] = field(default="ranked", init=False)
     index: int
-    candidates: tuple[Candidate, ...]
+    """Index of the view, from 0."""
+    candidates: Annotated[tuple[Candidate, ...], Field(min_length=1)]
+    """The leading candidates, the best first."""
     margin: float
-    decision: StopDecision | None = None
+    """Score per view of the first candidate minus the highest score of any other enrolled object. The paper's search
+    uses an upper bound of that score. The margin can be negative."""
+    decision: Annotated[StopDecision, _NullThreshold()] | None = None
+    """Decision of the stopping rule after this view; null in the paper's search."""
 
 
 @dataclass(frozen=True, slots=True)
 class FrameUsed:
-    """A search in motion used a frame; the fields are its state after the frame.
+    """A search in motion used a frame.
 
-    ``seconds`` is the time since the search began, ``rejected`` the number of frames that were not used so far.
-    ``name`` is the best candidate with its ``probability``. ``outcome`` is what the stopping rule would decide at this
-    frame; it decides only when the frames have covered another step of the circle.
+    With ``--json``, and on the page of ``rig serve``, this event comes while the table rotates, and ``accepted``
+    follows when the table has stopped. In a saved run, it comes after its ``accepted``.
     """
 
+    event: Literal["frame_used"] = field(default="frame_used", init=False)
     index: int
+    """Index of the view, from 0."""
     azimuth_deg: float
+    """Azimuth of the camera around the object; 0° is arbitrary."""
     seconds: float
+    """Time since the search began."""
     rejected: int
+    """Number of frames in motion that were rejected so far."""
     name: str
+    """Name of the best candidate."""
     probability: float
+    """Probability of the best candidate among the enrolled objects."""
     outcome: Outcome
+    """Decision that the stopping rule would make now: ``continue``, ``found``, ``ambiguous`` or ``unknown``. It decides
+    only when the frames have covered another step of the circle."""
 
 
 @dataclass(frozen=True, slots=True)
 class Weighed:
-    """All rotations that the dense search weighed before it chose one.
-
-    ``rotations_deg`` are the camera's, positive to the left. ``confusion`` is the logarithm of the probability that two
-    objects are still confused after each rotation, ``cost`` the cost of its motion in the same unit. The rotation with
-    the lowest sum was chosen. ``similarity`` is the similarity of the two candidates after each rotation; None if it
-    compares no two candidates.
-    """
+    """All rotations that the dense search weighed before it chose one."""
 
     rotations_deg: tuple[float, ...]
+    """Possible rotations of the camera around the object; positive to the left. The other lists have a value for each
+    of them."""
     confusion: tuple[float, ...]
+    """Natural logarithm of the probability that two objects are still confused after the rotation."""
     cost: tuple[float, ...]
+    """Cost of the motion, in the same unit. The search chose the rotation with the lowest sum of confusion and cost."""
     similarity: tuple[float, ...] | None = None
+    """Similarity of the two candidates after the rotation, from 0 to 1; null if no two candidates are compared, and in
+    a search in motion."""
 
 
 @dataclass(frozen=True, slots=True)
 class Decided:
-    """The rotation to the next view, and the ``reason`` for it.
+    """The search chose the rotation to the next view."""
 
-    ``rotation_deg`` is the camera's around the object, positive to the left; the table rotates the other way, to
-    ``target_deg``. ``s_left`` and ``s_right`` are the similarities of the ``candidates`` from each side (Eq. 6), if
-    AHBR compared the sides. ``note`` is the explanation of a user's own strategy.
-    """
-
+    event: Literal["decided"] = field(default="decided", init=False)
     index: int
-    side: str
+    """Index of the last view before the rotation, from 0."""
+    side: Literal["left", "right"]
+    """Direction in which the camera moves around the object: ``left`` (counter-clockwise) or ``right``."""
     rotation_deg: float
+    """Rotation of the camera around the object; positive to the left."""
     target_deg: float
+    """Table angle of the next view."""
     s_left: float | None
+    """Sum of the similarities of all pairs of candidates, seen from the left; null if the sides were not compared."""
     s_right: float | None
+    """The same sum, seen from the right; null if the sides were not compared."""
     candidates: tuple[str, ...]
+    """Names of the candidates that were compared; fewer than two if there is no second candidate."""
     reason: RotationReason
+    """Reason of the rotation."""
     note: str = ""
+    """Explanation by a custom strategy; otherwise empty."""
     weighed: Weighed | None = None
+    """All rotations that the dense search weighed; null in the paper's search."""
 
 
 @dataclass(frozen=True, slots=True)
 class Enrolled:
-    """An object is complete in the catalog."""
+    """The enrollment of an object is complete. Searches can find the object from now on."""
 
+    event: Literal["enrolled"] = field(default="enrolled", init=False)
     name: str
+    """Name of the object."""
     views: int
+    """Number of views of the enrollment."""
     retakes: int
+    """Number of images that were taken again since the enrollment started or was resumed."""
     seconds: float
+    """Time since the enrollment started or was resumed, by the clock of the bench."""
 
 
 class SkipReason(StrEnum):
@@ -268,147 +342,193 @@ class SkipReason(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Item:
-    """The next object of a tray: ``number``, from 1, ``of`` all.
+    """The next object of a list (`rig enroll --list`)."""
 
-    ``action`` is "enroll", "resume" (take the missing views), "replace" (repeat an interrupted enrollment, because
-    the object was moved), or "skip". A skipped object has a ``reason``, and after an error its ``error_code``.
-    """
-
+    event: Literal["item"] = field(default="item", init=False)
     number: int
+    """Place of the object in the list, from 1."""
     of: int
+    """Number of objects in the list."""
     name: str
+    """Name of the object."""
     action: str
+    """What the program does with the object: ``enroll``, ``resume``, ``replace`` or ``skip``."""
     reason: SkipReason | None = None
+    """Why the object is skipped: ``already_enrolled``, ``operator`` (the operator decided it) or ``error``. Null if it
+    is not skipped."""
     error_code: int | None = None
+    """Code of the error because of which the object is skipped; otherwise null."""
 
 
 @dataclass(frozen=True, slots=True)
 class SimilarObject:
-    """An enrolled object that looks the same from some sides.
-
-    ``arcs_deg`` are those sides, azimuths from and to, counter-clockwise, and ``differs_deg`` the others;
-    ``other_differs_deg`` are the sides of the enrolled object that look like none of the new one. ``share`` is the
-    share of the new object's views that look the same; ``similarity`` is the largest of any two views.
-    """
+    """An enrolled object that looks like the new one from some sides."""
 
     name: str
+    """Name of the other enrolled object."""
     arcs_deg: tuple[tuple[float, float], ...]
+    """Sides from which the new object looks like this one: pairs of azimuths (from, to), counter-clockwise."""
     differs_deg: tuple[tuple[float, float], ...]
+    """The other sides of the new object: it looks like no view of this one there."""
     other_differs_deg: tuple[tuple[float, float], ...]
+    """Sides of this object that look like no view of the new one."""
     share: float
+    """Share of the new object's views that look like this object, from 0 to 1."""
     similarity: float
+    """Largest similarity of a view of one object and a view of the other."""
 
 
 @dataclass(frozen=True, slots=True)
 class SimilarObjects:
-    """Confusions of a new object: with itself, rotated by ``period_deg``, and with other objects.
+    """The program measured with the enrolled views what the new object can be confused with."""
 
-    ``period_deg`` is 360 if the object has no symmetry, 0 if it looks the same from all sides, None if it has too few
-    views. ``neighbour_similarity`` is the mean of neighbouring views, ``period_similarity`` of views a period apart.
-    """
-
+    event: Literal["similar_objects"] = field(default="similar_objects", init=False)
     name: str
+    """Name of the new object."""
     period_deg: float | None
+    """Smallest rotation after which the object looks the same. 360: no such rotation. 0: it looks the same from all
+    sides. Null: it has too few views."""
     neighbour_similarity: float | None
+    """Mean similarity of neighbouring views; null if the object has too few views."""
     period_similarity: float | None
+    """Mean similarity of views that are one period apart. For a period of 0, the lowest mean of all rotations; for 360,
+    the highest mean beyond the lowest."""
     objects: tuple[SimilarObject, ...]
+    """The most similar enrolled objects, at most three, the one with the largest ``share`` first."""
 
 
 @dataclass(frozen=True, slots=True)
 class EmptyTableImage:
-    """The empty-table image was taken and stored. Segmentation compares views with it.
+    """`rig empty-table` took and stored the empty-table image. `rejected` can precede this event."""
 
-    ``turning_share`` is the share of the image that changed while the table rotated a little, ``agreement`` the share
-    of its border that did not; None if the table could not rotate. ``replaced`` has the problems of the previous image.
-    """
-
+    event: Literal["empty_table_image"] = field(default="empty_table_image", init=False)
     taken_utc: str
+    """Date and time (UTC) of the image."""
     width: int
+    """Width of the image in pixels."""
     height: int
+    """Height of the image in pixels."""
     turning_share: float | None
+    """Share of the image, from 0 to 1, that changed when the table rotated; null if the table could not rotate."""
     agreement: float | None
+    """Share of the image's border, from 0 to 1, that did not change when the table rotated; null if the table could not
+    rotate."""
     evidence: ViewEvidence
+    """Measurements of the image."""
     replaced: tuple[dict[str, Any], ...]
+    """Problems of the previous empty-table image, each with its ``code`` and its parameters."""
     seconds: float
-    image_bgr: NDArray[np.uint8] = field(metadata=_OUTSIDE, repr=False)
+    """Duration of the command by the clock of the bench."""
+    image_bgr: Image = field(repr=False)
 
 
 @dataclass(frozen=True, slots=True)
 class Warned:
-    """A warning for the operator while the plan continues; ``index`` is the view at which it was noticed."""
+    """The program noticed something that the operator should check. The plan continues."""
 
+    event: Literal["warned"] = field(default="warned", init=False)
     index: int | None
+    """Index of the view at which the program noticed it, from 0; null if it concerns no view."""
     note: Note
+    """Code and values of the warning."""
 
 
 @dataclass(frozen=True, slots=True)
 class Waiting:
-    """The plan waits for the operator."""
+    """With `--watch`, the plan waits for an object."""
 
+    event: Literal["waiting"] = field(default="waiting", init=False)
     reason: WaitReason
+    """What the plan waits for: ``first-object`` (put it on the empty table) or ``next-object``."""
 
 
 @dataclass(frozen=True, slots=True)
 class Failed:
-    """An object could not be identified, and the plan continues with the next one; the fields are the error's."""
+    """With ``--watch``, no view was acceptable (``code`` 600), or no object was on the table (606).
 
+    The plan waits for the next object.
+    """
+
+    event: Literal["failed"] = field(default="failed", init=False)
     error: str
+    """Kind of the error."""
     code: int
+    """Number of the error."""
     what: str
+    """What happened."""
     evidence: dict[str, Any]
+    """Measurements and names that show the error."""
     next_step: str
+    """What the operator should do."""
 
 
 @dataclass(frozen=True, slots=True)
 class Identified:
-    """The answer: an object's name, or None for an unknown object.
+    """The answer of an identification."""
 
-    ``outcome`` is whether the object was found, is ambiguous, or is unknown. ``possible`` names the objects that it may
-    be: one, several, or none. The ``name`` of an ambiguous object is the first of them.
-
-    ``score`` and ``margin`` are per view. ``pose_deg`` is the azimuth of the last view, in the catalog's frame.
-    ``yaw_deg`` is the object's rotation relative to its enrollment, counter-clockwise, with the standard uncertainty
-    ``yaw_sigma_deg``. It is None if the views do not determine it, or if the object looks the same every
-    ``period_deg``; ``yaw_set_deg`` then has all equivalent rotations. ``period_deg`` is 360 without symmetry, 0 if the
-    object looks the same from all sides, None if that is not known. The paper's search has no uncertainty.
-
-    ``reason`` is why the search ended; ``note`` is the explanation of a user's own strategy.
-    The paper's search compares the score with ``min_score`` and the margin with ``min_margin``; the dense search
-    compares the probability of the first candidate with ``min_confidence`` and the open-set score with
-    ``open_set_threshold``, None if no object is called unknown. That probability is the ``confidence`` if the object
-    was found; otherwise it is None, and the probabilities of the ``candidates`` are shares among the enrolled objects.
-    """
-
+    event: Literal["identified"] = field(default="identified", init=False)
     name: str | None
-    candidates: tuple[Candidate, ...]
+    """Name of the object; the likeliest one if the object is ambiguous, null if it is unknown."""
+    candidates: Annotated[tuple[Candidate, ...], Field(min_length=1)]
+    """The leading candidates, the best first."""
     score: float
+    """Score per view of the first candidate."""
     margin: float
+    """Margin after the last view, as in ``ranked``."""
     pose_deg: float
+    """Azimuth of the camera around the object at the last view, with the 0° of the object's enrollment."""
     yaw_deg: float | None
+    """Counter-clockwise rotation of the object relative to its enrollment; null if it is not known, or if several
+    rotations look the same."""
     views: int
+    """Number of views that the search used."""
     travelled_deg: float
+    """Total rotation of the table, in both directions."""
     seconds: float
+    """Duration of the search by the clock of the bench."""
     reason: StopReason
+    """Reason why the search ended."""
     outcome: Outcome
+    """Kind of answer: ``found``, ``ambiguous`` or ``unknown``."""
     possible: tuple[str, ...]
+    """Names of the objects that it may be, the likeliest first: one if it was found, several if it is ambiguous, none
+    if it is unknown."""
     yaw_sigma_deg: float | None = None
+    """Standard uncertainty of each rotation in ``yaw_set_deg``; null if the rotation is not known, and in the paper's
+    search."""
     yaw_set_deg: tuple[float, ...] = ()
+    """All rotations that look the same: one without symmetry, n with an n-fold symmetry, none if the rotation is not
+    known."""
     period_deg: float | None = None
+    """Smallest rotation after which the object looks the same. 360: no such rotation. 0: it looks the same from all
+    sides. Null: not known."""
     note: str = ""
+    """Explanation by a custom strategy; otherwise empty."""
     min_score: float | None = None
+    """Paper's search: score below which an object is unknown. Null in the dense search."""
     min_margin: float | None = None
+    """Paper's search: margin at which the search ends. Null in the dense search."""
     confidence: float | None = None
+    """Dense search: probability of the object among the enrolled objects. Null if the object is ambiguous or unknown,
+    and in the paper's search."""
     min_confidence: float | None = None
+    """Dense search: confidence at which the search ends. Null in the paper's search."""
     open_set_score: float | None = None
+    """Dense search: how closely the views resemble an enrolled object. Null in the paper's search."""
     open_set_threshold: float | None = None
+    """Dense search: open-set score below which an object is unknown. Null if no object is called unknown, and in the
+    paper's search."""
 
 
 @dataclass(frozen=True, slots=True)
 class Recorded:
-    """The answer is recorded in the catalog under a number (`rig results show`), with the sample that was given."""
+    """The answer was stored as a result in the catalog."""
 
+    event: Literal["recorded"] = field(default="recorded", init=False)
     result: int
+    """Number of the result, for ``rig results show``."""
     sample: str | None
+    """Name of the sample that the operator gave; null if none was given."""
 
 
 Event = (
@@ -435,23 +555,44 @@ Event = (
 )
 
 
-def event_kind(kind: type) -> str:
-    """Return the name of a kind of event in JSON: ``"empty_table_image"`` of `EmptyTableImage`."""
-    return re.sub(r"(?<!^)(?=[A-Z])", "_", kind.__name__).lower()
+JsonEvent = Annotated[Event, Discriminator("event")]
+"""An event as a type of pydantic: its field ``event`` names its kind."""
+DESCRIBED: Final = ConfigDict(
+    use_attribute_docstrings=True, json_schema_serialization_defaults_required=True, defer_build=True
+)
+"""How pydantic describes events in a JSON schema. It parses the sources for that, so only documents use it."""
+
+
+@cache
+def _adapter() -> TypeAdapter[Event]:
+    return TypeAdapter(JsonEvent, config=ConfigDict(allow_inf_nan=False))
 
 
 def event_dict(event: Event) -> dict[str, Any]:
-    """Return an event as plain data for JSON, its kind under ``"event"``; pictures are left out."""
-    return {"event": event_kind(type(event)), **plain(event)}
+    """Return an event as JSON values; images are left out, and numbers that are not finite are None."""
+    values: dict[str, Any] = from_json(_adapter().dump_json(event, fallback=str))
+    return values
+
+
+def event_of(values: Mapping[str, Any]) -> Event:
+    """Return the event of JSON values from `event_dict`; its images are empty. Unknown fields are left out.
+
+    Raises
+    ------
+    ValueError
+        The values are not an event; the text names the field.
+    """
+    try:
+        return _adapter().validate_json(to_json(values), strict=True)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_context=False, include_input=False)[0]
+        raise ValueError(": ".join(map(str, (*first["loc"], first["msg"])))) from error
 
 
 def plain(value: Any) -> Any:
-    """Return ``value`` as JSON values: dataclasses as dicts, tuples as lists, numbers that are not finite as None.
-
-    Fields marked ``json=False`` are left out.
-    """
+    """Return ``value`` as JSON values: dataclasses as dicts, tuples as lists, numbers that are not finite as None."""
     if is_dataclass(value) and not isinstance(value, type):
-        return {f.name: plain(getattr(value, f.name)) for f in fields(value) if f.metadata.get("json", True)}
+        return {f.name: plain(getattr(value, f.name)) for f in fields(value)}
     if isinstance(value, Enum):
         return value.value
     if isinstance(value, tuple | list):

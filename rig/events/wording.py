@@ -12,6 +12,7 @@ from rig.events.events import (
     Decided,
     Identified,
     Moved,
+    Ranked,
     RotationReason,
     ScanStarted,
     SimilarObject,
@@ -31,10 +32,10 @@ def decision_words(decided: Decided) -> str:
     # A rotation of AHBR is at most 90°; a larger one leads past views that were taken before (`hbr.next_view`).
     past = decided.s_left is not None and round(abs(decided.rotation_deg), 1) > 90
     rotation = f"{decided.side} {abs(decided.rotation_deg):.1f}°{', past earlier views' if past else ''}"
-    return f"{rotation}: {rotation_words(decided)}."
+    return f"{rotation}: {_rotation_words(decided)}."
 
 
-def rotation_words(decided: Decided) -> str:
+def _rotation_words(decided: Decided) -> str:
     """Return why a rotation was chosen."""
     match decided.reason:
         case RotationReason.FIRST_STEP:
@@ -97,6 +98,11 @@ def stop_words(decision: StopDecision, views: int) -> str:
             return f"no enrolled object is similar enough: the open-set score is {abs(above):.3f} below its threshold"
         case _:
             return f"the best candidate after {counted(views, 'view')}, with a probability of {share} below {least}"
+
+
+def ranking_words(ranked: Ranked | None) -> str:
+    """Return what the stopping rule decided with a ranking, and why; empty if no rule did."""
+    return "" if ranked is None or ranked.decision is None else stop_words(ranked.decision, ranked.index + 1)
 
 
 def verification_words(verified: Verified) -> str:

@@ -29,8 +29,8 @@ from rig.events.wording import (
     decision_words,
     move_words,
     outcome_words,
+    ranking_words,
     share_words,
-    stop_words,
     verification_words,
 )
 from rig.report.arc_figure import ArcFigure, arc_figure
@@ -244,11 +244,6 @@ def _leading(one: Candidate, ranked: Ranked) -> tuple[str, str, str]:
     return one.name, f"{one.score:.3f}", share_words(one, ranked.decision)
 
 
-def _decision(ranked: Ranked | None) -> str:
-    decision = None if ranked is None else ranked.decision
-    return "" if ranked is None or decision is None else sentence(stop_words(decision, ranked.index + 1))
-
-
 def _decisions(record: IdentificationRecord) -> list[Markup]:
     """Return a chart for each decision that compared all possible rotations."""
     seen_deg = {view.index: _report_azimuth_deg(record, view.azimuth_deg) for view in record.views}
@@ -283,7 +278,7 @@ def _frames(record: IdentificationRecord) -> list[_Frame]:
                 where=f"{azimuth_words(_report_azimuth_deg(record, view.azimuth_deg))}°",
                 rejected=listed(view.rejected),
                 leading=[_leading(c, thought) for c in thought.candidates[:3]] if thought else [],
-                decided=_decision(thought),
+                decided=sentence(words) if (words := ranking_words(thought)) else "",
                 margin=signed(thought.margin, 3) if thought else "",
                 moved=sentence(move_words(view.move)) if view.move and view.index else "",
                 decision=decision_words(decision) if decision else "",

@@ -27,8 +27,8 @@ from rig.events.events import (
     Rejected,
     SimilarObjects,
     Started,
+    event_of,
 )
-from rig.events.reading import built
 from rig.report.contact_sheet import Image, Region, thumbnail
 from rig.views.capture import ViewEvidence, rejection_text
 
@@ -69,21 +69,14 @@ class _ViewCollector:
                 self._rejected.append(", ".join(rejection_text(reason, event.evidence) for reason in event.reasons))
             case Accepted():
                 rejected, self._rejected = tuple(self._rejected), []
-                view = self.view(event.index, event.azimuth_deg, event.image_bgr, event.evidence, event.segmentation)
-                self.views.append(replace(view, move=self._move, rejected=rejected))
+                self.views.append(replace(self.view(event), move=self._move, rejected=rejected))
             case _:
                 pass
 
-    def view(
-        self,
-        index: int,
-        azimuth_deg: float,
-        image_bgr: Image,
-        evidence: ViewEvidence,
-        segmentation: Mapping[str, Any] | None,
-    ) -> ReportView:
-        box = None if segmentation is None else segmentation.get("box_px")
-        return ReportView(index, azimuth_deg, thumbnail(image_bgr, self.size, self.region, box), evidence, None, ())
+    def view(self, taken: Accepted) -> ReportView:
+        box = None if taken.segmentation is None else taken.segmentation.get("box_px")
+        picture = thumbnail(taken.image_bgr, self.size, self.region, box)
+        return ReportView(taken.index, taken.azimuth_deg, picture, taken.evidence, None, ())
 
 
 class EnrollmentRecord:
@@ -128,9 +121,10 @@ class EnrollmentRecord:
         seen = {view.index for view in self.views}
         for record, image_bgr in stored:
             if record.index not in seen:
-                evidence = built(ViewEvidence, record.evidence)
-                view = self._collector.view(record.index, record.azimuth_deg, image_bgr, evidence, record.segmentation)
-                self._collector.views.append(view)
+                taken = {name: getattr(record, name) for name in ("index", "azimuth_deg", "evidence", "segmentation")}
+                event = event_of({"event": "accepted", **taken})
+                assert isinstance(event, Accepted)
+                self._collector.views.append(self._collector.view(replace(event, image_bgr=image_bgr)))
         self._collector.views.sort(key=lambda view: view.index)
         self.planned = max(self.planned, len(self.views))
 

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from rig.core.clock import Clock
 from rig.core.errors import ConfigError, DeviceFault, DeviceSilent, NotReady, UsageError
+from rig.core.json_form import NumberOrNull
 from rig.core.phrases import signed
 from rig.devices.imu import Imu
 
@@ -98,16 +99,16 @@ class Agreement:
 
 @dataclass(frozen=True, slots=True)
 class Stillness:
-    """Movement that encoder and gyro measured between settling and the end of the exposure.
+    """Movement that encoder and gyro measured between settling and the end of the exposure."""
 
-    ``peak_rate_dps`` is infinite if samples of the gyro are missing; ``platter_change_deg`` is the platter's rotation
-    by the gyro, ``encoder_change_deg`` the shaft's.
-    """
-
-    peak_rate_dps: float
+    peak_rate_dps: NumberOrNull
+    """Largest rate of the platter by the gyro; null if samples of the gyro were lost."""
     encoder_change_deg: float
-    platter_change_deg: float
+    """Rotation of the shaft since the table came to rest, by the encoder."""
+    platter_change_deg: NumberOrNull
+    """Rotation of the platter since the table came to rest, by the gyro; null if it is not known."""
     still: bool
+    """Whether these values count as rest."""
 
 
 def compare(

@@ -7,7 +7,18 @@ from typing import Any, Final
 
 from hbr.dense.verification import Verification
 from rig.events.compared import Compared, Verified
-from rig.events.events import Accepted, Decided, FrameUsed, Identified, Moved, Ranked, RotationReason, plain
+from rig.events.events import (
+    Accepted,
+    Decided,
+    Event,
+    FrameUsed,
+    Identified,
+    Moved,
+    Ranked,
+    RotationReason,
+    event_dict,
+    plain,
+)
 from rig.search.local_step import Comparison, compare_leaders, saved_leader_views, with_verification
 from rig.search.saved_run import SavedRun
 from rig.search.session import ArcSearch, DenseSearch, Search, begin_search
@@ -77,7 +88,7 @@ def check(run: SavedRun, *, by: AnyStrategy | None = None) -> Check:
     compared: Comparison | None = None
     table_deg = 0.0
     for event in run.events():
-        computed: Any = None
+        computed: Event | dict[str, Any] | None = None
         match event:
             case Moved():
                 table_deg = event.encoder_deg
@@ -136,7 +147,8 @@ def check(run: SavedRun, *, by: AnyStrategy | None = None) -> Check:
             case _:
                 pass
         if computed is not None:
-            saved, again = plain(event), plain(computed) if not isinstance(computed, dict) else computed
+            saved = event_dict(event)
+            again = {"event": event.event, **computed} if isinstance(computed, dict) else event_dict(computed)
             found.differences += _compare(found.views, "", saved, again)
     return found
 

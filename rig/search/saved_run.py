@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
 from importlib.metadata import version
-from math import isfinite
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Self, TextIO
@@ -31,8 +30,7 @@ from rig.config.values import validate
 from rig.core.errors import CatalogError, RigError, UsageError, os_errors_as
 from rig.core.files import json_values, read, write
 from rig.events.compared import Compared
-from rig.events.events import Accepted, Event, Failed, Identified, Moved, Ranked, Started, event_dict
-from rig.events.reading import event_of
+from rig.events.events import Accepted, Event, Failed, Identified, Started, event_dict, event_of
 from rig.search.model import Model, empty_table_for, model_of
 from rig.search.stopping_rules import FILE as STOPPING_RULE
 from rig.search.stopping_rules import read_stopping_rule, write_stopping_rule
@@ -229,10 +227,7 @@ class SavedRun:
         """
         for number, line in enumerate(self._lines, 1):
             try:
-                event = event_of(line, self._frame)
-                _check_event(event)
-                if isinstance(event, Compared):
-                    event = self._with_images(event)
+                event = self._with_images(event_of(line))
             except _DAMAGE as error:
                 raise _damaged(self.folder, f"events.jsonl, line {number}: {_reason(error)}") from error
             yield event
@@ -267,7 +262,11 @@ class SavedRun:
             raise _damaged(self.folder, "events.jsonl does not begin with the event started")
         return first
 
-    def _with_images(self, event: Compared) -> Compared:
+    def _with_images(self, event: Event) -> Event:
+        if isinstance(event, Accepted):
+            return replace(event, image_bgr=self._frame(event.index))
+        if not isinstance(event, Compared):
+            return event
         picture = _image(self.folder, self.folder / DIFFERS_HERE) if event.views else None
         leaders = tuple(
             tuple(_image(self.folder, leader_path(self.folder, side, number)) for number in range(len(azimuths_deg)))
@@ -372,18 +371,6 @@ def _descriptor(folder: Path, used: dict[str, Any]) -> Descriptor:
     if number != kind.version:
         raise ValueError(f"it was described by {name} {number}, which this program does not have")
     return kind
-
-
-def _check_event(event: Event) -> None:
-    """Check the values that a search computes with; those of other events are only shown."""
-    if isinstance(event, Accepted) and not isfinite(event.azimuth_deg):
-        raise ValueError("the azimuth is not a number")
-    if isinstance(event, Moved) and not isfinite(event.encoder_deg):
-        raise ValueError("the table angle is not a number")
-    if isinstance(event, Started) and event.seed is not None and event.seed < 0:
-        raise ValueError("the seed is negative")
-    if isinstance(event, Ranked | Identified) and not event.candidates:
-        raise ValueError("there are no candidates")
 
 
 def _image(folder: Path, path: Path) -> NDArray[np.uint8]:

@@ -49,42 +49,50 @@ class RejectReason(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class MotionEvidence:
-    """The motion of the table while a view was exposed.
-
-    ``middle_ns`` is the middle of the exposure of the object's middle row, or of the frame's if no object was found, on
-    the bench's clock. ``angle_deg`` is the table's angle then, with its standard uncertainty; ``speed_dps`` is its
-    speed, and ``smear_px`` the motion during the exposure at the edge of the region. ``residual_deg`` is the largest
-    difference between encoder and gyro during the motion.
-    """
+    """The motion of the table while a view was exposed."""
 
     middle_ns: int
+    """Middle of the exposure of the object's middle row, or of the frame's if no object was found, in ns of the bench's
+    clock."""
     angle_deg: float
+    """Table angle at that time."""
     angle_sigma_deg: float
+    """Standard uncertainty of ``angle_deg``."""
     speed_dps: float
+    """Speed of the table at that time."""
     smear_px: float
+    """Motion in the image during the exposure, at the edge of the region of interest, in pixels."""
     residual_deg: float
+    """Largest difference between encoder and gyro during the motion."""
 
 
 @dataclass(frozen=True, slots=True)
 class ViewEvidence:
-    """The measurements that decide whether a frame is accepted.
-
-    ``settled_ns`` and ``exposed_ns`` are times on the bench's clock. ``sharpness`` is the variance of the Laplacian of
-    the grey region, in squared levels. The shares are shares of the region's pixels. For a view that was taken in
-    motion, ``settled_ns`` is the time at which the motion began, ``motion`` describes it, and ``stillness`` is None.
-    """
+    """The measurements that decide whether a frame is accepted."""
 
     settled_ns: int
+    """Time at which the table came to rest, in ns of the bench's clock; for a view in motion, the time at which the
+    motion began."""
     exposed_ns: int
+    """Time at which the exposure began, in ns of the bench's clock."""
     sharpness: float
+    """Variance of the Laplacian of the region of interest in grey, in squared grey levels."""
     mean_level: float
+    """Mean grey level of the region of interest, from 0 to 255."""
     dark_share: float
+    """Share of the region's pixels with a grey level below 8, from 0 to 1."""
     saturated_share: float
+    """Share of the region's pixels with the grey level 255, from 0 to 1."""
     repeated: bool
+    """Whether the camera sent its last frame again."""
     locks: CameraLocks
+    """Settings of the camera, as the camera reports them."""
     locks_hold: bool
+    """Whether these settings are the same as at the beginning of the plan."""
     stillness: Stillness | None
+    """Motion of the table from rest until the end of the exposure; null for a view in motion."""
     motion: MotionEvidence | None = None
+    """Motion of the table during the exposure; null for a view at rest."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,6 +9,7 @@ from fastapi import APIRouter, Header, Query, Request, Response, WebSocket, WebS
 from fastapi.responses import StreamingResponse
 
 from rig.core.errors import JobNotFound, TooManyListeners
+from rig.web.event_schema import JobMessage
 from rig.web.hub import MAX_LISTENERS
 from rig.web.problems import problem
 from rig.web.remote_bench import BOUNDARY
@@ -16,6 +17,12 @@ from rig.web.requests import Job, JobRequest
 from rig.web.server import AnswerBody, Limit, OperatorPerson, Server, Watcher, page_of
 
 MAX_VIEWERS = 50
+
+
+class EventStream(StreamingResponse):
+    """Server-sent events."""
+
+    media_type = "text/event-stream"
 
 
 def add_bench(api: APIRouter, server: Server) -> None:
@@ -29,15 +36,14 @@ def add_bench(api: APIRouter, server: Server) -> None:
         """Stop the table, and cancel all jobs. Needs no lease. The answer says whether the bench has confirmed it."""
         return {**await server.remote.stop(), "status": server.remote.status}
 
-    @api.get("/events", tags=["bench"], response_class=StreamingResponse)
+    @api.get("/events", tags=["bench"], response_class=EventStream, responses={200: {"model": JobMessage}})
     async def events(
         request: Request, _person: Watcher, last_event_id: Annotated[str | None, Header(max_length=64)] = None
-    ) -> StreamingResponse:
+    ) -> EventStream:
         """Send events: plan, job, status, lease, stop. `Last-Event-ID` continues after a lost connection."""
         _check_number(server.hub.listeners, MAX_LISTENERS)
         headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
-        stream = server.hub.stream(last_event_id, lambda: server.still_allowed(request))
-        return StreamingResponse(stream, media_type="text/event-stream", headers=headers)
+        return EventStream(server.hub.stream(last_event_id, lambda: server.still_allowed(request)), headers=headers)
 
     @api.websocket("/socket")
     async def socket(socket: WebSocket) -> None:

@@ -4,7 +4,7 @@ import re
 from typing import Annotated, Any, Final
 
 from fastapi import APIRouter, Query, Request, Response
-from fastapi.responses import HTMLResponse
+from fastapi.responses import HTMLResponse, JSONResponse
 from pydantic import Field
 
 from rig.calibrations import CalibrationStore
@@ -13,9 +13,10 @@ from rig.catalog.records import Outcome
 from rig.catalog.results import ResultFilter, correct, find_result, find_results
 from rig.core.errors import JobNotFound
 from rig.core.masking import masked
-from rig.events.events import plain
+from rig.events.events import event_dict, plain
 from rig.search.replay import Check, check
 from rig.search.saved_run import SavedRun, load_run
+from rig.web.event_schema import SavedRunBody
 from rig.web.server import CorrectionBody, Limit, OperatorPerson, Server, Watcher, long_work, page_of, time_text
 from rig.web.work import calibrations
 
@@ -39,21 +40,16 @@ def add_records(api: APIRouter, server: Server) -> None:
         names = [path.parent.name for path in server.runs.glob("*/run.json") if RUN_NAME.fullmatch(path.parent.name)]
         return page_of(request, [{"name": name} for name in sorted(names, reverse=True)], "name", limit, after)
 
-    @api.get("/runs/{name}", tags=["runs"])
-    def run(name: str, _person: Watcher) -> dict[str, Any]:
+    @api.get("/runs/{name}", tags=["runs"], responses={200: {"model": SavedRunBody}})
+    def run(name: str, _person: Watcher) -> Response:
         """Return the events of a saved run."""
-        from rig.events.events import event_dict
         from rig.events.lines import line
 
         saved = load(name)
         with saved.damage():
             events = [{**event_dict(event), "text": line(event)} for event in saved.events()]
-        return {
-            "name": name,
-            "started_utc": saved.about["started_utc"],
-            "bench": saved.about["bench"],
-            "events": events,
-        }
+        about = {"started_utc": saved.about["started_utc"], "bench": saved.about["bench"]}
+        return JSONResponse({"name": name, **about, "events": events})
 
     @api.get("/runs/{name}/report", tags=["runs"], response_class=HTMLResponse)
     async def report(name: str, _person: Watcher) -> HTMLResponse:

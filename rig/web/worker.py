@@ -243,8 +243,7 @@ class BenchWorker:
             if job.progress is not None:
                 left_s = None if self._left is None else self._left.seconds
                 job.progress = job.progress.model_copy(update={"done": job.progress.done + 1, "seconds_left": left_s})
-        text = line(event)
-        self._publish("plan", {"job": job.id, "text": text, **plain(values)})
+        self._publish("plan", {"job": job.id, "text": line(event), **values})
         if isinstance(event, Started | Accepted):
             self._queue.update(job, durable=job.views == 1)
         self._check(job, can_pause=isinstance(event, Accepted | Decided))

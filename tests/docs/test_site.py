@@ -2,6 +2,7 @@
 
 import re
 import shlex
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -71,6 +72,14 @@ def test_links_between_pages_exist():
         for target in re.findall(r"\]\((?!https?:|#)([^)#\s]+)", path.read_text(encoding="utf-8")):
             generated = target.startswith("../images/architecture")
             assert generated or (path.parent / target).exists(), f"{path.relative_to(ROOT)}: {target}"
+
+
+def test_page_of_events_has_its_tables_on_the_site():
+    page = SimpleNamespace(file=SimpleNamespace(generated_by=None, src_uri="events.md"))
+    text = generate.on_page_markdown((DOCS / "events.md").read_text(encoding="utf-8"), page)
+    for heading in ("## started", "## frame_used", "### view_evidence", "### stop_decision", "## Codes"):
+        assert text.count(f"\n{heading}\n") == 1
+    assert "| `rotation_imu_deg` | number or null | The same rotation by the gyro; null" in text
 
 
 def test_links_out_of_docs_are_rewritten_for_the_site():

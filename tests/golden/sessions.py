@@ -175,7 +175,7 @@ def _jobs(folder: Path, session: dict[str, Any]) -> Values:
             request.update({step[path]: path for path in ("pause", "cancel") if path in step})
             answer = served.client.post("/api/v1/jobs", json=step["job"])
             if answer.status_code != 201:
-                values.append({"refused": answer.status_code, **answer.json()})
+                values.append({"rejected": answer.status_code, **answer.json()})
                 continue
             job = answer.json()["id"]
             if "pause" in step:

@@ -235,11 +235,10 @@ def _candidates(result: "Result") -> str:
 
 def _event(result: "Result") -> "Identified | None":
     """Return the recorded event; None if another version of the program recorded it."""
-    from rig.events.events import Identified
-    from rig.events.reading import built
+    from rig.events.events import Identified, event_of
 
     try:
-        answer: Identified = built(Identified, result.details)
-    except (LookupError, TypeError, ValueError, AttributeError):
+        answer = event_of(result.details)
+    except ValueError:
         return None
-    return answer
+    return answer if isinstance(answer, Identified) else None

@@ -32,7 +32,7 @@ from rig.events.events import (
     Waiting,
 )
 from rig.events.lines import line
-from rig.events.wording import decision_words, move_words, share_words, similar_objects_words, stop_words
+from rig.events.wording import decision_words, move_words, ranking_words, share_words, similar_objects_words
 from rig.motion.motion_model import MotionModel
 from rig.plans.estimate import TimeLeft
 from rig.views.capture import ViewEvidence, rejection_text
@@ -297,9 +297,7 @@ class IdentifyView(LiveView):
 
     @property
     def _decision(self) -> str:
-        if self._ranked is None or self._ranked.decision is None:
-            return ""
-        return stop_words(self._ranked.decision, self._ranked.index + 1)
+        return ranking_words(self._ranked)
 
     def render(self) -> RenderableType:
         table = Table(box=None, pad_edge=False, expand=False)

@@ -1,13 +1,14 @@
-"""Emitted events agree with docs/events.md, which is their schema."""
+"""Emitted events agree with the tables of their documentation, and are read again as they were."""
 
 import re
 from dataclasses import fields, is_dataclass
-from pathlib import Path
+from math import inf
 from typing import Any, get_args
 
 import pytest
 
 import hbr
+from docs.generate import CODES, events_page
 from hbr import StopDecision
 from rig.catalog import Catalog
 from rig.core.errors import ViewRejected
@@ -21,6 +22,8 @@ from rig.events.events import (
     FrameUsed,
     Note,
     NoteCode,
+    Ranked,
+    RotationReason,
     ScanStarted,
     SimilarObject,
     Unwinding,
@@ -29,7 +32,7 @@ from rig.events.events import (
     Warned,
     Weighed,
     event_dict,
-    event_kind,
+    event_of,
 )
 from rig.motion.scan_speed import SpeedLimit
 from rig.plans.enroll import enroll
@@ -42,7 +45,9 @@ from rig.safety.gyro_rotation import Stillness
 from rig.search.model import load_model
 from rig.views.capture import MotionEvidence, ViewEvidence
 
-TEXT = (Path(__file__).parents[3] / "docs" / "events.md").read_text(encoding="utf-8")
+TEXT = events_page()
+KINDS = {next(f.default for f in fields(kind) if f.name == "event"): kind for kind in get_args(Event)}
+NOT_IN_TABLES = {"event", "image_bgr", "picture_bgr", "leaders"}
 PLAIN = {"string": str, "integer": int, "number": (int, float), "boolean": bool, "object": dict}
 PARTS = {
     "candidate": Candidate,
@@ -51,10 +56,10 @@ PARTS = {
     "weighed": Weighed,
     "note": Note,
     "stop_decision": StopDecision,
-    "evidence": ViewEvidence,
-    "locks": CameraLocks,
+    "view_evidence": ViewEvidence,
+    "camera_locks": CameraLocks,
     "stillness": Stillness,
-    "motion": MotionEvidence,
+    "motion_evidence": MotionEvidence,
 }
 
 
@@ -94,7 +99,8 @@ def check_fields(value: dict[str, Any], kind: str, where: str) -> None:
 
 
 def check_event(event: Event) -> str:
-    """Compare an event with the document and return its kind."""
+    """Compare an event with the document, read it again, and return its kind."""
+    assert event_dict(event_of(event_dict(event))) == event_dict(event)
     return check_values(event_dict(event))
 
 
@@ -105,12 +111,18 @@ def check_values(reported: dict[str, Any]) -> str:
 
 
 def test_every_event_and_part_is_documented_with_exactly_its_fields():
-    kinds = {event_kind(kind): kind for kind in get_args(Event)}
-    assert SCHEMAS.keys() == kinds.keys() | PARTS.keys()
-    for name, kind in (kinds | PARTS).items():
+    assert SCHEMAS.keys() == KINDS.keys() | PARTS.keys()
+    for name, kind in (KINDS | PARTS).items():
         assert is_dataclass(kind)
-        assert [f.name for f in fields(kind) if f.metadata.get("json", True)] == list(SCHEMAS[name]), name
+        assert [f.name for f in fields(kind) if f.name not in NOT_IN_TABLES] == list(SCHEMAS[name]), name
     assert f"# Events, schema {SCHEMA}" in TEXT
+
+
+def test_every_code_of_a_reason_or_note_has_its_meaning():
+    kinds = {kind.__name__: kind for kind in (RotationReason, hbr.StopReason, NoteCode)}
+    for name, heading in CODES.items():
+        (section,) = re.findall(rf"^### {heading.replace('-', ' ').capitalize()}\n(.*?)(?=^#|\Z)", TEXT, re.M | re.S)
+        assert set(re.findall(r"^\| `([\w-]+)` \| [^|]+ \|$", section, re.M)) == {str(code) for code in kinds[name]}
 
 
 def test_every_event_that_the_plans_emit_is_as_documented(simulated, tmp_path):
@@ -145,9 +157,11 @@ def test_every_event_that_the_plans_emit_is_as_documented(simulated, tmp_path):
     sides = ((0.0,), (10.0, 20.0))
     shown = (ComparedView(2, 0.9, 5000.0),)
     seen.add(check_event(Compared(3, ("a", "b"), "a", 0.9, (1.0, -1.0), 0.01, 0.01, 0.1, 0.2, 1.5, shown, sides)))
+    decision = StopDecision(hbr.Outcome.FOUND, hbr.StopReason.CONFIDENT, 0, 0.99, 0.98, 1.0, -inf)  # none is unknown
+    seen.add(check_event(Ranked(3, (Candidate("dice", 0.9, 30.0, 0.99),), 0.2, decision)))
     seen.add(check_event(Verified(3, "dice", 0.7, 0.4, 1.2, 0.0, -1.3, hbr.Outcome.FOUND)))
     seen.add(check_event(Unwinding(0, 330.0, 0.0, 1, (-400.0, 400.0))))
-    assert seen == {event_kind(kind) for kind in get_args(Event)}
+    assert seen == KINDS.keys()
 
 
 @pytest.mark.parametrize(

@@ -25,8 +25,8 @@ from rig.events.events import (
     RotationReason,
     Started,
     event_dict,
+    event_of,
 )
-from rig.events.reading import event_of
 from rig.search.replay import check
 from rig.search.saved_run import RunWriter, load_run
 from tests.rig.search.run_samples import saved_runs
@@ -335,7 +335,7 @@ def test_number_that_was_not_finite_is_read_as_nan(saved):
     accepted = next(e for e in saved["ahbr"][1] if isinstance(e, Accepted))
     values = event_dict(Rejected(0, 1, ("gyro",), accepted.evidence))
     values["evidence"]["stillness"]["peak_rate_dps"] = None
-    again = event_of(values, None)
+    again = event_of(values)
     assert isinstance(again, Rejected)
     assert np.isnan(again.evidence.stillness.peak_rate_dps)
-    assert isinstance(event_of({**event_dict(saved["ahbr"][1][0]), "newer": 1}, None), Started)
+    assert isinstance(event_of({**event_dict(saved["ahbr"][1][0]), "newer": 1}), Started)
