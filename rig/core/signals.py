@@ -41,6 +41,8 @@ class _State:
     waiting: int | None = None
     raised_ns: int | None = None
     raised: int = 0
+    dropping: bool = False
+    """Whether Python drops exceptions now, because `_raise_again` runs."""
     report_dropped: Callable[["sys.UnraisableHookArgs"], None] = sys.__unraisablehook__
 
 
@@ -102,6 +104,8 @@ def _ignore_signals() -> None:
 
 def _end(number: int, _frame: object) -> None:
     now_ns = _clock.now_ns()
+    if _state.dropping:
+        return  # Python would drop this one, too; it comes again
     if _state.depth and now_ns - _state.held_ns < HOLD_S * 1e9:
         _state.waiting = _state.waiting or number
     elif _state.raised_ns is None or now_ns - _state.raised_ns >= HOLD_S * 1e9:
@@ -112,11 +116,21 @@ def _end(number: int, _frame: object) -> None:
 def _raise_again(dropped: "sys.UnraisableHookArgs") -> None:
     """Send a signal again whose exception Python has dropped; otherwise the program would continue."""
     if _state.raised_ns is not None and isinstance(dropped.exc_value, KeyboardInterrupt | SystemExit):
-        _state.raised_ns = None
-        main_thread = threading.main_thread().ident
-        threading.Timer(AGAIN_S, signal.pthread_kill, (main_thread, _state.raised)).start()
+        _state.raised_ns, _state.dropping = None, True
+        try:
+            threading.Thread(target=_send_again, daemon=True).start()
+        finally:
+            _state.dropping = False
     else:
         _state.report_dropped(dropped)
+
+
+def _send_again() -> None:
+    main_thread = threading.main_thread().ident
+    assert main_thread is not None
+    while _state.raised_ns is None:  # until the handler has raised it
+        _clock.sleep(AGAIN_S)
+        signal.pthread_kill(main_thread, _state.raised)
 
 
 def _raise(number: int) -> None:

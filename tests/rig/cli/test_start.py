@@ -109,6 +109,17 @@ def new(settings):
     threading.Event().wait(60)
 """
 
+SLOW = (
+    """
+usual = threading.Thread.start
+def start(thread):
+    usual(thread)
+    threading.Event().wait(0.1)
+threading.Thread.start = start
+"""
+    + DEL
+)
+
 
 @pytest.mark.parametrize(
     ("command", "output", "errors"),
@@ -116,6 +127,7 @@ def new(settings):
         pytest.param(PLAIN, "closed\n", "", id="command-of-a-package"),
         pytest.param(SET_NAME, "", "Interrupted.\n", id="python-3.11-makes-another-exception-of-it"),
         pytest.param(DEL, "", "Interrupted.\n", id="python-drops-the-exception"),
+        pytest.param(SLOW, "", "Interrupted.\n", id="python-drops-the-exception-on-a-busy-computer"),
     ],
 )
 def test_ctrl_c_unwinds_each_command(command, output, errors):
