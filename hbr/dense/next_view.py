@@ -17,6 +17,8 @@ from hbr.dense.index import BINS
 from hbr.descriptors import Packed
 from hbr.kernels import calls
 
+#: How reliably a view separates two objects that look different.
+SHARPNESS: Final = 100.0
 #: Largest number of compared hypotheses, and the share of the belief that is not compared.
 _STRONGEST: Final = 16
 _NEGLIGIBLE: Final = 1e-3
@@ -29,7 +31,7 @@ _ALL_ROTATIONS_DEG.flags.writeable = False
 
 @dataclass(frozen=True, eq=False)
 class NextBestView:
-    """A rotation and the numbers of the decision for it.
+    """A rotation, or an arc of a search in motion, and the numbers of the decision for it.
 
     Attributes
     ----------
@@ -44,7 +46,7 @@ class NextBestView:
         All rotations that were weighed; the logarithm of the probability that two objects are still confused after
         each; the cost of the motion, in the same unit.
     similarity : float64 array (a,), or None
-        Similarity of the pair's views after each rotation; None if there is no pair.
+        Similarity of the pair's views after each rotation; None if there is no pair, and for an arc.
     """
 
     rotation_deg: float
@@ -60,7 +62,7 @@ def next_best_view(
     belief: Belief,
     *,
     beta: float = BETA,
-    sharpness: float = 100.0,
+    sharpness: float = SHARPNESS,
     rotations_deg: ArrayLike | None = None,
     seconds: ArrayLike | None = None,
     second_costs: float = 1.0,
@@ -121,7 +123,7 @@ def next_best_view(
         tells = novelty[:, None] * np.sqrt(known[:, first] * known[:, second])
         pairs = probability[first] * probability[second]
         remaining = pairs * np.exp(-sharpness * tells * (1 - similar))
-        confusion = np.log(np.maximum(2 * remaining.sum(axis=1), 1e-300))
+        confusion = log_confusion(remaining)
     else:  # one object alone: a new side helps to find its azimuth
         confusion = -sharpness * novelty
     # Choose the best one, and name the pair that it separates most.
@@ -136,6 +138,12 @@ def next_best_view(
         similarity = similar[:, most]
     rotation_deg = float(angles_deg[chosen])
     return NextBestView(rotation_deg, wrap360(here_deg + rotation_deg), pair, angles_deg, confusion, cost, similarity)
+
+
+def log_confusion(remaining: FloatArray) -> FloatArray:
+    """Return the logarithm of the probability of a confusion, (a,), from what remains of each pair, (a, p)."""
+    confusion: FloatArray = np.log(np.maximum(2 * remaining.sum(axis=1), 1e-300))
+    return confusion
 
 
 def _pairs(place: IndexArray) -> tuple[IndexArray, IndexArray]:

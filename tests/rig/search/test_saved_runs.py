@@ -34,7 +34,7 @@ from rig.events.reading import event_of
 from rig.plans.enroll import enroll
 from rig.plans.identify import identify
 from rig.plans.photograph_table import photograph_table
-from rig.search.model import load_model
+from rig.search.model import load_model, model_of
 from rig.search.replay import check
 from rig.search.saved_run import RunWriter, load_run
 from sim.bench import ShelfOperator, open_sim_bench
@@ -59,7 +59,7 @@ def saved(tmp_path_factory):
         list(photograph_table(bench))
         for name in ("mug-white", "mug-star", "lamp"):
             list(enroll(bench, catalog, name, views=6))
-        index = hbr.ViewIndex(catalog.views().views)
+        index = model_of(catalog.views().views)
         for number, strategy in enumerate(("ahbr", "hbr", "sweep", "random")):
             operator.next_object, operator.yaw_deg = "mug-star", 40.0 * number
             with RunWriter(home / strategy, bench, index) as writer:
@@ -390,9 +390,9 @@ def test_folder_without_a_run_or_not_empty_is_rejected(saved, tmp_path, simulate
     folder, _ = saved["ahbr"]
     bench = simulated().bench
     with pytest.raises(UsageError, match="not empty"):
-        RunWriter(folder, bench, hbr.ViewIndex(hbr.Views.empty()))
+        RunWriter(folder, bench, model_of(hbr.Views.empty()))
     with pytest.raises(UsageError, match="cannot be saved"):
-        RunWriter(Path("/proc/run"), bench, hbr.ViewIndex(hbr.Views.empty()))
+        RunWriter(Path("/proc/run"), bench, model_of(hbr.Views.empty()))
 
 
 def test_number_that_was_not_finite_is_read_as_nan(saved):
