@@ -25,7 +25,7 @@ from hbr.dense.calibration import fit_min_confidence
 from hbr.dense.filter import Belief, update_belief
 from hbr.dense.index import DenseIndex
 from hbr.dense.leave_one_out import LeaveOneOut, leave_one_out
-from hbr.dense.next_view import SHARPNESS, NextBestView, expected_similarity, log_confusion, strongest
+from hbr.dense.next_view import SHARPNESS, NextBestView, expected_similarity, log_confusion, pairs_of, strongest
 from hbr.dense.session import DenseSession
 from hbr.dense.stopping import Limitation, LimitationCode, Outcome, StopDecision, StoppingRule, StopReason
 
@@ -217,7 +217,7 @@ def next_arc(belief: Belief, *, beta: float, rotations_deg: FloatArray, seconds:
     apart_deg = size_deg(here_deg + rotations_deg[:, None] - belief.orientation_deg).min(axis=1)
     new = np.minimum(apart_deg / STEP_DEG, 1.0) * STEP_WEIGHT
     probability, place, bin_of = strongest(belief.posterior(beta))
-    first, second = np.nonzero(np.triu(place[:, None] != place))  # pairs of different objects
+    first, second = pairs_of(place)
     pairs = probability[first] * probability[second]
     confusion = np.zeros(len(rotations_deg))
     pair = None

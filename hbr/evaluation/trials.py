@@ -18,12 +18,12 @@ from hbr.dense.enrolled_views import answered
 from hbr.dense.filter import Belief, update_belief
 from hbr.dense.index import DenseIndex
 from hbr.dense.local_difference import LocalView
-from hbr.dense.next_view import most_informative_rotation
 from hbr.dense.session import DenseSession
 from hbr.dense.stopping import Outcome, StoppingRule
 from hbr.descriptors import descriptor
 from hbr.evaluation.draws import generator
 from hbr.evaluation.methods import Method
+from hbr.evaluation.mutual_information import most_informative_rotation
 from hbr.evaluation.near_twins import LocalPhotographs
 from hbr.evaluation.protocol import COMPARED, OUTCOMES, Protocol, Runs, views_of_trial
 from hbr.model.symmetry import symmetry
