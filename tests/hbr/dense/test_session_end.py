@@ -8,8 +8,10 @@ import pytest
 
 import hbr
 from hbr import Outcome, StopReason
+from hbr.dense.arc import ArcRule, ArcSession
 from hbr.dense.enrolled_views import NeedEnrolledViews, answered
 from hbr.dense.local_difference import LocalView
+from hbr.dense.verification import Verification
 from tests.hbr.dense.test_local_difference import shown
 from tests.hbr.dense.test_stopping import catalog
 
@@ -72,3 +74,20 @@ def test_without_enrolled_views_the_decision_stays(session) -> None:
     assert end.value.value is None
     assert session.end() == before
     assert answered(session.verify(lambda _: pytest.fail("it is not doubtful"))) is None
+
+
+def test_a_doubtful_search_in_motion_is_not_verified(session, monkeypatch) -> None:
+    monkeypatch.setattr("hbr.dense.session.is_doubtful", lambda *_: True)
+    need = next(session.verify(lambda _: pytest.fail("first it asks")))
+    assert need.object_index == session.end().object_index
+    moving = ArcSession(session.belief.index, ArcRule(session.rule, 2.0))
+    moving.add(session.belief.levels[0], 0.0)
+    assert answered(moving.verify(lambda _: pytest.fail("no view is needed"))) is None
+    assert moving.verification is None
+
+
+def test_a_measured_fit_replaces_the_enrolled_views(session) -> None:
+    before = session.end()
+    assert answered(session.verify(lambda _: pytest.fail("no view is needed"), Verification(0, 0.0, 0.0))) is not None
+    assert session.end() == session.verification.decided(before, session.found_from)
+    assert session.end().reason is StopReason.PIXEL_FIT
