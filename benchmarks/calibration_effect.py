@@ -22,7 +22,6 @@ from typing import Any
 
 import numpy as np
 
-import hbr
 from calibration.procedures import Backlash, CameraModel, Encoder, GyroScale, MotionModel, Repeatability, TableAxis
 from hbr.evaluation.statistics import wilson
 from rig.bench import Bench, calibrate
@@ -33,6 +32,7 @@ from rig.core.errors import RigError
 from rig.events.events import Identified, Moved
 from rig.plans.enroll import enroll
 from rig.plans.identify import identify
+from rig.search.model import model_of
 from sim.bench import ShelfOperator, open_sim_bench
 from sim.noise import NoiseModel
 from sim.objects.shelf import shelf
@@ -109,7 +109,7 @@ def run(seed: int, noise: NoiseModel, orientation: str, calibrated: bool, folder
                             enroll(bench, catalog, name, views=VIEWS), operator, orientation
                         )
                     continue
-                index = hbr.ViewIndex(catalog.views().views)
+                index = model_of(catalog.views().views)
             rng = np.random.default_rng(seed)
             for name in names * TRIALS:
                 operator.next_object, operator.yaw_deg = name, float(rng.uniform(0, 360))

@@ -31,11 +31,10 @@ from rig.motion.motion_model import MotionModel
 from rig.motion.move import equivalent_within
 from rig.motion.turntable import Flight, Turntable
 from rig.plans.capture import capture
-from rig.search.model import Model
-from rig.search.session import ArcSearch, begin_search
+from rig.search.model import DenseModel, Model, begin_search
 from rig.search.strategies import Finish
 from rig.views.capture import Viewer
-from rig.views.description import BENCH_DESCRIPTOR, ViewDescriber
+from rig.views.description import BENCH_DESCRIPTOR, DescribedView, ViewDescriber
 from rig.views.stream import FrameStream, middle_ns
 from sim.bench import ShelfOperator, open_sim_bench
 from sim.objects.shelf import shelf
@@ -112,12 +111,12 @@ def search(model: Model, config: RigConfig, seen: dict[str, Seen], start_deg: fl
     table_deg, travelled_deg, seconds, step_s = 0.0, 0.0, FIRST_VIEW_S[kind], 1 / config.camera.fps
     while True:
         at_deg, levels = nearest(seen["rest"], start_deg + table_deg)
-        ranked, step = session.add(levels, sign * at_deg % 360, table_deg=table_deg)
+        _, step = session.add(DescribedView({BENCH_DESCRIPTOR: levels}, None), sign * at_deg % 360, table_deg=table_deg)
         if isinstance(step, Finish):
             break
         goal_deg = equivalent_within(table_deg + sign * step.rotation_deg, table_deg, limits_deg)
         assert goal_deg is not None
-        if not isinstance(session, ArcSearch):
+        if not session.in_motion:
             seconds += times.move_s(goal_deg - table_deg) + times.view_s
             travelled_deg += abs(goal_deg - table_deg)
             table_deg = goal_deg
@@ -130,7 +129,9 @@ def search(model: Model, config: RigConfig, seen: dict[str, Seen], start_deg: fl
             table_deg += rate_dps * step_s
             travelled_deg, seconds = travelled_deg + abs(rate_dps) * step_s, seconds + step_s
             at_deg, levels = nearest(seen["motion"], start_deg + table_deg)
-            ranked, step = session.add(levels, sign * at_deg % 360, table_deg=table_deg)
+            _, step = session.add(
+                DescribedView({BENCH_DESCRIPTOR: levels}, None), sign * at_deg % 360, table_deg=table_deg
+            )
             if isinstance(step, Finish):
                 break
             if session.is_new_decision:
@@ -138,7 +139,7 @@ def search(model: Model, config: RigConfig, seen: dict[str, Seen], start_deg: fl
         if isinstance(step, Finish):
             break
         table_deg, seconds = goal_deg, seconds + 0.3  # the table has arrived and is at rest
-    answer = session.answer(ranked, step, travelled_deg=travelled_deg, seconds=seconds)
+    answer = session.answer(travelled_deg=travelled_deg, seconds=seconds)
     found = answer.name if answer.outcome is hbr.Outcome.FOUND else answer.outcome.value
     return {"found": found, "seconds": seconds, "views": answer.views, "travelled_deg": travelled_deg}
 
@@ -174,7 +175,7 @@ def main() -> None:
         objects, angles, levels = zip(*seen, strict=True)
         azimuths = config.table.orientation_sign * np.array(angles) % 360
         index = hbr.DenseIndex(hbr.Views(np.array(levels), azimuths, np.array(objects), tuple(known), BENCH_DESCRIPTOR))
-        model = Model(index, hbr.calibrate_stopping_rule(index).rule)
+        model = DenseModel(index, hbr.calibrate_stopping_rule(index).rule)
         for trial in range(given.trials // CATALOGS):
             name = str(rng.choice(unknown if trial % UNKNOWN_EVERY == UNKNOWN_EVERY - 1 else known))
             shown = changed(recorded[name], rng, given.strength) if given.strength else recorded[name]

@@ -17,14 +17,15 @@ from math import exp
 from typing import Final
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from hbr.core.angles import size_deg
+from hbr.core.angles import size_deg, wrap360
 from hbr.core.arrays import FloatArray, LevelArray
 from hbr.dense.calibration import fit_min_confidence
 from hbr.dense.filter import Belief, update_belief
 from hbr.dense.index import DenseIndex
 from hbr.dense.leave_one_out import LeaveOneOut, leave_one_out
-from hbr.dense.next_view import expected_similarity, strongest
+from hbr.dense.next_view import SHARPNESS, NextBestView, expected_similarity, log_confusion, pairs_of, strongest
 from hbr.dense.session import DenseSession
 from hbr.dense.stopping import Limitation, LimitationCode, Outcome, StopDecision, StoppingRule, StopReason
 
@@ -45,7 +46,6 @@ MOTION_LOSS: Final = 0.007
 """Largest loss of similarity by smear and rolling shutter: 5 % quantile of views of COIL-100 in motion, compared with a
 second enrollment at rest."""
 MOST_SEARCHES: Final = 160
-_SHARPNESS: Final = 100.0
 
 
 def frame_weight(apart_deg: float) -> float:
@@ -112,60 +112,37 @@ def fit_arc_rule(searches: LeaveOneOut, rest: StoppingRule) -> ArcRule:
 
 
 class ArcSession(DenseSession):
-    """A search in motion, the same for the bench and for replay.
+    """A search in motion.
 
     All frames give the confidence. The open-set score comes from frames that are `SIDE_DEG` apart, because it was
-    measured on such views.
-
-    Attributes
-    ----------
-    decisions
-        Decisions so far; the first view is the first one.
-    is_new_decision
-        Whether the last view led to a decision.
-    present : StopDecision
-        What the rule would decide after the last frame, if it decided after each one.
+    measured on such views. ``decisions`` is the number of decisions so far; the first view is the first one.
     """
-
-    present: StopDecision
 
     def __init__(self, index: DenseIndex, rule: ArcRule) -> None:
         super().__init__(index, rule.rest, max_views=DECISIONS)
         self.decisions = 0
-        self.is_new_decision = False
         self._min_confidence = rule.min_confidence
         self._covered_deg = 0.0
         self._sides: tuple[Belief, int] | None = None
 
-    def add(
-        self,
-        levels: LevelArray,
-        orientation_deg: float,
-        *,
-        earlier: Sequence[LevelArray] | None = None,
-        reliable: bool = True,
-        same_bench: bool | None = None,
-    ) -> StopDecision:
-        """Add the next frame and return the rule's last decision; `is_new_decision` says whether it is a new one."""
-        if earlier is not None:
-            self._sides = None  # these belief and views were described differently
+    def _replace(self, queries: Sequence[LevelArray]) -> None:
+        super()._replace(queries)
+        self._sides = None  # these belief and views were described differently
+
+    def _begin_view(self, orientation_deg: float) -> None:
         if self._queries:
             self._covered_deg += min(self._apart_deg(orientation_deg), STEP_DEG)
         decisions = 1 + int(self._covered_deg / STEP_DEG + 1e-9)
         self.is_new_decision = decisions > self.decisions
         self.decisions = decisions
-        if self.is_new_decision:
-            self.present = super().add(
-                levels, orientation_deg, earlier=earlier, reliable=reliable, same_bench=same_bench
-            )
-        else:
-            self._reliable, self._same_bench = reliable, same_bench
-            self._extend(levels, orientation_deg)
-            self.present = self._decide(self.belief)
-        return self.decision
 
     def _apart_deg(self, orientation_deg: float) -> float:
         return float(size_deg(self.belief.orientation_deg - orientation_deg).min())
+
+    def next_best_view(self, rotations_deg: ArrayLike | None = None, seconds: ArrayLike | None = None) -> NextBestView:
+        """Return the rotation along the most informative arc, as `next_arc` does; rotations and times are needed."""
+        ends_deg, times_s = np.asarray(rotations_deg, np.float64), np.asarray(seconds, np.float64)
+        return next_arc(self.belief, beta=self.rule.beta, rotations_deg=ends_deg, seconds=times_s)
 
     def _weight(self, orientation_deg: float) -> float | None:
         return frame_weight(self._apart_deg(orientation_deg)) if self._queries else None
@@ -174,8 +151,8 @@ class ArcSession(DenseSession):
         sides = self._frames_apart(belief)
         last = last or self.decisions >= DECISIONS
         most = sides.queries if last else self.max_views
-        decision = self.rule.decide(sides, max_views=most, reliable=self._reliable, same_bench=self._same_bench)
-        if decision.outcome is Outcome.UNKNOWN and self.decisions > 1 and self._is_doubtful(decision):
+        decision = self.rule.decide(sides, max_views=most, reliable=self._reliable, same_bench=self._like_enrollment)
+        if decision.outcome is Outcome.UNKNOWN and self.decisions > 1 and self._may_be_smeared(decision):
             return replace(decision, outcome=Outcome.AMBIGUOUS if last else Outcome.CONTINUE)
         if self.decisions == 1 or decision.reason is StopReason.BELOW_OPEN_SET_THRESHOLD:
             return decision
@@ -199,7 +176,12 @@ class ArcSession(DenseSession):
             min_confidence=self._min_confidence,
         )
 
-    def _is_doubtful(self, decision: StopDecision) -> bool:
+    @property
+    def is_doubtful(self) -> bool:
+        """Never: a search in motion is not verified, because its frames are smeared, and mostly segmented only once."""
+        return False
+
+    def _may_be_smeared(self, decision: StopDecision) -> bool:
         """Return whether an enrolled object could have missed the threshold because it was in motion.
 
         A fitted open-set score has other units; its rule has a doubtful range of its own.
@@ -218,18 +200,7 @@ class ArcSession(DenseSession):
         return sides
 
 
-@dataclass(frozen=True, eq=False)
-class NextArc:
-    """An arc and the numbers of the decision for it, as in `hbr.dense.next_view.NextBestView`."""
-
-    rotation_deg: float
-    pair: tuple[int, int] | None
-    rotations_deg: FloatArray
-    confusion: FloatArray
-    cost: FloatArray
-
-
-def next_arc(belief: Belief, *, beta: float, rotations_deg: FloatArray, seconds: FloatArray) -> NextArc:
+def next_arc(belief: Belief, *, beta: float, rotations_deg: FloatArray, seconds: FloatArray) -> NextBestView:
     """Choose the arc with the lowest sum of expected confusion and cost.
 
     All frames on the way count: the exponents of `hbr.dense.next_view.next_best_view` are added up from the last view
@@ -246,7 +217,7 @@ def next_arc(belief: Belief, *, beta: float, rotations_deg: FloatArray, seconds:
     apart_deg = size_deg(here_deg + rotations_deg[:, None] - belief.orientation_deg).min(axis=1)
     new = np.minimum(apart_deg / STEP_DEG, 1.0) * STEP_WEIGHT
     probability, place, bin_of = strongest(belief.posterior(beta))
-    first, second = np.nonzero(np.triu(place[:, None] != place))  # pairs of different objects
+    first, second = pairs_of(place)
     pairs = probability[first] * probability[second]
     confusion = np.zeros(len(rotations_deg))
     pair = None
@@ -259,14 +230,14 @@ def next_arc(belief: Belief, *, beta: float, rotations_deg: FloatArray, seconds:
         if not len(way):
             continue
         if pairs.any():
-            remaining = pairs * np.exp(-_SHARPNESS * np.cumsum(exponent[way], axis=0))
-            confusion[way] = np.log(np.maximum(2 * remaining.sum(axis=1), 1e-300))
+            confusion[way] = log_confusion(pairs * np.exp(-SHARPNESS * np.cumsum(exponent[way], axis=0)))
         else:  # one object alone: a new side helps to find its azimuth
-            confusion[way] = -_SHARPNESS * np.cumsum(new[way])
+            confusion[way] = -SHARPNESS * np.cumsum(new[way])
     sums = np.where(np.abs(rotations_deg) >= LEAST_ARC_DEG, confusion + seconds, np.inf)
     chosen = int((sums if np.isfinite(sums).any() else confusion + seconds).argmin())
     if pairs.any():
         most = int(pairs.argmax())
         objects = belief.index.object_index
         pair = int(objects[place[first[most]]]), int(objects[place[second[most]]])
-    return NextArc(float(rotations_deg[chosen]), pair, rotations_deg, confusion, seconds)
+    rotation_deg = float(rotations_deg[chosen])
+    return NextBestView(rotation_deg, wrap360(here_deg + rotation_deg), pair, rotations_deg, confusion, seconds, None)

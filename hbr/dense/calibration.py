@@ -6,7 +6,7 @@
 Decisions: docs/decisions/0026, docs/decisions/0049, docs/decisions/0059, docs/decisions/0060.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from math import ceil, floor, inf, nan
 from typing import Final
@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from hbr.core.arrays import FloatArray
 from hbr.dense.filter import BETA, update_belief
 from hbr.dense.index import DenseIndex
-from hbr.dense.leave_one_out import Found, Leaders, LeaveOneOut, Task, leader, leave_one_out, usual_scores
+from hbr.dense.leave_one_out import Leaders, LeaveOneOut, Tasks, leader, leave_one_out, usual_scores
 from hbr.dense.open_set import OpenSetModel, fitted_before
 from hbr.dense.shifted_searches import STRENGTHS, ShiftedSearches, can_shift, shifted_searches
 from hbr.dense.stopping import Limitation, LimitationCode, ShiftRates, StoppingRule
@@ -75,10 +75,8 @@ def min_confidence_for(confidence: FloatArray, correct: NDArray[np.bool_], error
     fewer than ``1 / error_rate`` searches the result is inf.
     """
     for least in np.unique(np.concatenate([[0.5], confidence[confidence > 0.5]])).tolist():
-        ends = confidence >= least
-        at = np.flatnonzero(ends.any(axis=1))
-        wrong = int((~correct[at, ends[at].argmax(axis=1)]).sum())
-        if len(at) and (wrong + 1) / (len(at) + 1) <= error_rate:
+        ended, wrong = _ended(confidence, correct, least)
+        if len(ended) and (wrong + 1) / (len(ended) + 1) <= error_rate:
             return float(least)
     return inf
 
@@ -140,7 +138,7 @@ def fit_min_confidence(searches: LeaveOneOut, error_rate: float) -> tuple[float,
     if found <= 1:
         return found, None
     count, needed = len(searches.confidence), ceil(1 / error_rate)
-    ended, wrong = _ended(searches, UNCALIBRATED_MIN_CONFIDENCE)
+    ended, wrong = _ended(searches.confidence, searches.correct, UNCALIBRATED_MIN_CONFIDENCE)
     values = {"rate": error_rate, "searches": count, "needed": needed, "min_confidence": UNCALIBRATED_MIN_CONFIDENCE}
     code = LimitationCode.ERROR_RATE if count < needed else LimitationCode.SIMILAR_OBJECTS
     return UNCALIBRATED_MIN_CONFIDENCE, Limitation(code, {**values, "wrong": wrong, "ended": len(ended)})
@@ -266,7 +264,7 @@ def calibrate_stopping_rule(
     most_shifted_searches: int = MOST_SEARCHES,
     sample: int | None = None,
     progress: Callable[[int, int], object] | None = None,
-    tasks: Callable[[Callable[[Task], Found], Sequence[Task]], Iterable[tuple[Task, Found]]] | None = None,
+    tasks: Tasks | None = None,
 ) -> CalibratedRule:
     """Search for the enrolled objects among each other, and return the rule that is fitted to these searches.
 
@@ -321,7 +319,7 @@ def _calibrated(
     confused: tuple[tuple[str, str], ...] = (),
 ) -> CalibratedRule:
     """Return the rule with the results of its leave-one-out searches."""
-    ended, wrong = _ended(searches, rule.min_confidence)
+    ended, wrong = _ended(searches.confidence, searches.correct, rule.min_confidence)
     return CalibratedRule(
         rule,
         views=searches.confidence.shape[1],
@@ -341,7 +339,7 @@ def calibration_searches(
     most_searches: int = MOST_SEARCHES,
     sample: int | None = None,
     progress: Callable[[int, int], object] | None = None,
-    tasks: Callable[[Callable[[Task], Found], Sequence[Task]], Iterable[tuple[Task, Found]]] | None = None,
+    tasks: Tasks | None = None,
 ) -> LeaveOneOut | None:
     """Return the leave-one-out searches of a calibration; None if objects cannot be compared with each other."""
     usual_views = int(np.median((~index.left_out).sum(axis=1)))
@@ -390,9 +388,9 @@ def _rule_without_candidates(index: DenseIndex, error_rate: float, false_reject:
     )
 
 
-def _ended(searches: LeaveOneOut, min_confidence: float) -> tuple[NDArray[np.intp], int]:
+def _ended(confidence: FloatArray, correct: NDArray[np.bool_], min_confidence: float) -> tuple[NDArray[np.intp], int]:
     """Return the view (from 0) after which each ended search ends at this confidence, and the number of wrong ones."""
-    ends = searches.confidence >= min_confidence
+    ends = confidence >= min_confidence
     at = np.flatnonzero(ends.any(axis=1))
     view = ends[at].argmax(axis=1)
-    return view, int((~searches.correct[at, view]).sum())
+    return view, int((~correct[at, view]).sum())

@@ -17,7 +17,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from hbr.core.angles import size_deg, wrap360
+from hbr.core.angles import size_deg
 from hbr.core.arrays import FloatArray, IndexArray, LevelArray
 from hbr.core.segments import lengths, ranges
 from hbr.dense.whitening import Whitening
@@ -214,22 +214,8 @@ class DenseIndex:
         compiled = calls.nearest_view(self._segments, self.views.azimuth_deg, place, at_deg)
         if compiled is not None:
             return compiled
-        count, columns = self._segments.lengths[place], np.arange(len(place))
-        own_deg = np.where(self.left_out[place], 900.0, self.azimuth_deg[place])
-        keys = (
-            own_deg + 1000.0 * columns[:, None]
-        )  # one rising row of all: column i lies between 1000 i and 1000 (i + 1)
-        behind = np.searchsorted(keys.ravel(), wrap360(at_deg) + 1000.0 * columns) - own_deg.shape[1] * columns
-        before, behind = (behind - 1) % count, behind % count
-        is_new = np.diff(own_deg, axis=1, prepend=-1.0) != 0
-        first = np.maximum.accumulate(np.where(is_new, np.arange(own_deg.shape[1]), 0), axis=1)
-        before = first[columns, before]
-        before_deg, behind_deg = (size_deg(own_deg[columns, at] - at_deg) for at in (before, behind))
-        is_before = (before_deg < behind_deg) | ((before_deg == behind_deg) & (before < behind))
-        return (
-            self.rows[place, np.where(is_before, before, behind)],
-            np.where(is_before, before_deg, behind_deg),
-        )
+        rows = self.nearest_views(place, at_deg.T, 1)[:, :, 0].T
+        return rows, size_deg(self.views.azimuth_deg[rows] - at_deg)
 
     @cached_property
     def _ring(self) -> tuple[IndexArray, FloatArray, Floats]:

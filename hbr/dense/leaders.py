@@ -1,42 +1,25 @@
-"""The last step of a search that does not end with one object: its two leaders, compared pixel by pixel.
-
-The bench, its replay and `rig eval` take this step in the same way.
+"""The comparison of the two leaders of a search that does not end with one object, pixel by pixel.
 
 Decision: docs/decisions/0057.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from hbr.core.angles import wrap180, wrap360
-from hbr.core.arrays import FloatArray, IndexArray
+from hbr.core.angles import wrap360
+from hbr.core.arrays import FloatArray
+from hbr.dense.enrolled_views import Asking, NeedEnrolledViews, Queries
 from hbr.dense.filter import Belief
 from hbr.dense.local_difference import NEAREST, LocalDecision, LocalView, chosen_views, compare_objects, poses_of
-from hbr.dense.stopping import Outcome
+from hbr.dense.stopping import Outcome, StopDecision, StopReason
 
 #: Share of the probability that the two leaders have together.
 LEADERS: Final = 0.9
 #: Near twins score nearly the same: with a larger margin, an unknown object is not compared with the two leaders.
 TWIN_MARGIN: Final = 0.02
-
-LeaderViews = Callable[[int, Sequence[float]], Sequence[LocalView]]
-"""Returns the enrolled views of an object, by its index in the views' names, near some azimuths."""
-
-
-def near(own_deg: ArrayLike, azimuths_deg: Sequence[float]) -> IndexArray:
-    """Return the indices of the views, at ``own_deg`` (n,), that a comparison near some azimuths needs, by azimuth.
-
-    There is one more than `NEAREST` for each azimuth, because the comparison leaves one out.
-    """
-    own_deg = np.asarray(own_deg, np.float64)
-    away_deg = np.abs(wrap180(own_deg - np.asarray(azimuths_deg)[:, None]))
-    wanted = np.unique(np.argsort(away_deg, axis=1, kind="stable")[:, : NEAREST + 1])
-    places: IndexArray = wanted[np.argsort(own_deg[wanted], kind="stable")]
-    return places
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +40,8 @@ class LeaderComparison:
         Outcome of the search after the comparison.
     winner : int or None
         The leader that was found, as an index of the views' names; None if the comparison names none.
+    max_error : float
+        Largest probability that a decision is wrong.
     """
 
     leaders: tuple[int, int]
@@ -65,18 +50,26 @@ class LeaderComparison:
     found: LocalDecision
     outcome: Outcome
     winner: int | None
+    max_error: float
+
+    def decided(self, decision: StopDecision) -> StopDecision:
+        """Return the decision that replaces the given one; its probability is that of the comparison."""
+        if self.winner is None:
+            changed = self.outcome is not decision.outcome
+            return replace(decision, outcome=self.outcome, reason=StopReason.LOCAL_DIFFERENCE) if changed else decision
+        return replace(
+            decision,
+            outcome=Outcome.FOUND,
+            reason=StopReason.LOCAL_DIFFERENCE,
+            object_index=self.winner,
+            probability=1.0 - self.found.error_bound,
+            min_confidence=1.0 - self.max_error,
+        )
 
 
 def compare_leaders(
-    belief: Belief,
-    outcome: Outcome,
-    orientations_deg: Sequence[float],
-    view: Callable[[int], LocalView],
-    leader_views: LeaderViews,
-    *,
-    beta: float,
-    max_error: float,
-) -> LeaderComparison | None:
+    belief: Belief, outcome: Outcome, queries: Queries, *, beta: float, max_error: float
+) -> Asking[LeaderComparison | None]:
     """Compare the two leaders of a search that is ambiguous, or that calls near twins unknown; None if it has no two.
 
     If two near twins are enrolled, the leading one has a small margin, and the open-set score is low. Therefore an
@@ -88,12 +81,8 @@ def compare_leaders(
         After the last view.
     outcome
         Outcome with which the search would end.
-    orientations_deg
-        Orientation of each view of the search.
-    view
-        Returns a view of the search.
-    leader_views
-        Returns enrolled views.
+    queries
+        The views of the search.
     beta
         As for `Belief.posterior`.
     max_error
@@ -108,24 +97,28 @@ def compare_leaders(
     if len(order) < 2 or float(probability[order].sum()) < LEADERS:
         return None
     first, second = belief.index.object_index[order].tolist()
+    orientations_deg = belief.orientation_deg.tolist()
     compared = chosen_views(orientations_deg)
     rotations_deg = [tuple(deg - orientations_deg[-1] for deg in poses_of(belief, one)) for one in (first, second)]
-    near = [
-        [float(wrap360(orientations_deg[n] + added_deg)) for added_deg in rotations for n in compared]
-        for rotations in rotations_deg
-    ]
-    views = leader_views(first, near[0]), leader_views(second, near[1])
-    if min(map(len, views)) <= NEAREST:
+    enrolled = []
+    for leader, rotations in zip((first, second), rotations_deg, strict=True):
+        near_deg = [float(wrap360(orientations_deg[n] + added_deg)) for added_deg in rotations for n in compared]
+        views = yield NeedEnrolledViews(leader, tuple(near_deg))
+        if views is None:
+            return None
+        enrolled.append(views)
+    if min(map(len, enrolled)) <= NEAREST:
         return None
-    queries = [view(n) for n in compared]
-    found = compare_objects(queries, views, (rotations_deg[0], rotations_deg[1]), max_error=max_error)
+    both = enrolled[0], enrolled[1]
+    likeliest = [queries(n)[0] for n in compared]
+    found = compare_objects(likeliest, both, (rotations_deg[0], rotations_deg[1]), max_error=max_error)
     winner: int | None = None
     if outcome is Outcome.AMBIGUOUS or (found.fits and found.twins):
         if found.winner is not None:
             outcome, winner = Outcome.FOUND, (first, second)[found.winner]
         else:
             outcome = Outcome.AMBIGUOUS
-    return LeaderComparison((first, second), tuple(compared), views, found, outcome, winner)
+    return LeaderComparison((first, second), tuple(compared), both, found, outcome, winner, max_error)
 
 
 def _margin(scores: FloatArray, probability: FloatArray) -> float:

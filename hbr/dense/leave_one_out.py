@@ -91,6 +91,10 @@ class Found(NamedTuple):
     correct: list[bool]
 
 
+Tasks = Callable[[Callable[[Task], Found], Sequence[Task]], Iterable[tuple[Task, Found]]]
+"""Applies a function to each task, for example in other processes; yields each task with its result, in any order."""
+
+
 @dataclass(frozen=True, eq=False)
 class LeaveOneOut:
     """Searches for every object with its own enrolled views; arrays of (searches, views).
@@ -133,7 +137,7 @@ def leave_one_out(
     step_deg: float = _STEP_DEG,
     weight: float | None = None,
     progress: Callable[[int, int], object] | None = None,
-    tasks: Callable[[Callable[[Task], "Found"], Sequence[Task]], Iterable[tuple[Task, "Found"]]] | None = None,
+    tasks: Tasks | None = None,
 ) -> LeaveOneOut:
     """Search for every object with its own enrolled views, as if the camera had been beside their azimuths.
 
@@ -163,9 +167,8 @@ def leave_one_out(
         the same distance from their enrolled views, because two sessions differ in all views in the same way.
     progress : callable, optional
         Called before each object with the number of objects done, and of all.
-    tasks : callable, optional
-        Applies a function to each task, for example in other processes, and yields each task with its result, in any
-        order.
+    tasks : Tasks, optional
+        Applies the search for an object to each task.
 
     Raises
     ------

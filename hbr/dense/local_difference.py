@@ -27,7 +27,7 @@ from hbr.core.angles import wrap180, wrap360
 from hbr.core.arrays import ImageArray
 from hbr.dense.filter import Belief
 from hbr.dense.index import BIN_DEG
-from hbr.dense.pose import SHARPNESS
+from hbr.dense.pose import likely_azimuths
 
 #: Side of the compared images.
 SIDE_PX: Final = 128
@@ -177,10 +177,7 @@ class _Shown(NamedTuple):
 
 def poses_of(belief: Belief, object_index: int) -> tuple[float, ...]:
     """Return the likely azimuths of an object at the last view, the likeliest first; symmetric objects have several."""
-    ranking = belief.ranking()
-    best_deg = float(ranking.pose_deg[ranking.object_index == object_index][0])
-    (support,) = belief.support[belief.index.object_index == object_index].astype(np.float64)
-    likely = np.exp(SHARPNESS * (support - support.max()) / np.sqrt(belief.queries))
+    best_deg, likely = likely_azimuths(belief, object_index)
     found = [best_deg]
     for place in np.argsort(-likely, kind="stable").tolist():
         azimuth_deg = float(wrap360(place * BIN_DEG + belief.rotated_deg))

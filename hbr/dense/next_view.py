@@ -17,19 +17,21 @@ from hbr.dense.index import BINS
 from hbr.descriptors import Packed
 from hbr.kernels import calls
 
+#: How reliably a view separates two objects that look different.
+SHARPNESS: Final = 100.0
 #: Largest number of compared hypotheses, and the share of the belief that is not compared.
 _STRONGEST: Final = 16
 _NEGLIGIBLE: Final = 1e-3
 #: Distance in degrees up to which a view near an earlier one adds little.
 _NEAR_DEG: Final = 15.0
 #: Rotations in steps of 5 degrees, the shorter way round.
-_ALL_ROTATIONS_DEG: Final = np.delete(np.arange(-BINS // 2 + 1.0, BINS // 2 + 1), BINS // 2 - 1) * (360 / BINS)
-_ALL_ROTATIONS_DEG.flags.writeable = False
+ALL_ROTATIONS_DEG: Final = np.delete(np.arange(-BINS // 2 + 1.0, BINS // 2 + 1), BINS // 2 - 1) * (360 / BINS)
+ALL_ROTATIONS_DEG.flags.writeable = False
 
 
 @dataclass(frozen=True, eq=False)
 class NextBestView:
-    """A rotation and the numbers of the decision for it.
+    """A rotation, or an arc of a search in motion, and the numbers of the decision for it.
 
     Attributes
     ----------
@@ -44,7 +46,7 @@ class NextBestView:
         All rotations that were weighed; the logarithm of the probability that two objects are still confused after
         each; the cost of the motion, in the same unit.
     similarity : float64 array (a,), or None
-        Similarity of the pair's views after each rotation; None if there is no pair.
+        Similarity of the pair's views after each rotation; None if there is no pair, and for an arc.
     """
 
     rotation_deg: float
@@ -60,18 +62,17 @@ def next_best_view(
     belief: Belief,
     *,
     beta: float = BETA,
-    sharpness: float = 100.0,
+    sharpness: float = SHARPNESS,
     rotations_deg: ArrayLike | None = None,
     seconds: ArrayLike | None = None,
-    second_costs: float = 1.0,
 ) -> NextBestView:
     """Choose the rotation with the lowest sum of expected confusion and cost.
 
     For hypotheses p, p' of different objects, a rotation a leaves the confusion
     Σ p p' exp(-λ ν(a) √(κ(a) κ'(a)) (1 - T(view(a), view'(a)))), where ν(a) = 1 - exp(-½ (d / 15°)²) discounts a view
     at the distance d from the nearest earlier one, and κ(a) = exp(-½ (e / 15°)²) one at the distance e from the nearest
-    enrolled view, because nothing is known about the views between. The logarithm of the confusion and μ · time(a) are
-    added up; of equal sums, the earlier rotation is chosen.
+    enrolled view, because nothing is known about the views between. The logarithm of the confusion and the time in
+    seconds are added up; of equal sums, the earlier rotation is chosen.
 
     Parameters
     ----------
@@ -85,27 +86,25 @@ def next_best_view(
         Possible rotations, e.g. within the cable budget; by default every 5 degrees, the shorter way round.
     seconds : array (a,), optional
         Time of each by the bench's motion model; by default at 90 degrees per second.
-    second_costs : float
-        μ: cost of a second, in logarithms of the confusion.
 
     Raises
     ------
     ValueError
         There is no rotation to choose from, or the number of times is another one.
     """
-    angles_deg = _ALL_ROTATIONS_DEG
+    angles_deg = ALL_ROTATIONS_DEG
     if rotations_deg is not None:
         angles_deg = np.asarray(rotations_deg, np.float64)
         if angles_deg.ndim != 1 or not len(angles_deg) or not np.isfinite(angles_deg).all():
             raise ValueError(
                 f"rotations_deg is {angles_deg}; at least one finite rotation is needed, check the cable's limits"
             )
-    times_s = np.abs(angles_deg) / 90
+    cost = np.abs(angles_deg) / 90
     if seconds is not None:
-        times_s = np.asarray(seconds, np.float64)
-        if times_s.shape != angles_deg.shape or not np.isfinite(times_s).all():
+        cost = np.asarray(seconds, np.float64)
+        if cost.shape != angles_deg.shape or not np.isfinite(cost).all():
             raise ValueError(
-                f"{len(angles_deg)} rotations and times of shape {times_s.shape}; one finite time each is needed"
+                f"{len(angles_deg)} rotations and times of shape {cost.shape}; one finite time each is needed"
             )
 
     # Weigh each rotation: expected confusion plus cost.
@@ -114,14 +113,13 @@ def next_best_view(
     apart_deg = size_deg(landing_deg[:, None] - belief.orientation_deg).min(axis=1)
     novelty = 1 - np.exp(-0.5 * (apart_deg / _NEAR_DEG) ** 2)
     probability, place, bin_of = strongest(belief.posterior(beta))
-    cost = second_costs * times_s
-    first, second = _pairs(place)
+    first, second = pairs_of(place)
     if len(first):
         similar, known = expected_similarity(belief, place, bin_of, angles_deg, first, second)
         tells = novelty[:, None] * np.sqrt(known[:, first] * known[:, second])
         pairs = probability[first] * probability[second]
         remaining = pairs * np.exp(-sharpness * tells * (1 - similar))
-        confusion = np.log(np.maximum(2 * remaining.sum(axis=1), 1e-300))
+        confusion = log_confusion(remaining)
     else:  # one object alone: a new side helps to find its azimuth
         confusion = -sharpness * novelty
     # Choose the best one, and name the pair that it separates most.
@@ -138,7 +136,13 @@ def next_best_view(
     return NextBestView(rotation_deg, wrap360(here_deg + rotation_deg), pair, angles_deg, confusion, cost, similarity)
 
 
-def _pairs(place: IndexArray) -> tuple[IndexArray, IndexArray]:
+def log_confusion(remaining: FloatArray) -> FloatArray:
+    """Return the logarithm of the probability of a confusion, (a,), from what remains of each pair, (a, p)."""
+    confusion: FloatArray = np.log(np.maximum(2 * remaining.sum(axis=1), 1e-300))
+    return confusion
+
+
+def pairs_of(place: IndexArray) -> tuple[IndexArray, IndexArray]:
     """Return the pairs of hypotheses of different objects; pairs with the same first one follow each other."""
     first, second = _all_pairs(len(place))
     different = place[first] != place[second]
@@ -148,31 +152,6 @@ def _pairs(place: IndexArray) -> tuple[IndexArray, IndexArray]:
 @lru_cache(maxsize=_STRONGEST)
 def _all_pairs(count: int) -> tuple[IndexArray, IndexArray]:
     return np.triu_indices(count, 1)
-
-
-def most_informative_rotation(belief: Belief, *, beta: float = BETA, rotations_deg: ArrayLike | None = None) -> float:
-    """Choose the rotation whose view is expected to leave the least entropy: a baseline for `next_best_view`.
-
-    If hypothesis h is true, the view after a rotation is the one that was enrolled there. The likelihood of hypothesis
-    h' is then exp(β T(view_h, view_h')^p).
-
-    Parameters
-    ----------
-    belief, beta, rotations_deg
-        As for `next_best_view`.
-    """
-    angles_deg = _ALL_ROTATIONS_DEG if rotations_deg is None else np.asarray(rotations_deg, np.float64)
-    probability, place, bin_of = strongest(belief.posterior(beta))
-    rows, _ = expected_views(belief, place, bin_of, angles_deg)
-    similar = belief.index.compared.among(rows)
-    weights = probability * np.exp(
-        beta / np.sqrt(belief.queries + 1) * (np.maximum(similar, 0) ** belief.index.power - 1)
-    )
-    weights /= weights.sum(axis=2, keepdims=True)
-    objects = (place[:, None] == np.unique(place)).astype(np.float64)
-    shares = weights @ objects
-    entropy = -(shares * np.log(np.maximum(shares, 1e-300))).sum(axis=2)
-    return float(angles_deg[int((entropy @ probability).argmin())])
 
 
 def strongest(posterior: FloatArray) -> tuple[FloatArray, IndexArray, IndexArray]:

@@ -55,11 +55,16 @@ class Pose:
 
 def pose(belief: Belief, object_index: int) -> Pose:
     """Return the pose of an object that the filter considers."""
-    ranking = belief.ranking()
-    azimuth_deg = float(ranking.pose_deg[ranking.object_index == object_index][0])
-    (support,) = belief.support[belief.index.object_index == object_index].astype(np.float64)
-    p = np.exp(SHARPNESS * (support - support.max()) / np.sqrt(belief.queries))
+    azimuth_deg, p = likely_azimuths(belief, object_index)
     return pose_of(p / p.sum(), azimuth_deg, azimuth_deg - belief.rotated_deg)
+
+
+def likely_azimuths(belief: Belief, object_index: int) -> tuple[float, FloatArray]:
+    """Return an object's estimated azimuth at the last query, and how likely those at the first one are, (72,)."""
+    ranking = belief.ranking()
+    (support,) = belief.support[belief.index.object_index == object_index].astype(np.float64)
+    p: FloatArray = np.exp(SHARPNESS * (support - support.max()) / np.sqrt(belief.queries))
+    return float(ranking.pose_deg[ranking.object_index == object_index][0]), p
 
 
 def pose_of(posterior: FloatArray, azimuth_deg: float, estimate_deg: float) -> Pose:

@@ -1,6 +1,9 @@
-"""One search by the dense filter: views in; belief, decision and next best view out.
+"""One search by the dense filter: views in; belief, decision and next best view out. It reads no image itself.
 
-Decision: docs/decisions/0054.
+When it ends, it takes two last steps. `DenseSession.verify` and `DenseSession.compare` ask for enrolled views
+(`NeedEnrolledViews`) and compare them with the views, pixel by pixel. `DenseSession.end` is the decision after them.
+
+Decisions: docs/decisions/0054, docs/decisions/0057, docs/decisions/0059, docs/decisions/0064.
 """
 
 from collections.abc import Sequence
@@ -10,10 +13,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from hbr.core.arrays import LevelArray
+from hbr.dense.enrolled_views import Asking, Queries
 from hbr.dense.filter import KEPT, Belief, completed, update_belief
 from hbr.dense.index import DenseIndex
+from hbr.dense.leaders import LeaderComparison, compare_leaders
 from hbr.dense.next_view import NextBestView, next_best_view
 from hbr.dense.stopping import Outcome, StopDecision, StoppingRule
+from hbr.dense.verification import Verification, found_from, is_doubtful, verify
+from hbr.descriptors.together import like_enrollment
 
 _WORTH_REDUCING: Final = 2
 
@@ -35,11 +42,23 @@ class DenseSession:
     belief : Belief
         After at least one view.
     decision : StopDecision
-        The rule's decision after the last view.
+        The rule's last decision: at rest, after the last view.
+    present : StopDecision
+        What the rule would decide after the last view, if it decided after each one.
+    is_new_decision : bool
+        Whether the last view led to a decision.
+    verification : Verification, optional
+        The verification of the leader after the last view, if there was one.
+    comparison : LeaderComparison, optional
+        The comparison of the two leaders after the last view, if there was one.
     """
 
     belief: Belief
     decision: StopDecision
+    present: StopDecision
+    is_new_decision = True
+    verification: Verification | None = None
+    comparison: LeaderComparison | None = None
 
     def __init__(self, index: DenseIndex, rule: StoppingRule, *, max_views: int = 8) -> None:
         self.rule = rule
@@ -51,6 +70,7 @@ class DenseSession:
         self._queries: list[LevelArray] = []
         self._reliable = True
         self._same_bench: bool | None = None
+        self._like_enrollment: bool | None = None
 
     def add(
         self,
@@ -60,8 +80,9 @@ class DenseSession:
         earlier: Sequence[LevelArray] | None = None,
         reliable: bool = True,
         same_bench: bool | None = None,
+        segmented_by: str | None = None,
     ) -> StopDecision:
-        """Add the next view, as for `update_belief`, and return the rule's decision.
+        """Add the next view, as for `update_belief`, and return the rule's last decision.
 
         Parameters
         ----------
@@ -76,15 +97,27 @@ class DenseSession:
             while it may take more views.
         same_bench : bool, optional
             Whether the bench is that of the enrollment; None: not known.
+        segmented_by : str, optional
+            The `hbr.segmentation.Method` of the view. The rule considers the bench only with a method that segments
+            like the enrollment (`hbr.descriptors.together.like_enrollment`).
         """
         self._reliable, self._same_bench = reliable, same_bench
+        self._like_enrollment = same_bench if segmented_by is None else like_enrollment(segmented_by, same_bench)
+        self.verification = self.comparison = None  # they were for the views before
         if earlier is not None:
             self._replace(earlier)
+        self._begin_view(orientation_deg)
         self._extend(levels, orientation_deg)
-        self.decision = self._decide(self.belief)
-        if self.decision.outcome is not Outcome.CONTINUE:
-            self._complete()
+        self.present = self._decide(self.belief)
+        if self.is_new_decision:
+            self.decision = self.present
+            if self.decision.outcome is not Outcome.CONTINUE:
+                self._complete()
+            self.present = self.decision
         return self.decision
+
+    def _begin_view(self, orientation_deg: float) -> None:
+        """Set ``is_new_decision`` for the next view."""
 
     def _extend(self, levels: LevelArray, orientation_deg: float) -> None:
         """Add a view to the belief."""
@@ -110,11 +143,58 @@ class DenseSession:
         return next_best_view(self.belief, beta=self.rule.beta, rotations_deg=rotations_deg, seconds=seconds)
 
     def end(self) -> StopDecision:
-        """Return the decision with which the search ends here, even if the rule would continue."""
-        if self.decision.outcome is Outcome.CONTINUE:
+        """Return the decision with which the search ends here, even if the rule would continue.
+
+        The last steps that were taken after the last view count.
+        """
+        decision = self.decision
+        if decision.outcome is Outcome.CONTINUE:
             self._complete()
-            return self._decide(self.belief, last=True)
-        return self.decision
+            decision = self._decide(self.belief, last=True)
+        if self.verification is not None:
+            decision = self.verification.decided(decision, self.found_from)
+        return decision if self.comparison is None else self.comparison.decided(decision)
+
+    @property
+    def found_from(self) -> float:
+        """Log-odds from which a verified leader is found (`hbr.dense.verification.found_from`)."""
+        return found_from(self._same_bench)
+
+    @property
+    def is_doubtful(self) -> bool:
+        """Whether the search must verify its leader before it ends (`hbr.dense.verification.is_doubtful`)."""
+        return is_doubtful(self.rule, self.end(), self.belief.queries, self.belief.index.views.descriptor)
+
+    def verify(self, queries: Queries, measured: Verification | None = None) -> Asking[Verification | None]:
+        """Verify a doubtful leader, pixel by pixel; None without doubt.
+
+        Parameters
+        ----------
+        queries
+            The views of the search.
+        measured : Verification, optional
+            The fit that was measured before; it is used instead of enrolled views.
+        """
+        self.verification = None
+        if measured is None and self.is_doubtful:
+            measured = yield from verify(self.belief, self.end().object_index, queries)
+        self.verification = measured
+        return measured
+
+    def compare(self, queries: Queries) -> Asking[LeaderComparison | None]:
+        """Compare the two leaders, pixel by pixel, if the search does not end with one object; else None.
+
+        Parameters
+        ----------
+        queries
+            The views of the search.
+        """
+        self.comparison = None
+        outcome, rule = self.end().outcome, self.rule
+        self.comparison = yield from compare_leaders(
+            self.belief, outcome, queries, beta=rule.beta, max_error=rule.error_rate
+        )
+        return self.comparison
 
     def _weight(self, orientation_deg: float) -> float | None:  # noqa: ARG002
         """Return the weight of the next view; None: 1."""
@@ -122,7 +202,7 @@ class DenseSession:
 
     def _decide(self, belief: Belief, *, last: bool = False) -> StopDecision:
         most = belief.queries if last else self.max_views
-        return self.rule.decide(belief, max_views=most, reliable=self._reliable, same_bench=self._same_bench)
+        return self.rule.decide(belief, max_views=most, reliable=self._reliable, same_bench=self._like_enrollment)
 
     def _complete(self) -> None:
         """Decide again before an end if an object that was left out after the first view can be first or second."""

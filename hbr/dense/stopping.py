@@ -180,15 +180,9 @@ class StoppingRule:
     rates: tuple[ShiftRates, ...] = ()
 
     def decide(
-        self,
-        belief: Belief,
-        *,
-        max_views: int = 8,
-        decisions: int | None = None,
-        reliable: bool = True,
-        same_bench: bool | None = None,
+        self, belief: Belief, *, max_views: int = 8, reliable: bool = True, same_bench: bool | None = None
     ) -> StopDecision:
-        """Decide whether a search ends after these views, or in motion after this number of ``decisions``.
+        """Decide whether a search ends after these views.
 
         An object is found if its confidence and its open-set score reach their thresholds. Before the last calibrated
         view the highest of all open-set thresholds counts: an unknown object that passes the first threshold gets
@@ -204,10 +198,10 @@ class StoppingRule:
         known = {True: self.same_bench_thresholds, False: self.changed_bench_thresholds, None: ()}[same_bench]
         thresholds = known or self.open_set_thresholds
         calibrated = len(thresholds)
-        decisions = belief.queries if decisions is None else decisions
-        n = min(decisions, calibrated) - 1
+        views = belief.queries
+        n = min(views, calibrated) - 1
         score = self._open_set_score(belief, n)
-        early = decisions < min(calibrated, max_views)
+        early = views < min(calibrated, max_views)
         threshold = max(thresholds) if early else thresholds[n]
         probability = float(probabilities[best])
         unknown_below = min(threshold, self.unknown_thresholds[n]) if self.unknown_thresholds else threshold
@@ -215,18 +209,18 @@ class StoppingRule:
             outcome = Outcome.CONTINUE if early else Outcome.UNKNOWN
             reason = StopReason.BELOW_OPEN_SET_THRESHOLD
             if not early and score >= unknown_below:
-                outcome = Outcome.CONTINUE if decisions < max_views else Outcome.AMBIGUOUS
+                outcome = Outcome.CONTINUE if views < max_views else Outcome.AMBIGUOUS
         elif probability >= self.min_confidence:
             outcome, reason = Outcome.FOUND, StopReason.CONFIDENT
-        elif decisions < max_views:
+        elif views < max_views:
             outcome, reason = Outcome.CONTINUE, StopReason.NOT_CONFIDENT
         else:
             outcome, reason = Outcome.AMBIGUOUS, StopReason.MAX_VIEWS
-        if not reliable and outcome is not Outcome.CONTINUE and decisions < max_views:
+        if not reliable and outcome is not Outcome.CONTINUE and views < max_views:
             outcome, reason = Outcome.CONTINUE, StopReason.BADLY_SEGMENTED
         object_index = int(belief.index.object_index[best])
         decision = StopDecision(outcome, reason, object_index, probability, self.min_confidence, score, threshold)
-        if same_bench and reliable and score < threshold and decisions <= calibrated:
+        if same_bench and reliable and score < threshold and views <= calibrated:
             return self._found_on_same_bench(belief, n, decision)
         return decision
 

@@ -8,7 +8,6 @@ leader, and its difference from the fit of the next candidates, are added to the
 Decisions: docs/decisions/0059, docs/decisions/0060.
 """
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -16,9 +15,8 @@ import numpy as np
 
 from hbr.core.angles import size_deg, wrap360
 from hbr.core.arrays import FloatArray
+from hbr.dense.enrolled_views import Asking, NeedEnrolledViews, Queries
 from hbr.dense.filter import Belief
-from hbr.dense.leaders import LeaderViews
-from hbr.dense.local_difference import LocalView
 from hbr.dense.open_set import fitted_before
 from hbr.dense.pixel_fit import Pixels, fit
 from hbr.dense.stopping import Outcome, StopDecision, StoppingRule, StopReason
@@ -103,10 +101,8 @@ def found_from(same_bench: bool | None) -> float:
     return FOUND_FROM_SAME_BENCH if same_bench else FOUND_FROM
 
 
-def verify(
-    belief: Belief, leader: int, segmentations: Callable[[int], Sequence[LocalView]], leader_views: LeaderViews
-) -> Verification:
-    """Compare the views of a search with the enrolled views of its leader and of the next candidates.
+def verify(belief: Belief, leader: int, queries: Queries) -> Asking[Verification | None]:
+    """Compare the views of a search with the enrolled views of its leader and of the next candidates; None without.
 
     Parameters
     ----------
@@ -114,21 +110,22 @@ def verify(
         After the last view.
     leader
         The leading candidate, as an index of the views' names.
-    segmentations
-        Returns a view of the search by each of its segmentations, in the order of the belief's levels.
-    leader_views
-        Returns the enrolled views of an object near some azimuths.
+    queries
+        The views of the search, in the order of the belief's levels.
     """
     index, ranking = belief.index, belief.ranking()
     last_deg = float(belief.orientation_deg[-1])
     pose_deg = dict(zip(ranking.object_index.tolist(), ranking.pose_deg.tolist(), strict=True))
     candidates = [leader, *[one for one in ranking.object_index.tolist() if one != leader][:_OTHERS]]
-    queries = [[Pixels.of(one) for one in segmentations(n)] for n in range(belief.queries)]
+    seen: list[list[Pixels]] = []
     similarity = descriptor(index.views.descriptor).similarity
     means = []
     for candidate in candidates:
         azimuths_deg = [wrap360(pose_deg[candidate] + o - last_deg) for o in belief.orientation_deg.tolist()]
-        views = leader_views(candidate, azimuths_deg)
+        views = yield NeedEnrolledViews(candidate, tuple(azimuths_deg))
+        if views is None:
+            return None
+        seen = seen or [[Pixels.of(one) for one in queries(n)] for n in range(belief.queries)]
         enrolled_deg = np.array([view.azimuth_deg for view in views])
         rows = index.views.of(candidate)
         prepared: dict[int, Pixels] = {}
@@ -141,6 +138,6 @@ def verify(
                 if place not in prepared:
                     prepared[place] = Pixels.of(views[place])
             likeliest = np.argsort(-alike, kind="stable")[:_SEGMENTATIONS].tolist()
-            fits.append(max(fit(queries[n][one], prepared[place]) for one in likeliest for place in near))
+            fits.append(max(fit(seen[n][one], prepared[place]) for one in likeliest for place in near))
         means.append(float(np.mean(fits)))
     return Verification(leader, means[0], float(np.mean(means[1:])) if len(means) > 1 else 0.0)

@@ -15,13 +15,12 @@ from numpy.typing import NDArray
 
 from hbr.core.angles import wrap180
 from hbr.core.arrays import ImageArray, LevelArray
+from hbr.dense.enrolled_views import answered, near
 from hbr.dense.index import DenseIndex
-from hbr.dense.last_steps import last_steps
-from hbr.dense.leaders import near
 from hbr.dense.local_difference import LocalView
 from hbr.dense.session import DenseSession
-from hbr.dense.stopping import Outcome, StopDecision, StoppingRule
-from hbr.descriptors.together import ViewsTogether, like_enrollment
+from hbr.dense.stopping import Outcome, StoppingRule
+from hbr.descriptors.together import ViewsTogether
 from hbr.evaluation.changed_bench import ENROLLMENT, HARD, MILD, Bench, Visit
 from hbr.evaluation.condition import object_mask
 from hbr.evaluation.datasets import Dataset, PhotographedObject, read_photograph
@@ -197,7 +196,6 @@ class _Search:
         self._names = index.views.object_names
         self._enrolled = enrolled
         self._leaders: list[str] = []
-        self._orientations_deg: list[float] = []
         self._result: SearchResult | None = None
 
     def add(self, views: ViewsTogether, azimuth_deg: float, same_bench: bool) -> None:
@@ -207,33 +205,32 @@ class _Search:
             azimuth_deg,
             earlier=earlier,
             reliable=views.reliable,
-            same_bench=like_enrollment(views.segmentations[-1][0].method, same_bench),
+            same_bench=same_bench,
+            segmented_by=views.segmentations[-1][0].method,
         )
-        self._orientations_deg.append(azimuth_deg)
         self._leaders.append(self._names[int(self._session.belief.ranking().object_index[0])])
         if self._result is None and decision.outcome is not Outcome.CONTINUE:
-            self._result = self._ended(decision, views, same_bench)
+            self._result = self._ended(views)
 
-    def _ended(self, decision: StopDecision, views: ViewsTogether, same_bench: bool) -> SearchResult:
-        """Return the result of a search that ends with this decision; the last step compares its two leaders."""
-        end, verification, compared = last_steps(
-            self._session.belief,
-            decision,
-            self._session.rule,
-            self._orientations_deg,
-            lambda n: _local_views(views, n, self._orientations_deg[n]),
-            self._near,
-            same_bench=same_bench,
-        )
-        outcome = end.outcome if compared is None else compared.outcome
-        winner = None if compared is None else compared.winner
+    def _ended(self, views: ViewsTogether) -> SearchResult:
+        """Return the result of a search that ends with its last steps."""
+        session = self._session
+        orientations_deg = session.belief.orientation_deg.tolist()
+
+        def queries(n: int) -> list[LocalView]:
+            return [LocalView(one.crop, one.mask, orientations_deg[n]) for one in views.segmentations[n]]
+
+        verification = answered(session.verify(queries), self._near)
+        before = session.end()
+        comparison = answered(session.compare(queries), self._near)
+        end = session.end()
         return SearchResult(
             (),
-            outcome,
-            self._names[end.object_index if winner is None else winner],
+            end.outcome,
+            self._names[end.object_index],
             len(self._leaders),
-            compared is not None,
-            outcome is not end.outcome,
+            comparison is not None,
+            end.outcome is not before.outcome,
             verification is not None,
         )
 
@@ -244,10 +241,6 @@ class _Search:
     def result(self) -> SearchResult:
         assert self._result is not None  # after the last view
         return replace(self._result, leaders=tuple(self._leaders))
-
-
-def _local_views(views: ViewsTogether, view: int, orientation_deg: float) -> list[LocalView]:
-    return [LocalView(one.crop, one.mask, orientation_deg) for one in views.segmentations[view]]
 
 
 def _without(index: DenseIndex, name: str) -> DenseIndex | None:

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from hbr.core.arrays import IndexArray
-from hbr.dense.leaders import near
+from hbr.dense.enrolled_views import near
 from hbr.dense.local_difference import LocalView
 from hbr.descriptors import descriptor
 from hbr.evaluation.condition import Condition, EvaluationImage

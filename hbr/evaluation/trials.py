@@ -14,17 +14,16 @@ from numpy.typing import NDArray
 from hbr.core.angles import wrap180
 from hbr.core.arrays import FloatArray, IndexArray, LevelArray
 from hbr.dense.calibration import calibrate_stopping_rule
+from hbr.dense.enrolled_views import answered
 from hbr.dense.filter import Belief, update_belief
 from hbr.dense.index import DenseIndex
-from hbr.dense.last_steps import last_steps
 from hbr.dense.local_difference import LocalView
-from hbr.dense.next_view import most_informative_rotation
 from hbr.dense.session import DenseSession
 from hbr.dense.stopping import Outcome, StoppingRule
 from hbr.descriptors import descriptor
-from hbr.descriptors.together import like_enrollment
 from hbr.evaluation.draws import generator
 from hbr.evaluation.methods import Method
+from hbr.evaluation.mutual_information import most_informative_rotation
 from hbr.evaluation.near_twins import LocalPhotographs
 from hbr.evaluation.protocol import COMPARED, OUTCOMES, Protocol, Runs, views_of_trial
 from hbr.model.symmetry import symmetry
@@ -130,7 +129,7 @@ class _Trials:
         segmented_by: Sequence[str] = (),
     ) -> None:
         self._same_bench = same_bench
-        self._bench_of_query = [like_enrollment(method, same_bench) for method in segmented_by or [""] * len(queries)]
+        self._segmented_by = segmented_by or [""] * len(queries)
         self._photographs = photographs
         self._object, self._queries, self._views = object_index, queries, views
         self._protocol, self._rule, self._now_ns = protocol, rule, now_ns
@@ -240,8 +239,13 @@ class _Trials:
                 for i, angle_deg in zip(seen[:-1], measured_deg, strict=False):
                     session.add(self._queries[i], angle_deg)
             start_ns = self._now_ns()
-            same_bench = self._bench_of_query[seen[-1]]
-            decision = session.add(self._queries[seen[-1]], measured_deg[-1], same_bench=same_bench)
+            newest = seen[-1]
+            decision = session.add(
+                self._queries[newest],
+                measured_deg[-1],
+                same_bench=self._same_bench,
+                segmented_by=self._segmented_by[newest],
+            )
             following = self._next_dense(method, draws, seen, session) if n + 1 < last else seen[-1]
             runs.step_ns[*at, n] = self._now_ns() - start_ns
             ranking = session.belief.ranking()
@@ -259,32 +263,26 @@ class _Trials:
 
     def _end(self, session: DenseSession, seen: list[int], measured_deg: list[float]) -> tuple[Outcome, int]:
         """Take the last steps of a search as on the bench; return the outcome, and `Runs.compared`."""
-        photographs, belief, decision = self._photographs, session.belief, session.decision
+        photographs = self._photographs
         if photographs is None:
-            return decision.outcome, -1
+            return session.decision.outcome, -1
         keep = self._keep(np.array(seen))
 
-        def query(n: int) -> LocalView:
-            return photographs.query(self._object, seen[n], measured_deg[n])
+        def queries(n: int) -> list[LocalView]:
+            return [photographs.query(self._object, seen[n], measured_deg[n])]
 
         def enrolled(leader: int, azimuths_deg: Sequence[float]) -> list[LocalView]:
             own = keep if leader == self._object else self._enrolled[self._views.of(leader)]
             return photographs.enrolled(leader, np.flatnonzero(own), azimuths_deg)
 
-        end, _, compared = last_steps(
-            belief,
-            decision,
-            session.rule,
-            measured_deg,
-            lambda n: [query(n)],
-            enrolled,
-            same_bench=self._same_bench,
-        )
+        answered(session.verify(queries), enrolled)
+        before = session.end()
+        compared = answered(session.compare(queries), enrolled)
         if compared is None:
-            return end.outcome, -1
+            return before.outcome, -1
         if compared.winner is not None:
-            return end.outcome, COMPARED.index("right" if compared.winner == self._object else "wrong")
-        return end.outcome, COMPARED.index("none" if compared.outcome is end.outcome else "ambiguous")
+            return before.outcome, COMPARED.index("right" if compared.winner == self._object else "wrong")
+        return before.outcome, COMPARED.index("none" if compared.outcome is before.outcome else "ambiguous")
 
     def _next_dense(self, method: Method, draws: _Draws, seen: list[int], session: DenseSession) -> int:
         match method.strategy:

@@ -1,4 +1,4 @@
-"""The steps that the plans share: rotate, capture an accepted view, add it to a search, warn of a changed bench."""
+"""The steps that the plans share: rotate, capture an accepted view, warn of a changed bench."""
 
 from collections.abc import Collection, Generator, Mapping
 from dataclasses import asdict
@@ -9,12 +9,10 @@ from numpy.typing import NDArray
 
 from rig.bench import Bench
 from rig.core.errors import CameraSettingsDiffer, NoObject, ViewRejected
-from rig.events.events import Accepted, Event, Moved, Note, NoteCode, Ranked, Rejected, Unwinding, Warned
+from rig.events.events import Accepted, Event, Moved, Note, NoteCode, Rejected, Unwinding, Warned
 from rig.motion.move import Move
 from rig.motion.turntable import Turntable
 from rig.safety.gyro_rotation import finite
-from rig.search.session import Search
-from rig.search.strategies import Finish, Rotate
 from rig.views.capture import Attempt, RejectReason, Viewer, rejection_text
 from rig.views.description import DescribedView
 from rig.views.empty_table import COMMAND, store_table_problem
@@ -114,21 +112,6 @@ def accepted(index: int, azimuth_deg: float, attempt: Attempt, described: Descri
     """Return the event of an accepted view."""
     return Accepted(
         index, azimuth_deg, attempt.evidence, attempt.image_bgr, described.segmentation, described.same_bench
-    )
-
-
-def add_view(
-    search: Search, described: DescribedView, azimuth_deg: float, table_deg: float
-) -> tuple[Ranked, Rotate | Finish]:
-    """Add a described view to a search; return the candidates and the decision."""
-    return search.add(
-        described.levels[search.descriptor],
-        azimuth_deg,
-        table_deg=table_deg,
-        earlier=described.earlier,
-        reliable=described.reliable,
-        same_bench=described.same_bench,
-        segmentation=described.segmentation,
     )
 
 

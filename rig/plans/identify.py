@@ -9,31 +9,18 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-import hbr
 from hbr.core.angles import wrap360
 from rig.bench import Bench
 from rig.config import RigConfig
 from rig.core.clock import seconds_between
-from rig.core.errors import CatalogError, RigError
-from rig.events.events import Event, FrameUsed, Identified, Note, NoteCode, Started, Warned
+from rig.events.events import Event, FrameUsed, Identified, Started
 from rig.motion.scan_speed import can_fly, require_camera_time
 from rig.motion.turntable import Turntable
-from rig.plans.capture import (
-    accepted,
-    add_view,
-    announced,
-    capture,
-    check_camera,
-    check_object,
-    moved,
-    unwind,
-    warn_of_table,
-)
-from rig.plans.identify_moving import decided as decided_event
+from rig.plans.capture import announced, check_camera, check_object, moved
 from rig.plans.identify_moving import search_in_motion
-from rig.search.local_step import compare_leaders, verify_leader
-from rig.search.model import Model, empty_table_for
-from rig.search.session import SHOWN, ArcSearch, Search, begin_search
+from rig.plans.search_steps import Searched, SearchSteps, unwound
+from rig.search.model import Model, begin_search, empty_table_for
+from rig.search.session import SHOWN
 from rig.search.strategies import AnyStrategy, Finish
 from rig.views.capture import Viewer
 from rig.views.description import SearchDescriber
@@ -42,7 +29,7 @@ from rig.views.empty_table import empty_table_status
 
 def identify(
     bench: Bench,
-    model: Model | hbr.ViewIndex,
+    model: Model,
     *,
     strategy: AnyStrategy | str | None = None,
     seed: int = 0,
@@ -64,8 +51,8 @@ def identify(
     ----------
     bench
         An open bench.
-    model : Model or hbr.ViewIndex
-        The enrolled views, from `rig.search.model.load_model`; a ViewIndex is for the paper's strategies.
+    model
+        The enrolled views, from `rig.search.model.load_model` or `rig.search.model.model_of`.
     strategy
         Its name, or a `Strategy` object. The default is the one that the model is for.
     seed
@@ -92,127 +79,78 @@ def identify(
     ViewRejected, MotionTimeout, DeviceFault, DeviceSilent
         See `rig.views.capture` and `rig.motion.turntable`.
     """
-    config = bench.config.identify
     if strategy is None and flies(bench.config, model):
         strategy = "arc"
     search, chosen = begin_search(model, bench.config, strategy, seed=seed, top=top)
-    if isinstance(search, ArcSearch):
+    if search.in_motion:
         require_camera_time(bench.config)
     viewer = Viewer(bench.camera, bench.config)
-    notes = model.notes if isinstance(model, Model) else ()
-    if isinstance(model, Model):
-        check_camera(bench, model.camera)
-    if empty_table is None and isinstance(model, Model):
+    check_camera(bench, model.camera)
+    notes = model.notes
+    if empty_table is None:
         empty_table, more = empty_table_for(bench, model)
         notes += more
     own = empty_table_status(bench).table if empty_table is None else None
-    check = partial(check_object, bench, empty_table=empty_table if own is None else own.image_bgr)
-    moving = isinstance(search, ArcSearch)
-    bench_image = model.bench_image if isinstance(model, Model) else None
-    if bench.config.table.carries == "camera":
-        bench_image = None  # the background of the object changes with each view
     describe = SearchDescriber(
-        bench.config.view, search.descriptor, empty_table, revise=not moving, bench_image=bench_image
+        bench.config.view,
+        search.descriptor,
+        empty_table,
+        revise=not search.in_motion,
+        # a camera that moves around the object sees another background in each view
+        bench_image=None if bench.config.table.carries == "camera" else model.bench_image,
     )
+    check = partial(check_object, bench, empty_table=empty_table if own is None else own.image_bgr)
+    steps = SearchSteps(bench, model, search, viewer, describe, check, top)
     bench.operator.place(None)
     yield Started(
         "identify",
         None,
-        config.max_views,
+        bench.config.identify.max_views,
         dict(bench.conditions),
         strategy=chosen.name,
         seed=seed,
         descriptor=search.descriptor,
         notes=notes,
     )
+    found = yield from search_in_motion(steps, live) if search.in_motion else _search_at_rest(steps)
+    answer = yield from steps.end(travelled_deg=found.travelled_deg, seconds=found.seconds)
+    yield answer
+    if found.failed:
+        raise found.failed
+    return answer
+
+
+def _search_at_rest(steps: SearchSteps) -> Generator[Event, None, Searched]:
+    """Take views at rest until the search ends."""
+    bench, search = steps.bench, steps.search
     started_ns = bench.clock.now_ns()
-    if isinstance(search, ArcSearch):
-        found = yield from search_in_motion(
-            bench, search, viewer, describe, check=check, top=top, started_ns=started_ns, live=live
-        )
-        answer = search.answer(found.ranked, found.end, travelled_deg=found.travelled_deg, seconds=found.seconds)
-        answer = yield from _compared(search, answer, describe, model)
-        yield answer
-        if found.failed:
-            raise found.failed
-        return answer
-    travelled_deg = 0.0
     sign = bench.config.table.orientation_sign  # the camera moves opposite to the table
+    travelled_deg = 0.0
     number = 0
-    failed: RigError | None = None
     with Turntable(bench) as table:
         move = table.hold()
         orientation_deg = sign * move.encoder_deg
         while True:
-            # View: at rest, an acceptable frame, described.
             yield moved(number, move)
-            captured = yield from capture(number, viewer, table, move.settled_ns)
-            azimuth_deg = float(wrap360(orientation_deg))
-            described = describe(captured.image_bgr)
-            yield accepted(number, azimuth_deg, captured, described)
-            if number == 0:
-                check(captured.image_bgr)
-            yield from warn_of_table(bench, number, described)
-            # Decide: rank the candidates, then rotate or finish.
-            ranked, step = add_view(search, described, azimuth_deg, table.rest_deg)
-            yield ranked
+            yield from steps.view(number, table, move.settled_ns, float(wrap360(orientation_deg)))
+            step = search.step
             if isinstance(step, Finish):
                 break
             # Rotate: within the cable budget, and use the measured rotation.
             asked_deg = table.rest_deg + sign * step.rotation_deg
-            decided = decided_event(number, step, table.within_reach(asked_deg), top)
-            yield decided
-            move = yield from announced(number, table, decided.target_deg, asked_deg=asked_deg)
+            target_deg = table.within_reach(asked_deg)
+            yield steps.decided(number, step, target_deg)
+            move = yield from announced(number, table, target_deg, asked_deg=asked_deg)
             travelled_deg += abs(move.rotation_deg)
             orientation_deg += sign * move.rotation_deg
             number += 1
         seconds = seconds_between(started_ns, bench.clock.now_ns())
-        try:
-            yield from unwind(number, table)
-        except RigError as error:
-            failed = error  # report the answer first
-    yield from _verified(search, describe, model)
-    answer = search.answer(ranked, step, travelled_deg=travelled_deg, seconds=seconds)
-    answer = yield from _compared(search, answer, describe, model)
-    yield answer
-    if failed:
-        raise failed
-    return answer
+        failed = yield from unwound(number, table)
+    return Searched(travelled_deg, seconds, failed)
 
 
-def _verified(search: Search, describe: SearchDescriber, model: Model | hbr.ViewIndex) -> Generator[Event, None, None]:
-    """Compare the views with the enrolled views of a doubtful leader pixel by pixel; the answer depends on it."""
-    if not isinstance(model, Model) or model.leader_views is None:
-        return
-    try:
-        found = verify_leader(search, describe.hypotheses, model.leader_views)
-    except CatalogError as error:  # an image is missing: the search has its answer without it
-        number = len(search.orientations_deg) - 1
-        yield Warned(number, Note(NoteCode.NOT_COMPARED, {"what": error.what, "next_step": error.next_step}))
-        return
-    if found is not None:
-        yield found
-
-
-def _compared(
-    search: Search, answer: Identified, describe: SearchDescriber, model: Model | hbr.ViewIndex
-) -> Generator[Event, None, Identified]:
-    """Compare the two leaders pixel by pixel if the search does not end with one object; return the answer."""
-    if not isinstance(model, Model) or model.leader_views is None:
-        return answer
-    try:
-        found = compare_leaders(search, answer, describe.segmentations, model.leader_views)
-    except CatalogError as error:  # an image is missing: the search has its answer without it
-        yield Warned(answer.views - 1, Note(NoteCode.NOT_COMPARED, {"what": error.what, "next_step": error.next_step}))
-        return answer
-    if found is None:
-        return answer
-    yield found.event
-    return found.answer_of(answer)
-
-
-def flies(config: RigConfig, model: Model | hbr.ViewIndex) -> bool:
+def flies(config: RigConfig, model: Model) -> bool:
     """Return whether a search without a named strategy takes frames in motion, by ``identify.mode``."""
-    is_dense = isinstance(model, Model) and isinstance(model.index, hbr.DenseIndex)
+    is_dense = model.rule is not None
     mode = config.identify.mode
     return is_dense and config.identify.strategy is None and (mode == "fly" or (mode == "auto" and can_fly(config)))

@@ -9,26 +9,22 @@ Decision: docs/decisions/0047.
 
 from collections.abc import Callable, Generator
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Final
 
-import numpy as np
-from numpy.typing import NDArray
-
-from hbr import StopReason
 from hbr.core.angles import wrap360
-from rig.bench import Bench
 from rig.core.clock import seconds_between
-from rig.core.errors import MotionStopped, RigError
-from rig.events.events import Decided, Event, FrameUsed, Ranked, Rejected
+from rig.core.errors import MotionStopped
+from rig.devices.camera import CameraLocks
+from rig.events.events import Event, FrameUsed, Rejected
 from rig.motion.flight_views import FlightFrameCheck
+from rig.motion.move import Move
 from rig.motion.scan_speed import scan_speed
 from rig.motion.trajectory import TrajectoryRecorder
 from rig.motion.turntable import Flight, Turntable
-from rig.plans.capture import accepted, add_view, capture, moved, unwind, warn_of_table
-from rig.search.session import ArcSearch
-from rig.search.strategies import Finish, Rotate
-from rig.views.capture import Viewer
-from rig.views.description import ViewDescriber
+from rig.plans.capture import accepted, moved
+from rig.plans.search_steps import Searched, SearchSteps, unwound
+from rig.search.strategies import Finish
 from rig.views.stream import FrameStream
 
 FIRST_REST_S: Final = 0.15
@@ -42,39 +38,42 @@ NEW_GOAL_DEG: Final = 10.0
 
 
 @dataclass
-class Found:
-    """The end of a search in motion."""
-
-    ranked: Ranked
-    end: Finish
-    travelled_deg: float
-    seconds: float
-    failed: RigError | None
-
-
-@dataclass
 class _ArcFrames:
-    """The frames of an arc: the function `Flight.each` of a search."""
+    """The frames of a search on its arcs.
 
-    bench: Bench
+    ``number`` counts the views, and ``rejected`` the frames that were not used. ``events`` are those of the present arc
+    that have not been yielded. ``ended_ns`` is when the search ended on it, ``goal_deg`` where the table rotates to.
+    """
+
+    steps: SearchSteps
     table: Turntable
-    search: ArcSearch
-    stream: FrameStream
-    recorder: TrajectoryRecorder
-    frame_check: FlightFrameCheck
-    describe: ViewDescriber
-    top: int
     live: Callable[[FrameUsed], object]
     started_ns: int
-    number: int
-    rejected: int
-    ranked: Ranked
-    step: Rotate | Finish
-    goal_deg: float
-    events: list[Event]
+    velocity_dps: float
+    number: int = 0
+    rejected: int = 0
+    goal_deg: float = 0.0
     ended_ns: int | None = None
     rejected_in_a_row: int = 0
     stamps_ns: list[int] = field(default_factory=list)
+    events: list[Event] = field(default_factory=list)
+
+    @cached_property
+    def recorder(self) -> TrajectoryRecorder:
+        return self.table.recorder()
+
+    @cached_property
+    def stream(self) -> FrameStream:
+        return FrameStream(self.steps.bench.camera, self.steps.bench.clock)
+
+    def fly(self, goal_deg: float, locks: CameraLocks) -> Move:
+        """Rotate along an arc; ``locks`` are the camera's settings of the view before it."""
+        bench, recorder, stream = self.steps.bench, self.recorder, self.stream
+        self.frame_check = FlightFrameCheck(bench.config, locks, True, bench.clock.now_ns(), stream.period_s)
+        self.goal_deg, self.rejected_in_a_row, self.stamps_ns = goal_deg, 0, []
+        (low_deg, high_deg), here_deg = self.table.limits_deg, self.table.rest_deg
+        reach_deg = max(low_deg, here_deg - 360.0), min(high_deg, here_deg + 360.0)
+        return self.table.fly(goal_deg, Flight(self.each, reach_deg, recorder, self.velocity_dps, quiet=False))
 
     def each(self) -> float | None:
         """Take the next frame as evidence; return a new goal, or the stopping angle if the search has ended."""
@@ -98,167 +97,89 @@ class _ArcFrames:
         # Describe it, and add it to the search.
         self.rejected_in_a_row = 0
         self.number += 1
-        described = self.describe(attempt.image_bgr)
+        search, bench = self.steps.search, self.steps.bench
+        described = self.steps.describe(attempt.image_bgr)
         attempt = self.frame_check.at_the_object(attempt, described.segmentation, trajectory)
         motion = attempt.evidence.motion
         assert motion is not None
-        sign = self.bench.config.table.orientation_sign
+        sign = bench.config.table.orientation_sign
         azimuth_deg = float(wrap360(sign * motion.angle_deg))
         self.events.append(accepted(self.number, azimuth_deg, attempt, described))
-        self.ranked, self.step = add_view(self.search, described, azimuth_deg, motion.angle_deg)
-        seconds = seconds_between(self.started_ns, self.bench.clock.now_ns())
-        used = self.search.frame_used(self.number, azimuth_deg, seconds, self.rejected)
+        ranked, step = search.add(described, azimuth_deg, table_deg=motion.angle_deg)
+        seconds = seconds_between(self.started_ns, bench.clock.now_ns())
+        used = search.frame_used(self.number, azimuth_deg, seconds, self.rejected)
         self.live(used)
         self.events.append(used)
         # Follow a new decision: stop, or steer to another goal.
-        if not self.search.is_new_decision:
+        if not search.is_new_decision:
             return None
-        self.events.append(self.ranked)
-        if isinstance(self.step, Finish):
-            self.ended_ns = self.bench.clock.now_ns()
+        self.events.append(ranked)
+        if isinstance(step, Finish):
+            self.ended_ns = bench.clock.now_ns()
             return self._stop()
-        goal_deg = motion.angle_deg + sign * self.step.rotation_deg
+        goal_deg = motion.angle_deg + sign * step.rotation_deg
         if abs(goal_deg - self.goal_deg) <= NEW_GOAL_DEG:
             return None
         self.goal_deg = goal_deg
-        self.events.append(decided(self.number, self.step, goal_deg, self.top))
+        self.events.append(self.steps.decided(self.number, step, goal_deg))
         return goal_deg
 
     def _stop(self) -> float:
         """Return the angle at which the table stops if it brakes now."""
-        self.goal_deg = self.table.stopping_deg(self.bench.servo.read_state())
+        self.goal_deg = self.table.stopping_deg(self.steps.bench.servo.read_state())
         return self.goal_deg
 
 
-def search_in_motion(
-    bench: Bench,
-    search: ArcSearch,
-    viewer: Viewer,
-    describe: ViewDescriber,
-    *,
-    check: Callable[[NDArray[np.uint8]], None],
-    top: int,
-    started_ns: int,
-    live: Callable[[FrameUsed], object],
-) -> Generator[Event, None, Found]:
+def search_in_motion(steps: SearchSteps, live: Callable[[FrameUsed], object]) -> Generator[Event, None, Searched]:
     """Search along arcs until the stopping rule ends the search; the frames of an arc become events at its end.
 
-    ``check`` gets the first view, and raises an error if it shows no object. ``live`` gets the event of each frame
-    while the table still rotates. It must return at once, because it is called in the control loop. Raises what
-    `rig.plans.identify.identify` raises. After a fault in an arc, the events of its frames come when the torque is off,
-    because the consumer of events may pause. After a stop they do not come.
+    ``live`` gets the event of each frame while the table still rotates. It must return at once, because it is called in
+    the control loop. After a fault in an arc, the events of its frames come when the torque is off, because the
+    consumer of events may pause. After a stop they do not come. Raises what `rig.plans.identify.identify` raises.
     """
-    left: list[Event] = []
+    bench = steps.bench
+    started_ns = bench.clock.now_ns()
+    speed = scan_speed(bench.config, fps=bench.config.camera.fps, gyro_range_dps=bench.imu.range_dps, spacing_deg=None)
+    frames = _ArcFrames(steps, Turntable(bench, first_rest_s=FIRST_REST_S), live, started_ns, speed.dps)
     try:
-        found = yield from _search(
-            bench, search, viewer, describe, left, top=top, started_ns=started_ns, check=check, live=live
-        )
+        return (yield from _search(frames))
     except MotionStopped:
         raise
     except Exception:
-        yield from left
+        yield from frames.events
         raise
-    return found
 
 
-def _search(
-    bench: Bench,
-    search: ArcSearch,
-    viewer: Viewer,
-    describe: ViewDescriber,
-    left: list[Event],
-    *,
-    check: Callable[[NDArray[np.uint8]], None],
-    top: int,
-    started_ns: int,
-    live: Callable[[FrameUsed], object],
-) -> Generator[Event, None, Found]:
-    """Search; ``left`` receives the events of an arc that have not been yielded."""
-    config = bench.config
-    sign = config.table.orientation_sign
-    speed = scan_speed(config, fps=config.camera.fps, gyro_range_dps=bench.imu.range_dps, spacing_deg=None)
+def _search(frames: _ArcFrames) -> Generator[Event, None, Searched]:
+    steps, bench, search = frames.steps, frames.steps.bench, frames.steps.search
+    sign = bench.config.table.orientation_sign
     travelled_deg = 0.0
-    number = rejected = 0
-    failed: RigError | None = None
-    with Turntable(bench, first_rest_s=FIRST_REST_S) as table:
+    with frames.table as table:
         low_deg, high_deg = table.limits_deg
-        stream: FrameStream | None = None
-        recorder: TrajectoryRecorder | None = None
         settled_ns = bench.clock.now_ns()
         for _ in range(MOST_FLIGHTS):
             # A view at rest: the first one, and after each arc that ended without an answer.
-            captured = yield from capture(number, viewer, table, settled_ns)
             azimuth_deg = float(wrap360(sign * table.rest_deg))
-            described = describe(captured.image_bgr)
-            yield accepted(number, azimuth_deg, captured, described)
-            if number == 0:
-                check(captured.image_bgr)
-            yield from warn_of_table(bench, number, described)
-            ranked, step = add_view(search, described, azimuth_deg, table.rest_deg)
-            ended_ns = bench.clock.now_ns()
-            if search.is_new_decision:
-                yield ranked
+            captured = yield from steps.view(frames.number, table, settled_ns, azimuth_deg)
+            ended_ns, step = steps.decided_ns, search.step
             if isinstance(step, Finish):
                 break
             # An arc: frames are evidence while the table rotates.
             goal_deg = min(max(table.rest_deg + sign * step.rotation_deg, low_deg), high_deg)
             if search.is_new_decision:
-                yield decided(number, step, goal_deg, top)
-            recorder = recorder or table.recorder()
-            stream = stream or FrameStream(bench.camera, bench.clock)
-            frame_check = FlightFrameCheck(config, captured.evidence.locks, True, bench.clock.now_ns(), stream.period_s)
-            arc_frames = _ArcFrames(
-                bench,
-                table,
-                search,
-                stream,
-                recorder,
-                frame_check,
-                describe,
-                top,
-                live,
-                started_ns,
-                number,
-                rejected,
-                ranked,
-                step,
-                goal_deg,
-                left,
-            )
-            reach_deg = max(low_deg, table.rest_deg - 360.0), min(high_deg, table.rest_deg + 360.0)
-            move = table.fly(goal_deg, Flight(arc_frames.each, reach_deg, recorder, speed.dps, quiet=False))
-            yield from left
-            left.clear()
-            number, rejected, ranked, step = arc_frames.number, arc_frames.rejected, arc_frames.ranked, arc_frames.step
+                yield steps.decided(frames.number, step, goal_deg)
+            move = frames.fly(goal_deg, captured.evidence.locks)
+            yield from frames.events
+            frames.events.clear()
             travelled_deg += abs(move.rotation_deg)
-            yield moved(number, move)
-            if arc_frames.ended_ns is not None:
-                ended_ns = arc_frames.ended_ns
+            yield moved(frames.number, move)
+            if frames.ended_ns is not None:
+                ended_ns = frames.ended_ns
                 break
-            number += 1
+            frames.number += 1
             still = table.hold()
             settled_ns = still.settled_ns
-            yield moved(number, still)
-        seconds = seconds_between(started_ns, ended_ns)
-        try:
-            yield from unwind(number, table)
-        except RigError as error:
-            failed = error  # report the answer first
-    end = step if isinstance(step, Finish) else Finish(StopReason.MAX_VIEWS)
-    return Found(ranked, end, travelled_deg, seconds, failed)
-
-
-def decided(number: int, step: Rotate, target_deg: float, top: int) -> Decided:
-    """Return the event of a decision to rotate."""
-    return Decided(
-        index=number,
-        side="left" if step.rotation_deg >= 0 else "right",
-        rotation_deg=step.rotation_deg,
-        target_deg=target_deg,
-        s_left=step.s_left,
-        s_right=step.s_right,
-        candidates=step.candidates[:top],
-        reason=step.reason,
-        note=step.note,
-        weighed=step.weighed,
-    )
+            yield moved(frames.number, still)
+        seconds = seconds_between(frames.started_ns, ended_ns)
+        failed = yield from unwound(frames.number, table)
+    return Searched(travelled_deg, seconds, failed)

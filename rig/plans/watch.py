@@ -5,7 +5,6 @@ from collections.abc import Callable, Generator
 import numpy as np
 from numpy.typing import NDArray
 
-import hbr
 from rig.bench import Bench
 from rig.core.errors import NoObject, ViewRejected
 from rig.events.events import Event, Failed, FrameUsed, Waiting, WaitReason
@@ -19,7 +18,7 @@ from rig.search.strategies import AnyStrategy
 
 def watch(
     bench: Bench,
-    model: Callable[[], Model | hbr.ViewIndex],
+    model: Callable[[], Model],
     *,
     strategy: AnyStrategy | str | None = None,
     seed: int = 0,

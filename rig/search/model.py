@@ -1,19 +1,21 @@
-"""The model of a search: the enrolled views by one descriptor, and the stopping rule.
+"""The model of a search: the enrolled views by one descriptor, and the stopping rule. A search begins with it.
 
 Decision: docs/decisions/0030.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import partial
-from typing import Any
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 import hbr
-from hbr.dense.local_difference import LocalView
+from hbr.dense.arc import ArcRule, ArcSession, calibrate_arc_rule
 from rig.bench import Bench
 from rig.catalog import Catalog
 from rig.catalog.descriptions import (
@@ -27,23 +29,36 @@ from rig.catalog.descriptions import (
 from rig.catalog.jobs import JobProgress
 from rig.catalog.local_views import local_views
 from rig.catalog.prepared import prepared_views
-from rig.core.errors import CatalogError, DescriptorOutdated
+from rig.config import RigConfig
+from rig.core.errors import CatalogError, DescriptorOutdated, UsageError
 from rig.events.events import Note, NoteCode
-from rig.search.stopping_rules import stopping_rule_of
+from rig.search.comparison import EnrolledViews
+from rig.search.session import SHOWN, ArcSearch, DenseSearch, HoughSearch, Search
+from rig.search.stopping_rules import stopping_rule_of, write_stopping_rule
+from rig.search.strategies import (
+    AnyStrategy,
+    DenseSearchState,
+    SearchState,
+    Strategy,
+    descriptor_for,
+    is_in_motion,
+    strategy_for,
+)
+from rig.search.strategies import strategy as strategy_named
 from rig.views.description import BENCH_DESCRIPTOR, PAPER_DESCRIPTOR
 from rig.views.empty_table import empty_table_status
 
 
 @dataclass(frozen=True, eq=False)
-class Model:
-    """Enrolled views, prepared for searches.
+class Model(ABC):
+    """Enrolled views, prepared for searches: a `PaperModel` or a `DenseModel`.
 
     Attributes
     ----------
     index : hbr.ViewIndex or hbr.DenseIndex
         Index for the paper's searches, or for the dense search.
     rule : hbr.StoppingRule, optional
-        The rule that ends the dense search and decides which objects are unknown.
+        The rule that ends the dense search and decides which objects are unknown; None for the paper's.
     notes
         Notes for the operator about an answer by this model.
     with_empty_table
@@ -66,13 +81,7 @@ class Model:
     camera: tuple[Mapping[str, Any], ...] = field(default=(), repr=False)
     empty_table: NDArray[np.uint8] | None = field(default=None, repr=False)
     bench_image: NDArray[np.uint8] | None = field(default=None, repr=False)
-    leader_views: Callable[[str, Sequence[float]], Sequence[LocalView]] | None = field(default=None, repr=False)
-
-    def __post_init__(self) -> None:
-        if isinstance(self.index, hbr.DenseIndex) and self.rule is None:
-            raise ValueError(
-                "a dense search needs a stopping rule; use load_model, or hbr.calibrate_stopping_rule(index).rule"
-            )
+    leader_views: EnrolledViews | None = field(default=None, repr=False)
 
     @property
     def views(self) -> hbr.Views:
@@ -84,10 +93,96 @@ class Model:
         """The descriptor of the enrolled views, and of queries."""
         return self.views.descriptor
 
+    @abstractmethod
+    def search(self, config: RigConfig, strategy: AnyStrategy, *, seed: int, top: int) -> Search:
+        """Begin a search with a strategy for this descriptor; `begin_search` checks that."""
+
+    @abstractmethod
+    def write_rule(self, path: Path, *, made_utc: str) -> None:
+        """Store the stopping rule in a file if there is one; errors as for `write_stopping_rule`."""
+
+
+@dataclass(frozen=True, eq=False)
+class PaperModel(Model):
+    """A model for the paper's searches."""
+
+    index: hbr.ViewIndex
+
+    def search(self, config: RigConfig, strategy: AnyStrategy, *, seed: int, top: int) -> Search:
+        return HoughSearch(self.index, config, cast(Strategy[SearchState], strategy), seed=seed, top=top)
+
+    def write_rule(self, path: Path, *, made_utc: str) -> None:
+        """Store nothing: there is no rule."""
+
+
+@dataclass(frozen=True, eq=False)
+class DenseModel(Model):
+    """A model for the dense search; `hbr.calibrate_stopping_rule` makes the rule of an index."""
+
+    index: hbr.DenseIndex
+    rule: hbr.StoppingRule
+
+    def search(self, config: RigConfig, strategy: AnyStrategy, *, seed: int, top: int) -> Search:
+        chosen = cast(Strategy[DenseSearchState], strategy)
+        if is_in_motion(chosen):
+            moving = ArcSession(self.index, _arc_rule(self.index, self.rule))
+            return ArcSearch(moving, self.views, config, chosen, seed=seed, top=top)
+        session = hbr.DenseSession(self.index, self.rule, max_views=config.identify.max_views)
+        return DenseSearch(session, self.views, config, chosen, seed=seed, top=top)
+
+    def write_rule(self, path: Path, *, made_utc: str) -> None:
+        write_stopping_rule(path, self.rule, self.index, made_utc=made_utc)
+
+
+@lru_cache(maxsize=4)
+def _arc_rule(index: hbr.DenseIndex, rule: hbr.StoppingRule) -> ArcRule:
+    """Return the rule of searches in motion; it is fitted once for each model."""
+    return calibrate_arc_rule(index, rule)
+
 
 def model_of(views: hbr.Views, *, rule: hbr.StoppingRule | None = None) -> Model:
     """Return a model of views: for the dense search if there is a stopping rule, else for the paper's."""
-    return Model(hbr.ViewIndex(views)) if rule is None else Model(hbr.DenseIndex(views), rule)
+    return PaperModel(hbr.ViewIndex(views)) if rule is None else DenseModel(hbr.DenseIndex(views), rule)
+
+
+def begin_search(
+    model: Model, config: RigConfig, strategy: AnyStrategy | str | None = None, *, seed: int = 0, top: int = SHOWN
+) -> tuple[Search, AnyStrategy]:
+    """Begin a search, and return it with its strategy.
+
+    Parameters
+    ----------
+    model
+        What is enrolled.
+    config
+        Of the bench.
+    strategy
+        Its name, or a strategy object. The default is ``dense`` if the model is for it, else ``ahbr``.
+    seed
+        For strategies that draw random numbers.
+    top
+        The number of candidates that events name.
+
+    Raises
+    ------
+    CatalogError
+        Nothing is enrolled.
+    UsageError
+        There is no such strategy, or the model is not for it.
+    """
+    chosen = strategy_for(model.descriptor) if strategy is None else strategy
+    if isinstance(chosen, str):
+        chosen = strategy_named(chosen)
+    if not len(model.views):
+        raise CatalogError("The catalog is empty.", next_step="Enroll at least one object: rig enroll NAME.")
+    wanted = descriptor_for(chosen)
+    if wanted != model.descriptor:
+        raise UsageError(
+            f"The strategy {chosen.name!r} needs views by {wanted}; this model has views by {model.descriptor}.",
+            next_step=f"Load it with rig.search.model.load_model(catalog, descriptor={wanted!r}), or use another "
+            "strategy.",
+        )
+    return model.search(config, chosen, seed=seed, top=top), chosen
 
 
 def load_model(
@@ -135,13 +230,13 @@ def _load(catalog: Catalog, descriptor: str | None, progress: Callable[[JobProgr
         values = {"used": PAPER_DESCRIPTOR, "missing": BENCH_DESCRIPTOR, "objects": objects}
         notes = (Note(NoteCode.PAPER_SEARCH, values),)
     views = prepared_views(catalog, PAPER_DESCRIPTOR, progress)
-    return Model(hbr.ViewIndex(views), notes=notes if len(views) else (), camera=tuple(camera_settings(catalog)))
+    return PaperModel(hbr.ViewIndex(views), notes=notes if len(views) else (), camera=tuple(camera_settings(catalog)))
 
 
 def _dense(catalog: Catalog, progress: Callable[[JobProgress], None] | None) -> Model:
     views = prepared_views(catalog, BENCH_DESCRIPTOR, progress)
     if not len(views):
-        return Model(hbr.ViewIndex(hbr.Views.empty()))  # the search reports that the catalog is empty
+        return PaperModel(hbr.ViewIndex(hbr.Views.empty()))  # the search reports that the catalog is empty
     index = hbr.DenseIndex(views)
     rule, notes = stopping_rule_of(catalog.path, index)
     before = empty_tables(catalog)
@@ -158,7 +253,7 @@ def _dense(catalog: Catalog, progress: Callable[[JobProgress], None] | None) -> 
         elif (view := newest_view(catalog)) is not None:
             bench_image = read_image(catalog, view)
     camera = tuple(camera_settings(catalog))
-    return Model(index, rule, notes, with_image, camera, table, bench_image, partial(local_views, catalog))
+    return DenseModel(index, rule, notes, with_image, camera, table, bench_image, partial(local_views, catalog))
 
 
 def empty_table_for(bench: Bench, model: Model) -> tuple[NDArray[np.uint8] | None, tuple[Note, ...]]:
@@ -167,7 +262,7 @@ def empty_table_for(bench: Bench, model: Model) -> tuple[NDArray[np.uint8] | Non
     It is the bench's own of today, else the one of the enrollment. It is None if the objects were enrolled without an
     image, because views are compared only with views that were described in the same way.
     """
-    if not isinstance(model.index, hbr.DenseIndex):
+    if model.rule is None:
         return None, ()
     status = empty_table_status(bench)
     problems = {"problems": [problem.as_json() for problem in status.problems]}

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 from math import isclose
 from typing import Any, Final
 
+from hbr.dense.enrolled_views import answered
 from hbr.dense.verification import Verification
 from rig.events.compared import Compared, Verified
 from rig.events.events import (
@@ -19,9 +20,10 @@ from rig.events.events import (
     event_dict,
     plain,
 )
-from rig.search.local_step import Comparison, compare_leaders, saved_leader_views, with_verification
+from rig.search.comparison import saved_enrolled_views
+from rig.search.model import begin_search
 from rig.search.saved_run import SavedRun
-from rig.search.session import ArcSearch, DenseSearch, Search, begin_search
+from rig.search.session import Search
 from rig.search.strategies import AnyStrategy, Finish, Rotate
 from rig.views.description import SearchDescriber
 
@@ -83,9 +85,6 @@ def check(run: SavedRun, *, by: AnyStrategy | None = None) -> Check:
     found = Check(is_complete=run.error is not None and not run.is_cut)
     search: Search | None = None
     describe: SearchDescriber | None = None
-    ranked: Ranked | None = None
-    step: Rotate | Finish | None = None
-    compared: Comparison | None = None
     table_deg = 0.0
     for event in run.events():
         computed: Event | dict[str, Any] | None = None
@@ -98,50 +97,36 @@ def check(run: SavedRun, *, by: AnyStrategy | None = None) -> Check:
                     search, _ = begin_search(
                         run.model, run.config, by or started.strategy, seed=started.seed or 0, top=top
                     )
-                    revise = not isinstance(search, ArcSearch)
+                    revise = not search.in_motion
                     describe = SearchDescriber(run.config.view, run.views.descriptor, run.empty_table, revise=revise)
                 assert describe is not None
                 view = describe(event.image_bgr)
-                levels = view.levels[search.descriptor]
                 if event.evidence.motion is not None:
                     table_deg = event.evidence.motion.angle_deg
-                ranked, step = search.add(
-                    levels,
-                    event.azimuth_deg,
-                    table_deg=table_deg,
-                    earlier=view.earlier,
-                    reliable=view.reliable,
-                    same_bench=event.same_bench,
-                    segmentation=event.segmentation,
-                )
+                known = replace(view, segmentation=event.segmentation, same_bench=event.same_bench)
+                search.add(known, event.azimuth_deg, table_deg=table_deg)
                 found.views += 1
                 if event.segmentation is not None:
                     saved, again = event.segmentation, plain(view.segmentation)
                     found.differences += _compare(found.views, "segmentation", saved, again)
-            case Ranked() if ranked is not None:
+            case Ranked() if search is not None:
                 # The number of candidates is a setting of the run.
-                computed = replace(ranked, candidates=ranked.candidates[: len(event.candidates)])
-            case FrameUsed() if isinstance(search, ArcSearch):
+                computed = replace(search.ranked, candidates=search.ranked.candidates[: len(event.candidates)])
+            case FrameUsed() if search is not None and search.in_motion:
                 computed = search.frame_used(event.index, event.azimuth_deg, event.seconds, event.rejected)
             case Decided():
                 found.decisions += 1
-                computed = _decided(step, event)
-            case Verified() if isinstance(search, DenseSearch):
+                computed = _decided(None if search is None else search.step, event)
+            case Verified() if search is not None:
                 # the enrolled images are not in the run, so their measured fit is used
-                leader = search.belief.index.views.object_names.index(event.name)
-                computed = with_verification(search, Verification(leader, event.fit, event.others))
-            case Compared() if ranked is not None and search is not None and describe is not None:
-                end = step if isinstance(step, Finish) else Finish()
-                compared = compare_leaders(
-                    search, search.answer(ranked, end), describe.segmentations, saved_leader_views(event)
-                )
-                computed = {} if compared is None else compared.event
-            case Identified() if ranked is not None and search is not None:
+                measured = Verification(search.names.index(event.name), event.fit, event.others)
+                computed = answered(search.verify((), measured))
+            case Compared() if search is not None and describe is not None:
+                views = saved_enrolled_views(event, search.names)
+                computed = answered(search.compare(describe.hypotheses), views) or {}
+            case Identified() if search is not None:
                 found.decisions += 1
-                end = step if isinstance(step, Finish) else Finish()
-                answer = search.answer(ranked, end, travelled_deg=event.travelled_deg, seconds=event.seconds)
-                if compared is not None:
-                    answer = compared.answer_of(answer)
+                answer = search.answer(travelled_deg=event.travelled_deg, seconds=event.seconds)
                 computed = replace(answer, candidates=answer.candidates[: len(event.candidates)])
                 found.is_complete = not run.is_cut
             case _:

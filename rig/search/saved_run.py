@@ -33,7 +33,7 @@ from rig.events.compared import Compared
 from rig.events.events import Accepted, Event, Failed, Identified, Started, event_dict, event_of
 from rig.search.model import Model, empty_table_for, model_of
 from rig.search.stopping_rules import FILE as STOPPING_RULE
-from rig.search.stopping_rules import read_stopping_rule, write_stopping_rule
+from rig.search.stopping_rules import read_stopping_rule
 from rig.views import image_files as images
 
 FORMAT: Final = "hbr-rig run"
@@ -60,7 +60,7 @@ class RunWriter:
         A new or empty folder; missing folders above it are created.
     bench
         The bench of the search.
-    model : Model or hbr.ViewIndex
+    model
         The enrolled views.
     empty_table : uint8 array (H, W, 3), optional
         See `rig.plans.identify.identify`.
@@ -72,10 +72,9 @@ class RunWriter:
     """
 
     def __init__(
-        self, folder: Path, bench: Bench, model: Model | hbr.ViewIndex, *, empty_table: NDArray[np.uint8] | None = None
+        self, folder: Path, bench: Bench, model: Model, *, empty_table: NDArray[np.uint8] | None = None
     ) -> None:
         self._folder = folder
-        model = Model(model) if isinstance(model, hbr.ViewIndex) else model
         views = model.views
         kind = descriptor(views.descriptor)
         started_utc = bench.clock.utc().isoformat()
@@ -86,8 +85,7 @@ class RunWriter:
                     f"The folder {folder} is not empty.", next_step="Give a new folder for each run with --save-run."
                 )
             write(folder / "model.jsonl", "".join(_model_lines(views)).encode())
-            if model.rule is not None and isinstance(model.index, hbr.DenseIndex):
-                write_stopping_rule(folder / STOPPING_RULE, model.rule, model.index, made_utc=started_utc)
+            model.write_rule(folder / STOPPING_RULE, made_utc=started_utc)
             if empty_table is None:
                 empty_table, _ = empty_table_for(bench, model)
             if empty_table is not None:

@@ -1,122 +1,143 @@
-"""A search without its hardware: views in, ranking and decision out. The bench runs it, and a replay runs it again."""
+"""A search without its hardware: views in, ranking and decision out.
+
+A search does no I/O. It takes views (`Search.add`) and says what it needs next: a view after a rotation, or the end. At
+its end (`Search.end`) it asks for enrolled views, and returns the answer. The bench at rest and in motion
+(`rig.plans.identify`) and the replay (`rig.search.replay`) drive it; `rig eval` drives the same `hbr.DenseSession`.
+
+Decision: docs/decisions/0064.
+"""
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import replace
-from functools import lru_cache
 from math import isfinite
-from typing import Any, Final, cast
+from typing import ClassVar, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 import hbr
 from hbr.core.angles import wrap360
-from hbr.dense.arc import ArcRule, ArcSession, calibrate_arc_rule
+from hbr.core.arrays import IndexArray
+from hbr.dense.enrolled_views import Asking, NeedEnrolledViews, Queries
+from hbr.dense.local_difference import LocalView
 from hbr.dense.pose import pose
-from hbr.dense.verification import Verification, found_from, is_doubtful
-from hbr.descriptors.together import like_enrollment
+from hbr.dense.verification import UNKNOWN_BELOW, Verification
 from hbr.model.symmetry import symmetry
 from rig.config import RigConfig
-from rig.core.errors import CatalogError, UsageError
+from rig.events.compared import Compared, Verified
 from rig.events.events import Candidate, FrameUsed, Identified, Ranked
-from rig.search.model import Model
+from rig.search.comparison import compared_event
 from rig.search.strategies import (
-    Arc,
     DenseSearchState,
-    DenseStrategy,
     Finish,
     Rotate,
     SearchState,
     Strategy,
-    descriptor_for,
-    is_dense,
     reachable_arcs,
     reachable_rotations,
-    strategy_for,
 )
-from rig.search.strategies import strategy as strategy_named
+from rig.views.description import DescribedView
 
 SHOWN: Final = 5
 """Candidates that an event names by default."""
 
+Hypotheses = Sequence[Sequence[hbr.Segmentation]]
+"""All segmentations of each view of a search, the likeliest first (`rig.views.description.SearchDescriber`)."""
+
 
 class Search(ABC):
-    """One search for an object; `begin_search` makes it.
+    """One search for an object; `rig.search.model.begin_search` makes it.
+
+    Views can be added after its end, too: a replay adds all views of a run.
 
     Attributes
     ----------
     descriptor
         The descriptor that its queries need.
+    names
+        Names of the enrolled objects.
+    in_motion
+        Whether the frames of a rotation are its views.
+    ranked, step
+        The candidates after the last view, and the strategy's decision.
+    is_new_decision
+        Whether the last view led to a decision; between the decisions of a search in motion the last one stays.
     """
+
+    in_motion: ClassVar[bool] = False
+    ranked: Ranked
+    step: Rotate | Finish
+    is_new_decision = True
 
     def __init__(self, views: hbr.Views, config: RigConfig, *, seed: int, top: int) -> None:
         self.descriptor = views.descriptor
+        self.names = views.object_names
         self._config = config
         self._top = top
         self._rng = np.random.default_rng(seed)
         self._orientations: list[float] = []
-        self._earlier: Sequence[NDArray[np.uint8]] | None = None
-        self._reliable = True
-        self._same_bench: bool | None = None
-        self._alike: bool | None = None
 
-    def add(
-        self,
-        levels: NDArray[np.uint8],
-        azimuth_deg: float,
-        *,
-        table_deg: float,
-        earlier: Sequence[NDArray[np.uint8]] | None = None,
-        reliable: bool = True,
-        same_bench: bool | None = None,
-        segmentation: Mapping[str, Any] | None = None,
-    ) -> tuple[Ranked, Rotate | Finish]:
+    def add(self, view: DescribedView, azimuth_deg: float, *, table_deg: float) -> tuple[Ranked, Rotate | Finish]:
         """Add the next view; return the candidates, and the strategy's decision.
 
         Parameters
         ----------
-        levels : uint8 array (length,) or (k, length)
-            The view by the search's descriptor; for the dense search also several segmentations of it.
+        view
+            The view by the search's descriptor.
         azimuth_deg
             Orientation of the camera around the object, from any zero that all views share, in [0, 360).
         table_deg
             The table angle, unwrapped.
-        earlier : sequence of uint8 arrays, optional
-            The levels of the earlier views, which were segmented again.
-        reliable, same_bench
-            Whether the view was segmented reliably, and whether the bench is that of the enrollment, as for
-            `hbr.DenseSession.add`.
-        segmentation
-            `hbr.Segmentation.evidence` of the view.
         """
-        self._same_bench = self._alike = same_bench
-        if segmentation is not None:
-            self._alike = like_enrollment(segmentation.get("method", ""), same_bench)
         self._orientations.append(azimuth_deg)
-        self._earlier, self._reliable = earlier, reliable
-        ranked = self._rank(levels)
-        return ranked, self._decide(ranked, table_deg)
-
-    @property
-    def orientations_deg(self) -> tuple[float, ...]:
-        """Orientation of each view so far."""
-        return tuple(self._orientations)
+        self.ranked = self._rank(view)
+        self.step = self._decide(table_deg)
+        return self.ranked, self.step
 
     @abstractmethod
-    def _rank(self, levels: NDArray[np.uint8]) -> Ranked: ...
+    def _rank(self, view: DescribedView) -> Ranked: ...
 
     @abstractmethod
-    def _decide(self, ranked: Ranked, table_deg: float) -> Rotate | Finish: ...
+    def _decide(self, table_deg: float) -> Rotate | Finish: ...
 
-    def answer(self, ranked: Ranked, end: Finish, *, travelled_deg: float = 0.0, seconds: float = 0.0) -> Identified:
-        """Return the answer when the search ends."""
-        best = ranked.candidates[0]
+    def frame_used(self, number: int, azimuth_deg: float, seconds: float, rejected: int) -> FrameUsed:
+        """Return the event of the last frame of a search in motion; ``number`` counts the views from 0."""
+        raise NotImplementedError("only the dense search takes frames in motion")
+
+    def end(
+        self, hypotheses: Hypotheses, *, travelled_deg: float = 0.0, seconds: float = 0.0
+    ) -> Generator[NeedEnrolledViews | Verified | Compared, Sequence[LocalView] | None, Identified]:
+        """End the search after its last view: yield what it needs, and the events of its last steps; return the answer.
+
+        A doubtful leader is verified first, then the two leaders are compared. The driver answers `NeedEnrolledViews`
+        with the views, or with None if they cannot be read.
+        """
+        if verified := (yield from self.verify(hypotheses)):
+            yield verified
+        if compared := (yield from self.compare(hypotheses)):
+            yield compared
+        return self.answer(travelled_deg=travelled_deg, seconds=seconds)
+
+    def verify(self, hypotheses: Hypotheses, measured: Verification | None = None) -> Asking[Verified | None]:  # noqa: ARG002
+        """Verify a doubtful leader, as `hbr.DenseSession.verify`; the answer depends on it."""
+        yield from ()
+        return None
+
+    def compare(self, hypotheses: Hypotheses) -> Asking[Compared | None]:  # noqa: ARG002
+        """Compare the two leaders, as `hbr.DenseSession.compare`; the answer depends on it."""
+        yield from ()
+        return None
+
+    def answer(self, *, travelled_deg: float = 0.0, seconds: float = 0.0) -> Identified:
+        """Return the answer after the last view and the last steps that were taken."""
+        best = self.ranked.candidates[0]
+        end = self.step if isinstance(self.step, Finish) else Finish(hbr.StopReason.MAX_VIEWS)
         return Identified(
             name=best.name,
-            candidates=ranked.candidates,
+            candidates=self.ranked.candidates,
             score=best.score,
-            margin=ranked.margin,
+            margin=self.ranked.margin,
             pose_deg=best.pose_deg,
             yaw_deg=(yaw_deg := float(wrap360(self._orientations[-1] - best.pose_deg))),
             yaw_set_deg=(yaw_deg,),
@@ -133,7 +154,9 @@ class Search(ABC):
 class HoughSearch(Search):
     """The paper's search: views vote by lists of the most similar enrolled views (`hbr.retrieve`)."""
 
-    def __init__(self, index: hbr.ViewIndex, config: RigConfig, strategy: Strategy, *, seed: int, top: int) -> None:
+    def __init__(
+        self, index: hbr.ViewIndex, config: RigConfig, strategy: Strategy[SearchState], *, seed: int, top: int
+    ) -> None:
         super().__init__(index.views, config, seed=seed, top=top)
         given = config.identify.min_score
         self._min_score = (
@@ -143,8 +166,8 @@ class HoughSearch(Search):
         self._strategy = strategy
         self._descriptors: list[NDArray[np.uint8]] = []
 
-    def _rank(self, levels: NDArray[np.uint8]) -> Ranked:
-        self._descriptors.append(levels)
+    def _rank(self, view: DescribedView) -> Ranked:
+        self._descriptors.append(view.levels[self.descriptor])
         self._queries = queries = np.array(self._descriptors)
         config = self._config.identify
         self._ranking = ranking = hbr.retrieve(
@@ -162,13 +185,13 @@ class HoughSearch(Search):
         )
         return Ranked(views - 1, candidates, hbr.score_margin(ranking, queries) / views)
 
-    def _decide(self, ranked: Ranked, table_deg: float) -> Rotate | Finish:
+    def _decide(self, table_deg: float) -> Rotate | Finish:
         state = SearchState(
             index=self._index,
             queries=self._queries,
             ranking=self._ranking,
-            score=ranked.candidates[0].score,
-            margin=ranked.margin,
+            score=self.ranked.candidates[0].score,
+            margin=self.ranked.margin,
             min_score=self._min_score,
             table_deg=table_deg,
             limits_deg=self._config.table.limits_deg,
@@ -177,8 +200,8 @@ class HoughSearch(Search):
         )
         return self._strategy.next(state)
 
-    def answer(self, ranked: Ranked, end: Finish, *, travelled_deg: float = 0.0, seconds: float = 0.0) -> Identified:
-        answer = super().answer(ranked, end, travelled_deg=travelled_deg, seconds=seconds)
+    def answer(self, *, travelled_deg: float = 0.0, seconds: float = 0.0) -> Identified:
+        answer = super().answer(travelled_deg=travelled_deg, seconds=seconds)
         outcome, possible = hbr.Outcome.FOUND, answer.possible
         if answer.score < self._min_score:
             outcome, possible = hbr.Outcome.UNKNOWN, ()
@@ -208,43 +231,52 @@ class DenseSearch(Search):
 
     def __init__(
         self,
-        index: hbr.DenseIndex,
-        rule: hbr.StoppingRule,
+        session: hbr.DenseSession,
+        views: hbr.Views,
         config: RigConfig,
-        strategy: DenseStrategy,
+        strategy: Strategy[DenseSearchState],
         *,
         seed: int,
         top: int,
     ) -> None:
-        super().__init__(index.views, config, seed=seed, top=top)
+        super().__init__(views, config, seed=seed, top=top)
         self._strategy = strategy
-        self._session = hbr.DenseSession(index, rule, max_views=config.identify.max_views)
-        self._verification: Verification | None = None
+        self._session = session
 
-    def _rank(self, levels: NDArray[np.uint8]) -> Ranked:
+    def _rank(self, view: DescribedView) -> Ranked:
         decision = self._session.add(
-            levels,
+            view.levels[self.descriptor],
             self._orientations[-1],
-            earlier=self._earlier,
-            reliable=self._reliable,
-            same_bench=self._alike,
+            earlier=view.earlier,
+            reliable=view.reliable,
+            same_bench=view.same_bench,
+            segmented_by=None if view.segmentation is None else view.segmentation.get("method", ""),
         )
+        self.is_new_decision = self._session.is_new_decision
         belief = self._session.belief
-        probability = belief.posterior(self._session.rule.beta).sum(axis=1)
-        scores = belief.scores()
+        probability, scores, order = self._ordered()
         ranking = belief.ranking()
         pose_deg = dict(zip(ranking.object_index.tolist(), ranking.pose_deg.tolist(), strict=True))
         objects = belief.index.object_index.tolist()
-        names = belief.index.views.object_names
-        order = np.lexsort((-scores, -probability)).tolist()
         candidates = tuple(
-            Candidate(names[objects[i]], float(scores[i]), pose_deg[objects[i]], float(probability[i]))
-            for i in order[: self._top]
+            Candidate(self.names[objects[i]], float(scores[i]), pose_deg[objects[i]], float(probability[i]))
+            for i in order[: self._top].tolist()
         )
         others = float(scores[order[1:]].max()) if len(order) > 1 else 0.0
         return Ranked(belief.queries - 1, candidates, candidates[0].score - others, decision)
 
-    def _decide(self, ranked: Ranked, table_deg: float) -> Rotate | Finish:  # noqa: ARG002
+    def _ordered(self) -> tuple[NDArray[np.float64], NDArray[np.float64], IndexArray]:
+        """Return probability and score of each object considered, and their order, the likeliest first."""
+        belief = self._session.belief
+        probability, scores = belief.posterior(self._session.rule.beta).sum(axis=1), belief.scores()
+        return probability, scores, np.lexsort((-scores, -probability))
+
+    def frame_used(self, number: int, azimuth_deg: float, seconds: float, rejected: int) -> FrameUsed:
+        present = self._session.present
+        name = self.names[present.object_index]
+        return FrameUsed(number, azimuth_deg, seconds, rejected, name, present.probability, present.outcome)
+
+    def _decide(self, table_deg: float) -> Rotate | Finish:
         return self._next(table_deg, *reachable_rotations(self._config, table_deg))
 
     def _next(
@@ -262,173 +294,80 @@ class DenseSearch(Search):
         )
         return self._strategy.next(state)
 
-    @property
-    def belief(self) -> hbr.Belief:
-        """The belief after the last view."""
-        return self._session.belief
-
-    @property
-    def beta(self) -> float:
-        """As for `hbr.Belief.posterior`."""
-        return self._session.rule.beta
-
-    @property
-    def error_rate(self) -> float:
-        """The largest share of wrong objects among those named."""
-        return self._session.rule.error_rate
-
-    @property
-    def decision(self) -> hbr.StopDecision:
-        """The decision with which the search ends here, after the verification of its leader if there was one."""
+    def verify(self, hypotheses: Hypotheses, measured: Verification | None = None) -> Asking[Verified | None]:
+        found = yield from self._session.verify(self._queries(hypotheses), measured)
+        if found is None:
+            return None
         decision = self._session.end()
-        return decision if self._verification is None else self._verification.decided(decision, self.found_from)
+        return Verified(
+            index=len(self._orientations) - 1,
+            name=self.names[found.object_index],
+            fit=found.fit,
+            others=found.others,
+            score=found.score(decision.open_set_score),
+            found_from=self._session.found_from,
+            unknown_below=UNKNOWN_BELOW,
+            outcome=decision.outcome,
+        )
 
-    @property
-    def found_from(self) -> float:
-        """Log-odds from which a verified leader is found (`hbr.dense.verification.found_from`)."""
-        return found_from(self._same_bench)
+    def compare(self, hypotheses: Hypotheses) -> Asking[Compared | None]:
+        found = yield from self._session.compare(self._queries(hypotheses))
+        return None if found is None else compared_event(len(self._orientations) - 1, found, self.names)
 
-    @property
-    def is_doubtful(self) -> bool:
-        """Whether the leader is to be verified (`hbr.dense.verification.is_doubtful`)."""
-        belief, decision = self.belief, self._session.end()
-        return is_doubtful(self._session.rule, decision, belief.queries, belief.index.views.descriptor)
+    def _queries(self, hypotheses: Hypotheses) -> Queries:
+        return lambda n: [LocalView(one.crop, one.mask, self._orientations[n]) for one in hypotheses[n]]
 
-    def set_verification(self, verification: Verification) -> None:
-        """Use a verification of the leader in the answer."""
-        self._verification = verification
-
-    def pose_fields(self, object_index: int) -> dict[str, Any]:
-        """Return the fields of the answer about the rotation of an object."""
-        found = pose(self._session.belief, object_index)
+    def answer(self, *, travelled_deg: float = 0.0, seconds: float = 0.0) -> Identified:
+        answer = super().answer(travelled_deg=travelled_deg, seconds=seconds)
+        decision = self._session.end()
+        outcome, threshold = decision.outcome, decision.open_set_threshold
+        compared = decision.reason is hbr.StopReason.LOCAL_DIFFERENCE
+        possible = self._leaders() if compared else self._possible(decision)
+        found = pose(self._session.belief, decision.object_index)
         yaws_deg = tuple(float(wrap360(self._orientations[-1] - azimuth_deg)) for azimuth_deg in found.azimuth_deg)
-        return {
-            "yaw_deg": yaws_deg[0] if len(yaws_deg) == 1 else None,
-            "yaw_sigma_deg": found.sigma_deg,
-            "yaw_set_deg": yaws_deg,
-            "period_deg": found.period_deg,
-        }
-
-    def answer(self, ranked: Ranked, end: Finish, *, travelled_deg: float = 0.0, seconds: float = 0.0) -> Identified:
-        answer = super().answer(ranked, end, travelled_deg=travelled_deg, seconds=seconds)
-        decision = self.decision
-        threshold = decision.open_set_threshold
         return replace(
             answer,
-            name=None if decision.outcome is hbr.Outcome.UNKNOWN else answer.name,
-            outcome=decision.outcome,
-            reason=answer.reason if self._verification is None else decision.reason,
-            possible=self._possible(decision),
-            **self.pose_fields(decision.object_index),
-            confidence=decision.probability if decision.outcome is hbr.Outcome.FOUND else None,
+            name=None if outcome is hbr.Outcome.UNKNOWN else possible[0] if compared else answer.name,
+            outcome=outcome,
+            reason=decision.reason if compared or self._session.verification else answer.reason,
+            possible=possible,
+            yaw_deg=yaws_deg[0] if len(yaws_deg) == 1 else None,
+            yaw_sigma_deg=found.sigma_deg,
+            yaw_set_deg=yaws_deg,
+            period_deg=found.period_deg,
+            confidence=decision.probability if outcome is hbr.Outcome.FOUND else None,
             min_confidence=decision.min_confidence,
             open_set_score=decision.open_set_score,
             open_set_threshold=threshold if isfinite(threshold) else None,
         )
 
+    def _leaders(self) -> tuple[str, ...]:
+        """Return the objects that the comparison of the two leaders leaves possible."""
+        found = self._session.comparison
+        assert found is not None
+        return tuple(self.names[one] for one in (found.leaders if found.winner is None else (found.winner,)))
+
     def _possible(self, decision: hbr.StopDecision) -> tuple[str, ...]:
         """Return the possible objects: the likeliest, which together reach the confidence that ends a search."""
         if decision.outcome is hbr.Outcome.UNKNOWN:
             return ()
-        belief = self._session.belief
-        probability = belief.posterior(self._session.rule.beta).sum(axis=1)
-        order = np.lexsort((-belief.scores(), -probability))
+        probability, _, order = self._ordered()
         count = 1
         if decision.outcome is hbr.Outcome.AMBIGUOUS:
             count += int((np.cumsum(probability[order]) < decision.min_confidence).sum())
-        names = belief.index.views.object_names
-        return tuple(names[j] for j in belief.index.object_index[order[:count]].tolist())
+        return tuple(self.names[j] for j in self._session.belief.index.object_index[order[:count]].tolist())
 
 
 class ArcSearch(DenseSearch):
-    """The bench's own search in motion (`hbr.dense.arc`): each frame has a weight for its share of new evidence.
+    """The bench's own search in motion (`hbr.dense.arc`): each frame has a weight for its share of new evidence."""
 
-    `is_new_decision` says whether the last frame led to a decision; between decisions the last one stays.
-    """
+    in_motion = True
+    _way = 0.0
+    """The direction of the last rotation; 0 before the first one."""
 
-    def __init__(
-        self,
-        index: hbr.DenseIndex,
-        rule: hbr.StoppingRule,
-        config: RigConfig,
-        strategy: DenseStrategy,
-        *,
-        seed: int,
-        top: int,
-    ) -> None:
-        super().__init__(index, rule, config, strategy, seed=seed, top=top)
-        self._arc = self._session = ArcSession(index, _arc_rule(index, rule))
-        self._step: Rotate | Finish | None = None
-
-    @property
-    def is_new_decision(self) -> bool:
-        return self._arc.is_new_decision
-
-    def frame_used(self, number: int, azimuth_deg: float, seconds: float, rejected: int) -> FrameUsed:
-        """Return the event of the last frame; ``number`` counts the views from 0."""
-        present = self._arc.present
-        name = self._arc.belief.index.views.object_names[present.object_index]
-        return FrameUsed(number, azimuth_deg, seconds, rejected, name, present.probability, present.outcome)
-
-    def _decide(self, ranked: Ranked, table_deg: float) -> Rotate | Finish:  # noqa: ARG002
-        if self._step is None or self.is_new_decision:
-            way = float(np.sign(self._step.rotation_deg)) if isinstance(self._step, Rotate) else 0.0
-            self._step = self._next(table_deg, *reachable_arcs(self._config, table_deg, way))
-        return self._step
-
-
-@lru_cache(maxsize=4)
-def _arc_rule(index: hbr.DenseIndex, rule: hbr.StoppingRule) -> ArcRule:
-    """Return the rule of searches in motion; it is fitted once for each model."""
-    return calibrate_arc_rule(index, rule)
-
-
-def begin_search(
-    model: Model | hbr.ViewIndex,
-    config: RigConfig,
-    strategy: Strategy | DenseStrategy | str | None = None,
-    *,
-    seed: int = 0,
-    top: int = SHOWN,
-) -> tuple[Search, Strategy | DenseStrategy]:
-    """Begin a search, and return it with its strategy.
-
-    Parameters
-    ----------
-    model
-        What is enrolled.
-    config
-        Of the bench.
-    strategy
-        Its name, or a strategy object. The default is ``dense`` if the model is for it, else ``ahbr``.
-    seed
-        For strategies that draw random numbers.
-    top
-        The number of candidates that events name.
-
-    Raises
-    ------
-    CatalogError
-        Nothing is enrolled.
-    UsageError
-        There is no such strategy, or the model is not for it.
-    """
-    if isinstance(model, hbr.ViewIndex):
-        model = Model(model)
-    chosen = strategy_for(model.descriptor) if strategy is None else strategy
-    if isinstance(chosen, str):
-        chosen = strategy_named(chosen)
-    if not len(model.views):
-        raise CatalogError("The catalog is empty.", next_step="Enroll at least one object: rig enroll NAME.")
-    wanted = descriptor_for(chosen)
-    if isinstance(model.index, hbr.DenseIndex) and is_dense(chosen) and model.rule is not None:
-        if wanted == model.descriptor:
-            if isinstance(chosen, Arc):
-                return ArcSearch(model.index, model.rule, config, chosen, seed=seed, top=top), chosen
-            return DenseSearch(model.index, model.rule, config, chosen, seed=seed, top=top), chosen
-    elif isinstance(model.index, hbr.ViewIndex) and not is_dense(chosen):
-        return HoughSearch(model.index, config, cast(Strategy, chosen), seed=seed, top=top), chosen
-    raise UsageError(
-        f"The strategy {chosen.name!r} needs views by {wanted}; this model has views by {model.descriptor}.",
-        next_step=f"Load it with rig.search.model.load_model(catalog, descriptor={wanted!r}), or use another strategy.",
-    )
+    def _decide(self, table_deg: float) -> Rotate | Finish:
+        if not self.is_new_decision:
+            return self.step
+        step = self._next(table_deg, *reachable_arcs(self._config, table_deg, self._way))
+        self._way = float(np.sign(step.rotation_deg)) if isinstance(step, Rotate) else 0.0
+        return step

@@ -2,8 +2,7 @@
 
 `identify` asks one strategy after every view. Five come with the rig; others are passed as an object, or plug in by
 name through the entry-point group `rig.strategies`. The attribute ``descriptor`` of a strategy selects its search:
-without it, the paper's (`Strategy`, `SearchState`); with the bench's own descriptor, the dense search (`DenseStrategy`,
-`DenseSearchState`).
+without it, the paper's (`SearchState`); with the bench's own descriptor, the dense search (`DenseSearchState`).
 
 Decision: docs/decisions/0017.
 """
@@ -12,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from difflib import get_close_matches
 from importlib.metadata import entry_points
-from typing import Final, Protocol, TypeGuard
+from typing import Final, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +19,7 @@ from numpy.typing import NDArray
 import hbr
 from hbr import Outcome, StopReason
 from hbr.core.angles import wrap180
-from hbr.dense.arc import ARC_DEG, STEP_DEG, NextArc, next_arc
+from hbr.dense.arc import ARC_DEG, STEP_DEG
 from hbr.dense.next_view import NextBestView
 from rig.config import IdentifyConfig, RigConfig
 from rig.core.errors import UsageError
@@ -40,6 +39,8 @@ ALONE: Final = 0.95
 
 _REVISIT_DEG: Final = 10.0
 _DRAWS: Final = 20
+
+State = TypeVar("State", contravariant=True)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -143,38 +144,24 @@ class Finish:
     note: str = ""
 
 
-class Strategy(Protocol):
-    """A strategy of the paper's search: decides after each view."""
+class Strategy(Protocol[State]):
+    """Decides after each view.
+
+    A strategy of the dense search also has the attribute ``descriptor``: that of its views, ``edges+colours``. With the
+    attribute ``in_motion`` it chooses arcs, on which every frame is a view.
+    """
 
     @property
     def name(self) -> str:
         """The name that selects it, and that a saved run stores."""
         ...
 
-    def next(self, state: SearchState) -> Rotate | Finish:
+    def next(self, state: State) -> Rotate | Finish:
         """Return the rotation to the next view, or the end. The same state and draws give the same answer."""
         ...
 
 
-class DenseStrategy(Protocol):
-    """A strategy of the dense search: decides after each view."""
-
-    @property
-    def name(self) -> str:
-        """The name that selects it, and that a saved run stores."""
-        ...
-
-    @property
-    def descriptor(self) -> str:
-        """The descriptor of its views: ``edges+colours``, the bench's own."""
-        ...
-
-    def next(self, state: DenseSearchState) -> Rotate | Finish:
-        """Return the rotation to the next view, or the end. The same state and draws give the same answer."""
-        ...
-
-
-AnyStrategy = Strategy | DenseStrategy
+AnyStrategy = Strategy[SearchState] | Strategy[DenseSearchState]
 
 
 def descriptor_for(strategy: AnyStrategy) -> str:
@@ -182,9 +169,9 @@ def descriptor_for(strategy: AnyStrategy) -> str:
     return str(getattr(strategy, "descriptor", PAPER_DESCRIPTOR))
 
 
-def is_dense(strategy: AnyStrategy) -> TypeGuard[DenseStrategy]:
-    """Whether a strategy decides on the dense search."""
-    return descriptor_for(strategy) != PAPER_DESCRIPTOR
+def is_in_motion(strategy: AnyStrategy) -> bool:
+    """Return whether a strategy chooses arcs, on which every frame is a view."""
+    return bool(getattr(strategy, "in_motion", False))
 
 
 def strategy_for(descriptor: str) -> AnyStrategy:
@@ -307,26 +294,17 @@ class Dense:
         if not len(state.rotations_deg):
             return Finish(StopReason.NO_ROTATION_LEFT)
         best = state.session.next_best_view(state.rotations_deg, state.seconds)
-        return _rotate(state, best, best.similarity)
+        return _rotate(state, best)
 
 
-class Arc:
+class Arc(Dense):
     """The bench's own in motion: rotates along the most informative arc, and decides again while the table rotates."""
 
     name = "arc"
-    descriptor = BENCH_DESCRIPTOR
-
-    def next(self, state: DenseSearchState) -> Rotate | Finish:
-        if state.decision.outcome is not Outcome.CONTINUE:
-            return Finish(state.decision.reason)
-        if not len(state.rotations_deg):
-            return Finish(StopReason.NO_ROTATION_LEFT)
-        belief, beta = state.session.belief, state.session.rule.beta
-        best = next_arc(belief, beta=beta, rotations_deg=state.rotations_deg, seconds=state.seconds)
-        return _rotate(state, best, None)
+    in_motion = True
 
 
-def _rotate(state: DenseSearchState, best: NextBestView | NextArc, similarity: NDArray[np.float64] | None) -> Rotate:
+def _rotate(state: DenseSearchState, best: NextBestView) -> Rotate:
     names = state.session.belief.index.views.object_names
     if best.pair is not None:
         reason = RotationReason.SEPARATES_CANDIDATES
@@ -341,7 +319,7 @@ def _rotate(state: DenseSearchState, best: NextBestView | NextArc, similarity: N
             tuple(best.rotations_deg.tolist()),
             tuple(best.confusion.tolist()),
             tuple(best.cost.tolist()),
-            None if similarity is None else tuple(similarity.tolist()),
+            None if best.similarity is None else tuple(best.similarity.tolist()),
         ),
     )
 

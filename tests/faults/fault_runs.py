@@ -23,6 +23,7 @@ from rig.events.events import Accepted, Enrolled, Event, Identified
 from rig.plans.enroll import enroll
 from rig.plans.identify import identify
 from rig.safety.saved_state import MemoryStore
+from rig.search.model import Model, model_of
 from sim.bench import ShelfOperator, open_sim_bench
 from sim.devices import SimDevices
 from sim.faults import Fault, Faults
@@ -161,13 +162,13 @@ def identification(rig: Rig, *faults: str) -> Outcome:
 
 
 @cache
-def known_views() -> hbr.ViewIndex:
+def known_views() -> Model:
     """Return the views of three objects, enrolled without a fault."""
     with TemporaryDirectory() as folder, new_rig(Path(folder), seed=1) as rig, rig.opened() as (bench, catalog):
         for name in KNOWN:
             for _ in enroll(bench, catalog, name, views=6):
                 pass
-        return hbr.ViewIndex(catalog.views().views)
+        return model_of(catalog.views().views)
 
 
 def check_stored(

@@ -9,6 +9,7 @@ import pytest
 
 from hbr import Belief, DenseIndex, Outcome, StopDecision, StopReason, Views, update_belief
 from hbr.dense.calibration import calibrate_stopping_rule
+from hbr.dense.enrolled_views import answered
 from hbr.dense.local_difference import LocalView
 from hbr.dense.open_set import fitted_before
 from hbr.dense.pixel_fit import Pixels, fit
@@ -142,7 +143,8 @@ def test_the_leader_is_compared_at_its_pose_with_the_better_segmentation(index: 
         asked[leader] = list(azimuths_deg)
         return [replace(painted(leader), azimuth_deg=azimuth_deg) for azimuth_deg in azimuths_deg]
 
-    found = verify(so_far, 2, lambda _: [painted(9), painted(2)], enrolled)
+    found = answered(verify(so_far, 2, lambda _: [painted(9), painted(2)]), enrolled)
+    assert found is not None
     assert len(asked) == 4
     assert np.allclose(np.sort(asked[2]), np.sort(views.azimuth_deg[rows]), atol=15)
     assert found.object_index == 2

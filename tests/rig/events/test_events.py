@@ -42,7 +42,7 @@ from rig.plans.record import ResultRecorder
 from rig.plans.similar_objects import similar_objects
 from rig.plans.tray import TrayItem, enroll_tray
 from rig.safety.gyro_rotation import Stillness
-from rig.search.model import load_model
+from rig.search.model import load_model, model_of
 from rig.views.capture import MotionEvidence, ViewEvidence
 
 TEXT = events_page()
@@ -139,7 +139,7 @@ def test_every_event_that_the_plans_emit_is_as_documented(simulated, tmp_path):
         views = catalog.views().views
         seen |= {check_event(similar_objects(views, name)) for name in ("dice", "lamp")}
         recorder = ResultRecorder(tmp_path, s.bench, clock=s.bench.clock, catalog_version=catalog.version)
-        for event in recorder.stream(identify(s.bench, hbr.ViewIndex(views), strategy="sweep")):
+        for event in recorder.stream(identify(s.bench, model_of(views), strategy="sweep")):
             seen.add(check_event(event))
         s.operator.next_object = "radio"  # not enrolled: the dense search weighs its rotations, and ends
         reported = [event_dict(event) for event in identify(s.bench, load_model(catalog))]

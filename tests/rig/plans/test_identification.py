@@ -14,6 +14,7 @@ from rig.core.errors import (
 from rig.events.events import Accepted, Decided, Identified, Moved, Ranked
 from rig.plans.enroll import enroll
 from rig.plans.identify import identify
+from rig.search.model import model_of
 from sim.bench import ShelfOperator, open_sim_bench
 from sim.objects.shelf import shelf
 from sim.world import World
@@ -31,7 +32,7 @@ def three_enrolled(tmp_path_factory):
     ):
         for name in ("mug-dots", "lamp", "toy-car"):
             list(enroll(bench, catalog, name, views=VIEWS))
-        return hbr.ViewIndex(catalog.views().views)
+        return model_of(catalog.views().views)
 
 
 @pytest.fixture
@@ -61,16 +62,16 @@ def test_object_in_any_orientation_is_found_with_the_right_pose(shelf_of_three):
 
 
 def test_each_ranking_follows_from_the_accepted_images(shelf_of_three):
-    s, index = shelf_of_three
+    s, model = shelf_of_three
     s.operator.next_object = "lamp"
     x, y, width, height = s.bench.config.view.roi
     queries, orientations = [], []
-    for event in identify(s.bench, index):
+    for event in identify(s.bench, model):
         if isinstance(event, Accepted):
             queries.append(hbr.describe(event.image_bgr[y : y + height, x : x + width]))
             orientations.append(event.azimuth_deg)
         if isinstance(event, Ranked):
-            again = hbr.retrieve(np.array(queries), np.array(orientations), index)
+            again = hbr.retrieve(np.array(queries), np.array(orientations), model.index)
             assert [c.name for c in event.candidates] == list(again.names)
             assert [c.score for c in event.candidates] == pytest.approx(list(again.scores / len(queries)), abs=1e-3)
             assert event.margin == pytest.approx(hbr.score_margin(again, np.array(queries)) / len(queries), abs=1e-3)
@@ -124,4 +125,4 @@ def test_loose_platter_ends_an_identification_during_the_move(shelf_of_three):
 def test_empty_catalog_is_reported_before_anything_moves(simulated):
     s = simulated()
     with pytest.raises(CatalogError, match="empty"):
-        next(identify(s.bench, hbr.ViewIndex(hbr.Views.empty())))
+        next(identify(s.bench, model_of(hbr.Views.empty())))

@@ -21,7 +21,7 @@ from rig.core.errors import (
 from rig.events.events import Accepted, Enrolled, Moved, Rejected, Started, event_dict
 from rig.plans.enroll import enroll
 from rig.plans.identify import identify
-from rig.search.model import load_model
+from rig.search.model import load_model, model_of
 
 VIEWS = 8
 
@@ -295,7 +295,7 @@ def test_events_depend_on_nothing_but_the_seed(simulated, tmp_path):
         s = simulated(seed=seed)
         with Catalog.open(tmp_path / folder, clock=s.bench.clock) as catalog:
             events = [event_dict(e) for e in enroll(s.bench, catalog, "toy-car", views=3)]
-            return events + [event_dict(e) for e in identify(s.bench, hbr.ViewIndex(catalog.views().views))]
+            return events + [event_dict(e) for e in identify(s.bench, model_of(catalog.views().views))]
 
     events = run(5, "a")
     assert events == run(5, "b")

@@ -3,14 +3,13 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-import hbr
 from rig.catalog import Catalog
 from rig.config import load_config
 from rig.events.events import Event
 from rig.plans.enroll import enroll
 from rig.plans.identify import identify
 from rig.plans.photograph_table import photograph_table
-from rig.search.model import load_model
+from rig.search.model import load_model, model_of
 from rig.search.saved_run import RunWriter
 from sim.bench import ShelfOperator, open_sim_bench
 from sim.objects.shelf import shelf
@@ -32,7 +31,7 @@ def saved_runs(home: Path, strategies: Sequence[str] = ("ahbr", "hbr", "sweep", 
         list(photograph_table(bench))
         for name in ("mug-white", "mug-star", "lamp"):
             list(enroll(bench, catalog, name, views=6))
-        index = hbr.ViewIndex(catalog.views().views)
+        index = model_of(catalog.views().views)
         for number, strategy in enumerate(strategies):
             operator.next_object, operator.yaw_deg = "mug-star", 40.0 * number
             with RunWriter(home / strategy, bench, index) as writer:

@@ -27,6 +27,7 @@ from rig.events.events import (
     event_dict,
     event_of,
 )
+from rig.search.model import model_of
 from rig.search.replay import check
 from rig.search.saved_run import RunWriter, load_run
 from tests.rig.search.run_samples import saved_runs
@@ -326,9 +327,9 @@ def test_folder_without_a_run_or_not_empty_is_rejected(saved, tmp_path, simulate
     folder, _ = saved["ahbr"]
     bench = simulated().bench
     with pytest.raises(UsageError, match="not empty"):
-        RunWriter(folder, bench, hbr.ViewIndex(hbr.Views.empty()))
+        RunWriter(folder, bench, model_of(hbr.Views.empty()))
     with pytest.raises(UsageError, match="cannot be saved"):
-        RunWriter(Path("/proc/run"), bench, hbr.ViewIndex(hbr.Views.empty()))
+        RunWriter(Path("/proc/run"), bench, model_of(hbr.Views.empty()))
 
 
 def test_number_that_was_not_finite_is_read_as_nan(saved):

@@ -14,9 +14,11 @@ from rig.config import IdentifyConfig, RigConfig
 from rig.core.errors import CatalogError, UsageError
 from rig.events.events import RotationReason
 from rig.search import strategies
-from rig.search.session import Search, begin_search
+from rig.search.model import begin_search, model_of
+from rig.search.session import Search
 from rig.search.strategies import Finish, Rotate, SearchState, Strategy, end_by_margin, strategy
 from tests.fuzzing import examples
+from tests.rig.search.views import seen
 
 PAPERS = ["ahbr", "hbr", "sweep", "random"]
 
@@ -33,7 +35,7 @@ def model(objects: int = 4, views: int = 12) -> hbr.Views:
 
 def searching(known: hbr.Views, chosen: Strategy | str, *, seed: int = 0, top: int = 5, **config: float) -> Search:
     settings = RigConfig(identify=IdentifyConfig(**config))  # type: ignore[arg-type]
-    return begin_search(hbr.ViewIndex(known), settings, chosen, seed=seed, top=top)[0]
+    return begin_search(model_of(known), settings, chosen, seed=seed, top=top)[0]
 
 
 def run(chosen: Strategy | str, *, seed: int = 0, **config: float) -> tuple[list[Rotate], Finish, list[float]]:
@@ -44,7 +46,7 @@ def run(chosen: Strategy | str, *, seed: int = 0, **config: float) -> tuple[list
     while True:
         taken_deg.append(here_deg)
         levels = rng.integers(0, 8, 144, np.uint8)
-        _, step = search.add(levels, here_deg % 360, table_deg=-here_deg)
+        _, step = search.add(seen(levels), here_deg % 360, table_deg=-here_deg)
         if isinstance(step, Finish):
             return rotations, step, taken_deg
         rotations.append(step)
@@ -81,7 +83,7 @@ def test_large_margin_ends_all_but_the_passive_search(name, views):
     known = model()
     search = searching(known, name, max_views=5)
     for number in range(views):
-        ranked, step = search.add(known.descriptors[0], 0.0, table_deg=0.0)
+        ranked, step = search.add(seen(known.descriptors[0]), 0.0, table_deg=0.0)
         assert isinstance(step, Finish) == (number == views - 1)
     assert ranked.candidates[0].name == "o0"
 
@@ -90,7 +92,7 @@ def test_score_below_min_score_ends_no_search_early():
     known = model()
     search = searching(known, "sweep", max_views=5, min_score=1.0, margin=0.0)
     other = np.roll(known.descriptors[0], 1)
-    steps = [search.add(other, 0.0, table_deg=0.0)[1] for _ in range(5)]
+    steps = [search.add(seen(other), 0.0, table_deg=0.0)[1] for _ in range(5)]
     assert [isinstance(step, Finish) for step in steps] == [False] * 4 + [True]
 
 
@@ -98,7 +100,7 @@ def test_top_limits_the_named_candidates():
     known = model(objects=9)
     for top in (1, 3, 9):
         search = searching(known, "ahbr", list_length=200, top=top)
-        ranked, _ = search.add(known.descriptors[0], 0.0, table_deg=0.0)
+        ranked, _ = search.add(seen(known.descriptors[0]), 0.0, table_deg=0.0)
         assert len(ranked.candidates) == top
 
 

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-import hbr
 from rig.catalog import Catalog
 from rig.core.errors import DeviceSilent
 from rig.events.events import Failed, Identified, Waiting
 from rig.plans.enroll import enroll
 from rig.plans.watch import watch
+from rig.search.model import model_of
 from rig.views.object_presence import TableWatcher, is_empty_table
 from sim.objects.shelf import shelf
 
@@ -129,7 +129,7 @@ def test_watch_identifies_objects_and_continues_after_a_failure(simulated, tmp_p
     with Catalog.open(tmp_path, clock=s.bench.clock) as catalog:
         for name in ("toy-car", "book-night"):
             list(enroll(s.bench, catalog, name, views=6))
-        index = hbr.ViewIndex(catalog.views().views)
+        index = model_of(catalog.views().views)
     s.world.put(None)
     s.bench.operator = TableWatcher(s.bench)
     upcoming = [("toy-car", 30.0), ("radio", 0.0), ("book-night", 200.0)]

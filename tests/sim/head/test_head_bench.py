@@ -2,7 +2,6 @@
 
 import pytest
 
-from hbr import ViewIndex
 from hbr.core.angles import wrap180
 from rig.catalog import Catalog
 from rig.config import load_config
@@ -14,6 +13,7 @@ from rig.motion.turntable import Turntable
 from rig.plans.enroll import enroll
 from rig.plans.identify import identify
 from rig.safety.supervisor import TableState
+from rig.search.model import model_of
 from sim.bench import ShelfOperator, open_sim_bench
 from sim.devices import SimDevices
 from sim.objects.shelf import shelf
@@ -46,7 +46,7 @@ def test_object_is_enrolled_and_found_with_the_heads_gyro_alone(on_head, tmp_pat
             assert abs(wrap180(azimuth_deg - true_deg)) < 4.0  # an uncalibrated gyro: 1 % of a revolution
         assert any(abs(wrap180(a + round(-a / 90) * 90)) > 0.01 for a, _ in truth_deg)  # and not the encoder's stops
         s.operator.next_object, s.operator.yaw_deg = "mug-dots", 90.0
-        *_, answer = identify(s.bench, ViewIndex(catalog.views().views))
+        *_, answer = identify(s.bench, model_of(catalog.views().views))
     assert answer.name == "mug-dots"
     health = s.bench.head.health()
     assert (health["lost"], health["crc_errors"], health["missed"]) == (0, 0, 0)
