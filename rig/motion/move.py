@@ -56,4 +56,6 @@ def equivalent_within(target_deg: float, rest_deg: float, limits_deg: tuple[floa
     if low <= target_deg <= high:
         return target_deg
     revolutions = range(ceil((low - target_deg) / 360), floor((high - target_deg) / 360) + 1)
-    return min((target_deg + 360 * k for k in revolutions), key=lambda angle: abs(angle - rest_deg), default=None)
+    # clamped: a sum can be rounded to an angle just beyond a limit
+    angles_deg = (min(max(target_deg + 360 * k, low), high) for k in revolutions)
+    return min(angles_deg, key=lambda angle_deg: abs(angle_deg - rest_deg), default=None)

@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from rig.core.errors import DeviceSilent, FaultLatched, LimitExceeded, MotionTimeout, NoProgress, NotReady, Stalled
@@ -158,6 +158,7 @@ def test_target_beyond_the_limits_is_rejected_before_anything_moves():
 
 @examples(10)
 @given(target=st.floats(-3000, 3000), low=st.floats(-800, 0), span=st.floats(360, 1500))
+@example(target=-5e-324, low=0.0, span=360.0)
 def test_within_reach_returns_an_equivalent_angle(target, low, span):
     high = low + span
     if high < 0:
