@@ -10,12 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration import pictures
-from calibration.procedure import Ask, Evaluation, Progress
+from calibration.procedure import Ask, Evaluation
 from rig.bench import Bench
 from rig.calibrations import CalibrationResult, RejectionCode
 from rig.charts.xy import LIMIT, MEASURED, MODEL, OTHER, Axis, Chart, Series
 from rig.core.phrases import angle_words, percent
 from rig.events.events import Event
+from rig.jobs.desk import Progress
 from rig.motion.turntable import Turntable
 from rig.plans.capture import capture, moved
 from rig.views.capture import Viewer

@@ -16,13 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration import pictures
-from calibration.procedure import Ask, Evaluation, Measured, Procedure, Progress
+from calibration.procedure import Ask, Evaluation, Measured, Procedure
 from rig.bench import Bench
 from rig.calibrations import CalibrationResult, RejectionCode
 from rig.charts.xy import MODEL, Axis, Chart, Series
 from rig.core.phrases import percent
 from rig.devices.camera import CameraLocks
 from rig.events.events import plain
+from rig.jobs.desk import Progress
 from rig.views.capture import ImageQuality
 
 NOISE, FLAT_FIELD, DRIFT, SHARPNESS = "camera.noise", "camera.flat_field", "camera.drift", "camera.sharpness"

@@ -26,11 +26,12 @@ from numpy.typing import NDArray
 from calibration import pictures
 from calibration.camera_light import BOARD
 from calibration.camera_time_fit import FEWEST_FRAMES, Pass, bands_of, fit
-from calibration.procedure import Ask, Evaluation, Measured, Procedure, Progress, lower_end, returning
+from calibration.procedure import Ask, Evaluation, Measured, Procedure, lower_end, returning
 from rig.bench import Bench
 from rig.calibrations import CalibrationResult, RejectionCode
 from rig.charts.xy import MEASURED, MODEL, Axis, Chart, Series
 from rig.core.phrases import filled
+from rig.jobs.desk import Progress
 from rig.motion.trajectory import SLIP_DEG
 from rig.motion.turntable import Flight, Turntable
 from rig.views.description import within

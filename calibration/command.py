@@ -1,20 +1,17 @@
 """`rig calibrate ...`."""
 
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from calibration.outcome import as_json, in_force, outcome_text, plain_value, stored_results
+from calibration.outcome import as_json, plain_value, stored_results
 from rig.cli.ui.command import command
 from rig.cli.ui.settings import Settings
 
 if TYPE_CHECKING:
-    from calibration.procedure import Ask, Procedure
-    from rig.bench import Bench
-    from rig.calibrations import CalibrationResult
+    from calibration.procedure import Procedure
     from rig.views.charuco_board import Board
 
 EXIT_QUALITY = 6
@@ -301,60 +298,15 @@ def run(settings: Settings, *procedures: "Procedure") -> None:
     typer.Exit
         With code 6 if a calibration did not pass.
     """
-    from rig.bench import calibrate
-    from rig.calibrations import CalibrationStore
-    from rig.cli.catalog.catalog import report_other_regions
+    from calibration.jobs import calibrated
+    from rig.cli.ui.desk import CommandDesk
 
-    with settings.open_bench() as bench:
-        store = CalibrationStore(bench.config.calibration_path(bench.name))
-        for procedure in procedures:
-            for result in _results(settings, bench, procedure):
-                path = store.add(result)
-                then = ", in force from now on." if result.passed else "; earlier results stay in force."
-                outcome = {"event": "calibrated", "passed": result.passed, "id": result.id, "file": str(path)}
-                settings.say(f"{outcome_text(result)}\nStored in {path}{then}", {**outcome, **as_json(result)})
-                if not result.passed:
-                    raise typer.Exit(EXIT_QUALITY)
-            reported, region = bench.calibration_findings, bench.config.view.roi
-            calibrate(bench, store)
-            for finding in bench.calibration_findings:
-                if finding not in reported:  # a setting in the configuration takes precedence
-                    print(f"Note: {finding}.", file=sys.stderr)
-            if bench.config.view.roi != region and (catalog := settings.existing_catalog()):
-                with catalog:
-                    report_other_regions(settings, catalog, bench)
+    desk = CommandDesk(settings)
+    if not desk.run(calibrated(desk, procedures)):
+        raise typer.Exit(EXIT_QUALITY)
 
 
 def _board(columns: int, rows: int, square_mm: float) -> "Board":
     from rig.views.charuco_board import Board
 
     return Board(columns, rows, square_mm, square_mm * MARKER_SHARE)
-
-
-def _results(settings: Settings, bench: "Bench", procedure: "Procedure") -> "Iterator[CalibrationResult]":
-    """Report the events of a procedure as they come, and yield its results."""
-    from contextlib import closing
-
-    from calibration.procedure import Ask, Progress
-    from rig.calibrations import CalibrationResult
-    from rig.events.events import event_dict, plain
-    from rig.events.lines import line
-
-    required = [in_force(bench, name) for name in procedure.requires]
-    with closing(procedure.live(bench, *required)) as events:
-        for event in events:
-            if isinstance(event, CalibrationResult):
-                yield event
-            elif isinstance(event, Ask):
-                _ask(event, with_picture=not settings.json)
-            elif isinstance(event, Progress):
-                settings.say(event.words, {"event": "progress", **plain(event)})
-            else:
-                settings.say(line(event), event_dict(event))
-
-
-def _ask(request: "Ask", *, with_picture: bool) -> None:
-    """Print a request to the operator; at a terminal, wait for Enter."""
-    print(f"{request.words}{request.picture if with_picture else ''}", file=sys.stderr)
-    if sys.stdin.isatty():
-        typer.prompt("Then press Enter", default="", show_default=False, err=True)

@@ -18,11 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
-from calibration.procedure import Evaluation, Measured, Procedure, Progress, require_at_least
+from calibration.procedure import Evaluation, Measured, Procedure, require_at_least
 from rig.bench import Bench
 from rig.calibrations import CalibrationResult, RejectionCode
 from rig.charts.xy import MODEL, Axis, Chart, Series
 from rig.core.phrases import number, percent
+from rig.jobs.desk import Progress
 
 NAME = "imu.noise"
 

@@ -17,18 +17,11 @@ from rig.calibrations.rejection import rejection
 from rig.charts.xy import Chart
 from rig.core.errors import LimitExceeded, UsageError
 from rig.events.events import Event
+from rig.jobs.desk import Progress
 from rig.motion.move import Move
 from rig.motion.turntable import Turntable
 
 Plot = Callable[[CalibrationResult], Chart | None]
-
-
-@dataclass(frozen=True, slots=True)
-class Progress:
-    """Progress of a measurement: ``share`` from 0 to 1, and ``words`` about the last step."""
-
-    share: float
-    words: str
 
 
 @dataclass(frozen=True, slots=True)

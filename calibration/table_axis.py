@@ -27,10 +27,11 @@ from calibration import camera_model
 from calibration.board_views import STANDS as ALL_STANDS
 from calibration.board_views import BoardView, as_json, plot_views, points, reject_loose_board, span_deg, take_views
 from calibration.camera_model import PARAMETERS, matrix_of
-from calibration.procedure import Evaluation, Measured, Procedure, Progress
+from calibration.procedure import Evaluation, Measured, Procedure
 from rig.bench import Bench
 from rig.calibrations import CalibrationResult, Estimate, RejectionCode
 from rig.charts.xy import LIMIT, MODEL, Axis, Chart, Series
+from rig.jobs.desk import Progress
 from rig.views.charuco_board import Board
 
 NAME = "table.axis"

@@ -135,10 +135,6 @@ class IdentifyConfig(Section):
             raise ValueError(f"must not be above max_views, which is {max_views}")
         return min_views
 
-    def limited_to(self, max_views: int) -> "IdentifyConfig":
-        """Return these settings with another largest number of views, which the smallest one does not exceed."""
-        return self.model_copy(update={"max_views": max_views, "min_views": min(self.min_views, max_views)})
-
 
 class RigConfig(Section):
     """Everything in `rig.toml`."""
@@ -176,6 +172,12 @@ class RigConfig(Section):
                     f"roi {list(view.roi)} is not within the camera's frame of {camera.width}x{camera.height}"
                 )
         return view
+
+    def with_max_views(self, max_views: int) -> "RigConfig":
+        """Return this configuration with another largest number of views of a search; the smallest is not larger."""
+        identify = self.identify
+        limits = {"max_views": max_views, "min_views": min(identify.min_views, max_views)}
+        return self.model_copy(update={"identify": identify.model_copy(update=limits)})
 
     def catalog_path(self, bench_name: str) -> Path:
         """Return the catalog's folder; by default each bench has its own: simulated and real views do not mix."""

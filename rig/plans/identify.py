@@ -25,12 +25,15 @@ from rig.search.strategies import AnyStrategy, Finish
 from rig.views.capture import Viewer
 from rig.views.description import SearchDescriber
 from rig.views.empty_table import empty_table_status
+from rig.views.object_presence import TableWatcher
 
 
 def identify(
     bench: Bench,
     model: Model,
     *,
+    config: RigConfig | None = None,
+    watcher: TableWatcher | None = None,
     strategy: AnyStrategy | str | None = None,
     seed: int = 0,
     top: int = SHOWN,
@@ -53,6 +56,10 @@ def identify(
         An open bench.
     model
         The enrolled views, from `rig.search.model.load_model` or `rig.search.model.model_of`.
+    config
+        The settings of the search, if they are not those of the bench.
+    watcher
+        Waits until the object is on the table; by default the bench's own operator.
     strategy
         Its name, or a `Strategy` object. The default is the one that the model is for.
     seed
@@ -79,9 +86,10 @@ def identify(
     ViewRejected, MotionTimeout, DeviceFault, DeviceSilent
         See `rig.views.capture` and `rig.motion.turntable`.
     """
-    if strategy is None and flies(bench.config, model):
+    config = config or bench.config
+    if strategy is None and flies(config, model):
         strategy = "arc"
-    search, chosen = begin_search(model, bench.config, strategy, seed=seed, top=top)
+    search, chosen = begin_search(model, config, strategy, seed=seed, top=top)
     if search.in_motion:
         require_camera_time(bench.config)
     viewer = Viewer(bench.camera, bench.config)
@@ -101,11 +109,11 @@ def identify(
     )
     check = partial(check_object, bench, empty_table=empty_table if own is None else own.image_bgr)
     steps = SearchSteps(bench, model, search, viewer, describe, check, top)
-    bench.operator.place(None)
+    (watcher or bench.operator).place(None)
     yield Started(
         "identify",
         None,
-        bench.config.identify.max_views,
+        config.identify.max_views,
         dict(bench.conditions),
         strategy=chosen.name,
         seed=seed,

@@ -5,9 +5,8 @@ from collections import Counter
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
-from enum import StrEnum
 from pathlib import Path
-from typing import Final, Protocol
+from typing import Final
 
 from rig.bench import Bench
 from rig.catalog import Catalog, ObjectSummary, clean_name
@@ -21,9 +20,11 @@ from rig.core.errors import (
     os_errors_as,
 )
 from rig.core.files import read
+from rig.core.phrases import counted
 from rig.events.events import Event, Item, SkipReason
 from rig.motion.scan_speed import takes_in_motion
 from rig.plans.enroll import enroll
+from rig.plans.operator import Choice, Operator, Question, Subject, Unattended
 
 COLUMNS: Final = ("name", "label", "note", "views")
 MAX_FILE_BYTES: Final = 1_000_000
@@ -43,41 +44,6 @@ class TrayItem:
     label: str | None = None
     note: str | None = None
     views: int | None = None
-
-
-class TrayDecision(StrEnum):
-    """The decisions of the operator about an object."""
-
-    PROCEED = "proceed"
-    RESTART = "restart"
-    SKIP = "skip"
-    STOP = "stop"
-
-
-class TrayOperator(Protocol):
-    """An operator: puts the objects on the table and decides whether each is enrolled."""
-
-    def request(self, item: TrayItem, number: int, of: int, interrupted: ObjectSummary | None) -> TrayDecision:
-        """Wait until the object is on the table, and return the decision about it.
-
-        ``interrupted`` is the object's interrupted enrollment, if it has one: PROCEED resumes it, RESTART repeats it
-        because the object was moved.
-        """
-        ...
-
-    def decide_after_error(self, item: TrayItem, error: RigError) -> TrayDecision:
-        """Return whether to try an object again after an error (PROCEED), skip it, or stop the tray."""
-        ...
-
-
-class AutomaticOperator:
-    """An operator that is never asked, for benches that put each object on the same mark by themselves."""
-
-    def request(self, item: TrayItem, number: int, of: int, interrupted: ObjectSummary | None) -> TrayDecision:  # noqa: ARG002
-        return TrayDecision.PROCEED
-
-    def decide_after_error(self, item: TrayItem, error: RigError) -> TrayDecision:  # noqa: ARG002
-        return TrayDecision.STOP
 
 
 def read_tray(path: Path) -> tuple[TrayItem, ...]:
@@ -145,7 +111,7 @@ def enroll_tray(
     items: Sequence[TrayItem],
     *,
     views: int | None = None,
-    operator: TrayOperator | None = None,
+    operator: Operator | None = None,
     fly: bool | None = None,
 ) -> Generator[Event, None, None]:
     """Enroll the objects of a tray one after the other; yields an `Item` before the events of each.
@@ -162,7 +128,7 @@ def enroll_tray(
     views
         Number of views for objects without their own; by default ``enroll.views``.
     operator
-        Puts the objects on the table; by default an `AutomaticOperator`.
+        Puts the objects on the table, and decides whether each is enrolled; by default `Unattended`.
     fly
         Whether the views are taken in motion. The default is ``enroll.mode``; "auto" means in motion if the camera's
         time is calibrated and the cable budget allows a revolution.
@@ -172,7 +138,7 @@ def enroll_tray(
     RigError
         As in `enroll`, if the operator decides to stop.
     """
-    operator = operator or AutomaticOperator()
+    operator = operator or Unattended()
     for number, item in enumerate(items, 1):
         while True:
             known = {summary.name: summary for summary in catalog.known_objects()}.get(item.name)
@@ -180,13 +146,13 @@ def enroll_tray(
             if known is not None and interrupted is None and known.views:
                 yield Item(number, len(items), item.name, "skip", SkipReason.ALREADY_ENROLLED)
                 break
-            decision = operator.request(item, number, len(items), interrupted)
-            if decision is TrayDecision.STOP:
+            decision = operator.choose(next_object(item, number, len(items), interrupted))
+            if decision is Choice.STOP:
                 return
-            if decision is TrayDecision.SKIP:
+            if decision is Choice.SKIP:
                 yield Item(number, len(items), item.name, "skip", SkipReason.OPERATOR)
                 break
-            resume = interrupted is not None and decision is TrayDecision.PROCEED
+            resume = interrupted is not None and decision is not Choice.RESTART
             action = "resume" if resume else "replace" if interrupted else "enroll"
             yield Item(number, len(items), item.name, action)
             try:
@@ -202,14 +168,36 @@ def enroll_tray(
                     fly=takes_in_motion(bench.config, fly, tray=True),
                 )
             except OBJECT_ERRORS as error:
-                decision = operator.decide_after_error(item, error)
-                if decision is TrayDecision.STOP:
+                decision = operator.choose(after_error(error, item))
+                if decision is Choice.STOP:
                     raise
-                if decision is TrayDecision.SKIP:
+                if decision is Choice.SKIP:
                     yield Item(number, len(items), item.name, "skip", SkipReason.ERROR, error.code)
                     break
             else:
                 break
+
+
+def next_object(item: TrayItem, number: int, of: int, interrupted: ObjectSummary | None) -> Question:
+    """Return the question for the next object of a tray; ``interrupted`` is its interrupted enrollment, if any."""
+    label = f" ({item.label})" if item.label else ""
+    others = {Choice.SKIP: "skip", Choice.STOP: "stop"}
+    if interrupted is None:
+        text = f"{number} of {of}: put {item.name}{label} on the table and take your hands away."
+        return Question(Subject.OBJECT, text, {Choice.CONTINUE: "continue", **others})
+    views = counted(interrupted.unfinished_views or 0, "view")
+    text = (
+        f"{number} of {of}: {item.name} has {views} of an interrupted enrollment. You can resume it if the object was "
+        "not moved."
+    )
+    again = {Choice.CONTINUE: "resume", Choice.RESTART: "enroll again because the object was moved"}
+    return Question(Subject.UNFINISHED, text, {**again, **others})
+
+
+def after_error(error: RigError, item: TrayItem) -> Question:
+    """Return the question after an error that concerns one object."""
+    choices = {Choice.CONTINUE: "try again", Choice.SKIP: "skip", Choice.STOP: "stop"}
+    return Question(Subject.FAILURE, f"{item.name}: {error.what}\n{error.next_step}", choices, unattended=Choice.STOP)
 
 
 def _rows(text: str) -> Generator[tuple[int, list[str]], None, None]:

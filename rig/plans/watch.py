@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.bench import Bench
+from rig.config import RigConfig
 from rig.core.errors import NoObject, ViewRejected
 from rig.events.events import Event, Failed, FrameUsed, Waiting, WaitReason
 from rig.motion.turntable import Turntable
@@ -14,12 +15,15 @@ from rig.plans.identify import identify
 from rig.search.model import Model
 from rig.search.session import SHOWN
 from rig.search.strategies import AnyStrategy
+from rig.views.object_presence import TableWatcher
 
 
 def watch(
     bench: Bench,
     model: Callable[[], Model],
     *,
+    config: RigConfig | None = None,
+    watcher: TableWatcher | None = None,
     strategy: AnyStrategy | str | None = None,
     seed: int = 0,
     top: int = SHOWN,
@@ -28,7 +32,7 @@ def watch(
 ) -> Generator[Event, None, None]:
     """Identify one object after the other, until closed; yields a `Waiting` before the events of each.
 
-    The operator brings the objects, or the plan waits for them (`rig.views.object_presence.TableWatcher`). After each
+    The operator brings the objects, or the ``watcher`` waits for them. After each
     answer the table returns to its start angle and unwinds its cable. If no view of an object is acceptable, or no
     object is on the table, the plan yields `Failed` and waits for the next object; any other error ends the plan.
 
@@ -38,7 +42,7 @@ def watch(
         An open bench.
     model
         Returns the model before each search, so that objects enrolled meanwhile are found.
-    strategy, seed, top, empty_table, live
+    config, watcher, strategy, seed, top, empty_table, live
         As for `identify`.
 
     Raises
@@ -54,7 +58,15 @@ def watch(
         started = True
         try:
             answer = yield from identify(
-                bench, model(), strategy=strategy, seed=seed, top=top, empty_table=empty_table, live=live
+                bench,
+                model(),
+                config=config,
+                watcher=watcher,
+                strategy=strategy,
+                seed=seed,
+                top=top,
+                empty_table=empty_table,
+                live=live,
             )
             views = answer.views
         except (NoObject, ViewRejected) as error:

@@ -62,6 +62,8 @@ class RunWriter:
         The bench of the search.
     model
         The enrolled views.
+    config
+        The settings of the search, if they are not those of the bench.
     empty_table : uint8 array (H, W, 3), optional
         See `rig.plans.identify.identify`.
 
@@ -72,7 +74,13 @@ class RunWriter:
     """
 
     def __init__(
-        self, folder: Path, bench: Bench, model: Model, *, empty_table: NDArray[np.uint8] | None = None
+        self,
+        folder: Path,
+        bench: Bench,
+        model: Model,
+        config: RigConfig | None = None,
+        *,
+        empty_table: NDArray[np.uint8] | None = None,
     ) -> None:
         self._folder = folder
         views = model.views
@@ -100,7 +108,7 @@ class RunWriter:
                 "conditions": dict(bench.conditions),
                 "findings": list(bench.findings),
                 "descriptor": {"name": kind.name, "version": kind.version},
-                "config": bench.config.model_dump(mode="json"),
+                "config": (config or bench.config).model_dump(mode="json"),
             }
             write(folder / "run.json", (json.dumps(about, indent=2, default=str) + "\n").encode())
             self._events: TextIO = (folder / "events.jsonl").open("x", encoding="utf-8")
@@ -152,11 +160,18 @@ class RunSaver:
     ``folder`` is the folder of the last search, None before the first one.
     """
 
-    def __init__(self, next_folder: Callable[[], Path] | None, bench: Bench, model: Callable[[], Model]) -> None:
+    def __init__(
+        self,
+        next_folder: Callable[[], Path] | None,
+        bench: Bench,
+        model: Callable[[], Model],
+        config: RigConfig | None = None,
+    ) -> None:
         self.folder: Path | None = None
         self._next_folder = next_folder
         self._bench = bench
         self._model = model
+        self._config = config
         self._writer: RunWriter | None = None
 
     def __enter__(self) -> Self:
@@ -172,7 +187,7 @@ class RunSaver:
         """Store an event. Errors as for `RunWriter.add`."""
         if self._next_folder is not None and isinstance(event, Started):
             folder = self._next_folder()
-            self._writer = RunWriter(folder, self._bench, self._model())
+            self._writer = RunWriter(folder, self._bench, self._model(), self._config)
             self.folder = folder
         if self._writer is not None:
             self._writer.add(event)

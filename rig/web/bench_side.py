@@ -9,12 +9,13 @@ from pydantic import TypeAdapter
 from rig.bench import Bench, open_bench
 from rig.core.clock import SystemClock
 from rig.core.errors import JobNotFound
+from rig.plans.operator import Choice
 from rig.safety.stop_channel import StopListener, listen
 from rig.web.bench_catalog import BenchCatalog
 from rig.web.jobs import JobQueue
 from rig.web.link import Link, Message, answer
 from rig.web.picture import LivePicture
-from rig.web.requests import Choice, Job, JobRequest
+from rig.web.requests import Job, JobRequest
 from rig.web.setup import Setup
 from rig.web.work import WorkFactory, doctor_findings
 from rig.web.worker import BenchWorker

@@ -14,7 +14,8 @@ from rig.core.clock import Clock
 from rig.core.errors import JobNotFound, JobRejected, RigError, StateNotStored, os_errors_as
 from rig.core.files import read, write
 from rig.core.masking import masked
-from rig.web.requests import Choice, EnrollRequest, IdentifyRequest, Job, JobRequest, JobState, Question, TrayRequest
+from rig.plans.operator import Choice
+from rig.web.requests import EnrollRequest, IdentifyRequest, Job, JobRequest, JobState, Question, TrayRequest
 
 FILE: Final = "jobs.json"
 STORED: Final = 200

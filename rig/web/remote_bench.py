@@ -6,9 +6,10 @@ from pathlib import Path
 from typing import Any, Final
 
 from rig.core.clock import Clock, seconds_between
+from rig.plans.operator import Choice
 from rig.safety.stop_channel import StopAnswer, StopRequest, stop_answer
 from rig.web.link import Calls, Message
-from rig.web.requests import Choice, Job, JobRequest
+from rig.web.requests import Job, JobRequest
 
 BOUNDARY: Final = "frame"
 PICTURE_S: Final = 0.08

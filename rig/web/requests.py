@@ -5,6 +5,8 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from rig.plans.operator import Choice
+
 
 class _Request(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -140,15 +142,6 @@ JobRequest = Annotated[
     | CalibrateRequest,
     Field(discriminator="kind"),
 ]
-
-
-class Choice(StrEnum):
-    """An answer of the operator to a question of a job."""
-
-    CONTINUE = "continue"
-    RESTART = "restart"
-    SKIP = "skip"
-    STOP = "stop"
 
 
 class Question(_Request):

@@ -17,11 +17,11 @@ from starlette.requests import HTTPConnection
 from rig.config import RigConfig
 from rig.core.clock import SystemClock
 from rig.core.errors import Forbidden, LoginRequired, RigError, UsageError
+from rig.plans.operator import Choice
 from rig.web.access import LOCAL, Lease, Person, Role, Sessions
 from rig.web.bench_catalog import BenchCatalog
 from rig.web.hub import Hub
 from rig.web.remote_bench import RemoteBench
-from rig.web.requests import Choice
 
 COOKIE: Final = "rig-session"
 API: Final = "/api/v1"

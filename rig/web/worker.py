@@ -19,13 +19,14 @@ from rig.events.events import Accepted, Decided, Event, Started, event_dict, pla
 from rig.events.lines import line
 from rig.motion.motion_model import MotionModel
 from rig.plans.estimate import TimeLeft
+from rig.plans.operator import Choice
 from rig.safety.stop_channel import StopAnswer, StopListener
 from rig.safety.supervisor import stopped
 from rig.web.jobs import JobQueue
 from rig.web.outline import Outliner
 from rig.web.picture import LivePicture, ObservedCamera, jpeg
 from rig.web.problems import problem
-from rig.web.requests import Choice, Job, JobState, Progress, Question
+from rig.web.requests import Job, JobState, Progress, Question
 
 IDLE_S: Final = 0.05
 """Time between two checks of the queue."""

@@ -13,9 +13,10 @@ import typer
 
 from rig.cli.ui.command import command
 from rig.cli.ui.settings import Settings
-from rig.core.errors import RigError, UsageError
+from rig.core.errors import UsageError
 
 if TYPE_CHECKING:
+    from rig.events.events import Event
     from rig.plans.jog import JogKey
 
 _WAIT_S: Final = 0.2
@@ -46,32 +47,21 @@ def jog(
 
     Example: rig jog --step 1 --bench sim
     """
-    from rig.catalog import Action
+    from rig.cli.ui.desk import CommandDesk
     from rig.events.events import event_dict
     from rig.events.lines import line
-    from rig.plans.jog import jog as jog_table
+    from rig.jobs.table import jog as jog_job
 
     if not sys.stdin.isatty():
         raise UsageError("rig jog needs a terminal.", next_step="Use `rig goto ANGLE` in scripts.")
-    angle_deg = None
-    with settings.open_bench(devices=("imu",)) as bench, _keys_at_once():
-        print(f"→ +{step:g}°   ← −{step:g}°   ↑ ↓ step   h home   q end   Ctrl+C stop", file=sys.stderr)
-        events = jog_table(bench, _pressed(), step_deg=step)
-        try:
-            for event in events:
-                if isinstance(event, float):
-                    print(f"step {event:g}°", file=sys.stderr, flush=True)
-                    continue
-                termios.tcflush(sys.stdin, termios.TCIFLUSH)  # a key held down must not rotate the table after its end
-                settings.say(line(event), event_dict(event))
-                angle_deg = getattr(event, "encoder_deg", angle_deg)
-        except RigError as error:
-            settings.note(Action.MOVED, to_deg=angle_deg, ended=error.what)
-            raise
-        finally:
-            events.close()
-    if angle_deg is not None:
-        settings.note(Action.MOVED, to_deg=angle_deg)
+
+    def show(event: "Event") -> None:
+        termios.tcflush(sys.stdin, termios.TCIFLUSH)  # a key held down must not rotate the table after its end
+        settings.say(line(event), event_dict(event))
+
+    desk = CommandDesk(settings)
+    with _keys_at_once():
+        desk.run(jog_job(desk, _pressed(step), step_deg=step), show)
     print("The torque is off. To make this angle home: rig home --here", file=sys.stderr)
 
 
@@ -87,10 +77,11 @@ def _keys_at_once() -> Iterator[None]:
             termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)
 
 
-def _pressed() -> "Iterator[JogKey | None]":
-    """Yield the keys that are pressed, and None while there is none; end with the terminal."""
+def _pressed(step: float) -> "Iterator[JogKey | None]":
+    """Show the keys, and yield those that are pressed, or None while there is none; end with the terminal."""
     from rig.plans.jog import JogKey
 
+    print(f"→ +{step:g}°   ← −{step:g}°   ↑ ↓ step   h home   q end   Ctrl+C stop", file=sys.stderr)
     while True:
         if not select.select([sys.stdin], [], [], _WAIT_S)[0]:
             yield None

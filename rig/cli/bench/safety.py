@@ -42,13 +42,8 @@ def acknowledge(
 
     Example: rig acknowledge --reboot --bench sim
     """
-    with settings.open_bench(devices=("imu",)) as bench:
-        fault = bench.safety.fault
-        state, doubt = bench.safety.acknowledge(reboot=reboot), bench.safety.doubt
-    text = f"Acknowledged: {fault.what}" if fault else "No fault was latched."
-    report = {
-        "acknowledged": fault.model_dump() if fault else None,
-        "state": str(state),
-        "doubt": str(doubt) if doubt else None,
-    }
-    settings.say(f"{text}\nThe table is {state}{f': {doubt}' if doubt else ''}.", report)
+    from rig.cli.ui.desk import CommandDesk
+    from rig.jobs.table import acknowledge as acknowledge_job
+
+    desk = CommandDesk(settings)
+    desk.run(acknowledge_job(desk, reboot=reboot))

@@ -1,19 +1,17 @@
 """`rig goto`, `rig home` and `rig status`."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
 from rig.cli.ui.command import command
 from rig.cli.ui.exit_codes import EXIT_DECLINED
-from rig.cli.ui.prompts import ask_yes_no
 from rig.cli.ui.settings import Settings
-from rig.core.phrases import angle_words, budget_words, signed
+from rig.core.phrases import angle_words, budget_words
 
 if TYPE_CHECKING:
     from rig.core.errors import RigError
-    from rig.motion.turntable import Turntable
     from rig.safety.saved_state import ServerAddress
     from rig.safety.supervisor import Safety
 
@@ -27,14 +25,11 @@ def goto(
 
     Example: rig goto -90 --bench sim
     """
-    from rig.config import MAX_LIMIT_DEG
-    from rig.core.errors import UsageError
-    from rig.motion.turntable import Turntable
+    from rig.cli.ui.desk import CommandDesk
+    from rig.jobs.table import goto as goto_job
 
-    if not abs(angle_deg) <= MAX_LIMIT_DEG:  # also true for nan
-        raise UsageError(f"{angle_deg:g} is not an angle of the table.", next_step="Give the angle in degrees.")
-    with settings.open_bench(devices=("imu",)) as bench, Turntable(bench) as table:
-        _rotate(settings, table, angle_deg)
+    desk = CommandDesk(settings)
+    desk.run(goto_job(desk, angle_deg))
 
 
 @command
@@ -58,49 +53,16 @@ def home(
 
     Example: rig home --revolutions 0 --bench sim
     """
+    from rig.cli.ui.desk import CommandDesk
     from rig.core.errors import UsageError
-    from rig.motion.turntable import Turntable
+    from rig.jobs.table import home as home_job
+    from rig.jobs.table import refer
 
     if here and revolutions is not None:
         raise UsageError("--here and --revolutions cannot be combined.", next_step="Give one of them.")
-    with settings.open_bench(devices=("imu",)) as bench:
-        if here:
-            bench.safety.set_angle(0.0)
-            settings.say("The present angle is home now.", {"table_deg": 0.0})
-            return
-        if revolutions is not None:
-            position_deg = bench.servo.read_state().position_deg
-            angle_deg = bench.safety.angle_reference.with_revolutions(position_deg, revolutions)
-            if abs(angle_deg) > 180.0 and not bench.safety.beyond_limits(angle_deg) and not yes:
-                question = (
-                    f"The table is then at {angle_words(angle_deg, 0)} and rotates by {signed(-angle_deg, 0)}° to "
-                    "home. Rotate it?"
-                )
-                if not ask_yes_no(question):
-                    raise typer.Exit(EXIT_DECLINED)
-            bench.safety.set_revolutions(revolutions)
-        with Turntable(bench) as table:
-            _rotate(settings, table, 0.0)
-
-
-def _rotate(settings: Settings, table: "Turntable", angle_deg: float) -> None:
-    """Rotate the table, and report the events of the rotation."""
-    from rig.catalog import Action
-    from rig.core.errors import RigError
-    from rig.events.events import Event, event_dict
-    from rig.events.lines import line
-    from rig.plans.capture import announced, moved
-
-    def steps() -> Iterator[Event]:
-        yield moved(0, (yield from announced(0, table, angle_deg)))
-
-    try:
-        for event in steps():
-            settings.say(line(event), event_dict(event))
-    except RigError as error:
-        settings.note(Action.MOVED, to_deg=angle_deg, ended=error.what)
-        raise
-    settings.note(Action.MOVED, to_deg=angle_deg)
+    desk = CommandDesk(settings, yes=yes)
+    if not desk.run(refer(desk, here=True) if here else home_job(desk, revolutions=revolutions)) and not here:
+        raise typer.Exit(EXIT_DECLINED)
 
 
 @command

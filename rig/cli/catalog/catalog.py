@@ -1,6 +1,5 @@
 """`rig catalog ...`: the objects of a catalog, one by one."""
 
-import sys
 from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,10 +12,7 @@ from rig.cli.ui.settings import Settings
 from rig.core.phrases import number
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    from rig.bench import Bench
-    from rig.catalog import Catalog, ObjectDetails, ObjectSummary
+    from rig.catalog import ObjectDetails, ObjectSummary
 
 app = typer.Typer(help="Manage the enrolled objects.", no_args_is_help=True)
 
@@ -277,40 +273,6 @@ def stats(settings: Settings) -> None:
         print(
             f"removable    {size_words(found.deleted_image_bytes)} of deleted objects (rig catalog gc), "
             f"{size_words(found.old_image_bytes)} of earlier enrollments (rig catalog gc --old)"
-        )
-
-
-def report_other_regions(settings: Settings, catalog: "Catalog", bench: "Bench") -> None:
-    """Report on stderr if objects were enrolled with another region of the images than the bench uses now.
-
-    Two regions that both follow from a calibration of the axis show the same part of an object. They are not reported.
-    """
-    from rig.calibrations import CalibrationStore
-    from rig.calibrations.store import CALIBRATIONS
-    from rig.catalog.descriptions import described_regions
-
-    known = CalibrationStore(bench.config.calibration_path(bench.name)).history("table.axis")
-    calibrated = {(one.id, tuple(one.settings["view.roi"])) for one in known if "view.roi" in one.settings}
-
-    def is_calibrated(region: Any, calibrations: "Iterable[str]") -> bool:
-        return any((id_, region) in calibrated for id_ in calibrations)
-
-    region = bench.config.view.roi
-    calibrated_now = is_calibrated(region, bench.conditions.get(CALIBRATIONS, ()))
-    others = {
-        other
-        for other, calibrations in described_regions(catalog, settings.bench_name)
-        if other != region and not (calibrated_now and is_calibrated(other, calibrations))
-    }
-    if others:
-        enrolled = " and ".join(sorted("the whole image" if other is None else str(list(other)) for other in others))
-        argument = "whole" if region is None else ",".join(map(str, region))
-        print(
-            f"Note: objects of this bench were enrolled with view.roi = {enrolled}; now it is "
-            f"{'the whole image' if region is None else list(region)}"
-            f"{' (axis calibration)' if calibrated_now else ''}. If the camera was not moved: "
-            f"rig catalog redescribe --region {argument}. If it was moved: enroll these objects again (--replace).",
-            file=sys.stderr,
         )
 
 

@@ -16,9 +16,10 @@ from rig.cli.ui.settings import Settings
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from rig.bench import Bench
-    from rig.catalog import Catalog
+    from rig.cli.ui.desk import CommandDesk
+    from rig.cli.ui.live import EnrollView
     from rig.events.events import Event
+    from rig.jobs.desk import Steps
     from rig.report import EnrollmentRecord
 
 
@@ -83,6 +84,9 @@ def enroll(
 
     Example: rig enroll mug-white --bench sim --fly
     """
+    from rig.cli.ui.desk import CommandDesk
+    from rig.jobs.enroll import enroll as enroll_job
+    from rig.jobs.enroll import enroll_list
     from rig.plans.tray import read_tray
 
     # Reject wrong options before a device is opened.
@@ -99,39 +103,28 @@ def enroll(
         return
 
     settings.deliver_waiting()
-    with (
-        settings.open_bench() as bench,
-        settings.open_for_enrollment(bench.clock) as catalog,
-        settings.background_check(),
-    ):
-        from rig.bench import ObjectAlreadyPlaced
-        from rig.cli.catalog.catalog import report_other_regions
-        from rig.cli.objects.empty_table import ensure_empty_table_image
-        from rig.cli.ui.operator_prompts import OperatorPrompts
-        from rig.plans.enroll import enroll as enroll_one
-        from rig.plans.tray import AutomaticOperator, enroll_tray, left_to_enroll
-
-        labels = ", ".join(label) if label else None
-        if name is not None:  # reject it before the operator clears the table
-            catalog.check_enrollable(name, label=labels, note=note, resume=resume, replace=replace)
-        report_other_regions(settings, catalog, bench)
-        if name is not None or left_to_enroll(catalog, items):
-            ensure_empty_table_image(settings, bench, ask=not yes, then=name)
-        job = _Job(settings, bench, catalog)
+    continued = [name, "--resume"] if name is not None else ["--list", str(tray)]
+    others = "" if name is not None else " with the other objects"
+    shown = _Shown(settings, report, [f"To continue{others}:", _command(settings, given, *continued)])
+    desk = shown.desk = CommandDesk(settings, shown.close_view, yes=yes)
+    with settings.background_check():
         if name is not None:
-            events = enroll_one(
-                bench, catalog, name, views=views, label=labels, note=note, resume=resume, replace=replace, fly=fly
+            labels = ", ".join(label) if label else None
+            job = enroll_job(
+                desk,
+                name,
+                views=views,
+                label=labels,
+                note=note,
+                resume=resume,
+                replace=replace,
+                fly=fly,
+                ask=not yes,
             )
-            job.run(events, ["To continue:", _command(settings, given, name, "--resume")], report)
+            shown.run(job)
         else:
-            asks = isinstance(bench.operator, ObjectAlreadyPlaced)
-            operator = OperatorPrompts(job.close_view) if asks else AutomaticOperator()
-            job.run(
-                enroll_tray(bench, catalog, items, views=views, operator=operator, fly=fly),
-                ["To continue with the other objects:", _command(settings, given, "--list", str(tray))],
-                report,
-            )
-            job.print_total(len(items))
+            shown.run(enroll_list(desk, items, views=views, fly=fly, ask=not yes))
+            shown.print_total(len(items))
 
 
 def _command(settings: Settings, given: "Mapping[str, Any]", *arguments: str) -> str:
@@ -146,16 +139,17 @@ def _command(settings: Settings, given: "Mapping[str, Any]", *arguments: str) ->
     return f"  {shlex.join(['rig', 'enroll', *arguments, *options, *settings.arguments()])}"
 
 
-class _Job:
-    """Runs the plan of one or more enrollments, shows its events, and writes the report."""
+class _Shown:
+    """Shows the events of one or more enrollments, and writes the report."""
 
-    def __init__(self, settings: Settings, bench: "Bench", catalog: "Catalog") -> None:
-        from rig.cli.ui.live import EnrollView
+    desk: "CommandDesk"
+
+    def __init__(self, settings: Settings, report: Path | None, how_to_continue: list[str]) -> None:
         from rig.cli.ui.present import console
 
         self._settings = settings
-        self._bench = bench
-        self._catalog = catalog
+        self._report = report
+        self._how_to_continue = how_to_continue
         self._screen = console(stderr=settings.json)
         self._view: EnrollView | None = None
         self._heading = ""
@@ -169,46 +163,19 @@ class _Job:
             self._view.__exit__(None, None, None)
             self._view = None
 
-    def run(self, events: Any, how_to_continue: list[str], report: Path | None) -> None:
-        """Run the plan to its end; after an interruption print how to continue."""
-        from rig.catalog.shared import comparable_views
-        from rig.cli.ui.jobs import progress_bar
-        from rig.events.events import Enrolled, Item
-        from rig.plans.similar_objects import similar_objects
-
+    def run(self, job: "Steps[None]") -> None:
+        """Run the job to its end; after an interruption print how to continue."""
         try:
-            for event in events:
-                if isinstance(event, Item):
-                    self.close_view()
-                    self._heading = f"{event.number} of {event.of} "
-                if isinstance(event, Enrolled):  # it is in the catalog now; Enrolled stays its last event
-                    with progress_bar("Preparing objects for searches") as progress:
-                        views = comparable_views(self._catalog, event.name, progress=progress)
-                    self._show(similar_objects(views, event.name))
-                self._show(event)
-                if isinstance(event, Enrolled):
-                    self._enrolled += 1
-                    self._complete()
-                    self._stored_views = 0
-                    self._deliver()
+            self.desk.run(job, self._show)
         except BaseException:
             self.close_view()
             if self._stored_views or self._enrolled:
-                print("\n".join(["The views taken so far are stored.", *how_to_continue]), file=sys.stderr)
+                print("\n".join(["The views taken so far are stored.", *self._how_to_continue]), file=sys.stderr)
             raise
         finally:
-            events.close()
             self.close_view()
-            if report is not None and self._records:
-                self._write(report)
-
-    def _deliver(self) -> None:
-        """Deliver the object, so that the other benches have it before this one has enrolled the next."""
-        from rig.catalog.journal import Journal
-
-        if isinstance(self._catalog, Journal):
-            self.close_view()
-            self._settings.deliver()
+            if self._report is not None and self._records:
+                self._write(self._report)
 
     def print_total(self, items: int) -> None:
         if not self._settings.json:
@@ -216,17 +183,20 @@ class _Job:
 
     def _show(self, event: "Event") -> None:
         from rig.cli.ui.live import EnrollView
-        from rig.events.events import Accepted, Started, event_dict
+        from rig.events.events import Accepted, Enrolled, Item, Started, event_dict
         from rig.report import EnrollmentRecord
 
+        if isinstance(event, Item):
+            self.close_view()
+            self._heading = f"{event.number} of {event.of} "
         if self._settings.json:
             self._settings.print_json(event_dict(event))
+        bench = self.desk.bench
         if isinstance(event, Started):
             self.close_view()
-            self._report_journal()
-            self._records.append(EnrollmentRecord(region=self._bench.config.view.roi))
+            self._records.append(EnrollmentRecord(region=bench.config.view.roi))
         if self._view is None:
-            self._view = EnrollView(self._screen, self._bench.config, self._heading)
+            self._view = EnrollView(self._screen, bench.config, self._heading)
             self._view.__enter__()
         self._stored_views += isinstance(event, Accepted)
         if self._records:
@@ -234,20 +204,17 @@ class _Job:
         # in a pipe, the text on stderr would only repeat the JSON
         if not self._settings.json or self._screen.is_terminal:
             self._view.add(event)
-
-    def _report_journal(self) -> None:
-        """Say that the server of the catalog does not answer, and that the views are stored all the same."""
-        from rig.catalog.shared import journal_words
-
-        if words := journal_words(self._catalog):
-            print(f"Note: {words}", file=sys.stderr)
+        if isinstance(event, Enrolled):
+            self._enrolled += 1
+            self._stored_views = 0
+            self._complete()
 
     def _complete(self) -> None:
         """Add the views of earlier sessions to the record of a resumed enrollment."""
-        record = self._records[-1]
-        stored = self._catalog.object(record.name).views
+        record, catalog = self._records[-1], self.desk.catalog
+        stored = catalog.object(record.name).views
         if len(stored) > len(record.views):
-            record.complete((view.record, self._catalog.read_image(view)) for view in stored)
+            record.complete((view.record, catalog.read_image(view)) for view in stored)
 
     def _write(self, path: Path) -> None:
         from rig.core.phrases import counted
@@ -255,7 +222,7 @@ class _Job:
 
         names = ", ".join(record.name for record in self._records[:3])
         title = names if len(self._records) <= 3 else counted(len(self._records), "object")
-        meta = Meta(conditions=self._records[-1].conditions, date=self._bench.clock.utc())
+        meta = Meta(conditions=self._records[-1].conditions, date=self.desk.bench.clock.utc())
         write_report(path, render_report(f"Enrolled: {title}", "", self._records, [], meta=meta))
         print(f"Report: {path}", file=sys.stderr)
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Collection
 
     from rig.bench import Bench
-    from rig.catalog import Action, Catalog
+    from rig.catalog import Catalog
     from rig.catalog.background import BackgroundCheck
     from rig.catalog.delivery import Delivery
     from rig.catalog.shared import BackgroundDelivery
@@ -187,16 +187,6 @@ class Settings:
         """Return the bench's catalog, opened for reading; None if there is none yet."""
         place = self.load().catalog_place(self.bench_name)
         return self.open_catalog(read_only=True) if place.may_exist() else None
-
-    def note(self, action: "Action", **details: Any) -> None:
-        """Write an action on the bench into the log of its catalog (`rig log`), if it has one."""
-        if not self.load().catalog_place(self.bench_name).may_exist():
-            return
-        try:
-            with self.open_catalog() as catalog:
-                catalog.note(action, **details)
-        except RigError as error:  # the action itself succeeded
-            print(f"Note: the log has no entry for this action. {error.what}", file=sys.stderr)
 
     def say(self, text: str, data: Any) -> None:
         """Print ``text``, or with ``--json`` ``data`` as one line of JSON."""

@@ -11,10 +11,11 @@ import pytest
 
 from rig.bench import ObjectAlreadyPlaced, open_bench
 from rig.catalog import Catalog
-from rig.cli.objects.empty_table import ensure_empty_table_image
+from rig.cli.ui.desk import CommandDesk
 from rig.cli.ui.settings import Settings
 from rig.config import load_config
 from rig.events.events import Accepted
+from rig.jobs.table_image import refresh_table_image
 from rig.plans.enroll import enroll
 from rig.views.empty_table import empty_table_status
 from tests.small import SMALL
@@ -114,7 +115,8 @@ def asked(
             times = iter(range(99))
             answers._asked = lambda: s.world.put(None) if next(times) == 1 else None  # forgotten the first time
         monkeypatch.setattr("sys.stdin", answers)
-        ensure_empty_table_image(Settings(json=as_json), s.bench, ask=ask, then="toy-car")
+        desk = CommandDesk(Settings(json=as_json))
+        desk.run(refresh_table_image(desk, s.bench, s.bench.operator, ask=ask, then="toy-car"))
         return empty_table_status(s.bench).table, capsys.readouterr().err
 
     return run

@@ -9,8 +9,9 @@ from rig.core.errors import NoObject
 from rig.events.events import Accepted, Failed, Identified, Ranked, ScanStarted, Started, Waiting
 from rig.plans.enroll import enroll
 from rig.plans.identify import identify
+from rig.plans.operator import Choice, Subject
 from rig.plans.photograph_table import photograph_table
-from rig.plans.tray import TrayDecision, enroll_tray
+from rig.plans.tray import enroll_tray
 from rig.plans.watch import watch
 from rig.search.model import load_model
 from sim.bench import ShelfOperator, open_sim_bench
@@ -113,13 +114,15 @@ def test_views_are_not_continued_on_an_empty_table(bench, catalog, world):
 
 def test_operator_of_a_tray_can_put_the_object_on_the_table_and_try_again(bench, catalog, world):
     class Forgetful(Scripted):
-        def decide_after_error(self, item, error):
-            world.put(shelf()["lamp"])
-            return super().decide_after_error(item, error)
+        def choose(self, question):
+            if question.subject is Subject.FAILURE:
+                world.put(shelf()["lamp"])
+            return super().choose(question)
 
-    operator = Forgetful(problem=[TrayDecision.PROCEED])
+    operator = Forgetful(problem=[Choice.CONTINUE])
     list(enroll_tray(bench, catalog, items("lamp"), views=6, operator=operator, fly=False))
-    assert operator.troubles == [("lamp", NoObject)]
+    (failure,) = operator.troubles
+    assert failure.startswith("lamp: No object is on the table")
     assert [one.name for one in catalog.objects()] == ["lamp"]
 
 

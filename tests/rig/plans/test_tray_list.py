@@ -12,7 +12,8 @@ from rig.catalog import Catalog
 from rig.core.errors import NoObject, ObjectNotFound, RotationDisagreement, UsageError, ViewRejected
 from rig.events.events import Accepted, Enrolled, Item
 from rig.plans.enroll import enroll
-from rig.plans.tray import OBJECT_ERRORS, TrayDecision, TrayItem, enroll_tray, read_tray
+from rig.plans.operator import Choice, Subject
+from rig.plans.tray import OBJECT_ERRORS, TrayItem, enroll_tray, read_tray
 
 TEXT = st.text(string.ascii_letters + string.digits + " äöü,;\"'-_", min_size=1, max_size=12).map(str.strip)
 
@@ -107,13 +108,12 @@ class Scripted:
         self.brought = []
         self.troubles = []
 
-    def request(self, item, number, of, kept):
-        self.brought.append((item.name, number, of, kept.unfinished_views if kept else None))
-        return self._bring.pop(0) if self._bring else TrayDecision.PROCEED
-
-    def decide_after_error(self, item, error):
-        self.troubles.append((item.name, type(error)))
-        return self._problem.pop(0)
+    def choose(self, question):
+        if question.subject is Subject.FAILURE:
+            self.troubles.append(question.text)
+            return self._problem.pop(0)
+        self.brought.append(question.text)
+        return self._bring.pop(0) if self._bring else Choice.CONTINUE
 
 
 @pytest.fixture
@@ -145,7 +145,9 @@ def test_complete_objects_are_skipped_and_interrupted_ones_resumed(simulated, ca
     operator = Scripted()
     events = list(enroll_tray(s.bench, catalog, items("dice", "lamp", "clock"), views=4, operator=operator))
     assert actions(events) == [("dice", "skip"), ("lamp", "resume"), ("clock", "enroll")]
-    assert operator.brought == [("lamp", 2, 3, 2), ("clock", 3, 3, None)]
+    resumed, put = operator.brought
+    assert resumed.startswith("2 of 3: lamp has 2 views of an interrupted enrollment.")
+    assert put.startswith("3 of 3: put clock on the table")
     assert [e.name for e in events if isinstance(e, Enrolled)] == ["lamp", "clock"]
     assert actions(enroll_tray(s.bench, catalog, items("dice", "lamp", "clock"))) == [
         ("dice", "skip"),
@@ -157,7 +159,7 @@ def test_complete_objects_are_skipped_and_interrupted_ones_resumed(simulated, ca
 def test_interrupted_object_that_was_moved_is_enrolled_again(simulated, catalog):
     s = simulated()
     interrupted(s, catalog, "lamp")
-    events = list(enroll_tray(s.bench, catalog, items("lamp"), views=4, operator=Scripted([TrayDecision.RESTART])))
+    events = list(enroll_tray(s.bench, catalog, items("lamp"), views=4, operator=Scripted([Choice.RESTART])))
     assert actions(events) == [("lamp", "replace")]
     assert sum(isinstance(e, Accepted) for e in events) == 4
     assert len({view.session.id for view in catalog.object("lamp").views}) == 1
@@ -165,7 +167,7 @@ def test_interrupted_object_that_was_moved_is_enrolled_again(simulated, catalog)
 
 def test_operator_can_skip_objects_or_stop(simulated, catalog):
     s = simulated()
-    operator = Scripted([TrayDecision.SKIP, TrayDecision.PROCEED, TrayDecision.STOP])
+    operator = Scripted([Choice.SKIP, Choice.CONTINUE, Choice.STOP])
     events = list(enroll_tray(s.bench, catalog, items("lamp", "dice", "clock"), views=4, operator=operator))
     assert actions(events) == [("lamp", "skip"), ("dice", "enroll")]
     assert [o.name for o in catalog.objects()] == ["dice"]
@@ -175,24 +177,26 @@ def test_object_in_the_dark_is_tried_again_with_its_stored_views(simulated, cata
     s = simulated()
 
     class Lights(Scripted):
-        def decide_after_error(self, item, error):
-            s.world.change(light=(1.0, 1.0, 1.0))
-            return super().decide_after_error(item, error)
+        def choose(self, question):
+            if question.subject is Subject.FAILURE:
+                s.world.change(light=(1.0, 1.0, 1.0))
+            return super().choose(question)
 
-    operator = Lights(problem=[TrayDecision.PROCEED])
+    operator = Lights(problem=[Choice.CONTINUE])
     events = []
     for event in enroll_tray(s.bench, catalog, items("dice"), views=4, operator=operator):
         if isinstance(event, Accepted) and not any(isinstance(earlier, Accepted) for earlier in events):
             s.world.change(light=(0.0, 0.0, 0.0))
         events.append(event)
-    assert operator.troubles == [("dice", ViewRejected)]
+    (failure,) = operator.troubles
+    assert failure.startswith("dice: View 2 was rejected")
     assert actions(events) == [("dice", "enroll"), ("dice", "resume")]
     assert catalog.object("dice").summary.views == 4
 
 
 def test_object_that_fails_is_skipped_or_ends_the_tray(simulated, catalog):
     s = simulated()
-    operator = Scripted(problem=[TrayDecision.SKIP])
+    operator = Scripted(problem=[Choice.SKIP])
     events = list(enroll_tray(s.bench, catalog, items("nonsense", "dice"), views=4, operator=operator))
     assert actions(events) == [("nonsense", "enroll"), ("nonsense", "skip"), ("dice", "enroll")]
     with pytest.raises(ObjectNotFound):

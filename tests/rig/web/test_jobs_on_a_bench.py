@@ -113,7 +113,7 @@ def test_name_in_use_is_rejected_before_the_table_moves(serve):
     assert served.run(kind="enroll", name="lamp", views=4)["state"] == "done"
     angle_deg = served.client.get("/api/v1/status").json()["table_deg"]
     job = served.run(kind="enroll", name="lamp", views=4)
-    assert (job["state"], job["error"]["code"], job["views"]) == ("failed", 200, 0)
+    assert (job["state"], job["error"]["code"], job["views"]) == ("failed", 701, 0)
     assert served.client.get("/api/v1/status").json()["table_deg"] == angle_deg
 
 

@@ -87,7 +87,7 @@ def test_sample_of_watch_is_that_of_the_object_on_the_table(rig, with_operator, 
         return f"S-{on_table[-1]}" if on_table else None
 
     scanned_ns: list[int] = []
-    monkeypatch.setattr("rig.views.object_presence.TableWatcher", Comes)
+    monkeypatch.setattr("rig.jobs.identify.TableWatcher", Comes)
     monkeypatch.setattr("rig.cli.ui.prompts.ask_sample", scan)
     done = rig("identify", "--watch", "--scan", "--json")
     assert done.exit_code == 130, done.output
@@ -219,7 +219,7 @@ def test_watch_waits_until_the_camera_sees_an_object(rig, with_operator, monkeyp
             world.clock.call_at(world.clock.now_ns() + 3 * 10**9, lambda: world.put(shelf()["lamp"], 33.0))
             super().place(name)
 
-    monkeypatch.setattr("rig.views.object_presence.TableWatcher", Comes)
+    monkeypatch.setattr("rig.jobs.identify.TableWatcher", Comes)
     done = rig("identify", "--watch", "--json")
     assert done.exit_code == 130
     events = [json.loads(line) for line in done.stdout.splitlines()]

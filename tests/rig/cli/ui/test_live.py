@@ -18,7 +18,7 @@ from hbr import Outcome
 from rig.catalog import ObjectSummary
 from rig.cli.ui.keys import Pause
 from rig.cli.ui.live import EnrollView, IdentifyView, LiveView
-from rig.cli.ui.operator_prompts import OperatorPrompts
+from rig.cli.ui.operator import TerminalOperator
 from rig.config import load_config
 from rig.core.clock import SystemClock
 from rig.core.errors import UsageError, ViewRejected
@@ -36,7 +36,8 @@ from rig.events.events import (
     Waiting,
     WaitReason,
 )
-from rig.plans.tray import TrayDecision, TrayItem
+from rig.plans.operator import Choice
+from rig.plans.tray import TrayItem, after_error, next_object
 from rig.views.capture import MotionEvidence
 from tests.programs import Program
 from tests.rig.report.report_samples import enrolling, identifying, searching_densely
@@ -339,37 +340,37 @@ def test_sigtstp_pauses_between_two_views_and_sigcont_resumes(folder):
     assert "5 views enrolled" in rest
 
 
-def asked(answers: str, kept: ObjectSummary | None = None) -> tuple[TrayDecision, str]:
+def asked(answers: str, kept: ObjectSummary | None = None) -> tuple[Choice, str]:
     questions = io.StringIO()
-    person = OperatorPrompts(questions=questions, answers=io.StringIO(answers))
-    return person.request(TrayItem(2, "mug", "kitchen"), 3, 25, kept), questions.getvalue()
+    person = TerminalOperator(questions=questions, answers=io.StringIO(answers))
+    return person.choose(next_object(TrayItem(2, "mug", "kitchen"), 3, 25, kept)), questions.getvalue()
 
 
 def test_operator_is_asked_for_the_next_object():
     answer, question = asked("\n")
-    assert answer is TrayDecision.PROCEED
+    assert answer is Choice.CONTINUE
     assert question.startswith("3 of 25: put mug (kitchen) on the table")
     assert "\a" not in question  # a pipe makes no sound
-    assert asked("s\n")[0] is TrayDecision.SKIP
-    assert asked("what?\nn\nQ\n")[0] is TrayDecision.STOP  # after an invalid answer, the question is asked again
-    assert asked("")[0] is TrayDecision.STOP
+    assert asked("s\n")[0] is Choice.SKIP
+    assert asked("what?\nn\nQ\n")[0] is Choice.STOP  # after an invalid answer, the question is asked again
+    assert asked("")[0] is Choice.STOP
 
 
 def test_operator_is_asked_whether_an_interrupted_object_was_moved():
     clock = SystemClock()
     kept = ObjectSummary("mug", "", "", clock.utc(), None, 0, 31)
     answer, question = asked("n\n", kept)
-    assert answer is TrayDecision.RESTART
+    assert answer is Choice.RESTART
     assert "31 views of an interrupted enrollment" in question
-    assert asked("\n", kept)[0] is TrayDecision.PROCEED
+    assert asked("\n", kept)[0] is Choice.CONTINUE
 
 
 def test_operator_decides_about_an_object_that_failed():
     error = ViewRejected("View 3 was rejected: too dark.", next_step="Check the light.")
-    for said, expected in (("\n", TrayDecision.PROCEED), ("s\n", TrayDecision.SKIP), ("q\n", TrayDecision.STOP)):
+    for said, expected in (("\n", Choice.CONTINUE), ("s\n", Choice.SKIP), ("q\n", Choice.STOP)):
         questions = io.StringIO()
-        person = OperatorPrompts(questions=questions, answers=io.StringIO(said))
-        assert person.decide_after_error(TrayItem(2, "mug"), error) is expected
+        person = TerminalOperator(questions=questions, answers=io.StringIO(said))
+        assert person.choose(after_error(error, TrayItem(2, "mug"))) is expected
         assert "too dark" in questions.getvalue()
         assert "Check the light" in questions.getvalue()
 
@@ -380,7 +381,7 @@ def test_unreadable_input_is_a_usage_error():
             raise OSError("no input")
 
     with pytest.raises(UsageError):
-        OperatorPrompts(questions=io.StringIO(), answers=Closed()).request(TrayItem(2, "mug"), 1, 1, None)
+        TerminalOperator(questions=io.StringIO(), answers=Closed()).choose(next_object(TrayItem(2, "mug"), 1, 1, None))
 
 
 def test_skipped_objects_are_reported():

@@ -1,0 +1,104 @@
+"""What a job gets from the presenter that runs it, and what it yields besides events."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Generator, Iterable, Iterator
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+from rig.bench import Bench, ObjectAlreadyPlaced
+from rig.bench.bench import DEVICES
+from rig.catalog import Action, Catalog
+from rig.catalog.jobs import JobProgress
+from rig.config import RigConfig
+from rig.config.catalog_place import CatalogPlace
+from rig.core.clock import Clock, SystemClock
+from rig.core.errors import RigError
+from rig.events.events import Event
+from rig.plans.operator import Operator, Unattended
+
+
+@dataclass(frozen=True, slots=True)
+class Remark:
+    """A sentence for the operator: about the catalog, the journal, the log, or an ``event`` that prepares the job.
+
+    ``picture`` is a drawing of letters for a terminal.
+    """
+
+    text: str
+    is_warning: bool = True
+    event: Event | None = None
+    picture: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """The result of a job that ends without an event: its JSON values, and a sentence."""
+
+    values: dict[str, Any]
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """Progress of a measurement: ``share`` from 0 to 1, and ``words`` about the last step."""
+
+    share: float
+    words: str
+
+
+T = TypeVar("T")
+Step = Event | Remark | Result | Progress
+Steps = Generator[Step, None, T]
+
+
+class Desk(ABC):
+    """The place where a job runs: it opens bench and catalog, and asks the operator.
+
+    Attributes
+    ----------
+    operator
+        Answers the questions.
+    config
+        The configuration of the bench before it is opened.
+    place
+        Place of the bench's catalog.
+    """
+
+    operator: Operator
+    config: RigConfig
+    place: CatalogPlace
+
+    @abstractmethod
+    def open_bench(self, devices: Iterable[str] = DEVICES) -> AbstractContextManager[Bench]:
+        """Open the bench, or return the one that is open; the servo and ``devices`` are opened now."""
+
+    def who_places(self, bench: Bench) -> Operator:
+        """Return who answers questions about the objects of a tray: no person if the bench places them by itself."""
+        return self.operator if isinstance(bench.operator, ObjectAlreadyPlaced) else Unattended()
+
+    @abstractmethod
+    def open_to_read(self) -> Catalog:
+        """Open the catalog for a search; if its server does not answer, its local copy."""
+
+    @abstractmethod
+    def open_to_enroll(self, clock: Clock) -> Catalog:
+        """Open the catalog for new views, which ``clock`` dates; if it is on a server, the journal."""
+
+    @abstractmethod
+    def deliver(self) -> Iterator[Remark]:
+        """Deliver the journal to the server of the catalog, if it has one."""
+
+    def preparing(self) -> AbstractContextManager[Callable[[JobProgress], None]]:
+        """Return a display of the progress while the views of the catalog are read for the first time."""
+        return nullcontext(lambda _: None)
+
+    def log(self, action: Action, **details: Any) -> Iterator[Remark]:
+        """Write an action on the bench into the log of its catalog, if it has one."""
+        if not self.place.may_exist():
+            return
+        try:
+            with Catalog.open(self.place, clock=SystemClock()) as catalog:
+                catalog.note(action, **details)
+        except RigError as error:  # the action itself succeeded
+            yield Remark(f"The log has no entry for this action. {error.what}")

@@ -1,0 +1,75 @@
+"""The jobs that enroll: one object, or a tray."""
+
+from collections.abc import Generator, Sequence
+from contextlib import closing
+
+from rig.catalog import Catalog
+from rig.catalog.shared import comparable_views, journal_words
+from rig.events.events import Enrolled, Event, Started
+from rig.jobs.desk import Desk, Remark, Steps
+from rig.jobs.regions import warn_of_other_regions
+from rig.jobs.table_image import refresh_table_image
+from rig.plans.enroll import enroll as enroll_views
+from rig.plans.similar_objects import similar_objects
+from rig.plans.tray import TrayItem, enroll_tray, left_to_enroll
+
+
+def enroll(
+    desk: Desk,
+    name: str,
+    *,
+    views: int | None = None,
+    label: str | None = None,
+    note: str | None = None,
+    resume: bool = False,
+    replace: bool = False,
+    fly: bool | None = None,
+    ask: bool = True,
+) -> Steps[None]:
+    """Enroll an object, name the objects that it resembles, and deliver it to the server of the catalog, if any.
+
+    ``ask`` says whether the operator may be asked for a new empty-table image; the rest is as for
+    `rig.plans.enroll.enroll`.
+
+    Raises
+    ------
+    ObjectExists, CatalogError, CatalogBusy
+        The name cannot be enrolled; nothing has moved.
+    RigError
+        As in `rig.plans.enroll.enroll`.
+    """
+    with desk.open_bench() as bench, desk.open_to_enroll(bench.clock) as catalog:
+        catalog.check_enrollable(name, label=label, note=note, resume=resume, replace=replace)
+        yield from warn_of_other_regions(bench, catalog)
+        yield from refresh_table_image(desk, bench, bench.operator, ask=ask, then=name)
+        events = enroll_views(
+            bench, catalog, name, views=views, label=label, note=note, resume=resume, replace=replace, fly=fly
+        )
+        yield from _delivered(desk, catalog, events)
+
+
+def enroll_list(
+    desk: Desk, items: Sequence[TrayItem], *, views: int | None = None, fly: bool | None = None, ask: bool = True
+) -> Steps[None]:
+    """Enroll the objects of a tray one after the other; complete ones are skipped (`rig.plans.tray.enroll_tray`)."""
+    with desk.open_bench() as bench, desk.open_to_enroll(bench.clock) as catalog:
+        yield from warn_of_other_regions(bench, catalog)
+        if left_to_enroll(catalog, items):
+            yield from refresh_table_image(desk, bench, bench.operator, ask=ask)
+        events = enroll_tray(bench, catalog, items, views=views, operator=desk.who_places(bench), fly=fly)
+        yield from _delivered(desk, catalog, events)
+
+
+def _delivered(desk: Desk, catalog: Catalog, events: Generator[Event, None, object]) -> Steps[None]:
+    """Yield the events; compare each new object with the others, and deliver it before the next one is enrolled."""
+    with closing(events):
+        for event in events:
+            if isinstance(event, Started) and (words := journal_words(catalog)):
+                yield Remark(words)
+            if isinstance(event, Enrolled):  # it is in the catalog now; Enrolled stays its last event
+                with desk.preparing() as progress:
+                    others = comparable_views(catalog, event.name, progress=progress)
+                yield similar_objects(others, event.name)
+            yield event
+            if isinstance(event, Enrolled):
+                yield from desk.deliver()

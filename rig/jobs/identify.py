@@ -1,0 +1,133 @@
+"""The job that identifies one object, or with ``watch`` one after the other."""
+
+from collections.abc import Callable, Generator
+from contextlib import closing
+from pathlib import Path
+
+from rig.bench import ObjectAlreadyPlaced, TableClearer
+from rig.catalog.results import clean_text
+from rig.core.clock import SystemClock
+from rig.core.errors import UsageError
+from rig.events.events import Event, FrameUsed, Identified, Started
+from rig.jobs.desk import Desk, Steps
+from rig.jobs.regions import warn_of_other_regions
+from rig.jobs.table_image import refresh_table_image
+from rig.plans.identify import identify as identify_one
+from rig.plans.record import ResultRecorder
+from rig.plans.watch import watch as watch_table
+from rig.search.current_model import CurrentModel
+from rig.search.saved_run import RunSaver
+from rig.search.session import SHOWN
+from rig.search.strategies import descriptor_for
+from rig.search.strategies import strategy as strategy_named
+from rig.views.description import PAPER_DESCRIPTOR
+from rig.views.object_presence import TableWatcher
+
+
+def identify(
+    desk: Desk,
+    *,
+    strategy: str | None = None,
+    max_views: int | None = None,
+    top: int = SHOWN,
+    seed: int = 0,
+    watch: bool = False,
+    sample: str | None = None,
+    scan: bool = False,
+    person: str | None = None,
+    next_folder: Callable[[], Path] | None = None,
+    live: Callable[[FrameUsed], object] = lambda _: None,
+) -> Steps[Identified | None]:
+    """Identify the object on the table, record the answer in the catalog, save the run; return the last answer.
+
+    Parameters
+    ----------
+    desk
+        Where the job runs.
+    strategy
+        Its name; the default is ``identify.strategy``.
+    max_views
+        The default is ``identify.max_views``.
+    top, seed, live
+        As for `rig.plans.identify.identify`.
+    watch
+        Wait for the next object after each answer, until the job is closed.
+    sample, scan
+        The sample on the table, or whether the operator is asked for it: with ``watch`` for each object.
+    person
+        Who works at the bench; None for the user's account.
+    next_folder
+        Returns the folder of the next saved run; None saves nothing.
+
+    Raises
+    ------
+    UsageError
+        The sample cannot be recorded, or there is no such strategy.
+    RigError
+        As in `rig.plans.identify.identify` and `rig.search.model.load_model`.
+    """
+    config = desk.config.identify
+    sample = _checked(sample, scan=scan, watch=watch, records=config.record != "none")
+    name = strategy or config.strategy
+    chosen = None if name is None else strategy_named(name)
+    answer: Identified | None = None
+    with (
+        desk.open_to_read() as catalog,
+        CurrentModel(catalog, None if chosen is None else descriptor_for(chosen)) as model,
+    ):
+        known = model()  # report a catalog that cannot be searched before the bench is opened
+        if scan and not watch:
+            sample = desk.operator.ask_sample()
+        with desk.open_bench() as bench:
+            settings = bench.config if max_views is None else bench.config.with_max_views(max_views)
+            yield from warn_of_other_regions(bench, catalog)
+            # The camera sees when the operator has put the next object on the table.
+            by_hand = isinstance(bench.operator, ObjectAlreadyPlaced)
+            watcher = TableWatcher(bench) if watch and by_hand else None
+            placer = watcher or bench.operator
+            uses_image = known.descriptor != PAPER_DESCRIPTOR and known.with_empty_table is not False
+            if uses_image and isinstance(placer, TableClearer):
+                yield from refresh_table_image(desk, bench, placer, ask=False)
+            events: Generator[Event, None, object]
+            if watch:
+                events = watch_table(
+                    bench, model, config=settings, watcher=watcher, strategy=chosen, seed=seed, top=top, live=live
+                )
+            else:
+                events = identify_one(bench, known, config=settings, strategy=chosen, seed=seed, top=top, live=live)
+            recorder = ResultRecorder(
+                *(desk.place, bench),
+                clock=SystemClock(),
+                catalog_version=lambda: model.version,
+                operator=person,
+                with_image=config.record == "image",
+            )
+            recorder.sample = sample
+            if config.record != "none":
+                events = recorder.stream(events)
+            with closing(events), RunSaver(next_folder, bench, model, settings) as saver:
+                for event in events:
+                    if scan and watch and isinstance(event, Started):  # the object is on the table
+                        recorder.sample = desk.operator.ask_sample()
+                        if watcher is not None:
+                            watcher.wait_until_still()
+                    saver.add(event)
+                    if isinstance(event, Identified):
+                        answer = event
+                    if not isinstance(event, FrameUsed):  # shown by ``live`` while the table rotated
+                        yield event
+    return answer
+
+
+def _checked(sample: str | None, *, scan: bool, watch: bool, records: bool) -> str | None:
+    if sample is not None and (watch or scan):
+        raise UsageError(
+            "--sample names the sample of one object; --watch and --scan are for several.",
+            next_step="Remove --sample, and use --scan to give the sample of each object.",
+        )
+    if (sample is not None or scan) and not records:
+        raise UsageError(
+            "The answer is not recorded, because identify.record is none.",
+            next_step="Allow it: rig config set identify.record image",
+        )
+    return None if sample is None else clean_text(sample, "sample")

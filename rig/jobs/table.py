@@ -1,0 +1,108 @@
+"""The jobs that rotate the table, set its angle, and acknowledge a fault."""
+
+from collections.abc import Iterable
+from contextlib import closing
+from typing import Final
+
+from rig.bench import Bench
+from rig.catalog import Action
+from rig.config import MAX_LIMIT_DEG
+from rig.core.errors import RigError, UsageError
+from rig.core.phrases import angle_words, signed
+from rig.jobs.desk import Desk, Remark, Result, Steps
+from rig.motion.turntable import Turntable
+from rig.plans.capture import announced, moved
+from rig.plans.jog import JogKey
+from rig.plans.jog import jog as jog_table
+from rig.plans.operator import Choice, Question, Subject
+
+DEVICES: Final = ("imu",)
+"""The devices that a rotation needs besides the servo."""
+LEAVE: Final = {Choice.CONTINUE: "rotate", Choice.STOP: "leave it"}
+
+
+def goto(desk: Desk, angle_deg: float) -> Steps[None]:
+    """Rotate the table to an angle, and write the rotation into the log of the catalog."""
+    if not abs(angle_deg) <= MAX_LIMIT_DEG:  # also true for nan
+        raise UsageError(f"{angle_deg:g} is not an angle of the table.", next_step="Give the angle in degrees.")
+    with desk.open_bench(DEVICES) as bench:
+        yield from _rotated(desk, bench, angle_deg)
+
+
+def home(desk: Desk, *, revolutions: int | None = None) -> Steps[bool]:
+    """Rotate the table to home, after ``revolutions`` were set as by `refer`; return whether it may.
+
+    The operator is asked before a rotation by more than half a revolution that follows from ``revolutions``.
+    """
+    with desk.open_bench(DEVICES) as bench:
+        if revolutions is not None:
+            position_deg = bench.servo.read_state().position_deg
+            angle_deg = bench.safety.angle_reference.with_revolutions(position_deg, revolutions)
+            if abs(angle_deg) > 180.0 and not bench.safety.beyond_limits(angle_deg):
+                text = (
+                    f"The table is then at {angle_words(angle_deg, 0)} and rotates by {signed(-angle_deg, 0)}° to home."
+                )
+                if desk.operator.choose(Question(Subject.LONG_WAY, text, LEAVE, default=Choice.STOP)) is Choice.STOP:
+                    return False
+            bench.safety.set_revolutions(revolutions)
+        yield from _rotated(desk, bench, 0.0)
+    return True
+
+
+def _rotated(desk: Desk, bench: Bench, angle_deg: float) -> Steps[None]:
+    try:
+        with Turntable(bench) as table:
+            yield moved(0, (yield from announced(0, table, angle_deg)))
+    except RigError as error:
+        yield from desk.log(Action.MOVED, to_deg=angle_deg, ended=error.what)
+        raise
+    yield from desk.log(Action.MOVED, to_deg=angle_deg)
+
+
+def jog(desk: Desk, keys: Iterable[JogKey | None], *, step_deg: float) -> Steps[None]:
+    """Rotate the table by one step for each key, and write the last angle into the log of the catalog."""
+    angle_deg = None
+    with desk.open_bench(DEVICES) as bench, closing(jog_table(bench, keys, step_deg=step_deg)) as events:
+        try:
+            for event in events:
+                if isinstance(event, float):
+                    yield Remark(f"step {event:g}°", is_warning=False)
+                    continue
+                yield event
+                angle_deg = getattr(event, "encoder_deg", angle_deg)
+        except RigError as error:
+            yield from desk.log(Action.MOVED, to_deg=angle_deg, ended=error.what)
+            raise
+    if angle_deg is not None:
+        yield from desk.log(Action.MOVED, to_deg=angle_deg)
+
+
+def refer(desk: Desk, *, revolutions: int | None = None, here: bool = False) -> Steps[None]:
+    """Set the table's angle after the operator has looked at the cable; nothing moves.
+
+    Either ``here`` makes the present angle home, or ``revolutions`` is how many the cable is wound up.
+    """
+    if here == (revolutions is not None):
+        raise UsageError("revolutions and here are both given, or both missing.", next_step="Give one of them.")
+    with desk.open_bench(DEVICES) as bench:
+        if revolutions is None:
+            bench.safety.set_angle(0.0)
+        else:
+            bench.safety.set_revolutions(revolutions)
+        table_deg = bench.safety.angle_reference.to_table(bench.servo.read_state().position_deg)
+    text = "The present angle is home now." if here else "The table's angle is set."
+    yield Result({"table_deg": 0.0 if here else table_deg}, text)
+
+
+def acknowledge(desk: Desk, *, reboot: bool = False) -> Steps[None]:
+    """Acknowledge the latched fault; ``reboot`` restarts the servo first, which clears its hardware errors."""
+    with desk.open_bench(DEVICES) as bench:
+        fault = bench.safety.fault
+        state, doubt = bench.safety.acknowledge(reboot=reboot), bench.safety.doubt
+    text = f"Acknowledged: {fault.what}" if fault else "No fault was latched."
+    values = {
+        "acknowledged": fault.model_dump() if fault else None,
+        "state": str(state),
+        "doubt": str(doubt) if doubt else None,
+    }
+    yield Result(values, f"{text}\nThe table is {state}{f': {doubt}' if doubt else ''}.")

@@ -1,0 +1,91 @@
+"""The operator of a job: its questions, and who answers them.
+
+The terminal (`rig.cli.ui.operator`), the browser (`rig.web.work`) and `Unattended` implement `Operator`.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Protocol
+
+
+class Choice(StrEnum):
+    """The answers of the operator."""
+
+    CONTINUE = "continue"
+    RESTART = "restart"
+    KEEP = "keep"
+    SKIP = "skip"
+    STOP = "stop"
+
+
+class Subject(StrEnum):
+    """What a question is about."""
+
+    OBJECT = "object"
+    """The next object must come onto the table."""
+    UNFINISHED = "unfinished"
+    """The next object has an interrupted enrollment."""
+    FAILURE = "failure"
+    """An object could not be enrolled."""
+    EMPTY_TABLE = "empty-table"
+    """The table must be empty for its image."""
+    LONG_WAY = "long-way"
+    """The table would rotate by more than half a revolution."""
+    CALIBRATION = "calibration"
+    """A step of a calibration needs the operator."""
+
+
+@dataclass(frozen=True, slots=True)
+class Question:
+    """A question to the operator.
+
+    Attributes
+    ----------
+    subject, text
+        What it is about, and what to do, as sentences.
+    choices
+        The possible answers, with what each one does.
+    default
+        The answer of the key Enter.
+    unattended
+        The answer if there is no operator.
+    picture
+        A drawing of letters for a terminal.
+    """
+
+    subject: Subject
+    text: str
+    choices: Mapping[Choice, str] = field(default_factory=lambda: {Choice.CONTINUE: "continue", Choice.STOP: "stop"})
+    default: Choice = Choice.CONTINUE
+    unattended: Choice = Choice.CONTINUE
+    picture: str = ""
+
+
+class Operator(Protocol):
+    """An operator: answers the questions of a job."""
+
+    @property
+    def is_there(self) -> bool:
+        """Whether a person can answer, so that it is useful to ask."""
+        ...
+
+    def choose(self, question: Question) -> Choice:
+        """Wait for the answer to a question, and return it."""
+        ...
+
+    def ask_sample(self) -> str | None:
+        """Wait until the sample on the table is scanned or typed; None if it has no name."""
+        ...
+
+
+class Unattended:
+    """No operator: each question has the answer that is right without one, for example on a bench with a robot."""
+
+    is_there = False
+
+    def choose(self, question: Question) -> Choice:
+        return question.unattended
+
+    def ask_sample(self) -> str | None:
+        return None
