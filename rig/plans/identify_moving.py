@@ -9,6 +9,7 @@ Decision: docs/decisions/0047.
 
 from collections.abc import Callable, Generator
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -19,17 +20,17 @@ from hbr.core.angles import wrap360
 from rig.bench import Bench
 from rig.core.clock import seconds_between
 from rig.core.errors import MotionStopped, RigError
+from rig.devices.camera import CameraLocks
 from rig.events.events import Decided, Event, FrameUsed, Ranked, Rejected
-from rig.motion.flight_views import FlightFrameCheck
+from rig.motion.flight_views import FlightFrames
 from rig.motion.scan_speed import scan_speed
-from rig.motion.trajectory import TrajectoryRecorder
-from rig.motion.turntable import Flight, Turntable
+from rig.motion.turntable import Turntable
 from rig.plans.capture import accepted, add_view, capture, moved, unwind, warn_of_table
 from rig.search.session import ArcSearch
 from rig.search.strategies import Finish, Rotate
 from rig.views.capture import Viewer
 from rig.views.description import ViewDescriber
-from rig.views.stream import FrameStream
+from rig.views.stream import StreamFrame
 
 FIRST_REST_S: Final = 0.15
 """Time over which the gyro is averaged before the first view; the fit of the trajectory corrects the bias later."""
@@ -53,53 +54,46 @@ class Found:
 
 
 @dataclass
-class _ArcFrames:
-    """The frames of an arc: the function `Flight.each` of a search."""
+class _Arcs:
+    """The state of a search along arcs, and what it does with each frame of an arc."""
 
     bench: Bench
-    table: Turntable
     search: ArcSearch
-    stream: FrameStream
-    recorder: TrajectoryRecorder
-    frame_check: FlightFrameCheck
     describe: ViewDescriber
     top: int
-    live: Callable[[FrameUsed], object]
     started_ns: int
-    number: int
-    rejected: int
-    ranked: Ranked
-    step: Rotate | Finish
-    goal_deg: float
-    events: list[Event]
-    ended_ns: int | None = None
+    live: Callable[[FrameUsed], object]
+    events: list[Event] = field(default_factory=list)
+    """Events of the present arc, which have not been yielded."""
+    number: int = 0
+    rejected: int = 0
     rejected_in_a_row: int = 0
-    stamps_ns: list[int] = field(default_factory=list)
+    ended_ns: int | None = None
+    goal_deg: float = 0.0
+    locks: CameraLocks = field(init=False)
+    ranked: Ranked = field(init=False)
+    step: Rotate | Finish = field(init=False)
 
-    def each(self) -> float | None:
-        """Take the next frame as evidence; return a new goal, or the stopping angle if the search has ended."""
-        frame = self.stream.next(self.table.collect_gyro, newest=True)
-        if frame is None:
-            return None
-        self.stamps_ns = [*self.stamps_ns[1 - STAMPS :], frame.stamp_ns]
+    def take(self, frames: FlightFrames, frame: StreamFrame) -> float | None:
+        """Take a frame as evidence; return a new goal, or the stopping angle if the search has ended."""
         if self.ended_ns is not None or self.rejected_in_a_row >= MOST_REJECTED:
             return self.goal_deg
         # Check the frame.
-        trajectory = self.recorder.fit()
+        trajectory = frames.recorder.fit()
         if trajectory is None:
             return None
-        irregular = bool(self.frame_check.irregular(self.stamps_ns)[-1])
-        attempt = self.frame_check.attempt(frame, trajectory, irregular=irregular)
+        irregular = frame.stamp_ns in frames.irregular_ns(STAMPS)
+        attempt = frames.attempt(frame, trajectory, self.locks, locks_hold=True, irregular=irregular)
         if not attempt.accepted:
             self.rejected += 1
             self.rejected_in_a_row += 1
             self.events.append(Rejected(self.number + 1, 1, attempt.reasons, attempt.evidence))
-            return self._stop() if self.rejected_in_a_row >= MOST_REJECTED else None
+            return self._stop(frames) if self.rejected_in_a_row >= MOST_REJECTED else None
         # Describe it, and add it to the search.
         self.rejected_in_a_row = 0
         self.number += 1
         described = self.describe(attempt.image_bgr)
-        attempt = self.frame_check.at_the_object(attempt, described.segmentation, trajectory)
+        attempt = frames.at_the_object(attempt, described.segmentation, trajectory)
         motion = attempt.evidence.motion
         assert motion is not None
         sign = self.bench.config.table.orientation_sign
@@ -116,7 +110,7 @@ class _ArcFrames:
         self.events.append(self.ranked)
         if isinstance(self.step, Finish):
             self.ended_ns = self.bench.clock.now_ns()
-            return self._stop()
+            return self._stop(frames)
         goal_deg = motion.angle_deg + sign * self.step.rotation_deg
         if abs(goal_deg - self.goal_deg) <= NEW_GOAL_DEG:
             return None
@@ -124,9 +118,8 @@ class _ArcFrames:
         self.events.append(decided(self.number, self.step, goal_deg, self.top))
         return goal_deg
 
-    def _stop(self) -> float:
-        """Return the angle at which the table stops if it brakes now."""
-        self.goal_deg = self.table.stopping_deg(self.bench.servo.read_state())
+    def _stop(self, frames: FlightFrames) -> float:
+        self.goal_deg = frames.stopping_deg()
         return self.goal_deg
 
 
@@ -148,104 +141,68 @@ def search_in_motion(
     `rig.plans.identify.identify` raises. After a fault in an arc, the events of its frames come when the torque is off,
     because the consumer of events may pause. After a stop they do not come.
     """
-    left: list[Event] = []
+    arcs = _Arcs(bench, search, describe, top, started_ns, live)
     try:
-        found = yield from _search(
-            bench, search, viewer, describe, left, top=top, started_ns=started_ns, check=check, live=live
-        )
+        return (yield from _search(arcs, viewer, check))
     except MotionStopped:
         raise
     except Exception:
-        yield from left
+        yield from arcs.events
         raise
-    return found
 
 
-def _search(
-    bench: Bench,
-    search: ArcSearch,
-    viewer: Viewer,
-    describe: ViewDescriber,
-    left: list[Event],
-    *,
-    check: Callable[[NDArray[np.uint8]], None],
-    top: int,
-    started_ns: int,
-    live: Callable[[FrameUsed], object],
-) -> Generator[Event, None, Found]:
-    """Search; ``left`` receives the events of an arc that have not been yielded."""
+def _search(arcs: _Arcs, viewer: Viewer, check: Callable[[NDArray[np.uint8]], None]) -> Generator[Event, None, Found]:
+    bench, search = arcs.bench, arcs.search
     config = bench.config
     sign = config.table.orientation_sign
     speed = scan_speed(config, fps=config.camera.fps, gyro_range_dps=bench.imu.range_dps, spacing_deg=None)
     travelled_deg = 0.0
-    number = rejected = 0
     failed: RigError | None = None
     with Turntable(bench, first_rest_s=FIRST_REST_S) as table:
         low_deg, high_deg = table.limits_deg
-        stream: FrameStream | None = None
-        recorder: TrajectoryRecorder | None = None
+        frames: FlightFrames | None = None
         settled_ns = bench.clock.now_ns()
         for _ in range(MOST_FLIGHTS):
             # A view at rest: the first one, and after each arc that ended without an answer.
-            captured = yield from capture(number, viewer, table, settled_ns)
+            captured = yield from capture(arcs.number, viewer, table, settled_ns)
             azimuth_deg = float(wrap360(sign * table.rest_deg))
-            described = describe(captured.image_bgr)
-            yield accepted(number, azimuth_deg, captured, described)
-            if number == 0:
+            described = arcs.describe(captured.image_bgr)
+            yield accepted(arcs.number, azimuth_deg, captured, described)
+            if arcs.number == 0:
                 check(captured.image_bgr)
-            yield from warn_of_table(bench, number, described)
-            ranked, step = add_view(search, described, azimuth_deg, table.rest_deg)
+            yield from warn_of_table(bench, arcs.number, described)
+            arcs.ranked, arcs.step = add_view(search, described, azimuth_deg, table.rest_deg)
             ended_ns = bench.clock.now_ns()
             if search.is_new_decision:
-                yield ranked
-            if isinstance(step, Finish):
+                yield arcs.ranked
+            if isinstance(arcs.step, Finish):
                 break
             # An arc: frames are evidence while the table rotates.
-            goal_deg = min(max(table.rest_deg + sign * step.rotation_deg, low_deg), high_deg)
+            arcs.goal_deg = min(max(table.rest_deg + sign * arcs.step.rotation_deg, low_deg), high_deg)
             if search.is_new_decision:
-                yield decided(number, step, goal_deg, top)
-            recorder = recorder or table.recorder()
-            stream = stream or FrameStream(bench.camera, bench.clock)
-            frame_check = FlightFrameCheck(config, captured.evidence.locks, True, bench.clock.now_ns(), stream.period_s)
-            arc_frames = _ArcFrames(
-                bench,
-                table,
-                search,
-                stream,
-                recorder,
-                frame_check,
-                describe,
-                top,
-                live,
-                started_ns,
-                number,
-                rejected,
-                ranked,
-                step,
-                goal_deg,
-                left,
-            )
+                yield decided(arcs.number, arcs.step, arcs.goal_deg, arcs.top)
+            frames = frames or FlightFrames(bench, table, newest=True)
+            arcs.locks, arcs.rejected_in_a_row = captured.evidence.locks, 0
             reach_deg = max(low_deg, table.rest_deg - 360.0), min(high_deg, table.rest_deg + 360.0)
-            move = table.fly(goal_deg, Flight(arc_frames.each, reach_deg, recorder, speed.dps, quiet=False))
-            yield from left
-            left.clear()
-            number, rejected, ranked, step = arc_frames.number, arc_frames.rejected, arc_frames.ranked, arc_frames.step
+            move = frames.fly(arcs.goal_deg, partial(arcs.take, frames), reach_deg, speed.dps, quiet=False)
+            yield from arcs.events
+            arcs.events.clear()
             travelled_deg += abs(move.rotation_deg)
-            yield moved(number, move)
-            if arc_frames.ended_ns is not None:
-                ended_ns = arc_frames.ended_ns
+            yield moved(arcs.number, move)
+            if arcs.ended_ns is not None:
+                ended_ns = arcs.ended_ns
                 break
-            number += 1
+            arcs.number += 1
             still = table.hold()
             settled_ns = still.settled_ns
-            yield moved(number, still)
-        seconds = seconds_between(started_ns, ended_ns)
+            yield moved(arcs.number, still)
+        seconds = seconds_between(arcs.started_ns, ended_ns)
         try:
-            yield from unwind(number, table)
+            yield from unwind(arcs.number, table)
         except RigError as error:
             failed = error  # report the answer first
-    end = step if isinstance(step, Finish) else Finish(StopReason.MAX_VIEWS)
-    return Found(ranked, end, travelled_deg, seconds, failed)
+    end = arcs.step if isinstance(arcs.step, Finish) else Finish(StopReason.MAX_VIEWS)
+    return Found(arcs.ranked, end, travelled_deg, seconds, failed)
 
 
 def decided(number: int, step: Rotate, target_deg: float, top: int) -> Decided:
