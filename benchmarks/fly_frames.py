@@ -15,6 +15,7 @@ import os
 import time
 from collections import defaultdict
 from collections.abc import Callable
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -27,8 +28,8 @@ from hbr.dense.stopping import StoppingRule
 from rig.config import RigConfig, load_config
 from rig.core.clock import SystemClock
 from rig.devices.camera import Frame
-from rig.motion.flight_views import FlightFrameCheck
-from rig.motion.turntable import Flight, Turntable
+from rig.motion.flight_views import FlightFrames
+from rig.motion.turntable import Turntable
 from rig.views.description import BENCH_DESCRIPTOR, SearchDescriber
 from rig.views.stream import FrameStream, StreamFrame
 from sim.bench import ShelfOperator, open_sim_bench
@@ -87,8 +88,7 @@ def measured(index: hbr.DenseIndex, background: str) -> tuple[dict[str, list[flo
             operator.devices.camera.backdrop = another_bench(np.random.default_rng(1))
         locks = bench.camera.read_locks()
         with Turntable(bench) as table:
-            recorder, stream = table.recorder(), FrameStream(bench.camera, bench.clock)
-            frame_check = FlightFrameCheck(config, locks, True, bench.clock.now_ns(), stream.period_s)
+            frames = FlightFrames(bench, table)
 
             def begin() -> Work:
                 describe, session = begun(index, config)
@@ -96,10 +96,11 @@ def measured(index: hbr.DenseIndex, background: str) -> tuple[dict[str, list[flo
 
             def work(frame: StreamFrame, describe: SearchDescriber, session: ArcSession) -> None:
                 started = time.thread_time()
-                trajectory = timed(spent["angle"], recorder.fit)
+                trajectory = timed(spent["angle"], frames.recorder.fit)
                 if trajectory is None:
                     return
-                attempt = timed(spent["checks"], lambda: frame_check.attempt(frame, trajectory, irregular=False))
+                checked = partial(frames.attempt, frame, trajectory, locks, locks_hold=True, irregular=False)
+                attempt = timed(spent["checks"], checked)
                 levels = timed(spent["description"], lambda: describe(frame.image_bgr)).levels[BENCH_DESCRIPTOR]
                 motion = attempt.evidence.motion
                 assert motion is not None
@@ -108,13 +109,11 @@ def measured(index: hbr.DenseIndex, background: str) -> tuple[dict[str, list[flo
 
             use = begin()
 
-            def each() -> None:
-                if (frame := stream.next(table.collect_gyro)) is None:
-                    return
+            def take(frame: StreamFrame) -> None:
                 images.append(frame.image_bgr)
                 use(frame)
 
-            table.fly(180.0, Flight(each, (0.0, 180.0), recorder, config.table.velocity_dps))
+            frames.fly(180.0, take, (0.0, 180.0), config.table.velocity_dps)
     return {step: list(times) for step, times in spent.items()}, images, begin
 
 

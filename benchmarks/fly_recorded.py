@@ -27,15 +27,16 @@ from hbr.core.angles import size_deg
 from hbr.descriptors.shift import Shift
 from rig.bench import Bench
 from rig.config import RigConfig, load_config
+from rig.motion.flight_views import FlightFrames
 from rig.motion.motion_model import MotionModel
 from rig.motion.move import equivalent_within
-from rig.motion.turntable import Flight, Turntable
+from rig.motion.turntable import Turntable
 from rig.plans.capture import capture
 from rig.search.model import DenseModel, Model, begin_search
 from rig.search.strategies import Finish
 from rig.views.capture import Viewer
 from rig.views.description import BENCH_DESCRIPTOR, DescribedView, ViewDescriber
-from rig.views.stream import FrameStream, middle_ns
+from rig.views.stream import StreamFrame, middle_ns
 from sim.bench import ShelfOperator, open_sim_bench
 from sim.objects.shelf import shelf
 from sim.world import World
@@ -80,22 +81,20 @@ def record(bench: Bench, operator: ShelfOperator, name: str) -> dict[str, Seen]:
 def revolution(bench: Bench, table: Turntable, describe: ViewDescriber) -> Seen:
     """Rotate once, and return the frames at full speed."""
     table.goto(0.0)
-    recorder, stream = table.recorder(), FrameStream(bench.camera, bench.clock)
-    frames: list[tuple[int, Any]] = []
+    frames = FlightFrames(bench, table)
+    seen: list[tuple[int, Any]] = []
 
-    def each() -> None:
-        if (frame := stream.next(table.collect_gyro)) is None:
-            return
+    def take(frame: StreamFrame) -> None:
         middle = middle_ns(frame.stamp_ns, bench.config.camera_time)
-        frames.append((middle, describe(frame.image_bgr).levels[BENCH_DESCRIPTOR]))
+        seen.append((middle, describe(frame.image_bgr).levels[BENCH_DESCRIPTOR]))
 
     speed = bench.config.table.velocity_dps
-    table.fly(360.0, Flight(each, (0.0, 360.0), recorder, speed))
-    trajectory = recorder.fit()
+    frames.fly(360.0, take, (0.0, 360.0), speed)
+    trajectory = frames.recorder.fit()
     assert trajectory is not None
-    motion = trajectory.at([at for at, _ in frames])
+    motion = trajectory.at([at for at, _ in seen])
     steady = np.abs(motion.rate_dps) > 0.9 * speed
-    return [(float(motion.angle_deg[k]), frames[k][1]) for k in np.flatnonzero(steady)]
+    return [(float(motion.angle_deg[k]), seen[k][1]) for k in np.flatnonzero(steady)]
 
 
 def nearest(seen: Seen, angle_deg: float) -> tuple[float, Any]:

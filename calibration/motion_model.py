@@ -120,7 +120,6 @@ def evaluate(moves: Sequence[TimedMove], nominal: MotionProfile) -> Evaluation:
     covariance = np.linalg.inv(fit.jac.T @ fit.jac) * scatter**2
     for (name, unit), value, variance in zip(PARAMETERS.items(), fit.x, np.diag(covariance), strict=True):
         found.estimate(name, value, sqrt(float(variance)), unit)
-    found.proposed = {"table.settle_s": round(found.estimates["delay"].value, 3)}
     found.evidence = {"moves": plain(list(moves)), "scatter_s": scatter}
     worst = int(np.argmax(np.abs(residuals)))
     found.residual = abs(float(residuals[worst]))

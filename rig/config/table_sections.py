@@ -55,9 +55,6 @@ class TableConfig(Section):
     backlash_deg: float = Field(
         0.5, ge=0, le=10, description="largest backlash between encoder and platter that is not a fault"
     )
-    settle_s: float = Field(
-        0.46, ge=0.001, le=10, description="time from the end of a motion until the table is at rest, for estimates"
-    )
     orientation: Literal["encoder", "imu"] = Field(
         "encoder", description="source of a view's angle: the servo's encoder, or only the gyro on the platter"
     )

@@ -1,84 +1,146 @@
-"""Checks frames that were taken while the table rotated, as `rig.views.capture` does for frames at rest."""
+"""Takes frames while the table rotates, and checks them as `rig.views.capture` does for frames at rest."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rig.config import RigConfig
+from rig.bench import Bench
 from rig.devices.camera import CameraLocks
+from rig.motion.move import Move
 from rig.motion.scan_speed import smear_px, time_sigma_ms
 from rig.motion.trajectory import Trajectory
+from rig.motion.turntable import Flight, Turntable
 from rig.views.capture import Attempt, ImageQuality, MotionEvidence, RejectReason, ViewEvidence
-from rig.views.stream import StreamFrame, after_middle_row_ns, irregular_stamps, middle_ns
+from rig.views.stream import FrameStream, StreamFrame, after_middle_row_ns, irregular_stamps, middle_ns
+
+READINGS: Final = 8
+"""Readings of the encoder from which the angle of a frame is estimated during a flight."""
 
 
-@dataclass(frozen=True, slots=True)
-class FlightFrameCheck:
-    """Checks the frames of one motion.
+class FlightFrames:
+    """The frames of one flight, or of several flights with one trajectory.
+
+    Parameters
+    ----------
+    bench, table
+        An open bench, and its table with torque on.
+    newest
+        Whether frames are dropped for which the program is too slow.
 
     Attributes
     ----------
-    locks
-        The camera's settings at the beginning; they must not have changed (``locks_hold``).
-    begun_ns
-        When the motion began.
-    period_s
-        Time between two frames.
+    recorder
+        The recorder of the trajectory.
     """
 
-    config: RigConfig
-    locks: CameraLocks
-    locks_hold: bool
-    begun_ns: int
-    period_s: float
+    def __init__(self, bench: Bench, table: Turntable, *, newest: bool = False) -> None:
+        self.recorder = table.recorder()
+        self._config = bench.config
+        self._bench = bench
+        self._table = table
+        self._stream = FrameStream(bench.camera, bench.clock)
+        self._newest = newest
+        self._stamps_ns: list[int] = []
+        self._begun_ns = bench.clock.now_ns()
 
-    def irregular(self, stamps_ns: Sequence[int]) -> NDArray[np.bool_]:
-        """Return which time stamps of consecutive frames cannot be trusted, bool (n,)."""
-        return irregular_stamps(stamps_ns, self.period_s, self.config.camera_time.jitter_ms)
+    def fly(
+        self,
+        target_deg: float,
+        take: Callable[[StreamFrame], float | None],
+        reach_deg: tuple[float, float],
+        velocity_dps: float,
+        *,
+        quiet: bool = True,
+    ) -> Move:
+        """Rotate as `Turntable.fly` does, and call ``take`` with each frame; it may return a new goal."""
+        self._begun_ns = self._bench.clock.now_ns()
+        self._stamps_ns.clear()
 
-    def attempt(self, frame: StreamFrame, trajectory: Trajectory, *, irregular: bool) -> Attempt:
-        """Return a frame as an attempt at a view: its evidence, and the reasons to reject it."""
-        quality = ImageQuality.of(frame.image_bgr, self.config.view)
-        middle = middle_ns(frame.stamp_ns, self.config.camera_time)
+        def each() -> float | None:
+            frame = self._stream.next(self._table.collect_gyro, newest=self._newest)
+            if frame is None:
+                return None
+            self._stamps_ns.append(frame.stamp_ns)
+            return take(frame)
+
+        return self._table.fly(target_deg, Flight(each, reach_deg, self.recorder, velocity_dps, quiet))
+
+    def stopping_deg(self) -> float:
+        """Return the angle at which the table stops if it brakes now."""
+        return self._table.stopping_deg(self._bench.servo.read_state())
+
+    def about_deg(self, frame: StreamFrame) -> float:
+        """Return the approximate angle of a frame during a flight, from the last readings of the encoder."""
+        time_ns = middle_ns(frame.stamp_ns, self._config.camera_time)
+        readings = self.recorder.newest_readings(READINGS)
+        if len(readings) < 2:
+            return readings[-1][1] if readings else self._table.rest_deg
+        times = np.array([(t - time_ns) * 1e-9 for t, _ in readings])
+        angles = np.array([angle for _, angle in readings])
+        if times[-1] >= 0:
+            return float(np.interp(0.0, times, angles))
+        rate = (angles[-1] - angles[-2]) / max(times[-1] - times[-2], 1e-3)
+        return float(angles[-1] - rate * times[-1])
+
+    def irregular_ns(self, last: int = 0) -> set[int]:
+        """Return which time stamps of this flight, or of its ``last`` frames, cannot be trusted."""
+        stamps_ns = np.array(self._stamps_ns[-last:], np.int64)
+        off = irregular_stamps(stamps_ns.tolist(), self._stream.period_s, self._config.camera_time.jitter_ms)
+        return set(stamps_ns[off].tolist())
+
+    def attempt(
+        self, frame: StreamFrame, trajectory: Trajectory, locks: CameraLocks, *, locks_hold: bool, irregular: bool
+    ) -> Attempt:
+        """Return a frame of this flight as an attempt at a view: its evidence, and the reasons to reject it.
+
+        Parameters
+        ----------
+        locks, locks_hold
+            The camera's settings before the flight, and whether they have not changed.
+        irregular
+            Whether the frame's time stamp is one of `irregular_ns`.
+        """
+        config = self._config
+        quality = ImageQuality.of(frame.image_bgr, config.view)
+        middle = middle_ns(frame.stamp_ns, config.camera_time)
         motion = trajectory.at([middle])
         speed_dps = abs(float(motion.rate_dps[0]))
-        time_deg = speed_dps * time_sigma_ms(self.config) * 1e-3
+        time_deg = speed_dps * time_sigma_ms(config) * 1e-3
         evidence = MotionEvidence(
             middle,
             float(motion.angle_deg[0]),
             float(np.hypot(motion.sigma_deg[0], time_deg)),
             speed_dps,
-            smear_px(self.config, speed_dps),
+            smear_px(config, speed_dps),
             trajectory.residual_deg,
         )
         reasons = []
         if irregular or not frame.stamped:
             reasons.append(RejectReason.TIME_UNCERTAIN)
-        if evidence.angle_sigma_deg > self.config.view.max_angle_sigma_deg or not trajectory.consistent:
+        if evidence.angle_sigma_deg > config.view.max_angle_sigma_deg or not trajectory.consistent:
             reasons.append(RejectReason.ANGLE_UNCERTAIN)
-        if evidence.smear_px > 1.1 * self.config.view.max_smear_px:  # the speed varies about the chosen one
+        if evidence.smear_px > 1.1 * config.view.max_smear_px:  # the speed varies about the chosen one
             reasons.append(RejectReason.SMEARED)
         if frame.repeated:
             reasons.append(RejectReason.REPEATED_FRAME)
-        if not self.locks_hold:
+        if not locks_hold:
             reasons.append(RejectReason.LOCKS_CHANGED)
-        reasons += quality.reasons(self.config.view)
+        reasons += quality.reasons(config.view)
         return Attempt(
             1,
             frame.image_bgr,
             ViewEvidence(
-                settled_ns=self.begun_ns,
+                settled_ns=self._begun_ns,
                 exposed_ns=frame.stamp_ns,
                 sharpness=quality.sharpness,
                 mean_level=quality.mean_level,
                 dark_share=quality.dark_share,
                 saturated_share=quality.saturated_share,
                 repeated=frame.repeated,
-                locks=self.locks,
-                locks_hold=self.locks_hold,
+                locks=locks,
+                locks_hold=locks_hold,
                 stillness=None,
                 motion=evidence,
             ),
@@ -95,7 +157,7 @@ class FlightFrameCheck:
         motion, box = attempt.evidence.motion, (segmentation or {}).get("box_px")
         if motion is None or box is None:
             return attempt
-        middle_ns = motion.middle_ns + after_middle_row_ns(self.config, box)
+        middle_ns = motion.middle_ns + after_middle_row_ns(self._config, box)
         angle_deg = float(trajectory.at([middle_ns]).angle_deg[0])
         motion = replace(motion, middle_ns=middle_ns, angle_deg=angle_deg)
         return replace(attempt, evidence=replace(attempt.evidence, motion=motion))

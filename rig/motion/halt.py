@@ -24,19 +24,25 @@ STOP_ALLOWANCE_S = 0.5
 """Time for a stop in addition to its ramp; then the torque goes off in any case."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class MotionPath:
     """The range of the servo's positions in a motion, the highest speed, and the last trusted reading."""
 
     ends_deg: tuple[float, float]
     cruise_dps: float
-    trusted: ServoState | None
+    trusted: ServoState | None = None
 
+    def reaches(self, state: ServoState) -> bool:
+        """Return whether the table can have rotated from the last trusted reading to this one."""
+        if self.trusted is None:
+            return True
+        passed_s = seconds_between(self.trusted.time_ns, state.time_ns)
+        return abs(state.position_deg - self.trusted.position_deg) <= 1.5 * self.cruise_dps * passed_s + OVERSHOOT_DEG
 
-def reachable(earlier: ServoState, later: ServoState, cruise_dps: float) -> bool:
-    """Return whether a table can rotate from one reading to the other in the time between them."""
-    passed_s = seconds_between(earlier.time_ns, later.time_ns)
-    return abs(later.position_deg - earlier.position_deg) <= 1.5 * cruise_dps * passed_s + OVERSHOOT_DEG
+    def add(self, state: ServoState) -> None:
+        """Trust a reading if the table can have rotated there."""
+        if self.reaches(state):
+            self.trusted = state
 
 
 def halt(
@@ -97,7 +103,7 @@ def _agreed_reading(servo: Servo, clock: Clock, path: MotionPath) -> ServoState 
         if plausible and abs(moved_deg) < noise_deg:
             return None  # it stands still
         agreeing = agreeing + 1 if plausible else 0
-        needed = 1 if path.trusted is None or reachable(path.trusted, later, path.cruise_dps) else AGREEMENTS
+        needed = 1 if path.reaches(later) else AGREEMENTS
         if agreeing >= needed and seconds_between(later.time_ns, clock.now_ns()) <= STALE_S:
             return later
         earlier = later

@@ -10,6 +10,8 @@ from rig.devices.servo import MotionProfile
 from rig.motion.move import motion_seconds
 from rig.motion.turntable import FIRST_REST_S
 
+SETTLING_MS: Final = 220.0
+"""Time of a move for ringing and for the bus; before and after it, the table is quiet for ``table.quiet_s``."""
 FRAMES: Final = 1.5
 """Frames from the table's rest until one was exposed completely."""
 
@@ -24,7 +26,7 @@ class MotionModel:
         """Return the duration of a move until the table is at rest; downwards it includes the approach from below."""
         table = self.config.table
         profile = MotionProfile(table.velocity_dps, table.acceleration_dps2)
-        seconds = table.settle_s + motion_seconds(distance_deg, profile)
+        seconds = (SETTLING_MS + 2e3 * table.quiet_s) / 1e3 + motion_seconds(distance_deg, profile)
         if distance_deg < 0:
             seconds += motion_seconds(table.approach_deg, profile) + 2 * table.poll_s
         return seconds

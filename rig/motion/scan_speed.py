@@ -35,14 +35,10 @@ class ScanSpeed:
     value: float
 
 
-def edge_px(config: RigConfig) -> float:
-    """Return the distance of the region's edge from its middle, where the axis is, in pixels."""
-    return (config.camera.width if config.view.roi is None else config.view.roi[2]) / 2
-
-
 def smear_px(config: RigConfig, speed_dps: float) -> float:
-    """Return the motion at the edge of the region during an exposure, in pixels."""
-    return abs(radians(speed_dps)) * edge_px(config) * exposure_s(config)
+    """Return the motion at the edge of the region during an exposure, in pixels; the axis is in its middle."""
+    width_px = config.camera.width if config.view.roi is None else config.view.roi[2]
+    return abs(radians(speed_dps)) * (width_px / 2) * exposure_s(config)
 
 
 def exposure_s(config: RigConfig) -> float:

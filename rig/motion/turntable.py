@@ -3,37 +3,26 @@
 Decision: docs/decisions/0004.
 """
 
-from collections import deque
-from collections.abc import Callable
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
+from functools import partial
 from math import copysign, isfinite, remainder
 from typing import Self
 
 from rig.bench import Bench
 from rig.core.clock import seconds_between
-from rig.core.errors import (
-    FollowingError,
-    LimitExceeded,
-    MotionTimeout,
-    NoProgress,
-    NotReady,
-    RequestRejected,
-    RigError,
-    RotationDisagreement,
-    TorqueStaysOn,
-    UsageError,
-)
+from rig.core.errors import LimitExceeded, NotReady, RigError, RotationDisagreement, TorqueStaysOn, UsageError
 from rig.core.phrases import angle_words, budget_words
 from rig.core.signals import uninterrupted
 from rig.devices.servo import MotionProfile, ServoState
-from rig.motion.fault_causes import explain_unsettled, find_cause
-from rig.motion.halt import QUIET_COUNTS, MotionPath, halt, reachable
+from rig.motion.arrival import Arrival, causes_found
+from rig.motion.halt import QUIET_COUNTS, MotionPath, halt
 from rig.motion.move import Move, equivalent_within, motion_seconds
 from rig.motion.trajectory import TrajectoryRecorder
 from rig.safety.gyro_rotation import GyroRotationMeter, Stillness, compare
 from rig.safety.motion_checks import MotionMonitor, SlipMonitor
-from rig.safety.supervisor import TableState
+from rig.safety.supervisor import Motion, TableState
 
 FIRST_REST_S = 0.6
 """Time over which the gyro is averaged for its first bias."""
@@ -67,6 +56,16 @@ class Flight:
     quiet: bool = True
 
 
+@dataclass(slots=True)
+class _Rotation:
+    """The beginning of a rotation, and what checks it; the table stays if there is no ``monitor``."""
+
+    started_ns: int
+    start_deg: float
+    slip: SlipMonitor | None = None
+    monitor: MotionMonitor | None = None
+
+
 class Turntable(AbstractContextManager["Turntable"]):
     """The table of an open bench, with torque on for the duration of a ``with`` block.
 
@@ -97,8 +96,8 @@ class Turntable(AbstractContextManager["Turntable"]):
         )
         self._profile: MotionProfile | None = None
         self._rest_deg = 0.0
-        self._path_deg = (0.0, 0.0)
-        self._trusted: ServoState | None = None
+        self._path = MotionPath((0.0, 0.0), self._config.velocity_dps)
+        self._arrival_at = partial(Arrival, self._servo, self._gyro, self._clock, self._config)
         self._backlash_taken_up = False
 
     def __enter__(self) -> Self:
@@ -182,7 +181,9 @@ class Turntable(AbstractContextManager["Turntable"]):
 
     def hold(self) -> Move:
         """Stay, and return when the table is at rest: a move without rotation, before a first view."""
-        return self._move(self._rest_deg, ())
+        rotation = self._begin()
+        self._wait_for_rest(self._rest_deg, self._config.quiet_s, SETTLE_ALLOWANCE_S)
+        return self._end(rotation, rotation.start_deg)
 
     def goto(self, target_deg: float) -> Move:
         """Rotate to ``target_deg`` (table, unwrapped) and return when the table is at rest there.
@@ -203,7 +204,19 @@ class Turntable(AbstractContextManager["Turntable"]):
             An earlier motion was interrupted.
         """
         self.check_target(target_deg)
-        return self._move(target_deg, self._waypoints(target_deg))
+        waypoints = self._waypoints(target_deg)
+        rotation = self._begin(*waypoints)
+        with self._safety.motion((rotation.start_deg, *waypoints), self._stop) as motion:
+            with causes_found(self._servo, self._limits):
+                for goal_deg in waypoints:
+                    rotation.monitor = self._monitor(self._rest_deg, goal_deg)
+                    self._servo.arm_watchdog(self._config.watchdog_s)
+                    self._safety.set_goal(self._safety.angle_reference.to_servo(goal_deg))
+                    # The table must rest only at the last stop; at the others it is enough to arrive.
+                    quiet_s = self._config.quiet_s if goal_deg is waypoints[-1] else 0.0
+                    self._wait_for_rest(goal_deg, quiet_s, self._allowed_s(goal_deg - self._rest_deg), rotation)
+            self._arrive(motion)
+        return self._end(rotation, target_deg)
 
     def recorder(self) -> TrajectoryRecorder:
         """Return a recorder for the next motions, with what is known about the gyro now."""
@@ -222,34 +235,25 @@ class Turntable(AbstractContextManager["Turntable"]):
 
         The table does not approach the target from below. Raises what `goto` raises.
         """
-        low_deg, high_deg = flight.reach_deg
-        for end_deg in (target_deg, low_deg, high_deg):
+        ends_deg = target_deg, *flight.reach_deg
+        for end_deg in ends_deg:
             self.check_target(end_deg)
-        assert self._profile is not None
-        usual = self._profile
-        if abs(flight.velocity_dps - usual.velocity_dps) > 1e-3:
-            self._profile = self._servo.set_profile(MotionProfile(flight.velocity_dps, usual.acceleration_dps2))
-        self._gyro.taps.append(flight.recorder.add_samples)
-        try:
-            return self._move(target_deg, (target_deg,), flight)
-        finally:
-            self._gyro.taps.remove(flight.recorder.add_samples)
-            if self._profile is not None and self._profile != usual:
-                with uninterrupted():
-                    self._profile = usual
-                    self._restore_profile(usual)
-
-    def _restore_profile(self, profile: MotionProfile) -> None:
-        """Set the usual speed again; after a fault the servo may not answer, and the next program sets it."""
-        if self._safety.state is TableState.READY:
-            self._servo.set_profile(profile)
+        with self._recorded(flight):
+            rotation = self._begin(*ends_deg)
+            with self._safety.motion((rotation.start_deg, *ends_deg), self._stop) as motion:
+                with causes_found(self._servo, self._limits):
+                    rotation.monitor = self._monitor(self._rest_deg, target_deg)
+                    self._servo.arm_watchdog(self._config.watchdog_s)
+                    self._safety.set_goal(self._safety.angle_reference.to_servo(target_deg))
+                    target_deg = self._wait_in_flight(target_deg, flight, rotation)
+                self._arrive(motion)
+            return self._end(rotation, target_deg)
 
     def stopping_deg(self, state: ServoState) -> float:
         """Return where the table stops if it brakes now, as a table angle within the limits."""
-        assert self._profile is not None
         rate_dps = self._config.direction * state.velocity_dps
         age_s = seconds_between(state.time_ns, self._clock.now_ns()) + self._config.poll_s / 2
-        ramp_deg = copysign(rate_dps**2 / (2 * self._profile.acceleration_dps2), rate_dps) + rate_dps * age_s
+        ramp_deg = copysign(rate_dps**2 / (2 * self._torque_profile().acceleration_dps2), rate_dps) + rate_dps * age_s
         low_deg, high_deg = self._config.limits_deg
         here_deg = self._safety.angle_reference.to_table(state.position_deg)
         return min(max(here_deg + ramp_deg, low_deg), high_deg)
@@ -298,33 +302,53 @@ class Turntable(AbstractContextManager["Turntable"]):
             else:
                 return
 
-    def _move(self, target_deg: float, waypoints: tuple[float, ...], flight: Flight | None = None) -> Move:
+    def _torque_profile(self) -> MotionProfile:
+        """Return the profile that the servo follows; raise `NotReady` if the table has no torque."""
         if self._profile is None:
             raise NotReady(
                 "The table has no torque.", next_step="Use it in a with block: `with Turntable(bench) as table:`."
             )
+        return self._profile
+
+    @contextmanager
+    def _recorded(self, flight: Flight) -> Iterator[None]:
+        """Set the speed of a flight and give its recorder the gyro's samples; afterwards set the usual speed again."""
+        usual = self._torque_profile()
+        if abs(flight.velocity_dps - usual.velocity_dps) > 1e-3:
+            self._profile = self._servo.set_profile(MotionProfile(flight.velocity_dps, usual.acceleration_dps2))
+        self._gyro.taps.append(flight.recorder.add_samples)
+        try:
+            yield
+        finally:
+            self._gyro.taps.remove(flight.recorder.add_samples)
+            if self._profile != usual:
+                with uninterrupted():
+                    self._profile = usual
+                    if self._safety.state is TableState.READY:  # after a fault the servo may not answer
+                        self._servo.set_profile(usual)
+
+    def _begin(self, *ends_deg: float) -> _Rotation:
+        """Begin to measure a rotation that stays between the present angle and these; none if the table stays."""
+        self._torque_profile()
         self._safety.require_ready()
-        started_ns, start_deg = self._clock.now_ns(), self._rest_deg
+        rotation = _Rotation(self._clock.now_ns(), self._rest_deg)
         self._learn_bias(self._config.quiet_s)  # the bias drifts, so each rest measures it again
         self._gyro.begin()
-        if not waypoints:
-            self._wait_for_rest(target_deg, self._config.quiet_s, SETTLE_ALLOWANCE_S)
-        else:
-            ends_deg = [self._safety.angle_reference.to_servo(angle) for angle in (start_deg, *waypoints)]
-            steered_deg = () if flight is None else flight.reach_deg
-            ends_deg += [self._safety.angle_reference.to_servo(angle) for angle in steered_deg]
-            self._path_deg, self._trusted = (min(ends_deg), max(ends_deg)), None
-            with self._safety.motion((start_deg, *waypoints, *steered_deg), self._stop) as motion:
-                slip = SlipMonitor(self._limits, start_deg) if self._trust_gyro else None
-                for waypoint in waypoints:
-                    # The table must rest only at the last stop; at the others it is enough to arrive.
-                    last = waypoint is waypoints[-1] and (flight is None or flight.quiet)
-                    target_deg = self._approach(waypoint, self._config.quiet_s if last else 0.0, slip, flight)
-                self._servo.disarm_watchdog()
-                motion.arrived(self._safety.angle_reference.to_servo(self._rest_deg))
-        self._backlash_taken_up = self._backlash_taken_up or bool(waypoints)
+        if ends_deg:
+            path_deg = [self._safety.angle_reference.to_servo(angle) for angle in (self._rest_deg, *ends_deg)]
+            self._path = MotionPath((min(path_deg), max(path_deg)), self._config.velocity_dps)
+            rotation.slip = SlipMonitor(self._limits, self._rest_deg) if self._trust_gyro else None
+        return rotation
+
+    def _arrive(self, motion: Motion) -> None:
+        self._servo.disarm_watchdog()
+        motion.arrived(self._safety.angle_reference.to_servo(self._rest_deg))
+        self._backlash_taken_up = True
+
+    def _end(self, rotation: _Rotation, commanded_deg: float) -> Move:
+        """Return the finished rotation, as encoder and gyro measured it."""
         gyro = self._gyro.end()
-        rotation_deg = self._rest_deg - start_deg
+        rotation_deg = self._rest_deg - rotation.start_deg
         agreement = None
         if gyro.valid:
             agreement = compare(
@@ -338,129 +362,91 @@ class Turntable(AbstractContextManager["Turntable"]):
                 evidence={"table_deg": round(self._rest_deg, 2)},
             )
         return Move(
-            target_deg, self._rest_deg, rotation_deg, gyro, agreement, started_ns, self._clock.now_ns(), by_gyro
+            commanded_deg,
+            self._rest_deg,
+            rotation_deg,
+            gyro,
+            agreement,
+            rotation.started_ns,
+            self._clock.now_ns(),
+            by_gyro,
         )
 
     def _monitor(self, start_deg: float, goal_deg: float) -> MotionMonitor:
-        assert self._profile is not None
         return MotionMonitor(
             self._limits,
             self._servo.limits,
             start_deg=start_deg,
             goal_deg=goal_deg,
             tolerance_deg=self._config.tolerance_deg,
-            cruise_dps=self._profile.velocity_dps,
+            cruise_dps=self._torque_profile().velocity_dps,
         )
 
-    def _approach(
-        self, goal_deg: float, quiet_s: float, slip: SlipMonitor | None, flight: Flight | None = None
-    ) -> float:
-        """Rotate to ``goal_deg`` under supervision; return the last goal when the table has been quiet there."""
-        assert self._profile is not None
-        monitor = self._monitor(self._rest_deg, goal_deg)
-        allowed_s = self._allowed_s(goal_deg - self._rest_deg)
-        try:
-            self._servo.arm_watchdog(self._config.watchdog_s)
-            self._safety.set_goal(self._safety.angle_reference.to_servo(goal_deg))
-            return self._wait_for_rest(goal_deg, quiet_s, allowed_s, monitor, slip, flight)
-        except (RequestRejected, FollowingError, MotionTimeout, NoProgress) as symptom:
-            raise find_cause(symptom, self._servo, self._limits) from None
-
     def _allowed_s(self, distance_deg: float) -> float:
-        assert self._profile is not None
-        return 1.5 * motion_seconds(distance_deg, self._profile) + SETTLE_ALLOWANCE_S
-
-    def _steer(self, state: ServoState, goal_deg: float) -> MotionMonitor:
-        """Give the moving servo another goal; return the monitor of the motion from here on."""
-        self._safety.set_goal(self._safety.angle_reference.to_servo(goal_deg))
-        here_deg = self._safety.angle_reference.to_table(state.position_deg)
-        # If the goal is behind the table, it overshoots before it comes back.
-        start_deg = max(here_deg, self.stopping_deg(state), key=lambda angle: abs(angle - goal_deg))
-        return self._monitor(start_deg, goal_deg)
+        return 1.5 * motion_seconds(distance_deg, self._torque_profile()) + SETTLE_ALLOWANCE_S
 
     def _wait_for_rest(
-        self,
-        goal_deg: float,
-        quiet_s: float,
-        allowed_s: float,
-        monitor: MotionMonitor | None = None,
-        slip: SlipMonitor | None = None,
-        flight: Flight | None = None,
-    ) -> float:
-        """Poll until the profile has ended near the goal and all is quiet for ``quiet_s``; return the goal.
+        self, goal_deg: float, quiet_s: float, allowed_s: float, rotation: _Rotation | None = None
+    ) -> None:
+        """Poll until the table has arrived at the goal and has been quiet for ``quiet_s``.
 
-        The polling also feeds the servo's watchdog. Decision: docs/decisions/0044.
+        The polling also feeds the servo's watchdog.
         """
-        config, to_table = self._config, self._safety.angle_reference.to_table
-        start_ns = self._clock.now_ns()
-        readings: deque[tuple[int, float]] = deque()
-        while True:
-            steer_deg = None
-            if flight is None:
-                self._clock.sleep(config.poll_s)
-            else:
-                steer_deg = flight.each()
-            # Read the devices.
-            self._safety.check_stop_request()
-            state = self._servo.read_state()
-            for observer in self._safety.observers:
-                observer(state)
-            if self._trusted is None or reachable(self._trusted, state, config.velocity_dps):
-                self._trusted = state
-            self._gyro.update(now=flight is not None)
-            angle_deg = to_table(state.position_deg)
-            if flight is not None:
-                flight.recorder.add_reading(state.sampled_ns or state.time_ns, angle_deg)
-            # Steer to another goal.
-            if flight is not None and steer_deg is not None and abs(steer_deg - goal_deg) > config.tolerance_deg / 2:
-                goal_deg = min(max(steer_deg, flight.reach_deg[0]), flight.reach_deg[1])
-                monitor = self._steer(state, goal_deg)
-                allowed_s = seconds_between(start_ns, self._clock.now_ns()) + self._allowed_s(goal_deg - angle_deg)
-            # Check the motion, then whether the table has arrived and is quiet.
-            if monitor:
-                lag_deg = None if state.trajectory_deg is None else state.trajectory_deg - state.position_deg
-                monitor.check(state, angle_deg, lag_deg)
-            else:
-                self._safety.check_servo(state)
-            if slip:
-                self._check_slip(slip, state.time_ns, angle_deg)
-            arrived = not state.moving and abs(angle_deg - goal_deg) <= config.tolerance_deg
-            if not arrived:
-                readings.clear()
-            readings.append((state.time_ns, angle_deg))
-            if arrived and self._quiet(readings, quiet_s) and (state.in_position or self._holds()):
-                self._rest_deg = sum(angle for _, angle in readings) / len(readings)
-                return goal_deg
-            elapsed_s = seconds_between(start_ns, self._clock.now_ns())
-            if elapsed_s > allowed_s:
-                peak_dps = self._gyro.peak_dps(config.quiet_s)
-                raise explain_unsettled(goal_deg, angle_deg, allowed_s, state, arrived, peak_dps, config.velocity_dps)
+        arrival, rest_deg = self._arrival_at(goal_deg, quiet_s, allowed_s), None
+        while rest_deg is None:
+            self._clock.sleep(self._config.poll_s)
+            state, angle_deg = self._read()
+            self._check(state, angle_deg, rotation)
+            rest_deg = arrival.rest_deg(state, angle_deg)
+        self._rest_deg = rest_deg
 
-    def _holds(self) -> bool:
-        """Return whether the servo's torque is on; without torque there is no motion profile."""
-        condition = self._servo.read_condition()
-        return condition.torque and not condition.power_lost
+    def _wait_in_flight(self, goal_deg: float, flight: Flight, rotation: _Rotation) -> float:
+        """Record and steer until the table has arrived; return the last goal."""
+        low_deg, high_deg = flight.reach_deg
+        quiet_s = self._config.quiet_s if flight.quiet else 0.0
+        arrival = self._arrival_at(goal_deg, quiet_s, self._allowed_s(goal_deg - self._rest_deg))
+        rest_deg = None
+        while rest_deg is None:
+            asked_deg = flight.each()
+            next_deg = goal_deg if asked_deg is None else min(max(asked_deg, low_deg), high_deg)
+            state, angle_deg = self._read(gyro_now=True)
+            flight.recorder.add_reading(state.sampled_ns or state.time_ns, angle_deg)
+            if abs(next_deg - goal_deg) > self._config.tolerance_deg / 2:
+                goal_deg = next_deg
+                self._safety.set_goal(self._safety.angle_reference.to_servo(goal_deg))
+                # If the goal is behind the table, it overshoots before it comes back.
+                stop_deg = self.stopping_deg(state)
+                farthest_deg = stop_deg if abs(stop_deg - goal_deg) > abs(angle_deg - goal_deg) else angle_deg
+                rotation.monitor = self._monitor(farthest_deg, goal_deg)
+                arrival = self._arrival_at(goal_deg, quiet_s, self._allowed_s(goal_deg - angle_deg))
+            self._check(state, angle_deg, rotation)
+            rest_deg = arrival.rest_deg(state, angle_deg)
+        self._rest_deg = rest_deg
+        return goal_deg
 
-    def _check_slip(self, slip: SlipMonitor, time_ns: int, angle_deg: float) -> None:
-        slip.add_reading(time_ns, angle_deg)
-        if encoder := slip.encoder_deg(self._gyro.newest_ns):
-            at_ns, rotation_deg = encoder
-            slip.compare(rotation_deg, self._gyro.since_rest(at_ns))
+    def _read(self, *, gyro_now: bool = False) -> tuple[ServoState, float]:
+        """Look for a request to stop, then read servo and gyro; return the servo's state and the table's angle."""
+        self._safety.check_stop_request()
+        state = self._servo.read_state()
+        for observer in self._safety.observers:
+            observer(state)
+        self._path.add(state)
+        self._gyro.update(now=gyro_now)
+        return state, self._safety.angle_reference.to_table(state.position_deg)
 
-    def _quiet(self, readings: deque[tuple[int, float]], quiet_s: float) -> bool:
-        """Return whether the readings span ``quiet_s`` without a motion; drop older readings."""
-        while len(readings) > 1 and seconds_between(readings[1][0], readings[-1][0]) >= quiet_s:
-            readings.popleft()
-        if seconds_between(readings[0][0], readings[-1][0]) < quiet_s:
-            return False
-        angles = [angle for _, angle in readings]
-        if max(angles) - min(angles) > QUIET_COUNTS * self._servo.resolution_deg:
-            return False
-        if quiet_s == 0 or self._gyro.bias is None:
-            return True
-        return self._gyro.peak_dps(quiet_s) <= self._config.quiet_dps
+    def _check(self, state: ServoState, angle_deg: float, rotation: _Rotation | None) -> None:
+        """Check the servo, and the rotation if there is one."""
+        if rotation is None or rotation.monitor is None:
+            self._safety.check_servo(state)
+        else:
+            lag_deg = None if state.trajectory_deg is None else state.trajectory_deg - state.position_deg
+            rotation.monitor.check(state, angle_deg, lag_deg)
+        if rotation is not None and (slip := rotation.slip):
+            slip.add_reading(state.time_ns, angle_deg)
+            if encoder := slip.encoder_deg(self._gyro.newest_ns):
+                at_ns, rotation_deg = encoder
+                slip.compare(rotation_deg, self._gyro.since_rest(at_ns))
 
     def _stop(self) -> bool:
-        ramp_dps2 = self._profile.acceleration_dps2 if self._profile else self._config.acceleration_dps2
-        path = MotionPath(self._path_deg, self._config.velocity_dps, self._trusted)
-        return halt(self._servo, self._clock, self._safety.set_goal, path, ramp_dps2, self._config.poll_s)
+        ramp_dps2 = (self._profile or self._config).acceleration_dps2
+        return halt(self._servo, self._clock, self._safety.set_goal, self._path, ramp_dps2, self._config.poll_s)

@@ -9,7 +9,7 @@ Decision: docs/decisions/0047.
 
 from collections.abc import Generator, Mapping
 from concurrent.futures import Future
-from dataclasses import dataclass, field
+from functools import partial
 from math import inf
 
 import numpy as np
@@ -21,65 +21,20 @@ from rig.catalog import Enrollment, ViewRecord
 from rig.core.errors import LimitExceeded, RotationDisagreement
 from rig.core.phrases import angle_words
 from rig.events.events import Accepted, Event, Rejected, ScanStarted, plain
-from rig.motion.flight_views import FlightFrameCheck
+from rig.motion.flight_views import FlightFrames
 from rig.motion.move import Move
-from rig.motion.scan_speed import require_camera_time, scan_speed
-from rig.motion.trajectory import TrajectoryRecorder
+from rig.motion.scan_speed import scan_speed
 from rig.motion.turntable import Flight, Turntable
 from rig.plans.capture import announced, capture, check_object, moved, warn_of_table
 from rig.views.capture import Attempt, Viewer
 from rig.views.description import DescribedView, ViewDescriber
 from rig.views.image_files import Encoder
-from rig.views.stream import FrameStream, StreamFrame, middle_ns
+from rig.views.stream import StreamFrame
 
 NEAR_SHARE = 0.6
 """Largest distance of a frame from its planned angle, as a share of the step."""
-READINGS = 8
-"""Readings of the encoder from which the angle of a frame is estimated during the revolution."""
-
-
-@dataclass
-class Scan:
-    """The frames of a revolution: the nearest one to each planned angle, and the time stamps of all."""
-
-    bench: Bench
-    table: Turntable
-    stream: FrameStream
-    recorder: TrajectoryRecorder
-    angles_deg: Mapping[int, float]
-    nearest: dict[int, tuple[float, StreamFrame]] = field(default_factory=dict)
-    stamps_ns: list[int] = field(default_factory=list)
-
-    def each(self) -> None:
-        """Wait for the next frame, and hold it in memory if it is the nearest so far to a planned angle."""
-        frame = self.stream.next(self.table.collect_gyro)
-        if frame is None:
-            return
-        self.stamps_ns.append(frame.stamp_ns)
-        about_deg = self._about_deg(middle_ns(frame.stamp_ns, self.bench.config.camera_time))
-        for index, angle_deg in self.angles_deg.items():
-            away_deg = abs(angle_deg - about_deg)
-            if away_deg < self.nearest.get(index, (15.0, None))[0]:
-                self.nearest[index] = away_deg, frame
-
-    def _about_deg(self, time_ns: int) -> float:
-        """Return the approximate angle at a time, from the last readings of the encoder."""
-        readings = self.recorder.newest_readings(READINGS)
-        if len(readings) < 2:
-            return readings[-1][1] if readings else self.table.rest_deg
-        times = np.array([(t - time_ns) * 1e-9 for t, _ in readings])
-        angles = np.array([angle for _, angle in readings])
-        if times[-1] >= 0:
-            return float(np.interp(0.0, times, angles))
-        rate = (angles[-1] - angles[-2]) / max(times[-1] - times[-2], 1e-3)
-        return float(angles[-1] - rate * times[-1])
-
-
-def start_of_revolution(bench: Bench, angles_deg: Mapping[int, float]) -> float | None:
-    """Return the start of a revolution upwards that passes all angles; None if the cable budget does not allow one."""
-    low_deg, high_deg = bench.config.table.limits_deg
-    start_deg = min(min(angles_deg.values()), high_deg - 360.0)
-    return start_deg if start_deg >= low_deg and max(angles_deg.values()) <= start_deg + 360.0 else None
+HELD_DEG = 15.0
+"""Largest distance of a frame from its planned angle, as far as it is known during the revolution."""
 
 
 def fly_views(
@@ -97,8 +52,6 @@ def fly_views(
 
     Raises
     ------
-    UsageError
-        The camera's time is not calibrated.
     LimitExceeded
         The cable budget does not allow a revolution.
     NoObject
@@ -108,16 +61,16 @@ def fly_views(
     """
     # Plan the revolution and its speed.
     config = bench.config
-    require_camera_time(config)
-    start_deg = start_of_revolution(bench, angles_deg)
-    if start_deg is None:
+    low_deg, high_deg = config.table.limits_deg
+    ordered = sorted(angles_deg.values())
+    start_deg = min(ordered[0], high_deg - 360.0)
+    if start_deg < low_deg or ordered[-1] > start_deg + 360.0:
         raise LimitExceeded(
             "A scan needs a revolution upwards. The cable budget does not allow that.",
             next_step="Increase table.limits_deg if the cable is long enough, or take the views at rest.",
             evidence={"limits_deg": list(config.table.limits_deg)},
         )
     end_deg = start_deg + 360.0
-    ordered = sorted(angles_deg.values())
     spacing_deg = min(np.diff(ordered).tolist(), default=360.0)
     speed = scan_speed(
         config, fps=bench.camera.identity.fps, gyro_range_dps=bench.imu.range_dps, spacing_deg=spacing_deg
@@ -128,31 +81,33 @@ def fly_views(
     before = yield from capture(0, viewer, table, bench.clock.now_ns())
     check_object(bench, before.image_bgr, describe.empty_table)
     yield ScanStarted(speed.dps, speed.limit, speed.value, start_deg, end_deg)
-    recorder = table.recorder()
-    scan = Scan(bench, table, FrameStream(bench.camera, bench.clock), recorder, angles_deg)
-    begun_ns = bench.clock.now_ns()
-    move = table.fly(end_deg, Flight(scan.each, (start_deg, end_deg), recorder, speed.dps))
+    frames = FlightFrames(bench, table)
+    nearest: dict[int, tuple[float, StreamFrame]] = {}
+
+    def hold_nearest(frame: StreamFrame) -> None:
+        about_deg = frames.about_deg(frame)
+        for index, angle_deg in angles_deg.items():
+            away_deg = abs(angle_deg - about_deg)
+            if away_deg < nearest.get(index, (HELD_DEG, None))[0]:
+                nearest[index] = away_deg, frame
+
+    move = frames.fly(end_deg, hold_nearest, (start_deg, end_deg), speed.dps)
     yield moved(len(angles_deg), move)
-    trajectory = recorder.fit()
+    trajectory = frames.recorder.fit()
     if trajectory is None or move.agreement is None or not (move.agreement.agrees and trajectory.consistent):
         raise _disagreement(bench, move, None if trajectory is None else trajectory.residual_deg)
     after = yield from capture(0, viewer, table, move.settled_ns)
     # Check the nearest frame to each angle, and store the accepted ones.
-    frame_check = FlightFrameCheck(
-        config,
-        before.evidence.locks,
-        before.evidence.locks_hold and after.evidence.locks_hold,
-        begun_ns,
-        scan.stream.period_s,
-    )
-    off = dict(zip(scan.stamps_ns, frame_check.irregular(scan.stamps_ns).tolist(), strict=True))
+    locks, locks_hold = before.evidence.locks, before.evidence.locks_hold and after.evidence.locks_hold
+    irregular_ns = frames.irregular_ns()
     stored: set[int] = set()
     encoder = Encoder()
     for index, angle_deg in angles_deg.items():
-        _, frame = scan.nearest.pop(index, (inf, None))
+        _, frame = nearest.pop(index, (inf, None))
         if frame is None:
             continue
-        attempt = frame_check.attempt(frame, trajectory, irregular=off[frame.stamp_ns])
+        irregular = frame.stamp_ns in irregular_ns
+        attempt = frames.attempt(frame, trajectory, locks, locks_hold=locks_hold, irregular=irregular)
         assert attempt.evidence.motion is not None
         if abs(attempt.evidence.motion.angle_deg - angle_deg) > NEAR_SHARE * spacing_deg:
             continue  # the frames near this angle were lost
@@ -161,7 +116,7 @@ def fly_views(
             continue
         encoded = encoder.begin(attempt.image_bgr)
         described = describe(attempt.image_bgr)
-        attempt = frame_check.at_the_object(attempt, described.segmentation, trajectory)
+        attempt = frames.at_the_object(attempt, described.segmentation, trajectory)
         yield from _store(bench, enrollment, index, angle_deg, attempt, described, encoded)
         stored.add(index)
     return stored, start_deg, before.image_bgr, after.image_bgr
@@ -196,16 +151,10 @@ def _store(
 
 def park(table: Turntable, bench: Bench) -> Move:
     """Return to 0 to free the cable; the table need not be quiet there, because no view follows."""
-    low_deg, high_deg = sorted((0.0, table.rest_deg))
-    poll_s = bench.config.table.poll_s
-    flight = Flight(
-        lambda: bench.clock.sleep(poll_s),
-        (low_deg, high_deg),
-        table.recorder(),
-        bench.config.table.velocity_dps,
-        quiet=False,
-    )
-    return table.fly(0.0, flight)
+    config = bench.config.table
+    reach_deg = min(0.0, table.rest_deg), max(0.0, table.rest_deg)
+    pause = partial(bench.clock.sleep, config.poll_s)
+    return table.fly(0.0, Flight(pause, reach_deg, table.recorder(), config.velocity_dps, quiet=False))
 
 
 def _disagreement(bench: Bench, move: Move, residual_deg: float | None) -> RotationDisagreement:

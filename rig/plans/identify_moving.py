@@ -17,15 +17,14 @@ from rig.core.clock import seconds_between
 from rig.core.errors import MotionStopped
 from rig.devices.camera import CameraLocks
 from rig.events.events import Event, FrameUsed, Rejected
-from rig.motion.flight_views import FlightFrameCheck
+from rig.motion.flight_views import FlightFrames
 from rig.motion.move import Move
 from rig.motion.scan_speed import scan_speed
-from rig.motion.trajectory import TrajectoryRecorder
-from rig.motion.turntable import Flight, Turntable
+from rig.motion.turntable import Turntable
 from rig.plans.capture import accepted, moved
 from rig.plans.search_steps import Searched, SearchSteps, unwound
 from rig.search.strategies import Finish
-from rig.views.stream import FrameStream
+from rig.views.stream import StreamFrame
 
 FIRST_REST_S: Final = 0.15
 """Time over which the gyro is averaged before the first view; the fit of the trajectory corrects the bias later."""
@@ -55,40 +54,30 @@ class _ArcFrames:
     goal_deg: float = 0.0
     ended_ns: int | None = None
     rejected_in_a_row: int = 0
-    stamps_ns: list[int] = field(default_factory=list)
     events: list[Event] = field(default_factory=list)
+    locks: CameraLocks = field(init=False)
 
     @cached_property
-    def recorder(self) -> TrajectoryRecorder:
-        return self.table.recorder()
-
-    @cached_property
-    def stream(self) -> FrameStream:
-        return FrameStream(self.steps.bench.camera, self.steps.bench.clock)
+    def flight(self) -> FlightFrames:
+        return FlightFrames(self.steps.bench, self.table, newest=True)
 
     def fly(self, goal_deg: float, locks: CameraLocks) -> Move:
         """Rotate along an arc; ``locks`` are the camera's settings of the view before it."""
-        bench, recorder, stream = self.steps.bench, self.recorder, self.stream
-        self.frame_check = FlightFrameCheck(bench.config, locks, True, bench.clock.now_ns(), stream.period_s)
-        self.goal_deg, self.rejected_in_a_row, self.stamps_ns = goal_deg, 0, []
+        self.goal_deg, self.rejected_in_a_row, self.locks = goal_deg, 0, locks
         (low_deg, high_deg), here_deg = self.table.limits_deg, self.table.rest_deg
         reach_deg = max(low_deg, here_deg - 360.0), min(high_deg, here_deg + 360.0)
-        return self.table.fly(goal_deg, Flight(self.each, reach_deg, recorder, self.velocity_dps, quiet=False))
+        return self.flight.fly(goal_deg, self.take, reach_deg, self.velocity_dps, quiet=False)
 
-    def each(self) -> float | None:
-        """Take the next frame as evidence; return a new goal, or the stopping angle if the search has ended."""
-        frame = self.stream.next(self.table.collect_gyro, newest=True)
-        if frame is None:
-            return None
-        self.stamps_ns = [*self.stamps_ns[1 - STAMPS :], frame.stamp_ns]
+    def take(self, frame: StreamFrame) -> float | None:
+        """Take a frame as evidence; return a new goal, or the stopping angle if the search has ended."""
         if self.ended_ns is not None or self.rejected_in_a_row >= MOST_REJECTED:
             return self.goal_deg
         # Check the frame.
-        trajectory = self.recorder.fit()
+        trajectory = self.flight.recorder.fit()
         if trajectory is None:
             return None
-        irregular = bool(self.frame_check.irregular(self.stamps_ns)[-1])
-        attempt = self.frame_check.attempt(frame, trajectory, irregular=irregular)
+        irregular = frame.stamp_ns in self.flight.irregular_ns(STAMPS)
+        attempt = self.flight.attempt(frame, trajectory, self.locks, locks_hold=True, irregular=irregular)
         if not attempt.accepted:
             self.rejected += 1
             self.rejected_in_a_row += 1
@@ -99,7 +88,7 @@ class _ArcFrames:
         self.number += 1
         search, bench = self.steps.search, self.steps.bench
         described = self.steps.describe(attempt.image_bgr)
-        attempt = self.frame_check.at_the_object(attempt, described.segmentation, trajectory)
+        attempt = self.flight.at_the_object(attempt, described.segmentation, trajectory)
         motion = attempt.evidence.motion
         assert motion is not None
         sign = bench.config.table.orientation_sign
@@ -125,8 +114,7 @@ class _ArcFrames:
         return goal_deg
 
     def _stop(self) -> float:
-        """Return the angle at which the table stops if it brakes now."""
-        self.goal_deg = self.table.stopping_deg(self.steps.bench.servo.read_state())
+        self.goal_deg = self.flight.stopping_deg()
         return self.goal_deg
 
 

@@ -133,6 +133,31 @@ def test_goal_may_change_without_a_stop_and_speed_returns_to_the_usual() -> None
         assert table.goto(90.0).seconds < 1.5
 
 
+def test_goal_beyond_the_reach_of_a_flight_is_moved_into_it_and_the_usual_speed_returns() -> None:
+    with motion_bench(seed=1) as (bench, wires), Turntable(bench) as table:
+        usual, speeds = wires.device.memory["Profile Velocity"], set()
+
+        def each() -> float:
+            wires.world.clock.sleep(0.033)
+            speeds.add(wires.device.memory["Profile Velocity"])
+            return 300.0
+
+        move = table.fly(60.0, Flight(each, (0.0, 70.0), table.recorder(), 45.0))
+        assert move.commanded_deg == 70.0
+        assert move.encoder_deg == pytest.approx(70.0, abs=0.3)
+        assert usual not in speeds
+        assert wires.device.memory["Profile Velocity"] == usual
+
+
+def test_flight_waits_for_quiet_only_if_it_must() -> None:
+    with motion_bench(seed=1) as (bench, wires), Turntable(bench) as table:
+        pause, seconds = partial(wires.world.clock.sleep, 0.033), []
+        for goal_deg, quiet in ((60.0, True), (0.0, False)):
+            flight = Flight(pause, (0.0, 60.0), table.recorder(), 90.0, quiet)
+            seconds.append(table.fly(goal_deg, flight).seconds)
+        assert seconds[1] < seconds[0] - bench.config.table.quiet_s / 2
+
+
 @pytest.mark.parametrize(
     ("angles", "states", "used"),
     [

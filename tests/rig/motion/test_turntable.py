@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from rig.core.errors import DeviceSilent, FaultLatched, LimitExceeded, MotionTimeout, NoProgress, NotReady, Stalled
 from rig.devices.servo import MotionProfile
 from rig.motion.move import motion_seconds
-from rig.motion.turntable import Turntable
+from rig.motion.trajectory import TrajectoryRecorder
+from rig.motion.turntable import Flight, Turntable
 from rig.safety.supervisor import TableState
 from sim.noise import NoiseModel
 from sim.servo import Frame
@@ -176,6 +177,12 @@ def test_within_reach_returns_an_equivalent_angle(target, low, span):
 def test_motion_needs_torque():
     with motion_bench() as (bench, _), pytest.raises(NotReady, match="torque"):
         Turntable(bench).goto(5.0)
+
+
+def test_flight_needs_torque():
+    recorder = TrajectoryRecorder(0.088, 0.5, 0.01, 0.0035)
+    with motion_bench() as (bench, _), pytest.raises(NotReady, match="torque"):
+        Turntable(bench).fly(5.0, Flight(lambda: None, (0.0, 5.0), recorder, 90.0))
 
 
 def test_jam_is_detected_before_the_servo_shuts_down():

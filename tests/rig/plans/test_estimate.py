@@ -12,8 +12,10 @@ from rig.config import load_config
 from rig.core.errors import LimitExceeded
 from rig.events.events import Accepted, Enrolled, Moved, Started
 from rig.motion.motion_model import MotionModel
+from rig.motion.turntable import Turntable
 from rig.plans.enroll import enroll
 from rig.plans.estimate import TimeLeft, dry_run, even_azimuths, table_angles
+from tests.rig.bench_parts import motion_bench
 
 LIMITS = st.floats(-2000, 0).flatmap(
     lambda low: st.tuples(st.just(low), st.floats(max(0.0, low + 360.0), low + 4000.0))
@@ -75,6 +77,13 @@ def test_motion_model_predicts_the_duration_within_10_percent(simulated, tmp_pat
     assert before.seconds == pytest.approx(duration_s, rel=0.1)
     for now_ns, seconds in predicted:
         assert seconds == pytest.approx((end_ns - now_ns) * 1e-9, rel=0.1, abs=1.5)
+
+
+@pytest.mark.parametrize("quiet_s", [0.05, 0.12, 0.6])
+def test_move_is_estimated_with_the_time_in_which_the_table_must_be_quiet(quiet_s):
+    with motion_bench(f"table.quiet_s={quiet_s}") as (bench, _), Turntable(bench) as table:
+        table.goto(10.0)
+        assert MotionModel(bench.config).move_s(90.0) == pytest.approx(table.goto(100.0).seconds, abs=0.1)
 
 
 def test_dry_run_shows_the_actions_and_moves_and_stores_nothing(simulated, tmp_path):
