@@ -23,7 +23,6 @@ from calibration.procedure import (
     lower_end,
     require_at_least,
     returning,
-    table_settings,
 )
 from rig.bench import Bench
 from rig.calibrations import CalibrationResult, RejectionCode
@@ -76,7 +75,7 @@ class Backlash(Procedure):
         require_at_least(MIN_REVERSALS, self.reversals, "reversals")
         legs: list[Leg] = []
         # Without the usual approach from one side, because the backlash is measured.
-        with table_settings(bench, approach_deg=0.0), Turntable(bench, trust_gyro=False) as table:
+        with Turntable(bench, trust_gyro=False, approach_deg=0.0) as table:
             base_deg = lower_end(bench, table.rest_deg, LONG_DEG)
             with returning(table) as goto:
                 yield moved(0, goto(base_deg + LONG_DEG))

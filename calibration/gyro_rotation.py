@@ -28,7 +28,6 @@ from calibration.procedure import (
     lower_end,
     require_at_least,
     returning,
-    table_settings,
 )
 from rig.bench import Bench
 from rig.calibrations import CalibrationResult, RejectionCode
@@ -90,8 +89,7 @@ class GyroRotation(Procedure):
         moves: list[TimedLeg] = []
         index = 0
         for speed, share in SPEEDS.items():
-            slower = table_settings(bench, velocity_dps=velocity_dps * share)
-            with slower, Turntable(bench, trust_gyro=False) as table:
+            with Turntable(bench, trust_gyro=False, velocity_dps=velocity_dps * share) as table:
                 base_deg = lower_end(bench, table.rest_deg, DISTANCE_DEG)
                 with returning(table) as goto:
                     for number in range(2 * self.repeats + 1):

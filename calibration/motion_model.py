@@ -23,7 +23,6 @@ from calibration.procedure import (
     lower_end,
     require_at_least,
     returning,
-    table_settings,
 )
 from rig.bench import Bench
 from rig.calibrations import CalibrationResult, RejectionCode
@@ -82,7 +81,7 @@ class MotionModel(Procedure):
     def measure(self, bench: Bench, *_: CalibrationResult) -> Measured:
         require_at_least(MIN_ROUNDS, self.rounds, "rounds")
         moves: list[TimedMove] = []
-        with table_settings(bench, approach_deg=0.0), Turntable(bench) as table:
+        with Turntable(bench, approach_deg=0.0) as table:
             base_deg = lower_end(bench, table.rest_deg, DISTANCES_DEG[-1])
             with returning(table) as goto:
                 ends = (goal for distance in DISTANCES_DEG * self.rounds for goal in (base_deg + distance, base_deg))

@@ -163,17 +163,6 @@ def returning(table: Turntable) -> Iterator[Callable[[float], Move]]:
     table.goto(start_deg)
 
 
-@contextmanager
-def table_settings(bench: Bench, **changes: float) -> Iterator[None]:
-    """Change settings of ``table`` for the length of a ``with`` block."""
-    before = bench.config
-    bench.config = before.model_copy(update={"table": before.table.model_copy(update=changes)})
-    try:
-        yield
-    finally:
-        bench.config = before
-
-
 def require_at_least(minimum: float, value: float, what: str) -> None:
     """Raise `UsageError` if ``value`` is below ``minimum``."""
     if value < minimum:

@@ -80,10 +80,14 @@ class Turntable(AbstractContextManager["Turntable"]):
         Whether a motion is stopped if the gyro contradicts the encoder. Calibrations of the gyro set it to False.
     first_rest_s
         How long the gyro is averaged for its first bias.
+    changes
+        Settings of the section ``table`` that differ from those of the bench. Calibrations change them.
     """
 
-    def __init__(self, bench: Bench, *, trust_gyro: bool = True, first_rest_s: float = FIRST_REST_S) -> None:
-        self._config = bench.config.table
+    def __init__(
+        self, bench: Bench, *, trust_gyro: bool = True, first_rest_s: float = FIRST_REST_S, **changes: float
+    ) -> None:
+        self._config = bench.config.table.model_copy(update=changes)
         self._limits = bench.config.safety
         self._servo = bench.servo
         self._clock = bench.clock
