@@ -37,7 +37,7 @@ def test_all_pages_work_in_a_day_at_the_bench(page, serve_process, tmp_path, vie
     page.set_input_files("#file", tray)
     page.click("#tray-start")
     for name in ("mug-star", "mug-white"):
-        page.wait_for_selector(f".question:has-text('put {name} on the table')", timeout=WAIT_MS)
+        page.wait_for_selector(f".question:has-text('put {name} (kitchen) on the table')", timeout=WAIT_MS)
         page.click(".question button:has-text('Continue')")
     job_done(page, "Enroll a tray")
     # Identify.
