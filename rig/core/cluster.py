@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Final, TypeVar
 
 from rig.core.errors import ClusterFailed, ExtraMissing, UsageError
+from rig.core.phrases import whole
 
 _Item = TypeVar("_Item")
 _T = TypeVar("_T")
@@ -44,7 +45,7 @@ class Cluster:
         name, _, count = self.address.partition(":")
         if name != LOCAL:
             return None
-        if count and not (count.isdecimal() and int(count) > 0):
+        if count and not whole(count):
             raise UsageError(f"--cluster {self.address!r}: {count!r} is not a number.", next_step="Give local:2.")
         return int(count or 0)
 

@@ -5,6 +5,11 @@ from string import Formatter
 from typing import Any
 
 
+def whole(text: str) -> int | None:
+    """Return the number of a text of up to 15 digits; None for any other text. Python rejects thousands of digits."""
+    return int(text) if text.isdecimal() and len(text) <= 15 else None
+
+
 def percent_words(probability: float) -> str:
     """Return a probability in percent; "<0.1 %" and ">99.9 %" at the ends."""
     if probability > 0.999:

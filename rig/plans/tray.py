@@ -20,7 +20,7 @@ from rig.core.errors import (
     os_errors_as,
 )
 from rig.core.files import read
-from rig.core.phrases import counted
+from rig.core.phrases import counted, whole
 from rig.events.events import Event, Item, SkipReason
 from rig.motion.scan_speed import takes_in_motion
 from rig.plans.enroll import enroll
@@ -232,9 +232,10 @@ def _item(line: int, headings: Sequence[str], cells: Sequence[str]) -> TrayItem:
     values = {heading: cell.strip() for heading, cell in zip(headings, cells, strict=False)}
     views = None
     if values.get("views"):
-        if not values["views"].isdecimal() or not MIN_VIEWS <= int(values["views"]) <= MAX_VIEWS:
+        views = whole(values["views"])
+        if views is None or not MIN_VIEWS <= views <= MAX_VIEWS:
             raise UsageError(
-                f"views is {values['views']!r}, not a number from {MIN_VIEWS} to {MAX_VIEWS}.", next_step="Correct it."
+                f"views is {values['views'][:20]!r}, not a number from {MIN_VIEWS} to {MAX_VIEWS}.",
+                next_step="Correct it.",
             )
-        views = int(values["views"])
     return TrayItem(line, clean_name(values.get("name", "")), values.get("label"), values.get("note"), views)

@@ -13,6 +13,8 @@ from weakref import WeakKeyDictionary
 from starlette.exceptions import HTTPException
 from uvicorn.protocols.http.h11_impl import H11Protocol, RequestResponseCycle
 
+from rig.core.phrases import whole
+
 Scope = MutableMapping[str, Any]
 Message = MutableMapping[str, Any]
 Receive = Callable[[], Awaitable[Message]]
@@ -80,7 +82,7 @@ class Guard:
             return
         limit = self._max_upload_bytes if scope["path"] == self._upload_path else MAX_BODY_BYTES
         declared = headers.get("content-length", "0")
-        if not declared.isdecimal() or int(declared) > limit:
+        if (size := whole(declared)) is None or size > limit:
             await _reject(send, 413, "The request is too large.", f"Send at most {limit} bytes.")
             return
         received = 0

@@ -13,6 +13,8 @@ from contextlib import aclosing
 from dataclasses import dataclass
 from typing import Any, Final
 
+from rig.core.phrases import whole
+
 CAPACITY: Final = 20_000
 """Messages that can be sent again after a lost connection: about 200 enrollments of 72 views."""
 MAX_SIZE: Final = 64_000_000
@@ -87,9 +89,10 @@ class Hub:
         if not last_event_id:
             return self._last, False
         epoch, _, number = last_event_id.rpartition("-")
-        if epoch != self._epoch or not number.isdecimal() or int(number) > self._last:
+        position = whole(number)
+        if epoch != self._epoch or position is None or position > self._last:
             return self._last, True
-        return int(number), False
+        return position, False
 
     async def messages(
         self, last_event_id: str | None = None, still_allowed: Callable[[], bool] = lambda: True

@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from typing import TypeVar
 
 from rig.core.errors import UsageError
+from rig.core.phrases import whole
 
 T = TypeVar("T")
 
@@ -62,8 +63,8 @@ def ask_choice(question: str, options: Sequence[str], *, other: str = "") -> int
         print(f"  o  {other}", file=sys.stderr)
     while True:
         answer = ask_line(f"1–{len(options)}{' or o' if other else ''}:").lower()
-        if answer.isdigit() and 1 <= int(answer) <= len(options):
-            return int(answer) - 1
+        if (chosen := whole(answer)) is not None and 1 <= chosen <= len(options):
+            return chosen - 1
         if answer == "o" and other:
             return None
         print(f"Answer with a number from 1 to {len(options)}{', or with o' if other else ''}.", file=sys.stderr)

@@ -89,6 +89,7 @@ def test_every_mistake_is_reported_with_its_line(tmp_path):
         ('name\n"mug\n', "not CSV"),
         ("name\nmug\nname\xe4\n".encode("latin-1"), "line 3: byte 0xe4"),
         ("name,views\nmug,3\n", "from 4 to 720"),
+        (f"name,views\nmug,{'1' * 5000}\n", "from 4 to 720"),
     ],
 )
 def test_unusable_lists_are_rejected(tmp_path, text, words):
