@@ -300,8 +300,11 @@ def run(settings: Settings, *procedures: "Procedure") -> None:
     """
     from calibration.jobs import calibrated
     from rig.cli.ui.desk import CommandDesk
+    from rig.cli.ui.jobs import is_interactive
+    from rig.cli.ui.operator import TerminalOperator
 
     desk = CommandDesk(settings)
+    desk.operator = TerminalOperator(is_there=is_interactive())  # also with --json: a person must put the board there
     if not desk.run(calibrated(desk, procedures)):
         raise typer.Exit(EXIT_QUALITY)
 

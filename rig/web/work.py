@@ -9,7 +9,7 @@ from typing import Any, Final, Protocol, assert_never
 
 from rig.bench import Bench
 from rig.bench.bench import DEVICES
-from rig.catalog import Catalog
+from rig.catalog import Action, Catalog
 from rig.config import RigConfig
 from rig.core.clock import Clock
 from rig.core.errors import UsageError
@@ -80,6 +80,10 @@ class ServedDesk(Desk):
 
     def open_to_enroll(self, clock: Clock) -> Catalog:
         return self._catalog.open_to_enroll(clock)
+
+    def log(self, action: Action, **details: Any) -> Iterator[Remark]:
+        if self.place.url is None:  # waiting for a server that is away would delay the answer to a STOP
+            yield from super().log(action, **details)
 
     def deliver(self) -> Iterator[Remark]:
         for words in self._catalog.deliver():

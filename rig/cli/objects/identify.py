@@ -90,7 +90,7 @@ def identify(
 
     desk = CommandDesk(settings)
     with ExitStack() as beside, IdentifyView(screen, keys=not scan) as view:
-        if watch and desk.place.may_exist():
+        if watch:
             beside.enter_context(settings.background_check())
             beside.enter_context(settings.background_delivery())
         job = identify_job(

@@ -5,7 +5,7 @@ This module imports none of numpy, cv2, scipy and sqlalchemy: `rig --help` must 
 
 import json
 import sys
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,10 +15,10 @@ from rig.core.masking import masked
 
 if TYPE_CHECKING:
     from collections.abc import Collection
+    from contextlib import AbstractContextManager
 
     from rig.bench import Bench
     from rig.catalog import Catalog
-    from rig.catalog.background import BackgroundCheck
     from rig.catalog.delivery import Delivery
     from rig.catalog.shared import BackgroundDelivery
     from rig.config import RigConfig
@@ -160,15 +160,19 @@ class Settings:
 
         return BackgroundDelivery(self.load().catalog_place(self.bench_name), SystemClock(), _report)
 
-    def background_check(self) -> "BackgroundCheck":
+    def background_check(self) -> "AbstractContextManager[object]":
         """Return a check of the bench's catalog during the work of a ``with`` block; damage is printed on stderr."""
         from rig.catalog.background import BackgroundCheck
         from rig.core.clock import SystemClock
 
+        place = self.load().catalog_place(self.bench_name)
+        if not place.may_exist():
+            return nullcontext()
+
         def report(damage: RigError) -> None:
             _report(f"{damage.what} Next step: {damage.next_step}")
 
-        return BackgroundCheck(self.load().catalog_place(self.bench_name), SystemClock(), report)
+        return BackgroundCheck(place, SystemClock(), report)
 
     def _no_catalog(self, path: Path) -> RigError:
         """Return the error that the bench has no catalog; it names the benches that have one."""
