@@ -10,6 +10,7 @@ from queue import Empty, SimpleQueue
 from threading import Thread
 
 from rig.core.errors import RigError
+from rig.core.next_steps import Do
 from rig.doctor.context import DoctorContext
 from rig.doctor.finding import Finding, FindingCode, bad, of_error
 
@@ -60,9 +61,9 @@ def _run(context: DoctorContext, check: Check, put: Callable[[Finding | str | No
     except RigError as error:
         put(of_error(check.topic, error))
     except OSError as error:  # a device was unplugged, or a file cannot be read
-        put(bad(check.topic, FindingCode.CHECK_INTERRUPTED, context.rig("doctor"), reason=str(error)))
+        put(bad(check.topic, FindingCode.CHECK_INTERRUPTED, context.step(Do.DOCTOR()), reason=str(error)))
     except Exception as error:  # a bug: report it as one, and continue with the other checks
-        fix = "Report this with the output of `rig doctor --json`"
+        fix = context.step(Do.REPORT_DEFECT())
         put(bad(check.topic, FindingCode.CHECK_FAILED, fix, 1, error=repr(error)))
     finally:
         with suppress(RuntimeError):  # the interpreter is shutting down

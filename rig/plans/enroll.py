@@ -17,6 +17,7 @@ from rig.catalog import Catalog, Enrollment, Provenance, ViewRecord
 from rig.catalog.descriptions import unfinished_camera_settings
 from rig.core.clock import seconds_between
 from rig.core.errors import ObjectMoved, RigError, RotationDisagreement
+from rig.core.next_steps import Do
 from rig.core.phrases import angle_words
 from rig.events.events import Accepted, Enrolled, Event, Started, plain
 from rig.motion.move import Move
@@ -265,7 +266,7 @@ def require_not_moved(
         raise ObjectMoved(
             f"{enrollment.object_name} is not where it was for view {index + 1}: it fell, was pushed, or slid on the "
             "platter. The views of this session are abandoned.",
-            next_step="Put the object back on its mark, fasten it, and enroll it again with --replace.",
+            next_step=("Put the object back on its mark, and fasten it.", Do.ENROLL_AGAIN(name=enrollment.object_name)),
             evidence={"similarity": round(alike, 3), "smallest_similarity": SAME_SIMILARITY, "table_deg": angle_deg},
         )
 
@@ -292,15 +293,18 @@ def _disagreement(move: Move) -> RotationDisagreement:
         return RotationDisagreement(
             "It is not known whether the platter followed the servo's rotation of "
             f"{angle_words(move.rotation_encoder_deg, 2)}: {move.gyro.reason}.",
-            next_step="If nothing hit the table, continue with --resume. Otherwise enroll the object again with "
-            "--replace.",
+            next_step=("If nothing hit the table,", Do.CONTINUE_ENROLLMENT(), "Otherwise,", Do.ENROLL_AGAIN()),
             evidence={"table_deg": round(move.encoder_deg, 2)},
         )
     return RotationDisagreement(
         f"The servo rotated {angle_words(move.rotation_encoder_deg, 2)}, but the platter "
         f"{angle_words(move.gyro.angle_deg, 2)}.",
-        next_step="Tighten the platter.",
-        afterwards="Enroll the object again with --replace: views from before and after a slip do not fit together.",
+        next_step=(
+            "Tighten the platter.",
+            Do.ACKNOWLEDGE(),
+            Do.ENROLL_AGAIN(),
+            "Views from before and after a slip do not fit together.",
+        ),
         evidence={
             "difference_deg": round(move.agreement.difference_deg, 3),
             "bound_deg": round(move.agreement.bound_deg, 3),

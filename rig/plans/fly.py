@@ -19,6 +19,7 @@ from hbr.core.angles import wrap360
 from rig.bench import Bench
 from rig.catalog import Enrollment, ViewRecord
 from rig.core.errors import LimitExceeded, RotationDisagreement
+from rig.core.next_steps import Do
 from rig.core.phrases import angle_words
 from rig.events.events import Accepted, Event, Rejected, ScanStarted, plain
 from rig.motion.flight_views import FlightFrames
@@ -164,9 +165,13 @@ def _disagreement(bench: Bench, move: Move, residual_deg: float | None) -> Rotat
         what += f", and on the way they differed by up to {residual_deg:.2f}°"
     error = RotationDisagreement(
         f"{what}. No view of this revolution is stored.",
-        next_step="Tighten the platter.",
-        afterwards="Enroll the object again with --replace. If the gyro lost samples, check the IMU's cable and "
-        "continue with --resume.",
+        next_step=(
+            "Tighten the platter.",
+            Do.ACKNOWLEDGE(),
+            Do.ENROLL_AGAIN(),
+            "If the gyro lost samples, check the IMU's cable, and",
+            Do.CONTINUE_ENROLLMENT(),
+        ),
         evidence={
             "table_deg": round(move.encoder_deg, 2),
             "residual_deg": None if residual_deg is None else round(residual_deg, 3),

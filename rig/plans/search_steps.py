@@ -11,6 +11,7 @@ from hbr.dense.enrolled_views import NeedEnrolledViews
 from hbr.dense.local_difference import LocalView
 from rig.bench import Bench
 from rig.core.errors import CatalogError, RigError
+from rig.core.next_steps import steps_as_json
 from rig.events.events import Decided, Event, Identified, Note, NoteCode, Warned
 from rig.motion.turntable import Turntable
 from rig.plans.capture import accepted, capture, unwind, warn_of_table
@@ -100,7 +101,7 @@ class SearchSteps:
                 try:
                     views = self.model.leader_views(self.search.names[asked.object_index], asked.azimuths_deg)
                 except CatalogError as error:
-                    values = {"what": error.what, "next_step": error.next_step}
+                    values = {"what": error.what, "next_step": error.next_step, "steps": steps_as_json(error.steps)}
                     yield Warned(self.search.ranked.index, Note(NoteCode.NOT_COMPARED, values))
 
 

@@ -70,7 +70,7 @@ def watch(
             )
             views = answer.views
         except (NoObject, ViewRejected) as error:
-            yield Failed(**{key: error.as_dict()[key] for key in ("error", "code", "what", "evidence", "next_step")})
+            yield Failed(**error.as_dict())
             views = 0
         with Turntable(bench) as table:
             if abs(table.rest_deg - home_deg) > bench.config.table.tolerance_deg:

@@ -13,6 +13,7 @@ from weakref import WeakKeyDictionary
 from starlette.exceptions import HTTPException
 from uvicorn.protocols.http.h11_impl import H11Protocol, RequestResponseCycle
 
+from rig.core.next_steps import Do, SomeSteps
 from rig.core.phrases import whole
 
 Scope = MutableMapping[str, Any]
@@ -114,10 +115,13 @@ class Guard:
 
         await self._app(scope, limited, guarded)
 
-    def _rejection(self, method: str, path: str, headers: dict[str, str]) -> tuple[int, str, str] | None:
+    def _rejection(self, method: str, path: str, headers: dict[str, str]) -> tuple[int, str, SomeSteps] | None:
         host = headers.get("host", "")
         if _host_name(host) not in self._hosts:
-            step = "Use an address that rig serve prints, or allow this name with --allow-host."
+            step = (
+                "Use an address that the server prints at its start, or allow this name:",
+                Do.SERVE_AGAIN(allow_host="NAME"),
+            )
             return 421, "The server does not answer to this host name.", step
         site = headers.get("sec-fetch-site", "none")
         navigates = method == "GET" and headers.get("sec-fetch-mode") == "navigate" and not path.startswith("/api/")
@@ -147,7 +151,7 @@ def _origin_host(origin: str) -> str:
         return ""
 
 
-async def _reject(send: Send, status: int, what: str, next_step: str) -> None:
+async def _reject(send: Send, status: int, what: str, next_step: SomeSteps) -> None:
     from rig.web.problems import problem_body
 
     body = problem_body(status, what, next_step)

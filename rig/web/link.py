@@ -16,6 +16,7 @@ from typing import Any, Final
 
 from rig.core import errors
 from rig.core.errors import BenchBusy, RigError
+from rig.core.next_steps import Do, steps_from_json
 
 HEAD: Final = struct.Struct(">II")
 """Length of the JSON text and of the content, in bytes."""
@@ -117,13 +118,14 @@ class Link:
 
 def error_values(error: RigError) -> Message:
     """Return an error as JSON values."""
-    return {"kind": type(error).__name__, **{key: getattr(error, key) for key in ("what", "next_step", "evidence")}}
+    values = error.as_dict()
+    return {"kind": type(error).__name__, **{key: values[key] for key in ("what", "steps", "evidence")}}
 
 
 def error_of(values: Message) -> RigError:
     """Return the error of these values."""
     kind = getattr(errors, values["kind"], RigError)
-    return kind(values["what"], next_step=values["next_step"], evidence=values["evidence"])
+    return kind(values["what"], next_step=steps_from_json(values["steps"]), evidence=values["evidence"])
 
 
 class Calls:
@@ -152,7 +154,7 @@ class Calls:
         except TimeoutError as error:
             raise BenchBusy(
                 "The process that owns the bench does not answer.",
-                next_step="Look at the table. If this stays so, end rig serve and start it again.",
+                next_step=("Look at the table. If this stays so,", Do.SERVE_AGAIN()),
             ) from error
         finally:
             del self._waiting[number]

@@ -13,9 +13,10 @@ from rig.catalog import Action, Catalog
 from rig.config import RigConfig
 from rig.core.clock import Clock
 from rig.core.errors import UsageError
+from rig.core.next_steps import as_steps, steps_as_json
 from rig.core.phrases import counted, duration_words
 from rig.events.events import Enrolled, Identified, event_dict, plain
-from rig.events.lines import line
+from rig.events.lines import page_line
 from rig.jobs.desk import Desk, Progress, Remark, Result, Step, Steps
 from rig.jobs.enroll import enroll, enroll_list
 from rig.jobs.identify import identify
@@ -39,6 +40,7 @@ from rig.web.requests import (
     ReferenceRequest,
     TrayRequest,
 )
+from rig.web.requests import Question as JobQuestion
 from rig.web.worker import Context, Work
 
 CALIBRATIONS: Final = "rig.calibrations"
@@ -99,7 +101,11 @@ class _BrowserOperator:
         self._context = context
 
     def choose(self, question: Question) -> Choice:
-        return self._context.asked(question.text, tuple(question.choices))
+        return self._context.asked(
+            JobQuestion(
+                text=question.text, choices=tuple(question.choices), steps=steps_as_json(as_steps(question.steps))
+            )
+        )
 
     def ask_sample(self) -> str | None:
         return None  # the request names it
@@ -194,7 +200,7 @@ class WorkFactory:
         with closing(self.examine()) as found:
             for finding in found:
                 findings.append(finding)
-                context.note(f"{finding['topic']}: {finding['finding']}")
+                context.note(f"{finding['topic']}: {finding['finding']}", ())
         context.job.result = {"findings": findings}
         bad = sum(finding["level"] == "bad" for finding in findings)
         context.job.result_text = f"{bad or 'No'} problem{'s' * (bad != 1)} found."
@@ -203,19 +209,19 @@ class WorkFactory:
 def _show(context: Context, step: Step) -> None:
     """Report a step of a job; an operator who cancels closes the job here, and so the torque goes off."""
     match step:
-        case Remark(text=text, event=event):
+        case Remark(text=text, event=event, steps=steps):
             if event is None:
-                context.note(text)
+                context.note(text, steps)
             else:
                 context.add(event)
         case Progress():
-            context.note(step.words)
+            context.note(step.words, ())
         case Result():
             context.job.result, context.job.result_text = step.values, step.text
         case _:
             context.add(step)
             if isinstance(step, Enrolled | Identified):
-                context.job.result, context.job.result_text = event_dict(step), line(step)
+                context.job.result, context.job.result_text = event_dict(step), page_line(step)
 
 
 def _dry_run(desk: Desk, request: DryRunRequest) -> Steps[None]:
@@ -240,7 +246,7 @@ def _calibrated(context: Context, desk: Desk, request: CalibrateRequest) -> Step
         for step in steps:
             if isinstance(step, Result):
                 results.append(step)
-                context.note(step.text)
+                context.note(step.text, ())
             else:
                 yield step
     values = [{"name": one.values["name"], "passed": one.values["passed"], "text": one.text} for one in results]

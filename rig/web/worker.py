@@ -14,9 +14,10 @@ from typing import Any, Final
 from rig.bench import Bench
 from rig.core.clock import SystemClock, seconds_between
 from rig.core.errors import DeviceMismatch, DeviceNotFound, DeviceSilent, RigError
+from rig.core.next_steps import NextSteps, SomeSteps, as_steps, steps_as_json
 from rig.devices.servo import ServoState
 from rig.events.events import Accepted, Decided, Event, Started, event_dict, plain
-from rig.events.lines import line
+from rig.events.lines import next_steps, page_line
 from rig.motion.motion_model import MotionModel
 from rig.plans.estimate import TimeLeft
 from rig.plans.operator import Choice
@@ -56,8 +57,8 @@ class Context:
     bench: Bench
     job: Job
     add: Callable[[Event], None]
-    note: Callable[[str], None]
-    asked: Callable[[str, tuple[Choice, ...]], Choice]
+    note: Callable[[str, SomeSteps], None]
+    asked: Callable[[Question], Choice]
     close_bench: Callable[[], None]
 
 
@@ -219,8 +220,8 @@ class BenchWorker:
             bench=self._bench(),
             job=job,
             add=lambda event: self._add(job, event),
-            note=lambda text: self._note(job, text),
-            asked=lambda text, choices: self._ask(job, text, choices),
+            note=lambda text, steps: self._note(job, text, steps),
+            asked=lambda question: self._ask(job, question),
             close_bench=self._close,
         )
 
@@ -244,14 +245,19 @@ class BenchWorker:
             if job.progress is not None:
                 left_s = None if self._left is None else self._left.seconds
                 job.progress = job.progress.model_copy(update={"done": job.progress.done + 1, "seconds_left": left_s})
-        self._publish("plan", {"job": job.id, "text": line(event), **values})
+        self._publish_plan(job, page_line(event), next_steps(event), values)
         if isinstance(event, Started | Accepted):
             self._queue.update(job, durable=job.views == 1)
         self._check(job, can_pause=isinstance(event, Accepted | Decided))
 
-    def _note(self, job: Job, text: str) -> None:
-        self._publish("plan", {"job": job.id, "event": "note", "text": text})
+    def _note(self, job: Job, text: str, steps: SomeSteps) -> None:
+        self._publish_plan(job, text, as_steps(steps), {"event": "note"})
         self._check(job, can_pause=False)
+
+    def _publish_plan(self, job: Job, text: str, steps: NextSteps, values: dict[str, Any]) -> None:
+        if steps:
+            values["steps"] = steps_as_json(steps)
+        self._publish("plan", {"job": job.id, "text": text, **values})
 
     def _check(self, job: Job, *, can_pause: bool) -> None:
         if self._stopped() or self._queue.is_cancelled(job):
@@ -265,8 +271,8 @@ class BenchWorker:
         job.state = JobState.RUNNING
         self._queue.update(job, durable=True)
 
-    def _ask(self, job: Job, text: str, choices: tuple[Choice, ...]) -> Choice:
-        self._queue.ask(job, Question(text=text, choices=choices))
+    def _ask(self, job: Job, question: Question) -> Choice:
+        self._queue.ask(job, question)
         while (choice := self._queue.answered(job)) is None:
             self._wait(job)
         self._queue.ask(job, None)
@@ -365,8 +371,9 @@ class BenchWorker:
             values |= {
                 "bench": bench.name,
                 "state": str(safety.state),
-                "fault": safety.fault.model_dump() if safety.fault else None,
+                "fault": safety.fault.as_dict() if safety.fault else None,
                 "doubt": str(safety.doubt) if safety.doubt else None,
+                "steps": steps_as_json(safety.next_step or bench.calibration_steps),
                 "limits_deg": list(config.table.limits_deg),
                 "findings": list(bench.findings),
                 "camera": plain(bench.camera.identity),

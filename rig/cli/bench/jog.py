@@ -14,6 +14,7 @@ import typer
 from rig.cli.ui.command import command
 from rig.cli.ui.settings import Settings
 from rig.core.errors import UsageError
+from rig.core.next_steps import Do
 
 if TYPE_CHECKING:
     from rig.events.events import Event
@@ -53,7 +54,7 @@ def jog(
     from rig.jobs.table import jog as jog_job
 
     if not sys.stdin.isatty():
-        raise UsageError("rig jog needs a terminal.", next_step="Use `rig goto ANGLE` in scripts.")
+        raise UsageError("rig jog needs a terminal.", next_step=("In scripts,", Do.GOTO()))
 
     def show(event: "Event") -> None:
         termios.tcflush(sys.stdin, termios.TCIFLUSH)  # a key held down must not rotate the table after its end

@@ -7,6 +7,7 @@ import typer
 from rig.cli.ui.command import command
 from rig.cli.ui.prompts import ask_yes_no
 from rig.cli.ui.settings import Settings
+from rig.core.next_steps import Do
 
 if TYPE_CHECKING:
     from rig.doctor.context import DoctorContext
@@ -90,7 +91,7 @@ def settings_(
     elif written:
         print("Written and verified.")
     elif differences:
-        print(f"To write them: {context.rig('servo settings --write')}")
+        print(f"To write them: {context.step(Do.SERVO_SETTINGS()).command}")
     if differences and not written:
         raise typer.Exit(4)
 
@@ -148,7 +149,7 @@ def _change(settings: Settings, what: str, new: int, yes: bool) -> None:
     if followed:
         print(f"{followed}: servo.{what} = {new}")
     elif getattr(context.config.servo, what) != new:
-        print(f"To use it: {context.set(f'servo.{what}', new)}")
+        print(f"To use it: {context.set(f'servo.{what}', new).command}")
 
 
 def _follow(settings: Settings, context: "DoctorContext", what: str, old: int, new: int) -> str:

@@ -8,6 +8,7 @@ import typer
 from rig.cli.ui.command import command
 from rig.cli.ui.exit_codes import EXIT_DECLINED
 from rig.cli.ui.settings import Settings
+from rig.core.next_steps import Do, in_words
 from rig.core.phrases import angle_words, budget_words
 
 if TYPE_CHECKING:
@@ -89,7 +90,7 @@ def status(settings: Settings) -> None:
         report: dict[str, Any] = {
             "bench": bench.name,
             "state": str(safety.state),
-            "fault": safety.fault.model_dump() if safety.fault else None,
+            "fault": safety.fault.as_dict() if safety.fault else None,
             "doubt": str(safety.doubt) if safety.doubt else None,
             "table_deg": table_deg,
             "limits_deg": list(config.limits_deg),
@@ -110,6 +111,8 @@ def status(settings: Settings) -> None:
         _print_devices(report)
         for finding in bench.findings:
             print(f"note     {finding}")
+        if bench.calibration_steps:
+            print(f"         {in_words(bench.calibration_steps)}")
     _exit_if_missing(report)
 
 
@@ -193,7 +196,7 @@ def _served_status(settings: Settings, server: "ServerAddress") -> None:
     except (OSError, ValueError) as error:
         raise BenchBusy(
             f"The server at {server.url} uses the bench and does not answer.",
-            next_step=f"If it hangs: `rig stop`, or end process {server.pid}.",
+            next_step=("If it hangs,", Do.STOP(), f"Or end process {server.pid}."),
             evidence={"reason": str(error)},
         ) from error
     if settings.json:
@@ -217,5 +220,5 @@ def _table_text(angle_deg: float | None, limits_deg: tuple[float, float]) -> str
 def _state_text(safety: "Safety") -> str:
     if safety.fault is not None:
         fault = safety.fault
-        return f"{safety.state} {fault.code} since {fault.utc}: {fault.what} {fault.next_step}"
+        return f"{safety.state} {fault.code} since {fault.utc}: {fault.what} {in_words(safety.next_step)}"
     return f"{safety.state}: {safety.doubt} (`rig home --help`)" if safety.doubt else str(safety.state)

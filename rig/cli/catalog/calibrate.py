@@ -11,6 +11,7 @@ from rig.cli.ui.cluster import ClusterOption, jobs_of
 from rig.cli.ui.command import command
 from rig.cli.ui.exit_codes import EXIT_INTERRUPTED
 from rig.cli.ui.settings import Settings
+from rig.core.next_steps import Do
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -60,7 +61,7 @@ def calibrate(
         with progress_bar("Preparing objects for searches") as progress:
             views = prepared_views(catalog, BENCH_DESCRIPTOR, progress)
         if not len(views):
-            raise CatalogError("The catalog is empty.", next_step="Enroll at least one object: rig enroll NAME.")
+            raise CatalogError("The catalog is empty.", next_step=Do.ENROLL())
         path = catalog.path / FILE
     begun_ns = clock.now_ns()
     print(f"Searching for {len(views.object_names)} objects among each other ...", file=sys.stderr)

@@ -14,6 +14,7 @@ from rig.cli.ui.complete import object_names
 from rig.cli.ui.jobs import run_job, size_words
 from rig.cli.ui.models import descriptor_name
 from rig.cli.ui.settings import Settings
+from rig.core.next_steps import Do
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -140,7 +141,7 @@ def _read_batch(source: Path, pattern: str | None, table_angles: bool) -> "Impor
     now = SystemClock().utc()
     if source.is_dir():
         if (source / "catalog.sqlite").exists():
-            raise UsageError(f"{source} is a catalog.", next_step=f"Import it: rig catalog merge {source}")
+            raise UsageError(f"{source} is a catalog.", next_step=Do.MERGE(source=source))
         if (source / MANIFEST).exists():
             return read_unpacked(source)
         return read_folder(source, pattern=pattern or DEFAULT_PATTERN, table_angles=table_angles, now=now)
@@ -240,7 +241,7 @@ def export(
             labelled = [item.name for item in catalog.objects() if item.label == label]
             wanted = [name for name in labelled if not wanted or name in wanted]
         if label is not None and not wanted:
-            raise ExportFailed(f"No object has the label {label!r}.", next_step="List the objects: rig catalog list")
+            raise ExportFailed(f"No object has the label {label!r}.", next_step=Do.LIST_OBJECTS())
         objects = read_objects(catalog, wanted)
         match form:
             case Format.BUNDLE:
