@@ -45,7 +45,9 @@ def bench_state(context: DoctorContext) -> Iterator[Finding]:
             (
                 "Check how far the cable is wound up, then",
                 context.step(Do.ACKNOWLEDGE()),
-                context.step(Do.SET_REVOLUTIONS()),
+                "If it hangs free,",
+                context.step(Do.SET_REVOLUTIONS(revolutions=0)),
+                "Otherwise, give the revolutions that it is wound up.",
             ),
             5,
             what=state.fault.what if state.fault else state.damage,

@@ -147,7 +147,7 @@ class FindingCode(Enum):
         "views wait {delay_ms:.0f} ms longer: by camera.time, exposures begin that long before their time stamp"
     )
     CAMERA_DELAY_UNKNOWN = (
-        "a delay inside the camera does not show in its time stamps; to measure it: {command} (table rotates)"
+        "a delay inside the camera does not show in its time stamps; a calibration measures it (the table rotates)"
     )
     # the scan of all devices
     NO_USB_PORT = "no serial port on USB (found: {found})"

@@ -8,7 +8,7 @@ from rig.catalog import Catalog
 from rig.core.errors import CatalogError
 from rig.core.next_steps import Do, SomeSteps
 from rig.doctor.context import DoctorContext
-from rig.doctor.finding import Finding, FindingCode, bad, fine, of_error, warning
+from rig.doctor.finding import Finding, FindingCode, Severity, bad, fine, of_error, warning
 from rig.views.stream import exposed_before_stamp_ns
 
 IMAGES = 24  # number of images that are verified; `rig catalog verify` verifies all
@@ -83,11 +83,8 @@ def _camera_delay(context: DoctorContext, calibrations: Iterable[BenchCalibratio
     in_force = (one.result for one in calibrations if one.status is CalibrationStatus.IN_FORCE)
     config, _ = apply_results(context.config, in_force)
     if config.camera_time.offset_ms is None:
-        return fine(
-            "calibration",
-            FindingCode.CAMERA_DELAY_UNKNOWN,
-            command=context.step(Do.CALIBRATE(name="camera-time")).command,
-        )
+        measure = context.step(Do.CALIBRATE(name="camera-time"))
+        return Finding("calibration", Severity.FINE, FindingCode.CAMERA_DELAY_UNKNOWN, steps=(measure,))
     delay_ms = exposed_before_stamp_ns(config) * 1e-6
     found = config.camera_time.model_dump()
     return fine("calibration", FindingCode.CAMERA_DELAY, delay_ms=delay_ms, **found)

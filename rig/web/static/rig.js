@@ -338,7 +338,7 @@ export function showJob(box, job) {
   if (job.result_text) parts.push(...job.result_text.split("\n").map((text) => h("p", {}, text)));
   if (job.error) parts.push(h("p", { class: "error" }, `Error ${job.error.code}: ${job.error.what}`), h("p", {}, "Next step: ", ...nextSteps(job.error.steps)));
   if (job.resume) {
-    parts.push(h("div", { class: "row" }, h("button", { onclick: () => submit(job.resume) }, "Continue"), job.command && h("code", {}, job.command)));
+    parts.push(h("div", { class: "row" }, h("button", { onclick: () => submit(job.resume) }, "Continue")));
   }
   box.replaceChildren(...parts);
   return undefined;

@@ -77,6 +77,7 @@ def _parsed(command: Any, words: list[str]) -> set[str]:
 def test_each_command_exists_with_its_options():
     root, named = typer.main.get_command(app), list(_named_steps())
     assert {action for action, _ in named} | {Do.ACKNOWLEDGE_IN_PROGRAM} == set(Do)  # no member is unused
+    assert all(keys for action, keys in named if action is Do.SET_REVOLUTIONS)  # a page has a button for it
     for action, keys in named:
         if action.command.startswith("rig "):
             placed = dict.fromkeys(re.findall(r"{(\w+)}", action.command), "1")

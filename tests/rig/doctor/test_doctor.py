@@ -295,10 +295,7 @@ def result(bench, days_ago: float, valid_days: float | None = None, **device: ob
 def test_delay_inside_the_camera_is_reported_from_its_calibration():
     with unopened() as bench:
         (found,) = (f for f in bench.findings("calibration") if f.level is Severity.FINE)
-        assert (found.code, found.parameters["command"]) == (
-            FindingCode.CAMERA_DELAY_UNKNOWN,
-            "rig calibrate camera-time --bench sim",
-        )
+        assert (found.code, found.steps) == (FindingCode.CAMERA_DELAY_UNKNOWN, (Do.CALIBRATE(name="camera-time"),))
     with unopened("camera_time.offset_ms=-90", "camera_time.readout_ms=10") as bench:
         (found,) = (f for f in bench.findings("calibration") if f.level is Severity.FINE)
         assert found.code is FindingCode.CAMERA_DELAY
