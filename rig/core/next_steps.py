@@ -5,7 +5,7 @@ module words it for a terminal. The page `rig.web.next_steps` words it as button
 """
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from enum import StrEnum, unique
 from shlex import quote
@@ -36,6 +36,7 @@ class Do(StrEnum):
         return member
 
     def __call__(self, **parameters: Any) -> "NextStep":
+        """Return the action with its parameters; those that are None or False do not apply."""
         return NextStep(
             self, {key: value for key, value in parameters.items() if value is not None and value is not False}
         )
@@ -108,6 +109,7 @@ class Do(StrEnum):
     END_SIM_BENCH = "end-sim-bench", "end it", "rig sim-bench --folder {folder} quit"
 
 
+_KEY: Final = re.compile(r"{(\w+)}")
 _ACTIONS: Final = {str(action): action for action in Do}
 
 
@@ -135,37 +137,33 @@ class NextStep:
     @property
     def command(self) -> str:
         """The command line; an unknown parameter is in capitals. Empty if no command does the action."""
-        return self._with_options(self.action.command) if self.action.command else ""
+        words = _KEY.sub(lambda key: quote(str(self.parameters.get(key[1], key[1].upper()))), self.action.command)
+        if not words.startswith("rig "):
+            return words
+        return " ".join([words, *self._given_options(), *map(quote, self.options)])
 
     @property
     def words(self) -> str:
         """The action in words, for a terminal, without capital and full stop."""
-        if self.action.command:
-            return f"{self.text}: `{self.command}`"
-        words = self._with_options("")
-        return f"{self.text} with {words}" if words else self.text
+        if self.action is Do.RUN_AGAIN and self.parameters:
+            return f"{self.text} with {' '.join(self._given_options())}"
+        return f"{self.text}: `{self.command}`" if self.command else self.text
 
     @property
     def text(self) -> str:
         """The action in words, without a command."""
-        return re.sub(r"{(\w+)}", lambda key: str(self.parameters.get(key[1], key[1])), self.action.words)
+        return _KEY.sub(lambda key: str(self.parameters.get(key[1], key[1])), self.action.words)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the step as `--json` prints it."""
         return {"action": str(self.action), "parameters": self.parameters, "command": self.command or None}
 
-    def _with_options(self, command: str) -> str:
-        rest = dict(self.parameters)
-
-        def placed(key: re.Match[str]) -> str:
-            return quote(str(rest.pop(key[1]))) if key[1] in rest else key[1].upper()
-
-        words = [re.sub(r"{(\w+)}", placed, command)] if command else []
-        for key, value in rest.items():
-            words.append(f"--{key.replace('_', '-')}")
-            if value is not True:
-                words.append(quote(str(value)))
-        return " ".join([*words, *map(quote, self.options)])
+    def _given_options(self) -> Iterator[str]:
+        """Yield the words of the parameters that are options of the command."""
+        placed = _KEY.findall(self.action.command)
+        for key, value in self.parameters.items():
+            if key not in placed:
+                yield f"--{key.replace('_', '-')}" + ("" if value is True else f" {quote(str(value))}")
 
 
 NextSteps = tuple[str | NextStep, ...]

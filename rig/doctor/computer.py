@@ -36,7 +36,7 @@ def bench_state(context: DoctorContext) -> Iterator[Finding]:
     path = context.config.state_path(context.bench)
     if context.holder is not None:
         who = f"process {context.holder.pid} ({context.holder.command})" if context.holder.pid else "another process"
-        yield warning("bench", FindingCode.BENCH_IN_USE, context.step(Do.STOP()), holder=who, pid=context.holder.pid)
+        yield warning("bench", FindingCode.BENCH_IN_USE, Do.STOP(), holder=who, pid=context.holder.pid)
     state = FileStore(path).load()
     if state.damage:
         yield bad(
@@ -44,9 +44,9 @@ def bench_state(context: DoctorContext) -> Iterator[Finding]:
             FindingCode.STATE_DAMAGED,
             (
                 "Check how far the cable is wound up, then",
-                context.step(Do.ACKNOWLEDGE()),
+                Do.ACKNOWLEDGE(),
                 "If it hangs free,",
-                context.step(Do.SET_REVOLUTIONS(revolutions=0)),
+                Do.SET_REVOLUTIONS(revolutions=0),
                 "Otherwise, give the revolutions that it is wound up.",
             ),
             5,
@@ -54,7 +54,7 @@ def bench_state(context: DoctorContext) -> Iterator[Finding]:
             damage=state.damage,
         )
     elif state.fault is not None:
-        yield bad("bench", FindingCode.FAULT_LATCHED, context.step(Do.ACKNOWLEDGE()), 5, **state.fault.as_dict())
+        yield bad("bench", FindingCode.FAULT_LATCHED, Do.ACKNOWLEDGE(), 5, **state.fault.as_dict())
     if context.holder is None and not state.damage and state.fault is None:
         yield fine("bench", FindingCode.BENCH_FREE, bench=context.bench, state=path)
 
@@ -85,7 +85,7 @@ def _i2c(context: DoctorContext) -> Iterator[Finding]:
     if node is not None:
         yield from access(context, "port", node, "i2c")
     elif buses:
-        fix = context.set("imu.bus", buses[0].path.removeprefix("/dev/i2c-"))
+        fix = Do.SET_KEY(key="imu.bus", value=buses[0].path.removeprefix("/dev/i2c-"))
         yield bad("port", FindingCode.NO_I2C_BUS, fix, wanted=bus, found=_names(buses))
     else:
         yield bad("port", FindingCode.NO_I2C_BUS, i2c_command(context), wanted=bus, found=[])
@@ -100,9 +100,9 @@ def _video(context: DoctorContext) -> Iterator[Finding]:
     if node is not None:
         yield from access(context, "port", node, "video")
     else:
-        fix: SomeSteps = ("Connect the camera, then", context.step(Do.FIND()))
+        fix: SomeSteps = ("Connect the camera, then", Do.FIND())
         if cameras:
-            fix = context.set("camera.source", cameras[0].stable or cameras[0].path)
+            fix = Do.SET_KEY(key="camera.source", value=cameras[0].stable or cameras[0].path)
         yield bad("port", FindingCode.NO_CAMERA_DEVICE, fix, wanted=camera, found=_names(cameras))
 
 
@@ -113,20 +113,20 @@ def disk(context: DoctorContext) -> Iterator[Finding]:
     views = there.free_bytes // VIEW_BYTES
     free = {"free_gb": there.free_bytes / 1e9, "path": path, "objects": views // context.config.enroll.views}
     if there.free_bytes < TOO_LITTLE_ROOM:
-        yield bad("disk", FindingCode.FREE_SPACE, context.step(Do.REMOVE_DELETED()), 7, **free)
+        yield bad("disk", FindingCode.FREE_SPACE, Do.REMOVE_DELETED(), 7, **free)
     elif there.free_bytes < LITTLE_ROOM:
-        yield warning("disk", FindingCode.FREE_SPACE, context.step(Do.REMOVE_DELETED()), **free)
+        yield warning("disk", FindingCode.FREE_SPACE, Do.REMOVE_DELETED(), **free)
     else:
         yield fine("disk", FindingCode.FREE_SPACE, **free)
     if not there.writable:
         fix: SomeSteps = (
             f"sudo chown -R {context.computer.user.name} {path}"
             if path.exists()
-            else context.set("catalog.path", "FOLDER")
+            else Do.SET_KEY(key="catalog.path", value="FOLDER")
         )
         yield bad("disk", FindingCode.NOT_WRITABLE, fix, 7, user=context.computer.user.name, path=path)
     if there.network:
-        fix = context.set("catalog.path", "FOLDER-ON-A-LOCAL-DISK")
+        fix = Do.SET_KEY(key="catalog.path", value="FOLDER-ON-A-LOCAL-DISK")
         yield warning("disk", FindingCode.NETWORK_DISK, fix, path=path)
 
 
@@ -139,7 +139,7 @@ def clock(context: DoctorContext) -> Iterator[Finding]:
     civil_s = (timer.utc() - start_utc).total_seconds()
     pause = {"wanted_ms": 1e3 * _PAUSE_S, "pause_ms": 1e3 * passed_s}
     if not _PAUSE_S * 0.9 <= passed_s <= _PAUSE_S + _PAUSE_ERROR_S:
-        fix: SomeSteps = ("Close other programs and switch power saving off, then", context.step(Do.DOCTOR()))
+        fix: SomeSteps = ("Close other programs and switch power saving off, then", Do.DOCTOR())
         yield warning("clock", FindingCode.LONG_PAUSE, fix, **pause)
     else:
         yield fine("clock", FindingCode.PAUSE, **pause)
@@ -209,11 +209,11 @@ def _missing(context: DoctorContext, key: str, wanted: str, found: list[SerialPo
             fix = PORT_GRABBERS["brltty"]
             return bad("port", FindingCode.BRLTTY_TAKES_PORT, fix, wanted=wanted, pid=program.pid)
         case []:
-            fix = ("Plug the adapter in, then", context.step(Do.FIND()))
+            fix = ("Plug the adapter in, then", Do.FIND())
         case [one]:
-            fix = context.set(key, one.stable or one.path)
+            fix = Do.SET_KEY(key=key, value=one.stable or one.path)
         case _:
-            fix = context.step(Do.SETUP())
+            fix = Do.SETUP()
     return bad("port", FindingCode.NO_SERIAL_PORT, fix, wanted=wanted, found=_names(found))
 
 

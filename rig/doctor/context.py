@@ -41,11 +41,7 @@ class DoctorContext:
 
     def step(self, step: NextStep) -> NextStep:
         """Return a step whose command is for this bench."""
-        return replace(step, options=self.options)
-
-    def set(self, key: str, value: Any) -> NextStep:
-        """Return the step that changes one key of the configuration."""
-        return replace(Do.SET_KEY(key=key, value=str(value)), options=self.file_options)
+        return replace(step, options=self.file_options if step.action is Do.SET_KEY else self.options)
 
     @property
     def catalog_path(self) -> Path:

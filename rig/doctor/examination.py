@@ -5,7 +5,7 @@ Decision: docs/decisions/0013.
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from queue import Empty, SimpleQueue
 from threading import Thread
 
@@ -51,7 +51,8 @@ def run_checks(
             if item is None:
                 break
             if isinstance(item, Finding):
-                yield item
+                steps = (step if isinstance(step, str) else context.step(step) for step in item.steps)
+                yield replace(item, steps=tuple(steps))
 
 
 def _run(context: DoctorContext, check: Check, put: Callable[[Finding | str | None], None]) -> None:
@@ -61,9 +62,9 @@ def _run(context: DoctorContext, check: Check, put: Callable[[Finding | str | No
     except RigError as error:
         put(of_error(check.topic, error))
     except OSError as error:  # a device was unplugged, or a file cannot be read
-        put(bad(check.topic, FindingCode.CHECK_INTERRUPTED, context.step(Do.DOCTOR()), reason=str(error)))
+        put(bad(check.topic, FindingCode.CHECK_INTERRUPTED, Do.DOCTOR(), reason=str(error)))
     except Exception as error:  # a bug: report it as one, and continue with the other checks
-        fix = context.step(Do.REPORT_DEFECT())
+        fix = Do.REPORT_DEFECT()
         put(bad(check.topic, FindingCode.CHECK_FAILED, fix, 1, error=repr(error)))
     finally:
         with suppress(RuntimeError):  # the interpreter is shutting down

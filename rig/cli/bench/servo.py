@@ -149,7 +149,7 @@ def _change(settings: Settings, what: str, new: int, yes: bool) -> None:
     if followed:
         print(f"{followed}: servo.{what} = {new}")
     elif getattr(context.config.servo, what) != new:
-        print(f"To use it: {context.set(f'servo.{what}', new).command}")
+        print(f"To use it: {context.step(Do.SET_KEY(key=f'servo.{what}', value=new)).command}")
 
 
 def _follow(settings: Settings, context: "DoctorContext", what: str, old: int, new: int) -> str:

@@ -31,6 +31,7 @@ FOR_TERMINALS = ("rig/cli", "sim/demo", "sim/realtime")
             Do.REDESCRIBE(descriptor=None, region="1,2,3,4"),
             "Describe the stored images again: `rig catalog redescribe --region 1,2,3,4`.",
         ),
+        (Do.ACKNOWLEDGE_IN_PROGRAM(reboot=True), f"{Do.ACKNOWLEDGE_IN_PROGRAM.words.capitalize()}."),
         (Do.RUN_AGAIN(on_conflict="skip"), "Start again with --on-conflict skip."),
         (Do.INSTALL_EXTRA(extra="web"), "Install the missing packages: `pip install 'hbr-rig[web]'`."),
         (Do.SET_REVOLUTIONS(revolutions=-1), "Set the revolutions of the cable to -1: `rig home --revolutions -1`."),

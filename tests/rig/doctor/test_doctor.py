@@ -68,8 +68,8 @@ def test_torque_watchdog_and_factory_settings_are_reported_and_not_changed(bench
 @pytest.mark.parametrize(
     ("place", "step"),
     [
-        ((3, 57_600), Do.SET_KEY(key="servo.id", value="3")),
-        ((1, 1_000_000), Do.SET_KEY(key="servo.baud", value="1000000")),
+        ((3, 57_600), Do.SET_KEY(key="servo.id", value=3)),
+        ((1, 1_000_000), Do.SET_KEY(key="servo.baud", value=1000000)),
         ((3, 1_000_000), Do.SETUP()),
     ],
 )
