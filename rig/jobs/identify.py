@@ -13,8 +13,8 @@ from rig.jobs.desk import Desk, Steps
 from rig.jobs.regions import warn_of_other_regions
 from rig.jobs.table_image import refresh_table_image
 from rig.plans.identify import identify as identify_one
+from rig.plans.identify import watch as watch_table
 from rig.plans.record import ResultRecorder
-from rig.plans.watch import watch as watch_table
 from rig.search.current_model import CurrentModel
 from rig.search.saved_run import RunSaver
 from rig.search.session import SHOWN
@@ -88,13 +88,19 @@ def identify(
             uses_image = known.descriptor != PAPER_DESCRIPTOR and known.with_empty_table is not False
             if uses_image and isinstance(placer, TableClearer):
                 yield from refresh_table_image(desk, bench, placer, ask=False)
-            events: Generator[Event, None, object]
-            if watch:
-                events = watch_table(
-                    bench, model, config=settings, watcher=watcher, strategy=chosen, seed=seed, top=top, live=live
+
+            def one() -> Generator[Event, None, Identified]:
+                return identify_one(
+                    *(bench, model()),
+                    config=settings,
+                    watcher=watcher,
+                    strategy=chosen,
+                    seed=seed,
+                    top=top,
+                    live=live,
                 )
-            else:
-                events = identify_one(bench, known, config=settings, strategy=chosen, seed=seed, top=top, live=live)
+
+            events: Generator[Event, None, object] = watch_table(bench, one) if watch else one()
             recorder = ResultRecorder(
                 *(desk.place, bench),
                 clock=SystemClock(),

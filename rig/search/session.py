@@ -2,7 +2,7 @@
 
 A search does no I/O. It takes views (`Search.add`) and says what it needs next: a view after a rotation, or the end. At
 its end (`Search.end`) it asks for enrolled views, and returns the answer. The bench at rest and in motion
-(`rig.plans.identify`) and the replay (`rig.search.replay`) drive it; `rig eval` drives the same `hbr.DenseSession`.
+(`rig.plans.search_views`) and the replay (`rig.search.replay`) drive it; `rig eval` drives the same `hbr.DenseSession`.
 
 Decision: docs/decisions/0064.
 """
