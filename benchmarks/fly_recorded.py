@@ -89,7 +89,7 @@ def revolution(bench: Bench, table: Turntable, describe: ViewDescriber) -> Seen:
         seen.append((middle, describe(frame.image_bgr).levels[BENCH_DESCRIPTOR]))
 
     speed = bench.config.table.velocity_dps
-    frames.fly(360.0, take, (0.0, 360.0), speed)
+    table.fly(360.0, frames.flight(take, (0.0, 360.0), speed))
     trajectory = frames.recorder.fit()
     assert trajectory is not None
     motion = trajectory.at([at for at, _ in seen])

@@ -172,7 +172,7 @@ class EnrollmentViews:
                 if away_deg < nearest.get(index, (HELD_DEG, None))[0]:
                     nearest[index] = away_deg, frame
 
-        move = frames.fly(end_deg, hold_nearest, (start_deg, end_deg), speed.dps)
+        move = table.fly(end_deg, frames.flight(hold_nearest, (start_deg, end_deg), speed.dps))
         yield moved(len(angles_deg), move)
         trajectory = frames.recorder.fit()
         if trajectory is None or move.agreement is None or not (move.agreement.agrees and trajectory.consistent):
@@ -183,15 +183,13 @@ class EnrollmentViews:
         after = yield from capture(0, self.viewer, table, move.settled_ns)
         # Check the nearest frame to each angle, and store the accepted ones.
         locks, locks_hold = before.evidence.locks, before.evidence.locks_hold and after.evidence.locks_hold
-        irregular_ns = frames.irregular_ns()
         stored: set[int] = set()
         encoder = Encoder()
         for index, angle_deg in angles_deg.items():
             _, frame = nearest.pop(index, (inf, None))
             if frame is None:
                 continue
-            irregular = frame.stamp_ns in irregular_ns
-            attempt = frames.attempt(frame, trajectory, locks, locks_hold=locks_hold, irregular=irregular)
+            attempt = frames.attempt(frame, trajectory, locks, locks_hold=locks_hold)
             assert attempt.evidence.motion is not None
             if abs(attempt.evidence.motion.angle_deg - angle_deg) > NEAR_SHARE * spacing_deg:
                 continue  # the frames near this angle were lost

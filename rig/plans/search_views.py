@@ -192,7 +192,7 @@ class ViewsInMotion(ViewsAtRest):
             yield self._decided(step, self.goal_deg)
         reach_deg = max(low_deg, here_deg - 360.0), min(high_deg, here_deg + 360.0)
         self.rejected_in_a_row = 0
-        move = self.frames.fly(self.goal_deg, self._take, reach_deg, self.velocity_dps, quiet=False)
+        move = self.table.fly(self.goal_deg, self.frames.flight(self._take, reach_deg, self.velocity_dps, quiet=False))
         yield from self.unseen
         self.unseen.clear()
         self.travelled_deg += abs(move.rotation_deg)
@@ -212,8 +212,7 @@ class ViewsInMotion(ViewsAtRest):
         trajectory = self.frames.recorder.fit()
         if trajectory is None:
             return None
-        irregular = frame.stamp_ns in self.frames.irregular_ns(STAMPS)
-        attempt = self.frames.attempt(frame, trajectory, self.locks, locks_hold=True, irregular=irregular)
+        attempt = self.frames.attempt(frame, trajectory, self.locks, stamps=STAMPS)
         if not attempt.accepted:
             self.rejected += 1
             self.rejected_in_a_row += 1
@@ -247,5 +246,5 @@ class ViewsInMotion(ViewsAtRest):
         return goal_deg
 
     def _stop(self) -> float:
-        self.goal_deg = self.frames.stopping_deg()
+        self.goal_deg = self.table.stopping_deg(self.bench.servo.read_state())
         return self.goal_deg
