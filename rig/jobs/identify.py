@@ -91,13 +91,7 @@ def identify(
 
             def one() -> Generator[Event, None, Identified]:
                 return identify_one(
-                    *(bench, model()),
-                    config=settings,
-                    watcher=watcher,
-                    strategy=chosen,
-                    seed=seed,
-                    top=top,
-                    live=live,
+                    bench, model(), config=settings, watcher=watcher, strategy=chosen, seed=seed, top=top, live=live
                 )
 
             events: Generator[Event, None, object] = watch_table(bench, one) if watch else one()
@@ -109,8 +103,6 @@ def identify(
                 with_image=config.record == "image",
             )
             recorder.sample = sample
-            if config.record != "none":
-                events = recorder.stream(events)
             with closing(events), RunSaver(next_folder, bench, model, settings) as saver:
                 for event in events:
                     if scan and watch and isinstance(event, Started):  # the object is on the table
@@ -122,6 +114,8 @@ def identify(
                         answer = event
                     if not isinstance(event, FrameUsed):  # shown by ``live`` while the table rotated
                         yield event
+                    if config.record != "none" and (recorded := recorder.add(event)):
+                        yield recorded
     return answer
 
 

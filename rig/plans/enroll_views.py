@@ -152,9 +152,7 @@ class EnrollmentViews:
             )
         end_deg = start_deg + 360.0
         spacing_deg = min(np.diff(ordered).tolist(), default=360.0)
-        speed = scan_speed(
-            config, fps=self.bench.camera.identity.fps, gyro_range_dps=self.bench.imu.range_dps, spacing_deg=spacing_deg
-        )
+        speed = scan_speed(config, self.bench.imu.range_dps, spacing_deg, self.bench.camera.identity.fps)
         # Rotate, between two frames at rest of the same side.
         if abs(table.rest_deg - start_deg) > config.table.tolerance_deg:
             yield moved(0, (yield from announced(0, table, start_deg)))

@@ -102,7 +102,7 @@ def identify(
     config = config or bench.config
     if strategy is None and _flies(config, model):
         strategy = "arc"
-    search, chosen = begin_search(model, config, strategy, seed=seed, top=top)
+    search = begin_search(model, config, strategy, seed=seed, top=top)
     if search.in_motion:
         require_camera_time(bench.config)
     viewer = Viewer(bench.camera, bench.config)
@@ -127,14 +127,14 @@ def identify(
         None,
         config.identify.max_views,
         dict(bench.conditions),
-        strategy=chosen.name,
+        strategy=search.strategy.name,
         seed=seed,
         descriptor=search.descriptor,
         notes=notes,
     )
     # Take views until the search ends.
     kind = ViewsInMotion if search.in_motion else ViewsAtRest
-    views = kind(bench, search, viewer, describe, check, top, live)
+    views = kind(bench, search, viewer, describe, check, live)
     try:
         with views.table as table:
             yield from views.begin()

@@ -20,7 +20,7 @@ from hbr.core.angles import wrap360
 from rig.bench import Bench
 from rig.core.clock import seconds_between
 from rig.devices.camera import CameraLocks
-from rig.events.events import Decided, Event, FrameUsed, Moved, Rejected
+from rig.events.events import Event, FrameUsed, Moved, Rejected
 from rig.motion.flight_views import FlightFrames
 from rig.motion.move import Move
 from rig.motion.scan_speed import scan_speed
@@ -50,8 +50,6 @@ class ViewsAtRest:
     ----------
     check
         Gets the image of the first view, and raises an error if it shows no object.
-    top
-        The number of candidates that the events name.
     live
         Called with the event of each frame of a search in motion.
     number
@@ -67,7 +65,6 @@ class ViewsAtRest:
     viewer: Viewer
     describe: SearchDescriber
     check: Callable[[NDArray[np.uint8]], None]
-    top: int
     live: Callable[[FrameUsed], object]
     first_rest_s: float = FIRST_REST_S
     number: int = 0
@@ -119,7 +116,7 @@ class ViewsAtRest:
         """Rotate to the next view: within the cable budget, and use the measured rotation."""
         asked_deg = self.table.rest_deg + self.sign * step.rotation_deg
         target_deg = self.table.within_reach(asked_deg)
-        yield self._decided(step, target_deg)
+        yield self.search.decided(self.number, target_deg)
         move = yield from announced(self.number, self.table, target_deg, asked_deg=asked_deg)
         self.travelled_deg += abs(move.rotation_deg)
         self._orientation_deg += self.sign * move.rotation_deg
@@ -129,20 +126,6 @@ class ViewsAtRest:
     def _rested(self, move: Move) -> Moved:
         self.settled_ns = move.settled_ns
         return moved(self.number, move)
-
-    def _decided(self, step: Rotate, target_deg: float) -> Decided:
-        return Decided(
-            index=self.number,
-            side="left" if step.rotation_deg >= 0 else "right",
-            rotation_deg=step.rotation_deg,
-            target_deg=target_deg,
-            s_left=step.s_left,
-            s_right=step.s_right,
-            candidates=step.candidates[: self.top],
-            reason=step.reason,
-            note=step.note,
-            weighed=step.weighed,
-        )
 
 
 @dataclass
@@ -168,9 +151,7 @@ class ViewsInMotion(ViewsAtRest):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        config = self.bench.config
-        speed = scan_speed(config, fps=config.camera.fps, gyro_range_dps=self.bench.imu.range_dps, spacing_deg=None)
-        self.velocity_dps = speed.dps
+        self.velocity_dps = scan_speed(self.bench.config, self.bench.imu.range_dps).dps
 
     @property
     def azimuth_deg(self) -> float:
@@ -189,7 +170,7 @@ class ViewsInMotion(ViewsAtRest):
         (low_deg, high_deg), here_deg = self.table.limits_deg, self.table.rest_deg
         self.goal_deg = min(max(here_deg + self.sign * step.rotation_deg, low_deg), high_deg)
         if self.search.is_new_decision:
-            yield self._decided(step, self.goal_deg)
+            yield self.search.decided(self.number, self.goal_deg)
         reach_deg = max(low_deg, here_deg - 360.0), min(high_deg, here_deg + 360.0)
         self.rejected_in_a_row = 0
         move = self.table.fly(self.goal_deg, self.frames.flight(self._take, reach_deg, self.velocity_dps, quiet=False))
@@ -242,7 +223,7 @@ class ViewsInMotion(ViewsAtRest):
         if abs(goal_deg - self.goal_deg) <= NEW_GOAL_DEG:
             return None
         self.goal_deg = goal_deg
-        self.unseen.append(self._decided(step, goal_deg))
+        self.unseen.append(self.search.decided(self.number, goal_deg))
         return goal_deg
 
     def _stop(self) -> float:

@@ -11,7 +11,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Generator, Sequence
 from dataclasses import replace
 from math import isfinite
-from typing import ClassVar, Final
+from typing import Any, ClassVar, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +26,7 @@ from hbr.dense.verification import UNKNOWN_BELOW, Verification
 from hbr.model.symmetry import symmetry
 from rig.config import RigConfig
 from rig.events.compared import Compared, Verified
-from rig.events.events import Candidate, FrameUsed, Identified, Ranked
+from rig.events.events import Candidate, Decided, FrameUsed, Identified, Ranked, RotationReason
 from rig.search.comparison import compared_event
 from rig.search.strategies import (
     DenseSearchState,
@@ -57,6 +57,8 @@ class Search(ABC):
         The descriptor that its queries need.
     names
         Names of the enrolled objects.
+    strategy
+        Chooses after each view.
     in_motion
         Whether the frames of a rotation are its views.
     ranked, step
@@ -70,9 +72,10 @@ class Search(ABC):
     step: Rotate | Finish
     is_new_decision = True
 
-    def __init__(self, views: hbr.Views, config: RigConfig, *, seed: int, top: int) -> None:
+    def __init__(self, views: hbr.Views, config: RigConfig, strategy: Strategy[Any], *, seed: int, top: int) -> None:
         self.descriptor = views.descriptor
         self.names = views.object_names
+        self.strategy = strategy
         self._config = config
         self._top = top
         self._rng = np.random.default_rng(seed)
@@ -100,6 +103,23 @@ class Search(ABC):
 
     @abstractmethod
     def _decide(self, table_deg: float) -> Rotate | Finish: ...
+
+    def decided(self, number: int, target_deg: float) -> Decided:
+        """Return the event of the last decision, a rotation of the table to ``target_deg``."""
+        step = self.step
+        assert isinstance(step, Rotate)
+        return Decided(
+            index=number,
+            side="left" if step.rotation_deg >= 0 else "right",
+            rotation_deg=step.rotation_deg,
+            target_deg=target_deg,
+            s_left=step.s_left,
+            s_right=step.s_right,
+            candidates=step.candidates[: self._top],
+            reason=RotationReason(step.reason),
+            note=step.note,
+            weighed=step.weighed,
+        )
 
     def frame_used(self, number: int, azimuth_deg: float, seconds: float, rejected: int) -> FrameUsed:
         """Return the event of the last frame of a search in motion; ``number`` counts the views from 0."""
@@ -155,15 +175,14 @@ class HoughSearch(Search):
     """The paper's search: views vote by lists of the most similar enrolled views (`hbr.retrieve`)."""
 
     def __init__(
-        self, index: hbr.ViewIndex, config: RigConfig, strategy: Strategy[SearchState], *, seed: int, top: int
+        self, index: hbr.ViewIndex, config: RigConfig, strategy: Strategy[Any], *, seed: int, top: int
     ) -> None:
-        super().__init__(index.views, config, seed=seed, top=top)
+        super().__init__(index.views, config, strategy, seed=seed, top=top)
         given = config.identify.min_score
         self._min_score = (
             hbr.open_set_threshold(index.views, repeatability=config.identify.repeatability) if given is None else given
         )
         self._index = index
-        self._strategy = strategy
         self._descriptors: list[NDArray[np.uint8]] = []
 
     def _rank(self, view: DescribedView) -> Ranked:
@@ -198,7 +217,7 @@ class HoughSearch(Search):
             config=self._config.identify,
             rng=self._rng,
         )
-        return self._strategy.next(state)
+        return self.strategy.next(state)
 
     def answer(self, *, travelled_deg: float = 0.0, seconds: float = 0.0) -> Identified:
         answer = super().answer(travelled_deg=travelled_deg, seconds=seconds)
@@ -234,13 +253,12 @@ class DenseSearch(Search):
         session: hbr.DenseSession,
         views: hbr.Views,
         config: RigConfig,
-        strategy: Strategy[DenseSearchState],
+        strategy: Strategy[Any],
         *,
         seed: int,
         top: int,
     ) -> None:
-        super().__init__(views, config, seed=seed, top=top)
-        self._strategy = strategy
+        super().__init__(views, config, strategy, seed=seed, top=top)
         self._session = session
 
     def _rank(self, view: DescribedView) -> Ranked:
@@ -292,7 +310,7 @@ class DenseSearch(Search):
             config=self._config.identify,
             rng=self._rng,
         )
-        return self._strategy.next(state)
+        return self.strategy.next(state)
 
     def verify(self, hypotheses: Hypotheses, measured: Verification | None = None) -> Asking[Verified | None]:
         found = yield from self._session.verify(self._queries(hypotheses), measured)

@@ -201,7 +201,7 @@ def reachable_arcs(config: RigConfig, table_deg: float, way: float) -> tuple[NDA
     ``way`` is the sign of the present rotation of the camera, 0 at rest. An arc in the other direction also takes the
     time for a reversal.
     """
-    speed = scan_speed(config, fps=config.camera.fps, gyro_range_dps=config.imu.range_dps, spacing_deg=None).dps
+    speed = scan_speed(config, config.imu.range_dps).dps
     low_deg, high_deg = config.table.limits_deg
     arcs_deg = np.arange(STEP_DEG, 180.0 + STEP_DEG, STEP_DEG)
     arcs_deg = np.concatenate([-arcs_deg[::-1], arcs_deg])
