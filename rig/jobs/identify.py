@@ -16,7 +16,7 @@ from rig.plans.identify import identify as identify_one
 from rig.plans.identify import watch as watch_table
 from rig.plans.record import ResultRecorder
 from rig.search.current_model import CurrentModel
-from rig.search.saved_run import RunSaver
+from rig.search.saved_run import saving
 from rig.search.session import SHOWN
 from rig.search.strategies import descriptor_for
 from rig.search.strategies import strategy as strategy_named
@@ -103,13 +103,13 @@ def identify(
                 with_image=config.record == "image",
             )
             recorder.sample = sample
-            with closing(events), RunSaver(next_folder, bench, model, settings) as saver:
+            with closing(events), saving(next_folder, bench, model, settings) as save:
                 for event in events:
                     if scan and watch and isinstance(event, Started):  # the object is on the table
                         recorder.sample = desk.operator.ask_sample()
                         if watcher is not None:
                             watcher.wait_until_still()
-                    saver.add(event)
+                    save(event)
                     if isinstance(event, Identified):
                         answer = event
                     if not isinstance(event, FrameUsed):  # shown by ``live`` while the table rotated

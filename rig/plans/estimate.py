@@ -232,8 +232,7 @@ class TimeLeft:
             return model.enrollment_s(angles[0], angles, in_motion=self._in_motion)
         if self._in_motion:
             return model.park_s(angles[0] + 360.0)
-        left = sum(model.move_s(b - a) + model.view_s for a, b in pairwise(angles[done - 1 :]))
-        expected = sum(model.move_s(b - a) + model.view_s for a, b in pairwise(angles[:done]))
-        if done > 1 and expected > 0:
+        left, expected = model.views_s(angles[done - 1 :]), model.views_s(angles[:done])
+        if expected > 0:
             left *= seconds_between(self._exposed_ns[0], self._exposed_ns[-1]) / expected
         return left + model.move_s(-angles[-1])
