@@ -95,14 +95,15 @@ class Search(ABC):
         """
         self._orientations.append(azimuth_deg)
         self.ranked = self._rank(view)
-        self.step = self._decide(table_deg)
+        if self.is_new_decision:
+            self.step = self.strategy.next(self._state(table_deg))
         return self.ranked, self.step
 
     @abstractmethod
     def _rank(self, view: DescribedView) -> Ranked: ...
 
     @abstractmethod
-    def _decide(self, table_deg: float) -> Rotate | Finish: ...
+    def _state(self, table_deg: float) -> SearchState | DenseSearchState: ...
 
     def decided(self, number: int, target_deg: float) -> Decided:
         """Return the event of the last decision, a rotation of the table to ``target_deg``."""
@@ -204,8 +205,8 @@ class HoughSearch(Search):
         )
         return Ranked(views - 1, candidates, hbr.score_margin(ranking, queries) / views)
 
-    def _decide(self, table_deg: float) -> Rotate | Finish:
-        state = SearchState(
+    def _state(self, table_deg: float) -> SearchState:
+        return SearchState(
             index=self._index,
             queries=self._queries,
             ranking=self._ranking,
@@ -217,7 +218,6 @@ class HoughSearch(Search):
             config=self._config.identify,
             rng=self._rng,
         )
-        return self.strategy.next(state)
 
     def answer(self, *, travelled_deg: float = 0.0, seconds: float = 0.0) -> Identified:
         answer = super().answer(travelled_deg=travelled_deg, seconds=seconds)
@@ -294,14 +294,9 @@ class DenseSearch(Search):
         name = self.names[present.object_index]
         return FrameUsed(number, azimuth_deg, seconds, rejected, name, present.probability, present.outcome)
 
-    def _decide(self, table_deg: float) -> Rotate | Finish:
-        return self._next(table_deg, *reachable_rotations(self._config, table_deg))
-
-    def _next(
-        self, table_deg: float, rotations_deg: NDArray[np.float64], seconds: NDArray[np.float64]
-    ) -> Rotate | Finish:
-        """Ask the strategy, which chooses among these rotations of the camera."""
-        state = DenseSearchState(
+    def _state(self, table_deg: float) -> DenseSearchState:
+        rotations_deg, seconds = self._reachable(table_deg)
+        return DenseSearchState(
             session=self._session,
             decision=self._session.decision,
             rotations_deg=rotations_deg,
@@ -310,7 +305,10 @@ class DenseSearch(Search):
             config=self._config.identify,
             rng=self._rng,
         )
-        return self.strategy.next(state)
+
+    def _reachable(self, table_deg: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the rotations of the camera that the cable allows, and the time of each."""
+        return reachable_rotations(self._config, table_deg)
 
     def verify(self, hypotheses: Hypotheses, measured: Verification | None = None) -> Asking[Verified | None]:
         found = yield from self._session.verify(self._queries(hypotheses), measured)
@@ -380,12 +378,8 @@ class ArcSearch(DenseSearch):
     """The bench's own search in motion (`hbr.dense.arc`): each frame has a weight for its share of new evidence."""
 
     in_motion = True
-    _way = 0.0
-    """The direction of the last rotation; 0 before the first one."""
 
-    def _decide(self, table_deg: float) -> Rotate | Finish:
-        if not self.is_new_decision:
-            return self.step
-        step = self._next(table_deg, *reachable_arcs(self._config, table_deg, self._way))
-        self._way = float(np.sign(step.rotation_deg)) if isinstance(step, Rotate) else 0.0
-        return step
+    def _reachable(self, table_deg: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        before = getattr(self, "step", None)  # there is no step before the first view
+        way = float(np.sign(before.rotation_deg)) if isinstance(before, Rotate) else 0.0
+        return reachable_arcs(self._config, table_deg, way)

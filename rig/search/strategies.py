@@ -43,9 +43,28 @@ _DRAWS: Final = 20
 State = TypeVar("State", contravariant=True)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SearchState:
-    """The state of the paper's search after a view.
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class _AnyState:
+    """What the state of each search has.
+
+    Attributes
+    ----------
+    table_deg
+        The table angle, unwrapped.
+    config
+        The settings of a search.
+    rng
+        For strategies that draw random numbers: seeded, so that a saved run can be computed again.
+    """
+
+    table_deg: float
+    config: IdentifyConfig
+    rng: np.random.Generator
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class SearchState(_AnyState):
+    """The state of the paper's search after a view; also ``table_deg``, ``config`` and ``rng``.
 
     Attributes
     ----------
@@ -59,12 +78,8 @@ class SearchState:
         Hough score and margin of the leading candidate, per view (`hbr.score_margin`).
     min_score
         Below this score per view the object is unknown.
-    table_deg, limits_deg
-        The table angle, unwrapped, and the limits of the cable.
-    config
-        The settings of a search.
-    rng
-        For strategies that draw random numbers: seeded, so that a saved run can be computed again.
+    limits_deg
+        The limits of the cable.
     """
 
     index: hbr.ViewIndex
@@ -73,10 +88,7 @@ class SearchState:
     score: float
     margin: float
     min_score: float
-    table_deg: float
     limits_deg: tuple[float, float]
-    config: IdentifyConfig
-    rng: np.random.Generator
 
     @property
     def views(self) -> int:
@@ -84,9 +96,9 @@ class SearchState:
         return len(self.queries)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class DenseSearchState:
-    """The state of the dense search after a view.
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class DenseSearchState(_AnyState):
+    """The state of the dense search after a view; also ``table_deg``, ``config`` and ``rng``.
 
     Attributes
     ----------
@@ -96,21 +108,12 @@ class DenseSearchState:
         The stopping rule's decision.
     rotations_deg, seconds : float64 arrays (a,)
         Rotations of the camera around the object that the cable allows, every 5°, and the time of each on this bench.
-    table_deg
-        The table angle, unwrapped.
-    config
-        The settings of a search.
-    rng
-        For strategies that draw random numbers: seeded, so that a saved run can be computed again.
     """
 
     session: hbr.DenseSession
     decision: hbr.StopDecision
     rotations_deg: NDArray[np.float64]
     seconds: NDArray[np.float64]
-    table_deg: float
-    config: IdentifyConfig
-    rng: np.random.Generator
 
     @property
     def views(self) -> int:
