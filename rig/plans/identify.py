@@ -11,7 +11,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from hbr.dense.enrolled_views import NeedEnrolledViews
+from hbr.dense.enrolled_views import answered
 from hbr.dense.local_difference import LocalView
 from rig.bench import Bench
 from rig.config import RigConfig
@@ -150,9 +150,8 @@ def identify(
         # The events of an interrupted arc come when the torque is off, because their consumer may pause.
         yield from views.unseen
         raise
-    answer = yield from _answered(
-        model, search, describe.hypotheses, travelled_deg=views.travelled_deg, seconds=seconds
-    )
+    yield from _last_steps(model, search, describe.hypotheses)
+    answer = search.answer(travelled_deg=views.travelled_deg, seconds=seconds)
     yield answer
     if failed:  # the answer is reported first
         raise failed
@@ -177,27 +176,25 @@ def _unwound(number: int, table: Turntable) -> Generator[Event, None, RigError |
     return None
 
 
-def _answered(
-    model: Model, search: Search, hypotheses: Hypotheses, *, travelled_deg: float, seconds: float
-) -> Generator[Event, None, Identified]:
-    """End the search; return its answer. If an enrolled image is missing, the answer is the one without it."""
-    steps = search.end(hypotheses, travelled_deg=travelled_deg, seconds=seconds)
-    views: Sequence[LocalView] | None = None
-    while True:
+def _last_steps(model: Model, search: Search, hypotheses: Hypotheses) -> Generator[Event, None, None]:
+    """Take the last steps of a search. If an enrolled image is missing, the answer is the one without it."""
+    missing: list[CatalogError] = []
+
+    def enrolled(object_index: int, azimuths_deg: Sequence[float]) -> Sequence[LocalView] | None:
         try:
-            asked = steps.send(views)
-        except StopIteration as end:
-            answer: Identified = end.value
-            return answer
-        views = None
-        if not isinstance(asked, NeedEnrolledViews):
-            yield asked
-        elif model.leader_views is not None:
-            try:
-                views = model.leader_views(search.names[asked.object_index], asked.azimuths_deg)
-            except CatalogError as error:
-                values = {"what": error.what, "next_step": error.next_step}
-                yield Warned(search.ranked.index, Note(NoteCode.NOT_COMPARED, values))
+            return None if model.leader_views is None else model.leader_views(search.names[object_index], azimuths_deg)
+        except CatalogError as error:
+            missing.append(error)
+            return None
+
+    for step in search.last_steps(hypotheses):
+        event = answered(step, enrolled)
+        for error in missing:
+            values = {"what": error.what, "next_step": error.next_step}
+            yield Warned(search.ranked.index, Note(NoteCode.NOT_COMPARED, values))
+        missing.clear()
+        if event is not None:
+            yield event
 
 
 def watch(

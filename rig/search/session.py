@@ -1,14 +1,14 @@
 """A search without its hardware: views in, ranking and decision out.
 
 A search does no I/O. It takes views (`Search.add`) and says what it needs next: a view after a rotation, or the end. At
-its end (`Search.end`) it asks for enrolled views, and returns the answer. The bench at rest and in motion
+its end (`Search.last_steps`) it asks for enrolled views, and then it answers. The bench at rest and in motion
 (`rig.plans.search_views`) and the replay (`rig.search.replay`) drive it; `rig eval` drives the same `hbr.DenseSession`.
 
 Decision: docs/decisions/0064.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Generator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from math import isfinite
 from typing import Any, ClassVar, Final
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 import hbr
 from hbr.core.angles import wrap360
 from hbr.core.arrays import IndexArray
-from hbr.dense.enrolled_views import Asking, NeedEnrolledViews, Queries
+from hbr.dense.enrolled_views import Asking, Queries
 from hbr.dense.local_difference import LocalView
 from hbr.dense.pose import pose
 from hbr.dense.verification import UNKNOWN_BELOW, Verification
@@ -126,19 +126,9 @@ class Search(ABC):
         """Return the event of the last frame of a search in motion; ``number`` counts the views from 0."""
         raise NotImplementedError("only the dense search takes frames in motion")
 
-    def end(
-        self, hypotheses: Hypotheses, *, travelled_deg: float = 0.0, seconds: float = 0.0
-    ) -> Generator[NeedEnrolledViews | Verified | Compared, Sequence[LocalView] | None, Identified]:
-        """End the search after its last view: yield what it needs, and the events of its last steps; return the answer.
-
-        A doubtful leader is verified first, then the two leaders are compared. The driver answers `NeedEnrolledViews`
-        with the views, or with None if they cannot be read.
-        """
-        if verified := (yield from self.verify(hypotheses)):
-            yield verified
-        if compared := (yield from self.compare(hypotheses)):
-            yield compared
-        return self.answer(travelled_deg=travelled_deg, seconds=seconds)
+    def last_steps(self, hypotheses: Hypotheses) -> tuple[Asking[Verified | None], Asking[Compared | None]]:
+        """Return the steps before the answer: a doubtful leader is verified, then the two leaders are compared."""
+        return self.verify(hypotheses), self.compare(hypotheses)
 
     def verify(self, hypotheses: Hypotheses, measured: Verification | None = None) -> Asking[Verified | None]:  # noqa: ARG002
         """Verify a doubtful leader, as `hbr.DenseSession.verify`; the answer depends on it."""
