@@ -150,7 +150,7 @@ def dry_run(
     for given, own_views in names.items():
         name = clean_name(given)
         summary = known.get(name)
-        action, obstacle = _action(summary, resume=resume, replace=replace, tray=len(names) > 1)
+        action, obstacle = planned_action(summary, resume=resume, replace=replace, tray=len(names) > 1)
         azimuths: Sequence[float] = ()
         if action in ("enroll", "replace"):
             azimuths = even_azimuths(own_views or views or bench.config.enroll.views, limits_deg, sign)
@@ -184,7 +184,10 @@ def dry_run(
     return tuple(found)
 
 
-def _action(known: ObjectSummary | None, *, resume: bool, replace: bool, tray: bool) -> tuple[str, Obstacle | None]:
+def planned_action(
+    known: ObjectSummary | None, *, resume: bool = False, replace: bool = False, tray: bool = False
+) -> tuple[str, Obstacle | None]:
+    """Return what an enrollment does with an object of the catalog, as in `DryRun`; None: the catalog has none."""
     if known is not None and known.unfinished_views is not None:
         if resume or tray:
             return "resume", None

@@ -49,6 +49,15 @@ _MAX_BYTES: Final = {"run.json": 1_000_000, "model.jsonl": 32_000_000, "events.j
 """Larger than the files of all real runs. Values of JSON can need twenty times as much memory as their text."""
 _DAMAGE: Final = (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError, cv2.error)
 """Exceptions because of values of a wrong type."""
+_WORDS: Final = {
+    KeyError: "the value {0!r} is missing",
+    IndexError: "a list is too short",
+    RecursionError: "its values are nested too deeply",
+    ArithmeticError: "a number is too large or too small",
+    AttributeError: "a value has the wrong kind",
+    cv2.error: "a value has the wrong kind",
+}
+"""Python's own errors in words."""
 
 
 class RunWriter:
@@ -390,19 +399,8 @@ def _bytes(folder: Path, name: str) -> bytes:
 
 def _reason(error: Exception) -> str:
     """Return an error in words; of Python's own errors, only those of a ValueError or TypeError are useful."""
-    match error:
-        case KeyError():
-            text = f"the value {error.args[0]!r} is missing" if error.args else "a value is missing"
-        case IndexError():
-            text = "a list is too short"
-        case RecursionError():
-            text = "its values are nested too deeply"
-        case ArithmeticError():
-            text = "a number is too large or too small"
-        case AttributeError() | cv2.error():
-            text = "a value has the wrong kind"
-        case _:
-            text = str(error)
+    words = next((words for kind, words in _WORDS.items() if isinstance(error, kind)), None)
+    text = str(error) if words is None else words.format(*error.args)
     return text if len(text) <= MAX_REASON else f"{text[:MAX_REASON]}…"
 
 
