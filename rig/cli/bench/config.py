@@ -8,8 +8,10 @@ import typer
 from rig.cli.ui.command import command
 from rig.cli.ui.complete import config_keys
 from rig.cli.ui.settings import Settings
+from rig.core.clock import SystemClock
 from rig.core.errors import ConfigError, UsageError
 from rig.core.masking import masked
+from rig.core.phrases import counted
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -32,7 +34,6 @@ def check(settings: Settings) -> None:
     Example: rig config check --config rig.toml
     """
     from rig.config.wording import key_info
-    from rig.core.phrases import counted
 
     values, config, _ = _checked(settings)
     given = sum(values.origin(info.key) != "default" for info in key_info(type(config)))
@@ -202,7 +203,7 @@ def _print_json(
     rows: "Sequence[tuple[KeyInfo, Any, list[tuple[str, Any]]]]",
     calibrations: "Sequence[BenchCalibration]",
 ) -> None:
-    from rig.events.events import plain
+    from rig.core.json_form import plain
 
     settings.print_json(
         {
@@ -235,7 +236,6 @@ def _print_json(
 def _calibrations_on_bench(settings: Settings, config: "RigConfig") -> "list[BenchCalibration]":
     """Return the bench's calibrations; their status as far as it is known without opening the bench."""
     from rig.calibrations import CalibrationStore, apparatus
-    from rig.core.clock import SystemClock
 
     name = settings.bench or config.default_bench
     mounted = apparatus(name, {part: {} for part in ("servo", "imu", "camera")}, config, {})

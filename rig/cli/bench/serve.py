@@ -9,6 +9,7 @@ import typer
 
 from rig.cli.ui.command import command
 from rig.cli.ui.settings import Settings
+from rig.core.clock import SystemClock
 from rig.core.errors import UsageError
 
 if TYPE_CHECKING:
@@ -62,7 +63,6 @@ def serve(
             f"rig serve needs packages that are not installed ({error.name}).",
             next_step="Install them: pip install 'hbr-rig[web]'",
         ) from error
-    from rig.core.clock import SystemClock
     from rig.safety.saved_state import SERVER_FOLDER
     from rig.web.access import Role, Tokens
     from rig.web.run import run_server

@@ -1,6 +1,7 @@
 """`rig snapshot`."""
 
 import sys
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -31,7 +32,7 @@ def snapshot(
 
     Example: rig snapshot table.png --bench sim
     """
-    from rig.events.events import plain
+    from rig.core.json_form import plain
     from rig.views.image_files import encode
 
     check_new(file, ".png")
@@ -57,8 +58,6 @@ def take(settings: Settings, *, refocus: bool = False) -> "tuple[Frame, CameraId
     DeviceNotFound, DeviceSilent
         The camera is missing, or delivers no frames.
     """
-    from contextlib import closing
-
     from rig.doctor.camera import open_camera
 
     with doctor_context(settings) as context:

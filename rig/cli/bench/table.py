@@ -1,13 +1,16 @@
 """`rig goto`, `rig home` and `rig status`."""
 
 from collections.abc import Callable, Mapping
+from contextlib import closing
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
+from rig.cli.bench.findings import doctor_context
 from rig.cli.ui.command import command
 from rig.cli.ui.exit_codes import EXIT_DECLINED
 from rig.cli.ui.settings import Settings
+from rig.core.errors import BenchBusy, DeviceMismatch, DeviceNotFound, DeviceSilent, RigError, UsageError
 from rig.core.phrases import angle_words, budget_words
 
 if TYPE_CHECKING:
@@ -54,7 +57,6 @@ def home(
     Example: rig home --revolutions 0 --bench sim
     """
     from rig.cli.ui.desk import CommandDesk
-    from rig.core.errors import UsageError
     from rig.jobs.table import home as home_job
     from rig.jobs.table import refer
 
@@ -71,8 +73,7 @@ def status(settings: Settings) -> None:
 
     Example: rig status --bench sim --json
     """
-    from rig.core.errors import DeviceMismatch, DeviceNotFound, DeviceSilent
-    from rig.events.events import plain
+    from rig.core.json_form import plain
     from rig.safety.bench_lock import server_address
 
     if server := server_address(settings.load().state_path(settings.bench_name)):
@@ -115,8 +116,6 @@ def status(settings: Settings) -> None:
 
 def _read(values: Callable[[], dict[str, Any]]) -> dict[str, Any]:
     """Return the values of a device; if it does not work, its error."""
-    from rig.core.errors import RigError
-
     try:
         return values()
     except RigError as error:
@@ -125,12 +124,9 @@ def _read(values: Callable[[], dict[str, Any]]) -> dict[str, Any]:
 
 def _status_without_servo(settings: Settings, missing: "RigError") -> NoReturn:
     """Print what works of a bench that cannot be opened, and exit with the error's code."""
-    from contextlib import closing
-
-    from rig.cli.bench.findings import doctor_context
+    from rig.core.json_form import plain
     from rig.devices.open_imu import open_imu
     from rig.doctor.camera import open_camera
-    from rig.events.events import plain
 
     with doctor_context(settings) as context:
         config, computer = context.config, context.computer
@@ -177,8 +173,6 @@ def _served_status(settings: Settings, server: "ServerAddress") -> None:
     import ssl
     from urllib.parse import urlsplit
     from urllib.request import Request, urlopen
-
-    from rig.core.errors import BenchBusy
 
     place = urlsplit(server.url)
     everywhere = place.hostname in ("0.0.0.0", "::")

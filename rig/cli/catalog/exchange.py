@@ -1,8 +1,10 @@
 """`rig import` and `rig export`."""
 
 import sys
+from contextlib import nullcontext
 from dataclasses import replace
 from enum import StrEnum
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -14,6 +16,9 @@ from rig.cli.ui.complete import object_names
 from rig.cli.ui.jobs import run_job, size_words
 from rig.cli.ui.models import descriptor_name
 from rig.cli.ui.settings import Settings
+from rig.core.clock import SystemClock, seconds_between
+from rig.core.errors import ExportFailed, ImportRejected, UsageError
+from rig.core.phrases import counted
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -104,11 +109,7 @@ def run_import(
     jobs: "Jobs | None",
 ) -> None:
     """Import a batch, or check it, and report."""
-    from contextlib import nullcontext
-
     from rig.catalog.exchange import Conflict, import_objects, plan_import, preview_import
-    from rig.core.clock import SystemClock, seconds_between
-    from rig.core.errors import UsageError
 
     try:
         conflict = Conflict(on_conflict)
@@ -134,8 +135,6 @@ def run_import(
 def _read_batch(source: Path, pattern: str | None, table_angles: bool) -> "ImportBatch":
     from rig.catalog.exchange import DEFAULT_PATTERN, read_bundle, read_folder, read_table, read_unpacked
     from rig.catalog.exchange.bundle import MANIFEST
-    from rig.core.clock import SystemClock
-    from rig.core.errors import ImportRejected, UsageError
 
     now = SystemClock().utc()
     if source.is_dir():
@@ -158,10 +157,8 @@ def _read_batch(source: Path, pattern: str | None, table_angles: bool) -> "Impor
 
 
 def _report(settings: Settings, done: "Imported", seconds: float, *, dry_run: bool) -> None:
-    from rig.core.phrases import counted
-
     if settings.json:
-        from rig.events.events import plain
+        from rig.core.json_form import plain
 
         values = {**plain(replace(done, rejected=())), "rejected": [file.as_json() for file in done.rejected]}
         settings.print_json({"dry_run": dry_run, "seconds": round(seconds, 3), **values})
@@ -229,8 +226,6 @@ def export(
     Example: rig export training --format coco --split view --bench sim
     """
     from rig.catalog.exchange import read_objects, write_bundle, write_folder, write_parquet, write_table
-    from rig.core.errors import ExportFailed
-    from rig.core.phrases import counted
     from rig.report.catalog_page import write_catalog_page, write_sheets
 
     form = format_ or _format(target)
@@ -274,9 +269,7 @@ def _export_training(
     jobs: int | None,
 ) -> None:
     from rig.catalog.exchange.training import Annotations, Split, write_training
-    from rig.core.errors import UsageError
-    from rig.core.phrases import counted
-    from rig.events.events import plain
+    from rig.core.json_form import plain
 
     try:
         shares = [float(part) for part in fractions.split(",")]
@@ -305,8 +298,6 @@ def _export_training(
 
 def _intrinsics(settings: Settings) -> "Intrinsics":
     """Return a function that finds the calibrated camera of a session among the calibration results of its bench."""
-    from functools import cache
-
     from rig.calibrations import CalibrationStore
     from rig.calibrations.store import CALIBRATIONS
 
@@ -324,8 +315,6 @@ def _intrinsics(settings: Settings) -> "Intrinsics":
 
 
 def _format(target: Path) -> Format:
-    from rig.core.errors import UsageError
-
     suffix = target.suffix.lower()
     known = {
         "": Format.COIL,

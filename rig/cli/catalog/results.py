@@ -10,6 +10,8 @@ from rig.cli.ui.command import command
 from rig.cli.ui.complete import object_names
 from rig.cli.ui.jobs import print_table
 from rig.cli.ui.settings import Settings
+from rig.core.errors import UsageError
+from rig.core.phrases import counted
 
 if TYPE_CHECKING:
     from rig.catalog.results import Answer, Result
@@ -89,7 +91,7 @@ def show(settings: Settings, result: ResultArgument) -> None:
     Example: rig results show 12 --bench sim
     """
     from rig.catalog.results import find_result
-    from rig.events.events import plain
+    from rig.core.json_form import plain
 
     with settings.open_catalog(read_only=True) as catalog:
         found = find_result(catalog, result)
@@ -139,8 +141,6 @@ def export(
     Example: rig results export june.csv --since 2026-06-01 --before 2026-07-01 --bench sim
     """
     from rig.catalog.exchange.results_table import TableFormat, write_results
-    from rig.core.errors import UsageError
-    from rig.core.phrases import counted
 
     try:
         form = TableFormat(target.suffix.lower().removeprefix("."))
@@ -196,7 +196,6 @@ def _find(
 ) -> "list[Result]":
     from rig.catalog.records import Outcome
     from rig.catalog.results import ResultFilter, find_results
-    from rig.core.errors import UsageError
 
     try:
         wanted = None if outcome is None else Outcome(outcome)

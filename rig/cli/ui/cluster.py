@@ -4,6 +4,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from rig.core.errors import UsageError
+
 if TYPE_CHECKING:
     from rig.core.processes import Jobs
 
@@ -26,7 +28,6 @@ def jobs_of(jobs: int | None, cluster: str | None) -> "Jobs | None":
         Both are given.
     """
     from rig.core.cluster import Cluster
-    from rig.core.errors import UsageError
 
     if cluster is None:
         return jobs
