@@ -96,7 +96,7 @@ def serve(
         needs_login=needs_login,
     )
     if settings.bench_name == "sim" and "speed" not in settings.load().bench.get("sim", {}):
-        settings = settings.merged(None, None, ["bench.sim.speed=1"], None, False)  # people watch it
+        settings = settings.merged(overrides=["bench.sim.speed=1"])  # people watch it
     arguments = tuple(settings.arguments())
     settings.opened.append(settings.bench_name)
 

@@ -6,6 +6,7 @@ import typer
 
 from rig.cli.bench.findings import doctor_context, show_progress
 from rig.cli.ui.command import command
+from rig.cli.ui.options import YesOption
 from rig.cli.ui.prompts import ask_yes_no
 from rig.cli.ui.settings import Settings
 
@@ -14,8 +15,6 @@ if TYPE_CHECKING:
     from rig.doctor.single_servo import SingleServo
 
 app = typer.Typer(help="Show the servo's registers, and change its settings, id and baud rate.", no_args_is_help=True)
-
-YesOption = Annotated[bool, typer.Option("--yes", "-y", help="Do not ask for confirmation.")]
 
 
 @app.command("info")

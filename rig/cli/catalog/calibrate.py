@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from rig.cli.ui.cluster import ClusterOption, jobs_of
 from rig.cli.ui.command import command
 from rig.cli.ui.jobs import interruptible
+from rig.cli.ui.options import ClusterOption, jobs_of
 from rig.cli.ui.settings import Settings
 from rig.core.clock import SystemClock, seconds_between
 from rig.core.errors import CatalogError

@@ -8,6 +8,7 @@ import typer
 from rig.cli.ui.command import command
 from rig.cli.ui.complete import object_names
 from rig.cli.ui.jobs import confirm, print_table, size_words
+from rig.cli.ui.options import YesOption
 from rig.cli.ui.settings import Settings
 from rig.core.errors import UsageError
 from rig.core.phrases import counted, number
@@ -18,7 +19,6 @@ if TYPE_CHECKING:
 app = typer.Typer(help="Manage the enrolled objects.", no_args_is_help=True)
 
 NameArgument = Annotated[str, typer.Argument(metavar="NAME", help="Name of the object.", autocompletion=object_names)]
-YesOption = Annotated[bool, typer.Option("--yes", "-y", help="Do not ask for confirmation.")]
 
 
 @app.command("list")

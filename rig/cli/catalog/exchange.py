@@ -10,11 +10,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rig.cli.ui.cluster import ClusterOption, jobs_of
 from rig.cli.ui.command import command
 from rig.cli.ui.complete import object_names
 from rig.cli.ui.jobs import run_job, size_words
-from rig.cli.ui.models import descriptor_name
+from rig.cli.ui.options import ClusterOption, DryImportOption, JobsOption, descriptor_name, jobs_of
 from rig.cli.ui.settings import Settings
 from rig.core.clock import SystemClock, seconds_between
 from rig.core.errors import ExportFailed, ImportRejected, UsageError
@@ -77,8 +76,8 @@ def import_(
             "rig catalog redescribe can do it later.",
         ),
     ] = None,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only report what would be imported.")] = False,
-    jobs: Annotated[int | None, typer.Option(min=1, help="Number of processes (default: one per core).")] = None,
+    dry_run: DryImportOption = False,
+    jobs: JobsOption = None,
     cluster: ClusterOption = None,
 ) -> None:
     """Import photographs with known angles, or objects of another bench; all or nothing.

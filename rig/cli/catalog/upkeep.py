@@ -7,19 +7,16 @@ from typing import Annotated, Any
 
 import typer
 
-from rig.cli.catalog.catalog import YesOption, app
-from rig.cli.ui.cluster import ClusterOption, jobs_of
+from rig.cli.catalog.catalog import app
 from rig.cli.ui.command import command
 from rig.cli.ui.complete import object_names
 from rig.cli.ui.exit_codes import EXIT_CATALOG
 from rig.cli.ui.jobs import confirm, print_table, run_job, size_words
-from rig.cli.ui.models import descriptor_name
+from rig.cli.ui.options import ClusterOption, DryImportOption, JobsOption, YesOption, descriptor_name, jobs_of
 from rig.cli.ui.settings import Settings
 from rig.core.clock import SystemClock
 from rig.core.errors import UsageError
 from rig.core.phrases import angle_words, counted
-
-JobsOption = Annotated[int | None, typer.Option(min=1, help="Number of processes (default: one per core).")]
 
 
 @app.command("verify")
@@ -322,7 +319,7 @@ def merge(
     on_conflict: Annotated[
         str, typer.Option(metavar="reject|skip|replace", help="What to do with objects that are in both.")
     ] = "reject",
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only report what would be imported.")] = False,
+    dry_run: DryImportOption = False,
     jobs: JobsOption = None,
 ) -> None:
     """Import the objects of another catalog with all their enrollments; all or nothing.

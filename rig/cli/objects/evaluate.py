@@ -11,10 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rig.cli.ui.cluster import ClusterOption, jobs_of
 from rig.cli.ui.command import command
 from rig.cli.ui.exit_codes import EXIT_INTERRUPTED
-from rig.cli.ui.models import descriptor_name
+from rig.cli.ui.options import ClusterOption, JobsOption, descriptor_name, jobs_of
 from rig.cli.ui.settings import Settings
 from rig.core.errors import UsageError
 
@@ -134,7 +133,7 @@ def evaluate(
         float | None,
         typer.Option(min=0, help="Margin per view that ends a search of the paper (default: identify.margin)."),
     ] = None,
-    jobs: Annotated[int | None, typer.Option(min=1, help="Number of processes (default: one per core).")] = None,
+    jobs: JobsOption = None,
     cluster: ClusterOption = None,
     out: Annotated[
         Path | None,

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 
 from rig.cli.ui.command import command
-from rig.cli.ui.models import ModelOption, load_model_file
+from rig.cli.ui.options import ModelOption, load_model_file
 from rig.cli.ui.settings import Settings
 from rig.core.errors import ReplayMismatch, RunIncomplete
 from rig.core.phrases import counted

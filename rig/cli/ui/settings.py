@@ -36,7 +36,13 @@ class Settings:
     """Benches that the command has opened."""
 
     def merged(
-        self, bench: str | None, config: Path | None, overrides: list[str] | None, seed: int | None, json: bool
+        self,
+        *,
+        bench: str | None = None,
+        config: Path | None = None,
+        overrides: list[str] | None = None,
+        seed: int | None = None,
+        json: bool = False,
     ) -> "Settings":
         """Return these settings, replaced by those that follow the command."""
         return replace(
