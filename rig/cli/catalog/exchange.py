@@ -6,7 +6,7 @@ from dataclasses import replace
 from enum import StrEnum
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
@@ -42,6 +42,16 @@ class Format(StrEnum):
     HTML = "html"
     COCO = "coco"
     YOLO = "yolo"
+
+
+_FORMAT_OF: Final = {
+    "": Format.COIL,
+    ".zip": Format.BUNDLE,
+    ".csv": Format.CSV,
+    ".parquet": Format.PARQUET,
+    ".html": Format.HTML,
+}
+"""The format that the suffix of a target names."""
 
 
 @command
@@ -227,6 +237,14 @@ def export(
     from rig.catalog.exchange import read_objects, write_bundle, write_folder, write_parquet, write_table
     from rig.report.catalog_page import write_catalog_page, write_sheets
 
+    writers = {
+        Format.BUNDLE: write_bundle,
+        Format.COIL: write_folder,
+        Format.CSV: write_table,
+        Format.PARQUET: write_parquet,
+        Format.SHEETS: write_sheets,
+        Format.HTML: write_catalog_page,
+    }
     form = format_ or _format(target)
     with settings.open_catalog(read_only=True) as catalog:
         wanted = list(names or [])
@@ -236,22 +254,10 @@ def export(
         if label is not None and not wanted:
             raise ExportFailed(f"No object has the label {label!r}.", next_step="List the objects: rig catalog list")
         objects = read_objects(catalog, wanted)
-        match form:
-            case Format.BUNDLE:
-                count = write_bundle(target, objects)
-            case Format.COIL:
-                count = write_folder(target, objects)
-            case Format.CSV:
-                count = write_table(target, objects)
-            case Format.PARQUET:
-                count = write_parquet(target, objects)
-            case Format.SHEETS:
-                count = write_sheets(target, objects)
-            case Format.HTML:
-                count = write_catalog_page(target, objects)
-            case Format.COCO | Format.YOLO:
-                _export_training(settings, target, list(objects), form, split, fractions, jobs)
-                return
+        if form in (Format.COCO, Format.YOLO):
+            _export_training(settings, target, list(objects), form, split, fractions, jobs)
+            return
+        count = writers[form](target, objects)
     settings.say(
         f"Exported {counted(count, 'object')} to {target} ({form}).",
         {"target": str(target), "format": form, "objects": count},
@@ -314,18 +320,11 @@ def _intrinsics(settings: Settings) -> "Intrinsics":
 
 
 def _format(target: Path) -> Format:
-    suffix = target.suffix.lower()
-    known = {
-        "": Format.COIL,
-        ".zip": Format.BUNDLE,
-        ".csv": Format.CSV,
-        ".parquet": Format.PARQUET,
-        ".html": Format.HTML,
-    }
-    if suffix not in known:
-        suffixes = ", ".join(f"{suffix or 'no suffix'} ({form})" for suffix, form in known.items())
+    form = _FORMAT_OF.get(target.suffix.lower())
+    if form is None:
+        suffixes = ", ".join(f"{suffix or 'no suffix'} ({form})" for suffix, form in _FORMAT_OF.items())
         raise UsageError(
             f"The suffix of {target} does not name a format.",
             next_step=f"Use one of these suffixes: {suffixes}. Or give --format.",
         )
-    return known[suffix]
+    return form
