@@ -6,6 +6,7 @@ import typer
 
 from rig.cli.bench.findings import doctor_context, show_findings
 from rig.cli.ui.command import command
+from rig.cli.ui.exit_codes import EXIT_DEVICE
 from rig.cli.ui.settings import Settings
 
 if TYPE_CHECKING:
@@ -46,7 +47,7 @@ def find(
     elif wanted:
         print(f"\nFor rig.toml (`rig setup` writes it):\n\n{with_values('', wanted)}", end="")
     if not wanted:
-        raise typer.Exit(4)
+        raise typer.Exit(EXIT_DEVICE)
 
 
 def proposed_settings(scan: "DeviceScan") -> "dict[Key, Any]":
