@@ -11,17 +11,16 @@ from rig.bench import Bench
 from rig.bench.bench import DEVICES
 from rig.catalog import Action, Catalog
 from rig.config import RigConfig
-from rig.core.clock import Clock
 from rig.core.errors import UsageError
+from rig.core.json_form import plain
 from rig.core.phrases import counted, duration_words
-from rig.events.events import Enrolled, Identified, event_dict, plain
+from rig.events.events import Enrolled, Identified, event_dict
 from rig.events.lines import line
 from rig.jobs.desk import Desk, Progress, Remark, Result, Step, Steps
-from rig.jobs.enroll import enroll, enroll_list
+from rig.jobs.enroll import enroll, enroll_list, plan
 from rig.jobs.identify import identify
 from rig.jobs.table import acknowledge, goto, home, refer
 from rig.jobs.table_image import take_table_image
-from rig.plans.estimate import dry_run
 from rig.plans.operator import Choice, Operator, Question
 from rig.plans.tray import TrayItem
 from rig.web.bench_catalog import BenchCatalog
@@ -78,16 +77,9 @@ class ServedDesk(Desk):
     def open_to_read(self) -> Catalog:
         return self._catalog.open_to_read()
 
-    def open_to_enroll(self, clock: Clock) -> Catalog:
-        return self._catalog.open_to_enroll(clock)
-
     def log(self, action: Action, **details: Any) -> Iterator[Remark]:
         if self.place.url is None:  # waiting for a server that is away would delay the answer to a STOP
             yield from super().log(action, **details)
-
-    def deliver(self) -> Iterator[Remark]:
-        for words in self._catalog.deliver():
-            yield Remark(words)
 
 
 class _BrowserOperator:
@@ -220,8 +212,7 @@ def _show(context: Context, step: Step) -> None:
 
 def _dry_run(desk: Desk, request: DryRunRequest) -> Steps[None]:
     names = {one.name: one.views for one in request.objects}
-    with desk.open_bench() as bench, desk.open_to_enroll(bench.clock) as catalog:
-        found = dry_run(bench, catalog, names, views=request.views, resume=request.resume, replace=request.replace)
+    found = plan(desk, names, views=request.views, resume=request.resume, replace=request.replace)
     views, seconds = sum(one.views for one in found), sum(one.seconds for one in found)
     yield Result(
         {"dry_run": plain(found)},

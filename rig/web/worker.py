@@ -14,8 +14,9 @@ from typing import Any, Final
 from rig.bench import Bench
 from rig.core.clock import SystemClock, seconds_between
 from rig.core.errors import DeviceMismatch, DeviceNotFound, DeviceSilent, RigError
+from rig.core.json_form import plain
 from rig.devices.servo import ServoState
-from rig.events.events import Accepted, Decided, Event, Started, event_dict, plain
+from rig.events.events import Accepted, Decided, Event, Started, event_dict
 from rig.events.lines import line
 from rig.motion.motion_model import MotionModel
 from rig.plans.estimate import TimeLeft
