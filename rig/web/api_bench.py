@@ -117,40 +117,40 @@ def add_jobs(api: APIRouter, server: Server) -> None:
         request: Request, _person: Watcher, limit: Limit = 50, after: Annotated[str | None, Query(max_length=32)] = None
     ) -> Response:
         """List the jobs, the newest first."""
-        return page_of(request, server.remote.jobs(), "id", limit, after)
+        return page_of(request, server.remote.ask("jobs"), "id", limit, after)
 
-    @api.post("/jobs", tags=["jobs"], status_code=201)
-    def submit(body: JobRequest, person: OperatorPerson) -> Job:
+    @api.post("/jobs", tags=["jobs"], status_code=201, response_model=Job)
+    def submit(body: JobRequest, person: OperatorPerson) -> Any:
         """Add a job to the queue."""
-        return server.remote.submit(body, person.name)
+        return server.remote.ask("submit", request=body, operator=person.name)
 
-    @api.get("/jobs/{job_id}", tags=["jobs"])
-    def job(job_id: str, _person: Watcher) -> Job:
+    @api.get("/jobs/{job_id}", tags=["jobs"], response_model=Job)
+    def job(job_id: str, _person: Watcher) -> Any:
         """Return a job."""
-        return server.remote.job(job_id)
+        return server.remote.ask("job", job_id=job_id)
 
-    @api.post("/jobs/{job_id}/cancel", tags=["jobs"])
-    def cancel(job_id: str, _person: OperatorPerson) -> Job:
+    @api.post("/jobs/{job_id}/cancel", tags=["jobs"], response_model=Job)
+    def cancel(job_id: str, _person: OperatorPerson) -> Any:
         """Cancel a job. A running one ends at its next step; views that were taken stay stored."""
-        return server.remote.cancel(job_id)
+        return server.remote.ask("cancel", job_id=job_id)
 
-    @api.post("/jobs/{job_id}/pause", tags=["jobs"])
-    def pause(job_id: str, _person: OperatorPerson) -> Job:
+    @api.post("/jobs/{job_id}/pause", tags=["jobs"], response_model=Job)
+    def pause(job_id: str, _person: OperatorPerson) -> Any:
         """Pause a job after its present view; the table holds its angle."""
-        return server.remote.pause(job_id)
+        return server.remote.ask("pause", job_id=job_id)
 
-    @api.post("/jobs/{job_id}/resume", tags=["jobs"])
-    def resume(job_id: str, _person: OperatorPerson) -> Job:
+    @api.post("/jobs/{job_id}/resume", tags=["jobs"], response_model=Job)
+    def resume(job_id: str, _person: OperatorPerson) -> Any:
         """Resume a paused job."""
-        return server.remote.resume(job_id)
+        return server.remote.ask("resume", job_id=job_id)
 
-    @api.post("/jobs/{job_id}/answer", tags=["jobs"])
-    def answer(job_id: str, body: AnswerBody, _person: OperatorPerson) -> Job:
+    @api.post("/jobs/{job_id}/answer", tags=["jobs"], response_model=Job)
+    def answer(job_id: str, body: AnswerBody, _person: OperatorPerson) -> Any:
         """Answer the question of a job."""
-        return server.remote.answer(job_id, body.choice)
+        return server.remote.ask("answer", job_id=job_id, choice=body.choice)
 
     @api.get("/jobs/{job_id}/views/{number}", tags=["jobs"], response_class=Response)
     def view(job_id: str, number: int, _person: Watcher) -> Response:
         """Return a picture of a recent job as JPEG, the first with number 0."""
-        found = server.remote.view(job_id, number)
+        _, found = server.remote.link.call("view", job_id=job_id, number=number)
         return Response(found, media_type="image/jpeg", headers={"Cache-Control": "private, max-age=3600"})

@@ -20,7 +20,7 @@ class _Numbers(Collector):
         self._server = server
 
     def collect(self) -> Iterator[Metric]:
-        server, status, numbers = self._server, self._server.remote.status, self._server.remote.numbers()
+        server, status, numbers = self._server, self._server.remote.status, self._server.remote.ask("numbers")
         yield GaugeMetricFamily("rig_bench_open", "Whether the bench is open.", float(bool(status.get("open"))))
         yield GaugeMetricFamily("rig_fault_latched", "Whether a fault is latched.", float(bool(status.get("fault"))))
         if (angle_deg := status.get("table_deg")) is not None:
@@ -30,7 +30,7 @@ class _Numbers(Collector):
             yield GaugeMetricFamily("rig_servo_volts", "Supply voltage.", servo["voltage_v"])
         yield GaugeMetricFamily("rig_viewers", "Open live pictures.", server.remote.viewers)
         yield GaugeMetricFamily("rig_event_listeners", "Open streams of events.", server.hub.listeners)
-        jobs = server.remote.jobs()
+        jobs = server.remote.ask("jobs")
         waiting = GaugeMetricFamily("rig_jobs", "Jobs by state.", labels=["state"])
         for state in JobState:
             waiting.add_metric([state.value], sum(job["state"] == state for job in jobs))
