@@ -15,8 +15,9 @@ from rig.web.bench_catalog import BenchCatalog
 from rig.web.jobs import JobQueue
 from rig.web.link import Functions, Link
 from rig.web.picture import LivePicture
+from rig.web.requests import Job
 from rig.web.setup import Setup
-from rig.web.work import WorkFactory, doctor_findings
+from rig.web.work import ServedDesk
 from rig.web.worker import BenchWorker
 
 
@@ -37,7 +38,10 @@ class BenchSide:
 
     def __init__(self, setup: Setup, folder: Path, clock: SystemClock, report: Callable[[str], None]) -> None:
         def opened() -> Bench:
-            return open_bench(setup.bench, setup.config, seed=setup.seed)
+            return open_bench(setup.bench, setup.config, seed=setup.seed, show_frame=self.picture.show)
+
+        def run(worker: BenchWorker, job: Job) -> None:
+            ServedDesk(worker, job, setup, catalog).run()
 
         self.link: Link | None = None
         self.stops: StopListener = listen(setup.state_folder)
@@ -45,12 +49,7 @@ class BenchSide:
         self.queue = JobQueue(folder, clock, lambda job: self.publish("job", job), setup.arguments, self.stops.count)
         place = setup.config.catalog_place(setup.bench)
         catalog = BenchCatalog(place, clock, lambda state: self.publish("catalog", state), report)
-        factory = WorkFactory(
-            *(catalog, setup.runs),
-            lambda: doctor_findings(setup.bench, setup.config, setup.seed, setup.arguments),
-            setup.seed or 0,
-        )
-        self.worker = BenchWorker(opened, self.queue, self.publish, self.picture, factory, self.stops, clock)
+        self.worker = BenchWorker(opened, self.queue, self.publish, self.picture, run, self.stops, clock)
         asked = ("jobs", "job", "submit", "cancel", "pause", "resume", "answer")
         self._functions: Functions = {
             **{name: validate_call(getattr(self.queue, name)) for name in asked},
@@ -83,10 +82,10 @@ class BenchSide:
         self.stops.close()
 
     def _view(self, job_id: str, number: int) -> tuple[None, bytes]:
-        found = self.worker.view(job_id, number)
-        if found is None:
+        pictures = self.worker.views.get(job_id, [])
+        if not 0 <= number < len(pictures):
             raise JobNotFound("There is no such picture (any more).", next_step="The catalog has all enrolled views.")
-        return None, found
+        return None, pictures[number]
 
     def _picture(self, after: int) -> tuple[dict[str, Any], bytes]:
         """Return the newest frame, unless its number is ``after``, and ask the camera for more."""

@@ -1,7 +1,6 @@
 """The live picture: the newest frame of the camera, encoded once for all viewers."""
 
 import threading
-from collections.abc import Callable
 from typing import Final
 
 import cv2
@@ -9,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.core.clock import Clock, seconds_between
-from rig.devices.camera import Camera, CameraIdentity, CameraLocks, Frame
 
 JPEG_QUALITY: Final = 80
 MAX_SIDE_PX: Final = 1280
@@ -70,26 +68,3 @@ def jpeg(image_bgr: NDArray[np.uint8], max_side_px: int = MAX_SIDE_PX) -> bytes:
     if not encoded:
         raise ValueError("the image cannot be encoded")
     return content.tobytes()
-
-
-class ObservedCamera:
-    """A camera that also shows its frames to an observer."""
-
-    def __init__(self, camera: Camera, observer: Callable[[NDArray[np.uint8]], None]) -> None:
-        self._camera = camera
-        self._observer = observer
-
-    @property
-    def identity(self) -> CameraIdentity:
-        return self._camera.identity
-
-    def capture(self, after_ns: int, meanwhile: Callable[[], object] | None = None) -> Frame:
-        frame = self._camera.capture(after_ns, meanwhile)
-        self._observer(frame.image_bgr)
-        return frame
-
-    def read_locks(self) -> CameraLocks:
-        return self._camera.read_locks()
-
-    def close(self) -> None:
-        self._camera.close()

@@ -12,8 +12,8 @@ from rig.bench import Bench, open_bench
 from rig.catalog import Catalog
 from rig.core.clock import SystemClock
 from rig.devices.servo import ServoState
+from rig.doctor.examination import run_checks
 from rig.safety.stop_channel import StopAnswer, StopRequest
-from rig.web.work import doctor_findings
 from sim.bench import ShelfOperator
 from tests.rig.web.conftest import Served
 
@@ -52,14 +52,14 @@ def halted(monkeypatch) -> Halted:
 def request_after_views(served: Served, requests: dict[int, str]) -> None:
     """Send a request about the running job right after its view of a number, before the job does anything else."""
     worker, left = served.side.worker, dict(requests)
-    publish = worker._publish
+    publish = worker.publish
 
     def published(kind: str, data: Any) -> None:
         publish(kind, data)
         if kind == "plan" and data["event"] == "accepted" and (request := left.pop(data["picture"] + 1, None)):
             assert served.client.post(f"/api/v1/jobs/{data['job']}/{request}").status_code == 200
 
-    worker._publish = published
+    worker.publish = published
 
 
 def test_enrolled_object_is_identified_and_its_run_is_saved(serve):
@@ -276,11 +276,11 @@ def test_doctor_finds_the_bench_closed_at_each_check(serve, monkeypatch):
     closed = []
 
     def watched(*arguments: Any) -> Any:
-        for finding in doctor_findings(*arguments):
+        for finding in run_checks(*arguments):
             closed.append(served.side.worker._held.bench is None)
             yield finding
 
-    monkeypatch.setattr("rig.web.bench_side.doctor_findings", watched)
+    monkeypatch.setattr("rig.doctor.examination.run_checks", watched)
     served = serve()
     assert served.run(kind="doctor")["state"] == "done"
     assert len(closed) > 5
