@@ -17,8 +17,9 @@ from rig.catalog import Catalog, Enrollment, Provenance, ViewRecord
 from rig.catalog.descriptions import unfinished_camera_settings
 from rig.core.clock import seconds_between
 from rig.core.errors import ObjectMoved, RigError, RotationDisagreement
+from rig.core.json_form import plain
 from rig.core.phrases import angle_words
-from rig.events.events import Accepted, Enrolled, Event, Started, plain
+from rig.events.events import Accepted, Enrolled, Event, Started
 from rig.motion.move import Move
 from rig.motion.scan_speed import require_camera_time, takes_in_motion
 from rig.motion.turntable import Turntable

@@ -7,6 +7,7 @@ from typing import Any, Final
 
 from hbr.dense.enrolled_views import answered
 from hbr.dense.verification import Verification
+from rig.core.json_form import plain
 from rig.events.compared import Compared, Verified
 from rig.events.events import (
     Accepted,
@@ -18,7 +19,6 @@ from rig.events.events import (
     Ranked,
     RotationReason,
     event_dict,
-    plain,
 )
 from rig.search.comparison import saved_enrolled_views
 from rig.search.model import begin_search

@@ -16,7 +16,7 @@ from rig.catalog.edit import delete, deleted_objects, rename, set_texts, undelet
 from rig.catalog.exchange import Conflict, import_objects, plan_import, read_bundle, read_objects, write_bundle
 from rig.catalog.jobs import finished
 from rig.catalog.prepared import searched_views
-from rig.events.events import plain
+from rig.core.json_form import plain
 from rig.plans.similar_objects import similar_objects
 from rig.web.picture import jpeg
 from rig.web.server import (

@@ -12,8 +12,9 @@ from rig.catalog.exchange.results_table import plain_row
 from rig.catalog.records import Outcome
 from rig.catalog.results import ResultFilter, correct, find_result, find_results
 from rig.core.errors import JobNotFound
+from rig.core.json_form import plain
 from rig.core.masking import masked
-from rig.events.events import event_dict, plain
+from rig.events.events import event_dict
 from rig.search.replay import Check, check
 from rig.search.saved_run import SavedRun, load_run
 from rig.web.event_schema import SavedRunBody

@@ -1,6 +1,6 @@
 """The job that runs on the served bench: its desk, what the pages see of it, and what they answer."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager, closing, nullcontext
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -11,13 +11,14 @@ from pydantic import BaseModel
 from rig.bench import Bench
 from rig.bench.bench import DEVICES
 from rig.catalog import Catalog
-from rig.core.clock import Clock
 from rig.core.errors import UsageError
+from rig.core.json_form import plain
+from rig.core.phrases import counted, duration_words
 from rig.events.events import Accepted, Decided, Enrolled, Event, Identified, Started, event_dict
 from rig.events.lines import line
 from rig.jobs.desk import Desk, Progress, Remark, Result, Step, Steps
 from rig.jobs.doctor import examine
-from rig.jobs.enroll import enroll, enroll_list, plan_enrollment
+from rig.jobs.enroll import enroll, enroll_list, plan
 from rig.jobs.identify import identify
 from rig.jobs.table import acknowledge, goto, home, refer
 from rig.jobs.table_image import take_table_image
@@ -103,13 +104,6 @@ class ServedDesk(Desk):
 
     def open_to_read(self) -> Catalog:
         return self._catalog.open_to_read()
-
-    def open_to_enroll(self, clock: Clock) -> Catalog:
-        return self._catalog.open_to_enroll(clock)
-
-    def deliver(self) -> Iterator[Remark]:
-        for words in self._catalog.deliver():
-            yield Remark(words)
 
     def choose(self, question: Question) -> Choice:
         queue, job = self._worker.queue, self.job
@@ -200,7 +194,13 @@ def _tray(desk: ServedDesk, objects: list[TrayObject], views: int | None) -> Ste
 
 
 def _dry_run(desk: ServedDesk, objects: list[TrayObject], **parameters: Any) -> Steps[None]:
-    return plan_enrollment(desk, {one.name: one.views for one in objects}, **parameters)
+    found = plan(desk, {one.name: one.views for one in objects}, **parameters)
+    views, seconds = sum(one.views for one in found), sum(one.seconds for one in found)
+    yield Result(
+        {"dry_run": plain(found)},
+        f"{counted(len(found), 'object')}, {counted(views, 'view')}, about {duration_words(seconds)}. "
+        "Nothing was moved or stored.",
+    )
 
 
 def _identify(desk: ServedDesk, **parameters: Any) -> Steps[Identified | None]:

@@ -14,8 +14,8 @@ from typing import Any, Final
 from rig.bench import Bench
 from rig.core.clock import SystemClock, seconds_between
 from rig.core.errors import DeviceMismatch, DeviceNotFound, DeviceSilent, RigError
+from rig.core.json_form import plain
 from rig.devices.servo import ServoState
-from rig.events.events import plain
 from rig.safety.stop_channel import StopAnswer, StopListener
 from rig.safety.supervisor import stopped
 from rig.web.jobs import JobQueue

@@ -29,7 +29,7 @@ def write_bundle(settings: Settings, file: Path, findings: "list[Finding]", *, p
         The file exists or cannot be written.
     """
     from rig.config.values import default_path
-    from rig.events.events import plain
+    from rig.core.json_form import plain
     from rig.safety.saved_state import FileStore
     from rig.views.image_files import encode
 

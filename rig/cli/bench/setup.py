@@ -9,9 +9,11 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
+from rig.cli.bench.findings import doctor_context, print_finding, show_progress
 from rig.cli.ui import prompts
 from rig.cli.ui.command import command
 from rig.cli.ui.settings import Settings
+from rig.core.errors import SeveralServos
 
 if TYPE_CHECKING:
     from rig.bench.computer import DeviceFile
@@ -39,7 +41,6 @@ def setup(
     Example: rig setup --bench sim --yes
     """
     from rig.cli.bench.doctor import print_findings
-    from rig.cli.bench.findings import doctor_context
     from rig.config import RigConfig, load_config
     from rig.config.toml_file import read_text, save, stated, with_values
     from rig.config.values import FILE_NAME, default_path
@@ -140,7 +141,6 @@ class Dialogue:
         return self.wanted
 
     def _scan(self, scan: "DeviceScan") -> None:
-        from rig.cli.bench.findings import print_finding, show_progress
         from rig.cli.ui.present import console
         from rig.doctor.examination import run_checks
 
@@ -208,7 +208,6 @@ class Dialogue:
     def _permanent_settings(self) -> None:
         """Show the differing settings of the servo's EEPROM, and write them if the operator agrees."""
         from rig.config.toml_file import Key
-        from rig.core.errors import SeveralServos
         from rig.devices.dynamixel.settings import ServoMode, compare, write
         from rig.doctor.single_servo import single_servo
 

@@ -3,14 +3,15 @@
 import os
 import sys
 from collections.abc import Iterable, Sequence
-from types import TracebackType
-from typing import Final, Self
+from contextlib import AbstractContextManager
+from typing import Final
 
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as RichProgress
 from rich.segment import Segment
 
+from rig.catalog.jobs import JobProgress
 from rig.cli.ui.terminal import unguarded
 from rig.core.control_characters import neutral
 from rig.core.phrases import angle_range, angle_words, azimuth_words, counted, duration_words
@@ -85,8 +86,8 @@ def _beginning(table_deg: float, first_deg: float) -> str:
     return f"It first {verb} to {angle_words(first_deg)}"
 
 
-class Progress:
-    """A progress bar on stderr; only its notes if stderr is not a terminal."""
+class Progress(AbstractContextManager["Progress"]):
+    """A progress bar on stderr, shown from its first call on; only its notes if stderr is not a terminal."""
 
     def __init__(self, title: str) -> None:
         self._bar = RichProgress(
@@ -101,25 +102,15 @@ class Progress:
         )
         self._task = self._bar.add_task(title, total=None, start=False)
 
-    def __enter__(self) -> Self:
-        self._bar.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._bar.stop()
 
-    def start(self, total: int) -> None:
+    def __call__(self, at: JobProgress) -> None:
+        """Show how much is done."""
+        self._bar.start()
         self._bar.start_task(self._task)
-        self._bar.update(self._task, total=total)
-
-    def advance(self) -> None:
-        self._bar.advance(self._task)
-
-    def at(self, done: int) -> None:
-        """Show that ``done`` items are done."""
-        self._bar.update(self._task, completed=done)
+        self._bar.update(self._task, total=at.total, completed=at.done)
 
     def note(self, text: str) -> None:
+        """Print a line above the bar."""
         self._bar.console.print(text, markup=False, highlight=False, soft_wrap=not self._bar.console.is_terminal)

@@ -271,7 +271,7 @@ def test_log_and_users_of_the_bench_hide_passwords(rig, tmp_path, monkeypatch):
         texts += [rig(*words, *options).output for words in (["goto", "20"], ["doctor", "--json"])]
     assert "rig jog --set catalog.url=postgresql://ada:***@host.invalid" in texts[2]
     assert not [text for text in texts if "w0rd" in text]
-    assert "w0rd" not in str(Settings().merged(None, None, [f"catalog.url={url}"], None, False).arguments())
+    assert "w0rd" not in str(Settings().merged(overrides=[f"catalog.url={url}"]).arguments())
 
 
 def test_table_rotates_without_a_camera(rig):
