@@ -4,18 +4,25 @@ import asyncio
 import json
 import threading
 from dataclasses import dataclass, field
-from typing import Any
+from inspect import signature
+from typing import Any, get_args
 
 import pytest
 
 from rig.bench import Bench, open_bench
 from rig.catalog import Catalog
+from rig.config import load_config
 from rig.core.clock import SystemClock
+from rig.core.errors import DeviceNotFound
 from rig.devices.servo import ServoState
 from rig.doctor.examination import run_checks
+from rig.safety.saved_state import SESSION
 from rig.safety.stop_channel import StopAnswer, StopRequest
+from rig.web.requests import GotoRequest, JobRequest
+from rig.web.setup import Listening, Setup
+from rig.web.work import JOBS
 from sim.bench import ShelfOperator
-from tests.rig.web.conftest import Served
+from tests.rig.web.conftest import Served, connected
 
 
 @dataclass
@@ -286,3 +293,48 @@ def test_doctor_finds_the_bench_closed_at_each_check(serve, monkeypatch):
     assert len(closed) > 5
     assert all(closed)
     assert served.run(kind="home")["state"] == "done"  # and it is opened again afterwards
+
+
+def test_doctor_examines_a_bench_that_cannot_be_opened(serve, monkeypatch):
+    def missing(*_arguments: Any, **_options: Any) -> Bench:
+        raise DeviceNotFound("The camera is missing.", next_step="Connect it.")
+
+    monkeypatch.setattr("rig.web.bench_side.open_bench", missing)
+    served = serve()
+    assert served.run(kind="home")["error"]["what"] == "The camera is missing."
+    assert served.run(kind="doctor")["state"] == "done"
+
+
+def test_rotation_waits_for_no_server_of_the_catalog(serve):
+    """The log of the catalog would have to be on its server, which may not answer for a long time."""
+    served = serve("catalog.url='postgresql+psycopg://ada:w0rd@host.invalid/rig'")
+    assert served.run(kind="goto", angle_deg=30)["state"] == "done"
+    plans = [json.loads(one.data) for one in served.server.hub.since(0)[0] if one.kind == "plan"]
+    assert [one["event"] for one in plans] == ["moved"]
+
+
+def test_request_has_the_parameters_of_its_job():
+    union, _ = get_args(JobRequest)
+    assert set(JOBS) == set(get_args(union))
+    for request, job in JOBS.items():
+        signature(job).bind(None, **{name: None for name in request.model_fields if name != "kind"})
+
+
+@pytest.mark.parametrize(
+    ("error", "state", "session"),
+    [(RuntimeError("a defect"), "failed", "failed"), (KeyboardInterrupt(), "interrupted", "interrupted")],
+)
+def test_server_that_ends_in_a_job_stores_how_it_ended(tmp_path, monkeypatch, error, state, session):
+    def fail(_event: Any) -> str:
+        raise error
+
+    monkeypatch.setattr("rig.web.work.line", fail)
+    config = load_config(None, [f"catalog.path={tmp_path}/catalog", f"state_dir={tmp_path}/state"])
+    setup = Setup(bench="sim", config=config, listening=Listening(host="127.0.0.1", port=0))
+    side, _, disconnect = connected(setup)
+    job = side.queue.submit(GotoRequest(angle_deg=30), "anna")
+    with pytest.raises(type(error)):
+        side.worker.run()
+    disconnect()
+    assert side.queue.job(job.id).state == state
+    assert json.loads((setup.state_folder / SESSION).read_text())["ended"] == session
