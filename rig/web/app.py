@@ -3,7 +3,7 @@
 from importlib.metadata import version
 from typing import Any, Final
 
-from fastapi import APIRouter, FastAPI, Request, Response
+from fastapi import FastAPI, Request, Response
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from fastapi.staticfiles import StaticFiles
@@ -17,7 +17,7 @@ from rig.web.api_records import add_records
 from rig.web.metrics import metrics_text
 from rig.web.pages import pages
 from rig.web.problems import MEDIA_TYPE, problem, problem_body, status_of
-from rig.web.server import API, Problem, Server, Watcher
+from rig.web.server import API, Problem, Routes, Server, Watcher
 
 _ERRORS: Final[dict[int | str, dict[str, Any]]] = {
     code: {"model": Problem, "description": text}
@@ -48,7 +48,11 @@ def create_app(server: Server) -> FastAPI:
         openapi_url=f"{API}/openapi.json",
     )
     app.state.server = server
-    app.include_router(_api(server), prefix=API, responses=_ERRORS)
+    routes = Routes()
+    for add in (add_access, add_bench, add_jobs, add_catalog, add_records):
+        add(routes, server)
+    for router in (routes.anybody, routes.watch, routes.operate):
+        app.include_router(router, prefix=API, responses=_ERRORS)
     app.include_router(pages(server))
     app.mount("/static", StaticFiles(packages=[("rig.web", "static")]), name="static")
 
@@ -73,13 +77,3 @@ def create_app(server: Server) -> FastAPI:
         return Response(body, error.status_code, headers=error.headers, media_type=MEDIA_TYPE)
 
     return app
-
-
-def _api(server: Server) -> APIRouter:
-    api = APIRouter()
-    add_access(api, server)
-    add_bench(api, server)
-    add_jobs(api, server)
-    add_catalog(api, server)
-    add_records(api, server)
-    return api
