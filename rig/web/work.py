@@ -28,8 +28,7 @@ from rig.plans.operator import Choice, Operator, Question
 from rig.plans.tray import TrayItem
 from rig.web import requests
 from rig.web.bench_catalog import BenchCatalog
-from rig.web.outline import Outliner
-from rig.web.picture import jpeg
+from rig.web.picture import Outliner, jpeg
 from rig.web.requests import Job, JobState, TrayObject
 from rig.web.setup import Setup
 from rig.web.worker import BenchWorker
