@@ -8,7 +8,6 @@ import threading
 from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, field
 from typing import Any, Final
 
 from rig.bench import Bench
@@ -38,14 +37,6 @@ _LOST: Final = (DeviceNotFound, DeviceMismatch, DeviceSilent)
 
 class JobCancelled(Exception):
     """The operator cancelled the running job."""
-
-
-@dataclass(slots=True)
-class _Open:
-    bench: Bench | None = None
-    error: RigError | None = None
-    tried_ns: int = 0
-    status: dict[str, Any] = field(default_factory=dict)
 
 
 class BenchWorker:
@@ -85,7 +76,12 @@ class BenchWorker:
         self._picture = picture
         self._run_job = run_job
         self._clock = clock
-        self._held = _Open()
+        self._bench: Bench | None = None
+        self._error: RigError | None = None
+        """Why the bench is not open."""
+        self._tried_ns: int | None = None
+        self.status: dict[str, Any] = {}
+        """The last known state of the bench, as JSON values; a new dict after each change."""
         self._job: Job | None = None
         self._ended = threading.Event()
         self._stops = stops
@@ -97,11 +93,6 @@ class BenchWorker:
         self._polled_ns: int | None = None
         self.intervals_s: deque[float] = deque(maxlen=INTERVALS)
         self.jobs_ended: dict[str, int] = {}
-
-    @property
-    def status(self) -> dict[str, Any]:
-        """The last known state of the bench, as JSON values; a new dict after each change."""
-        return self._held.status
 
     def end(self) -> None:
         """Make `run` return after the present step."""
@@ -132,8 +123,8 @@ class BenchWorker:
         self._polled_ns = None
         state, error = JobState.FAILED, None
         try:
-            if self._held.bench is not None:
-                self._held.bench.state.clear_stop()  # of an earlier job; `_check_stop` looks for those of this one
+            if self._bench is not None:
+                self._bench.state.clear_stop()  # of an earlier job; `_check_stop` looks for those of this one
             self._run_job(self, job)
             state = JobState.DONE
         except JobCancelled:
@@ -149,7 +140,7 @@ class BenchWorker:
             self._job = None
         self._answer_stop()
         if isinstance(error, _LOST):
-            self._held.error = error
+            self._error = error
             self.close()
         self.queue.end(job, state, error)
         self.jobs_ended[state.value] = self.jobs_ended.get(state.value, 0) + 1
@@ -173,7 +164,7 @@ class BenchWorker:
             return
         self._stops_before = self._stops.count()
         self.publish("stop", {"ended": False})
-        answer, bench = StopAnswer.NOT_CONFIRMED, self._held.bench
+        answer, bench = StopAnswer.NOT_CONFIRMED, self._bench
         if bench is not None:
             with suppress(RigError):
                 bench.servo.torque_off()
@@ -200,44 +191,43 @@ class BenchWorker:
 
     def bench(self) -> Bench:
         """Return the bench; it is opened if it is not open."""
-        held = self._held
-        if held.bench is None:
-            held.tried_ns = self._clock.now_ns()
+        if self._bench is None:
+            self._tried_ns = self._clock.now_ns()
             try:
                 bench = self._open_bench()
             except RigError as error:
-                held.error = error
+                self._error = error
                 self._read_status()
                 raise
             bench.safety.observers.append(self._observe)
             bench.safety.monitors.append(self._check_stop)
-            held.bench, held.error = bench, None
+            self._bench, self._error = bench, None
             self._read_status()
-        return held.bench
+        return self._bench
 
     def close(self, error: BaseException | None = None) -> None:
         """Close the bench; ``error`` is why."""
-        bench, self._held.bench = self._held.bench, None
+        bench, self._bench = self._bench, None
         if bench is not None:
             with suppress(RigError):  # the fault is latched, and the next opening reports it
                 bench.__exit__(type(error), error, None)
 
     def _idle(self) -> None:
         self._answer_stop()
-        held, now_ns = self._held, self._clock.now_ns()
-        if held.bench is None:
-            if held.tried_ns == 0 or seconds_between(held.tried_ns, now_ns) > REOPEN_S:
+        now_ns = self._clock.now_ns()
+        if self._bench is None:
+            if self._tried_ns is None or seconds_between(self._tried_ns, now_ns) > REOPEN_S:
                 with suppress(RigError):
                     self.bench()
             return
-        held.bench.clock.sleep(IDLE_S)
+        self._bench.clock.sleep(IDLE_S)
         if seconds_between(self._status_ns, now_ns) >= IDLE_STATUS_S:
             self._read_status()
         self._show_picture()
 
     def _show_picture(self) -> None:
         """Take a frame for the viewers, at most at the camera's rate."""
-        bench, age_s = self._held.bench, self._picture.age_s
+        bench, age_s = self._bench, self._picture.age_s
         if bench is None or not self._picture.wanted:
             return
         if age_s is not None and age_s < 1.0 / max(bench.camera.identity.fps, 1.0):
@@ -245,7 +235,7 @@ class BenchWorker:
         try:
             bench.camera.capture(bench.clock.now_ns())
         except RigError as error:
-            self._held.error = error
+            self._error = error
             if self._job is None:
                 self.close()
             self._read_status()
@@ -261,21 +251,21 @@ class BenchWorker:
 
     def _read_status(self) -> None:
         """Ask the servo for its state, and publish it."""
-        bench, state = self._held.bench, None
+        bench, state = self._bench, None
         if bench is not None:
             try:
                 state = bench.servo.read_state()
             except RigError as error:
-                self._held.error = error
+                self._error = error
                 self.close()
                 bench = None
         self._publish_status(state)
 
     def _publish_status(self, state: ServoState | None) -> None:
-        held, bench = self._held, self._held.bench
+        bench, error = self._bench, self._error
         self._status_ns = self._clock.now_ns()
         values: dict[str, Any] = {"open": bench is not None, "job": self._job.id if self._job else None}
-        values["error"] = plain(held.error.as_dict()) if held.error is not None and bench is None else None
+        values["error"] = plain(error.as_dict()) if error is not None and bench is None else None
         values["picture_age_s"] = self._picture.age_s
         values["problem"] = None if (found := self.queue.problem) is None else problem(found)
         if bench is not None:
@@ -304,5 +294,5 @@ class BenchWorker:
                     "moving": state.moving,
                 },
             }
-        held.status = values
+        self.status = values
         self.publish("status", values)

@@ -284,7 +284,7 @@ def test_doctor_finds_the_bench_closed_at_each_check(serve, monkeypatch):
 
     def watched(*arguments: Any) -> Any:
         for finding in run_checks(*arguments):
-            closed.append(served.side.worker._held.bench is None)
+            closed.append(served.side.worker._bench is None)
             yield finding
 
     monkeypatch.setattr("rig.doctor.examination.run_checks", watched)
