@@ -153,7 +153,7 @@ def _entry(entry: Any, where: str) -> Fault:
             return Fault.from_table(entry)
         raise _unreadable(str(entry))
     except UsageError as error:
-        raise UsageError(where + error.what, next_step=error.next_step, evidence=error.evidence) from error
+        raise UsageError(where + error.what, next_step=error.steps, evidence=error.evidence) from error
 
 
 def _number(name: str, key: str, value: Any) -> float:

@@ -4,6 +4,7 @@ import sys
 from collections.abc import Callable
 from typing import Final, TextIO
 
+from rig.cli.ui import prompts
 from rig.cli.ui.terminal import unguarded
 from rig.core.errors import UsageError
 from rig.core.next_steps import in_words
@@ -73,6 +74,4 @@ class TerminalOperator:
                 return choice
 
     def ask_sample(self) -> str | None:
-        from rig.cli.ui.prompts import ask_sample
-
-        return ask_sample()
+        return prompts.ask_sample()
