@@ -152,7 +152,7 @@ class NextStep:
     @property
     def text(self) -> str:
         """The action in words, without a command."""
-        return _KEY.sub(lambda key: str(self.parameters.get(key[1], key[1])), self.action.words)
+        return _KEY.sub(lambda key: str(self.parameters.get(key[1], key[1].upper())), self.action.words)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the step as `--json` prints it."""

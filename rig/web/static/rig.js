@@ -46,7 +46,7 @@ export function nextSteps(steps = []) {
   return steps.flatMap((step) => {
     if (typeof step === "string") return [`${step} `];
     const { words, job, page } = ACTIONS[step.action];
-    const text = words.replace(/\{(\w+)\}/g, (_, key) => step.parameters[key] ?? key);
+    const text = words.replace(/\{(\w+)\}/g, (_, key) => step.parameters[key] ?? key.toUpperCase());
     const label = text[0].toUpperCase() + text.slice(1);
     if (job) return [h("button", { onclick: () => submit({ ...job, ...step.parameters }) }, label), " "];
     if (page) return [h("a", { class: "button", href: page }, label), " "];
