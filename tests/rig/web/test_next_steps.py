@@ -5,6 +5,7 @@ import pytest
 from rig.core.next_steps import Do, in_words
 from rig.web.next_steps import JOBS, PAGES, page_actions
 from rig.web.pages import PAGES as ALL_PAGES
+from rig.web.work import JOBS as JOBS_OF_REQUESTS
 
 
 def test_each_action_is_worded_for_a_page_and_for_a_terminal():
@@ -25,6 +26,7 @@ def test_each_button_is_a_job_that_takes_the_parameters_of_its_step(action):
         parameters = {"reboot": True}
     request = {**page_actions()[str(action)]["job"], **action(**parameters).parameters}
     assert type(JOBS[action]).model_validate(request)
+    assert type(JOBS[action]) in JOBS_OF_REQUESTS
 
 
 def test_each_link_leads_to_a_page():
