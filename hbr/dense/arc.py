@@ -21,8 +21,8 @@ from numpy.typing import ArrayLike
 
 from hbr.core.angles import size_deg, wrap360
 from hbr.core.arrays import FloatArray, LevelArray
-from hbr.dense.calibration import fit_min_confidence
 from hbr.dense.filter import Belief, update_belief
+from hbr.dense.fitting import fit_min_confidence
 from hbr.dense.index import DenseIndex
 from hbr.dense.leave_one_out import LeaveOneOut, leave_one_out
 from hbr.dense.next_view import SHARPNESS, NextBestView, expected_similarity, log_confusion, pairs_of, strongest
@@ -76,7 +76,7 @@ class ArcRule:
     limitations: tuple[Limitation, ...] = ()
 
 
-def calibrate_arc_rule(index: DenseIndex, rest: StoppingRule, *, most_searches: int = MOST_SEARCHES) -> ArcRule:
+def fit_arc_rule(index: DenseIndex, rest: StoppingRule, *, most_searches: int = MOST_SEARCHES) -> ArcRule:
     """Return the rule of searches in motion, from leave-one-out searches along arcs of `ARC_DEG`.
 
     Searches that end with the first view count, too, because ``rest.error_rate`` is the error rate of all named
@@ -97,11 +97,11 @@ def calibrate_arc_rule(index: DenseIndex, rest: StoppingRule, *, most_searches: 
         step_deg=STEP_DEG,
         weight=STEP_WEIGHT,
     )
-    rule = fit_arc_rule(searches, rest)
+    rule = arc_rule_from_searches(searches, rest)
     return replace(rule, limitations=(*limitations, *rule.limitations))
 
 
-def fit_arc_rule(searches: LeaveOneOut, rest: StoppingRule) -> ArcRule:
+def arc_rule_from_searches(searches: LeaveOneOut, rest: StoppingRule) -> ArcRule:
     """Return the rule that keeps ``rest.error_rate`` in searches along arcs, with a decision every `STEP_DEG`."""
     confidence = searches.confidence.copy()
     confidence[:, 0] = confidence[:, 0] >= rest.min_confidence  # after the first view, the rule at rest decides

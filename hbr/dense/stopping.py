@@ -1,6 +1,6 @@
 """The stopping rule of the dense search: it ends searches and rejects unknown objects at measured error rates.
 
-`hbr.dense.calibration` sets the thresholds, and `StoppingRule.decide` applies them after each view of a search.
+`hbr.dense.fitting` sets the thresholds, and `StoppingRule.decide` applies them after each view of a search.
 
 Decisions: docs/decisions/0026, docs/decisions/0060.
 """
@@ -186,7 +186,7 @@ class StoppingRule:
 
         An object is found if its confidence and its open-set score reach their thresholds. Before the last calibrated
         view the highest of all open-set thresholds counts: an unknown object that passes the first threshold gets
-        another view, which costs an enrolled object little. From the last calibrated view on, an object below the
+        another view, which costs an enrolled object little. From the last fitted view on, an object below the
         threshold is unknown, even if views are left: no false-reject rate was measured for those. After ``max_views``
         an object with too little confidence is ambiguous. If the views were not segmented reliably, the search
         continues until ``max_views``: another view costs little, and the background is then known. ``same_bench`` is
@@ -197,11 +197,11 @@ class StoppingRule:
         best = int(probabilities.argmax())
         known = {True: self.same_bench_thresholds, False: self.changed_bench_thresholds, None: ()}[same_bench]
         thresholds = known or self.open_set_thresholds
-        calibrated = len(thresholds)
+        fitted = len(thresholds)
         views = belief.queries
-        n = min(views, calibrated) - 1
+        n = min(views, fitted) - 1
         score = self._open_set_score(belief, n)
-        early = views < min(calibrated, max_views)
+        early = views < min(fitted, max_views)
         threshold = max(thresholds) if early else thresholds[n]
         probability = float(probabilities[best])
         unknown_below = min(threshold, self.unknown_thresholds[n]) if self.unknown_thresholds else threshold
@@ -220,7 +220,7 @@ class StoppingRule:
             outcome, reason = Outcome.CONTINUE, StopReason.BADLY_SEGMENTED
         object_index = int(belief.index.object_index[best])
         decision = StopDecision(outcome, reason, object_index, probability, self.min_confidence, score, threshold)
-        if same_bench and reliable and score < threshold and views <= calibrated:
+        if same_bench and reliable and score < threshold and views <= fitted:
             return self._found_on_same_bench(belief, n, decision)
         return decision
 

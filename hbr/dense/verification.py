@@ -87,11 +87,11 @@ def is_doubtful(rule: StoppingRule, decision: StopDecision, views: int, kind: st
     kind
         The descriptor.
     """
-    calibrated = len(rule.open_set_thresholds)
-    model = fitted_before(kind, calibrated)
+    fitted = len(rule.open_set_thresholds)
+    model = fitted_before(kind, fitted)
     if model is None or rule.open_set is None or not np.array_equal(model.weights, rule.open_set.weights):
         return False
-    if decision.outcome is Outcome.CONTINUE or views < calibrated or decision.reason is StopReason.UNCHANGED_BENCH:
+    if decision.outcome is Outcome.CONTINUE or views < fitted or decision.reason is StopReason.UNCHANGED_BENCH:
         return False
     return _HOPELESS < decision.open_set_score < max(rule.open_set_thresholds)
 

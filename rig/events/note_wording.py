@@ -51,20 +51,20 @@ def note_words(note: Note) -> str:
         case NoteCode.TABLE_DIFFERS:
             return f"the table does not look as it did at {v['taken_utc']}; an object that is round may be on it"
         case NoteCode.STOPPING_RULE_UNREADABLE:
-            return f"the stored stopping rule cannot be read ({v['reason']}); to renew it: rig catalog calibrate"
+            return f"the stored stopping rule cannot be read ({v['reason']}); to renew it: rig catalog fit"
         case NoteCode.STOPPING_RULE_OUTDATED:
             changes = [f"{counted(v[key], 'object')} {key}" for key in ("added", "removed") if v[key]]
             changed = ", ".join(changes) or "other views, or another version of this program"
             return (
                 f"the stopping rule is from {v['made']}, and the catalog has changed since ({changed}), so it "
-                "guarantees no error rate; to renew it: rig catalog calibrate"
+                "guarantees no error rate; to renew it: rig catalog fit"
             )
         case NoteCode.RATES_NOT_GUARANTEED:
             accepted = f" and {percent(v['false_accept'])} of other objects accepted" if "false_accept" in v else ""
             return (
                 f"{v['searches']} leave-one-out searches cannot guarantee at most {percent(v['error_rate'])} wrong "
                 f"answers and {percent(v['false_reject'])} of the enrolled objects called unknown{accepted}; for the "
-                "reasons: rig catalog calibrate"
+                "reasons: rig catalog fit"
             )
         case NoteCode.NOT_RECORDED:
             return f"the answer is not recorded: {v['what'].rstrip('.')}"
@@ -101,7 +101,7 @@ def limitation_words(limitation: Limitation) -> str:
         case LimitationCode.SAMPLED:
             return (
                 f"only {v['searched']} of {counted(v['objects'], 'object')} were searched for, so no rate is "
-                "guaranteed; to search for all: rig catalog calibrate"
+                "guaranteed; to search for all: rig catalog fit"
             )
         case LimitationCode.FALSE_REJECT_RATE:
             return (
@@ -134,7 +134,7 @@ def limitation_words(limitation: Limitation) -> str:
             )
         case LimitationCode.SINGLE_VIEWS:
             return (
-                "objects with a single view cannot be calibrated: no object is called unknown, and no rate is "
+                "no rule can be fitted to objects with a single view: no object is called unknown, and no rate is "
                 "guaranteed; enroll more"
             )
 

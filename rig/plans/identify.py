@@ -43,7 +43,7 @@ def identify(
     """Identify the object on the table; yields events and returns the answer.
 
     After each view the strategy chooses the next view or ends the search (`rig.search.strategies`). ``dense`` is the
-    bench's own: it takes the next best view until the stopping rule, which was calibrated on the catalog, finds an
+    bench's own: it takes the next best view until the stopping rule, which was fitted to the catalog, finds an
     object or calls it unknown. ``ahbr`` is the paper's: the first rotation is fixed, and each further one leads to the
     side on which the candidates look less similar (Eq. 5-7). The search ends when an enrolled object leads all others
     by ``identify.margin`` per view, or after ``identify.max_views``. The object is unknown if its score per view is

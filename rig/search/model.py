@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import hbr
-from hbr.dense.arc import ArcRule, ArcSession, calibrate_arc_rule
+from hbr.dense.arc import ArcRule, ArcSession, fit_arc_rule
 from rig.bench import Bench
 from rig.catalog import Catalog
 from rig.catalog.descriptions import (
@@ -117,7 +117,7 @@ class PaperModel(Model):
 
 @dataclass(frozen=True, eq=False)
 class DenseModel(Model):
-    """A model for the dense search; `hbr.calibrate_stopping_rule` makes the rule of an index."""
+    """A model for the dense search; `hbr.fit_stopping_rule` makes the rule of an index."""
 
     index: hbr.DenseIndex
     rule: hbr.StoppingRule
@@ -137,7 +137,7 @@ class DenseModel(Model):
 @lru_cache(maxsize=4)
 def _arc_rule(index: hbr.DenseIndex, rule: hbr.StoppingRule) -> ArcRule:
     """Return the rule of searches in motion; it is fitted once for each model."""
-    return calibrate_arc_rule(index, rule)
+    return fit_arc_rule(index, rule)
 
 
 def model_of(views: hbr.Views, *, rule: hbr.StoppingRule | None = None) -> Model:
@@ -190,8 +190,8 @@ def load_model(
 ) -> Model:
     """Load the enrolled views: by the bench's own descriptor if every object has it, else by the paper's.
 
-    The stopping rule of the dense search is the one that `rig catalog calibrate` stored, if it is of this catalog.
-    Otherwise a quick calibration makes one (`rig.search.stopping_rules.stopping_rule_of`).
+    The stopping rule of the dense search is the one that `rig catalog fit` stored, if it is of this catalog.
+    Otherwise a quick fit makes one (`rig.search.stopping_rules.stopping_rule_of`).
 
     Parameters
     ----------

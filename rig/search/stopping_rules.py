@@ -1,4 +1,4 @@
-"""The stopping rule of a catalog: stored beside it, and calibrated again when the catalog changes.
+"""The stopping rule of a catalog: stored beside it, and fitted again when the catalog changes.
 
 See docs/decisions/0031-store-the-stopping-rule-beside-the-catalog.md.
 """
@@ -36,7 +36,7 @@ _KNOWN_SHARE: Final = 0.5
 _QUICK_S: Final = 0.4
 _LEAST_QUICK_S: Final = 0.08
 _LOADED_S: Final = 5e-6
-"""Time for a calibration while the operator waits, its minimum, and its reduction by each loaded view."""
+"""Time for a fit while the operator waits, its minimum, and its reduction by each loaded view."""
 _SEARCH_S, _VIEW_S = 1.4e-3, 1.3e-6
 """Time of a leave-one-out search, and its increase with each enrolled view."""
 _QUICK_SHIFTED: Final = 80
@@ -46,15 +46,15 @@ _QUICK_SHIFTED: Final = 80
 def quick_stopping_rule(
     index: hbr.DenseIndex, *, error_rate: float = ERROR_RATE, false_reject: float = FALSE_REJECT
 ) -> hbr.StoppingRule:
-    """Return a stopping rule that is calibrated on as many objects as about 0.4 s allow."""
+    """Return a stopping rule that is fitted to as many objects as about 0.4 s allow."""
     budget_s = max(_QUICK_S - _LOADED_S * len(index.views), _LEAST_QUICK_S)
     searches = _affordable(len(index.views), budget_s)
     sample = None
     if searches < len(index):
-        # The calibration searches for each object of a sample once, among the others of the sample.
+        # The fit searches for each object of a sample once, among the others of the sample.
         each = len(index.views) // len(index)
         sample = next(n for n in range(len(index), 0, -1) if n <= max(1, _affordable(n * each, budget_s)))
-    return hbr.calibrate_stopping_rule(
+    return hbr.fit_stopping_rule(
         index,
         error_rate=error_rate,
         false_reject=false_reject,
@@ -71,7 +71,7 @@ def _affordable(views: int, budget_s: float) -> int:
 
 @dataclass(frozen=True, eq=False)
 class StoredRule:
-    """A stopping rule with the model that it was calibrated on.
+    """A stopping rule with the model that it was fitted to.
 
     Attributes
     ----------
@@ -82,7 +82,7 @@ class StoredRule:
     sha256
         Digest of the model (`digest`).
     made_utc
-        Time of the calibration, in the format of ISO 8601.
+        Time of the fit, in the format of ISO 8601.
     """
 
     rule: hbr.StoppingRule
@@ -118,9 +118,9 @@ def digest(index: hbr.DenseIndex) -> str:
 def stopping_rule_of(folder: Path, index: hbr.DenseIndex) -> tuple[hbr.StoppingRule, tuple[Note, ...]]:
     """Return the stopping rule for a model, and notes for the operator about it.
 
-    A stored rule of this model is used as it is. If the catalog has changed since, it is calibrated again if that is
+    A stored rule of this model is used as it is. If the catalog has changed since, it is fitted again if that is
     quick for all objects; otherwise the stored rule is used, and new objects count as typical. If there is no rule, or
-    one of another catalog, which knows less than half of the objects, a quick calibration makes one.
+    one of another catalog, which knows less than half of the objects, a quick fit makes one.
     """
     notes: list[Note] = []
     try:
@@ -243,7 +243,7 @@ def read_stopping_rule(folder: Path) -> StoredRule | None:
     except (OSError, ValueError, KeyError, TypeError, AttributeError, ArithmeticError) as error:
         raise CatalogError(
             f"The stopping rule in {path} cannot be read.",
-            next_step="Renew it: rig catalog calibrate",
+            next_step="Renew it: rig catalog fit",
             evidence={"reason": str(error)},
         ) from error
 

@@ -14,11 +14,11 @@ from hbr.dense.arc import (
     STEP_WEIGHT,
     ArcRule,
     ArcSession,
-    calibrate_arc_rule,
+    arc_rule_from_searches,
     fit_arc_rule,
     frame_weight,
 )
-from hbr.dense.calibration import UNCALIBRATED_MIN_CONFIDENCE, calibrate_stopping_rule
+from hbr.dense.fitting import UNFITTED_MIN_CONFIDENCE, fit_stopping_rule
 from hbr.dense.stopping import LimitationCode, StoppingRule, StopReason
 from tests.hbr.dense.test_stopping import catalog
 
@@ -30,7 +30,7 @@ def index() -> DenseIndex:
 
 @pytest.fixture(scope="module")
 def rest(index: DenseIndex) -> StoppingRule:
-    return calibrate_stopping_rule(index, most_searches=60).rule
+    return fit_stopping_rule(index, most_searches=60).rule
 
 
 def pass_by(session: ArcSession, of: Views, row: int, degrees: float) -> list[Outcome]:
@@ -50,7 +50,7 @@ def test_evidence_of_an_arc_does_not_depend_on_the_number_of_its_frames() -> Non
 
 
 def test_first_view_is_decided_as_at_rest(index: DenseIndex, rest: StoppingRule) -> None:
-    rule = calibrate_arc_rule(index, rest, most_searches=24)
+    rule = fit_arc_rule(index, rest, most_searches=24)
     for row in range(0, len(index.views), 9):
         levels = index.views.levels(np.array([row]))[0]
         at_rest, moving = DenseSession(index, rest), ArcSession(index, rule)
@@ -113,21 +113,21 @@ def test_error_rate_counts_only_decisions_that_can_end_a_search(index: DenseInde
     rest = replace(rest, error_rate=0.05)
     correct = searches.correct.copy()
     correct[:, 1 : round(SIDE_DEG / STEP_DEG)] = False  # wrong where no decision is made
-    usual = fit_arc_rule(replace(searches, correct=correct), rest)
+    usual = arc_rule_from_searches(replace(searches, correct=correct), rest)
     assert usual.limitations == ()
     assert usual.min_confidence >= rest.min_confidence
     correct[:, 0] = False  # and where the first view ends the search
-    wrong = fit_arc_rule(replace(searches, correct=correct), replace(rest, min_confidence=0.0))
+    wrong = arc_rule_from_searches(replace(searches, correct=correct), replace(rest, min_confidence=0.0))
     assert [one.code for one in wrong.limitations] == [LimitationCode.SIMILAR_OBJECTS]
     assert wrong.limitations[0].values["wrong"] == len(correct)
 
 
 def test_rule_of_a_large_catalog_is_fitted_to_a_part_with_a_limitation(index: DenseIndex, rest: StoppingRule) -> None:
-    rule = calibrate_arc_rule(index, rest, most_searches=4)
-    assert rule.min_confidence == max(UNCALIBRATED_MIN_CONFIDENCE, rest.min_confidence)
+    rule = fit_arc_rule(index, rest, most_searches=4)
+    assert rule.min_confidence == max(UNFITTED_MIN_CONFIDENCE, rest.min_confidence)
     strict = replace(rest, min_confidence=0.9999)
-    assert calibrate_arc_rule(index, strict, most_searches=4).min_confidence == 0.9999
+    assert fit_arc_rule(index, strict, most_searches=4).min_confidence == 0.9999
     assert [one.code for one in rule.limitations] == [LimitationCode.SAMPLED, LimitationCode.ERROR_RATE]
     assert rule.limitations[0].values == {"searched": 4, "objects": len(index)}
     single = DenseIndex(catalog(objects=1))
-    assert calibrate_arc_rule(single, rest).min_confidence == rest.min_confidence
+    assert fit_arc_rule(single, rest).min_confidence == rest.min_confidence

@@ -31,7 +31,7 @@ def session() -> hbr.DenseSession:
     own = others.of(0)
     twin = hbr.Views.of_object("twin", others.levels(own), others.azimuth_deg[own])
     index = hbr.DenseIndex(hbr.Views.concatenate([others, twin]))
-    rule = hbr.calibrate_stopping_rule(hbr.DenseIndex(others)).rule
+    rule = hbr.fit_stopping_rule(hbr.DenseIndex(others)).rule
     usual = np.vstack([rule.usual_scores, rule.usual_scores[:1]])
     session = hbr.DenseSession(index, replace(rule, usual_scores=usual), max_views=1)
     session.add(others.levels(own[:1])[0], 0.0)

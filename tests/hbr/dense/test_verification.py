@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from hbr import Belief, DenseIndex, Outcome, StopDecision, StopReason, Views, update_belief
-from hbr.dense.calibration import calibrate_stopping_rule
 from hbr.dense.enrolled_views import answered
+from hbr.dense.fitting import fit_stopping_rule
 from hbr.dense.local_difference import LocalView
 from hbr.dense.open_set import fitted_before
 from hbr.dense.pixel_fit import Pixels, fit
@@ -102,7 +102,7 @@ def index() -> DenseIndex:
 
 @pytest.fixture(scope="module")
 def rule(index: DenseIndex) -> StoppingRule:
-    plain = calibrate_stopping_rule(index).rule
+    plain = fit_stopping_rule(index).rule
     return replace(plain, open_set=fitted_before(KIND, 4), open_set_thresholds=(3.0, 3.0, 3.0, -1.0))
 
 

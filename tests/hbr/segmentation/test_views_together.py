@@ -122,7 +122,7 @@ def test_no_answer_on_a_guessed_view_while_another_one_is_possible() -> None:
     views = hbr.ViewsTogether("edges+colours")
     views.add(images[0])
     index = hbr.DenseIndex(hbr.Views(views.levels[0][:1], np.zeros(1), np.zeros(1, np.intp), ("a",), "edges+colours"))
-    rule = hbr.calibrate_stopping_rule(index).rule
+    rule = hbr.fit_stopping_rule(index).rule
     session = hbr.DenseSession(index, rule)
     decision = session.add(views.levels[0], 0.0, reliable=views.reliable)
     assert (decision.outcome, decision.reason) == (hbr.Outcome.CONTINUE, hbr.StopReason.BADLY_SEGMENTED)

@@ -22,7 +22,7 @@ from tests.rig.report.report_samples import NOTE
         (NoteCode.EMPTY_TABLE_OF_ENROLLMENT, {"problems": [{"code": "missing"}]}, "enrollment is used (there is no"),
         (NoteCode.EMPTY_TABLE_CHANGED, {"problem": {"code": "missing"}}, "image: there is no"),
         (NoteCode.TABLE_DIFFERS, {"taken_utc": "2026-01-02"}, "does not look as it did at 2026-01-02"),
-        (NoteCode.STOPPING_RULE_UNREADABLE, {"reason": "no JSON"}, "(no JSON); to renew it: rig catalog calibrate"),
+        (NoteCode.STOPPING_RULE_UNREADABLE, {"reason": "no JSON"}, "(no JSON); to renew it: rig catalog fit"),
         (NoteCode.STOPPING_RULE_OUTDATED, {"made": "2026-01-02", "added": 1, "removed": 2}, "1 object added, 2 obj"),
         (NoteCode.STOPPING_RULE_OUTDATED, {"made": "2026-01-02", "added": 0, "removed": 0}, "(other views, or"),
         (NoteCode.NOT_COMPARED, {"what": "no image"}, "are not compared pixel by pixel: no image"),

@@ -1,4 +1,4 @@
-"""`rig catalog calibrate`: fit the stopping rule of the dense search to the catalog."""
+"""`rig catalog fit`: fit the stopping rule of the dense search to the catalog."""
 
 import os
 import sys
@@ -15,7 +15,7 @@ from rig.cli.ui.settings import Settings
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
 
-    from hbr import CalibratedRule
+    from hbr import FittedRule
     from hbr.dense.leave_one_out import Found, Task
     from rig.catalog.unfinished import UnfinishedJob
 
@@ -24,7 +24,7 @@ _SEVERAL_PROCESSES: Final = 20_000
 
 
 @command
-def calibrate(
+def fit(
     settings: Settings,
     error_rate: Annotated[
         float, typer.Option(min=0.0001, max=0.5, help="Largest share of wrong objects among those named.")
@@ -34,16 +34,16 @@ def calibrate(
     ] = 0.02,
     cluster: ClusterOption = None,
 ) -> None:
-    """Calibrate the stopping rule, which decides when rig identify ends a search.
+    """Fit the stopping rule, which decides when rig identify ends a search, to the catalog.
 
     The command searches for each enrolled object with its own views, as if the camera had been a little to the side.
     Then it leaves the object out and searches again, as for an unknown object. In a catalog of more than 1000 objects,
     it searches for 1000 of them among all. It reports what the rule cannot guarantee, and how much more data is needed.
     Repeat the command when rig identify reports that the catalog has changed.
 
-    Example: rig catalog calibrate --bench sim --error-rate 0.005
+    Example: rig catalog fit --bench sim --error-rate 0.005
     """
-    from hbr import DenseIndex, calibrate_stopping_rule
+    from hbr import DenseIndex, fit_stopping_rule
     from rig.catalog.jobs import JobProgress
     from rig.catalog.prepared import prepared_views
     from rig.catalog.unfinished import UnfinishedJob
@@ -65,7 +65,7 @@ def calibrate(
     begun_ns = clock.now_ns()
     print(f"Searching for {len(views.object_names)} objects among each other ...", file=sys.stderr)
     index = DenseIndex(views)
-    unfinished = UnfinishedJob(path.with_name("calibrate.unfinished"), digest(index))
+    unfinished = UnfinishedJob(path.with_name("fit.unfinished"), digest(index))
     unfinished.load()
     with unfinished, _interruptible(unfinished), progress_bar("Searching") as progress:
 
@@ -75,7 +75,7 @@ def calibrate(
         where = jobs_of(None, cluster)
         if where is None and len(views) >= _SEVERAL_PROCESSES:
             where = os.cpu_count() or 1
-        found = calibrate_stopping_rule(
+        found = fit_stopping_rule(
             index,
             error_rate=error_rate,
             false_reject=false_reject,
@@ -90,7 +90,7 @@ def calibrate(
     if settings.json:
         outcome = {key: value for key, value in plain(found).items() if key != "rule"}
         values = stopping_rule_values(found.rule, index, made_utc=made_utc)
-        settings.print_json({"file": str(path), "calibration": outcome, **values})
+        settings.print_json({"file": str(path), "fit": outcome, **values})
         return
     for words in _lines(found, len(views.object_names), seconds_between(begun_ns, clock.now_ns())):
         print(words)
@@ -137,7 +137,7 @@ def _interruptible(unfinished: "UnfinishedJob") -> "Iterator[None]":
         raise typer.Exit(EXIT_INTERRUPTED) from None
 
 
-def _lines(found: "CalibratedRule", objects: int, seconds: float) -> list[str]:
+def _lines(found: "FittedRule", objects: int, seconds: float) -> list[str]:
     from math import isfinite
 
     from rig.core.phrases import counted, percent, percent_words, sentence

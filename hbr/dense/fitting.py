@@ -1,6 +1,6 @@
 """The thresholds of the stopping rule, from searches for the objects of a catalog among each other.
 
-`leave_one_out` searches for every object, `fit_stopping_rule` sets the thresholds from these searches, and
+`leave_one_out` searches for every object, `rule_from_searches` sets the thresholds from these searches, and
 `fit_open_set` fits the open-set score to changes of the bench (`hbr.dense.shifted_searches`).
 
 Decisions: docs/decisions/0026, docs/decisions/0049, docs/decisions/0059, docs/decisions/0060.
@@ -25,7 +25,7 @@ from hbr.dense.stopping import Limitation, LimitationCode, ShiftRates, StoppingR
 #: No search ends at a smaller confidence, even if all leave-one-out searches were right: real views may be less clear.
 SMALLEST_MIN_CONFIDENCE: Final = 0.9
 #: Confidence that ends a search if the catalog has too little data for the error rate that was asked for.
-UNCALIBRATED_MIN_CONFIDENCE: Final = 0.98
+UNFITTED_MIN_CONFIDENCE: Final = 0.98
 #: With fewer objects, no second candidate remains when one object is left out.
 FEWEST_OBJECTS: Final = 3
 #: With fewer objects, the open-set score is not fitted to changes of the bench: a share of 2 % needs this many objects.
@@ -38,10 +38,10 @@ _EARLY_ACCEPT: Final = 0.0025
 _MILD: Final = 0.5
 #: The strengths up to this one are those of a bench that has not changed.
 _SAME: Final = 0.25
-#: Views of a leave-one-out search, if most objects have enough; searches in a calibration.
-CALIBRATED_VIEWS: Final = 4
+#: Views of a leave-one-out search, if most objects have enough; searches of a fit.
+FITTED_VIEWS: Final = 4
 MOST_SEARCHES: Final = 400
-#: Largest number of objects that a calibration searches for: it then measures a rate of 1 % to a third of its value.
+#: Largest number of objects that a fit searches for: it then measures a rate of 1 % to a third of its value.
 MOST_OBJECTS: Final = 1000
 
 
@@ -81,13 +81,13 @@ def min_confidence_for(confidence: FloatArray, correct: NDArray[np.bool_], error
     return inf
 
 
-def fit_stopping_rule(
+def rule_from_searches(
     searches: LeaveOneOut, *, error_rate: float = 0.01, false_reject: float = 0.02, objects: int | None = None
 ) -> StoppingRule:
     """Fit the rule that keeps the error rates in leave-one-out searches.
 
     If there is too little data for a rate, the rule does what the data allows and states a limitation: a search ends at
-    `UNCALIBRATED_MIN_CONFIDENCE`, and objects that score less than every search did are unknown.
+    `UNFITTED_MIN_CONFIDENCE`, and objects that score less than every search did are unknown.
 
     Parameters
     ----------
@@ -138,10 +138,10 @@ def fit_min_confidence(searches: LeaveOneOut, error_rate: float) -> tuple[float,
     if found <= 1:
         return found, None
     count, needed = len(searches.confidence), ceil(1 / error_rate)
-    ended, wrong = _ended(searches.confidence, searches.correct, UNCALIBRATED_MIN_CONFIDENCE)
-    values = {"rate": error_rate, "searches": count, "needed": needed, "min_confidence": UNCALIBRATED_MIN_CONFIDENCE}
+    ended, wrong = _ended(searches.confidence, searches.correct, UNFITTED_MIN_CONFIDENCE)
+    values = {"rate": error_rate, "searches": count, "needed": needed, "min_confidence": UNFITTED_MIN_CONFIDENCE}
     code = LimitationCode.ERROR_RATE if count < needed else LimitationCode.SIMILAR_OBJECTS
-    return UNCALIBRATED_MIN_CONFIDENCE, Limitation(code, {**values, "wrong": wrong, "ended": len(ended)})
+    return UNFITTED_MIN_CONFIDENCE, Limitation(code, {**values, "wrong": wrong, "ended": len(ended)})
 
 
 def fit_open_set(rule: StoppingRule, searches: ShiftedSearches, model: OpenSetModel | None = None) -> StoppingRule:
@@ -221,7 +221,7 @@ def _accepted_from(unknown: FloatArray) -> FloatArray:
 
 
 @dataclass(frozen=True, eq=False)
-class CalibratedRule:
+class FittedRule:
     """A stopping rule with its results in the leave-one-out searches that it was fitted to.
 
     Attributes
@@ -255,7 +255,7 @@ class CalibratedRule:
     searched: int = 0
 
 
-def calibrate_stopping_rule(
+def fit_stopping_rule(
     index: DenseIndex,
     *,
     error_rate: float = 0.01,
@@ -265,7 +265,7 @@ def calibrate_stopping_rule(
     sample: int | None = None,
     progress: Callable[[int, int], object] | None = None,
     tasks: Tasks | None = None,
-) -> CalibratedRule:
+) -> FittedRule:
     """Search for the enrolled objects among each other, and return the rule that is fitted to these searches.
 
     Parameters
@@ -273,7 +273,7 @@ def calibrate_stopping_rule(
     index : DenseIndex
         Of at least one object.
     error_rate, false_reject
-        As for `fit_stopping_rule`.
+        As for `rule_from_searches`.
     most_searches
         Total number of searches, from different first views. Each object is searched for at least once; if there are
         more than `MOST_OBJECTS`, this many of them, evenly spread.
@@ -284,24 +284,24 @@ def calibrate_stopping_rule(
     progress, tasks
         As for `leave_one_out`.
     """
-    searches = calibration_searches(index, most_searches=most_searches, sample=sample, progress=progress, tasks=tasks)
+    searches = fitting_searches(index, most_searches=most_searches, sample=sample, progress=progress, tasks=tasks)
     if searches is None:
-        return CalibratedRule(_rule_without_candidates(index, error_rate, false_reject))
+        return FittedRule(_rule_without_candidates(index, error_rate, false_reject))
     objects = len(index) if sample is None else min(len(index), max(2, sample))
-    rule = fit_stopping_rule(searches, error_rate=error_rate, false_reject=false_reject, objects=objects)
+    rule = rule_from_searches(searches, error_rate=error_rate, false_reject=false_reject, objects=objects)
     if sample is None and len(index) >= FEWEST_OBJECTS_SHIFTED and can_shift(index):
         views = searches.confidence.shape[1]
         shifted = shifted_searches(index, views=views, searches=most_shifted_searches)
         rule = with_false_accepts(rule, searches)
         rule = fit_open_set(rule, shifted, fitted_before(index.views.descriptor, views))
         rejected = sum(one.rejected for one in rule.rates)  # in searches under changes of the bench
-        return _calibrated(rule, searches, rejected=rejected, accepted=sum(one.false_accepts for one in rule.rates))
+        return _fitted(rule, searches, rejected=rejected, accepted=sum(one.false_accepts for one in rule.rates))
     known, unknown = (part.open_set_score(rule.usual_scores)[:, -1] for part in (searches.known, searches.unknown))
     accepted = unknown >= rule.open_set_thresholds[-1]
     pairs = np.stack([searches.searched, searches.unknown.object_index[:, -1]], axis=1)[accepted]
     confused, first, times = np.unique(pairs, axis=0, return_index=True, return_counts=True)
     names = index.views.object_names
-    return _calibrated(
+    return _fitted(
         rule,
         searches,
         rejected=int((known < rule.open_set_thresholds[-1]).sum()),
@@ -310,17 +310,17 @@ def calibrate_stopping_rule(
     )
 
 
-def _calibrated(
+def _fitted(
     rule: StoppingRule,
     searches: LeaveOneOut,
     *,
     rejected: int,
     accepted: int | None,
     confused: tuple[tuple[str, str], ...] = (),
-) -> CalibratedRule:
+) -> FittedRule:
     """Return the rule with the results of its leave-one-out searches."""
     ended, wrong = _ended(searches.confidence, searches.correct, rule.min_confidence)
-    return CalibratedRule(
+    return FittedRule(
         rule,
         views=searches.confidence.shape[1],
         ended=len(ended),
@@ -333,7 +333,7 @@ def _calibrated(
     )
 
 
-def calibration_searches(
+def fitting_searches(
     index: DenseIndex,
     *,
     most_searches: int = MOST_SEARCHES,
@@ -341,7 +341,7 @@ def calibration_searches(
     progress: Callable[[int, int], object] | None = None,
     tasks: Tasks | None = None,
 ) -> LeaveOneOut | None:
-    """Return the leave-one-out searches of a calibration; None if objects cannot be compared with each other."""
+    """Return the leave-one-out searches of a fit; None if objects cannot be compared with each other."""
     usual_views = int(np.median((~index.left_out).sum(axis=1)))
     if len(index) < 2 or usual_views < 2:
         return None
@@ -350,7 +350,7 @@ def calibration_searches(
         places = np.unique(np.linspace(0, len(index) - 1, max(2, sample)).astype(int))
     return leave_one_out(
         index.only(places),
-        views=min(CALIBRATED_VIEWS, usual_views),
+        views=min(FITTED_VIEWS, usual_views),
         searches=max(1, min(most_searches // len(index), int(index.rows.shape[1]))),
         most_objects=MOST_OBJECTS,
         progress=progress,
@@ -377,7 +377,7 @@ def _rule_without_candidates(index: DenseIndex, error_rate: float, false_reject:
         threshold = float(leaders.open_set_score(usual).min())
     return StoppingRule(
         beta=BETA,
-        min_confidence=UNCALIBRATED_MIN_CONFIDENCE,
+        min_confidence=UNFITTED_MIN_CONFIDENCE,
         usual_scores=usual,
         open_set_thresholds=(threshold,),
         error_rate=error_rate,
