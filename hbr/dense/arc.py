@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike
 from hbr.core.angles import size_deg, wrap360
 from hbr.core.arrays import FloatArray, LevelArray
 from hbr.dense.filter import Belief, update_belief
-from hbr.dense.fitting import fit_min_confidence
+from hbr.dense.fitting import fit_min_confidence, searched_objects
 from hbr.dense.index import DenseIndex
 from hbr.dense.leave_one_out import LeaveOneOut, leave_one_out
 from hbr.dense.next_view import SHARPNESS, NextBestView, expected_similarity, log_confusion, pairs_of, strongest
@@ -83,22 +83,19 @@ def fit_arc_rule(index: DenseIndex, rest: StoppingRule, *, most_searches: int = 
     objects. If there are more objects than searches, a sample of the objects is searched for among each other. A
     catalog without candidates or with single views has the confidence of searches at rest.
     """
-    if len(index) < 2 or int(np.median((~index.left_out).sum(axis=1))) < 2:
+    is_sampled = len(index) > most_searches
+    chosen = searched_objects(index, most_searches, most_searches if is_sampled else None)
+    if chosen is None:
         return ArcRule(rest, rest.min_confidence)
-    limitations = []
-    if len(index) > most_searches:
-        limitations.append(Limitation(LimitationCode.SAMPLED, {"searched": most_searches, "objects": len(index)}))
-        index = index.only(np.unique(np.linspace(0, len(index) - 1, most_searches).astype(int)))
+    some, each, _ = chosen
     searches = leave_one_out(
-        index,
-        beta=rest.beta,
-        views=DECISIONS,
-        searches=max(1, min(most_searches // len(index), int(index.rows.shape[1]))),
-        step_deg=STEP_DEG,
-        weight=STEP_WEIGHT,
+        some, beta=rest.beta, views=DECISIONS, searches=each, step_deg=STEP_DEG, weight=STEP_WEIGHT
     )
     rule = arc_rule_from_searches(searches, rest)
-    return replace(rule, limitations=(*limitations, *rule.limitations))
+    if not is_sampled:
+        return rule
+    sampled = Limitation(LimitationCode.SAMPLED, {"searched": most_searches, "objects": len(index)})
+    return replace(rule, limitations=(sampled, *rule.limitations))
 
 
 def arc_rule_from_searches(searches: LeaveOneOut, rest: StoppingRule) -> ArcRule:

@@ -1,7 +1,7 @@
 """The thresholds of the stopping rule, from searches for the objects of a catalog among each other.
 
 `leave_one_out` searches for every object, `rule_from_searches` sets the thresholds from these searches, and
-`fit_open_set` fits the open-set score to changes of the bench (`hbr.dense.shifted_searches`).
+`fit_open_set` fits the open-set score to changes of the bench (`shifted_searches`).
 
 Decisions: docs/decisions/0026, docs/decisions/0049, docs/decisions/0059, docs/decisions/0060.
 """
@@ -17,9 +17,16 @@ from numpy.typing import ArrayLike, NDArray
 from hbr.core.arrays import FloatArray
 from hbr.dense.filter import BETA, update_belief
 from hbr.dense.index import DenseIndex
-from hbr.dense.leave_one_out import Leaders, LeaveOneOut, Tasks, leader, leave_one_out, usual_scores
-from hbr.dense.open_set import OpenSetModel, fitted_before
-from hbr.dense.shifted_searches import STRENGTHS, ShiftedSearches, can_shift, shifted_searches
+from hbr.dense.leave_one_out import (
+    STRENGTHS,
+    LeaveOneOut,
+    ShiftedSearches,
+    Tasks,
+    can_shift,
+    leave_one_out,
+    shifted_searches,
+)
+from hbr.dense.open_set import Leaders, OpenSetModel, fitted_before, leader, usual_scores
 from hbr.dense.stopping import Limitation, LimitationCode, ShiftRates, StoppingRule
 
 #: No search ends at a smaller confidence, even if all leave-one-out searches were right: real views may be less clear.
@@ -289,47 +296,31 @@ def fit_stopping_rule(
         return FittedRule(_rule_without_candidates(index, error_rate, false_reject))
     objects = len(index) if sample is None else min(len(index), max(2, sample))
     rule = rule_from_searches(searches, error_rate=error_rate, false_reject=false_reject, objects=objects)
-    if sample is None and len(index) >= FEWEST_OBJECTS_SHIFTED and can_shift(index):
-        views = searches.confidence.shape[1]
-        shifted = shifted_searches(index, views=views, searches=most_shifted_searches)
-        rule = with_false_accepts(rule, searches)
-        rule = fit_open_set(rule, shifted, fitted_before(index.views.descriptor, views))
-        rejected = sum(one.rejected for one in rule.rates)  # in searches under changes of the bench
-        return _fitted(rule, searches, rejected=rejected, accepted=sum(one.false_accepts for one in rule.rates))
-    known, unknown = (part.open_set_score(rule.usual_scores)[:, -1] for part in (searches.known, searches.unknown))
-    accepted = unknown >= rule.open_set_thresholds[-1]
-    pairs = np.stack([searches.searched, searches.unknown.object_index[:, -1]], axis=1)[accepted]
-    confused, first, times = np.unique(pairs, axis=0, return_index=True, return_counts=True)
-    names = index.views.object_names
-    return _fitted(
-        rule,
-        searches,
-        rejected=int((known < rule.open_set_thresholds[-1]).sum()),
-        accepted=int(accepted.sum()) if objects >= FEWEST_OBJECTS else None,
-        confused=tuple((names[a], names[b]) for a, b in confused[np.lexsort((first, -times))].tolist()),
-    )
-
-
-def _fitted(
-    rule: StoppingRule,
-    searches: LeaveOneOut,
-    *,
-    rejected: int,
-    accepted: int | None,
-    confused: tuple[tuple[str, str], ...] = (),
-) -> FittedRule:
-    """Return the rule with the results of its leave-one-out searches."""
     ended, wrong = _ended(searches.confidence, searches.correct, rule.min_confidence)
-    return FittedRule(
+    found = FittedRule(
         rule,
         views=searches.confidence.shape[1],
         ended=len(ended),
         wrong=wrong,
         mean_views=float(ended.mean() + 1) if len(ended) else nan,
-        rejected=rejected,
-        accepted=accepted,
-        confused=confused,
         searched=len(np.unique(searches.searched)),
+    )
+    if sample is None and len(index) >= FEWEST_OBJECTS_SHIFTED and can_shift(index):
+        shifted = shifted_searches(index, views=found.views, searches=most_shifted_searches)
+        rule = with_false_accepts(rule, searches)
+        rule = fit_open_set(rule, shifted, fitted_before(index.views.descriptor, found.views))
+        rejected = sum(one.rejected for one in rule.rates)  # in searches under changes of the bench
+        return replace(found, rule=rule, rejected=rejected, accepted=sum(one.false_accepts for one in rule.rates))
+    known, unknown = (part.open_set_score(rule.usual_scores)[:, -1] for part in (searches.known, searches.unknown))
+    accepted = unknown >= rule.open_set_thresholds[-1]
+    pairs = np.stack([searches.searched, searches.unknown.object_index[:, -1]], axis=1)[accepted]
+    confused, first, times = np.unique(pairs, axis=0, return_index=True, return_counts=True)
+    names = index.views.object_names
+    return replace(
+        found,
+        rejected=int((known < rule.open_set_thresholds[-1]).sum()),
+        accepted=int(accepted.sum()) if objects >= FEWEST_OBJECTS else None,
+        confused=tuple((names[a], names[b]) for a, b in confused[np.lexsort((first, -times))].tolist()),
     )
 
 
@@ -342,20 +333,34 @@ def fitting_searches(
     tasks: Tasks | None = None,
 ) -> LeaveOneOut | None:
     """Return the leave-one-out searches of a fit; None if objects cannot be compared with each other."""
-    usual_views = int(np.median((~index.left_out).sum(axis=1)))
-    if len(index) < 2 or usual_views < 2:
+    chosen = searched_objects(index, most_searches, sample)
+    if chosen is None:
         return None
-    places = np.arange(len(index))
-    if sample is not None:
-        places = np.unique(np.linspace(0, len(index) - 1, max(2, sample)).astype(int))
+    some, each, views = chosen
     return leave_one_out(
-        index.only(places),
-        views=min(FITTED_VIEWS, usual_views),
-        searches=max(1, min(most_searches // len(index), int(index.rows.shape[1]))),
+        some,
+        views=min(FITTED_VIEWS, views),
+        searches=each,
         most_objects=MOST_OBJECTS,
         progress=progress,
         tasks=tasks,
     )
+
+
+def searched_objects(
+    index: DenseIndex, most_searches: int, sample: int | None = None
+) -> tuple[DenseIndex, int, int] | None:
+    """Return an index of the objects to search for among each other, the searches for each, and their usual views.
+
+    None if objects cannot be compared with each other. A ``sample`` is spread evenly; by default all are searched for.
+    """
+    usual_views = int(np.median(index.view_counts))
+    if len(index) < 2 or usual_views < 2:
+        return None
+    each = max(1, min(most_searches // len(index), int(index.view_counts.max())))
+    if sample is not None:
+        index = index.only(np.unique(np.linspace(0, len(index) - 1, max(2, sample)).astype(int)))
+    return index, each, usual_views
 
 
 def _rule_without_candidates(index: DenseIndex, error_rate: float, false_reject: float) -> StoppingRule:
@@ -373,7 +378,7 @@ def _rule_without_candidates(index: DenseIndex, error_rate: float, false_reject:
             update_belief(levels[row], azimuth_deg[row], index.without(np.array([row]))).scores()
             for row in range(searches)
         ]
-        leaders = Leaders.of([leader(index.object_index, scores) for scores in left_out], (searches, 1))
+        leaders = Leaders.of(np.array([[leader(index.object_index, scores)] for scores in left_out]))
         threshold = float(leaders.open_set_score(usual).min())
     return StoppingRule(
         beta=BETA,

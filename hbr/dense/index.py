@@ -189,6 +189,11 @@ class DenseIndex:
         """Number of views of each object."""
         return self._segments.lengths
 
+    def rows_of(self, place: int) -> IndexArray:
+        """Return the rows of the views of the object at a place, by rising azimuth."""
+        begin = self._segments.begin[place]
+        return self._segments.order[begin : begin + self._segments.lengths[place]]
+
     def nearest_views(self, places: IndexArray, at_deg: FloatArray, count: int) -> IndexArray:
         """Return the rows of the views that are nearest to azimuths, (m, n, count), for objects (m,) and (m, n).
 

@@ -14,8 +14,7 @@ import numpy as np
 
 from hbr.core.arrays import FloatArray
 from hbr.dense.filter import Belief
-from hbr.dense.leave_one_out import leader, open_set_score
-from hbr.dense.open_set import OpenSetModel, evidence
+from hbr.dense.open_set import OpenSetModel, evidence, leader, open_set_score
 
 
 class Outcome(StrEnum):
@@ -149,7 +148,7 @@ class StoppingRule:
     limitations : tuple of Limitation
         What the rule does not guarantee; empty if it guarantees both rates.
     open_set : OpenSetModel, optional
-        The weights of the open-set score. Without them the score is that of `hbr.dense.leave_one_out.open_set_score`.
+        The weights of the open-set score. Without them the score is that of `hbr.dense.open_set.open_set_score`.
     unknown_thresholds : tuple of float
         With weights: open-set scores after 1, 2, ... views below which an object is unknown. Between them and
         ``open_set_thresholds`` it is ambiguous. Without weights both thresholds are one.
@@ -157,7 +156,7 @@ class StoppingRule:
         With weights: ``open_set_thresholds`` for a bench that is known to have changed since the enrollment, and for
         one that is known to be the same.
     leave_one_out_thresholds : tuple of float
-        With weights: scores of `hbr.dense.leave_one_out.open_set_score` after 1, 2, ... views. On an unchanged bench,
+        With weights: scores of `hbr.dense.open_set.open_set_score` after 1, 2, ... views. On an unchanged bench,
         few enrolled objects score less, and an object that reaches the highest of them is found.
     rates : tuple of ShiftRates
         Measured rates under changes of the bench.
@@ -242,7 +241,11 @@ class StoppingRule:
 
     def _open_set_score(self, belief: Belief, n: int) -> float:
         if self.open_set is not None:
-            _, numbers = evidence(belief.index, belief.support, belief.orientation_deg, belief.levels)
+            index, unit = belief.index, belief.index.whitening.unit
+            units = [unit(np.atleast_2d(query)) for query in belief.levels]
+            _, numbers = evidence(
+                index, belief.support, belief.orientation_deg, units, lambda rows: unit(index.views.levels(rows))
+            )
             return self.open_set.score(numbers, belief.queries)
         return self._leave_one_out_score(belief, n)[1]
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from hbr.core.arrays import BoolArray
 from hbr.dense.fitting import conformal_threshold
-from hbr.dense.leave_one_out import Leaders, usual_scores
+from hbr.dense.open_set import Leaders, usual_scores
 from hbr.dense.stopping import StoppingRule
 from hbr.evaluation.draws import generator
 from hbr.evaluation.protocol import Protocol, Runs

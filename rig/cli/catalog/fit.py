@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
 
     from hbr import FittedRule
-    from hbr.dense.leave_one_out import Found, Task
+    from hbr.core.arrays import FloatArray
+    from hbr.dense.leave_one_out import Task
     from rig.catalog.unfinished import UnfinishedJob
 
 _SEVERAL_PROCESSES: Final = 20_000
@@ -100,25 +101,25 @@ def fit(
 def _continued(
     unfinished: "UnfinishedJob",
     tasks: "Sequence[Task]",
-    search: "Callable[[Sequence[Task]], Iterable[tuple[Task, Found]]]",
-) -> "Iterator[tuple[Task, Found]]":
+    search: "Callable[[Sequence[Task]], Iterable[tuple[Task, FloatArray]]]",
+) -> "Iterator[tuple[Task, FloatArray]]":
     """Yield the searches for all objects: first those that are stored, then the others, which are stored, too."""
-    from hbr.dense.leave_one_out import Found
+    import numpy as np
+
+    from hbr.dense.leave_one_out import NUMBERS_OF_VIEW
 
     left = []
     for task in tasks:
         try:
-            *leaders, confidence, correct = unfinished.found[repr(task)]
-            known, unknown = ([(int(n), float.fromhex(a), float.fromhex(b)) for n, a, b in part] for part in leaders)
-            done = Found(known, unknown, [float.fromhex(one) for one in confidence], [bool(one) for one in correct])
+            found = np.array(unfinished.found[repr(task)], np.float64)
         except (KeyError, TypeError, ValueError):  # not stored, or changed by hand
-            left.append(task)
+            found = np.empty(0)
+        if found.ndim == 3 and found.shape[2] == NUMBERS_OF_VIEW:
+            yield task, found
         else:
-            yield task, done
+            left.append(task)
     for task, found in search(left):
-        leaders = [[(int(n), float(a).hex(), float(b).hex()) for n, a, b in part] for part in found[:2]]
-        confidence, correct = [float(one).hex() for one in found.confidence], [bool(one) for one in found.correct]
-        unfinished.store({repr(task): [*leaders, confidence, correct]})
+        unfinished.store({repr(task): found.tolist()})
         yield task, found
 
 

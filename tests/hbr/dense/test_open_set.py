@@ -13,9 +13,8 @@ from hbr.dense.fitting import (
     rule_from_searches,
     with_false_accepts,
 )
-from hbr.dense.leave_one_out import leave_one_out
+from hbr.dense.leave_one_out import STRENGTHS, ShiftedSearches, leave_one_out
 from hbr.dense.open_set import NUMBERS, OpenSetModel
-from hbr.dense.shifted_searches import STRENGTHS, ShiftedSearches
 from hbr.dense.stopping import LimitationCode, StoppingRule, StopReason
 from tests.hbr.dense.searches import belief_after
 from tests.hbr.dense.test_stopping import catalog

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import hbr
-from hbr.dense.shifted_searches import can_shift
+from hbr.dense.leave_one_out import can_shift
 from hbr.dense.whitening import Whitening
 from hbr.descriptors.shift import Shift
 from hbr.descriptors.together import like_enrollment
