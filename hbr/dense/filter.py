@@ -15,7 +15,7 @@ import numpy as np
 
 from hbr.core.angles import wrap180, wrap360
 from hbr.core.arrays import FloatArray, IndexArray, LevelArray
-from hbr.dense.index import BIN_DEG, BINS, DenseIndex, Floats
+from hbr.dense.index import BIN_DEG, BINS, POWER, DenseIndex, Floats
 
 #: As for `Belief.posterior`: fits the similarities of the bench's own descriptor.
 BETA: Final = 30.0
@@ -71,7 +71,7 @@ class Belief:
     def scores(self) -> FloatArray:
         """Score of every object considered: the power mean of the similarities at the best azimuth, 0..1."""
         mean = self.support.max(axis=1).astype(np.float64) / self.amount
-        scores: FloatArray = np.maximum(mean, 0) ** (1 / self.index.power)
+        scores: FloatArray = np.maximum(mean, 0) ** (1 / POWER)
         return scores
 
     def ranking(self) -> "DenseRanking":

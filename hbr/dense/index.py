@@ -28,6 +28,8 @@ from hbr.model.views import Views
 #: Number of azimuths at the first query.
 BINS: Final = 72
 BIN_DEG: Final = 360 / BINS
+#: p, of the similarities.
+POWER: Final = 4.0
 #: An angle in degrees that is larger than every azimuth.
 _FAR_DEG: Final = 2000.0
 
@@ -43,20 +45,15 @@ class DenseIndex:
         Of any descriptor. Objects without views are left out.
     omega : float
         Weight ω of the orientation, per revolution.
-    power : float
-        p, of the similarities; 1 for the plain sum.
     """
 
-    def __init__(self, views: Views, *, omega: float = 2.0, power: float = 4.0) -> None:
+    def __init__(self, views: Views, *, omega: float = 2.0) -> None:
         if not (np.isfinite(omega) and omega >= 0):
             raise ValueError(f"omega is {omega}; a finite weight of at least 0 is needed, 2 by default")
-        if not (np.isfinite(power) and power >= 1):
-            raise ValueError(f"power is {power}; a finite one of at least 1 is needed, 4 by default")
         if not len(views):
             raise ValueError("there are no views; enroll at least one object first")
         self.views = views
         self.omega = omega
-        self.power = power
         self.object_index: IndexArray = np.flatnonzero(np.bincount(views.object_index))
         self.compared = views.prepared()
         self.whitening = Whitening(views)
@@ -78,7 +75,7 @@ class DenseIndex:
 
     def __getstate__(self) -> dict[str, object]:
         """Return what another process needs; it prepares the views for comparison itself."""
-        own = {name: self.__dict__[name] for name in ("views", "omega", "power", "object_index")}
+        own = {name: self.__dict__[name] for name in ("views", "omega", "object_index")}
         return own | {"segments": (self._segments.order, self._segments.begin, self._segments.lengths)}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -171,7 +168,7 @@ class DenseIndex:
             most = np.max([compared.bounds(row, self._segments) for row in np.atleast_2d(query)], axis=0)
         else:
             most = self.best(query)
-        return self._raised(most).astype(np.float64)
+        return _raised(most).astype(np.float64)
 
     def nearest(self, query: LevelArray, kept: int) -> IndexArray:
         """Return the objects with the most similar views, ascending places (kept,); of equal ones, the first."""
@@ -259,7 +256,7 @@ class DenseIndex:
             For azimuths 0, 5, 10, ... at the first query.
         """
         whole, part_deg = divmod(rotated_deg % 360.0, BIN_DEG)
-        levels = self._raised(similar)
+        levels = _raised(similar)
         slope = self.omega / 360
         azimuth_deg = self.views.azimuth_deg
         compiled = calls.support(self._segments, azimuth_deg, levels, slope, part_deg, int(whole))
@@ -284,12 +281,8 @@ class DenseIndex:
         np.maximum(best, behind[place, count - 1] - revolution + slope_at, out=best)
         return np.roll(best, -int(whole), axis=1)
 
-    def _raised(self, similar: FloatArray) -> Floats:
-        """Return the similarities to the power p; for 4 by products, which are the same on every computer."""
-        raised = np.maximum(similar, 0)
-        if self.power == 4:
-            np.square(raised, out=raised)
-            np.square(raised, out=raised)
-        else:
-            raised **= self.power
-        return raised.astype(np.float32)
+
+def _raised(similar: FloatArray) -> Floats:
+    """Return the similarities to the power p = 4, by products, which are the same on every computer."""
+    raised = np.square(np.maximum(similar, 0))
+    return np.square(raised, out=raised).astype(np.float32)

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hbr.core.arrays import FloatArray, IndexArray
-from hbr.dense.index import BIN_DEG, DenseIndex
+from hbr.dense.index import BIN_DEG, POWER, DenseIndex
 
 #: Weight of the margin in the open-set score without fitted weights, and of the leader's usual score.
 _MARGIN_WEIGHT: Final = 0.5
@@ -139,7 +139,7 @@ def evidence(
         Place of an object that does not count, as if it were not enrolled.
     """
     count = len(units)
-    scores = np.maximum(support.max(axis=1).astype(np.float64) / count, 0) ** (1 / index.power)
+    scores = np.maximum(support.max(axis=1).astype(np.float64) / count, 0) ** (1 / POWER)
     if without is not None:
         scores[without] = -1.0
     order = np.argsort(-scores, kind="stable")[: COHORT + 1]

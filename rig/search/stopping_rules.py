@@ -15,6 +15,7 @@ import numpy as np
 
 import hbr
 from hbr.dense.filter import BETA
+from hbr.dense.index import POWER
 from hbr.dense.open_set import NUMBERS, OpenSetModel
 from hbr.dense.stopping import Limitation, LimitationCode, ShiftRates
 from hbr.descriptors import descriptor
@@ -105,7 +106,7 @@ def digest(index: hbr.DenseIndex) -> str:
     """Return a digest of a model: its objects, their views, the descriptor's version, and the program that searches."""
     views = index.views
     kind = descriptor(views.descriptor)
-    searched = [version("hbr-rig"), kind.name, kind.version, index.omega, index.power, BETA]
+    searched = [version("hbr-rig"), kind.name, kind.version, index.omega, POWER, BETA]
     found = sha256(json.dumps([searched, views.object_names], ensure_ascii=False).encode())
     for column in (views.object_index.astype("<i8"), views.azimuth_deg.astype("<f8")):
         found.update(np.ascontiguousarray(column).data)

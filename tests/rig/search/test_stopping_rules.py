@@ -227,7 +227,7 @@ def test_digest_changes_with_everything_that_the_rule_depends_on():
     views = index.views
     moved = hbr.Views(views.descriptors, views.azimuth_deg + 1, views.object_index, views.object_names, KIND.name)
     renamed = hbr.Views(views.descriptors, views.azimuth_deg, views.object_index, ("a", "b"), KIND.name)
-    others = [hbr.DenseIndex(moved), hbr.DenseIndex(renamed), hbr.DenseIndex(views, power=1.0), shelf(8, 9)]
+    others = [hbr.DenseIndex(moved), hbr.DenseIndex(renamed), hbr.DenseIndex(views, omega=1.0), shelf(8, 9)]
     assert len({digest(one) for one in (index, *others)}) == 5
     assert digest(shelf(8, 8)) == digest(index)
 
