@@ -11,10 +11,8 @@ from typing import Final
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from hbr.core.arrays import ImageArray
-from hbr.dense.local_difference import LocalView
+from hbr.dense.local_difference import LocalView, Map, Mask, affine_map
 
 #: Side of the compared images, and their largest movement in the first step.
 SIDE_PX: Final = 64
@@ -35,8 +33,6 @@ _DARK: Final = (9.0, 12.0)
 #: Smallest number of common pixels for a comparison.
 _FEWEST: Final = 60
 
-Map = NDArray[np.float32]
-
 
 @dataclass(frozen=True, eq=False)
 class Pixels:
@@ -53,15 +49,13 @@ class Pixels:
     """
 
     colours: Map
-    mask: NDArray[np.uint8]
+    mask: Mask
     alone: Map
 
     @classmethod
     def of(cls, view: LocalView) -> "Pixels":
         """Prepare a view."""
-        size = (SIDE_PX, SIDE_PX)
-        crop: ImageArray = cv2.resize(view.crop, size, interpolation=cv2.INTER_AREA).astype(np.uint8, copy=False)
-        mask = cv2.resize(view.mask, size, interpolation=cv2.INTER_AREA).astype(np.uint8, copy=False)
+        crop, mask = view.resized(SIDE_PX)
         levels = crop.astype(np.float32)
         brightness = np.log(levels.mean(axis=2) + _DARK[0])
         blue, green, red = cv2.split(np.log(levels + _DARK[1]))
@@ -99,11 +93,9 @@ def _registered(view: Pixels, enrolled: Pixels, begin: Map) -> Map | None:
     """Return the affine map, (2, 3), from pixels of a view to those of an enrolled view; None if none is found."""
     inside = cv2.erode((enrolled.mask > 127).astype(np.uint8), np.ones((3, 3), np.uint8))
     here, there = (np.ascontiguousarray(one.colours[:, :, 0]) for one in (view, enrolled))
-    try:
-        _, found = cv2.findTransformECC(here, there, begin.copy(), cv2.MOTION_AFFINE, _CRITERIA, inside, 3)
-    except cv2.error:  # an even surface has nothing to register
+    move = affine_map(here, there, begin, inside, _CRITERIA, 3)
+    if move is None:
         return None
-    move = np.asarray(found, np.float32)
     area = float(np.linalg.det(move[:, :2]))
     plausible = _AREAS[0] < area < _AREAS[1] and float(np.abs(move[:, :2] - np.eye(2)).max()) < _MOST_SHEAR
     return move if plausible else None

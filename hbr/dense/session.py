@@ -13,13 +13,20 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from hbr.core.arrays import LevelArray
-from hbr.dense.enrolled_views import Asking, Queries
 from hbr.dense.filter import KEPT, Belief, completed, update_belief
 from hbr.dense.index import DenseIndex
-from hbr.dense.leaders import LeaderComparison, compare_leaders
+from hbr.dense.last_steps import (
+    Asking,
+    LeaderComparison,
+    Queries,
+    Verification,
+    compare_leaders,
+    found_from,
+    is_doubtful,
+    verify,
+)
 from hbr.dense.next_view import NextBestView, next_best_view
 from hbr.dense.stopping import Outcome, StopDecision, StoppingRule
-from hbr.dense.verification import Verification, found_from, is_doubtful, verify
 from hbr.descriptors.together import like_enrollment
 
 _WORTH_REDUCING: Final = 2
@@ -157,12 +164,12 @@ class DenseSession:
 
     @property
     def found_from(self) -> float:
-        """Log-odds from which a verified leader is found (`hbr.dense.verification.found_from`)."""
+        """Log-odds from which a verified leader is found (`hbr.dense.last_steps.found_from`)."""
         return found_from(self._same_bench)
 
     @property
     def is_doubtful(self) -> bool:
-        """Whether the search must verify its leader before it ends (`hbr.dense.verification.is_doubtful`)."""
+        """Whether the search must verify its leader before it ends (`hbr.dense.last_steps.is_doubtful`)."""
         return is_doubtful(self.rule, self.end(), self.belief.queries, self.belief.index.views.descriptor)
 
     def verify(self, queries: Queries, measured: Verification | None = None) -> Asking[Verification | None]:

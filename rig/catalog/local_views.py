@@ -4,8 +4,8 @@ from collections.abc import Sequence
 
 from sqlalchemy import select
 
-from hbr.core.angles import wrap180
-from hbr.dense.local_difference import NEAREST, LocalView
+from hbr.dense.last_steps import near
+from hbr.dense.local_difference import LocalView
 from rig.catalog.catalog import Catalog
 from rig.catalog.describing import stored_describer
 from rig.catalog.schema import sessions
@@ -24,21 +24,15 @@ def local_views(catalog: Catalog, name: str, azimuths_deg: Sequence[float]) -> l
         There is no such object, or an image is missing or is not the stored one.
     """
     views = catalog.object(name).views
-    wanted = {
-        view.id: view
-        for azimuth_deg in azimuths_deg
-        for view in sorted(views, key=lambda view: abs(wrap180(view.record.azimuth_deg - azimuth_deg)))[: NEAREST + 1]
-    }
+    wanted = [views[place] for place in near([view.record.azimuth_deg for view in views], azimuths_deg).tolist()]
     with catalog.database.read() as connection:
         tables = {
             row.id: (row.empty_table_image, row.empty_table_image_sha256)
-            for row in connection.execute(
-                select(sessions).where(sessions.c.id.in_({v.session.id for v in wanted.values()}))
-            )
+            for row in connection.execute(select(sessions).where(sessions.c.id.in_({v.session.id for v in wanted})))
             if row.empty_table_image is not None
         }
     found = []
-    for view in wanted.values():
+    for view in wanted:
         describer = stored_describer(
             catalog.database.images, (BENCH_DESCRIPTOR,), view.record.region, tables.get(view.session.id)
         )
@@ -49,4 +43,4 @@ def local_views(catalog: Catalog, name: str, azimuths_deg: Sequence[float]) -> l
                 f"The view {view.id} of {name} cannot be segmented: {error}.", next_step="Check it: rig catalog verify"
             ) from error
         found.append(LocalView(cut.crop, cut.mask, view.record.azimuth_deg))
-    return sorted(found, key=lambda view: view.azimuth_deg)
+    return found

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hbr.dense.enrolled_views import NeedEnrolledViews
+from hbr.dense.last_steps import NeedEnrolledViews
 from hbr.dense.local_difference import LocalView
 from rig.bench import Bench
 from rig.core.errors import CatalogError, RigError

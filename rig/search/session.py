@@ -19,10 +19,9 @@ from numpy.typing import NDArray
 import hbr
 from hbr.core.angles import wrap360
 from hbr.core.arrays import IndexArray
-from hbr.dense.enrolled_views import Asking, NeedEnrolledViews, Queries
+from hbr.dense.last_steps import UNKNOWN_BELOW, Asking, NeedEnrolledViews, Queries, Verification
 from hbr.dense.local_difference import LocalView
 from hbr.dense.pose import pose
-from hbr.dense.verification import UNKNOWN_BELOW, Verification
 from hbr.model.symmetry import symmetry
 from rig.config import RigConfig
 from rig.events.compared import Compared, Verified

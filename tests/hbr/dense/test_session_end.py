@@ -9,9 +9,8 @@ import pytest
 import hbr
 from hbr import Outcome, StopReason
 from hbr.dense.arc import ArcRule, ArcSession
-from hbr.dense.enrolled_views import NeedEnrolledViews, answered
+from hbr.dense.last_steps import NeedEnrolledViews, Verification, answered
 from hbr.dense.local_difference import LocalView
-from hbr.dense.verification import Verification
 from tests.hbr.dense.test_local_difference import shown
 from tests.hbr.dense.test_stopping import catalog
 

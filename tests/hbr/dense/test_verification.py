@@ -8,21 +8,21 @@ import numpy as np
 import pytest
 
 from hbr import Belief, DenseIndex, Outcome, StopDecision, StopReason, Views, update_belief
-from hbr.dense.enrolled_views import answered
 from hbr.dense.fitting import fit_stopping_rule
-from hbr.dense.local_difference import LocalView
-from hbr.dense.open_set import fitted_before
-from hbr.dense.pixel_fit import Pixels, fit
-from hbr.dense.stopping import StoppingRule
-from hbr.dense.verification import (
+from hbr.dense.last_steps import (
     FOUND_FROM,
     FOUND_FROM_SAME_BENCH,
     UNKNOWN_BELOW,
     Verification,
+    answered,
     found_from,
     is_doubtful,
     verify,
 )
+from hbr.dense.local_difference import LocalView
+from hbr.dense.open_set import fitted_before
+from hbr.dense.pixel_fit import Pixels, fit
+from hbr.dense.stopping import StoppingRule
 from tests.hbr.dense.test_stopping import catalog
 
 KIND = "edges+colours"
