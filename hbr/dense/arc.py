@@ -12,7 +12,7 @@ Decisions: docs/decisions/0047, docs/decisions/0055.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from math import exp
 from typing import Final
 
@@ -25,9 +25,9 @@ from hbr.dense.filter import Belief, update_belief
 from hbr.dense.fitting import fit_min_confidence, searched_objects
 from hbr.dense.index import DenseIndex
 from hbr.dense.leave_one_out import LeaveOneOut, leave_one_out
-from hbr.dense.next_view import SHARPNESS, NextBestView, expected_similarity, log_confusion, pairs_of, strongest
+from hbr.dense.next_view import SHARPNESS, NextBestView, log_confusion, pairs_after
 from hbr.dense.session import DenseSession
-from hbr.dense.stopping import Limitation, LimitationCode, Outcome, StopDecision, StoppingRule, StopReason
+from hbr.dense.stopping import Outcome, StopDecision, StoppingRule, StopReason
 
 STEP_DEG: Final = 15.0
 """The rule decides each time the frames have covered this much more of the circle."""
@@ -57,68 +57,56 @@ STEP_WEIGHT: Final = STEP_DEG / FRAME_DEG * frame_weight(FRAME_DEG)
 """Sum of the weights of the frames between two decisions."""
 
 
-@dataclass(frozen=True, eq=False)
-class ArcRule:
-    """The rule that ends a search in motion.
-
-    Attributes
-    ----------
-    rest : StoppingRule
-        The rule of searches at rest. It decides after the first view, and decides which objects are unknown.
-    min_confidence : float
-        Confidence that ends a search later.
-    limitations : tuple of Limitation
-        Rates that the rule does not guarantee, in addition to those of ``rest``.
-    """
-
-    rest: StoppingRule
-    min_confidence: float
-    limitations: tuple[Limitation, ...] = ()
-
-
-def fit_arc_rule(index: DenseIndex, rest: StoppingRule, *, most_searches: int = MOST_SEARCHES) -> ArcRule:
-    """Return the rule of searches in motion, from leave-one-out searches along arcs of `ARC_DEG`.
+def fit_arc_confidence(index: DenseIndex, rest: StoppingRule, *, most_searches: int = MOST_SEARCHES) -> float:
+    """Return the confidence that ends a search in motion, from leave-one-out searches along arcs of `ARC_DEG`.
 
     Searches that end with the first view count, too, because ``rest.error_rate`` is the error rate of all named
     objects. If there are more objects than searches, a sample of the objects is searched for among each other. A
-    catalog without candidates or with single views has the confidence of searches at rest.
+    catalog without candidates or with single views has the confidence of searches at rest, ``rest.min_confidence``.
     """
-    is_sampled = len(index) > most_searches
-    chosen = searched_objects(index, most_searches, most_searches if is_sampled else None)
+    chosen = searched_objects(index, most_searches, most_searches if len(index) > most_searches else None)
     if chosen is None:
-        return ArcRule(rest, rest.min_confidence)
+        return rest.min_confidence
     some, each, _ = chosen
     searches = leave_one_out(
         some, beta=rest.beta, views=DECISIONS, searches=each, step_deg=STEP_DEG, weight=STEP_WEIGHT
     )
-    rule = arc_rule_from_searches(searches, rest)
-    if not is_sampled:
-        return rule
-    sampled = Limitation(LimitationCode.SAMPLED, {"searched": most_searches, "objects": len(index)})
-    return replace(rule, limitations=(sampled, *rule.limitations))
+    return arc_confidence(searches, rest)
 
 
-def arc_rule_from_searches(searches: LeaveOneOut, rest: StoppingRule) -> ArcRule:
-    """Return the rule that keeps ``rest.error_rate`` in searches along arcs, with a decision every `STEP_DEG`."""
+def arc_confidence(searches: LeaveOneOut, rest: StoppingRule) -> float:
+    """Return the confidence that keeps ``rest.error_rate`` in searches along arcs, with a decision every `STEP_DEG`."""
     confidence = searches.confidence.copy()
     confidence[:, 0] = confidence[:, 0] >= rest.min_confidence  # after the first view, the rule at rest decides
     confidence[:, 1 : round(SIDE_DEG / STEP_DEG)] = 0.0  # no object is found this soon
-    found, limitation = fit_min_confidence(replace(searches, confidence=confidence), rest.error_rate)
-    # If no confidence keeps the rate, a search in motion must not end sooner than one at rest.
-    return ArcRule(rest, max(found, rest.min_confidence), () if limitation is None else (limitation,))
+    found, _ = fit_min_confidence(replace(searches, confidence=confidence), rest.error_rate)
+    return max(found, rest.min_confidence)  # even if no confidence keeps the rate: not sooner than at rest
 
 
 class ArcSession(DenseSession):
     """A search in motion.
 
-    All frames give the confidence. The open-set score comes from frames that are `SIDE_DEG` apart, because it was
-    measured on such views. ``decisions`` is the number of decisions so far; the first view is the first one.
+    The rule of searches at rest decides after the first view, and decides which objects are unknown. All frames give
+    the confidence. The open-set score comes from frames that are `SIDE_DEG` apart, because it was measured on such
+    views.
+
+    Parameters
+    ----------
+    index, rule
+        As for a search at rest.
+    min_confidence : float
+        Confidence that ends the search after the first view, from `fit_arc_confidence`.
+
+    Attributes
+    ----------
+    decisions : int
+        Number of decisions so far; the first view is the first one.
     """
 
-    def __init__(self, index: DenseIndex, rule: ArcRule) -> None:
-        super().__init__(index, rule.rest, max_views=DECISIONS)
+    def __init__(self, index: DenseIndex, rule: StoppingRule, min_confidence: float) -> None:
+        super().__init__(index, rule, max_views=DECISIONS)
         self.decisions = 0
-        self._min_confidence = rule.min_confidence
+        self._min_confidence = min_confidence
         self._covered_deg = 0.0
         self._sides: tuple[Belief, int] | None = None
 
@@ -213,28 +201,20 @@ def next_arc(belief: Belief, *, beta: float, rotations_deg: FloatArray, seconds:
     here_deg = float(belief.orientation_deg[-1])
     apart_deg = size_deg(here_deg + rotations_deg[:, None] - belief.orientation_deg).min(axis=1)
     new = np.minimum(apart_deg / STEP_DEG, 1.0) * STEP_WEIGHT
-    probability, place, bin_of = strongest(belief.posterior(beta))
-    first, second = pairs_of(place)
-    pairs = probability[first] * probability[second]
+    pairs = pairs_after(belief, beta, rotations_deg)
+    is_one = not pairs.probability.any()  # one object alone: a new side helps to find its azimuth
+    exponent = np.zeros_like(pairs.similar) if is_one else new[:, None] * pairs.known * (1 - pairs.similar)
     confusion = np.zeros(len(rotations_deg))
-    pair = None
-    if pairs.any():
-        similar, known = expected_similarity(belief, place, bin_of, rotations_deg, first, second)
-        exponent = new[:, None] * np.sqrt(known[:, first] * known[:, second]) * (1 - similar)
     for side in (1.0, -1.0):
         way = np.flatnonzero(np.sign(rotations_deg) == side)
         way = way[np.argsort(np.abs(rotations_deg[way]))]
-        if not len(way):
-            continue
-        if pairs.any():
-            confusion[way] = log_confusion(pairs * np.exp(-SHARPNESS * np.cumsum(exponent[way], axis=0)))
-        else:  # one object alone: a new side helps to find its azimuth
+        if is_one:
             confusion[way] = -SHARPNESS * np.cumsum(new[way])
+        else:
+            remaining = pairs.probability * np.exp(-SHARPNESS * np.cumsum(exponent[way], axis=0))
+            confusion[way] = log_confusion(remaining)
     sums = np.where(np.abs(rotations_deg) >= LEAST_ARC_DEG, confusion + seconds, np.inf)
     chosen = int((sums if np.isfinite(sums).any() else confusion + seconds).argmin())
-    if pairs.any():
-        most = int(pairs.argmax())
-        objects = belief.index.object_index
-        pair = int(objects[place[first[most]]]), int(objects[place[second[most]]])
     rotation_deg = float(rotations_deg[chosen])
+    pair = None if is_one else pairs.named(int(pairs.probability.argmax()))
     return NextBestView(rotation_deg, wrap360(here_deg + rotation_deg), pair, rotations_deg, confusion, seconds, None)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import hbr
-from hbr.dense.arc import ArcRule, ArcSession, fit_arc_rule
+from hbr.dense.arc import ArcSession, fit_arc_confidence
 from rig.bench import Bench
 from rig.catalog import Catalog
 from rig.catalog.descriptions import (
@@ -125,7 +125,7 @@ class DenseModel(Model):
     def search(self, config: RigConfig, strategy: AnyStrategy, *, seed: int, top: int) -> Search:
         chosen = cast(Strategy[DenseSearchState], strategy)
         if is_in_motion(chosen):
-            moving = ArcSession(self.index, _arc_rule(self.index, self.rule))
+            moving = ArcSession(self.index, self.rule, _arc_confidence(self.index, self.rule))
             return ArcSearch(moving, self.views, config, chosen, seed=seed, top=top)
         session = hbr.DenseSession(self.index, self.rule, max_views=config.identify.max_views)
         return DenseSearch(session, self.views, config, chosen, seed=seed, top=top)
@@ -135,9 +135,9 @@ class DenseModel(Model):
 
 
 @lru_cache(maxsize=4)
-def _arc_rule(index: hbr.DenseIndex, rule: hbr.StoppingRule) -> ArcRule:
-    """Return the rule of searches in motion; it is fitted once for each model."""
-    return fit_arc_rule(index, rule)
+def _arc_confidence(index: hbr.DenseIndex, rule: hbr.StoppingRule) -> float:
+    """Return the confidence that ends searches in motion; it is fitted once for each model."""
+    return fit_arc_confidence(index, rule)
 
 
 def model_of(views: hbr.Views, *, rule: hbr.StoppingRule | None = None) -> Model:

@@ -8,7 +8,7 @@ import pytest
 
 import hbr
 from hbr import Outcome, StopReason
-from hbr.dense.arc import ArcRule, ArcSession
+from hbr.dense.arc import ArcSession
 from hbr.dense.last_steps import NeedEnrolledViews, Verification, answered
 from hbr.dense.local_difference import LocalView
 from tests.hbr.dense.test_local_difference import shown
@@ -79,7 +79,7 @@ def test_a_doubtful_search_in_motion_is_not_verified(session, monkeypatch) -> No
     monkeypatch.setattr("hbr.dense.session.is_doubtful", lambda *_: True)
     need = next(session.verify(lambda _: pytest.fail("first it asks")))
     assert need.object_index == session.end().object_index
-    moving = ArcSession(session.belief.index, ArcRule(session.rule, 2.0))
+    moving = ArcSession(session.belief.index, session.rule, 2.0)
     moving.add(session.belief.levels[0], 0.0)
     assert answered(moving.verify(lambda _: pytest.fail("no view is needed"))) is None
     assert moving.verification is None
