@@ -115,7 +115,7 @@ class ArcSession(DenseSession):
         self._sides = None  # these belief and views were described differently
 
     def _begin_view(self, orientation_deg: float) -> None:
-        if self._queries:
+        if self._so_far is not self._index:
             self._covered_deg += min(self._apart_deg(orientation_deg), STEP_DEG)
         decisions = 1 + int(self._covered_deg / STEP_DEG + 1e-9)
         self.is_new_decision = decisions > self.decisions
@@ -130,7 +130,7 @@ class ArcSession(DenseSession):
         return next_arc(self.belief, beta=self.rule.beta, rotations_deg=ends_deg, seconds=times_s)
 
     def _weight(self, orientation_deg: float) -> float | None:
-        return frame_weight(self._apart_deg(orientation_deg)) if self._queries else None
+        return frame_weight(self._apart_deg(orientation_deg)) if isinstance(self._so_far, Belief) else None
 
     def _decide(self, belief: Belief, *, last: bool = False) -> StopDecision:
         sides = self._frames_apart(belief)
@@ -142,7 +142,7 @@ class ArcSession(DenseSession):
         if self.decisions == 1 or decision.reason is StopReason.BELOW_OPEN_SET_THRESHOLD:
             return decision
         enough = sides.queries > 1  # as at rest: an object that is not found by its first view is found by two
-        probabilities = belief.posterior(self.rule.beta).sum(axis=1)
+        probabilities = belief.probability(self.rule.beta)
         best = int(probabilities.argmax())
         probability = float(probabilities[best])
         outcome, reason = Outcome.CONTINUE, StopReason.NOT_CONFIDENT

@@ -6,7 +6,6 @@ The paper's voting (`hbr.retrieve`) follows the few views on its lists. This fil
 Decision: docs/decisions/0025.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Final
@@ -120,6 +119,11 @@ class Belief:
             self._posteriors[beta] = probability
         return self._posteriors[beta]
 
+    def probability(self, beta: float = BETA) -> FloatArray:
+        """Return the probability of every object considered, (k,): the sum over its azimuths."""
+        probability: FloatArray = self.posterior(beta).sum(axis=1)
+        return probability
+
     @cached_property
     def _posteriors(self) -> dict[float, FloatArray]:
         return {}
@@ -203,7 +207,7 @@ def update_belief(
     return Belief(index, index.support(similar, 0.0), np.array([orientation_deg], np.float64), levels=(query,))
 
 
-def completed(belief: Belief, index: DenseIndex, queries: Sequence[LevelArray]) -> Belief:
+def completed(belief: Belief, index: DenseIndex) -> Belief:
     """Return a belief with all objects that can be first or second, as if they had been considered from the start.
 
     The support of an object is at most the sum of the largest similarities of its views. Objects that were left out
@@ -215,20 +219,18 @@ def completed(belief: Belief, index: DenseIndex, queries: Sequence[LevelArray]) 
         Of some objects of the index.
     index : DenseIndex
         With all objects.
-    queries : sequence of uint8 arrays (length,) or (h, length)
-        The queries of the belief.
     """
     kept = np.searchsorted(index.object_index, belief.index.object_index)
     best = belief.support.max(axis=1)
     second = float(np.partition(best, -2)[-2]) if len(best) > 1 else -np.inf
-    bounds = np.sum([index.bounds(query) for query in queries], axis=0)
+    bounds = np.sum([index.bounds(query) for query in belief.levels], axis=0)
     bounds[kept] = np.inf
-    places = np.flatnonzero(bounds >= second - _ROUNDING * len(queries))
+    places = np.flatnonzero(bounds >= second - _ROUNDING * belief.queries)
     if len(places) == len(kept):
         return belief
     more: DenseIndex | Belief = index.only(places)
-    weights = [None] * len(queries) if belief.weights is None else belief.weights.tolist()
-    for query, orientation_deg, weight in zip(queries, belief.orientation_deg.tolist(), weights, strict=True):
+    weights = [None] * belief.queries if belief.weights is None else belief.weights.tolist()
+    for query, orientation_deg, weight in zip(belief.levels, belief.orientation_deg.tolist(), weights, strict=True):
         more = update_belief(query, orientation_deg, more, kept=len(places), weight=weight)
     assert isinstance(more, Belief)
     return more

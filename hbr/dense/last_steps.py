@@ -149,11 +149,6 @@ def is_doubtful(rule: StoppingRule, decision: StopDecision, views: int, kind: st
     return _HOPELESS < decision.open_set_score < max(rule.open_set_thresholds)
 
 
-def found_from(same_bench: bool | None) -> float:
-    """Return the log-odds from which an object is found."""
-    return FOUND_FROM_SAME_BENCH if same_bench else FOUND_FROM
-
-
 def verify(belief: Belief, leader: int, queries: Queries) -> Asking[Verification | None]:
     """Compare the views of a search with the enrolled views of its leader and of the next candidates; None without.
 
@@ -264,7 +259,7 @@ def compare_leaders(
     """
     if outcome not in (Outcome.AMBIGUOUS, Outcome.UNKNOWN):
         return None
-    probability = belief.posterior(beta).sum(axis=1)
+    probability = belief.probability(beta)
     if outcome is Outcome.UNKNOWN and _margin(belief.scores(), probability) > TWIN_MARGIN:
         return None
     order = np.argsort(-probability, kind="stable")[:2]

@@ -182,7 +182,7 @@ def _searches_for(
             support += added if weight is None or n == 0 else added * np.float32(weight)
             weights = None if weight is None else np.concatenate([[1.0], np.full(n, weight)])
             belief = Belief(index, support, azimuth_deg[chosen[: n + 1]], weights)
-            scores, probability = belief.scores(), belief.posterior(beta).sum(axis=1)
+            scores, probability = belief.scores(), belief.probability(beta)
             known, unknown = leader(index.object_index, scores), leader(others, np.delete(scores, place))
             numbers[search, n] = (*known, *unknown, probability.max(), probability.argmax() == place)
     return numbers
@@ -292,7 +292,7 @@ def _numbers(
 
     left_out = index.whitening.without(index.rows_of(place))
     in_white = [index.whitening.white(query) for query in queries]
-    units, others = [unit_rows(one) for one in in_white], [left_out.unit(one) for one in in_white]
+    units, others = [unit_rows(one) for one in in_white], [left_out(one) for one in in_white]
     support = np.zeros((len(index), BINS), np.float32)
     known, unknown = np.zeros((2, len(queries), len(NUMBERS)))
     correct = np.zeros(len(queries), np.bool_)
@@ -300,6 +300,6 @@ def _numbers(
         support += index.support(index.similarity(query), float(azimuth_deg[n] - azimuth_deg[0]))
         so_far = index, support, azimuth_deg[: n + 1]
         best, known[n] = evidence(*so_far, units[: n + 1], lambda some: unit_rows(whitened(some)))
-        _, unknown[n] = evidence(*so_far, others[: n + 1], lambda some: left_out.unit(whitened(some)), without=place)
+        _, unknown[n] = evidence(*so_far, others[: n + 1], lambda some: left_out(whitened(some)), without=place)
         correct[n] = best == place
     return known, unknown, correct

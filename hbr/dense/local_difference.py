@@ -160,11 +160,12 @@ class LocalDecision:
 
 
 class _Fit(NamedTuple):
-    """An enrolled view that was registered to another one, and its difference from that one."""
+    """An enrolled view that was registered to another one, its difference from that one, and the mean of that."""
 
     image: ImageArray
     mask: Mask
     apart: Map
+    mean: float
 
 
 def chosen_views(orientations_deg: Sequence[float]) -> list[int]:
@@ -257,13 +258,8 @@ def _best_pose(
     queries: Sequence[LocalView], views: Sequence[LocalView], rotations_deg: Sequence[float]
 ) -> tuple[float, list[list[_Fit]]]:
     """Return the rotation at which an object fits the views best, with the enrolled views there, the best one first."""
-    found = []
-    for rotation_deg in rotations_deg:
-        fits = [_fits(query, views, query.azimuth_deg + rotation_deg) for query in queries]
-        apart = sum(_mean(query, fit[0].apart) for query, fit in zip(queries, fits, strict=True))
-        found.append((apart, rotation_deg, fits))
-    _, rotation_deg, fits = min(found, key=lambda one: one[0])
-    return rotation_deg, fits
+    poses = [(deg, [_fits(query, views, query.azimuth_deg + deg) for query in queries]) for deg in rotations_deg]
+    return min(poses, key=lambda pose: sum(best.mean for best, *_ in pose[1]))
 
 
 def _nearest(views: Sequence[LocalView], azimuth_deg: float, count: int) -> list[LocalView]:
@@ -272,16 +268,14 @@ def _nearest(views: Sequence[LocalView], azimuth_deg: float, count: int) -> list
 
 def _fits(query: LocalView, views: Sequence[LocalView], azimuth_deg: float) -> list[_Fit]:
     """Return the enrolled views nearest to an azimuth, registered to a view, the one that fits best first."""
-    image, _ = query.resized(SIDE_PX)
+    image, mask = query.resized(SIDE_PX)
+    own = (mask > 127).astype(np.uint8)
     found = []
     for view in _nearest(views, azimuth_deg, NEAREST):
-        moved, mask = _registered(view, query)
-        found.append(_Fit(moved, mask, pixel_difference(image, moved)))
-    return sorted(found, key=lambda fit: _mean(query, fit.apart))
-
-
-def _mean(query: LocalView, apart: Map) -> float:
-    return float(cv2.mean(apart, mask=(query.resized(SIDE_PX)[1] > 127).astype(np.uint8))[0])
+        moved, moved_mask = _registered(view, query)
+        apart = pixel_difference(image, moved)
+        found.append(_Fit(moved, moved_mask, apart, float(cv2.mean(apart, mask=own)[0])))
+    return sorted(found, key=lambda fit: fit.mean)
 
 
 def _shown(number: int, query: LocalView, first: Sequence[_Fit], second: Sequence[_Fit]) -> ViewDifference:
@@ -298,18 +292,9 @@ def _shown(number: int, query: LocalView, first: Sequence[_Fit], second: Sequenc
     total = float((weights * both).sum())
     score = float((weights * (b.apart - a.apart)).sum()) / total if total > 0 else 0.0
     own = mask > 127
-    rest = [float(np.maximum(one.apart - noise, 0)[own].sum()) for one in (a, b)]
-    return ViewDifference(
-        number,
-        score,
-        float(weights.sum()),
-        (rest[0], rest[1]),
-        int(own.sum()),
-        weights,
-        image,
-        a.image,
-        b.image,
-    )
+    of_first, of_second = (float(np.maximum(one.apart - noise, 0)[own].sum()) for one in (a, b))
+    weight, pixels = float(weights.sum()), int(own.sum())
+    return ViewDifference(number, score, weight, (of_first, of_second), pixels, weights, image, a.image, b.image)
 
 
 def _registered(view: LocalView, to: LocalView) -> tuple[ImageArray, Mask]:

@@ -16,12 +16,13 @@ from hbr.core.arrays import LevelArray
 from hbr.dense.filter import KEPT, Belief, completed, update_belief
 from hbr.dense.index import DenseIndex
 from hbr.dense.last_steps import (
+    FOUND_FROM,
+    FOUND_FROM_SAME_BENCH,
     Asking,
     LeaderComparison,
     Queries,
     Verification,
     compare_leaders,
-    found_from,
     is_doubtful,
     verify,
 )
@@ -74,7 +75,6 @@ class DenseSession:
         self._kept = KEPT if len(index) > _WORTH_REDUCING * KEPT else len(index)
         self._index = index
         self._so_far: DenseIndex | Belief = index
-        self._queries: list[LevelArray] = []
         self._reliable = True
         self._same_bench: bool | None = None
         self._like_enrollment: bool | None = None
@@ -131,17 +131,16 @@ class DenseSession:
         self._so_far = self.belief = update_belief(
             levels, orientation_deg, self._so_far, kept=self._kept, weight=self._weight(orientation_deg)
         )
-        self._queries.append(levels)
 
     def _replace(self, queries: Sequence[LevelArray]) -> None:
         """Compute the belief again from other descriptions of the same views."""
-        if len(queries) != len(self._queries):
-            raise ValueError(f"{len(queries)} earlier views; the search has {len(self._queries)}")
-        same = all(np.array_equal(a, b) for a, b in zip(queries, self._queries, strict=True))
-        if same or not queries:
+        before = self._so_far.levels if isinstance(self._so_far, Belief) else ()
+        if len(queries) != len(before):
+            raise ValueError(f"{len(queries)} earlier views; the search has {len(before)}")
+        if all(np.array_equal(a, b) for a, b in zip(queries, before, strict=True)):
             return
         orientations_deg = self.belief.orientation_deg.tolist()
-        self._so_far, self._queries = self._index, []
+        self._so_far = self._index
         for query, orientation_deg in zip(queries, orientations_deg, strict=True):
             self._extend(query, orientation_deg)
 
@@ -164,8 +163,8 @@ class DenseSession:
 
     @property
     def found_from(self) -> float:
-        """Log-odds from which a verified leader is found (`hbr.dense.last_steps.found_from`)."""
-        return found_from(self._same_bench)
+        """Log-odds from which a verified leader is found."""
+        return FOUND_FROM_SAME_BENCH if self._same_bench else FOUND_FROM
 
     @property
     def is_doubtful(self) -> bool:
@@ -215,7 +214,7 @@ class DenseSession:
         """Decide again before an end if an object that was left out after the first view can be first or second."""
         if len(self.belief.index) == len(self._index):
             return
-        found = completed(self.belief, self._index, self._queries)
+        found = completed(self.belief, self._index)
         if found is not self.belief:
             self._so_far = self.belief = found
             self.decision = self._decide(found)

@@ -192,7 +192,7 @@ class StoppingRule:
         whether the bench is that of the enrollment; None: not known. On the same bench, an object with enough
         confidence is also found if it reaches all leave-one-out thresholds, which are for an unchanged bench.
         """
-        probabilities = belief.posterior(self.beta).sum(axis=1)
+        probabilities = belief.probability(self.beta)
         best = int(probabilities.argmax())
         known = {True: self.same_bench_thresholds, False: self.changed_bench_thresholds, None: ()}[same_bench]
         thresholds = known or self.open_set_thresholds

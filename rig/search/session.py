@@ -267,7 +267,7 @@ class DenseSearch(Search):
     def _ordered(self) -> tuple[NDArray[np.float64], NDArray[np.float64], IndexArray]:
         """Return probability and score of each object considered, and their order, the likeliest first."""
         belief = self._session.belief
-        probability, scores = belief.posterior(self._session.rule.beta).sum(axis=1), belief.scores()
+        probability, scores = belief.probability(self._session.rule.beta), belief.scores()
         return probability, scores, np.lexsort((-scores, -probability))
 
     def frame_used(self, number: int, azimuth_deg: float, seconds: float, rejected: int) -> FrameUsed:

@@ -82,7 +82,7 @@ def test_no_object_that_can_lead_or_be_second_is_lost(seed: int, queries: int) -
         few = update_belief(query, angle, few, kept=1)
     assert isinstance(few, Belief)
     assert len(few.index) == 1
-    found, whole = completed(few, index, seen).ranking(), every.ranking()
+    found, whole = completed(few, index).ranking(), every.ranking()
     np.testing.assert_array_equal(found.object_index[:2], whole.object_index[:2])
     np.testing.assert_array_equal(found.scores[:2], whole.scores[:2])
     np.testing.assert_array_equal(found.pose_deg[:2], whole.pose_deg[:2])
