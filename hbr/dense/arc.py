@@ -27,7 +27,7 @@ from hbr.dense.index import DenseIndex
 from hbr.dense.leave_one_out import LeaveOneOut, leave_one_out
 from hbr.dense.next_view import SHARPNESS, NextBestView, log_confusion, pairs_after
 from hbr.dense.session import DenseSession
-from hbr.dense.stopping import Outcome, StopDecision, StoppingRule, StopReason
+from hbr.dense.stopping import Outcome, StopDecision, StoppingRule, StopReason, by_confidence
 
 STEP_DEG: Final = 15.0
 """The rule decides each time the frames have covered this much more of the circle."""
@@ -141,17 +141,10 @@ class ArcSession(DenseSession):
             return replace(decision, outcome=Outcome.AMBIGUOUS if last else Outcome.CONTINUE)
         if self.decisions == 1 or decision.reason is StopReason.BELOW_OPEN_SET_THRESHOLD:
             return decision
-        enough = sides.queries > 1  # as at rest: an object that is not found by its first view is found by two
-        probabilities = belief.probability(self.rule.beta)
-        best = int(probabilities.argmax())
-        probability = float(probabilities[best])
-        outcome, reason = Outcome.CONTINUE, StopReason.NOT_CONFIDENT
-        if enough and probability >= self._min_confidence:
-            outcome, reason = Outcome.FOUND, StopReason.CONFIDENT
-            if not (self._reliable or last):
-                outcome, reason = Outcome.CONTINUE, StopReason.BADLY_SEGMENTED
-        elif last:
-            outcome, reason = Outcome.AMBIGUOUS, StopReason.MAX_VIEWS
+        best, probability = belief.likeliest(self.rule.beta)
+        # as at rest: an object that is not found by its first view is found by two
+        is_enough = sides.queries > 1 and probability >= self._min_confidence
+        outcome, reason = by_confidence(is_enough, last=last, reliable=self._reliable)
         return replace(
             decision,
             outcome=outcome,

@@ -124,6 +124,12 @@ class Belief:
         probability: FloatArray = self.posterior(beta).sum(axis=1)
         return probability
 
+    def likeliest(self, beta: float = BETA) -> tuple[int, float]:
+        """Return the place in the index of the likeliest object, and its probability."""
+        probability = self.probability(beta)
+        place = int(probability.argmax())
+        return place, float(probability[place])
+
     @cached_property
     def _posteriors(self) -> dict[float, FloatArray]:
         return {}

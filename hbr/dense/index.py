@@ -55,8 +55,7 @@ class DenseIndex:
         self.views = views
         self.omega = omega
         self.object_index: IndexArray = np.flatnonzero(np.bincount(views.object_index))
-        self.compared = views.prepared()
-        self.whitening = Whitening(views)
+        self._prepare()
         order, begin = views.of_each(self.object_index)
         count = lengths(begin, len(order))
         rising = np.diff(views.azimuth_deg[order], prepend=0) >= 0
@@ -75,15 +74,15 @@ class DenseIndex:
 
     def __getstate__(self) -> dict[str, object]:
         """Return what another process needs; it prepares the views for comparison itself."""
-        own = {name: self.__dict__[name] for name in ("views", "omega", "object_index")}
-        return own | {"segments": (self._segments.order, self._segments.begin, self._segments.lengths)}
+        return {name: self.__dict__[name] for name in ("views", "omega", "object_index", "_segments")}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        segments = state.pop("segments")
         self.__dict__.update(state)
+        self._prepare()
+
+    def _prepare(self) -> None:
         self.compared = self.views.prepared()
         self.whitening = Whitening(self.views)
-        self._set_segments(*segments)
 
     def without(self, views: IndexArray) -> "DenseIndex":
         """Return an index that leaves out some views; each object must keep at least one."""

@@ -182,9 +182,9 @@ def _searches_for(
             support += added if weight is None or n == 0 else added * np.float32(weight)
             weights = None if weight is None else np.concatenate([[1.0], np.full(n, weight)])
             belief = Belief(index, support, azimuth_deg[chosen[: n + 1]], weights)
-            scores, probability = belief.scores(), belief.probability(beta)
+            scores, (likeliest, confidence) = belief.scores(), belief.likeliest(beta)
             known, unknown = leader(index.object_index, scores), leader(others, np.delete(scores, place))
-            numbers[search, n] = (*known, *unknown, probability.max(), probability.argmax() == place)
+            numbers[search, n] = (*known, *unknown, confidence, likeliest == place)
     return numbers
 
 

@@ -124,6 +124,15 @@ class ShiftRates:
     false_accepts: int
 
 
+def by_confidence(is_enough: bool, *, last: bool, reliable: bool) -> tuple[Outcome, StopReason]:
+    """Return what a search does whose open-set score is high enough, from whether its confidence is enough, too."""
+    if is_enough and (reliable or last):
+        return Outcome.FOUND, StopReason.CONFIDENT
+    if last:
+        return Outcome.AMBIGUOUS, StopReason.MAX_VIEWS
+    return Outcome.CONTINUE, StopReason.BADLY_SEGMENTED if is_enough else StopReason.NOT_CONFIDENT
+
+
 @dataclass(frozen=True, eq=False)
 class StoppingRule:
     """A rule that ends a search and decides which objects are unknown.
@@ -183,8 +192,8 @@ class StoppingRule:
     ) -> StopDecision:
         """Decide whether a search ends after these views.
 
-        An object is found if its confidence and its open-set score reach their thresholds. Before the last calibrated
-        view the highest of all open-set thresholds counts: an unknown object that passes the first threshold gets
+        An object is found if its confidence and its open-set score reach their thresholds. Before the last fitted view
+        the highest of all open-set thresholds counts: an unknown object that passes the first threshold gets
         another view, which costs an enrolled object little. From the last fitted view on, an object below the
         threshold is unknown, even if views are left: no false-reject rate was measured for those. After ``max_views``
         an object with too little confidence is ambiguous. If the views were not segmented reliably, the search
@@ -192,31 +201,26 @@ class StoppingRule:
         whether the bench is that of the enrollment; None: not known. On the same bench, an object with enough
         confidence is also found if it reaches all leave-one-out thresholds, which are for an unchanged bench.
         """
-        probabilities = belief.probability(self.beta)
-        best = int(probabilities.argmax())
+        best, probability = belief.likeliest(self.beta)
         known = {True: self.same_bench_thresholds, False: self.changed_bench_thresholds, None: ()}[same_bench]
         thresholds = known or self.open_set_thresholds
         fitted = len(thresholds)
         views = belief.queries
         n = min(views, fitted) - 1
         score = self._open_set_score(belief, n)
-        early = views < min(fitted, max_views)
+        early, last = views < min(fitted, max_views), views >= max_views
         threshold = max(thresholds) if early else thresholds[n]
-        probability = float(probabilities[best])
         unknown_below = min(threshold, self.unknown_thresholds[n]) if self.unknown_thresholds else threshold
-        if score < threshold:
-            outcome = Outcome.CONTINUE if early else Outcome.UNKNOWN
-            reason = StopReason.BELOW_OPEN_SET_THRESHOLD
-            if not early and score >= unknown_below:
-                outcome = Outcome.CONTINUE if views < max_views else Outcome.AMBIGUOUS
-        elif probability >= self.min_confidence:
-            outcome, reason = Outcome.FOUND, StopReason.CONFIDENT
-        elif views < max_views:
-            outcome, reason = Outcome.CONTINUE, StopReason.NOT_CONFIDENT
+        if score >= threshold:
+            outcome, reason = by_confidence(probability >= self.min_confidence, last=last, reliable=reliable)
         else:
-            outcome, reason = Outcome.AMBIGUOUS, StopReason.MAX_VIEWS
-        if not reliable and outcome is not Outcome.CONTINUE and views < max_views:
-            outcome, reason = Outcome.CONTINUE, StopReason.BADLY_SEGMENTED
+            outcome, reason = Outcome.UNKNOWN, StopReason.BELOW_OPEN_SET_THRESHOLD
+            if not early and score >= unknown_below:
+                outcome = Outcome.AMBIGUOUS
+            if early or (outcome is Outcome.AMBIGUOUS and not last):
+                outcome = Outcome.CONTINUE
+            elif not (reliable or last):
+                outcome, reason = Outcome.CONTINUE, StopReason.BADLY_SEGMENTED
         object_index = int(belief.index.object_index[best])
         decision = StopDecision(outcome, reason, object_index, probability, self.min_confidence, score, threshold)
         if same_bench and reliable and score < threshold and views <= fitted:
