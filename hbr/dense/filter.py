@@ -217,14 +217,8 @@ def completed(belief: Belief, index: DenseIndex) -> Belief:
     """Return a belief with all objects that can be first or second, as if they had been considered from the start.
 
     The support of an object is at most the sum of the largest similarities of its views. Objects that were left out
-    after the first query, and whose sum reaches the support of the second object considered, are added.
-
-    Parameters
-    ----------
-    belief : Belief
-        Of some objects of the index.
-    index : DenseIndex
-        With all objects.
+    after the first query, and whose sum reaches the support of the second object considered, are added. The index has
+    all objects.
     """
     kept = np.searchsorted(index.object_index, belief.index.object_index)
     best = belief.support.max(axis=1)

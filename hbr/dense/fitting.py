@@ -98,8 +98,6 @@ def rule_from_searches(
 
     Parameters
     ----------
-    searches : LeaveOneOut
-        As `leave_one_out` returns it.
     error_rate, false_reject : float
         Share of wrong objects among those named, and of enrolled objects called unknown.
     objects : int, optional

@@ -126,19 +126,9 @@ class Verification:
 def is_doubtful(rule: StoppingRule, decision: StopDecision, views: int, kind: str) -> bool:
     """Return whether a search must verify its leader before it ends.
 
-    This is so if the open-set score is too low for an answer after fewer views. The weights are for the scores that
-    come with the program. The rule has them if the catalog has enough objects.
-
-    Parameters
-    ----------
-    rule
-        Of the search.
-    decision
-        Decision with which it would end.
-    views
-        Views so far.
-    kind
-        The descriptor.
+    This is so if the open-set score of the decision with which it would end is too low for an answer after fewer views.
+    The weights are for the scores that come with the program for a descriptor, the ``kind``. The rule has them if the
+    catalog has enough objects.
     """
     fitted = len(rule.open_set_thresholds)
     model = fitted_before(kind, fitted)
@@ -152,14 +142,7 @@ def is_doubtful(rule: StoppingRule, decision: StopDecision, views: int, kind: st
 def verify(belief: Belief, leader: int, queries: Queries) -> Asking[Verification | None]:
     """Compare the views of a search with the enrolled views of its leader and of the next candidates; None without.
 
-    Parameters
-    ----------
-    belief
-        After the last view.
-    leader
-        The leading candidate, as an index of the views' names.
-    queries
-        The views of the search, in the order of the belief's levels.
+    The leader is an index of the views' names, and the queries are in the order of the belief's levels.
     """
     index, ranking = belief.index, belief.ranking()
     last_deg = float(belief.orientation_deg[-1])
@@ -242,20 +225,8 @@ def compare_leaders(
     """Compare the two leaders of a search that is ambiguous, or that calls near twins unknown; None if it has no two.
 
     If two near twins are enrolled, the leading one has a small margin, and the open-set score is low. Therefore an
-    object that fits one of them up to noise is not unknown.
-
-    Parameters
-    ----------
-    belief
-        After the last view.
-    outcome
-        Outcome with which the search would end.
-    queries
-        The views of the search.
-    beta
-        As for `Belief.posterior`.
-    max_error
-        Largest probability that a decision is wrong.
+    object that fits one of them up to noise is not unknown. ``outcome`` is that with which the search would end, and
+    ``max_error`` the largest probability that a decision is wrong.
     """
     if outcome not in (Outcome.AMBIGUOUS, Outcome.UNKNOWN):
         return None

@@ -65,13 +65,7 @@ class Leaders:
         return cls(found[..., 0].astype(np.intp), found[..., 1], found[..., 2])
 
     def open_set_score(self, usual_scores: FloatArray) -> FloatArray:
-        """Return the open-set score after each view of each search, (searches, views).
-
-        Parameters
-        ----------
-        usual_scores : float64 array (objects, views)
-            As `usual_scores` returns it.
-        """
+        """Return the open-set score after each view of each search, (searches, views), from all `usual_scores`."""
         usual = usual_scores[self.object_index, np.arange(self.score.shape[1])]
         return open_set_score(self.score, self.margin, usual, np.median(usual_scores, axis=0))
 
@@ -99,16 +93,8 @@ def open_set_score(score: Scores, margin: Scores, usual: Scores, typical: Scores
 
     It is the score plus half of the margin, minus the amount by which the leader usually scores more than other
     objects. An unknown object resembles several enrolled objects a little; an enrolled object resembles one of them
-    closely. An object that looks the same from all sides usually scores more, so it must match better.
-
-    Parameters
-    ----------
-    score, margin
-        As in `Leaders`.
-    usual
-        The usual score of the leader, see `usual_scores`.
-    typical
-        The median of the usual scores of all objects.
+    closely. An object that looks the same from all sides usually scores more, so it must match better. ``usual`` is
+    the usual score of the leader (`usual_scores`), and ``typical`` the median of those of all objects.
     """
     return score + _MARGIN_WEIGHT * margin - _USUAL_WEIGHT * (usual - typical)
 

@@ -85,16 +85,9 @@ def _likely_azimuths(belief: Belief, object_index: int) -> tuple[float, FloatArr
 
 
 def pose_of(posterior: FloatArray, azimuth_deg: float, estimate_deg: float) -> Pose:
-    """Return the pose by the posterior of one object's azimuths.
+    """Return the pose by the posterior of one object's azimuths, float64 (72,), at the first query.
 
-    Parameters
-    ----------
-    posterior : float64 array (72,)
-        Probability of the azimuths 0, 5, ... at the first query.
-    azimuth_deg
-        The estimated azimuth at the last query.
-    estimate_deg
-        The same at the first query.
+    The estimated azimuth is ``azimuth_deg`` at the last query, and ``estimate_deg`` at the first one.
     """
     away_deg: FloatArray = np.arange(BINS, dtype=np.float64) * BIN_DEG - estimate_deg
     sigma_deg = _sigma_deg(posterior, away_deg, 360.0)

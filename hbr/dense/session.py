@@ -174,12 +174,7 @@ class DenseSession:
     def verify(self, queries: Queries, measured: Verification | None = None) -> Asking[Verification | None]:
         """Verify a doubtful leader, pixel by pixel; None without doubt.
 
-        Parameters
-        ----------
-        queries
-            The views of the search.
-        measured : Verification, optional
-            The fit that was measured before; it is used instead of enrolled views.
+        A fit that was ``measured`` before is used instead of enrolled views.
         """
         self.verification = None
         if measured is None and self.is_doubtful:
@@ -188,13 +183,7 @@ class DenseSession:
         return measured
 
     def compare(self, queries: Queries) -> Asking[LeaderComparison | None]:
-        """Compare the two leaders, pixel by pixel, if the search does not end with one object; else None.
-
-        Parameters
-        ----------
-        queries
-            The views of the search.
-        """
+        """Compare the two leaders, pixel by pixel, if the search does not end with one object; else None."""
         self.comparison = None
         outcome, rule = self.end().outcome, self.rule
         self.comparison = yield from compare_leaders(
