@@ -26,7 +26,7 @@ from hbr.dense.leave_one_out import (
     leave_one_out,
     shifted_searches,
 )
-from hbr.dense.open_set import Leaders, OpenSetModel, fitted_before, leader, usual_scores
+from hbr.dense.open_set import OpenSetModel, fitted_before, open_set_score, usual_scores
 from hbr.dense.stopping import Limitation, LimitationCode, ShiftRates, StoppingRule
 
 #: No search ends at a smaller confidence, even if all leave-one-out searches were right: real views may be less clear.
@@ -373,11 +373,10 @@ def _rule_without_candidates(index: DenseIndex, error_rate: float, false_reject:
         code, searches = LimitationCode.ONE_OBJECT, len(index.views)
         levels, azimuth_deg = index.views.descriptors, index.views.azimuth_deg
         left_out = [
-            update_belief(levels[row], azimuth_deg[row], index.without(np.array([row]))).scores()
+            float(update_belief(levels[row], azimuth_deg[row], index.without(np.array([row]))).scores()[0])
             for row in range(searches)
         ]
-        leaders = Leaders.of(np.array([[leader(index.object_index, scores)] for scores in left_out]))
-        threshold = float(leaders.open_set_score(usual).min())
+        threshold = min(open_set_score(score, score, 0.0, 0.0) for score in left_out)  # all of it is the margin
     return StoppingRule(
         beta=BETA,
         min_confidence=UNFITTED_MIN_CONFIDENCE,
