@@ -138,19 +138,11 @@ def evidence(
     white = np.zeros(len(order))
     for n, unit in enumerate(units):
         white += (near[:, n] @ unit.T).max(axis=(1, 2)) / count
-    if len(order) == 1:
-        return best, np.array([*[scores[best]] * 3, *[white[0]] * 3, 0.0])
-    others, white_others = scores[order[1:]], white[1:]
-    found = [
-        scores[best],
-        scores[best] - others[0],
-        scores[best] - others.mean(),
-        white[0],
-        white[0] - white_others.max(),
-        white[0] - white_others.mean(),
-        white_others.mean(),
-    ]
-    return best, np.array(found)
+    numbers: list[float] = []
+    for one in (scores[order], white):
+        first, others = one[0], one[1:]
+        numbers += [first, first - others.max(), first - others.mean()] if len(others) else [first] * 3
+    return best, np.array([*numbers, white[1:].mean() if len(order) > 1 else 0.0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,17 +186,14 @@ class OpenSetModel:
         correct : bool array (searches, views)
             Whether the leading candidate of `known` is right.
         """
-        views = known.shape[1]
-        middle, spread, weights, offset = [], [], [], []
-        for n in range(views):
+        fits = []
+        for n in range(known.shape[1]):
             numbers = np.concatenate([known[:, n], unknown[:, n]])
             wanted = np.concatenate([np.where(correct[:, n], 1.0, -1.0), -np.ones(len(unknown))])
-            middle.append(numbers.mean(axis=0))
-            spread.append(np.maximum(numbers.std(axis=0), 1e-6))
-            found = _logistic((numbers - middle[-1]) / spread[-1], wanted)
-            weights.append(found[:-1])
-            offset.append(found[-1])
-        return cls(np.array(middle), np.array(spread), np.array(weights), np.array(offset))
+            middle, spread = numbers.mean(axis=0), np.maximum(numbers.std(axis=0), 1e-6)
+            found = _logistic((numbers - middle) / spread, wanted)
+            fits.append((middle, spread, found[:-1], found[-1]))
+        return cls(*map(np.array, zip(*fits, strict=True)))
 
 
 #: Weights of the numbers after 1, 2, 3 and 4 views, and offsets, by descriptor. They were fitted to searches for

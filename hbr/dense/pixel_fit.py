@@ -17,9 +17,8 @@ from hbr.dense.local_difference import LocalView, Map, Mask, affine_map
 #: Side of the compared images, and their largest movement in the first step.
 SIDE_PX: Final = 64
 _REACH_PX: Final = 10
-#: Scales of the first step, and largest ratio of the scales of width and height.
-_SCALES: Final = (0.88, 1.0, 1.13)
-_MOST_APART: Final = 1.2
+#: Scales of width and height in the first step.
+_SCALES: Final = ((0.88, 0.88), (0.88, 1.0), (1.0, 0.88), (1.0, 1.0), (1.0, 1.13), (1.13, 1.0), (1.13, 1.13))
 #: Smallest gain of correlation that justifies a change of a scale, and a movement by a pixel of the reduced image.
 _SCALE_COST: Final = 0.02
 _PIXEL_COST: Final = 0.002
@@ -107,17 +106,14 @@ def _begin(view: Pixels, enrolled: Pixels) -> Map:
     half = cv2.resize(wide, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
     side = enrolled.alone.shape[0]
     found: list[tuple[float, tuple[float, float, float, float]]] = []
-    for across in _SCALES:
-        for down in _SCALES:
-            if not 1 / _MOST_APART < across / down < _MOST_APART:
-                continue
-            middle = (side - 1) / 2
-            scaled = np.array([[across, 0, (1 - across) * middle], [0, down, (1 - down) * middle]])
-            part = cv2.warpAffine(enrolled.alone, scaled, (side, side), borderMode=cv2.BORDER_REPLICATE)
-            _, similar, _, (x, y) = cv2.minMaxLoc(cv2.matchTemplate(half, part, cv2.TM_CCOEFF_NORMED))
-            away = x - _REACH_PX / 2, y - _REACH_PX / 2
-            similar -= _SCALE_COST * ((across != 1) + (down != 1)) + _PIXEL_COST * (abs(away[0]) + abs(away[1]))
-            found.append((similar, (across, down, 2 * away[0], 2 * away[1])))
+    middle = (side - 1) / 2
+    for across, down in _SCALES:
+        scaled = np.array([[across, 0, (1 - across) * middle], [0, down, (1 - down) * middle]])
+        part = cv2.warpAffine(enrolled.alone, scaled, (side, side), borderMode=cv2.BORDER_REPLICATE)
+        _, similar, _, (x, y) = cv2.minMaxLoc(cv2.matchTemplate(half, part, cv2.TM_CCOEFF_NORMED))
+        away = x - _REACH_PX / 2, y - _REACH_PX / 2
+        similar -= _SCALE_COST * ((across != 1) + (down != 1)) + _PIXEL_COST * (abs(away[0]) + abs(away[1]))
+        found.append((similar, (across, down, 2 * away[0], 2 * away[1])))
     across, down, x_px, y_px = max(found)[1]
     middle = (SIDE_PX - 1) / 2
     forward = np.array([[across, 0, (1 - across) * middle + x_px], [0, down, (1 - down) * middle + y_px], [0, 0, 1]])
