@@ -132,16 +132,15 @@ class ArcSession(DenseSession):
     def _weight(self, orientation_deg: float) -> float | None:
         return frame_weight(self._apart_deg(orientation_deg)) if isinstance(self._so_far, Belief) else None
 
-    def _decide(self, belief: Belief, *, last: bool = False) -> StopDecision:
-        sides = self._frames_apart(belief)
+    def _decide(self, *, last: bool = False) -> StopDecision:
+        sides = self._frames_apart()
         last = last or self.decisions >= DECISIONS
-        most = sides.queries if last else self.max_views
-        decision = self.rule.decide(sides, max_views=most, reliable=self._reliable, same_bench=self._like_enrollment)
+        decision = self._by_rule(sides, sides.queries if last else self.max_views)
         if decision.outcome is Outcome.UNKNOWN and self.decisions > 1 and self._may_be_smeared(decision):
             return replace(decision, outcome=Outcome.AMBIGUOUS if last else Outcome.CONTINUE)
         if self.decisions == 1 or decision.reason is StopReason.BELOW_OPEN_SET_THRESHOLD:
             return decision
-        best, probability = belief.likeliest(self.rule.beta)
+        best, probability = self.belief.likeliest(self.rule.beta)
         # as at rest: an object that is not found by its first view is found by two
         is_enough = sides.queries > 1 and probability >= self._min_confidence
         outcome, reason = by_confidence(is_enough, last=last, reliable=self._reliable)
@@ -149,7 +148,7 @@ class ArcSession(DenseSession):
             decision,
             outcome=outcome,
             reason=reason,
-            object_index=int(belief.index.object_index[best]),
+            object_index=int(self.belief.index.object_index[best]),
             probability=probability,
             min_confidence=self._min_confidence,
         )
@@ -167,8 +166,9 @@ class ArcSession(DenseSession):
         missing = decision.open_set_threshold - decision.open_set_score
         return self.rule.open_set is None and missing <= MOTION_LOSS
 
-    def _frames_apart(self, belief: Belief) -> Belief:
+    def _frames_apart(self) -> Belief:
         """Return the belief from the frames that are at least `SIDE_DEG` apart from each other."""
+        belief = self.belief
         sides, seen = self._sides if self._sides and self._sides[0].index is belief.index else (None, 0)
         for levels, orientation_deg in zip(belief.levels[seen:], belief.orientation_deg[seen:].tolist(), strict=True):
             if sides is None or size_deg(sides.orientation_deg - orientation_deg).min() >= SIDE_DEG:

@@ -14,6 +14,7 @@ Decisions: docs/decisions/0057, docs/decisions/0059, docs/decisions/0060.
 
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import Final, NamedTuple, TypeVar
 
 import numpy as np
@@ -158,20 +159,22 @@ def verify(belief: Belief, leader: int, queries: Queries) -> Asking[Verification
             return None
         seen = seen or [[Pixels.of(one) for one in queries(n)] for n in range(belief.queries)]
         enrolled_deg = np.array([view.azimuth_deg for view in views])
+        nearest = [_nearest(enrolled_deg, azimuth_deg).tolist() for azimuth_deg in azimuths_deg]
+        prepared = {place: Pixels.of(views[place]) for place in set(chain(*nearest))}
         rows = index.views.of(candidate)
-        prepared: dict[int, Pixels] = {}
         fits = []
         for n, azimuth_deg in enumerate(azimuths_deg):
-            near = np.argsort(size_deg(enrolled_deg - azimuth_deg), kind="stable")[:NEAREST].tolist()
-            own = rows[np.argsort(size_deg(index.views.azimuth_deg[rows] - azimuth_deg), kind="stable")[:NEAREST]]
+            own = rows[_nearest(index.views.azimuth_deg[rows], azimuth_deg)]
             alike: FloatArray = similarity(np.atleast_2d(belief.levels[n]), index.views.levels(own)).max(axis=1)
-            for place in near:
-                if place not in prepared:
-                    prepared[place] = Pixels.of(views[place])
             likeliest = np.argsort(-alike, kind="stable")[:_SEGMENTATIONS].tolist()
-            fits.append(max(fit(seen[n][one], prepared[place]) for one in likeliest for place in near))
+            fits.append(max(fit(seen[n][one], prepared[place]) for one in likeliest for place in nearest[n]))
         means.append(float(np.mean(fits)))
     return Verification(leader, means[0], float(np.mean(means[1:])) if len(means) > 1 else 0.0)
+
+
+def _nearest(own_deg: FloatArray, azimuth_deg: float) -> IndexArray:
+    """Return the indices of the `NEAREST` views to an azimuth."""
+    return np.argsort(size_deg(own_deg - azimuth_deg), kind="stable")[:NEAREST]
 
 
 @dataclass(frozen=True, eq=False)
@@ -252,12 +255,10 @@ def compare_leaders(
     both = enrolled[0], enrolled[1]
     likeliest = [queries(n)[0] for n in compared]
     found = compare_objects(likeliest, both, (rotations_deg[0], rotations_deg[1]), max_error=max_error)
-    winner: int | None = None
+    winner = None
     if outcome is Outcome.AMBIGUOUS or (found.fits and found.twins):
-        if found.winner is not None:
-            outcome, winner = Outcome.FOUND, (first, second)[found.winner]
-        else:
-            outcome = Outcome.AMBIGUOUS
+        winner = None if found.winner is None else (first, second)[found.winner]
+        outcome = Outcome.AMBIGUOUS if winner is None else Outcome.FOUND
     return LeaderComparison((first, second), tuple(compared), both, found, outcome, winner, max_error)
 
 

@@ -115,7 +115,7 @@ class DenseSession:
             self._replace(earlier)
         self._begin_view(orientation_deg)
         self._extend(levels, orientation_deg)
-        self.present = self._decide(self.belief)
+        self.present = self._decide()
         if self.is_new_decision:
             self.decision = self.present
             if self.decision.outcome is not Outcome.CONTINUE:
@@ -156,7 +156,7 @@ class DenseSession:
         decision = self.decision
         if decision.outcome is Outcome.CONTINUE:
             self._complete()
-            decision = self._decide(self.belief, last=True)
+            decision = self._decide(last=True)
         if self.verification is not None:
             decision = self.verification.decided(decision, self.found_from)
         return decision if self.comparison is None else self.comparison.decided(decision)
@@ -195,9 +195,11 @@ class DenseSession:
         """Return the weight of the next view; None: 1."""
         return None
 
-    def _decide(self, belief: Belief, *, last: bool = False) -> StopDecision:
-        most = belief.queries if last else self.max_views
-        return self.rule.decide(belief, max_views=most, reliable=self._reliable, same_bench=self._like_enrollment)
+    def _decide(self, *, last: bool = False) -> StopDecision:
+        return self._by_rule(self.belief, self.belief.queries if last else self.max_views)
+
+    def _by_rule(self, belief: Belief, max_views: int) -> StopDecision:
+        return self.rule.decide(belief, max_views=max_views, reliable=self._reliable, same_bench=self._like_enrollment)
 
     def _complete(self) -> None:
         """Decide again before an end if an object that was left out after the first view can be first or second."""
@@ -206,4 +208,4 @@ class DenseSession:
         found = completed(self.belief, self._index)
         if found is not self.belief:
             self._so_far = self.belief = found
-            self.decision = self._decide(found)
+            self.decision = self._decide()
