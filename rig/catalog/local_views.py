@@ -16,7 +16,7 @@ from rig.views.description import BENCH_DESCRIPTOR
 def local_views(catalog: Catalog, name: str, azimuths_deg: Sequence[float]) -> list[LocalView]:
     """Return the enrolled views of an object that are nearest to each of these azimuths, by azimuth.
 
-    There is one more than `NEAREST` for each azimuth, because a comparison leaves one out.
+    Which these are, `hbr.dense.last_steps.near` decides for the bench and for the evaluation.
 
     Raises
     ------
@@ -24,7 +24,7 @@ def local_views(catalog: Catalog, name: str, azimuths_deg: Sequence[float]) -> l
         There is no such object, or an image is missing or is not the stored one.
     """
     views = catalog.object(name).views
-    wanted = [views[place] for place in near([view.record.azimuth_deg for view in views], azimuths_deg).tolist()]
+    wanted = [views[place] for place in near([view.record.azimuth_deg for view in views], azimuths_deg)]
     with catalog.database.read() as connection:
         tables = {
             row.id: (row.empty_table_image, row.empty_table_image_sha256)
