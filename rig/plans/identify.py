@@ -11,7 +11,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from hbr.dense.enrolled_views import answered
+from hbr.dense.last_steps import answered
 from hbr.dense.local_difference import LocalView
 from rig.bench import Bench
 from rig.config import RigConfig
@@ -56,7 +56,7 @@ def identify(
     """Identify the object on the table; yields events and returns the answer.
 
     After each view the strategy chooses the next view or ends the search (`rig.search.strategies`). ``dense`` is the
-    bench's own: it takes the next best view until the stopping rule, which was calibrated on the catalog, finds an
+    bench's own: it takes the next best view until the stopping rule, which was fitted to the catalog, finds an
     object or calls it unknown. ``ahbr`` is the paper's: the first rotation is fixed, and each further one leads to the
     side on which the candidates look less similar (Eq. 5-7). The search ends when an enrolled object leads all others
     by ``identify.margin`` per view, or after ``identify.max_views``. The object is unknown if its score per view is

@@ -5,8 +5,7 @@ from dataclasses import dataclass, field, replace
 from math import isclose
 from typing import Any, Final
 
-from hbr.dense.enrolled_views import answered
-from hbr.dense.verification import Verification
+from hbr.dense.last_steps import Verification, answered
 from rig.core.json_form import plain
 from rig.events.compared import Compared, Verified
 from rig.events.events import (
