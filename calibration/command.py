@@ -9,7 +9,6 @@ import typer
 from calibration.outcome import as_json, plain_value, stored_results
 from rig.cli.ui.command import command
 from rig.cli.ui.exit_codes import EXIT_QUALITY
-from rig.cli.ui.jobs import is_interactive
 from rig.cli.ui.settings import Settings
 
 if TYPE_CHECKING:
@@ -300,10 +299,8 @@ def run(settings: Settings, *procedures: "Procedure") -> None:
     """
     from calibration.jobs import calibrated
     from rig.cli.ui.desk import CommandDesk
-    from rig.cli.ui.operator import TerminalOperator
 
-    desk = CommandDesk(settings)
-    desk.operator = TerminalOperator(is_there=is_interactive())  # also with --json: a person must put the board there
+    desk = CommandDesk(settings, with_json=True)  # a person must put the board there
     if not desk.run(calibrated(desk, procedures)):
         raise typer.Exit(EXIT_QUALITY)
 

@@ -6,6 +6,7 @@ import typer
 
 from rig.cli.bench.findings import doctor_context, show_progress
 from rig.cli.ui.command import command
+from rig.cli.ui.exit_codes import EXIT_DEVICE
 from rig.cli.ui.options import YesOption
 from rig.cli.ui.prompts import ask_yes_no
 from rig.cli.ui.settings import Settings
@@ -90,7 +91,7 @@ def settings_(
     elif differences:
         print(f"To write them: {context.rig('servo settings --write')}")
     if differences and not written:
-        raise typer.Exit(4)
+        raise typer.Exit(EXIT_DEVICE)
 
 
 @app.command("set-id")

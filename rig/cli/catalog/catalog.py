@@ -7,7 +7,7 @@ import typer
 
 from rig.cli.ui.command import command
 from rig.cli.ui.complete import object_names
-from rig.cli.ui.jobs import confirm, print_table, size_words
+from rig.cli.ui.jobs import confirm, size_words
 from rig.cli.ui.options import YesOption
 from rig.cli.ui.settings import Settings
 from rig.core.errors import UsageError
@@ -63,6 +63,8 @@ def list_(
 
 
 def _print_objects(objects: "list[ObjectSummary]") -> None:
+    from rig.cli.ui.present import print_table
+
     rows = []
     for item in objects:
         views = str(item.views)

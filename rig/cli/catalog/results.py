@@ -8,7 +8,6 @@ import typer
 from rig.cli.catalog.upkeep import parse_time
 from rig.cli.ui.command import command
 from rig.cli.ui.complete import object_names
-from rig.cli.ui.jobs import print_table
 from rig.cli.ui.settings import Settings
 from rig.core.errors import UsageError
 from rig.core.phrases import counted
@@ -53,6 +52,7 @@ def list_(settings: Settings, **filters: Unpack[Filters]) -> None:
     Example: rig results list --sample S-0042 --since 7d --bench sim
     """
     from rig.catalog.exchange.results_table import plain_row
+    from rig.cli.ui.present import print_table
 
     found = _find(settings, filters)
     if settings.json:

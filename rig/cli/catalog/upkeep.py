@@ -11,7 +11,7 @@ from rig.cli.catalog.catalog import app
 from rig.cli.ui.command import command
 from rig.cli.ui.complete import object_names
 from rig.cli.ui.exit_codes import EXIT_CATALOG
-from rig.cli.ui.jobs import confirm, print_table, run_job, size_words
+from rig.cli.ui.jobs import confirm, run_job, size_words
 from rig.cli.ui.options import ClusterOption, DryImportOption, JobsOption, YesOption, descriptor_name, jobs_of
 from rig.cli.ui.settings import Settings
 from rig.core.clock import SystemClock
@@ -238,6 +238,7 @@ def log(
 
     Example: rig log --since 7d --bench sim
     """
+    from rig.cli.ui.present import print_table
     from rig.core.json_form import plain
 
     begin = parse_time(since, "--since")

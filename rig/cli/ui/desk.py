@@ -12,7 +12,7 @@ from rig.catalog.jobs import JobProgress
 from rig.catalog.journal import waiting
 from rig.catalog.local_copy import open_or_copy
 from rig.catalog.shared import BackgroundDelivery
-from rig.cli.ui.jobs import is_interactive
+from rig.cli.ui import jobs
 from rig.cli.ui.operator import TerminalOperator
 from rig.cli.ui.present import Progress as ProgressBar
 from rig.cli.ui.settings import Settings
@@ -33,8 +33,8 @@ class CommandDesk(Desk):
         The options of the command.
     before
         Called before each question and each note: removes the live display.
-    yes
-        Do not ask.
+    yes, with_json
+        Do not ask; ask at a terminal also with ``--json``, because a person must do something.
 
     Attributes
     ----------
@@ -45,12 +45,18 @@ class CommandDesk(Desk):
     bench: Bench
     catalog: Catalog
 
-    def __init__(self, settings: Settings, before: Callable[[], None] = lambda: None, *, yes: bool = False) -> None:
+    def __init__(
+        self,
+        settings: Settings,
+        before: Callable[[], None] = lambda: None,
+        *,
+        yes: bool = False,
+        with_json: bool = False,
+    ) -> None:
         self.config = settings.load()
         self.place = settings.place
-        self.operator: Operator = (
-            Unattended() if yes else TerminalOperator(is_there=not settings.json and is_interactive(), before=before)
-        )
+        is_there = (with_json or not settings.json) and jobs.is_interactive()
+        self.operator: Operator = Unattended() if yes else TerminalOperator(is_there=is_there, before=before)
         self._settings = settings
         self._before = before
 

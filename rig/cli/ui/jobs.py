@@ -1,7 +1,7 @@
-"""Progress of the catalog's long jobs, questions before deletions, and tables."""
+"""Long jobs of the catalog, and questions before deletions."""
 
 import sys
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator
 from contextlib import closing, contextmanager
 from typing import TYPE_CHECKING, TypeVar
 
@@ -9,7 +9,6 @@ import typer
 
 from rig.cli.ui.exit_codes import EXIT_DECLINED, EXIT_INTERRUPTED
 from rig.cli.ui.settings import Settings
-from rig.core.control_characters import neutral
 from rig.core.errors import UsageError
 
 if TYPE_CHECKING:
@@ -57,33 +56,6 @@ def confirm(question: str, *, yes: bool, settings: Settings) -> None:
     if not typer.confirm(question, err=True):
         print("Nothing was changed.", file=sys.stderr)
         raise typer.Exit(EXIT_DECLINED)
-
-
-def print_table(columns: Sequence[str], rows: Iterable[Sequence[str]], *, right: Sequence[str] = ()) -> None:
-    """Print a table as wide as the terminal; in a pipe print every row in full, as one line."""
-    from rich.cells import cell_len
-    from rich.table import Table
-    from rich.text import Text
-
-    from rig.cli.ui.present import console
-
-    screen = console()
-    if screen.is_terminal:
-        table: Table = Table(box=None, pad_edge=False)
-        for column in columns:
-            table.add_column(column, justify="right" if column in right else "left", overflow="fold")
-        for row in rows:
-            table.add_row(*map(Text, row))  # a name can contain what Rich would read as markup
-        screen.print(table)
-        return
-    # Rich takes milliseconds for each row
-    lines = [[neutral(cell) for cell in row] for row in (columns, *rows)]
-    widths = [max(map(cell_len, cells)) for cells in zip(*lines, strict=True)]
-    for line in lines:
-        spaces = [" " * (width - cell_len(cell)) for cell, width in zip(line, widths, strict=True)]
-        cells = zip(columns, line, spaces, strict=True)
-        print("  ".join(space + cell if name in right else cell + space for name, cell, space in cells).rstrip())
-    sys.stdout.flush()
 
 
 def size_words(size: float) -> str:

@@ -1,4 +1,4 @@
-"""The text of dry runs on a terminal, and progress bars."""
+"""Tables, progress bars and the text of dry runs on a terminal."""
 
 import os
 import sys
@@ -6,10 +6,13 @@ from collections.abc import Iterable, Sequence
 from contextlib import AbstractContextManager
 from typing import Final
 
+from rich.cells import cell_len
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as RichProgress
 from rich.segment import Segment
+from rich.table import Table
+from rich.text import Text
 
 from rig.catalog.jobs import JobProgress
 from rig.cli.ui.terminal import unguarded
@@ -39,6 +42,27 @@ def console(*, stderr: bool = False, plain: bool = False) -> Console:
     if not screen.is_terminal and "COLUMNS" not in os.environ:
         screen.width = _PIPE_COLUMNS
     return screen
+
+
+def print_table(columns: Sequence[str], rows: Iterable[Sequence[str]], *, right: Sequence[str] = ()) -> None:
+    """Print a table as wide as the terminal; in a pipe print every row in full, as one line."""
+    screen = console()
+    if screen.is_terminal:
+        table: Table = Table(box=None, pad_edge=False)
+        for column in columns:
+            table.add_column(column, justify="right" if column in right else "left", overflow="fold")
+        for row in rows:
+            table.add_row(*map(Text, row))  # a name can contain what Rich would read as markup
+        screen.print(table)
+        return
+    # Rich takes milliseconds for each row
+    lines = [[neutral(cell) for cell in row] for row in (columns, *rows)]
+    widths = [max(map(cell_len, cells)) for cells in zip(*lines, strict=True)]
+    for line in lines:
+        spaces = [" " * (width - cell_len(cell)) for cell, width in zip(line, widths, strict=True)]
+        cells = zip(columns, line, spaces, strict=True)
+        print("  ".join(space + cell if name in right else cell + space for name, cell, space in cells).rstrip())
+    sys.stdout.flush()
 
 
 def dry_run_lines(found: Sequence[DryRun]) -> list[str]:
