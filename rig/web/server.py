@@ -196,7 +196,7 @@ async def long_work(work: Callable[[], Result]) -> Result:
 
 
 Watcher = Annotated[Person, Depends(watcher)]
-Operator = Annotated[Person, Depends(operator)]
+OperatorPerson = Annotated[Person, Depends(operator)]
 
 
 class Routes:
