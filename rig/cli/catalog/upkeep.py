@@ -271,12 +271,8 @@ def _detail(key: str, value: Any) -> str:
         return name if value else ""
     if key.endswith("_deg") and isinstance(value, int | float):
         return f"{name} {angle_words(value)}"
-    return f"{name} {_short(value)}"
-
-
-def _short(value: Any) -> str:
     text = ", ".join(map(str, value)) if isinstance(value, list) else str(value)
-    return text if len(text) <= 60 else f"{text[:59]}…"
+    return f"{name} {text if len(text) <= 60 else f'{text[:59]}…'}"
 
 
 def _region(settings: Settings, text: str) -> Any:
