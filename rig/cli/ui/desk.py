@@ -13,8 +13,8 @@ from rig.catalog.journal import waiting
 from rig.catalog.local_copy import open_or_copy
 from rig.catalog.shared import BackgroundDelivery
 from rig.cli.ui import jobs
-from rig.cli.ui.operator import TerminalOperator
 from rig.cli.ui.present import Progress as ProgressBar
+from rig.cli.ui.prompts import TerminalOperator
 from rig.cli.ui.settings import Settings
 from rig.core.clock import Clock, SystemClock
 from rig.core.errors import RigError
