@@ -99,7 +99,7 @@ def measured(index: hbr.DenseIndex, background: str) -> tuple[dict[str, list[flo
                 trajectory = timed(spent["angle"], frames.recorder.fit)
                 if trajectory is None:
                     return
-                checked = partial(frames.attempt, frame, trajectory, locks, locks_hold=True, irregular=False)
+                checked = partial(frames.attempt, frame, trajectory, locks)
                 attempt = timed(spent["checks"], checked)
                 levels = timed(spent["description"], lambda: describe(frame.image_bgr)).levels[BENCH_DESCRIPTOR]
                 motion = attempt.evidence.motion
@@ -113,7 +113,7 @@ def measured(index: hbr.DenseIndex, background: str) -> tuple[dict[str, list[flo
                 images.append(frame.image_bgr)
                 use(frame)
 
-            frames.fly(180.0, take, (0.0, 180.0), config.table.velocity_dps)
+            table.fly(180.0, frames.flight(take, (0.0, 180.0), config.table.velocity_dps))
     return {step: list(times) for step, times in spent.items()}, images, begin
 
 

@@ -89,7 +89,7 @@ def revolution(bench: Bench, table: Turntable, describe: ViewDescriber) -> Seen:
         seen.append((middle, describe(frame.image_bgr).levels[BENCH_DESCRIPTOR]))
 
     speed = bench.config.table.velocity_dps
-    frames.fly(360.0, take, (0.0, 360.0), speed)
+    table.fly(360.0, frames.flight(take, (0.0, 360.0), speed))
     trajectory = frames.recorder.fit()
     assert trajectory is not None
     motion = trajectory.at([at for at, _ in seen])
@@ -106,7 +106,7 @@ def search(model: Model, config: RigConfig, seen: dict[str, Seen], start_deg: fl
     """Search for a recorded object from a table angle on; return the answer."""
     sign, limits_deg = config.table.orientation_sign, config.table.limits_deg
     times, ramp = MotionModel(config), config.table.acceleration_dps2
-    session, _ = begin_search(model, config, "dense" if kind == "rest" else "arc")
+    session = begin_search(model, config, "dense" if kind == "rest" else "arc")
     table_deg, travelled_deg, seconds, step_s = 0.0, 0.0, FIRST_VIEW_S[kind], 1 / config.camera.fps
     while True:
         at_deg, levels = nearest(seen["rest"], start_deg + table_deg)

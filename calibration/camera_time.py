@@ -32,10 +32,11 @@ from rig.calibrations import CalibrationResult, RejectionCode
 from rig.charts.xy import MEASURED, MODEL, Axis, Chart, Series
 from rig.core.phrases import filled
 from rig.jobs.desk import Progress
+from rig.motion.flight_views import FlightFrames
 from rig.motion.trajectory import SLIP_DEG
-from rig.motion.turntable import Flight, Turntable
+from rig.motion.turntable import Turntable
 from rig.views.description import within
-from rig.views.stream import FrameStream, irregular_stamps
+from rig.views.stream import StreamFrame
 
 NAME = "camera.time"
 
@@ -98,7 +99,7 @@ class CameraTime(Procedure):
         with Turntable(bench) as table, returning(table) as goto:
             length_deg = ARC_DEG + 2 * _ramp_deg(max(speeds), bench)
             middle_deg = lower_end(bench, table.rest_deg, length_deg) + length_deg / 2
-            stream = FrameStream(bench.camera, bench.clock)
+            flights = FlightFrames(bench, table)
             worst_deg = 0.0
             speeds_dps = [speed for _ in range(self.rounds) for speed in sorted({*speeds, speeds[0]})]
             for number, speed in enumerate(speeds_dps):
@@ -106,7 +107,7 @@ class CameraTime(Procedure):
                 ends_deg = middle_deg - half_deg, middle_deg + half_deg
                 goto(ends_deg[0])
                 for way in (1, -1):
-                    taken = _take_pass(table, stream, bench, ends_deg, speed, way)
+                    taken = _take_pass(table, flights, bench, ends_deg, speed, way)
                     if taken is None:
                         yield found.reject(RejectionCode.STAMPS_UNUSABLE)
                         return
@@ -129,39 +130,35 @@ def _ramp_deg(speed_dps: float, bench: Bench) -> float:
 
 
 def _take_pass(
-    table: Turntable, stream: FrameStream, bench: Bench, ends_deg: tuple[float, float], speed_dps: float, way: int
+    table: Turntable, flights: FlightFrames, bench: Bench, ends_deg: tuple[float, float], speed_dps: float, way: int
 ) -> tuple[Pass, float, int] | None:
     """Rotate over the arc; return the frames at constant speed, the trajectory's residual, and the lost frames.
 
     None if the time stamps cannot be used.
     """
-    recorder = table.recorder()
+    flights.recorder = table.recorder()  # each pass has a trajectory of its own
     stamps: list[int] = []
     images: list[NDArray[np.float32]] = []
     usable = True
 
-    def each() -> None:
+    def take(frame: StreamFrame) -> None:
         nonlocal usable
-        frame = stream.next(table.collect_gyro)
-        if frame is None:
-            return
         usable = usable and frame.stamped
         if not frame.repeated:
             stamps.append(frame.stamp_ns)
             images.append(small(frame.image_bgr, bench))
 
-    table.fly(ends_deg[1 if way > 0 else 0], Flight(each, ends_deg, recorder, speed_dps))
-    trajectory = recorder.fit()
+    table.fly(ends_deg[1 if way > 0 else 0], flights.flight(take, ends_deg, speed_dps))
+    trajectory = flights.recorder.fit()
     if not usable or trajectory is None:
         return None
-    off = irregular_stamps(stamps, stream.period_s, bench.config.camera_time.jitter_ms)
     motion = trajectory.at(stamps)
     steady = np.abs(np.abs(motion.rate_dps) - speed_dps) < 0.1 * speed_dps + 1.0
     begun = np.flatnonzero(steady)
     if len(begun):
         steady &= np.array(stamps) > np.array(stamps)[begun[0]] + round(RAMP_S * 1e9)
-    used = np.flatnonzero(steady & ~off)
-    steps = np.diff(np.array(stamps)[used]) * 1e-9 / stream.period_s if len(used) > 1 else np.zeros(0)
+    used = np.flatnonzero(steady & ~np.isin(stamps, list(flights.irregular_ns())))
+    steps = np.diff(np.array(stamps)[used]) * 1e-9 / flights.stream.period_s if len(used) > 1 else np.zeros(0)
     missing = int((np.rint(steps) - 1).clip(0).sum())
     shape = (0, 1, 1) if not len(used) else (len(used), *images[0].shape)
     return (

@@ -5,13 +5,13 @@ import json
 import sys
 from pathlib import Path
 
-from rig import Catalog, load_model, open_bench, photograph_table
+from rig import Catalog, identify, load_model, open_bench, photograph_table
 from rig.bench import ObjectAlreadyPlaced, TableClearer
 from rig.config import load_config
 from rig.core.clock import SystemClock
 from rig.core.errors import RigError
 from rig.events.events import Identified, event_dict
-from rig.plans.watch import watch
+from rig.plans.identify import watch
 from rig.views.object_presence import TableWatcher
 
 
@@ -34,7 +34,7 @@ def main() -> int:
                     print(json.dumps(event_dict(taken)), flush=True)
             answers = 0
             # The model is loaded before each search, so that newly enrolled objects are found, too.
-            for event in watch(bench, lambda: load_model(catalog)):
+            for event in watch(bench, lambda: identify(bench, load_model(catalog))):
                 print(json.dumps(event_dict(event)), flush=True)
                 answers += isinstance(event, Identified)
                 if answers == arguments.answers:

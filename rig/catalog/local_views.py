@@ -4,8 +4,8 @@ from collections.abc import Sequence
 
 from sqlalchemy import select
 
-from hbr.core.angles import wrap180
-from hbr.dense.local_difference import NEAREST, LocalView
+from hbr.dense.enrolled_views import near
+from hbr.dense.local_difference import LocalView
 from rig.catalog.catalog import Catalog
 from rig.catalog.describing import stored_describer
 from rig.catalog.schema import sessions
@@ -16,7 +16,7 @@ from rig.views.description import BENCH_DESCRIPTOR
 def local_views(catalog: Catalog, name: str, azimuths_deg: Sequence[float]) -> list[LocalView]:
     """Return the enrolled views of an object that are nearest to each of these azimuths, by azimuth.
 
-    There is one more than `NEAREST` for each azimuth, because a comparison leaves one out.
+    Which these are, `hbr.dense.enrolled_views.near` decides for the bench and for the evaluation.
 
     Raises
     ------
@@ -24,21 +24,15 @@ def local_views(catalog: Catalog, name: str, azimuths_deg: Sequence[float]) -> l
         There is no such object, or an image is missing or is not the stored one.
     """
     views = catalog.object(name).views
-    wanted = {
-        view.id: view
-        for azimuth_deg in azimuths_deg
-        for view in sorted(views, key=lambda view: abs(wrap180(view.record.azimuth_deg - azimuth_deg)))[: NEAREST + 1]
-    }
+    wanted = [views[place] for place in near([view.record.azimuth_deg for view in views], azimuths_deg)]
     with catalog.database.read() as connection:
         tables = {
             row.id: (row.empty_table_image, row.empty_table_image_sha256)
-            for row in connection.execute(
-                select(sessions).where(sessions.c.id.in_({v.session.id for v in wanted.values()}))
-            )
+            for row in connection.execute(select(sessions).where(sessions.c.id.in_({v.session.id for v in wanted})))
             if row.empty_table_image is not None
         }
     found = []
-    for view in wanted.values():
+    for view in wanted:
         describer = stored_describer(
             catalog.database.images, (BENCH_DESCRIPTOR,), view.record.region, tables.get(view.session.id)
         )
@@ -49,4 +43,4 @@ def local_views(catalog: Catalog, name: str, azimuths_deg: Sequence[float]) -> l
                 f"The view {view.id} of {name} cannot be segmented: {error}.", next_step="Check it: rig catalog verify"
             ) from error
         found.append(LocalView(cut.crop, cut.mask, view.record.azimuth_deg))
-    return sorted(found, key=lambda view: view.azimuth_deg)
+    return found

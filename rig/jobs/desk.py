@@ -64,11 +64,14 @@ class Desk(ABC):
         The configuration of the bench before it is opened.
     place
         Place of the bench's catalog.
+    log_waits_for_server
+        Whether an action on the bench may wait until a catalog on a server has its entry in the log.
     """
 
     operator: Operator
     config: RigConfig
     place: CatalogPlace
+    log_waits_for_server = True
 
     @abstractmethod
     def open_bench(self, devices: Iterable[str] = DEVICES) -> AbstractContextManager[Bench]:
@@ -102,7 +105,7 @@ class Desk(ABC):
 
     def log(self, action: Action, **details: Any) -> Iterator[Remark]:
         """Write an action on the bench into the log of its catalog, if it has one."""
-        if not self.place.may_exist():
+        if not self.place.may_exist() or not (self.place.url is None or self.log_waits_for_server):
             return
         try:
             with Catalog.open(self.place, clock=SystemClock()) as catalog:

@@ -13,10 +13,10 @@ from rig.jobs.desk import Desk, Steps
 from rig.jobs.regions import warn_of_other_regions
 from rig.jobs.table_image import refresh_table_image
 from rig.plans.identify import identify as identify_one
+from rig.plans.identify import watch as watch_table
 from rig.plans.record import ResultRecorder
-from rig.plans.watch import watch as watch_table
 from rig.search.current_model import CurrentModel
-from rig.search.saved_run import RunSaver
+from rig.search.saved_run import saving
 from rig.search.session import SHOWN
 from rig.search.strategies import descriptor_for
 from rig.search.strategies import strategy as strategy_named
@@ -88,13 +88,13 @@ def identify(
             uses_image = known.descriptor != PAPER_DESCRIPTOR and known.with_empty_table is not False
             if uses_image and isinstance(placer, TableClearer):
                 yield from refresh_table_image(desk, bench, placer, ask=False)
-            events: Generator[Event, None, object]
-            if watch:
-                events = watch_table(
-                    bench, model, config=settings, watcher=watcher, strategy=chosen, seed=seed, top=top, live=live
+
+            def one() -> Generator[Event, None, Identified]:
+                return identify_one(
+                    bench, model(), config=settings, watcher=watcher, strategy=chosen, seed=seed, top=top, live=live
                 )
-            else:
-                events = identify_one(bench, known, config=settings, strategy=chosen, seed=seed, top=top, live=live)
+
+            events: Generator[Event, None, object] = watch_table(bench, one) if watch else one()
             recorder = ResultRecorder(
                 *(desk.place, bench),
                 clock=SystemClock(),
@@ -103,19 +103,19 @@ def identify(
                 with_image=config.record == "image",
             )
             recorder.sample = sample
-            if config.record != "none":
-                events = recorder.stream(events)
-            with closing(events), RunSaver(next_folder, bench, model, settings) as saver:
+            with closing(events), saving(next_folder, bench, model, settings) as save:
                 for event in events:
                     if scan and watch and isinstance(event, Started):  # the object is on the table
                         recorder.sample = desk.operator.ask_sample()
                         if watcher is not None:
                             watcher.wait_until_still()
-                    saver.add(event)
+                    save(event)
                     if isinstance(event, Identified):
                         answer = event
                     if not isinstance(event, FrameUsed):  # shown by ``live`` while the table rotated
                         yield event
+                    if config.record != "none" and (recorded := recorder.add(event)):
+                        yield recorded
     return answer
 
 

@@ -8,7 +8,6 @@ import numpy as np
 
 from rig.bench import Bench
 from rig.devices.camera import CameraLocks
-from rig.motion.move import Move
 from rig.motion.scan_speed import smear_px, time_sigma_ms
 from rig.motion.trajectory import Trajectory
 from rig.motion.turntable import Flight, Turntable
@@ -33,6 +32,8 @@ class FlightFrames:
     ----------
     recorder
         The recorder of the trajectory.
+    stream
+        The frames of the camera.
     """
 
     def __init__(self, bench: Bench, table: Turntable, *, newest: bool = False) -> None:
@@ -40,41 +41,36 @@ class FlightFrames:
         self._config = bench.config
         self._bench = bench
         self._table = table
-        self._stream = FrameStream(bench.camera, bench.clock)
+        self.stream = FrameStream(bench.camera, bench.clock)
         self._newest = newest
         self._stamps_ns: list[int] = []
         self._begun_ns = bench.clock.now_ns()
 
-    def fly(
+    def flight(
         self,
-        target_deg: float,
         take: Callable[[StreamFrame], float | None],
         reach_deg: tuple[float, float],
         velocity_dps: float,
         *,
         quiet: bool = True,
-    ) -> Move:
-        """Rotate as `Turntable.fly` does, and call ``take`` with each frame; it may return a new goal."""
+    ) -> Flight:
+        """Begin a flight for `Turntable.fly`, which calls ``take`` with each frame; it may return a new goal."""
         self._begun_ns = self._bench.clock.now_ns()
         self._stamps_ns.clear()
 
         def each() -> float | None:
-            frame = self._stream.next(self._table.collect_gyro, newest=self._newest)
+            frame = self.stream.next(self._table.collect_gyro, newest=self._newest)
             if frame is None:
                 return None
             self._stamps_ns.append(frame.stamp_ns)
             return take(frame)
 
-        return self._table.fly(target_deg, Flight(each, reach_deg, self.recorder, velocity_dps, quiet))
-
-    def stopping_deg(self) -> float:
-        """Return the angle at which the table stops if it brakes now."""
-        return self._table.stopping_deg(self._bench.servo.read_state())
+        return Flight(each, reach_deg, self.recorder, velocity_dps, quiet)
 
     def about_deg(self, frame: StreamFrame) -> float:
         """Return the approximate angle of a frame during a flight, from the last readings of the encoder."""
         time_ns = middle_ns(frame.stamp_ns, self._config.camera_time)
-        readings = self.recorder.newest_readings(READINGS)
+        readings = self.recorder.readings[-READINGS:]
         if len(readings) < 2:
             return readings[-1][1] if readings else self._table.rest_deg
         times = np.array([(t - time_ns) * 1e-9 for t, _ in readings])
@@ -87,11 +83,17 @@ class FlightFrames:
     def irregular_ns(self, last: int = 0) -> set[int]:
         """Return which time stamps of this flight, or of its ``last`` frames, cannot be trusted."""
         stamps_ns = np.array(self._stamps_ns[-last:], np.int64)
-        off = irregular_stamps(stamps_ns.tolist(), self._stream.period_s, self._config.camera_time.jitter_ms)
+        off = irregular_stamps(stamps_ns.tolist(), self.stream.period_s, self._config.camera_time.jitter_ms)
         return set(stamps_ns[off].tolist())
 
     def attempt(
-        self, frame: StreamFrame, trajectory: Trajectory, locks: CameraLocks, *, locks_hold: bool, irregular: bool
+        self,
+        frame: StreamFrame,
+        trajectory: Trajectory,
+        locks: CameraLocks,
+        *,
+        locks_hold: bool = True,
+        stamps: int = 0,
     ) -> Attempt:
         """Return a frame of this flight as an attempt at a view: its evidence, and the reasons to reject it.
 
@@ -99,8 +101,8 @@ class FlightFrames:
         ----------
         locks, locks_hold
             The camera's settings before the flight, and whether they have not changed.
-        irregular
-            Whether the frame's time stamp is one of `irregular_ns`.
+        stamps
+            The number of the last time stamps that the frame's is compared with; 0 for all of this flight.
         """
         config = self._config
         quality = ImageQuality.of(frame.image_bgr, config.view)
@@ -117,7 +119,7 @@ class FlightFrames:
             trajectory.residual_deg,
         )
         reasons = []
-        if irregular or not frame.stamped:
+        if not frame.stamped or frame.stamp_ns in self.irregular_ns(stamps):
             reasons.append(RejectReason.TIME_UNCERTAIN)
         if evidence.angle_sigma_deg > config.view.max_angle_sigma_deg or not trajectory.consistent:
             reasons.append(RejectReason.ANGLE_UNCERTAIN)

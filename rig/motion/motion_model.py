@@ -41,6 +41,10 @@ class MotionModel:
         """Return the duration of a view: the time until a frame arrives."""
         return FRAMES / self.config.camera.fps
 
+    def views_s(self, angles_deg: Sequence[float]) -> float:
+        """Return the duration of the moves along these table angles, with a view at each but the first."""
+        return sum(self.move_s(b - a) + self.view_s for a, b in pairwise(angles_deg))
+
     def enrollment_s(self, start_deg: float, angles_deg: Sequence[float], *, in_motion: bool = False) -> float:
         """Return the duration of views at these table angles, from ``start_deg`` and back home.
 
@@ -52,6 +56,4 @@ class MotionModel:
             first_deg = angles_deg[0]
             before_s = self.move_s(first_deg - start_deg) if first_deg != start_deg else 0.0
             return FIRST_REST_S + before_s + 2 * self.view_s + self.move_s(360.0) + self.park_s(first_deg + 360.0)
-        stops = [start_deg, *angles_deg]
-        moves = sum(self.move_s(b - a) for a, b in pairwise(stops))
-        return FIRST_REST_S + moves + len(angles_deg) * self.view_s + self.move_s(-angles_deg[-1])
+        return FIRST_REST_S + self.views_s([start_deg, *angles_deg]) + self.move_s(-angles_deg[-1])

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from enum import StrEnum
-from math import hypot, radians
+from math import hypot, inf, radians
 from typing import Final
 
 from rig.config import RigConfig
@@ -83,8 +83,8 @@ def require_camera_time(config: RigConfig) -> None:
         )
 
 
-def scan_speed(config: RigConfig, *, fps: float, gyro_range_dps: float, spacing_deg: float | None) -> ScanSpeed:
-    """Return the fastest speed for views every ``spacing_deg``; None means that the angles of views are not planned."""
+def scan_speed(config: RigConfig, gyro_range_dps: float, spacing_deg: float = inf, fps: float = inf) -> ScanSpeed:
+    """Return the fastest speed for views every ``spacing_deg``; inf means that the angles of views are not planned."""
     milliseconds = exposure_s(config) * 1e3
     left_deg = max(config.view.max_angle_sigma_deg**2 - FIT_SIGMA_DEG**2, 1e-6) ** 0.5
     sigma_ms = max(time_sigma_ms(config), 1e-3)
@@ -93,7 +93,6 @@ def scan_speed(config: RigConfig, *, fps: float, gyro_range_dps: float, spacing_
         ScanSpeed(config.view.max_smear_px / smear_px(config, 1.0), SpeedLimit.SMEAR, milliseconds),
         ScanSpeed(GYRO_SHARE * gyro_range_dps, SpeedLimit.GYRO, gyro_range_dps),
         ScanSpeed(left_deg / (sigma_ms * 1e-3), SpeedLimit.TIME, sigma_ms),
+        ScanSpeed(FRAME_SHARE * spacing_deg * fps, SpeedLimit.FRAME_RATE, fps),
     ]
-    if spacing_deg is not None:
-        speeds.append(ScanSpeed(FRAME_SHARE * spacing_deg * fps, SpeedLimit.FRAME_RATE, fps))
     return min(speeds, key=lambda one: one.dps)

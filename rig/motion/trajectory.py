@@ -119,6 +119,11 @@ class TrajectoryRecorder:
         Standard uncertainty of the gyro's scale.
     arw
         Angle random walk of the gyro in °/√s.
+
+    Attributes
+    ----------
+    readings
+        The encoder readings so far: times and table angles.
     """
 
     resolution_deg: float
@@ -127,13 +132,13 @@ class TrajectoryRecorder:
     arw: float
     bias_dps: float = 0.0
     bias_sigma_dps: float = 0.1
-    _readings: list[tuple[int, float]] = field(default_factory=list)
+    readings: list[tuple[int, float]] = field(default_factory=list)
     _time_ns: list[Times] = field(default_factory=list)
     _rate: list[Floats] = field(default_factory=list)
 
     def add_reading(self, time_ns: int, angle_deg: float) -> None:
         """Add a reading of the encoder, as a table angle."""
-        self._readings.append((time_ns, angle_deg))
+        self.readings.append((time_ns, angle_deg))
 
     def add_samples(self, time_ns: Times, rate_dps: Floats) -> None:
         """Add samples of the gyro's rate about the table's axis (n,), with its bias; missing samples leave a gap."""
@@ -141,13 +146,9 @@ class TrajectoryRecorder:
             self._time_ns.append(time_ns)
             self._rate.append(rate_dps)
 
-    def newest_readings(self, count: int) -> list[tuple[int, float]]:
-        """Return the last encoder readings, times and table angles; at most ``count``."""
-        return self._readings[-count:]
-
     def fit(self) -> Trajectory | None:
         """Return the trajectory so far; None if there are too few readings or samples."""
-        if len(self._readings) < FEWEST_READINGS or not self._time_ns:
+        if len(self.readings) < FEWEST_READINGS or not self._time_ns:
             return None
         time_ns = np.concatenate(self._time_ns)
         rate: Floats = np.concatenate(self._rate) - self.bias_dps
@@ -161,8 +162,8 @@ class TrajectoryRecorder:
         missing = steps_s > 2.5 * np.median(steps_s)
         gaps: Floats = (time_s[:-1] + time_s[1:])[missing] / 2
         # Select the encoder readings that the backlash does not hide.
-        encoder_t = np.array([(t - start_ns) * 1e-9 for t, _ in self._readings])
-        encoder_deg = np.array([angle for _, angle in self._readings])
+        encoder_t = np.array([(t - start_ns) * 1e-9 for t, _ in self.readings])
+        encoder_deg = np.array([angle for _, angle in self.readings])
         played, used = backlash_states(encoder_deg, self.backlash_deg)
         used &= (encoder_t >= time_s[0]) & (encoder_t <= time_s[-1])
         if used.sum() < FEWEST_READINGS:

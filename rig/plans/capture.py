@@ -52,13 +52,6 @@ def announced(
     return table.goto(target_deg)
 
 
-def unwind(index: int, table: Turntable) -> Generator[Event, None, None]:
-    """Unwind the cable by whole revolutions, so that the camera sees the same side as before."""
-    target_deg = table.unwound_deg()
-    if table.unwound_revolutions(target_deg):
-        yield from announced(index, table, target_deg)
-
-
 def check_camera(bench: Bench, settings: Collection[Mapping[str, Any]]) -> None:
     """Check that the camera has one of these settings (`rig.devices.camera.CameraLocks`), which earlier views had.
 

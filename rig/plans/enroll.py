@@ -5,33 +5,23 @@ Each view is stored before the table rotates to the next one.
 Decision: docs/decisions/0002.
 """
 
-from collections.abc import Generator, Mapping
+from collections.abc import Generator
 from contextlib import suppress
 
-import numpy as np
-from numpy.typing import NDArray
-
-from hbr.core.angles import wrap360
 from rig.bench import Bench
-from rig.catalog import Catalog, Enrollment, Provenance, ViewRecord
+from rig.catalog import Catalog, Provenance
 from rig.catalog.descriptions import unfinished_camera_settings
 from rig.core.clock import seconds_between
-from rig.core.errors import ObjectMoved, RigError, RotationDisagreement
-from rig.core.json_form import plain
-from rig.core.phrases import angle_words
-from rig.events.events import Accepted, Enrolled, Event, Started
-from rig.motion.move import Move
+from rig.core.errors import RigError
+from rig.events.events import Enrolled, Event, Started
 from rig.motion.scan_speed import require_camera_time, takes_in_motion
 from rig.motion.turntable import Turntable
-from rig.plans.capture import announced, capture, check_camera, check_object, moved, warn_of_table
+from rig.plans.capture import check_camera
+from rig.plans.enroll_views import EnrollmentViews
 from rig.plans.estimate import even_azimuths, table_angles
-from rig.plans.fly import fly_views, park
-from rig.views.capture import Viewer, image_similarity
+from rig.views.capture import Viewer
 from rig.views.description import DESCRIPTORS, ViewDescriber
 from rig.views.empty_table import empty_table_status
-
-SAME_SIMILARITY = 0.97
-"""Two images of an object at one angle are more similar; after a shift by a centimetre they are less similar."""
 
 
 def enroll(
@@ -54,8 +44,8 @@ def enroll(
     enrollment keeps its views: ``resume`` takes the missing ones, provided that the object was not moved. Closing the
     generator switches the torque off.
 
-    With ``fly`` the views are taken in one revolution without a stop (`rig.plans.fly`). Views that fail or are missing
-    are then taken at rest. The default is ``enroll.mode``; "auto" means at rest.
+    With ``fly`` the views are taken in one revolution without a stop (`rig.plans.enroll_views`). Views that fail or are
+    missing are then taken at rest. The default is ``enroll.mode``; "auto" means at rest.
 
     Every view is described by `rig.views.description.DESCRIPTORS`. Segmentation uses the bench's empty-table image, if
     there is one (`rig.plans.photograph_table`); the enrollment stores it. At the end all views are segmented again,
@@ -127,10 +117,11 @@ def enroll(
             if empty_table is not None:
                 enrollment.store_empty_table(empty_table)
             describe = ViewDescriber(bench.config.view, DESCRIPTORS, empty_table)
-            if in_motion:
-                retakes = yield from _fly_and_complete(bench, enrollment, to_go, describe)
-            else:
-                retakes = yield from _take_views(bench, enrollment, to_go, describe)
+            viewer = Viewer(bench.camera, bench.config, encodes=not in_motion)
+            with Turntable(bench) as table:
+                taking = EnrollmentViews(bench, enrollment, describe, table, viewer)
+                yield from taking.take(to_go, in_motion=in_motion)
+            retakes = taking.retakes
         except BaseException:
             if not resume:
                 with suppress(RigError):  # it has views to resume
@@ -142,169 +133,3 @@ def enroll(
     done = Enrolled(enrollment.object_name, views, retakes, seconds_between(started_ns, bench.clock.now_ns()))
     yield done
     return done
-
-
-def _take_views(
-    bench: Bench, enrollment: Enrollment, angles_deg: Mapping[int, float], describe: ViewDescriber
-) -> Generator[Event, None, int]:
-    """Take and store the views at these table angles, return to 0, and return the number of repeated images."""
-    viewer = Viewer(bench.camera, bench.config, encodes=True)
-    with Turntable(bench) as table:
-        retakes, first, index = yield from _step_views(bench, enrollment, table, viewer, angles_deg, describe)
-        # Return to the first view to check that the object was not moved, then to 0 to free the cable: without its
-        # supply the servo loses the count of revolutions, and the next enrollment would wind up the cable further.
-        if first and first[0] != index:
-            yield from _check_not_moved(bench, enrollment, table, viewer, *first)
-        if first is None or first[0] == index or first[1] != 0.0:
-            yield from announced(index, table, 0.0)
-    return retakes
-
-
-def _fly_and_complete(
-    bench: Bench, enrollment: Enrollment, angles_deg: Mapping[int, float], describe: ViewDescriber
-) -> Generator[Event, None, int]:
-    """Take and store views in one revolution, the others at rest, go to 0; return the number of repeated images."""
-    viewer = Viewer(bench.camera, bench.config)
-    retakes = 0
-    with Turntable(bench) as table:
-        stored, start_deg, before, after = yield from fly_views(bench, enrollment, table, viewer, angles_deg, describe)
-        require_not_moved(bench, enrollment, 0, start_deg, before, after)
-        left = {index: angle for index, angle in angles_deg.items() if index not in stored}
-        if left:
-            retakes, _, index = yield from _step_views(bench, enrollment, table, viewer, left, describe)
-            yield from _check_not_moved(bench, enrollment, table, viewer, 0, start_deg, before)
-            if start_deg != 0.0:
-                yield from announced(index, table, 0.0)
-        else:
-            park(table, bench)
-    return len(left) + retakes
-
-
-def _step_views(
-    bench: Bench,
-    enrollment: Enrollment,
-    table: Turntable,
-    viewer: Viewer,
-    angles_deg: Mapping[int, float],
-    describe: ViewDescriber,
-) -> Generator[Event, None, tuple[int, tuple[int, float, NDArray[np.uint8]] | None, int]]:
-    """Take and store the views at these table angles at rest.
-
-    Returns the number of repeated images, index, angle and image of the first view, and the index of the last one.
-    """
-    sign = bench.config.table.orientation_sign
-    retakes = 0
-    imu = _ImuAngle()
-    first: tuple[int, float, NDArray[np.uint8]] | None = None
-    for index, angle_deg in angles_deg.items():
-        move = yield from announced(index, table, angle_deg)
-        yield moved(index, move)
-        if move.agreement is None or not move.agreement.agrees:
-            disagreement = _disagreement(move)
-            if move.agreement is not None:
-                bench.safety.latch(disagreement)  # a platter that has slipped once will slip again
-            raise disagreement
-        imu.add(move)
-        attempt = yield from capture(index, viewer, table, move.settled_ns)
-        retakes += attempt.number - 1
-        if first is None:
-            check_object(bench, attempt.image_bgr, describe.empty_table)
-        described = describe(attempt.image_bgr)
-        record = ViewRecord(
-            index=index,
-            commanded_deg=move.commanded_deg,
-            encoder_deg=move.encoder_deg,
-            azimuth_deg=float(wrap360(sign * (imu.angle_deg if move.by_gyro else move.encoder_deg))),
-            descriptors=described.levels,
-            captured_ns=attempt.evidence.exposed_ns,
-            imu_deg=imu.angle_deg,
-            imu_sigma_deg=imu.sigma_deg,
-            evidence=plain(attempt.evidence),
-            region=bench.config.view.roi,
-            segmentation=described.segmentation,
-        )
-        enrollment.add(record, attempt.image_bgr, attempt.encoded, described.segmented)
-        yield Accepted(index, record.azimuth_deg, attempt.evidence, attempt.image_bgr, described.segmentation)
-        yield from warn_of_table(bench, index, described)
-        first = first or (index, angle_deg, attempt.image_bgr)
-    return retakes, first, index
-
-
-def _check_not_moved(
-    bench: Bench,
-    enrollment: Enrollment,
-    table: Turntable,
-    viewer: Viewer,
-    index: int,
-    angle_deg: float,
-    image_bgr: NDArray[np.uint8],
-) -> Generator[Event, None, None]:
-    """Return to the angle of view ``index`` and check that the object is still where it was.
-
-    Raises
-    ------
-    ObjectMoved
-        It was moved between any two views, so all views of this session are abandoned.
-    """
-    move = yield from announced(index, table, angle_deg)
-    again = yield from capture(index, viewer, table, move.settled_ns)
-    require_not_moved(bench, enrollment, index, angle_deg, image_bgr, again.image_bgr)
-
-
-def require_not_moved(
-    bench: Bench,
-    enrollment: Enrollment,
-    index: int,
-    angle_deg: float,
-    image_bgr: NDArray[np.uint8],
-    again_bgr: NDArray[np.uint8],
-) -> None:
-    """Compare two frames of view ``index``; abandon the enrollment and raise `ObjectMoved` if the object moved."""
-    alike = image_similarity(image_bgr, again_bgr, bench.config.view)
-    if alike < SAME_SIMILARITY:
-        enrollment.abandon()
-        raise ObjectMoved(
-            f"{enrollment.object_name} is not where it was for view {index + 1}: it fell, was pushed, or slid on the "
-            "platter. The views of this session are abandoned.",
-            next_step="Put the object back on its mark, fasten it, and enroll it again with --replace.",
-            evidence={"similarity": round(alike, 3), "smallest_similarity": SAME_SIMILARITY, "table_deg": angle_deg},
-        )
-
-
-class _ImuAngle:
-    """The table angle by the gyro alone, from the first angle of the encoder."""
-
-    def __init__(self) -> None:
-        self.angle_deg = 0.0
-        self.sigma_deg = 0.0
-        self._begun = False
-
-    def add(self, move: Move) -> None:
-        if self._begun:
-            self.angle_deg += move.gyro.angle_deg
-            self.sigma_deg += move.gyro.sigma_deg  # added linearly: all moves share the same bias and scale error
-        else:
-            self._begun = True
-            self.angle_deg = move.commanded_deg if move.by_gyro else move.encoder_deg
-
-
-def _disagreement(move: Move) -> RotationDisagreement:
-    if move.agreement is None:
-        return RotationDisagreement(
-            "It is not known whether the platter followed the servo's rotation of "
-            f"{angle_words(move.rotation_encoder_deg, 2)}: {move.gyro.reason}.",
-            next_step="If nothing hit the table, continue with --resume. Otherwise enroll the object again with "
-            "--replace.",
-            evidence={"table_deg": round(move.encoder_deg, 2)},
-        )
-    return RotationDisagreement(
-        f"The servo rotated {angle_words(move.rotation_encoder_deg, 2)}, but the platter "
-        f"{angle_words(move.gyro.angle_deg, 2)}.",
-        next_step="Tighten the platter.",
-        afterwards="Enroll the object again with --replace: views from before and after a slip do not fit together.",
-        evidence={
-            "difference_deg": round(move.agreement.difference_deg, 3),
-            "bound_deg": round(move.agreement.bound_deg, 3),
-            "table_deg": round(move.encoder_deg, 2),
-        },
-    )

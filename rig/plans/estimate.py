@@ -150,7 +150,7 @@ def dry_run(
     for given, own_views in names.items():
         name = clean_name(given)
         summary = known.get(name)
-        action, obstacle = _action(summary, resume=resume, replace=replace, tray=len(names) > 1)
+        action, obstacle = planned_action(summary, resume=resume, replace=replace, tray=len(names) > 1)
         azimuths: Sequence[float] = ()
         if action in ("enroll", "replace"):
             azimuths = even_azimuths(own_views or views or bench.config.enroll.views, limits_deg, sign)
@@ -184,7 +184,10 @@ def dry_run(
     return tuple(found)
 
 
-def _action(known: ObjectSummary | None, *, resume: bool, replace: bool, tray: bool) -> tuple[str, Obstacle | None]:
+def planned_action(
+    known: ObjectSummary | None, *, resume: bool = False, replace: bool = False, tray: bool = False
+) -> tuple[str, Obstacle | None]:
+    """Return what an enrollment does with an object of the catalog, as in `DryRun`; None: the catalog has none."""
     if known is not None and known.unfinished_views is not None:
         if resume or tray:
             return "resume", None
@@ -232,8 +235,7 @@ class TimeLeft:
             return model.enrollment_s(angles[0], angles, in_motion=self._in_motion)
         if self._in_motion:
             return model.park_s(angles[0] + 360.0)
-        left = sum(model.move_s(b - a) + model.view_s for a, b in pairwise(angles[done - 1 :]))
-        expected = sum(model.move_s(b - a) + model.view_s for a, b in pairwise(angles[:done]))
-        if done > 1 and expected > 0:
+        left, expected = model.views_s(angles[done - 1 :]), model.views_s(angles[:done])
+        if expected > 0:
             left *= seconds_between(self._exposed_ns[0], self._exposed_ns[-1]) / expected
         return left + model.move_s(-angles[-1])

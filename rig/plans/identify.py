@@ -1,27 +1,40 @@
-"""The plan that identifies the object on the table: view, rank, decide, rotate, until the search ends.
+"""The plans that identify the object on the table, once or one object after the other.
+
+View, rank, decide, rotate, until the search ends.
 
 Decision: docs/decisions/0002.
 """
 
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Sequence
 from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hbr.core.angles import wrap360
+from hbr.dense.enrolled_views import answered
+from hbr.dense.local_difference import LocalView
 from rig.bench import Bench
 from rig.config import RigConfig
-from rig.core.clock import seconds_between
-from rig.events.events import Event, FrameUsed, Identified, Started
+from rig.core.errors import CatalogError, MotionStopped, NoObject, RigError, ViewRejected
+from rig.events.events import (
+    Event,
+    Failed,
+    FrameUsed,
+    Identified,
+    Note,
+    NoteCode,
+    Started,
+    Waiting,
+    WaitReason,
+    Warned,
+)
 from rig.motion.scan_speed import can_fly, require_camera_time
 from rig.motion.turntable import Turntable
 from rig.plans.capture import announced, check_camera, check_object, moved
-from rig.plans.identify_moving import search_in_motion
-from rig.plans.search_steps import Searched, SearchSteps, unwound
+from rig.plans.search_views import ViewsAtRest, ViewsInMotion
 from rig.search.model import Model, begin_search, empty_table_for
-from rig.search.session import SHOWN
-from rig.search.strategies import AnyStrategy, Finish
+from rig.search.session import SHOWN, Hypotheses, Search
+from rig.search.strategies import AnyStrategy, Rotate
 from rig.views.capture import Viewer
 from rig.views.description import SearchDescriber
 from rig.views.empty_table import empty_table_status
@@ -87,9 +100,9 @@ def identify(
         See `rig.views.capture` and `rig.motion.turntable`.
     """
     config = config or bench.config
-    if strategy is None and flies(config, model):
+    if strategy is None and _flies(config, model):
         strategy = "arc"
-    search, chosen = begin_search(model, config, strategy, seed=seed, top=top)
+    search = begin_search(model, config, strategy, seed=seed, top=top)
     if search.in_motion:
         require_camera_time(bench.config)
     viewer = Viewer(bench.camera, bench.config)
@@ -108,57 +121,114 @@ def identify(
         bench_image=None if bench.config.table.carries == "camera" else model.bench_image,
     )
     check = partial(check_object, bench, empty_table=empty_table if own is None else own.image_bgr)
-    steps = SearchSteps(bench, model, search, viewer, describe, check, top)
     (watcher or bench.operator).place(None)
     yield Started(
         "identify",
         None,
         config.identify.max_views,
         dict(bench.conditions),
-        strategy=chosen.name,
+        strategy=search.strategy.name,
         seed=seed,
         descriptor=search.descriptor,
         notes=notes,
     )
-    found = yield from search_in_motion(steps, live) if search.in_motion else _search_at_rest(steps)
-    answer = yield from steps.end(travelled_deg=found.travelled_deg, seconds=found.seconds)
+    # Take views until the search ends.
+    kind = ViewsInMotion if search.in_motion else ViewsAtRest
+    views = kind(bench, search, viewer, describe, check, live)
+    try:
+        with views.table as table:
+            yield from views.begin()
+            while not views.is_over:
+                yield from views.view()
+                if isinstance(search.step, Rotate):
+                    yield from views.rotate(search.step)
+            seconds = views.seconds
+            failed = yield from _unwound(views.number, table)
+    except MotionStopped:
+        raise
+    except Exception:
+        # The events of an interrupted arc come when the torque is off, because their consumer may pause.
+        yield from views.unseen
+        raise
+    yield from _last_steps(model, search, describe.hypotheses)
+    answer = search.answer(travelled_deg=views.travelled_deg, seconds=seconds)
     yield answer
-    if found.failed:
-        raise found.failed
+    if failed:  # the answer is reported first
+        raise failed
     return answer
 
 
-def _search_at_rest(steps: SearchSteps) -> Generator[Event, None, Searched]:
-    """Take views at rest until the search ends."""
-    bench, search = steps.bench, steps.search
-    started_ns = bench.clock.now_ns()
-    sign = bench.config.table.orientation_sign  # the camera moves opposite to the table
-    travelled_deg = 0.0
-    number = 0
-    with Turntable(bench) as table:
-        move = table.hold()
-        orientation_deg = sign * move.encoder_deg
-        while True:
-            yield moved(number, move)
-            yield from steps.view(number, table, move.settled_ns, float(wrap360(orientation_deg)))
-            step = search.step
-            if isinstance(step, Finish):
-                break
-            # Rotate: within the cable budget, and use the measured rotation.
-            asked_deg = table.rest_deg + sign * step.rotation_deg
-            target_deg = table.within_reach(asked_deg)
-            yield steps.decided(number, step, target_deg)
-            move = yield from announced(number, table, target_deg, asked_deg=asked_deg)
-            travelled_deg += abs(move.rotation_deg)
-            orientation_deg += sign * move.rotation_deg
-            number += 1
-        seconds = seconds_between(started_ns, bench.clock.now_ns())
-        failed = yield from unwound(number, table)
-    return Searched(travelled_deg, seconds, failed)
-
-
-def flies(config: RigConfig, model: Model) -> bool:
+def _flies(config: RigConfig, model: Model) -> bool:
     """Return whether a search without a named strategy takes frames in motion, by ``identify.mode``."""
     is_dense = model.rule is not None
     mode = config.identify.mode
     return is_dense and config.identify.strategy is None and (mode == "fly" or (mode == "auto" and can_fly(config)))
+
+
+def _unwound(number: int, table: Turntable) -> Generator[Event, None, RigError | None]:
+    """Unwind the cable by whole revolutions, so that the camera sees the same side as before; return the error."""
+    target_deg = table.unwound_deg()
+    try:
+        if table.unwound_revolutions(target_deg):
+            yield from announced(number, table, target_deg)
+    except RigError as error:
+        return error
+    return None
+
+
+def _last_steps(model: Model, search: Search, hypotheses: Hypotheses) -> Generator[Event, None, None]:
+    """Take the last steps of a search. If an enrolled image is missing, the answer is the one without it."""
+    missing: list[CatalogError] = []
+
+    def enrolled(object_index: int, azimuths_deg: Sequence[float]) -> Sequence[LocalView] | None:
+        try:
+            return None if model.leader_views is None else model.leader_views(search.names[object_index], azimuths_deg)
+        except CatalogError as error:
+            missing.append(error)
+            return None
+
+    for step in search.last_steps(hypotheses):
+        event = answered(step, enrolled)
+        for error in missing:
+            values = {"what": error.what, "next_step": error.next_step}
+            yield Warned(search.ranked.index, Note(NoteCode.NOT_COMPARED, values))
+        missing.clear()
+        if event is not None:
+            yield event
+
+
+def watch(
+    bench: Bench, identify_next: Callable[[], Generator[Event, None, Identified]]
+) -> Generator[Event, None, None]:
+    """Identify one object after the other, until closed; yields a `Waiting` before the events of each.
+
+    After each answer the table returns to its start angle and unwinds its cable. If no view of an object is acceptable,
+    or no object is on the table, the plan yields `Failed` and waits for the next object; any other error ends the plan.
+
+    Parameters
+    ----------
+    bench
+        An open bench.
+    identify_next
+        Begins `identify` for the next object, with a model of what is enrolled then. Its operator brings the objects,
+        or its watcher waits for them.
+
+    Raises
+    ------
+    RigError
+        As `identify`, except for `NoObject` and `ViewRejected`.
+    """
+    with Turntable(bench) as table:
+        home_deg = table.rest_deg
+    reason = WaitReason.FIRST_OBJECT
+    while True:
+        yield Waiting(reason)
+        reason = WaitReason.NEXT_OBJECT
+        try:
+            views = (yield from identify_next()).views
+        except (NoObject, ViewRejected) as error:
+            yield Failed(**{key: error.as_dict()[key] for key in ("error", "code", "what", "evidence", "next_step")})
+            views = 0
+        with Turntable(bench) as table:
+            if abs(table.rest_deg - home_deg) > bench.config.table.tolerance_deg:
+                yield moved(views, table.goto(home_deg))

@@ -1,6 +1,6 @@
-"""Record the answers of identifications in a catalog, while their events pass."""
+"""Record the answers of identifications in a catalog."""
 
-from collections.abc import Callable, Generator
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -18,9 +18,9 @@ from rig.events.events import Accepted, Event, Failed, Identified, Note, NoteCod
 
 
 class ResultRecorder:
-    """Records each answer of a stream of events, with the image of its first view.
+    """Records each answer of `identify` or `watch`, with the image of its first view.
 
-    An answer is never lost: it is yielded before it is recorded, and a catalog that cannot be written is a `Warned`.
+    An answer is never lost: show it before it is recorded. A catalog that cannot be written is a `Warned`.
 
     Parameters
     ----------
@@ -63,27 +63,24 @@ class ResultRecorder:
         self._image: NDArray[np.uint8] | None = None
         self._azimuths_deg: list[float] = []
 
-    def stream(self, events: Generator[Event, None, object]) -> Generator[Event, None, None]:
-        """Yield the events of `identify` or `watch`; after each answer also `Recorded`, or a `Warned` if that fails."""
-        try:
-            for event in events:
-                yield event
-                match event:
-                    case Started():
-                        self._image, self._azimuths_deg = None, []
-                    case Accepted():
-                        if self._with_image and self._image is None:
-                            self._image = event.image_bgr
-                        self._azimuths_deg.append(event.azimuth_deg)
-                    case Identified():
-                        yield self._record(event)
-                        self.sample = None
-                    case Failed():
-                        self.sample = None
-                    case _:
-                        pass
-        finally:
-            events.close()
+    def add(self, event: Event) -> Recorded | Warned | None:
+        """Take the next event; record an answer, and return the event about it."""
+        match event:
+            case Started():
+                self._image, self._azimuths_deg = None, []
+            case Accepted():
+                if self._with_image and self._image is None:
+                    self._image = event.image_bgr
+                self._azimuths_deg.append(event.azimuth_deg)
+            case Identified():
+                recorded = self._record(event)
+                self.sample = None
+                return recorded
+            case Failed():
+                self.sample = None
+            case _:
+                pass
+        return None
 
     def _record(self, answer: Identified) -> Recorded | Warned:
         try:

@@ -24,6 +24,7 @@ from rig.core.phrases import counted, whole
 from rig.events.events import Event, Item, SkipReason
 from rig.motion.scan_speed import takes_in_motion
 from rig.plans.enroll import enroll
+from rig.plans.estimate import planned_action
 from rig.plans.operator import Choice, Operator, Question, Subject, Unattended
 
 COLUMNS: Final = ("name", "label", "note", "views")
@@ -101,8 +102,8 @@ def read_tray(path: Path) -> tuple[TrayItem, ...]:
 
 def left_to_enroll(catalog: Catalog, items: Sequence[TrayItem]) -> list[TrayItem]:
     """Return the objects of a tray that are not enrolled, or whose enrollment was interrupted."""
-    enrolled = {known.name for known in catalog.known_objects() if known.views and known.unfinished_views is None}
-    return [item for item in items if item.name not in enrolled]
+    known = {summary.name: summary for summary in catalog.known_objects()}
+    return [item for item in items if planned_action(known.get(item.name), tray=True)[0] != "skip"]
 
 
 def enroll_tray(
@@ -142,18 +143,18 @@ def enroll_tray(
     for number, item in enumerate(items, 1):
         while True:
             known = {summary.name: summary for summary in catalog.known_objects()}.get(item.name)
-            interrupted = known if known is not None and known.unfinished_views is not None else None
-            if known is not None and interrupted is None and known.views:
+            action, _ = planned_action(known, tray=True)
+            if action == "skip":
                 yield Item(number, len(items), item.name, "skip", SkipReason.ALREADY_ENROLLED)
                 break
-            decision = operator.choose(next_object(item, number, len(items), interrupted))
+            decision = operator.choose(next_object(item, number, len(items), known if action == "resume" else None))
             if decision is Choice.STOP:
                 return
             if decision is Choice.SKIP:
                 yield Item(number, len(items), item.name, "skip", SkipReason.OPERATOR)
                 break
-            resume = interrupted is not None and decision is not Choice.RESTART
-            action = "resume" if resume else "replace" if interrupted else "enroll"
+            if decision is Choice.RESTART:
+                action = "replace"
             yield Item(number, len(items), item.name, action)
             try:
                 yield from enroll(
@@ -163,8 +164,8 @@ def enroll_tray(
                     views=item.views or views,
                     label=item.label,
                     note=item.note,
-                    resume=resume,
-                    replace=interrupted is not None and not resume,
+                    resume=action == "resume",
+                    replace=action == "replace",
                     fly=takes_in_motion(bench.config, fly, tray=True),
                 )
             except OBJECT_ERRORS as error:

@@ -9,7 +9,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,15 +35,7 @@ from rig.events.events import Note, NoteCode
 from rig.search.comparison import EnrolledViews
 from rig.search.session import SHOWN, ArcSearch, DenseSearch, HoughSearch, Search
 from rig.search.stopping_rules import stopping_rule_of, write_stopping_rule
-from rig.search.strategies import (
-    AnyStrategy,
-    DenseSearchState,
-    SearchState,
-    Strategy,
-    descriptor_for,
-    is_in_motion,
-    strategy_for,
-)
+from rig.search.strategies import AnyStrategy, descriptor_for, is_in_motion, strategy_for
 from rig.search.strategies import strategy as strategy_named
 from rig.views.description import BENCH_DESCRIPTOR, PAPER_DESCRIPTOR
 from rig.views.empty_table import empty_table_status
@@ -109,7 +101,7 @@ class PaperModel(Model):
     index: hbr.ViewIndex
 
     def search(self, config: RigConfig, strategy: AnyStrategy, *, seed: int, top: int) -> Search:
-        return HoughSearch(self.index, config, cast(Strategy[SearchState], strategy), seed=seed, top=top)
+        return HoughSearch(self.index, config, strategy, seed=seed, top=top)
 
     def write_rule(self, path: Path, *, made_utc: str) -> None:
         """Store nothing: there is no rule."""
@@ -123,12 +115,11 @@ class DenseModel(Model):
     rule: hbr.StoppingRule
 
     def search(self, config: RigConfig, strategy: AnyStrategy, *, seed: int, top: int) -> Search:
-        chosen = cast(Strategy[DenseSearchState], strategy)
-        if is_in_motion(chosen):
+        if is_in_motion(strategy):
             moving = ArcSession(self.index, _arc_rule(self.index, self.rule))
-            return ArcSearch(moving, self.views, config, chosen, seed=seed, top=top)
+            return ArcSearch(moving, self.views, config, strategy, seed=seed, top=top)
         session = hbr.DenseSession(self.index, self.rule, max_views=config.identify.max_views)
-        return DenseSearch(session, self.views, config, chosen, seed=seed, top=top)
+        return DenseSearch(session, self.views, config, strategy, seed=seed, top=top)
 
     def write_rule(self, path: Path, *, made_utc: str) -> None:
         write_stopping_rule(path, self.rule, self.index, made_utc=made_utc)
@@ -147,8 +138,8 @@ def model_of(views: hbr.Views, *, rule: hbr.StoppingRule | None = None) -> Model
 
 def begin_search(
     model: Model, config: RigConfig, strategy: AnyStrategy | str | None = None, *, seed: int = 0, top: int = SHOWN
-) -> tuple[Search, AnyStrategy]:
-    """Begin a search, and return it with its strategy.
+) -> Search:
+    """Begin a search, and return it.
 
     Parameters
     ----------
@@ -182,7 +173,7 @@ def begin_search(
             next_step=f"Load it with rig.search.model.load_model(catalog, descriptor={wanted!r}), or use another "
             "strategy.",
         )
-    return model.search(config, chosen, seed=seed, top=top), chosen
+    return model.search(config, chosen, seed=seed, top=top)
 
 
 def load_model(

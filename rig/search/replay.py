@@ -17,14 +17,13 @@ from rig.events.events import (
     Identified,
     Moved,
     Ranked,
-    RotationReason,
     event_dict,
 )
 from rig.search.comparison import saved_enrolled_views
 from rig.search.model import begin_search
 from rig.search.saved_run import SavedRun
 from rig.search.session import Search
-from rig.search.strategies import AnyStrategy, Finish, Rotate
+from rig.search.strategies import AnyStrategy, Rotate
 from rig.views.description import SearchDescriber
 
 TOLERANCE: Final = 1e-9
@@ -94,9 +93,8 @@ def check(run: SavedRun, *, by: AnyStrategy | None = None) -> Check:
             case Accepted():
                 if search is None:
                     top = len(run.views.object_names)
-                    search, _ = begin_search(
-                        run.model, run.config, by or started.strategy, seed=started.seed or 0, top=top
-                    )
+                    strategy = by or started.strategy
+                    search = begin_search(run.model, run.config, strategy, seed=started.seed or 0, top=top)
                     revise = not search.in_motion
                     describe = SearchDescriber(run.config.view, run.views.descriptor, run.empty_table, revise=revise)
                 assert describe is not None
@@ -116,7 +114,7 @@ def check(run: SavedRun, *, by: AnyStrategy | None = None) -> Check:
                 computed = search.frame_used(event.index, event.azimuth_deg, event.seconds, event.rejected)
             case Decided():
                 found.decisions += 1
-                computed = _decided(None if search is None else search.step, event)
+                computed = _decided(search, event)
             case Verified() if search is not None:
                 # the enrolled images are not in the run, so their measured fit is used
                 measured = Verification(search.names.index(event.name), event.fit, event.others)
@@ -138,20 +136,13 @@ def check(run: SavedRun, *, by: AnyStrategy | None = None) -> Check:
     return found
 
 
-def _decided(step: Rotate | Finish | None, saved: Decided) -> Decided | dict[str, Any]:
+def _decided(search: Search | None, saved: Decided) -> Decided | dict[str, Any]:
     """Return the event of the computed step; the target angle is the turntable's, not the search's."""
-    if not isinstance(step, Rotate):
+    step = None if search is None else search.step
+    if search is None or not isinstance(step, Rotate):
         return {"reason": None if step is None else plain(step.reason)}
-    return replace(
-        saved,
-        rotation_deg=step.rotation_deg,
-        s_left=step.s_left,
-        s_right=step.s_right,
-        candidates=step.candidates[: len(saved.candidates)],
-        reason=RotationReason(step.reason),
-        note=step.note,
-        weighed=step.weighed,
-    )
+    computed = search.decided(saved.index, saved.target_deg)
+    return replace(computed, candidates=computed.candidates[: len(saved.candidates)])
 
 
 def _compare(view: int, where: str, saved: Any, computed: Any) -> Iterator[Difference]:

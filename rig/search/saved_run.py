@@ -10,7 +10,7 @@ Decision: docs/decisions/0018.
 
 import json
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -49,6 +49,15 @@ _MAX_BYTES: Final = {"run.json": 1_000_000, "model.jsonl": 32_000_000, "events.j
 """Larger than the files of all real runs. Values of JSON can need twenty times as much memory as their text."""
 _DAMAGE: Final = (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError, cv2.error)
 """Exceptions because of values of a wrong type."""
+_WORDS: Final = {
+    KeyError: "the value {0!r} is missing",
+    IndexError: "a list is too short",
+    RecursionError: "its values are nested too deeply",
+    ArithmeticError: "a number is too large or too small",
+    AttributeError: "a value has the wrong kind",
+    cv2.error: "a value has the wrong kind",
+}
+"""Python's own errors in words."""
 
 
 class RunWriter:
@@ -64,8 +73,6 @@ class RunWriter:
         The enrolled views.
     config
         The settings of the search, if they are not those of the bench.
-    empty_table : uint8 array (H, W, 3), optional
-        See `rig.plans.identify.identify`.
 
     Raises
     ------
@@ -73,15 +80,7 @@ class RunWriter:
         The folder is not empty, or cannot be written to.
     """
 
-    def __init__(
-        self,
-        folder: Path,
-        bench: Bench,
-        model: Model,
-        config: RigConfig | None = None,
-        *,
-        empty_table: NDArray[np.uint8] | None = None,
-    ) -> None:
+    def __init__(self, folder: Path, bench: Bench, model: Model, config: RigConfig | None = None) -> None:
         self._folder = folder
         views = model.views
         kind = descriptor(views.descriptor)
@@ -94,8 +93,7 @@ class RunWriter:
                 )
             write(folder / "model.jsonl", "".join(_model_lines(views)).encode())
             model.write_rule(folder / STOPPING_RULE, made_utc=started_utc)
-            if empty_table is None:
-                empty_table, _ = empty_table_for(bench, model)
+            empty_table, _ = empty_table_for(bench, model)
             if empty_table is not None:
                 write(folder / EMPTY_TABLE, images.encode(empty_table))
             about = {
@@ -121,9 +119,6 @@ class RunWriter:
     ) -> None:
         if isinstance(error, RigError):
             self._line(error.as_dict())
-        self.close()
-
-    def close(self) -> None:
         self._events.close()
 
     def add(self, event: Event) -> None:
@@ -154,46 +149,28 @@ class RunWriter:
         self._events.flush()
 
 
-class RunSaver:
-    """Saves each search in the folder that ``next_folder`` returns; without ``next_folder`` it saves nothing.
+@contextmanager
+def saving(
+    next_folder: Callable[[], Path] | None, bench: Bench, model: Callable[[], Model], config: RigConfig | None = None
+) -> Iterator[Callable[[Event], None]]:
+    """Return a function, in a ``with`` block, that saves events: each search in the folder of ``next_folder``.
 
-    ``folder`` is the folder of the last search, None before the first one.
+    Without ``next_folder`` it saves nothing. Errors as for `RunWriter`.
     """
+    with ExitStack() as search:
+        writer: RunWriter | None = None
 
-    def __init__(
-        self,
-        next_folder: Callable[[], Path] | None,
-        bench: Bench,
-        model: Callable[[], Model],
-        config: RigConfig | None = None,
-    ) -> None:
-        self.folder: Path | None = None
-        self._next_folder = next_folder
-        self._bench = bench
-        self._model = model
-        self._config = config
-        self._writer: RunWriter | None = None
+        def save(event: Event) -> None:
+            nonlocal writer
+            if next_folder is not None and isinstance(event, Started):
+                writer = search.enter_context(RunWriter(next_folder(), bench, model(), config))
+            if writer is not None:
+                writer.add(event)
+                if isinstance(event, Identified | Failed):
+                    search.close()
+                    writer = None
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if self._writer is not None:
-            self._writer.__exit__(kind, error, trace)
-
-    def add(self, event: Event) -> None:
-        """Store an event. Errors as for `RunWriter.add`."""
-        if self._next_folder is not None and isinstance(event, Started):
-            folder = self._next_folder()
-            self._writer = RunWriter(folder, self._bench, self._model(), self._config)
-            self.folder = folder
-        if self._writer is not None:
-            self._writer.add(event)
-            if isinstance(event, Identified | Failed):
-                self._writer.close()
-                self._writer = None
+        yield save
 
 
 @dataclass(frozen=True, slots=True)
@@ -422,19 +399,8 @@ def _bytes(folder: Path, name: str) -> bytes:
 
 def _reason(error: Exception) -> str:
     """Return an error in words; of Python's own errors, only those of a ValueError or TypeError are useful."""
-    match error:
-        case KeyError():
-            text = f"the value {error.args[0]!r} is missing" if error.args else "a value is missing"
-        case IndexError():
-            text = "a list is too short"
-        case RecursionError():
-            text = "its values are nested too deeply"
-        case ArithmeticError():
-            text = "a number is too large or too small"
-        case AttributeError() | cv2.error():
-            text = "a value has the wrong kind"
-        case _:
-            text = str(error)
+    words = next((words for kind, words in _WORDS.items() if isinstance(error, kind)), None)
+    text = str(error) if words is None else words.format(*error.args)
     return text if len(text) <= MAX_REASON else f"{text[:MAX_REASON]}…"
 
 

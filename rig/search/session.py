@@ -1,17 +1,17 @@
 """A search without its hardware: views in, ranking and decision out.
 
 A search does no I/O. It takes views (`Search.add`) and says what it needs next: a view after a rotation, or the end. At
-its end (`Search.end`) it asks for enrolled views, and returns the answer. The bench at rest and in motion
-(`rig.plans.identify`) and the replay (`rig.search.replay`) drive it; `rig eval` drives the same `hbr.DenseSession`.
+its end (`Search.last_steps`) it asks for enrolled views, and then it answers. The bench at rest and in motion
+(`rig.plans.search_views`) and the replay (`rig.search.replay`) drive it; `rig eval` drives the same `hbr.DenseSession`.
 
 Decision: docs/decisions/0064.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Generator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from math import isfinite
-from typing import ClassVar, Final
+from typing import Any, ClassVar, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,14 +19,14 @@ from numpy.typing import NDArray
 import hbr
 from hbr.core.angles import wrap360
 from hbr.core.arrays import IndexArray
-from hbr.dense.enrolled_views import Asking, NeedEnrolledViews, Queries
+from hbr.dense.enrolled_views import Asking, Queries
 from hbr.dense.local_difference import LocalView
 from hbr.dense.pose import pose
 from hbr.dense.verification import UNKNOWN_BELOW, Verification
 from hbr.model.symmetry import symmetry
 from rig.config import RigConfig
 from rig.events.compared import Compared, Verified
-from rig.events.events import Candidate, FrameUsed, Identified, Ranked
+from rig.events.events import Candidate, Decided, FrameUsed, Identified, Ranked, RotationReason
 from rig.search.comparison import compared_event
 from rig.search.strategies import (
     DenseSearchState,
@@ -57,6 +57,8 @@ class Search(ABC):
         The descriptor that its queries need.
     names
         Names of the enrolled objects.
+    strategy
+        Chooses after each view.
     in_motion
         Whether the frames of a rotation are its views.
     ranked, step
@@ -70,9 +72,10 @@ class Search(ABC):
     step: Rotate | Finish
     is_new_decision = True
 
-    def __init__(self, views: hbr.Views, config: RigConfig, *, seed: int, top: int) -> None:
+    def __init__(self, views: hbr.Views, config: RigConfig, strategy: Strategy[Any], *, seed: int, top: int) -> None:
         self.descriptor = views.descriptor
         self.names = views.object_names
+        self.strategy = strategy
         self._config = config
         self._top = top
         self._rng = np.random.default_rng(seed)
@@ -92,32 +95,40 @@ class Search(ABC):
         """
         self._orientations.append(azimuth_deg)
         self.ranked = self._rank(view)
-        self.step = self._decide(table_deg)
+        if self.is_new_decision:
+            self.step = self.strategy.next(self._state(table_deg))
         return self.ranked, self.step
 
     @abstractmethod
     def _rank(self, view: DescribedView) -> Ranked: ...
 
     @abstractmethod
-    def _decide(self, table_deg: float) -> Rotate | Finish: ...
+    def _state(self, table_deg: float) -> SearchState | DenseSearchState: ...
+
+    def decided(self, number: int, target_deg: float) -> Decided:
+        """Return the event of the last decision, a rotation of the table to ``target_deg``."""
+        step = self.step
+        assert isinstance(step, Rotate)
+        return Decided(
+            index=number,
+            side="left" if step.rotation_deg >= 0 else "right",
+            rotation_deg=step.rotation_deg,
+            target_deg=target_deg,
+            s_left=step.s_left,
+            s_right=step.s_right,
+            candidates=step.candidates[: self._top],
+            reason=RotationReason(step.reason),
+            note=step.note,
+            weighed=step.weighed,
+        )
 
     def frame_used(self, number: int, azimuth_deg: float, seconds: float, rejected: int) -> FrameUsed:
         """Return the event of the last frame of a search in motion; ``number`` counts the views from 0."""
         raise NotImplementedError("only the dense search takes frames in motion")
 
-    def end(
-        self, hypotheses: Hypotheses, *, travelled_deg: float = 0.0, seconds: float = 0.0
-    ) -> Generator[NeedEnrolledViews | Verified | Compared, Sequence[LocalView] | None, Identified]:
-        """End the search after its last view: yield what it needs, and the events of its last steps; return the answer.
-
-        A doubtful leader is verified first, then the two leaders are compared. The driver answers `NeedEnrolledViews`
-        with the views, or with None if they cannot be read.
-        """
-        if verified := (yield from self.verify(hypotheses)):
-            yield verified
-        if compared := (yield from self.compare(hypotheses)):
-            yield compared
-        return self.answer(travelled_deg=travelled_deg, seconds=seconds)
+    def last_steps(self, hypotheses: Hypotheses) -> tuple[Asking[Verified | None], Asking[Compared | None]]:
+        """Return the steps before the answer: a doubtful leader is verified, then the two leaders are compared."""
+        return self.verify(hypotheses), self.compare(hypotheses)
 
     def verify(self, hypotheses: Hypotheses, measured: Verification | None = None) -> Asking[Verified | None]:  # noqa: ARG002
         """Verify a doubtful leader, as `hbr.DenseSession.verify`; the answer depends on it."""
@@ -155,15 +166,14 @@ class HoughSearch(Search):
     """The paper's search: views vote by lists of the most similar enrolled views (`hbr.retrieve`)."""
 
     def __init__(
-        self, index: hbr.ViewIndex, config: RigConfig, strategy: Strategy[SearchState], *, seed: int, top: int
+        self, index: hbr.ViewIndex, config: RigConfig, strategy: Strategy[Any], *, seed: int, top: int
     ) -> None:
-        super().__init__(index.views, config, seed=seed, top=top)
+        super().__init__(index.views, config, strategy, seed=seed, top=top)
         given = config.identify.min_score
         self._min_score = (
             hbr.open_set_threshold(index.views, repeatability=config.identify.repeatability) if given is None else given
         )
         self._index = index
-        self._strategy = strategy
         self._descriptors: list[NDArray[np.uint8]] = []
 
     def _rank(self, view: DescribedView) -> Ranked:
@@ -185,8 +195,8 @@ class HoughSearch(Search):
         )
         return Ranked(views - 1, candidates, hbr.score_margin(ranking, queries) / views)
 
-    def _decide(self, table_deg: float) -> Rotate | Finish:
-        state = SearchState(
+    def _state(self, table_deg: float) -> SearchState:
+        return SearchState(
             index=self._index,
             queries=self._queries,
             ranking=self._ranking,
@@ -198,7 +208,6 @@ class HoughSearch(Search):
             config=self._config.identify,
             rng=self._rng,
         )
-        return self._strategy.next(state)
 
     def answer(self, *, travelled_deg: float = 0.0, seconds: float = 0.0) -> Identified:
         answer = super().answer(travelled_deg=travelled_deg, seconds=seconds)
@@ -234,13 +243,12 @@ class DenseSearch(Search):
         session: hbr.DenseSession,
         views: hbr.Views,
         config: RigConfig,
-        strategy: Strategy[DenseSearchState],
+        strategy: Strategy[Any],
         *,
         seed: int,
         top: int,
     ) -> None:
-        super().__init__(views, config, seed=seed, top=top)
-        self._strategy = strategy
+        super().__init__(views, config, strategy, seed=seed, top=top)
         self._session = session
 
     def _rank(self, view: DescribedView) -> Ranked:
@@ -276,14 +284,9 @@ class DenseSearch(Search):
         name = self.names[present.object_index]
         return FrameUsed(number, azimuth_deg, seconds, rejected, name, present.probability, present.outcome)
 
-    def _decide(self, table_deg: float) -> Rotate | Finish:
-        return self._next(table_deg, *reachable_rotations(self._config, table_deg))
-
-    def _next(
-        self, table_deg: float, rotations_deg: NDArray[np.float64], seconds: NDArray[np.float64]
-    ) -> Rotate | Finish:
-        """Ask the strategy, which chooses among these rotations of the camera."""
-        state = DenseSearchState(
+    def _state(self, table_deg: float) -> DenseSearchState:
+        rotations_deg, seconds = self._reachable(table_deg)
+        return DenseSearchState(
             session=self._session,
             decision=self._session.decision,
             rotations_deg=rotations_deg,
@@ -292,7 +295,10 @@ class DenseSearch(Search):
             config=self._config.identify,
             rng=self._rng,
         )
-        return self._strategy.next(state)
+
+    def _reachable(self, table_deg: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the rotations of the camera that the cable allows, and the time of each."""
+        return reachable_rotations(self._config, table_deg)
 
     def verify(self, hypotheses: Hypotheses, measured: Verification | None = None) -> Asking[Verified | None]:
         found = yield from self._session.verify(self._queries(hypotheses), measured)
@@ -362,12 +368,8 @@ class ArcSearch(DenseSearch):
     """The bench's own search in motion (`hbr.dense.arc`): each frame has a weight for its share of new evidence."""
 
     in_motion = True
-    _way = 0.0
-    """The direction of the last rotation; 0 before the first one."""
 
-    def _decide(self, table_deg: float) -> Rotate | Finish:
-        if not self.is_new_decision:
-            return self.step
-        step = self._next(table_deg, *reachable_arcs(self._config, table_deg, self._way))
-        self._way = float(np.sign(step.rotation_deg)) if isinstance(step, Rotate) else 0.0
-        return step
+    def _reachable(self, table_deg: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        before = getattr(self, "step", None)  # there is no step before the first view
+        way = float(np.sign(before.rotation_deg)) if isinstance(before, Rotate) else 0.0
+        return reachable_arcs(self._config, table_deg, way)

@@ -30,6 +30,14 @@ MAX_FILE_BYTES: Final = 16_000_000
 VERSION: Final = 1
 ERROR_RATE: Final = 0.01
 FALSE_REJECT: Final = 0.02
+THRESHOLDS: Final = (
+    "open_set_thresholds",
+    "unknown_thresholds",
+    "changed_bench_thresholds",
+    "same_bench_thresholds",
+    "leave_one_out_thresholds",
+)
+"""The fields of a rule with one score for each number of views; -inf is null in the file."""
 
 _CHUNK: Final = 16_384
 """Views whose digest is computed at once."""
@@ -210,33 +218,26 @@ def read_stopping_rule(folder: Path) -> StoredRule | None:
                 f"this program reads {FORMAT} {VERSION}"
             )
         usual = {str(name): [float(score) for score in scores] for name, scores in values["usual_scores"].items()}
+        numbers: dict[str, Any] = {name: float(values[name]) for name in ("beta", "error_rate", "false_reject")}
+        thresholds: dict[str, Any] = {name: tuple(_value_or(one, -inf) for one in values[name]) for name in THRESHOLDS}
         rule = hbr.StoppingRule(
-            beta=float(values["beta"]),
+            **numbers,
+            **thresholds,
             min_confidence=_value_or(values["min_confidence"], inf),
             usual_scores=np.array(list(usual.values()), np.float64),
-            open_set_thresholds=tuple(_value_or(threshold, -inf) for threshold in values["open_set_thresholds"]),
-            error_rate=float(values["error_rate"]),
-            false_reject=float(values["false_reject"]),
             false_accept=_value_or(values["false_accept"], nan),
             searches=int(values["searches"]),
             limitations=tuple(
                 Limitation(LimitationCode(one["code"]), dict(one["values"])) for one in values["limitations"]
             ),
             open_set=_open_set(values["open_set"]),
-            unknown_thresholds=tuple(_value_or(threshold, -inf) for threshold in values["unknown_thresholds"]),
-            changed_bench_thresholds=tuple(map(float, values["changed_bench_thresholds"])),
-            same_bench_thresholds=tuple(map(float, values["same_bench_thresholds"])),
-            leave_one_out_thresholds=tuple(
-                _value_or(threshold, -inf) for threshold in values["leave_one_out_thresholds"]
-            ),
             rates=tuple(ShiftRates(**one) for one in values["rates"]),
         )
         views = len(rule.open_set_thresholds)
-        on_benches = rule.changed_bench_thresholds, rule.same_bench_thresholds, rule.leave_one_out_thresholds
-        if not {len(thresholds) for thresholds in (rule.unknown_thresholds, *on_benches)} <= {0, views}:
+        if not {len(several) for several in thresholds.values()} <= {0, views}:
             raise ValueError("it does not have one threshold for each number of views")
         scores = rule.usual_scores
-        if scores.ndim != 2 or scores.shape[1] != len(rule.open_set_thresholds) or not np.isfinite(scores).all():
+        if scores.ndim != 2 or scores.shape[1] != views or not np.isfinite(scores).all():
             raise ValueError("it does not have one usual score for each object and number of views")
         return StoredRule(rule, tuple(usual), str(values["model"]["sha256"]), str(values["made_utc"]))
     except FileNotFoundError:

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from difflib import get_close_matches
 from importlib.metadata import entry_points
-from typing import Final, Protocol, TypeVar
+from typing import ClassVar, Final, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,6 @@ import hbr
 from hbr import Outcome, StopReason
 from hbr.core.angles import wrap180
 from hbr.dense.arc import ARC_DEG, STEP_DEG
-from hbr.dense.next_view import NextBestView
 from rig.config import IdentifyConfig, RigConfig
 from rig.core.errors import UsageError
 from rig.events.events import RotationReason, Weighed
@@ -43,9 +42,28 @@ _DRAWS: Final = 20
 State = TypeVar("State", contravariant=True)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SearchState:
-    """The state of the paper's search after a view.
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class _AnyState:
+    """What the state of each search has.
+
+    Attributes
+    ----------
+    table_deg
+        The table angle, unwrapped.
+    config
+        The settings of a search.
+    rng
+        For strategies that draw random numbers: seeded, so that a saved run can be computed again.
+    """
+
+    table_deg: float
+    config: IdentifyConfig
+    rng: np.random.Generator
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class SearchState(_AnyState):
+    """The state of the paper's search after a view; also ``table_deg``, ``config`` and ``rng``.
 
     Attributes
     ----------
@@ -59,12 +77,8 @@ class SearchState:
         Hough score and margin of the leading candidate, per view (`hbr.score_margin`).
     min_score
         Below this score per view the object is unknown.
-    table_deg, limits_deg
-        The table angle, unwrapped, and the limits of the cable.
-    config
-        The settings of a search.
-    rng
-        For strategies that draw random numbers: seeded, so that a saved run can be computed again.
+    limits_deg
+        The limits of the cable.
     """
 
     index: hbr.ViewIndex
@@ -73,10 +87,7 @@ class SearchState:
     score: float
     margin: float
     min_score: float
-    table_deg: float
     limits_deg: tuple[float, float]
-    config: IdentifyConfig
-    rng: np.random.Generator
 
     @property
     def views(self) -> int:
@@ -84,9 +95,9 @@ class SearchState:
         return len(self.queries)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class DenseSearchState:
-    """The state of the dense search after a view.
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class DenseSearchState(_AnyState):
+    """The state of the dense search after a view; also ``table_deg``, ``config`` and ``rng``.
 
     Attributes
     ----------
@@ -96,21 +107,12 @@ class DenseSearchState:
         The stopping rule's decision.
     rotations_deg, seconds : float64 arrays (a,)
         Rotations of the camera around the object that the cable allows, every 5°, and the time of each on this bench.
-    table_deg
-        The table angle, unwrapped.
-    config
-        The settings of a search.
-    rng
-        For strategies that draw random numbers: seeded, so that a saved run can be computed again.
     """
 
     session: hbr.DenseSession
     decision: hbr.StopDecision
     rotations_deg: NDArray[np.float64]
     seconds: NDArray[np.float64]
-    table_deg: float
-    config: IdentifyConfig
-    rng: np.random.Generator
 
     @property
     def views(self) -> int:
@@ -176,7 +178,7 @@ def is_in_motion(strategy: AnyStrategy) -> bool:
 
 def strategy_for(descriptor: str) -> AnyStrategy:
     """Return the default strategy for views by a descriptor."""
-    return Active() if descriptor == PAPER_DESCRIPTOR else Dense()
+    return BUILT_IN["ahbr" if descriptor == PAPER_DESCRIPTOR else "dense"]
 
 
 def reachable_rotations(config: RigConfig, table_deg: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -201,7 +203,7 @@ def reachable_arcs(config: RigConfig, table_deg: float, way: float) -> tuple[NDA
     ``way`` is the sign of the present rotation of the camera, 0 at rest. An arc in the other direction also takes the
     time for a reversal.
     """
-    speed = scan_speed(config, fps=config.camera.fps, gyro_range_dps=config.imu.range_dps, spacing_deg=None).dps
+    speed = scan_speed(config, config.imu.range_dps).dps
     low_deg, high_deg = config.table.limits_deg
     arcs_deg = np.arange(STEP_DEG, 180.0 + STEP_DEG, STEP_DEG)
     arcs_deg = np.concatenate([-arcs_deg[::-1], arcs_deg])
@@ -233,60 +235,59 @@ def end_by_views(state: SearchState) -> Finish | None:
     return Finish(StopReason.MAX_VIEWS) if state.views >= state.config.max_views else None
 
 
-class Active:
-    """AHBR: rotates to the side on which the candidates look less similar (Eq. 5-7); the first rotation is fixed."""
+@dataclass(frozen=True)
+class PaperStrategy:
+    """A strategy of the paper's search: the rule that ends it, and the choice of the next rotation."""
 
-    name = "ahbr"
-
-    def next(self, state: SearchState) -> Rotate | Finish:
-        if end := end_by_margin(state):
-            return end
-        if state.views == 1:
-            return Rotate(state.config.first_step_deg, RotationReason.FIRST_STEP)
-        decision = hbr.next_view(state.ranking)
-        names = state.ranking.views.object_names
-        several = len(decision.candidates) > 1
-        return Rotate(
-            decision.rotation_deg,
-            RotationReason.LESS_SIMILAR_SIDE if several else RotationReason.ONE_CANDIDATE,
-            s_left=decision.s_left,
-            s_right=decision.s_right,
-            candidates=tuple(names[i] for i in decision.candidates),
-        )
-
-
-class Sweep:
-    """Rotates in even steps of a revolution, one for each allowed view, until the margin is large enough."""
-
-    name = "sweep"
+    name: str
+    end: Callable[[SearchState], Finish | None]
+    rotate: Callable[[SearchState], Rotate]
 
     def next(self, state: SearchState) -> Rotate | Finish:
-        return end_by_margin(state) or Rotate(360.0 / state.config.max_views, RotationReason.EVEN_STEPS)
+        return self.end(state) or self.rotate(state)
 
 
-class Random:
-    """Takes random views that were not taken before, until the margin is large enough."""
-
-    name = "random"
-
-    def next(self, state: SearchState) -> Rotate | Finish:
-        return end_by_margin(state) or Rotate(_draw(state), RotationReason.RANDOM)
-
-
-class Passive:
-    """HBR as the paper measures it: takes all allowed views at random, then answers."""
-
-    name = "hbr"
-
-    def next(self, state: SearchState) -> Rotate | Finish:
-        return end_by_views(state) or Rotate(_draw(state), RotationReason.RANDOM)
+def to_less_similar_side(state: SearchState) -> Rotate:
+    """Rotate to the side on which the candidates look less similar (Eq. 5-7); the first rotation is fixed."""
+    if state.views == 1:
+        return Rotate(state.config.first_step_deg, RotationReason.FIRST_STEP)
+    decision = hbr.next_view(state.ranking)
+    names = state.ranking.views.object_names
+    several = len(decision.candidates) > 1
+    return Rotate(
+        decision.rotation_deg,
+        RotationReason.LESS_SIMILAR_SIDE if several else RotationReason.ONE_CANDIDATE,
+        s_left=decision.s_left,
+        s_right=decision.s_right,
+        candidates=tuple(names[i] for i in decision.candidates),
+    )
 
 
-class Dense:
-    """The bench's own: rotates to the next best view, motion time included, until the stopping rule ends the search."""
+def by_even_steps(state: SearchState) -> Rotate:
+    """Rotate by an even step of a revolution, one for each allowed view."""
+    return Rotate(360.0 / state.config.max_views, RotationReason.EVEN_STEPS)
 
-    name = "dense"
-    descriptor = BENCH_DESCRIPTOR
+
+def to_random_azimuth(state: SearchState) -> Rotate:
+    """Rotate to a random azimuth without a view; to the last one drawn if there is none."""
+    seen_deg = state.ranking.orientation_deg
+    for _ in range(_DRAWS):
+        rotation_deg = float(state.rng.uniform(-180.0, 180.0))
+        if np.all(np.abs(wrap180(seen_deg[-1] + rotation_deg - seen_deg)) > _REVISIT_DEG):
+            break
+    return Rotate(rotation_deg, RotationReason.RANDOM)
+
+
+@dataclass(frozen=True)
+class DenseStrategy:
+    """The bench's own: rotates to the next best view, motion time included, until the stopping rule ends the search.
+
+    In motion it rotates along the most informative arc, and decides again while the table rotates.
+    """
+
+    name: str
+    in_motion: bool = False
+    descriptor: ClassVar[str] = BENCH_DESCRIPTOR
 
     def next(self, state: DenseSearchState) -> Rotate | Finish:
         if state.decision.outcome is not Outcome.CONTINUE:
@@ -294,39 +295,35 @@ class Dense:
         if not len(state.rotations_deg):
             return Finish(StopReason.NO_ROTATION_LEFT)
         best = state.session.next_best_view(state.rotations_deg, state.seconds)
-        return _rotate(state, best)
+        names = state.session.belief.index.views.object_names
+        if best.pair is not None:
+            reason = RotationReason.SEPARATES_CANDIDATES
+        else:  # the strongest hypotheses are poses of one object, but the others together may be as likely
+            leading = state.session.belief.posterior(state.session.rule.beta).sum(axis=1).max()
+            reason = RotationReason.NEW_SIDE if leading >= ALONE else RotationReason.SEVERAL_POSES
+        return Rotate(
+            best.rotation_deg,
+            reason,
+            candidates=() if best.pair is None else tuple(names[i] for i in best.pair),
+            weighed=Weighed(
+                tuple(best.rotations_deg.tolist()),
+                tuple(best.confusion.tolist()),
+                tuple(best.cost.tolist()),
+                None if best.similarity is None else tuple(best.similarity.tolist()),
+            ),
+        )
 
 
-class Arc(Dense):
-    """The bench's own in motion: rotates along the most informative arc, and decides again while the table rotates."""
-
-    name = "arc"
-    in_motion = True
-
-
-def _rotate(state: DenseSearchState, best: NextBestView) -> Rotate:
-    names = state.session.belief.index.views.object_names
-    if best.pair is not None:
-        reason = RotationReason.SEPARATES_CANDIDATES
-    else:  # the strongest hypotheses are poses of one object, but the others together may be as likely
-        leading = state.session.belief.posterior(state.session.rule.beta).sum(axis=1).max()
-        reason = RotationReason.NEW_SIDE if leading >= ALONE else RotationReason.SEVERAL_POSES
-    return Rotate(
-        best.rotation_deg,
-        reason,
-        candidates=() if best.pair is None else tuple(names[i] for i in best.pair),
-        weighed=Weighed(
-            tuple(best.rotations_deg.tolist()),
-            tuple(best.confusion.tolist()),
-            tuple(best.cost.tolist()),
-            None if best.similarity is None else tuple(best.similarity.tolist()),
-        ),
-    )
-
-
-BUILT_IN: Final[dict[str, Callable[[], AnyStrategy]]] = {
-    strategy.name: strategy for strategy in (Dense, Arc, Active, Passive, Sweep, Random)
-}
+_OWN: Final[tuple[AnyStrategy, ...]] = (
+    DenseStrategy("dense"),
+    DenseStrategy("arc", in_motion=True),
+    PaperStrategy("ahbr", end_by_margin, to_less_similar_side),
+    PaperStrategy("hbr", end_by_views, to_random_azimuth),
+    PaperStrategy("sweep", end_by_margin, by_even_steps),
+    PaperStrategy("random", end_by_margin, to_random_azimuth),
+)
+BUILT_IN: Final = {strategy.name: strategy for strategy in _OWN}
+"""The rig's own strategies. ``hbr`` takes all allowed views at random, as the paper measures HBR."""
 
 
 def names() -> list[str]:
@@ -343,7 +340,7 @@ def strategy(name: str) -> AnyStrategy:
         There is none, or its plug-in cannot be loaded.
     """
     if name in BUILT_IN:
-        return BUILT_IN[name]()
+        return BUILT_IN[name]
     for point in entry_points(group=GROUP):
         if point.name == name:
             try:
@@ -361,13 +358,3 @@ def strategy(name: str) -> AnyStrategy:
         next_step=f"Did you mean {near[0]}?" if near else "Choose one of those listed.",
         evidence={"strategies": names()},
     )
-
-
-def _draw(state: SearchState) -> float:
-    """Return a random rotation to an azimuth without a view; the last one drawn if there is none."""
-    seen_deg = state.ranking.orientation_deg
-    for _ in range(_DRAWS):
-        rotation_deg = float(state.rng.uniform(-180.0, 180.0))
-        if np.all(np.abs(wrap180(seen_deg[-1] + rotation_deg - seen_deg)) > _REVISIT_DEG):
-            break
-    return rotation_deg

@@ -148,10 +148,10 @@ def irregular_stamps(stamps_ns: Sequence[int], period_s: float, jitter_ms: float
     Lost frames leave gaps of whole periods. The rhythm is that of most frames. Stamps that jumped, or that the computer
     set late, do not fit it. Fewer than `FEWEST_STAMPS` stamps are compared with the period alone.
     """
+    if len(stamps_ns) < 2:
+        return np.zeros(len(stamps_ns), np.bool_)
     times = (np.asarray(stamps_ns, np.int64) - stamps_ns[0]) * 1e-9
     limit_s = max(GRID_MS, GRID_SIGMAS * (jitter_ms if isfinite(jitter_ms) else 0.0)) * 1e-3
-    if len(times) < 2:
-        return np.zeros(len(times), np.bool_)
     steps = np.diff(times)
     whole = np.maximum(np.rint(steps / period_s), 1)
     if len(times) < FEWEST_STAMPS:

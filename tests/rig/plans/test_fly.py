@@ -18,14 +18,14 @@ from rig.motion.scan_speed import SpeedLimit
 from rig.plans.estimate import dry_run
 from rig.plans.tray import TrayItem, enroll_tray
 from rig.safety.saved_state import StateStore
-from rig.views.stream import after_middle_row_ns
+from rig.views.stream import FrameStream, after_middle_row_ns, irregular_stamps
 from sim.bench import ShelfOperator, open_sim_bench
 from sim.faults import Fault
 from sim.noise import NoiseModel
 from sim.objects.polyhedron import box
 from sim.objects.solid import Solid
 from sim.world import World
-from tests.rig.motion.times import SMALL, camera_time
+from tests.rig.motion.times import SMALL, camera_time, no_frame
 
 WHITE = (200, 200, 200)
 
@@ -222,3 +222,17 @@ def test_trays_fly_if_the_camera_time_is_calibrated(tmp_path: Path) -> None:
         assert any(isinstance(event, ScanStarted) for event in tray)
         single = list(enroll(bench, catalog, "lamp", views=4))
         assert not any(isinstance(event, ScanStarted) for event in single)
+
+
+def test_views_of_a_revolution_without_any_frame_are_taken_at_rest(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr(FrameStream, "next", no_frame)
+    with flying(tmp_path, *FAST, camera_readout_ms=0.0) as (bench, catalog, _):
+        events = list(enroll(bench, catalog, "block", views=4, fly=True))
+        views = [event for event in events if isinstance(event, Accepted)]
+        assert [view.evidence.motion for view in views] == [None] * 4
+        assert len(catalog.object("block").views) == 4
+
+
+@pytest.mark.parametrize("stamps_ns", [[], [7]])
+def test_time_stamps_that_are_too_few_to_compare_are_regular(stamps_ns: list[int]) -> None:
+    assert irregular_stamps(stamps_ns, 1 / 30, 0.2).tolist() == [False] * len(stamps_ns)

@@ -8,11 +8,10 @@ from rig.catalog import Catalog
 from rig.core.errors import NoObject
 from rig.events.events import Accepted, Failed, Identified, Ranked, ScanStarted, Started, Waiting
 from rig.plans.enroll import enroll
-from rig.plans.identify import identify
+from rig.plans.identify import identify, watch
 from rig.plans.operator import Choice, Subject
 from rig.plans.photograph_table import photograph_table
 from rig.plans.tray import enroll_tray
-from rig.plans.watch import watch
 from rig.search.model import load_model
 from sim.bench import ShelfOperator, open_sim_bench
 from sim.objects.shelf import shelf
@@ -128,7 +127,7 @@ def test_operator_of_a_tray_can_put_the_object_on_the_table_and_try_again(bench,
 
 def test_watch_reports_an_empty_table_and_waits_for_the_next_object(bench, model, world):
     answers = []
-    for event in watch(bench, lambda: model, strategy="dense"):
+    for event in watch(bench, lambda: identify(bench, model, strategy="dense")):
         if isinstance(event, Waiting) and answers:
             world.put(shelf()["lamp"])
         if isinstance(event, Failed | Identified):

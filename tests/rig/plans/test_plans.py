@@ -12,7 +12,6 @@ from rig.core.errors import (
     CatalogError,
     DeviceFault,
     DeviceSilent,
-    ObjectExists,
     ObjectNotFound,
     RigError,
     RotationDisagreement,
@@ -122,15 +121,6 @@ def test_interrupted_enrollment_keeps_its_views_and_resume_takes_the_missing_one
     taken = [e.index for e in enroll(s.bench, catalog, "lamp", resume=True) if isinstance(e, Accepted)]
     assert taken == [3, 4, 5]
     assert catalog.object("lamp").summary.views == 6
-
-
-def test_enrolled_object_is_replaced_only_on_request(simulated, catalog):
-    s = simulated()
-    list(enroll(s.bench, catalog, "dice", views=4))
-    with pytest.raises(ObjectExists):
-        next(enroll(s.bench, catalog, "dice", views=4))
-    list(enroll(s.bench, catalog, "dice", views=5, replace=True))
-    assert catalog.object("dice").summary.views == 5
 
 
 def test_conditions_of_a_view_are_stored_with_it(simulated, catalog):

@@ -15,11 +15,11 @@ from tests.rig.report.report_samples import identifying
 
 
 def stream(recorder: ResultRecorder, times: int = 1):
-    def events():
-        for _ in range(times):
-            yield from identifying()
-
-    return recorder.stream(events())
+    for _ in range(times):
+        for event in identifying():
+            yield event
+            if recorded := recorder.add(event):
+                yield recorded
 
 
 @pytest.fixture

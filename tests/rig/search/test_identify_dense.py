@@ -7,9 +7,8 @@ import hbr
 from rig.catalog import Catalog
 from rig.events.events import Accepted, Decided, Identified, Note, NoteCode, Ranked, RotationReason, Started, Warned
 from rig.plans.enroll import enroll
-from rig.plans.identify import identify
+from rig.plans.identify import identify, watch
 from rig.plans.photograph_table import photograph_table
-from rig.plans.watch import watch
 from rig.search.model import load_model
 from tests.small import SMALL
 
@@ -148,7 +147,7 @@ def test_watch_finds_objects_enrolled_meanwhile(simulated, tmp_path):
         list(enroll(s.bench, catalog, "lamp", views=4))
         s.operator.next_object = "lamp"
         names = []
-        for event in watch(s.bench, lambda: load_model(catalog)):
+        for event in watch(s.bench, lambda: identify(s.bench, load_model(catalog))):
             if isinstance(event, Identified):
                 names.append(event.name)
                 if len(names) == 2:

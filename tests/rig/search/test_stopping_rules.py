@@ -55,7 +55,7 @@ def search_for(
 ) -> tuple[str | None, int]:
     """Search with the nearest views of ``other``; return the name that was found, and the number of views."""
     config = RigConfig.model_validate({"identify": {"max_views": max_views}})
-    search, _ = begin_search(DenseModel(index, rule), config)
+    search = begin_search(DenseModel(index, rule), config)
     here_deg, taken = 0.0, 0
     while True:
         nearest = np.abs((other.azimuth_deg - here_deg + 180) % 360 - 180).argmin()
@@ -261,8 +261,8 @@ class Around:
 def test_custom_strategy_decides_on_the_dense_search():
     index = shelf(12, 12, 12)
     model = DenseModel(index, hbr.calibrate_stopping_rule(index).rule)
-    search, chosen = begin_search(model, RigConfig(), Around())
-    assert chosen.name == "around"
+    search = begin_search(model, RigConfig(), Around())
+    assert search.strategy.name == "around"
     for number in range(3):
         ranked, step = search.add(seen(index.views.descriptors[6 * (number % 2)]), 180.0 * number % 360, table_deg=0.0)
     assert isinstance(step, Finish)
@@ -280,8 +280,8 @@ def test_strategy_that_does_not_fit_the_model_is_rejected():
         with pytest.raises(UsageError, match="needs views by") as caught:
             begin_search(model, RigConfig(), name)
         assert "load_model" in caught.value.next_step
-    assert begin_search(dense, RigConfig())[1].name == "dense"
-    assert begin_search(papers, RigConfig())[1].name == "ahbr"
+    assert begin_search(dense, RigConfig()).strategy.name == "dense"
+    assert begin_search(papers, RigConfig()).strategy.name == "ahbr"
     with pytest.raises(CatalogError, match="empty"):
         begin_search(model_of(hbr.Views.empty()), RigConfig(), strategy("dense"))
 
@@ -293,7 +293,7 @@ def _cedd() -> tuple[np.ndarray, np.ndarray]:
 def test_search_ends_if_the_cable_allows_no_rotation():
     index = shelf(8, 8, 8)
     config = RigConfig.model_validate({"table": {"mode": "pan", "limits_deg": [-1, 1]}})
-    search, _ = begin_search(DenseModel(index, hbr.calibrate_stopping_rule(index).rule), config)
+    search = begin_search(DenseModel(index, hbr.calibrate_stopping_rule(index).rule), config)
     unknown = views_of("unknown", 8, seed=5)
     _, step = search.add(seen(unknown.descriptors[0]), 0.0, table_deg=0.0)
     assert step == Finish(hbr.StopReason.NO_ROTATION_LEFT)

@@ -35,7 +35,7 @@ def model(objects: int = 4, views: int = 12) -> hbr.Views:
 
 def searching(known: hbr.Views, chosen: Strategy | str, *, seed: int = 0, top: int = 5, **config: float) -> Search:
     settings = RigConfig(identify=IdentifyConfig(**config))  # type: ignore[arg-type]
-    return begin_search(model_of(known), settings, chosen, seed=seed, top=top)[0]
+    return begin_search(model_of(known), settings, chosen, seed=seed, top=top)
 
 
 def run(chosen: Strategy | str, *, seed: int = 0, **config: float) -> tuple[list[Rotate], Finish, list[float]]:

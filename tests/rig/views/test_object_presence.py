@@ -7,7 +7,7 @@ from rig.catalog import Catalog
 from rig.core.errors import DeviceSilent
 from rig.events.events import Failed, Identified, Waiting
 from rig.plans.enroll import enroll
-from rig.plans.watch import watch
+from rig.plans.identify import identify, watch
 from rig.search.model import model_of
 from rig.views.object_presence import TableWatcher, is_empty_table
 from sim.objects.shelf import shelf
@@ -134,7 +134,7 @@ def test_watch_identifies_objects_and_continues_after_a_failure(simulated, tmp_p
     s.bench.operator = TableWatcher(s.bench)
     upcoming = [("toy-car", 30.0), ("radio", 0.0), ("book-night", 200.0)]
     answers = []
-    for event in watch(s.bench, lambda: index):
+    for event in watch(s.bench, lambda: identify(s.bench, index)):
         if isinstance(event, Waiting):
             assert s.world.shaft()[0] == pytest.approx(
                 0.0, abs=1.0
