@@ -77,7 +77,7 @@ def setup(
     after = replace(settings) if path.exists() else now
     written = {".".join(key): value for key, value in changes.items()}
     settings.say(f"{done}\n", {"path": path, "written": write, "settings": written})
-    code = print_findings(after)
+    code = print_findings(after)["exit_code"]
     if not settings.json:
         move = f"rotate the table with {context.rig('goto 90')}, then enroll with {context.rig('enroll NAME')}."
         fix = f"fix the findings marked ✗, then run {context.rig('doctor')}."

@@ -18,6 +18,7 @@ from rig.cli.ui.prompts import TerminalOperator
 from rig.cli.ui.settings import Settings
 from rig.core.clock import Clock, SystemClock
 from rig.core.errors import RigError
+from rig.doctor.finding import Finding, finding_words
 from rig.events.events import Event, event_dict
 from rig.events.lines import line
 from rig.jobs.desk import Desk, Progress, Remark, Result, Steps
@@ -115,6 +116,8 @@ class CommandDesk(Desk):
                     case Progress() as progress:
                         values = {"event": "progress", "share": progress.share, "words": progress.words}
                         self._settings.say(progress.words, values)
+                    case Finding() as finding:
+                        self._settings.say(finding_words(finding), finding.as_dict())
                     case event if show is not None:
                         show(event)
                     case event:
