@@ -12,9 +12,8 @@ from rig.catalog.jobs import JobProgress
 from rig.catalog.journal import waiting
 from rig.catalog.local_copy import open_or_copy
 from rig.catalog.shared import BackgroundDelivery
-from rig.cli.ui import jobs
+from rig.cli.ui import prompts
 from rig.cli.ui.present import Progress as ProgressBar
-from rig.cli.ui.prompts import TerminalOperator
 from rig.cli.ui.settings import Settings
 from rig.core.clock import Clock, SystemClock
 from rig.core.errors import RigError
@@ -56,8 +55,8 @@ class CommandDesk(Desk):
     ) -> None:
         self.config = settings.load()
         self.place = settings.place
-        is_there = (with_json or not settings.json) and jobs.is_interactive()
-        self.operator: Operator = Unattended() if yes else TerminalOperator(is_there=is_there, before=before)
+        is_there = (with_json or not settings.json) and prompts.is_interactive()
+        self.operator: Operator = Unattended() if yes else prompts.TerminalOperator(is_there=is_there, before=before)
         self._settings = settings
         self._before = before
 

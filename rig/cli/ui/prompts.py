@@ -4,6 +4,10 @@ import sys
 from collections.abc import Callable, Sequence
 from typing import Final, TypeVar
 
+import typer
+
+from rig.cli.ui.exit_codes import EXIT_DECLINED
+from rig.cli.ui.settings import Settings
 from rig.cli.ui.terminal import unguarded
 from rig.core.errors import UsageError
 from rig.core.phrases import whole
@@ -109,6 +113,28 @@ def ask_yes_no(question: str, *, default: bool = False) -> bool:
         if answer in ("", "y", "yes", "n", "no"):
             return answer[0] == "y" if answer else default
         print("Answer y or n.", file=sys.stderr)
+
+
+def is_interactive() -> bool:
+    """Return whether an operator can answer questions: standard input is a terminal."""
+    return sys.stdin.isatty()
+
+
+def confirm(question: str, *, yes: bool, settings: Settings) -> None:
+    """Ask before a deletion.
+
+    Raises
+    ------
+    UsageError
+        There is no terminal to ask on, and ``yes`` is not set.
+    """
+    if yes:
+        return
+    if settings.json or not is_interactive():
+        raise UsageError(f"{question} This needs a confirmation.", next_step="Add --yes to confirm.")
+    if not ask_yes_no(question):
+        print("Nothing was changed.", file=sys.stderr)
+        raise typer.Exit(EXIT_DECLINED)
 
 
 def ask_choice(question: str, options: Sequence[str], *, other: str = "") -> int | None:
