@@ -16,6 +16,7 @@ from rig.config.catalog_place import CatalogPlace
 from rig.core.clock import Clock, SystemClock
 from rig.core.errors import CatalogBusy, CatalogError, RigError
 from rig.core.next_steps import SomeSteps
+from rig.doctor.finding import Finding
 from rig.events.events import Event
 from rig.plans.operator import Operator, Unattended
 
@@ -51,7 +52,7 @@ class Progress:
 
 
 T = TypeVar("T")
-Step = Event | Remark | Result | Progress
+Step = Event | Remark | Result | Progress | Finding
 Steps = Generator[Step, None, T]
 
 

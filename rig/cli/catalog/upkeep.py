@@ -11,8 +11,9 @@ from rig.cli.catalog.catalog import app
 from rig.cli.ui.command import command
 from rig.cli.ui.complete import object_names
 from rig.cli.ui.exit_codes import EXIT_CATALOG
-from rig.cli.ui.jobs import confirm, run_job, size_words
+from rig.cli.ui.jobs import run_job, size_words
 from rig.cli.ui.options import ClusterOption, DryImportOption, JobsOption, YesOption, descriptor_name, jobs_of
+from rig.cli.ui.prompts import confirm
 from rig.cli.ui.settings import Settings
 from rig.core.clock import SystemClock
 from rig.core.errors import UsageError
@@ -271,12 +272,8 @@ def _detail(key: str, value: Any) -> str:
         return name if value else ""
     if key.endswith("_deg") and isinstance(value, int | float):
         return f"{name} {angle_words(value)}"
-    return f"{name} {_short(value)}"
-
-
-def _short(value: Any) -> str:
     text = ", ".join(map(str, value)) if isinstance(value, list) else str(value)
-    return text if len(text) <= 60 else f"{text[:59]}…"
+    return f"{name} {text if len(text) <= 60 else f'{text[:59]}…'}"
 
 
 def _region(settings: Settings, text: str) -> Any:
