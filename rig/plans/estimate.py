@@ -151,16 +151,14 @@ def dry_run(
         name = clean_name(given)
         summary = known.get(name)
         action, obstacle = planned_action(summary, resume=resume, replace=replace, tray=len(names) > 1)
-        azimuths: Sequence[float] = ()
+        planned: Sequence[float] = ()
         if action in ("enroll", "replace"):
-            azimuths = even_azimuths(own_views or views or bench.config.enroll.views, limits_deg, sign)
-            angles = table_angles(azimuths, limits_deg, sign)
-        elif action == "resume" and catalog is not None and (kept := catalog.resumable(name)) is not None:
-            every = table_angles(kept.planned_azimuth_deg, limits_deg, sign)
-            azimuths = [kept.planned_azimuth_deg[index] for index in kept.missing]
-            angles = tuple(every[index] for index in kept.missing)
-        else:
-            angles = ()
+            planned = even_azimuths(own_views or views or bench.config.enroll.views, limits_deg, sign)
+        missing: Sequence[int] = range(len(planned))
+        if action == "resume" and catalog is not None and (kept := catalog.resumable(name)) is not None:
+            planned, missing = kept.planned_azimuth_deg, kept.missing
+        every = table_angles(planned, limits_deg, sign)
+        angles = tuple(every[index] for index in missing)
         in_motion = takes_in_motion(bench.config, fly, tray=len(names) > 1)
         scan = (angles[0], angles[0] + 360.0) if in_motion and angles else angles
         stops = [table_deg, *scan, 0.0] if angles else [table_deg]
@@ -171,7 +169,7 @@ def dry_run(
                 obstacle=obstacle,
                 enrolled_views=summary.views if summary else 0,
                 views=len(angles),
-                azimuths_deg=tuple(azimuths),
+                azimuths_deg=tuple(planned[index] for index in missing),
                 angles_deg=angles,
                 table_deg=table_deg,
                 limits_deg=limits_deg,
