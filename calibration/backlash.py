@@ -27,7 +27,7 @@ from calibration.procedure import (
 from rig.bench import Bench
 from rig.calibrations import CalibrationResult, RejectionCode
 from rig.charts.xy import MODEL, Axis, Chart, Series
-from rig.events.events import plain
+from rig.core.json_form import plain
 from rig.motion.turntable import Turntable
 from rig.plans.capture import moved
 

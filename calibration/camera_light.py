@@ -20,9 +20,9 @@ from calibration.procedure import Ask, Evaluation, Measured, Procedure
 from rig.bench import Bench
 from rig.calibrations import CalibrationResult, RejectionCode
 from rig.charts.xy import MODEL, Axis, Chart, Series
+from rig.core.json_form import plain
 from rig.core.phrases import percent
 from rig.devices.camera import CameraLocks
-from rig.events.events import plain
 from rig.jobs.desk import Progress
 from rig.views.capture import ImageQuality
 

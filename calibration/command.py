@@ -8,13 +8,12 @@ import typer
 
 from calibration.outcome import as_json, plain_value, stored_results
 from rig.cli.ui.command import command
+from rig.cli.ui.exit_codes import EXIT_QUALITY
 from rig.cli.ui.settings import Settings
 
 if TYPE_CHECKING:
     from calibration.procedure import Procedure
     from rig.views.charuco_board import Board
-
-EXIT_QUALITY = 6
 
 MARKER_SHARE = 11 / 15
 """Side of a marker over that of its square, on every printed board."""
@@ -241,7 +240,7 @@ def show(settings: Settings) -> None:
     Example: rig calibrate show --bench sim
     """
     from rig.calibrations import CalibrationStatus
-    from rig.events.events import plain
+    from rig.core.json_form import plain
 
     with settings.open_bench(tell=False) as bench:
         store, calibrations = stored_results(bench)
@@ -300,11 +299,8 @@ def run(settings: Settings, *procedures: "Procedure") -> None:
     """
     from calibration.jobs import calibrated
     from rig.cli.ui.desk import CommandDesk
-    from rig.cli.ui.jobs import is_interactive
-    from rig.cli.ui.operator import TerminalOperator
 
-    desk = CommandDesk(settings)
-    desk.operator = TerminalOperator(is_there=is_interactive())  # also with --json: a person must put the board there
+    desk = CommandDesk(settings, with_json=True)  # a person must put the board there
     if not desk.run(calibrated(desk, procedures)):
         raise typer.Exit(EXIT_QUALITY)
 

@@ -2,6 +2,7 @@
 
 from typing import TYPE_CHECKING, Any
 
+from rig.core.errors import UsageError
 from rig.core.phrases import in_unit
 
 if TYPE_CHECKING:
@@ -20,7 +21,6 @@ def stored_results(bench: "Bench") -> "tuple[CalibrationStore, list[BenchCalibra
 def in_force(bench: "Bench", name: str) -> "CalibrationResult":
     """Return the result called ``name`` that is in force on the bench. Raises `UsageError` if there is none."""
     from rig.calibrations import CalibrationStatus
-    from rig.core.errors import UsageError
 
     for calibration in stored_results(bench)[1]:
         if calibration.result.name == name and calibration.status is CalibrationStatus.IN_FORCE:
@@ -32,7 +32,7 @@ def in_force(bench: "Bench", name: str) -> "CalibrationResult":
 
 def as_json(result: "CalibrationResult") -> dict[str, Any]:
     """Return a result as JSON; each rejection also in words."""
-    from rig.events.events import plain
+    from rig.core.json_form import plain
 
     rejections = [{"code": r.code.name.lower(), "values": plain(r.values), "text": str(r)} for r in result.rejections]
     return {**plain(result), "rejections": rejections}

@@ -3,7 +3,7 @@
 Kinds of benches are plug-ins of the entry-point group `rig.benches`: `hardware`, `sim`, and those of other packages.
 """
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import asdict, dataclass, field
 from difflib import get_close_matches
@@ -11,6 +11,8 @@ from functools import cache, partial
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Protocol, runtime_checkable
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import BaseModel
 
 from rig.calibrations import CalibrationStatus, CalibrationStore, apparatus, apply_results
@@ -20,7 +22,7 @@ from rig.config.values import Values, config_mistakes, validate
 from rig.core.clock import Clock
 from rig.core.errors import ConfigError, RigError, TorqueStaysOn
 from rig.core.signals import uninterrupted
-from rig.devices.camera import Camera
+from rig.devices.camera import Camera, ShownCamera
 from rig.devices.head.head import RigHead
 from rig.devices.imu import Imu
 from rig.devices.on_demand import OnDemand
@@ -205,6 +207,7 @@ def open_bench(
     *,
     seed: int | None = None,
     devices: Collection[str] = DEVICES,
+    show_frame: Callable[[NDArray[np.uint8]], None] | None = None,
 ) -> Bench:
     """Open a bench by name; use it in a ``with`` block.
 
@@ -218,6 +221,8 @@ def open_bench(
         Seed of a simulated bench; a real one ignores it.
     devices
         Devices to open now; the others are opened when they are first used. The servo is always opened.
+    show_frame
+        Called with the image of each frame of the camera, which must be one of ``devices``.
 
     Raises
     ------
@@ -233,6 +238,8 @@ def open_bench(
     bench = kind.open(config, options, seed)
     try:
         bench.open_devices(devices)
+        if show_frame is not None:
+            bench.camera = ShownCamera(bench.camera, show_frame)
         calibrate(bench, CalibrationStore(config.calibration_path(bench.name)))
     except BaseException:
         bench.close()

@@ -19,7 +19,8 @@ _TICK_PX: Final = 18.0
 """Room for the number of a view."""
 _FAR: Final = 3.0
 """A threshold is off the scale if its distance from the scores exceeds their range by this factor."""
-_STEPS: Final = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5)
+_STEPS: Final = [digit * 10.0**power for power in range(-3, 308) for digit in (1, 2, 5)][2:]
+"""From 0.005: a damaged run may hold a score of any size."""
 
 
 def score_chart(
@@ -101,7 +102,7 @@ def _ticks(values: Sequence[float], min_score: float | None, *, several: bool) -
             low, high = min(low, min_score), max(high, min_score)
     for step in _STEPS:
         first, last = floor(low / step + 1e-9), ceil(high / step - 1e-9)
-        if last - first <= 6:
+        if last - first <= 6 and step > 1e-9 * max(abs(low), abs(high)):  # below, neighbouring numbers would be equal
             break
     return [step * i for i in range(min(first, last - 2), last + 1)]
 

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from copy import copy
 from importlib.metadata import entry_points, version
 from io import TextIOWrapper
-from typing import Annotated, Any
+from typing import Annotated, Any, Unpack
 
 import typer
 from typer.core import TyperGroup
@@ -17,17 +17,9 @@ from rig.cli.bench import config, doctor, find, head, jog, safety, serve, servo,
 from rig.cli.catalog import calibrate as rules
 from rig.cli.catalog import catalog, deliver, exchange, results, upkeep
 from rig.cli.objects import empty_table, enroll, evaluate, identify, runs
-from rig.cli.ui.command import (
-    BenchOption,
-    ConfigOption,
-    JsonOption,
-    NoColorOption,
-    SeedOption,
-    SetOption,
-    show_error,
-    without_color,
-)
+from rig.cli.ui.command import show_error, without_color
 from rig.cli.ui.exit_codes import EXIT_CODES
+from rig.cli.ui.options import CommonOptions, show_parameters, spread
 from rig.cli.ui.settings import Settings
 from rig.cli.ui.terminal import checked_output, discard
 from rig.core.control_characters import neutral
@@ -102,24 +94,22 @@ def _print_version(wanted: bool) -> None:
         raise typer.Exit
 
 
-@app.callback()
 def common(
     ctx: typer.Context,
-    bench: BenchOption = None,
-    config: ConfigOption = None,
-    overrides: SetOption = None,
-    seed: SeedOption = None,
-    json_: JsonOption = False,
-    _no_color: NoColorOption = False,
     _version: Annotated[
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
     ] = False,
+    **given: Unpack[CommonOptions],
 ) -> None:
     """Read the common options before the command; they can also follow it."""
-    ctx.obj = Settings().merged(bench, config, overrides, seed, json_)
+    values: dict[str, Any] = {**given}
+    values.pop("no_color")  # `main` has looked for it already
+    ctx.obj = Settings().merged(**values)
 
 
 common.__doc__ = None  # or it would replace the help of the app
+show_parameters(common, spread(common))
+app.callback()(common)
 
 OBJECTS, BENCH, MORE = "Objects", "Bench", "More"  # panels of the help
 

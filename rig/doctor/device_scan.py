@@ -49,6 +49,18 @@ class FoundCamera:
     modes: tuple[VideoMode, ...] = ()
 
 
+@dataclass(frozen=True, slots=True)
+class Candidate:
+    """A device that may be the servo, the IMU or the camera of the table, in words, and its settings by key.
+
+    ``file`` is its own device file, if it disappears when the device is unplugged.
+    """
+
+    words: str
+    settings: dict[Key, Any]
+    file: DeviceFile | None = None
+
+
 @dataclass
 class DeviceScan:
     """A scan of all ports, buses and cameras, and the devices found.
@@ -70,6 +82,50 @@ class DeviceScan:
     heads: list[SerialPort] = field(default_factory=list)
     duplicate_ids: bool = False
     """Two servos with the same id were found."""
+
+    @property
+    def candidates(self) -> dict[str, list[Candidate]]:
+        """The devices found that the rig can use, by what they may be."""
+        servos = [
+            Candidate(
+                f"{port.path}: {found}",
+                {
+                    ("servo", "port"): port.stable or port.path,
+                    ("servo", "baud"): found.baud,
+                    ("servo", "id"): found.bus_id,
+                    ("servo", "model"): found.model,
+                },
+                port,
+            )
+            for port, found in self.servos
+        ]
+        imus = [
+            Candidate(
+                str(found),
+                {
+                    ("imu", "model"): found.driver,
+                    ("imu", "bus"): _number_or(found.bus, found.bus.removeprefix("/dev/i2c-")),
+                    ("imu", "address"): found.address,
+                },
+            )
+            for found in self.imus
+        ]
+        heads = [
+            Candidate(
+                f"on the rig head at {port.path}",
+                {("imu", "connection"): "head", ("head", "port"): port.stable or port.path},
+            )
+            for port in self.heads
+        ]
+        cameras = [
+            Candidate(f"{c.node.path}: {c.node.name}, {c.width}x{c.height}", camera_settings(c), c.node)
+            for c in self.cameras
+        ]
+        ribbons = [
+            Candidate(f"on ribbon cable {number}", {("camera", "source"): f"picamera2:{number}"})
+            for number in self.ribbons
+        ]
+        return {"servo": servos, "IMU": imus + heads, "camera": cameras + ribbons}
 
     @property
     def checks(self) -> tuple[Check, ...]:
@@ -231,43 +287,13 @@ def ribbon_camera(name: str, number: int) -> Finding:
     return fine("camera", FindingCode.RIBBON_CAMERA, **place)
 
 
-def servo_settings(port: SerialPort, servo: FoundServo) -> dict[Key, Any]:
-    """Return the settings of this servo, by key."""
-    return {
-        ("servo", "port"): port.stable or port.path,
-        ("servo", "baud"): servo.baud,
-        ("servo", "id"): servo.bus_id,
-        ("servo", "model"): servo.model,
-    }
-
-
-def imu_settings(found: FoundImu) -> dict[Key, Any]:
-    """Return the settings of this IMU, by key."""
-    number = found.bus.removeprefix("/dev/i2c-")
-    bus = int(number) if number.isdigit() else found.bus
-    where: dict[Key, Any] = {("imu", "model"): found.driver, ("imu", "bus"): bus, ("imu", "address"): found.address}
-    return where
-
-
-def head_settings(port: SerialPort) -> dict[Key, Any]:
-    """Return the settings of the IMU on a rig head, by key."""
-    return {("imu", "connection"): "head", ("head", "port"): port.stable or port.path}
-
-
-def ribbon_settings(number: int) -> dict[Key, Any]:
-    """Return the settings of a camera on a ribbon cable, by key."""
-    return {("camera", "source"): f"picamera2:{number}"}
-
-
 def camera_settings(found: FoundCamera) -> dict[Key, Any]:
     """Return the settings of this camera, by key; its number may change after a restart.
 
     The mode is the offered one that is nearest to the default. The region of another size is the square in its middle.
     """
     number = Path(found.node.path).name.removeprefix("video")
-    keys: dict[Key, Any] = {
-        ("camera", "source"): found.node.stable or (int(number) if number.isdigit() else found.node.path)
-    }
+    keys: dict[Key, Any] = {("camera", "source"): found.node.stable or _number_or(found.node.path, number)}
     usual = CameraConfig()
     mode = choose_mode(found.modes, usual.width, usual.height, usual.fps)
     if mode is not None and (mode.width, mode.height) != (usual.width, usual.height):
@@ -277,3 +303,8 @@ def camera_settings(found: FoundCamera) -> dict[Key, Any]:
     if mode is not None and 0 < mode.fps < 0.9 * usual.fps:
         keys[("camera", "fps")] = round(mode.fps, 3)
     return keys
+
+
+def _number_or(path: str, number: str) -> int | str:
+    """Return the number of a device file, or its path if it is not named by a number."""
+    return int(number) if number.isdigit() else path

@@ -7,10 +7,9 @@ Decision: docs/decisions/0063.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, is_dataclass
-from enum import Enum, StrEnum
+from dataclasses import dataclass, field
+from enum import StrEnum
 from functools import cache
-from math import isfinite
 from typing import Annotated, Any, Final, Literal
 
 from pydantic import ConfigDict, Discriminator, Field, GetCoreSchemaHandler, TypeAdapter, ValidationError
@@ -587,18 +586,3 @@ def event_of(values: Mapping[str, Any]) -> Event:
     except ValidationError as error:
         first = error.errors(include_url=False, include_context=False, include_input=False)[0]
         raise ValueError(": ".join(map(str, (*first["loc"], first["msg"])))) from error
-
-
-def plain(value: Any) -> Any:
-    """Return ``value`` as JSON values: dataclasses as dicts, tuples as lists, numbers that are not finite as None."""
-    if is_dataclass(value) and not isinstance(value, type):
-        return {f.name: plain(getattr(value, f.name)) for f in fields(value)}
-    if isinstance(value, Enum):
-        return value.value
-    if isinstance(value, tuple | list):
-        return [plain(v) for v in value]
-    if isinstance(value, dict):
-        return {k: plain(v) for k, v in value.items()}
-    if isinstance(value, float) and not isfinite(value):
-        return None
-    return value

@@ -10,10 +10,11 @@ from rig.bench import Bench, ObjectAlreadyPlaced
 from rig.bench.bench import DEVICES
 from rig.catalog import Action, Catalog
 from rig.catalog.jobs import JobProgress
+from rig.catalog.shared import deliver_journal, delivery_words, failure_words, open_for_enrollment
 from rig.config import RigConfig
 from rig.config.catalog_place import CatalogPlace
 from rig.core.clock import Clock, SystemClock
-from rig.core.errors import RigError
+from rig.core.errors import CatalogBusy, CatalogError, RigError
 from rig.events.events import Event
 from rig.plans.operator import Operator, Unattended
 
@@ -63,11 +64,14 @@ class Desk(ABC):
         The configuration of the bench before it is opened.
     place
         Place of the bench's catalog.
+    log_waits_for_server
+        Whether an action on the bench may wait until a catalog on a server has its entry in the log.
     """
 
     operator: Operator
     config: RigConfig
     place: CatalogPlace
+    log_waits_for_server = True
 
     @abstractmethod
     def open_bench(self, devices: Iterable[str] = DEVICES) -> AbstractContextManager[Bench]:
@@ -81,13 +85,19 @@ class Desk(ABC):
     def open_to_read(self) -> Catalog:
         """Open the catalog for a search; if its server does not answer, its local copy."""
 
-    @abstractmethod
     def open_to_enroll(self, clock: Clock) -> Catalog:
         """Open the catalog for new views, which ``clock`` dates; if it is on a server, the journal."""
+        return open_for_enrollment(self.place, clock)
 
-    @abstractmethod
     def deliver(self) -> Iterator[Remark]:
-        """Deliver the journal to the server of the catalog, if it has one."""
+        """Deliver the journal to the server of the catalog, if it has one; it keeps what cannot be delivered."""
+        if self.place.url is None:
+            return
+        try:
+            for one in deliver_journal(self.place, SystemClock()):
+                yield Remark(delivery_words(one, self.place), is_warning=one.conflict is not None)
+        except (CatalogError, CatalogBusy) as error:
+            yield Remark(failure_words(error))
 
     def preparing(self) -> AbstractContextManager[Callable[[JobProgress], None]]:
         """Return a display of the progress while the views of the catalog are read for the first time."""
@@ -95,7 +105,7 @@ class Desk(ABC):
 
     def log(self, action: Action, **details: Any) -> Iterator[Remark]:
         """Write an action on the bench into the log of its catalog, if it has one."""
-        if not self.place.may_exist():
+        if not self.place.may_exist() or not (self.place.url is None or self.log_waits_for_server):
             return
         try:
             with Catalog.open(self.place, clock=SystemClock()) as catalog:

@@ -21,8 +21,9 @@ from hbr.core.angles import wrap360
 from rig.bench import Bench
 from rig.catalog import Enrollment, ViewRecord
 from rig.core.errors import LimitExceeded, ObjectMoved, RotationDisagreement
+from rig.core.json_form import plain
 from rig.core.phrases import angle_words
-from rig.events.events import Event, Rejected, ScanStarted, plain
+from rig.events.events import Event, Rejected, ScanStarted
 from rig.motion.flight_views import FlightFrames
 from rig.motion.move import Move
 from rig.motion.scan_speed import scan_speed

@@ -8,8 +8,9 @@ from hbr.segmentation import MIN_AGREEMENT
 from rig.bench import Bench, TableClearer
 from rig.core.clock import seconds_between
 from rig.core.errors import TableNotEmpty, UsageError
+from rig.core.json_form import plain
 from rig.core.phrases import percent
-from rig.events.events import EmptyTableImage, Event, Note, NoteCode, Warned, plain
+from rig.events.events import EmptyTableImage, Event, Note, NoteCode, Warned
 from rig.motion.turntable import Turntable
 from rig.plans.capture import announced, capture
 from rig.plans.enroll_views import SAME_SIMILARITY

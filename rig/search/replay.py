@@ -7,6 +7,7 @@ from typing import Any, Final
 
 from hbr.dense.enrolled_views import answered
 from hbr.dense.verification import Verification
+from rig.core.json_form import plain
 from rig.events.compared import Compared, Verified
 from rig.events.events import (
     Accepted,
@@ -17,7 +18,6 @@ from rig.events.events import (
     Moved,
     Ranked,
     event_dict,
-    plain,
 )
 from rig.search.comparison import saved_enrolled_views
 from rig.search.model import begin_search

@@ -20,7 +20,8 @@ from hbr.dense.stopping import Limitation, LimitationCode, ShiftRates
 from hbr.descriptors import descriptor
 from rig.core.errors import CatalogError, os_errors_as
 from rig.core.files import json_values, read, write
-from rig.events.events import Note, NoteCode, plain
+from rig.core.json_form import plain
+from rig.events.events import Note, NoteCode
 
 FILE: Final = "search_rules.json"
 """Beside ``catalog.sqlite``."""

@@ -3,26 +3,26 @@
 from importlib.metadata import version
 from typing import Any
 
-from fastapi import APIRouter, Request, Response
+from fastapi import Request, Response
 
-from rig.web.server import COOKIE, HandOverBody, LeaseBody, LoginBody, Server, Watcher, require_operate
+from rig.web.server import COOKIE, HandOverBody, LeaseBody, LoginBody, Routes, Server, Watcher, require_operate
 
 
-def add_access(api: APIRouter, server: Server) -> None:
-    @api.get("/health", tags=["server"])
+def add_access(routes: Routes, server: Server) -> None:
+    @routes.anybody.get("/health", tags=["server"])
     def health() -> dict[str, Any]:
         """Return whether the server works; needs no login."""
         status = server.remote.status
         return {"status": "ok", "version": version("hbr-rig"), "bench_open": bool(status.get("open"))}
 
-    @api.post("/login", tags=["access"])
+    @routes.anybody.post("/login", tags=["access"])
     def login(body: LoginBody, response: Response) -> dict[str, Any]:
         """Log in with a token; the answer sets a cookie."""
         secret, person = server.sessions.login(body.token)
         response.set_cookie(COOKIE, secret, httponly=True, samesite="strict", secure=server.secure_cookies, path="/")
         return {"name": person.name, "role": person.role}
 
-    @api.post("/logout", tags=["access"])
+    @routes.anybody.post("/logout", tags=["access"])
     def logout(request: Request, response: Response) -> dict[str, Any]:
         """Log out. The open streams of this login end."""
         server.sessions.logout(request.cookies.get(COOKIE, ""))
@@ -30,39 +30,39 @@ def add_access(api: APIRouter, server: Server) -> None:
         response.delete_cookie(COOKIE, path="/")
         return {}
 
-    @api.get("/me", tags=["access"])
+    @routes.watch.get("/me", tags=["access"])
     def me(person: Watcher) -> dict[str, Any]:
         """Return who is logged in, and who has the lease."""
         holder = server.lease.holder
         mine = holder is not None and holder.key == person.key
         return {"name": person.name, "role": person.role, "has_lease": mine, "lease": server.lease.as_json()}
 
-    @api.get("/lease", tags=["access"])
-    def lease(_person: Watcher) -> dict[str, Any]:
+    @routes.watch.get("/lease", tags=["access"])
+    def lease() -> dict[str, Any]:
         """Return who has the lease."""
         return server.lease.as_json()
 
-    @api.post("/lease", tags=["access"])
+    @routes.watch.post("/lease", tags=["access"])
     def take_lease(body: LeaseBody, person: Watcher) -> dict[str, Any]:
         """Take or renew the lease."""
         require_operate(person)
         server.lease.take(person, force=body.force)
         return server.lease.as_json()
 
-    @api.post("/lease/ask", tags=["access"])
+    @routes.watch.post("/lease/ask", tags=["access"])
     def ask_lease(person: Watcher) -> dict[str, Any]:
         """Ask the operator who has the lease to hand it over."""
         require_operate(person)
         server.lease.ask(person)
         return server.lease.as_json()
 
-    @api.post("/lease/hand-over", tags=["access"])
+    @routes.watch.post("/lease/hand-over", tags=["access"])
     def hand_over(body: HandOverBody, person: Watcher) -> dict[str, Any]:
         """Give the lease to an operator who asked for it."""
         server.lease.hand_over(person, body.name, body.client)
         return server.lease.as_json()
 
-    @api.delete("/lease", tags=["access"])
+    @routes.watch.delete("/lease", tags=["access"])
     def release(person: Watcher) -> dict[str, Any]:
         """Give the lease back."""
         server.lease.release(person)

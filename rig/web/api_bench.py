@@ -5,7 +5,7 @@ import json
 from contextlib import aclosing
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Header, Query, Request, Response, WebSocket, WebSocketDisconnect
+from fastapi import Header, Request, Response, WebSocket, WebSocketDisconnect
 from fastapi.responses import StreamingResponse
 
 from rig.core.errors import JobNotFound, TooManyListeners
@@ -14,7 +14,7 @@ from rig.web.hub import MAX_LISTENERS
 from rig.web.problems import problem
 from rig.web.remote_bench import BOUNDARY
 from rig.web.requests import Job, JobRequest
-from rig.web.server import AnswerBody, Limit, OperatorPerson, Server, Watcher, page_of
+from rig.web.server import AnswerBody, Operator, Page, Routes, Server
 
 MAX_VIEWERS = 50
 
@@ -25,27 +25,27 @@ class EventStream(StreamingResponse):
     media_type = "text/event-stream"
 
 
-def add_bench(api: APIRouter, server: Server) -> None:
-    @api.get("/status", tags=["bench"])
-    def status(_person: Watcher) -> dict[str, Any]:
+def add_bench(routes: Routes, server: Server) -> None:
+    @routes.watch.get("/status", tags=["bench"])
+    def status() -> dict[str, Any]:
         """Return the state of the bench, as of the last second."""
         return _status(server)
 
-    @api.post("/stop", tags=["bench"])
-    async def stop(_person: Watcher) -> dict[str, Any]:
+    @routes.watch.post("/stop", tags=["bench"])
+    async def stop() -> dict[str, Any]:
         """Stop the table, and cancel all jobs. Needs no lease. The answer says whether the bench has confirmed it."""
         return {**await server.remote.stop(), "status": server.remote.status}
 
-    @api.get("/events", tags=["bench"], response_class=EventStream, responses={200: {"model": JobMessage}})
+    @routes.watch.get("/events", tags=["bench"], response_class=EventStream, responses={200: {"model": JobMessage}})
     async def events(
-        request: Request, _person: Watcher, last_event_id: Annotated[str | None, Header(max_length=64)] = None
+        request: Request, last_event_id: Annotated[str | None, Header(max_length=64)] = None
     ) -> EventStream:
         """Send events: plan, job, status, lease, stop. `Last-Event-ID` continues after a lost connection."""
         _check_number(server.hub.listeners, MAX_LISTENERS)
         headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
         return EventStream(server.hub.stream(last_event_id, lambda: server.still_allowed(request)), headers=headers)
 
-    @api.websocket("/socket")
+    @routes.anybody.websocket("/socket")
     async def socket(socket: WebSocket) -> None:
         """Send the events to a page, and take its STOP: the connection is open already, and no other can occupy it."""
         if not server.still_allowed(socket) or server.hub.listeners >= MAX_LISTENERS:
@@ -64,8 +64,8 @@ def add_bench(api: APIRouter, server: Server) -> None:
         finally:
             sending.cancel()
 
-    @api.get("/picture", tags=["bench"], response_class=Response)
-    async def picture(_person: Watcher) -> Response:
+    @routes.watch.get("/picture", tags=["bench"], response_class=Response)
+    async def picture() -> Response:
         """Return the newest frame of the camera as JPEG; the header X-Rig-Picture-Age has its age in seconds."""
         _, content, age_s = await server.remote.picture()
         if not content:
@@ -73,8 +73,8 @@ def add_bench(api: APIRouter, server: Server) -> None:
         headers = {"Cache-Control": "no-store", "X-Rig-Picture-Age": f"{age_s or 0.0:.2f}"}
         return Response(content, media_type="image/jpeg", headers=headers)
 
-    @api.get("/live", tags=["bench"], response_class=StreamingResponse)
-    async def live(request: Request, _person: Watcher) -> StreamingResponse:
+    @routes.watch.get("/live", tags=["bench"], response_class=StreamingResponse)
+    async def live(request: Request) -> StreamingResponse:
         """Send the camera's frames as MJPEG."""
         _check_number(server.remote.viewers, MAX_VIEWERS)
         kind = f"multipart/x-mixed-replace; boundary={BOUNDARY}"
@@ -111,46 +111,44 @@ def _check_number(present: int, most: int) -> None:
         )
 
 
-def add_jobs(api: APIRouter, server: Server) -> None:
-    @api.get("/jobs", tags=["jobs"])
-    def jobs(
-        request: Request, _person: Watcher, limit: Limit = 50, after: Annotated[str | None, Query(max_length=32)] = None
-    ) -> Response:
+def add_jobs(routes: Routes, server: Server) -> None:
+    @routes.watch.get("/jobs", tags=["jobs"])
+    def jobs(page: Page) -> Response:
         """List the jobs, the newest first."""
-        return page_of(request, server.remote.jobs(), "id", limit, after)
+        return page.of(server.remote.ask("jobs"), "id")
 
-    @api.post("/jobs", tags=["jobs"], status_code=201)
-    def submit(body: JobRequest, person: OperatorPerson) -> Job:
+    @routes.operate.post("/jobs", tags=["jobs"], status_code=201, response_model=Job)
+    def submit(body: JobRequest, person: Operator) -> Any:
         """Add a job to the queue."""
-        return server.remote.submit(body, person.name)
+        return server.remote.ask("submit", request=body, operator=person.name)
 
-    @api.get("/jobs/{job_id}", tags=["jobs"])
-    def job(job_id: str, _person: Watcher) -> Job:
+    @routes.watch.get("/jobs/{job_id}", tags=["jobs"], response_model=Job)
+    def job(job_id: str) -> Any:
         """Return a job."""
-        return server.remote.job(job_id)
+        return server.remote.ask("job", job_id=job_id)
 
-    @api.post("/jobs/{job_id}/cancel", tags=["jobs"])
-    def cancel(job_id: str, _person: OperatorPerson) -> Job:
+    @routes.operate.post("/jobs/{job_id}/cancel", tags=["jobs"], response_model=Job)
+    def cancel(job_id: str) -> Any:
         """Cancel a job. A running one ends at its next step; views that were taken stay stored."""
-        return server.remote.cancel(job_id)
+        return server.remote.ask("cancel", job_id=job_id)
 
-    @api.post("/jobs/{job_id}/pause", tags=["jobs"])
-    def pause(job_id: str, _person: OperatorPerson) -> Job:
+    @routes.operate.post("/jobs/{job_id}/pause", tags=["jobs"], response_model=Job)
+    def pause(job_id: str) -> Any:
         """Pause a job after its present view; the table holds its angle."""
-        return server.remote.pause(job_id)
+        return server.remote.ask("pause", job_id=job_id)
 
-    @api.post("/jobs/{job_id}/resume", tags=["jobs"])
-    def resume(job_id: str, _person: OperatorPerson) -> Job:
+    @routes.operate.post("/jobs/{job_id}/resume", tags=["jobs"], response_model=Job)
+    def resume(job_id: str) -> Any:
         """Resume a paused job."""
-        return server.remote.resume(job_id)
+        return server.remote.ask("resume", job_id=job_id)
 
-    @api.post("/jobs/{job_id}/answer", tags=["jobs"])
-    def answer(job_id: str, body: AnswerBody, _person: OperatorPerson) -> Job:
+    @routes.operate.post("/jobs/{job_id}/answer", tags=["jobs"], response_model=Job)
+    def answer(job_id: str, body: AnswerBody) -> Any:
         """Answer the question of a job."""
-        return server.remote.answer(job_id, body.choice)
+        return server.remote.ask("answer", job_id=job_id, choice=body.choice)
 
-    @api.get("/jobs/{job_id}/views/{number}", tags=["jobs"], response_class=Response)
-    def view(job_id: str, number: int, _person: Watcher) -> Response:
+    @routes.watch.get("/jobs/{job_id}/views/{number}", tags=["jobs"], response_class=Response)
+    def view(job_id: str, number: int) -> Response:
         """Return a picture of a recent job as JPEG, the first with number 0."""
-        found = server.remote.view(job_id, number)
+        _, found = server.remote.link.call("view", job_id=job_id, number=number)
         return Response(found, media_type="image/jpeg", headers={"Cache-Control": "private, max-age=3600"})

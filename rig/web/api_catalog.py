@@ -6,7 +6,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated, Any, Final
 
-from fastapi import APIRouter, Query, Request, Response
+from fastapi import Query, Request, Response
 from fastapi.responses import StreamingResponse
 from pydantic import Field
 from starlette.background import BackgroundTask
@@ -16,21 +16,10 @@ from rig.catalog.edit import delete, deleted_objects, rename, set_texts, undelet
 from rig.catalog.exchange import Conflict, import_objects, plan_import, read_bundle, read_objects, write_bundle
 from rig.catalog.jobs import finished
 from rig.catalog.prepared import searched_views
-from rig.events.events import plain
+from rig.core.json_form import plain
 from rig.plans.similar_objects import similar_objects
 from rig.web.picture import jpeg
-from rig.web.server import (
-    API,
-    Limit,
-    NameBody,
-    ObjectBody,
-    OperatorPerson,
-    Server,
-    Watcher,
-    long_work,
-    page_of,
-    time_text,
-)
+from rig.web.server import API, NameBody, ObjectBody, Page, Routes, Server, cached, long_work, time_text
 
 THUMB_PX: Final = 256
 UPLOAD: Final = f"{API}/import"
@@ -57,15 +46,12 @@ class _Download:
                 yield chunk
 
 
-def add_catalog(api: APIRouter, server: Server) -> None:
+def add_catalog(routes: Routes, server: Server) -> None:
     download = _Download()
 
-    @api.get("/objects", tags=["catalog"])
+    @routes.watch.get("/objects", tags=["catalog"])
     def objects(
-        request: Request,
-        _person: Watcher,
-        limit: Limit = 100,
-        after: Annotated[str | None, Query(max_length=100)] = None,
+        page: Page,
         search: Annotated[str, Query(max_length=100, description="part of the name, label or note")] = "",
         deleted: Annotated[bool, Query(description="list the deleted objects that can be restored")] = False,
     ) -> Response:
@@ -79,10 +65,10 @@ def add_catalog(api: APIRouter, server: Server) -> None:
             for one in found
             if wanted in f"{one.name}\n{one.label}\n{one.note}".casefold()
         ]
-        return page_of(request, sorted(rows, key=lambda row: row["name"]), "name", limit, after)
+        return page.of(sorted(rows, key=lambda row: row["name"]), "name")
 
-    @api.get("/objects/{name:path}", tags=["catalog"])
-    def one_object(name: str, _person: Watcher) -> dict[str, Any]:
+    @routes.watch.get("/objects/{name:path}", tags=["catalog"])
+    def one_object(name: str) -> dict[str, Any]:
         """Return an object with its enrollments and views."""
         with server.catalog.open_to_read() as catalog:
             found = catalog.object(name)
@@ -113,8 +99,8 @@ def add_catalog(api: APIRouter, server: Server) -> None:
             "similar": plain(similar) if similar else None,
         }
 
-    @api.patch("/objects/{name:path}", tags=["catalog"])
-    def change(name: str, body: ObjectBody, _person: OperatorPerson) -> dict[str, Any]:
+    @routes.operate.patch("/objects/{name:path}", tags=["catalog"])
+    def change(name: str, body: ObjectBody) -> dict[str, Any]:
         """Rename or label an object."""
         with server.catalog.open_to_change() as catalog:
             set_texts(catalog, name, label=body.label, note=body.note)
@@ -122,42 +108,42 @@ def add_catalog(api: APIRouter, server: Server) -> None:
                 rename(catalog, name, body.name)
             return _summary(catalog.summary(body.name or name))
 
-    @api.delete("/objects/{name:path}", tags=["catalog"])
-    def remove(name: str, _person: OperatorPerson) -> dict[str, Any]:
+    @routes.operate.delete("/objects/{name:path}", tags=["catalog"])
+    def remove(name: str) -> dict[str, Any]:
         """Delete an object. It can be restored until rig catalog gc removes it."""
         with server.catalog.open_to_change() as catalog:
             delete(catalog, name)
         return {"deleted": name}
 
-    @api.post("/undelete", tags=["catalog"])
-    def restore(body: NameBody, _person: OperatorPerson) -> dict[str, Any]:
+    @routes.operate.post("/undelete", tags=["catalog"])
+    def restore(body: NameBody) -> dict[str, Any]:
         """Restore a deleted object."""
         with server.catalog.open_to_change() as catalog:
             undelete(catalog, body.name)
             return _summary(catalog.summary(body.name))
 
-    @api.get("/views/{view_id}/image", tags=["catalog"], response_class=Response)
+    @routes.watch.get("/views/{view_id}/image", tags=["catalog"], response_class=Response)
     def image(
         request: Request,
-        _person: Watcher,
         view_id: Annotated[int, Field(ge=0, lt=2**62)],
         full: Annotated[bool, Query(description="the stored PNG instead of a small JPEG")] = False,
     ) -> Response:
         """Return the image of a view."""
         with server.catalog.open_to_read() as catalog:
             view = catalog.view(view_id)
-            etag = f'"{view.image_sha256}-{"full" if full else THUMB_PX}"'
-            if request.headers.get("if-none-match") == etag:
-                return Response(status_code=304, headers={"ETag": etag})
-            pixels = catalog.read_image(view)
-            content = catalog.image_path(view).read_bytes() if full else jpeg(pixels, THUMB_PX)
-        headers = {"ETag": etag, "Cache-Control": "private, max-age=86400"}
-        return Response(content, media_type="image/png" if full else "image/jpeg", headers=headers)
+            digest = f"{view.image_sha256}-{'full' if full else THUMB_PX}"
 
-    @api.post("/import", tags=["catalog"])
+            def answer() -> Response:
+                pixels = catalog.read_image(view)  # and check them
+                if full:
+                    return Response(catalog.image_path(view).read_bytes(), media_type="image/png")
+                return Response(jpeg(pixels, THUMB_PX), media_type="image/jpeg")
+
+            return cached(request, digest, answer, {"Cache-Control": "private, max-age=86400"})
+
+    @routes.operate.post("/import", tags=["catalog"])
     async def import_bundle(
         request: Request,
-        _person: OperatorPerson,
         on_conflict: Annotated[str, Query(pattern="^(reject|skip|replace)$")] = "reject",
     ) -> dict[str, Any]:
         """Import a bundle (.rigcat.zip); the body is the file. It is checked as rig import checks it."""
@@ -170,9 +156,9 @@ def add_catalog(api: APIRouter, server: Server) -> None:
                     await to_thread.run_sync(file.write, chunk)
             return await long_work(lambda: _import(server, path, on_conflict))
 
-    @api.get("/export", tags=["catalog"], response_class=StreamingResponse)
+    @routes.watch.get("/export", tags=["catalog"], response_class=StreamingResponse)
     async def export(
-        _person: Watcher, name: Annotated[list[str] | None, Query(description="default: all objects")] = None
+        name: Annotated[list[str] | None, Query(description="default: all objects")] = None,
     ) -> StreamingResponse:
         """Return a bundle with objects."""
         folder = TemporaryDirectory(prefix="rig-export-")

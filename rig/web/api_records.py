@@ -3,7 +3,7 @@
 import re
 from typing import Annotated, Any, Final
 
-from fastapi import APIRouter, Query, Request, Response
+from fastapi import Query, Response
 from fastapi.responses import HTMLResponse, JSONResponse
 from pydantic import Field
 
@@ -12,36 +12,32 @@ from rig.catalog.exchange.results_table import plain_row
 from rig.catalog.records import Outcome
 from rig.catalog.results import ResultFilter, correct, find_result, find_results
 from rig.core.errors import JobNotFound
+from rig.core.json_form import plain
 from rig.core.masking import masked
-from rig.events.events import event_dict, plain
+from rig.events.events import event_dict
 from rig.search.replay import Check, check
 from rig.search.saved_run import SavedRun, load_run
 from rig.web.event_schema import SavedRunBody
-from rig.web.server import CorrectionBody, Limit, OperatorPerson, Server, Watcher, long_work, page_of, time_text
+from rig.web.server import CorrectionBody, Operator, Page, Routes, Server, long_work, time_text
 from rig.web.work import calibrations
 
 RUN_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 
 
-def add_records(api: APIRouter, server: Server) -> None:
+def add_records(routes: Routes, server: Server) -> None:
     def load(name: str) -> SavedRun:
         if not RUN_NAME.fullmatch(name) or not (server.runs / name / "run.json").is_file():
             raise JobNotFound("There is no run with that name.", next_step="Choose one of GET /api/v1/runs.")
         return load_run(server.runs / name)
 
-    @api.get("/runs", tags=["runs"])
-    def runs(
-        request: Request,
-        _person: Watcher,
-        limit: Limit = 50,
-        after: Annotated[str | None, Query(max_length=100)] = None,
-    ) -> Response:
+    @routes.watch.get("/runs", tags=["runs"])
+    def runs(page: Page) -> Response:
         """List the saved runs, the newest first."""
         names = [path.parent.name for path in server.runs.glob("*/run.json") if RUN_NAME.fullmatch(path.parent.name)]
-        return page_of(request, [{"name": name} for name in sorted(names, reverse=True)], "name", limit, after)
+        return page.of([{"name": name} for name in sorted(names, reverse=True)], "name")
 
-    @api.get("/runs/{name}", tags=["runs"], responses={200: {"model": SavedRunBody}})
-    def run(name: str, _person: Watcher) -> Response:
+    @routes.watch.get("/runs/{name}", tags=["runs"], responses={200: {"model": SavedRunBody}})
+    def run(name: str) -> Response:
         """Return the events of a saved run."""
         from rig.events.lines import line
 
@@ -51,15 +47,15 @@ def add_records(api: APIRouter, server: Server) -> None:
         about = {"started_utc": saved.about["started_utc"], "bench": saved.about["bench"]}
         return JSONResponse({"name": name, **about, "events": events})
 
-    @api.get("/runs/{name}/report", tags=["runs"], response_class=HTMLResponse)
-    async def report(name: str, _person: Watcher) -> HTMLResponse:
+    @routes.watch.get("/runs/{name}/report", tags=["runs"], response_class=HTMLResponse)
+    async def report(name: str) -> HTMLResponse:
         """Return the report of a saved run as a page."""
         from rig.report.run_report import run_report
 
         return HTMLResponse(await long_work(lambda: run_report(load(name))))
 
-    @api.post("/runs/{name}/check", tags=["runs"])
-    async def check_run(name: str, _person: Watcher) -> dict[str, Any]:
+    @routes.watch.post("/runs/{name}/check", tags=["runs"])
+    async def check_run(name: str) -> dict[str, Any]:
         """Compute every decision of a saved run again from its images."""
 
         def checked() -> Check:
@@ -70,12 +66,9 @@ def add_records(api: APIRouter, server: Server) -> None:
         found = await long_work(checked)
         return {**plain(found), "differences": [str(difference) for difference in found.differences]}
 
-    @api.get("/results", tags=["results"])
+    @routes.watch.get("/results", tags=["results"])
     def results(
-        request: Request,
-        _person: Watcher,
-        limit: Limit = 100,
-        after: Annotated[str | None, Query(max_length=20)] = None,
+        page: Page,
         sample: Annotated[str | None, Query(max_length=100)] = None,
         object_name: Annotated[str | None, Query(alias="object", max_length=100)] = None,
         outcome: Outcome | None = None,
@@ -84,11 +77,11 @@ def add_records(api: APIRouter, server: Server) -> None:
         with server.catalog.open_to_read() as catalog:
             found = find_results(catalog, ResultFilter(sample, object_name, outcome))
         rows = [{**plain_row(one), "id": str(one.id)} for one in found]
-        return page_of(request, rows[::-1], "id", limit, after)
+        return page.of(rows[::-1], "id")
 
-    @api.post("/results/{result_id}/correct", tags=["results"])
+    @routes.operate.post("/results/{result_id}/correct", tags=["results"])
     def correct_result(
-        body: CorrectionBody, person: OperatorPerson, result_id: Annotated[int, Field(ge=1, lt=2**62)]
+        body: CorrectionBody, person: Operator, result_id: Annotated[int, Field(ge=1, lt=2**62)]
     ) -> dict[str, Any]:
         """Correct the object or the sample of an answer, with the reason. The answer itself stays."""
         with server.catalog.open_to_change() as catalog:
@@ -103,8 +96,8 @@ def add_records(api: APIRouter, server: Server) -> None:
             )
             return plain_row(find_result(catalog, result_id))
 
-    @api.get("/calibrations", tags=["bench"])
-    def calibration_list(_person: Watcher) -> dict[str, Any]:
+    @routes.watch.get("/calibrations", tags=["bench"])
+    def calibration_list() -> dict[str, Any]:
         """Return the calibrations in force, and those that a job can run."""
         store = CalibrationStore(server.config.calibration_path(server.bench))
         history = [
@@ -120,21 +113,16 @@ def add_records(api: APIRouter, server: Server) -> None:
         offered = {name: one.title for name, one in calibrations().items()}
         return {"history": history[::-1], "available": offered, "unreadable": [str(one) for one in store.unreadable]}
 
-    @api.get("/configuration", tags=["bench"])
-    def configuration(_person: Watcher) -> dict[str, Any]:
+    @routes.watch.get("/configuration", tags=["bench"])
+    def configuration() -> dict[str, Any]:
         """Return the configuration in force, without passwords."""
         values: dict[str, Any] = masked(server.config.model_dump(mode="json"))
         return values
 
-    @api.get("/log", tags=["bench"])
-    def log(
-        request: Request,
-        _person: Watcher,
-        limit: Limit = 100,
-        after: Annotated[str | None, Query(max_length=20)] = None,
-    ) -> Response:
+    @routes.watch.get("/log", tags=["bench"])
+    def log(page: Page) -> Response:
         """List the catalog's log, the newest first."""
         with server.catalog.open_to_read() as catalog:
             entries = catalog.log()
         rows = [{**plain(entry), "id": str(entry.id), "time_utc": time_text(entry.time_utc)} for entry in entries]
-        return page_of(request, rows[::-1], "id", limit, after)
+        return page.of(rows[::-1], "id")

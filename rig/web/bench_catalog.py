@@ -5,17 +5,9 @@ from typing import Any
 
 from rig.catalog import Catalog
 from rig.catalog.local_copy import Attempts, open_or_copy
-from rig.catalog.shared import (
-    BackgroundDelivery,
-    JournalState,
-    deliver_journal,
-    delivery_words,
-    failure_words,
-    open_for_enrollment,
-)
+from rig.catalog.shared import BackgroundDelivery, JournalState
 from rig.config.catalog_place import CatalogPlace
 from rig.core.clock import Clock
-from rig.core.errors import CatalogBusy, CatalogError
 
 
 class BenchCatalog:
@@ -58,19 +50,6 @@ class BenchCatalog:
     def open_to_change(self) -> Catalog:
         """Open the catalog to change its objects; a `CatalogUnavailable` if its server does not answer."""
         return Catalog.open(self.place, clock=self._clock)
-
-    def open_to_enroll(self, clock: Clock) -> Catalog:
-        """Open the catalog, or the journal, for new views; ``clock`` dates them."""
-        return open_for_enrollment(self.place, clock)
-
-    def deliver(self) -> list[str]:
-        """Deliver the journal now; return sentences about delivered objects, and reasons for the others."""
-        if self.place.url is None:
-            return []
-        try:
-            return [delivery_words(one, self.place) for one in deliver_journal(self.place, self._clock)]
-        except (CatalogError, CatalogBusy) as error:
-            return [failure_words(error)]
 
     def background_delivery(self) -> BackgroundDelivery:
         """Return a delivery of the journal during the work of a ``with`` block."""

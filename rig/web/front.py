@@ -12,7 +12,6 @@ import signal
 import socket
 import sys
 import threading
-from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any, Final
 
@@ -29,11 +28,10 @@ from rig.web.app import create_app
 from rig.web.bench_catalog import BenchCatalog
 from rig.web.guard import Guard, PatientProtocol
 from rig.web.hub import Hub
-from rig.web.link import Link, Message
-from rig.web.priority import WEB, set_priority, shorten_pauses
+from rig.web.link import Link
 from rig.web.remote_bench import RemoteBench
 from rig.web.server import Server
-from rig.web.setup import Listening, Setup, print_note
+from rig.web.setup import WEB_NICE, Listening, Setup, print_note, set_priority, shorten_pauses
 
 MAX_FILES: Final = 65_536
 THREADS: Final = 8
@@ -93,9 +91,9 @@ def guarded(server: Server, listening: Listening) -> Guard:
 class _Web(uvicorn.Server):
     """Uvicorn that tells the bench's process that it answers, and then once a second that it lives."""
 
-    def __init__(self, config: uvicorn.Config, tell: Callable[[Message], None]) -> None:
+    def __init__(self, config: uvicorn.Config, link: Link) -> None:
         super().__init__(config)
-        self._tell = tell
+        self._link = link
         self._living: asyncio.Task[None] | None = None
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
@@ -106,7 +104,7 @@ class _Web(uvicorn.Server):
 
     async def _live(self) -> None:
         while True:
-            self._tell({"alive": True})
+            self._link.tell("alive")
             await asyncio.sleep(SIGN_OF_LIFE_S)
 
 
@@ -146,7 +144,7 @@ def main(link_descriptor: int, socket_descriptor: int) -> None:
     resource.setrlimit(
         resource.RLIMIT_NOFILE, (MAX_FILES if hard == resource.RLIM_INFINITY else min(hard, MAX_FILES), hard)
     )
-    set_priority(WEB)
+    set_priority(WEB_NICE)
     sys.setswitchinterval(SWITCH_S)
     setup = Setup.model_validate_json(sys.stdin.buffer.read())
     server = make_server(setup, SystemClock())
@@ -157,10 +155,8 @@ def main(link_descriptor: int, socket_descriptor: int) -> None:
         server.hub.close()
         threading.Timer(END_S, os._exit, (0,)).start()  # a long export, for example
 
-    link = Link(socket.socket(fileno=link_descriptor), server.remote.received, ended)
-    web = _Web(uvicorn_config(guarded(server, setup.listening), setup.listening), link.send)
-    server.remote.calls.link = link
-    link.start()
+    server.remote.connect(socket.socket(fileno=link_descriptor), ended)
+    web = _Web(uvicorn_config(guarded(server, setup.listening), setup.listening), server.remote.link)
     shorten_pauses()
     with checked_catalog(server), server.catalog.background_delivery():
         web.run([socket.socket(fileno=socket_descriptor)])

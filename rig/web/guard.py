@@ -5,21 +5,18 @@ there are too many, the least useful one is closed.
 """
 
 import asyncio
-from collections.abc import Awaitable, Callable, MutableMapping
 from typing import Any, Final
 from urllib.parse import urlsplit
 from weakref import WeakKeyDictionary
 
+from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
+from starlette.responses import Response
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol, RequestResponseCycle
 
 from rig.core.phrases import whole
-
-Scope = MutableMapping[str, Any]
-Message = MutableMapping[str, Any]
-Receive = Callable[[], Awaitable[Message]]
-Send = Callable[[Message], Awaitable[None]]
-App = Callable[[Scope, Receive, Send], Awaitable[None]]
+from rig.web.problems import MEDIA_TYPE, problem_body
 
 MAX_BODY_BYTES: Final = 1_000_000
 """Largest size of a request, except an upload."""
@@ -59,7 +56,7 @@ class Guard:
         The path whose requests may be larger, and their largest size.
     """
 
-    def __init__(self, app: App, *, hosts: set[str], upload_path: str, max_upload_bytes: int) -> None:
+    def __init__(self, app: ASGIApp, *, hosts: set[str], upload_path: str, max_upload_bytes: int) -> None:
         self._app = app
         self._hosts = {host.lower() for host in hosts}
         self._upload_path = upload_path
@@ -69,22 +66,17 @@ class Guard:
         if scope["type"] == "lifespan":
             await self._app(scope, receive, send)
             return
-        headers = {name.decode("latin-1"): value.decode("latin-1") for name, value in scope["headers"]}
+        headers = Headers(scope=scope)
         if scope["type"] == "websocket":
             if self._rejection("GET", scope["path"], headers) is not None:
                 await send({"type": "websocket.close", "code": 1008})
             else:
                 await self._app(scope, receive, send)
             return
-        rejection = self._rejection(scope["method"], scope["path"], headers)
-        if rejection is not None:
-            await _reject(send, *rejection)
-            return
         limit = self._max_upload_bytes if scope["path"] == self._upload_path else MAX_BODY_BYTES
-        declared = headers.get("content-length", "0")
-        if (size := whole(declared)) is None or size > limit:
-            await _reject(send, 413, "The request is too large.", f"Send at most {limit} bytes.")
-            return
+        rejection = self._rejection(scope["method"], scope["path"], headers)
+        if (size := whole(headers.get("content-length", "0"))) is None or size > limit:
+            rejection = rejection or (413, "The request is too large.", f"Send at most {limit} bytes.")
         received = 0
         complete = False
         loop = asyncio.get_running_loop()
@@ -112,9 +104,13 @@ class Guard:
                 message["headers"] = [*message.get("headers", []), *_HEADERS]
             await send(message)
 
-        await self._app(scope, limited, guarded)
+        if rejection is None:
+            await self._app(scope, limited, guarded)
+        else:
+            body, status = problem_body(*rejection), rejection[0]
+            await Response(body, status, media_type=MEDIA_TYPE)(scope, receive, guarded)
 
-    def _rejection(self, method: str, path: str, headers: dict[str, str]) -> tuple[int, str, str] | None:
+    def _rejection(self, method: str, path: str, headers: Headers) -> tuple[int, str, str] | None:
         host = headers.get("host", "")
         if _host_name(host) not in self._hosts:
             step = "Use an address that rig serve prints, or allow this name with --allow-host."
@@ -145,15 +141,6 @@ def _origin_host(origin: str) -> str:
         return urlsplit(origin).netloc.lower()
     except ValueError:
         return ""
-
-
-async def _reject(send: Send, status: int, what: str, next_step: str) -> None:
-    from rig.web.problems import problem_body
-
-    body = problem_body(status, what, next_step)
-    headers = [(b"content-type", b"application/problem+json"), (b"content-length", str(len(body)).encode())]
-    await send({"type": "http.response.start", "status": status, "headers": [*headers, *_HEADERS]})
-    await send({"type": "http.response.body", "body": body})
 
 
 _silent: Final[WeakKeyDictionary["PatientProtocol", None]] = WeakKeyDictionary()

@@ -9,6 +9,7 @@ from shlex import join
 from typing import Final
 
 from pydantic import ValidationError
+from pydantic_core import to_jsonable_python
 
 from rig.core.clock import Clock
 from rig.core.errors import JobNotFound, JobRejected, RigError, StateNotStored, os_errors_as
@@ -90,7 +91,7 @@ class JobQueue:
         """
         with self._lock:
             self.heed_stops()
-            waiting = [job for job in self._jobs.values() if job.state is JobState.QUEUED]
+            waiting = self._waiting()
             size = len(request.model_dump_json()) + sum(len(self._texts[job.id]) for job in waiting)
             if len(waiting) >= MAX_QUEUED or size > MAX_QUEUED_BYTES:
                 raise JobRejected(
@@ -115,8 +116,9 @@ class JobQueue:
         with self._lock:
             job = self._unended(job_id)
             if job.state is JobState.QUEUED:
-                return self._end(job, JobState.CANCELLED).model_copy()
-            self._cancelled.add(job_id)
+                self._end(JobState.CANCELLED, job)
+            else:
+                self._cancelled.add(job_id)
             return job.model_copy()
 
     def heed_stops(self) -> bool:
@@ -127,14 +129,14 @@ class JobQueue:
                 return False
             self.heeded = stops
             self._cancelled |= {job.id for job in self._jobs.values() if not job.state.ended}
-            self._end_waiting(JobState.CANCELLED)
+            self._end(JobState.CANCELLED, *self._waiting())
             return True
 
     def hold(self) -> None:
         """Pause the running job and interrupt those that wait, because no page can show them any more."""
         with self._lock:
             self._pausing |= {job.id for job in self._jobs.values() if job.state is JobState.RUNNING}
-            self._end_waiting(JobState.INTERRUPTED)
+            self._interrupt(*self._waiting())
 
     def pause(self, job_id: str) -> Job:
         """Pause a running job at its next view. Raises `JobNotFound`, `JobRejected`."""
@@ -170,15 +172,15 @@ class JobQueue:
         """Return the oldest job that waits, now running; None if there is none within the time."""
         with self._lock:
             self.heed_stops()
-            waiting = self._oldest()
-            if waiting is None and timeout_s > 0:
+            if not self._waiting() and timeout_s > 0:
                 self._arrived.wait(timeout_s)
                 self.heed_stops()
-                waiting = self._oldest()
-            if waiting is not None:
-                waiting.state, waiting.started_utc = JobState.RUNNING, self._now()
-                self._store(waiting)
-            return waiting
+            if not (waiting := self._waiting()):
+                return None
+            job = waiting[0]
+            job.state, job.started_utc = JobState.RUNNING, self._now()
+            self._store(job)
+            return job
 
     # These two are asked during a motion, so they do not wait for the lock: another thread may be storing jobs.
 
@@ -212,33 +214,30 @@ class JobQueue:
     def end(self, job: Job, state: JobState, error: RigError | None = None) -> None:
         """End a job; an unfinished one gets the request that continues it."""
         with self._lock:
-            job.error = None if error is None else _json_error(error)
+            job.error = None if error is None else to_jsonable_python(error.as_dict(), fallback=str)
             if state is not JobState.DONE:
                 self._offer_to_continue(job)
-            self._end(job, state)
+            self._end(state, job)
 
     # -- inside -------------------------------------------------------------------------------------------------------
 
-    def _end(self, job: Job, state: JobState) -> Job:
-        self._mark_ended(job, state)
-        self._store(job)
-        return job
+    def _waiting(self) -> list[Job]:
+        return [job for job in self._jobs.values() if job.state is JobState.QUEUED]
 
-    def _mark_ended(self, job: Job, state: JobState) -> None:
-        job.state, job.ended_utc, job.question = state, self._now(), None
-        self._cancelled.discard(job.id)
-        self._pausing.discard(job.id)
-        self._answers.pop(job.id, None)
+    def _interrupt(self, *jobs: Job) -> None:
+        for job in jobs:
+            self._offer_to_continue(job)
+        self._end(JobState.INTERRUPTED, *jobs)
 
-    def _end_waiting(self, state: JobState) -> None:
-        """End all jobs that wait, and store them together."""
-        waiting = [job for job in self._jobs.values() if job.state is JobState.QUEUED]
-        for job in waiting:
-            if state is JobState.INTERRUPTED:
-                self._offer_to_continue(job)
-            self._mark_ended(job, state)
-        if waiting:
-            self._store(*waiting)
+    def _end(self, state: JobState, *jobs: Job) -> None:
+        """End jobs, and store them together."""
+        for job in jobs:
+            job.state, job.ended_utc, job.question = state, self._now(), None
+            self._cancelled.discard(job.id)
+            self._pausing.discard(job.id)
+            self._answers.pop(job.id, None)
+        if jobs:
+            self._store(*jobs)
 
     def _offer_to_continue(self, job: Job) -> None:
         """Set the request and the command that continue the work of a job that ended early."""
@@ -266,9 +265,6 @@ class JobQueue:
         if job.state.ended:
             raise JobRejected(f"The job is {job.state} already.", next_step="Submit a new job.")
         return job
-
-    def _oldest(self) -> Job | None:
-        return next((job for job in self._jobs.values() if job.state is JobState.QUEUED), None)
 
     def _now(self) -> str:
         return self._clock.utc().isoformat(timespec="seconds").replace("+00:00", "Z")
@@ -312,15 +308,6 @@ class JobQueue:
             with os_errors_as(StateNotStored, f"{self._file} cannot be renamed.", next_step="Delete it."):
                 self._file.replace(self._file.with_suffix(".json.damaged"))
             return
-        for job in jobs:
-            self._jobs[job.id] = job
-            self._texts[job.id] = job.model_dump_json()
-        for job in jobs:
-            if not job.state.ended:
-                self._offer_to_continue(job)
-                self._end(job, JobState.INTERRUPTED)
-
-
-def _json_error(error: RigError) -> dict[str, object]:
-    values: dict[str, object] = json.loads(json.dumps(error.as_dict(), default=str))
-    return values
+        self._jobs = {job.id: job for job in jobs}
+        self._texts = {job.id: job.model_dump_json() for job in jobs}
+        self._interrupt(*(job for job in jobs if not job.state.ended))

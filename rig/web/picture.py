@@ -1,18 +1,22 @@
-"""The live picture: the newest frame of the camera, encoded once for all viewers."""
+"""Pictures for the pages: the newest frame, encoded once for all viewers, and the outline of the object in a view."""
 
 import threading
-from collections.abc import Callable
 from typing import Final
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from rig.bench import Bench
 from rig.core.clock import Clock, seconds_between
-from rig.devices.camera import Camera, CameraIdentity, CameraLocks, Frame
+from rig.core.errors import RigError
+from rig.views.description import ViewDescriber, within
+from rig.views.empty_table import empty_table_status
 
 JPEG_QUALITY: Final = 80
 MAX_SIDE_PX: Final = 1280
+TOLERANCE_PX: Final = 1.0
+"""Points that change an outline by less are left out."""
 
 
 class LivePicture:
@@ -72,24 +76,32 @@ def jpeg(image_bgr: NDArray[np.uint8], max_side_px: int = MAX_SIDE_PX) -> bytes:
     return content.tobytes()
 
 
-class ObservedCamera:
-    """A camera that also shows its frames to an observer."""
+class Outliner:
+    """The outlines of the object in the views of one job, with the segmentation of their descriptions."""
 
-    def __init__(self, camera: Camera, observer: Callable[[NDArray[np.uint8]], None]) -> None:
-        self._camera = camera
-        self._observer = observer
+    def __init__(self, bench: Bench) -> None:
+        self._region = bench.config.view.roi
+        status = empty_table_status(bench)
+        self._describer = ViewDescriber(
+            bench.config.view, empty_table=None if status.table is None else status.table.image_bgr
+        )
 
-    @property
-    def identity(self) -> CameraIdentity:
-        return self._camera.identity
-
-    def capture(self, after_ns: int, meanwhile: Callable[[], object] | None = None) -> Frame:
-        frame = self._camera.capture(after_ns, meanwhile)
-        self._observer(frame.image_bgr)
-        return frame
-
-    def read_locks(self) -> CameraLocks:
-        return self._camera.read_locks()
-
-    def close(self) -> None:
-        self._camera.close()
+    def __call__(self, image_bgr: NDArray[np.uint8]) -> dict[str, list[list[int]] | list[int]] | None:
+        """Return ``box`` (x, y, width, height) and ``points`` in pixels of the frame; None if no object is found."""
+        try:
+            found = self._describer.segment(image_bgr)
+        except (RigError, ValueError):
+            return None
+        if found.box is None:
+            return None
+        x, y = (0, 0) if self._region is None else self._region[:2]
+        height, width = within(image_bgr, self._region).shape[:2]
+        mask = found.frame_mask(width, height).astype(np.uint8)
+        contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+        points = max(contours, key=cv2.contourArea, default=np.empty((0, 1, 2), np.int32))
+        shortened = cv2.approxPolyDP(points, TOLERANCE_PX, closed=True) if len(points) else points
+        left, top, box_width, box_height = found.box
+        return {
+            "box": [left + x, top + y, box_width, box_height],
+            "points": [[int(px) + x, int(py) + y] for px, py in shortened.reshape(-1, 2)],
+        }

@@ -1,15 +1,14 @@
 """The bench as the web process sees it: calls to the process that owns it, its events, and STOP."""
 
 import asyncio
+import socket
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Any, Final
 
 from rig.core.clock import Clock, seconds_between
-from rig.plans.operator import Choice
 from rig.safety.stop_channel import StopAnswer, StopRequest, stop_answer
-from rig.web.link import Calls, Message
-from rig.web.requests import Job, JobRequest
+from rig.web.link import Link
 
 BOUNDARY: Final = "frame"
 PICTURE_S: Final = 0.08
@@ -31,13 +30,19 @@ class RemoteBench:
         The computer's clock.
     received
         Called with the kind and the values of each event.
+
+    Attributes
+    ----------
+    link
+        Calls the functions of `rig.web.bench_side`, after `connect`.
     """
+
+    link: Link
 
     def __init__(self, state_folder: Path, clock: Clock, received: Callable[[str, Any], None]) -> None:
         self._state_folder = state_folder
         self._clock = clock
         self._received = received
-        self.calls = Calls()
         self.status: dict[str, Any] = {"open": False, "job": None, "error": None}
         """The last known state of the bench."""
         self.viewers = 0
@@ -47,14 +52,19 @@ class RemoteBench:
         self._fetched_ns: int | None = None
         self._fetching = asyncio.Lock()
 
-    def received(self, message: Message, content: bytes) -> None:
-        """Take a message of the other process."""
-        if "number" in message:
-            self.calls.answered(message, content)
-            return
-        if message["event"] == "status":
-            self.status = message["data"]
-        self._received(message["event"], message["data"])
+    def connect(self, connection: socket.socket, ended: Callable[[], None] = lambda: None) -> None:
+        """Connect to the process that owns the bench; ``ended`` is called once when it has gone."""
+        self.link = Link(connection, {"publish": self._published}, ended)
+        self.link.start()
+
+    def _published(self, kind: str, data: Any) -> None:
+        if kind == "status":
+            self.status = data
+        self._received(kind, data)
+
+    def ask(self, function: str, **values: Any) -> Any:
+        """Return the result of a function of `rig.web.bench_side`. Raises its errors, and `BenchBusy`."""
+        return self.link.call(function, **values)[0]
 
     # -- STOP: it asks no queue, no thread and no disk ----------------------------------------------------------------
 
@@ -74,41 +84,6 @@ class RemoteBench:
                 request.close()
         return {"ended": answer is StopAnswer.TORQUE_OFF, "answer": answer}
 
-    # -- jobs ---------------------------------------------------------------------------------------------------------
-
-    def jobs(self) -> list[dict[str, Any]]:
-        """Return all jobs, the newest first."""
-        return list(self.calls.call("jobs")[0])
-
-    def job(self, job_id: str) -> Job:
-        return self._job("job", job=job_id)
-
-    def submit(self, request: JobRequest, operator: str) -> Job:
-        return self._job("submit", request=request.model_dump(mode="json"), operator=operator)
-
-    def cancel(self, job_id: str) -> Job:
-        return self._job("cancel", job=job_id)
-
-    def pause(self, job_id: str) -> Job:
-        return self._job("pause", job=job_id)
-
-    def resume(self, job_id: str) -> Job:
-        return self._job("resume", job=job_id)
-
-    def answer(self, job_id: str, choice: Choice) -> Job:
-        return self._job("answer", job=job_id, choice=choice)
-
-    def view(self, job_id: str, number: int) -> bytes:
-        """Return a picture of a job as JPEG. Raises `JobNotFound`."""
-        return self.calls.call("view", job=job_id, number=number)[1]
-
-    def numbers(self) -> dict[str, Any]:
-        """Return the numbers for `rig.web.metrics`."""
-        return dict(self.calls.call("numbers")[0])
-
-    def _job(self, name: str, **values: Any) -> Job:
-        return Job.model_validate(self.calls.call(name, **values)[0])
-
     # -- the picture --------------------------------------------------------------------------------------------------
 
     async def picture(self) -> tuple[int, bytes, float | None]:
@@ -116,7 +91,7 @@ class RemoteBench:
         async with self._fetching:
             now_ns = self._clock.now_ns()
             if self._fetched_ns is None or seconds_between(self._fetched_ns, now_ns) > PICTURE_S:
-                values, content = await asyncio.to_thread(self.calls.call, "picture", after=self._newest[0])
+                values, content = await asyncio.to_thread(self.link.call, "picture", after=self._newest[0])
                 self._fetched_ns, self._age_s = self._clock.now_ns(), values["age_s"]
                 if content:
                     self._newest = (values["number"], content)

@@ -26,9 +26,8 @@ from rig.core.files import write
 from rig.safety.bench_lock import BenchLock
 from rig.safety.saved_state import SERVER_FILE, SERVER_FOLDER, ServerAddress
 from rig.web.bench_side import BenchSide
-from rig.web.link import Link, Message
-from rig.web.priority import BENCH, set_priority, shorten_pauses
-from rig.web.setup import Listening, Setup, print_note
+from rig.web.link import Link
+from rig.web.setup import BENCH_NICE, Listening, Setup, print_note, set_priority, shorten_pauses
 
 START_S: Final = 30.0
 END_S: Final = 6.0
@@ -77,7 +76,7 @@ def run_server(
     )
     folder = setup.state_folder / SERVER_FOLDER
     lock = BenchLock(folder, clock)  # one server for each bench
-    set_priority(BENCH)
+    set_priority(BENCH_NICE)
     try:
         side = BenchSide(setup, folder, clock, print_note)
         with _socket(listening) as connection:
@@ -165,16 +164,11 @@ class WebProcess:
         assert self._process.stdin is not None
         with suppress(BrokenPipeError), self._process.stdin as standard_input:  # the process has ended already
             standard_input.write(self._setup.model_dump_json().encode())
-        self._link = Link(ours, self._received, self._lost)
-        self._link.start()
-        self._side.connect(self._link)
+        self._link = self._side.connect(ours, self._lost, self._lives)
 
-    def _received(self, message: Message, content: bytes) -> None:
-        if "alive" in message:
-            self._alive_ns = self._clock.now_ns()
-            self._answers.set()
-        else:
-            self._side.received(message, content)
+    def _lives(self) -> None:
+        self._alive_ns = self._clock.now_ns()
+        self._answers.set()
 
     def _lost(self) -> None:
         self._ended.set()

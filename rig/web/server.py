@@ -10,7 +10,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Any, Final, TypeVar
 
-from fastapi import Depends, Query, Request, Response
+from fastapi import APIRouter, Depends, Query, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
 from starlette.requests import HTTPConnection
 
@@ -194,30 +194,62 @@ async def long_work(work: Callable[[], Result]) -> Result:
 
 
 Watcher = Annotated[Person, Depends(watcher)]
-OperatorPerson = Annotated[Person, Depends(operator)]
-Limit = Annotated[int, Query(ge=1, le=MAX_PAGE)]
+Operator = Annotated[Person, Depends(operator)]
 
 
-def page_of(request: Request, rows: list[dict[str, Any]], key: str, limit: int, after: str | None) -> Response:
-    """Return a page of a list with an ETag, and a link to the next page."""
-    start = 0
-    if after is not None:
-        places = [number for number, row in enumerate(rows) if row[key] == after]
-        if not places:
-            raise UsageError(
-                "The list has changed: the entry after which to continue is gone.", next_step="Start again."
-            )
-        start = places[0] + 1
-    shown = rows[start : start + limit]
-    more = shown[-1][key] if start + limit < len(rows) else None
-    body = json.dumps({"items": shown, "total": len(rows), "next": more}, ensure_ascii=False, default=str).encode()
-    etag = f'"{hashlib.sha256(body).hexdigest()[:32]}"'
-    headers = {"ETag": etag, "Cache-Control": "private, no-cache"}
-    if more is not None:
-        headers["Link"] = f'<{request.url.include_query_params(after=more)}>; rel="next"'
-    if request.headers.get("if-none-match") == etag:
-        return Response(status_code=304, headers=headers)
-    return Response(body, media_type="application/json", headers=headers)
+class Routes:
+    """The routes of the API by the right that they need: none, to watch, or to operate the bench."""
+
+    def __init__(self) -> None:
+        self.anybody = APIRouter()
+        self.watch = APIRouter(dependencies=[Depends(watcher)])
+        self.operate = APIRouter(dependencies=[Depends(operator)])
+
+
+class PageOfList:
+    """The page of a list that a request asks for."""
+
+    def __init__(
+        self,
+        request: Request,
+        limit: Annotated[int, Query(ge=1, le=MAX_PAGE)] = 100,
+        after: Annotated[str | None, Query(max_length=100)] = None,
+    ) -> None:
+        self._request = request
+        self._limit = limit
+        self._after = after
+
+    def of(self, rows: list[dict[str, Any]], key: str) -> Response:
+        """Return the page with an ETag, and a link to the next one; ``key`` names the entries."""
+        start = 0
+        if self._after is not None:
+            places = [number for number, row in enumerate(rows) if row[key] == self._after]
+            if not places:
+                raise UsageError(
+                    "The list has changed: the entry after which to continue is gone.", next_step="Start again."
+                )
+            start = places[0] + 1
+        shown = rows[start : start + self._limit]
+        more = shown[-1][key] if start + self._limit < len(rows) else None
+        values = {"items": shown, "total": len(rows), "next": more}
+        body = json.dumps(values, ensure_ascii=False, default=str).encode()
+        headers = {"Cache-Control": "private, no-cache"}
+        if more is not None:
+            headers["Link"] = f'<{self._request.url.include_query_params(after=more)}>; rel="next"'
+        digest = hashlib.sha256(body).hexdigest()[:32]
+        return cached(self._request, digest, lambda: Response(body, media_type="application/json"), headers)
+
+
+Page = Annotated[PageOfList, Depends()]
+
+
+def cached(request: Request, digest: str, answer: Callable[[], Response], headers: dict[str, str]) -> Response:
+    """Return the answer to a request, or only that the sender has it already; ``digest`` identifies its content."""
+    etag = f'"{digest}"'
+    known = request.headers.get("if-none-match") == etag
+    response = Response(status_code=304) if known else answer()
+    response.headers.update({"ETag": etag, **headers})
+    return response
 
 
 def time_text(at: datetime | None) -> str | None:

@@ -1,12 +1,19 @@
-"""What the two processes of a server must know."""
+"""What the two processes of a server must know, and what keeps them quick."""
 
+import gc
+import os
 import sys
 from contextlib import suppress
 from pathlib import Path
+from typing import Final
 
 from pydantic import BaseModel, ConfigDict
 
 from rig.config import RigConfig
+
+BENCH_NICE: Final = -10
+"""The process that owns the bench. Without root, a priority is raised only if the system permits it (`LimitNICE=`)."""
+WEB_NICE: Final = -5
 
 
 class Listening(BaseModel):
@@ -54,3 +61,21 @@ def print_note(text: str) -> None:
     """Print a note on stderr, unless it is closed."""
     with suppress(OSError):
         print(f"Note: {text}", file=sys.stderr, flush=True)
+
+
+def set_priority(nice: int) -> None:
+    """Give the calling thread, and those that it starts, a priority; without the right to it, nothing changes.
+
+    All threads of an interpreter need the same one: a thread that waits for the processor may hold the interpreter.
+    """
+    with suppress(OSError, AttributeError):
+        os.setpriority(os.PRIO_PROCESS, 0, nice)
+
+
+def shorten_pauses() -> None:
+    """Exclude all objects that exist now from the collection of garbage.
+
+    They live as long as the process. One pass over the imported modules stops all threads for 0.1 s.
+    """
+    gc.collect()
+    gc.freeze()

@@ -1,46 +1,39 @@
-"""The work of each kind of job on the served bench: the jobs of `rig.jobs`, and how the pages show them."""
+"""The job that runs on the served bench: its desk, what the pages see of it, and what they answer."""
 
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager, closing, nullcontext
-from dataclasses import dataclass
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Any, Final, Protocol, assert_never
+from typing import Any, Final, Protocol
+
+from pydantic import BaseModel
 
 from rig.bench import Bench
 from rig.bench.bench import DEVICES
-from rig.catalog import Action, Catalog
-from rig.config import RigConfig
-from rig.core.clock import Clock
+from rig.catalog import Catalog
 from rig.core.errors import UsageError
+from rig.core.json_form import plain
 from rig.core.phrases import counted, duration_words
-from rig.events.events import Enrolled, Identified, event_dict, plain
+from rig.events.events import Accepted, Decided, Enrolled, Event, Identified, Started, event_dict
 from rig.events.lines import line
 from rig.jobs.desk import Desk, Progress, Remark, Result, Step, Steps
-from rig.jobs.enroll import enroll, enroll_list
+from rig.jobs.doctor import examine
+from rig.jobs.enroll import enroll, enroll_list, plan
 from rig.jobs.identify import identify
 from rig.jobs.table import acknowledge, goto, home, refer
 from rig.jobs.table_image import take_table_image
-from rig.plans.estimate import dry_run
+from rig.motion.motion_model import MotionModel
+from rig.plans.estimate import TimeLeft
 from rig.plans.operator import Choice, Operator, Question
 from rig.plans.tray import TrayItem
+from rig.web import requests
 from rig.web.bench_catalog import BenchCatalog
-from rig.web.requests import (
-    AcknowledgeRequest,
-    CalibrateRequest,
-    DoctorRequest,
-    DryRunRequest,
-    EmptyTableRequest,
-    EnrollRequest,
-    GotoRequest,
-    HomeRequest,
-    IdentifyRequest,
-    Job,
-    ReferenceRequest,
-    TrayRequest,
-)
-from rig.web.worker import Context, Work
+from rig.web.picture import Outliner, jpeg
+from rig.web.requests import Job, JobState, TrayObject
+from rig.web.setup import Setup
+from rig.web.worker import BenchWorker
 
+VIEW_PX: Final = 480
 CALIBRATIONS: Final = "rig.calibrations"
 """Entry-point group of the calibrations."""
 
@@ -60,168 +53,147 @@ def calibrations() -> dict[str, Calibration]:
 
 
 class ServedDesk(Desk):
-    """The desk of a job of the server: the bench is open, and the pages ask."""
+    """The desk of a job of the server, and its operator: the bench is open, and the pages ask.
 
-    def __init__(self, context: Context, catalog: BenchCatalog) -> None:
-        self.operator = _BrowserOperator(context)
-        self.config = context.bench.config
+    Parameters
+    ----------
+    worker
+        Owns the bench.
+    job
+        The running job.
+    setup
+        The served bench.
+    catalog
+        Opens the bench's catalog.
+    """
+
+    is_there = True
+    log_waits_for_server = False  # which may be away: that would delay the answer to a STOP
+
+    def __init__(self, worker: BenchWorker, job: Job, setup: Setup, catalog: BenchCatalog) -> None:
+        self.operator = self
+        self.config = setup.config
         self.place = catalog.place
-        self._bench = context.bench
+        self.job = job
+        self.setup = setup
+        self._worker = worker
         self._catalog = catalog
+        self._left: TimeLeft | None = None
+        self._outline: Outliner | None = None
+
+    def run(self) -> None:
+        """Run the job to its end; an operator who cancels closes it, and so the torque goes off."""
+        request = self.job.request
+        parameters = {name: value for name, value in request if name != "kind"}
+        with closing(JOBS[type(request)](self, **parameters)) as steps:
+            for step in steps:
+                self._show(step)
+
+    # -- what a job needs ---------------------------------------------------------------------------------------------
 
     def open_bench(self, devices: Iterable[str] = DEVICES) -> AbstractContextManager[Bench]:  # noqa: ARG002
-        return nullcontext(self._bench)
+        return nullcontext(self._worker.bench())
+
+    def close_bench(self) -> None:
+        """Close the bench, for a job that opens its devices itself."""
+        self._worker.close()
 
     def who_places(self, bench: Bench) -> Operator:  # noqa: ARG002
-        return self.operator
+        return self
 
     def open_to_read(self) -> Catalog:
         return self._catalog.open_to_read()
 
-    def open_to_enroll(self, clock: Clock) -> Catalog:
-        return self._catalog.open_to_enroll(clock)
-
-    def log(self, action: Action, **details: Any) -> Iterator[Remark]:
-        if self.place.url is None:  # waiting for a server that is away would delay the answer to a STOP
-            yield from super().log(action, **details)
-
-    def deliver(self) -> Iterator[Remark]:
-        for words in self._catalog.deliver():
-            yield Remark(words)
-
-
-class _BrowserOperator:
-    """Asks in the browser."""
-
-    is_there = True
-
-    def __init__(self, context: Context) -> None:
-        self._context = context
-
     def choose(self, question: Question) -> Choice:
-        return self._context.asked(question.text, tuple(question.choices))
+        queue, job = self._worker.queue, self.job
+        queue.ask(job, requests.Question(text=question.text, choices=tuple(question.choices)))
+        while (choice := queue.answered(job)) is None:
+            self._worker.wait(job)
+        queue.ask(job, None)
+        return choice
 
     def ask_sample(self) -> str | None:
         return None  # the request names it
 
-
-@dataclass(slots=True)
-class WorkFactory:
-    """A factory of the work of a job.
-
-    Parameters
-    ----------
-    catalog
-        Opens the bench's catalog.
-    runs
-        Folder of the saved runs.
-    examine
-        Yields the findings of the doctor as JSON values; called while the bench is closed.
-    seed
-        For strategies that draw random numbers.
-    """
-
-    catalog: BenchCatalog
-    runs: Path
-    examine: Callable[[], Generator[dict[str, Any], None, None]]
-    seed: int = 0
-
-    def __call__(self, job: Job) -> Work:
-        if isinstance(job.request, DoctorRequest):
-            return self._examine  # which opens the devices itself
-
-        def work(context: Context) -> None:
-            desk = ServedDesk(context, self.catalog)
-            with closing(self._steps(context, desk)) as steps:
-                for step in steps:
-                    _show(context, step)
-
-        return work
-
-    def _steps(self, context: Context, desk: Desk) -> Steps[object]:
-        """Return the job that a request asks for."""
-        request = context.job.request
-        match request:
-            case EnrollRequest():
-                values = request.model_dump(exclude={"kind", "name"})
-                return enroll(desk, request.name, **values, ask=False)
-            case TrayRequest():
-                items = [
-                    TrayItem(n, one.name, one.label, one.note, one.views) for n, one in enumerate(request.objects, 1)
-                ]
-                return enroll_list(desk, items, views=request.views, ask=False)
-            case DryRunRequest():
-                return _dry_run(desk, request)
-            case IdentifyRequest():
-                return identify(
-                    desk,
-                    strategy=request.strategy,
-                    max_views=request.max_views,
-                    seed=self.seed,
-                    watch=request.watch,
-                    sample=request.sample,
-                    person=context.job.operator,
-                    next_folder=lambda: self._next_folder(context),
-                    live=context.add,
-                )
-            case EmptyTableRequest():
-                return take_table_image(desk, anyway=request.anyway)
-            case GotoRequest():
-                return goto(desk, request.angle_deg)
-            case HomeRequest():
-                return home(desk)
-            case ReferenceRequest():
-                return refer(desk, revolutions=request.revolutions, here=request.here)
-            case AcknowledgeRequest():
-                return acknowledge(desk, reboot=request.reboot)
-            case CalibrateRequest():
-                return _calibrated(context, desk, request)
-            case DoctorRequest():
-                raise AssertionError
-            case _:
-                assert_never(request)
-
-    def _next_folder(self, context: Context) -> Path:
+    def next_folder(self) -> Path:
         """Return the folder of the job's next saved run."""
-        name = f"{context.bench.clock.utc():%Y%m%d-%H%M%S}-{context.job.id}"
-        name = name if not (self.runs / name).exists() else f"{name}-{context.job.views}"
-        context.job.run = name
-        return self.runs / name
+        job, runs = self.job, self.setup.runs
+        name = f"{self._worker.bench().clock.utc():%Y%m%d-%H%M%S}-{job.id}"
+        job.run = name if not (runs / name).exists() else f"{name}-{job.views}"
+        return runs / job.run
 
-    def _examine(self, context: Context) -> None:
-        context.close_bench()  # the checks open the devices themselves
-        findings = []
-        with closing(self.examine()) as found:
-            for finding in found:
-                findings.append(finding)
-                context.note(f"{finding['topic']}: {finding['finding']}")
-        context.job.result = {"findings": findings}
-        bad = sum(finding["level"] == "bad" for finding in findings)
-        context.job.result_text = f"{bad or 'No'} problem{'s' * (bad != 1)} found."
+    # -- what the pages see -------------------------------------------------------------------------------------------
+
+    def _show(self, step: Step) -> None:
+        match step:
+            case Remark(text=text, event=event):
+                self._note(text) if event is None else self.show(event)
+            case Progress(words=text):
+                self._note(text)
+            case Result():
+                self.job.result, self.job.result_text = step.values, step.text
+            case _:
+                self.show(step)
+
+    def _note(self, text: str) -> None:
+        self._worker.publish("plan", {"job": self.job.id, "event": "note", "text": text})
+        self._worker.check(self.job)
+
+    def show(self, event: Event) -> None:
+        """Show an event; then pause or cancel the job if the operator asked for it."""
+        job, values, text = self.job, event_dict(event), line(event)
+        if isinstance(event, Started):
+            bench = self._worker.bench()
+            job.progress = requests.Progress(done=0, total=event.views)
+            self._outline = Outliner(bench)
+            left = TimeLeft(MotionModel(bench.config), event.angles_deg, in_motion=event.in_motion)
+            self._left = left if event.angles_deg else None
+        if self._left is not None:
+            self._left.add(event)
+        if isinstance(event, Accepted):
+            self._worker.views[job.id].append(jpeg(event.image_bgr, VIEW_PX))
+            values["picture"] = job.views
+            values["outline_px"] = None if self._outline is None else self._outline(event.image_bgr)
+            job.views += 1
+            if job.progress is not None:
+                left_s = None if self._left is None else self._left.seconds
+                job.progress = job.progress.model_copy(update={"done": job.progress.done + 1, "seconds_left": left_s})
+        if isinstance(event, Enrolled | Identified):
+            job.result, job.result_text = event_dict(event), text
+        self._worker.publish("plan", {"job": job.id, "text": text, **values})
+        if isinstance(event, Started | Accepted):
+            self._worker.queue.update(job, durable=job.views == 1)
+        self._worker.check(job)
+        if isinstance(event, Accepted | Decided):
+            self._pause()
+
+    def _pause(self) -> None:
+        """Wait while the operator wants the job to pause."""
+        worker, job = self._worker, self.job
+        if not worker.queue.is_paused(job):
+            return
+        job.state = JobState.PAUSED
+        worker.queue.update(job, durable=True)
+        while worker.queue.is_paused(job):
+            worker.wait(job)
+        job.state = JobState.RUNNING
+        worker.queue.update(job, durable=True)
 
 
-def _show(context: Context, step: Step) -> None:
-    """Report a step of a job; an operator who cancels closes the job here, and so the torque goes off."""
-    match step:
-        case Remark(text=text, event=event):
-            if event is None:
-                context.note(text)
-            else:
-                context.add(event)
-        case Progress():
-            context.note(step.words)
-        case Result():
-            context.job.result, context.job.result_text = step.values, step.text
-        case _:
-            context.add(step)
-            if isinstance(step, Enrolled | Identified):
-                context.job.result, context.job.result_text = event_dict(step), line(step)
+# -- the jobs ----------------------------------------------------------------------------------------------------------
 
 
-def _dry_run(desk: Desk, request: DryRunRequest) -> Steps[None]:
-    names = {one.name: one.views for one in request.objects}
-    with desk.open_bench() as bench, desk.open_to_enroll(bench.clock) as catalog:
-        found = dry_run(bench, catalog, names, views=request.views, resume=request.resume, replace=request.replace)
+def _enroll(desk: ServedDesk, **parameters: Any) -> Steps[None]:
+    return enroll(desk, **parameters, ask=False)
+
+
+def _tray(desk: ServedDesk, objects: list[TrayObject], views: int | None) -> Steps[None]:
+    items = [TrayItem(number, one.name, one.label, one.note, one.views) for number, one in enumerate(objects, 1)]
+    return enroll_list(desk, items, views=views, ask=False)
+
+
+def _dry_run(desk: ServedDesk, objects: list[TrayObject], **parameters: Any) -> Steps[None]:
+    found = plan(desk, {one.name: one.views for one in objects}, **parameters)
     views, seconds = sum(one.views for one in found), sum(one.seconds for one in found)
     yield Result(
         {"dry_run": plain(found)},
@@ -230,32 +202,51 @@ def _dry_run(desk: Desk, request: DryRunRequest) -> Steps[None]:
     )
 
 
-def _calibrated(context: Context, desk: Desk, request: CalibrateRequest) -> Steps[None]:
+def _identify(desk: ServedDesk, **parameters: Any) -> Steps[Identified | None]:
+    return identify(
+        desk,
+        **parameters,
+        seed=desk.setup.seed or 0,
+        person=desk.job.operator,
+        next_folder=desk.next_folder,
+        live=desk.show,
+    )
+
+
+def _examine(desk: ServedDesk) -> Steps[None]:
+    desk.close_bench()  # the checks open the devices themselves
+    setup = desk.setup
+    return examine(setup.bench, setup.config, seed=setup.seed, options=setup.arguments)
+
+
+def _calibrate(desk: ServedDesk, name: str, object: str | None) -> Steps[None]:
     """Run a calibration; its results are those of the job together."""
     found = calibrations()
-    if request.name not in found:
-        raise UsageError(f"There is no calibration {request.name!r}.", next_step=f"Choose one of {', '.join(found)}.")
+    if name not in found:
+        raise UsageError(f"There is no calibration {name!r}.", next_step=f"Choose one of {', '.join(found)}.")
     results: list[Result] = []
-    with closing(found[request.name](desk, request.object)) as steps:
+    with closing(found[name](desk, object)) as steps:
         for step in steps:
             if isinstance(step, Result):
                 results.append(step)
-                context.note(step.text)
+                yield Remark(step.text)
             else:
                 yield step
     values = [{"name": one.values["name"], "passed": one.values["passed"], "text": one.text} for one in results]
     yield Result({"calibrations": values}, "\n".join(one.text for one in results))
 
 
-def doctor_findings(
-    bench: str, config: RigConfig, seed: int | None, options: tuple[str, ...]
-) -> Generator[dict[str, Any], None, None]:
-    """Yield the findings of the doctor about a bench that is not open."""
-    from rig.doctor.checks import CHECKS
-    from rig.doctor.context import open_context
-    from rig.doctor.examination import run_checks
-
-    with open_context(bench, config, seed=seed, options=options) as context:
-        context.holder = None  # the holder is this program, which has closed its devices
-        for finding in run_checks(context, CHECKS):
-            yield finding.as_dict()
+JOBS: Final[dict[type[BaseModel], Callable[..., Steps[object]]]] = {
+    requests.EnrollRequest: _enroll,
+    requests.TrayRequest: _tray,
+    requests.DryRunRequest: _dry_run,
+    requests.IdentifyRequest: _identify,
+    requests.EmptyTableRequest: take_table_image,
+    requests.GotoRequest: goto,
+    requests.HomeRequest: home,
+    requests.ReferenceRequest: refer,
+    requests.AcknowledgeRequest: acknowledge,
+    requests.CalibrateRequest: _calibrate,
+    requests.DoctorRequest: _examine,
+}
+"""The job of each request; the fields of the request are its parameters."""

@@ -17,6 +17,7 @@ from rich.table import Table
 from hbr import Outcome
 from rig.bench import Bench
 from rig.catalog import Catalog
+from rig.catalog.jobs import JobProgress
 from rig.cli.ui.present import Progress, console
 from rig.cli.ui.settings import Settings
 from rig.config.values import validate
@@ -253,15 +254,15 @@ def _photograph(bench: Bench, operator: ShelfOperator, *, marked: bool = False) 
 def _enroll_all(
     bench: Bench, catalog: Catalog, names: Sequence[str], views: int, *, say: bool
 ) -> list[EnrollmentRecord]:
-    records = []
+    records, done = [], 0
     with Progress("enrolling") as progress:
-        progress.start(len(names) * views)
         for name in names:
             record = EnrollmentRecord(region=bench.config.view.roi)
             for event in enroll(bench, catalog, name, views=views):
                 record.add(event)
                 if isinstance(event, Accepted):
-                    progress.advance()
+                    done += 1
+                    progress(JobProgress(done, len(names) * views))
             records.append(record)
             if say and record.result:
                 progress.note(line(record.result))

@@ -10,7 +10,7 @@ from rig.config.imus import imu_kinds
 from rig.core.errors import ConfigError, DeviceMismatch
 from rig.devices.open_imu import open_imu
 from rig.doctor.bus_scan import scan_imus
-from rig.doctor.device_scan import imu_settings
+from rig.doctor.device_scan import DeviceScan
 from rig.events.events import Moved
 from sim.bench import ShelfOperator, open_sim_bench
 from sim.imu.mpu6050 import SimMpu6050
@@ -46,7 +46,8 @@ def test_new_imu_measures_the_rotations_of_an_enrollment(tmp_path):
 def test_search_and_doctor_name_the_new_imu():
     with unopened(CHOSEN) as bench:
         (found,) = scan_imus(bench.context.computer, 1)
-        assert imu_settings(found) == {("imu", "model"): "lsm6dsox", ("imu", "bus"): 1, ("imu", "address"): 0x6A}
+        (candidate,) = DeviceScan(imus=[found]).candidates["IMU"]
+        assert candidate.settings == {("imu", "model"): "lsm6dsox", ("imu", "bus"): 1, ("imu", "address"): 0x6A}
         assert not bench.problems("imu")
         bench.devices.i2c.detach(0x6A)
         bench.devices.i2c.attach(0x6A, SimMpu6050(bench.devices.world))

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import unicodedata
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -24,6 +25,7 @@ CONFIG = (
     'default_bench = "sim"\n[camera]\nwidth = 320\nheight = 240\n[view]\nroi = [40, 0, 240, 240]\n'
     '[catalog]\npath = "catalog"\n'
 )
+WITH_VALUE = ("--seed", "--views", "--revolutions", "--config", "--set", "--bench")
 NIGHTLY = 200
 """How many times as many cases the nightly profile has."""
 
@@ -116,8 +118,14 @@ def check(done: Done, arguments: tuple[str, ...]) -> None:
         assert not [c for c in text if unicodedata.category(c) == "Cc" and c not in "\n\t"], (arguments, text)
     if done.exit_code:
         assert "Next step:" in done.err or "─ Error ─" in done.err or done.exit_code in (6, 7, 8), (arguments, done)
-    if "--json" in arguments:
+    if asks_for_json(arguments):
         assert all(isinstance(json.loads(line), dict) for line in done.out.splitlines()), (arguments, done.out)
+
+
+def asks_for_json(arguments: tuple[str, ...]) -> bool:
+    """Return whether ``--json`` is an option here: not the value of another option, and not after ``--``."""
+    options = arguments[: arguments.index("--")] if "--" in arguments else arguments
+    return any(word == "--json" and before not in WITH_VALUE for before, word in pairwise(("", *options)))
 
 
 def tree(folder: Path) -> dict[str, Any]:

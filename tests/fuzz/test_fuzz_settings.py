@@ -113,6 +113,8 @@ OPTIONS = [
 @example("import", ["9" * 256])
 @example("eval", ["--json", "9/" * 2100])
 @example("status", ["--seed", "9" * 4000])
+@example("config path", ["--set", "--json"])
+@example("config path", ["--", "--json"])
 def test_any_arguments_end_with_a_documented_exit_code(commands, command, arguments):
     commands.fresh()
     commands.run(*command.split(), "--bench", "sim", *arguments)

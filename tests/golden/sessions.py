@@ -158,7 +158,7 @@ def _jobs(folder: Path, session: dict[str, Any]) -> Values:
     with pytest.MonkeyPatch.context() as patch, starting(folder) as start:
         patch.setattr(BenchWorker, "_idle", wait)
         served = start(*session.get("settings", ()))
-        publish = served.side.worker._publish
+        publish = served.side.worker.publish
         request: dict[int, str] = {}
 
         def published(kind: str, data: Any) -> None:
@@ -168,7 +168,7 @@ def _jobs(folder: Path, session: dict[str, Any]) -> Values:
                 if data["event"] == "accepted" and (path := request.pop(data["picture"] + 1, None)):
                     served.client.post(f"/api/v1/jobs/{data['job']}/{path}")
 
-        served.side.worker._publish = published
+        served.side.worker.publish = published
         for step in session["steps"]:
             values.append({"request": step["job"]})
             request.clear()

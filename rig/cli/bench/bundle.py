@@ -5,19 +5,21 @@ import platform
 from importlib.metadata import distributions
 from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from zipfile import ZIP_DEFLATED, ZipFile
 
 from rig.cli.bench.snapshot import take, write_new
 from rig.cli.ui.settings import Settings
+from rig.config.values import default_path
 from rig.core.errors import RigError
+from rig.core.json_form import plain
 from rig.core.masking import masked
+from rig.doctor.finding import Finding
+from rig.safety.saved_state import FileStore
+from rig.views.image_files import encode
 
-if TYPE_CHECKING:
-    from rig.doctor.finding import Finding
 
-
-def write_bundle(settings: Settings, file: Path, findings: "list[Finding]", *, picture: bool) -> None:
+def write_bundle(settings: Settings, file: Path, findings: list[Finding], *, picture: bool) -> None:
     """Write findings, log, configuration and versions into a ZIP file, and with ``picture`` one image of the camera.
 
     Passwords and tokens are masked. What cannot be read is left out; the list ``missing`` in ``versions.json`` has the
@@ -28,11 +30,6 @@ def write_bundle(settings: Settings, file: Path, findings: "list[Finding]", *, p
     UsageError
         The file exists or cannot be written.
     """
-    from rig.config.values import default_path
-    from rig.events.events import plain
-    from rig.safety.saved_state import FileStore
-    from rig.views.image_files import encode
-
     contents: dict[str, bytes] = {"findings.json": _json([finding.as_dict() for finding in findings])}
     missing: list[str] = []
 

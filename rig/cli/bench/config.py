@@ -8,11 +8,13 @@ import typer
 from rig.cli.ui.command import command
 from rig.cli.ui.complete import config_keys
 from rig.cli.ui.settings import Settings
+from rig.core.clock import SystemClock
 from rig.core.errors import ConfigError, UsageError
 from rig.core.masking import masked
+from rig.core.phrases import counted
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
 
     from pydantic import BaseModel
 
@@ -32,7 +34,6 @@ def check(settings: Settings) -> None:
     Example: rig config check --config rig.toml
     """
     from rig.config.wording import key_info
-    from rig.core.phrases import counted
 
     values, config, _ = _checked(settings)
     given = sum(values.origin(info.key) != "default" for info in key_info(type(config)))
@@ -66,14 +67,14 @@ def show(
     calibrations = _calibrations_on_bench(settings, config)
     in_force = [calibration.result for calibration in calibrations if calibration.status is CalibrationStatus.IN_FORCE]
     applied, _ = apply_results(config, in_force)
-    layers = _Layers(values, settings, in_force)
+    layers = _layers(values, settings, in_force)
 
     def is_wanted(name: str) -> bool:
         return not wanted or any(name == one or name.startswith(f"{one}.") for one in wanted)
 
     every = list(_keys(applied, options))
     rows = [
-        (info, _masked(info, value), [(origin, _masked(info, other)) for origin, other in layers.below(info)])
+        (info, _masked(info, value), layers(info))
         for info, value in every
         if is_wanted(info.name) and not (changed and value == info.default)
     ]
@@ -202,8 +203,6 @@ def _print_json(
     rows: "Sequence[tuple[KeyInfo, Any, list[tuple[str, Any]]]]",
     calibrations: "Sequence[BenchCalibration]",
 ) -> None:
-    from rig.events.events import plain
-
     settings.print_json(
         {
             "path": values.path,
@@ -223,8 +222,8 @@ def _print_json(
                 {
                     "id": one.result.id,
                     "status": one.status,
-                    "estimates": plain(one.result.estimates),
-                    "settings": plain(one.result.settings),
+                    "estimates": one.result.estimates,
+                    "settings": one.result.settings,
                 }
                 for one in calibrations
             ],
@@ -235,29 +234,27 @@ def _print_json(
 def _calibrations_on_bench(settings: Settings, config: "RigConfig") -> "list[BenchCalibration]":
     """Return the bench's calibrations; their status as far as it is known without opening the bench."""
     from rig.calibrations import CalibrationStore, apparatus
-    from rig.core.clock import SystemClock
 
     name = settings.bench or config.default_bench
     mounted = apparatus(name, {part: {} for part in ("servo", "imu", "camera")}, config, {})
     return CalibrationStore(config.calibration_path(name)).on_bench(mounted, SystemClock().utc())
 
 
-class _Layers:
-    """The values that a key has in the command line, the file, the calibrations and the defaults."""
+def _layers(
+    values: "Values", settings: Settings, in_force: "Sequence[CalibrationResult]"
+) -> "Callable[[KeyInfo], list[tuple[str, Any]]]":
+    """Return a function for the sources and the values of a key: that in force, then those that it overrides."""
+    from rig.config.values import read_values
 
-    def __init__(self, values: "Values", settings: Settings, in_force: "Sequence[CalibrationResult]") -> None:
-        from rig.config.values import read_values
+    files = [values, read_values(settings.config)] if settings.overrides else [values]
 
-        self._files = [values, read_values(settings.config)] if settings.overrides else [values]
-        self._in_force = in_force
+    def of(info: "KeyInfo") -> list[tuple[str, Any]]:
+        given = {one.origin(info.key): one for one in files if one.origin(info.key) != "default"}
+        layers = [(origin, _value(one.values, info.key)) for origin, one in given.items()]
+        layers += [(r.id, r.settings[info.name]) for r in reversed(in_force) if info.name in r.settings]
+        return [(origin, _masked(info, value)) for origin, value in (*layers, ("default", info.default))]
 
-    def below(self, info: "KeyInfo") -> list[tuple[str, Any]]:
-        """Return the source and the value in each layer that has one, the one in force first."""
-        found = {values.origin(info.key): values for values in self._files}
-        found.pop("default", None)
-        layers = [(origin, _value(values.values, info.key)) for origin, values in found.items()]
-        layers += [(r.id, r.settings[info.name]) for r in reversed(self._in_force) if info.name in r.settings]
-        return [*layers, ("default", info.default)]
+    return of
 
 
 def _keys(config: "RigConfig", options: "Mapping[str, BaseModel]") -> "Iterator[tuple[KeyInfo, Any]]":

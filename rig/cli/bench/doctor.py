@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rig.cli.bench.findings import doctor_context, print_finding, show_progress
+from rig.cli.bench.findings import doctor_context, print_finding, show_findings
 from rig.cli.bench.snapshot import check_new
 from rig.cli.ui.command import command
 from rig.cli.ui.settings import Settings
@@ -64,7 +64,6 @@ def print_findings(settings: Settings, findings: "list[Finding] | None" = None) 
     from rig.config import RigConfig
     from rig.config.values import default_path
     from rig.doctor.checks import CHECKS
-    from rig.doctor.examination import run_checks
     from rig.doctor.finding import FindingCode, Severity, bad, fine, of_error
 
     screen = console()
@@ -87,8 +86,7 @@ def print_findings(settings: Settings, findings: "list[Finding] | None" = None) 
         config = None
     try:
         with doctor_context(settings, default=config is None) as context:
-            for finding in run_checks(context, CHECKS, show_progress):
-                add(finding)
+            findings += show_findings(None if settings.json else screen, context, CHECKS)
     except RigError as error:  # there is no such bench, or no such part of it
         add(of_error("bench", error))
     counts = {level: sum(finding.level is level for finding in findings) for level in Severity}

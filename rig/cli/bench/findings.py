@@ -10,11 +10,12 @@ from rig.cli.ui.terminal import unguarded
 from rig.core.control_characters import neutral
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterable, Iterator
 
     from rich.console import Console
 
     from rig.doctor.context import DoctorContext
+    from rig.doctor.examination import Check
     from rig.doctor.finding import Finding
 
 _TOPIC_WIDTH = 12
@@ -34,6 +35,18 @@ def doctor_context(settings: Settings, *, default: bool = False) -> "Iterator[Do
     name = settings.bench or config.default_bench
     with open_context(name, config, seed=settings.seed, options=options, file_options=file_options) as context:
         yield context
+
+
+def show_findings(screen: "Console | None", context: "DoctorContext", checks: "Iterable[Check]") -> "list[Finding]":
+    """Run checks, and print and return their findings; nothing is printed without a screen."""
+    from rig.doctor.examination import run_checks
+
+    findings = []
+    for finding in run_checks(context, checks, show_progress):
+        findings.append(finding)
+        if screen is not None:
+            print_finding(screen, finding)
+    return findings
 
 
 def print_finding(screen: "Console", finding: "Finding") -> None:

@@ -1,5 +1,6 @@
 """`rig head`: the rig head's identity and serial number."""
 
+from contextlib import closing
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -39,8 +40,6 @@ def set_serial(
 
 def _show(settings: Settings, serial: int | None) -> None:
     """Store the serial number unless it is None, and print the head's identity."""
-    from contextlib import closing
-
     from rig.devices.head.connection import version
     from rig.devices.head.protocol import BAUD, SERIAL_UNSET, Board
     from rig.devices.head.serial_number import read_identity, store_serial

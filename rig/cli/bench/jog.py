@@ -1,7 +1,5 @@
 """`rig jog`."""
 
-import os
-import select
 import sys
 import termios
 import tty
@@ -12,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 
 from rig.cli.ui.command import command
+from rig.cli.ui.keys import read_keys
 from rig.cli.ui.settings import Settings
 from rig.core.errors import UsageError
 
@@ -82,14 +81,5 @@ def _pressed(step: float) -> "Iterator[JogKey | None]":
     from rig.plans.jog import JogKey
 
     print(f"→ +{step:g}°   ← −{step:g}°   ↑ ↓ step   h home   q end   Ctrl+C stop", file=sys.stderr)
-    while True:
-        if not select.select([sys.stdin], [], [], _WAIT_S)[0]:
-            yield None
-            continue
-        try:
-            data = os.read(sys.stdin.fileno(), 64)
-        except OSError:  # the terminal is gone
-            return
-        if not data:
-            return
-        yield next((JogKey(name) for code, name in _KEYS.items() if data.startswith(code)), None)
+    while (keys := read_keys(_WAIT_S)) is not None:
+        yield next((JogKey(name) for code, name in _KEYS.items() if keys.startswith(code)), None)

@@ -6,6 +6,7 @@ import typer
 
 from rig.cli.ui.command import command
 from rig.cli.ui.settings import Settings
+from rig.core.clock import SystemClock
 
 
 @command
@@ -14,7 +15,6 @@ def stop(settings: Settings) -> None:
 
     Example: rig stop --bench sim
     """
-    from rig.core.clock import SystemClock
     from rig.motion.stop_request import stop as stop_bench
 
     done = stop_bench(settings.bench_name, settings.load(), SystemClock(), seed=settings.seed)

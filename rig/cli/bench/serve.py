@@ -9,6 +9,7 @@ import typer
 
 from rig.cli.ui.command import command
 from rig.cli.ui.settings import Settings
+from rig.core.clock import SystemClock
 from rig.core.errors import UsageError
 
 if TYPE_CHECKING:
@@ -62,7 +63,6 @@ def serve(
             f"rig serve needs packages that are not installed ({error.name}).",
             next_step="Install them: pip install 'hbr-rig[web]'",
         ) from error
-    from rig.core.clock import SystemClock
     from rig.safety.saved_state import SERVER_FOLDER
     from rig.web.access import Role, Tokens
     from rig.web.run import run_server
@@ -96,7 +96,7 @@ def serve(
         needs_login=needs_login,
     )
     if settings.bench_name == "sim" and "speed" not in settings.load().bench.get("sim", {}):
-        settings = settings.merged(None, None, ["bench.sim.speed=1"], None, False)  # people watch it
+        settings = settings.merged(overrides=["bench.sim.speed=1"])  # people watch it
     arguments = tuple(settings.arguments())
     settings.opened.append(settings.bench_name)
 

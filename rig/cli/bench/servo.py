@@ -4,7 +4,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from rig.cli.bench.findings import doctor_context, show_progress
 from rig.cli.ui.command import command
+from rig.cli.ui.exit_codes import EXIT_DEVICE
+from rig.cli.ui.options import YesOption
 from rig.cli.ui.prompts import ask_yes_no
 from rig.cli.ui.settings import Settings
 
@@ -14,8 +17,6 @@ if TYPE_CHECKING:
 
 app = typer.Typer(help="Show the servo's registers, and change its settings, id and baud rate.", no_args_is_help=True)
 
-YesOption = Annotated[bool, typer.Option("--yes", "-y", help="Do not ask for confirmation.")]
-
 
 @app.command("info")
 @command
@@ -24,7 +25,6 @@ def info(settings: Settings) -> None:
 
     Example: rig servo info --bench sim
     """
-    from rig.cli.bench.findings import doctor_context, show_progress
     from rig.doctor.register_meaning import meaning
     from rig.doctor.single_servo import single_servo
 
@@ -70,7 +70,6 @@ def settings_(
 
     Example: rig servo settings --write --bench sim
     """
-    from rig.cli.bench.findings import doctor_context, show_progress
     from rig.devices.dynamixel.settings import ServoMode, compare
     from rig.devices.dynamixel.settings import write as write_settings
     from rig.doctor.single_servo import single_servo
@@ -92,7 +91,7 @@ def settings_(
     elif differences:
         print(f"To write them: {context.rig('servo settings --write')}")
     if differences and not written:
-        raise typer.Exit(4)
+        raise typer.Exit(EXIT_DEVICE)
 
 
 @app.command("set-id")
@@ -124,7 +123,6 @@ def set_baud(
 
 
 def _change(settings: Settings, what: str, new: int, yes: bool) -> None:
-    from rig.cli.bench.findings import doctor_context, show_progress
     from rig.doctor.single_servo import single_servo
 
     with doctor_context(settings) as context, single_servo(context, show_progress) as servo:

@@ -5,23 +5,24 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
+from rig.cli.bench.findings import doctor_context, show_findings
 from rig.cli.ui import prompts
 from rig.cli.ui.command import command
 from rig.cli.ui.settings import Settings
+from rig.core.errors import SeveralServos
 
 if TYPE_CHECKING:
     from rig.bench.computer import DeviceFile
     from rig.config.toml_file import Key
     from rig.doctor.context import DoctorContext
-    from rig.doctor.device_scan import DeviceScan
-
-T = TypeVar("T")
+    from rig.doctor.device_scan import Candidate, DeviceScan
 
 MIN_BUDGET_DEG, MAX_BUDGET_DEG = 180.0, 90_000.0
+_PORT: Final = ("servo", "port")
 
 
 @command
@@ -39,7 +40,6 @@ def setup(
     Example: rig setup --bench sim --yes
     """
     from rig.cli.bench.doctor import print_findings
-    from rig.cli.bench.findings import doctor_context
     from rig.config import RigConfig, load_config
     from rig.config.toml_file import read_text, save, stated, with_values
     from rig.config.values import FILE_NAME, default_path
@@ -93,88 +93,63 @@ class Dialogue:
 
     def run(self) -> "dict[Key, Any]":
         """Return the settings that were found or entered, by key."""
-        from rig.doctor.device_scan import (
-            DeviceScan,
-            camera_settings,
-            head_settings,
-            imu_settings,
-            ribbon_settings,
-            servo_settings,
-        )
-
-        scan = DeviceScan()
-        self._scan(scan)
+        scan = self._scan()
         while (
             not scan.servos
             and not scan.duplicate_ids
             and self._search_again("No servo that the rig can drive was found.")
         ):
-            scan = DeviceScan()
-            self._scan(scan)
-        computer = self.context.computer
-        servo = self._pick("servo", scan.servos, [f"{p.path}: {s}" for p, s in scan.servos], lambda pair: pair[0])
-        if servo is not None:
-            self.wanted |= servo_settings(*servo)
-            if computer.same_file(servo[0].path, self.context.config.servo.port) and self._configured("servo", "port"):
-                self.wanted[("servo", "port")] = self.context.config.servo.port  # keep the configured name
+            scan = self._scan()
+        config, found = self.context.config, scan.candidates
+        if (servo := self._pick("servo", found["servo"])) is not None:
+            self.wanted |= servo.settings
+            path = config.servo.port
+            if self._configured("servo", "port") and self.context.computer.same_file(servo.settings[_PORT], path):
+                self.wanted[_PORT] = path  # keep the configured name
             self._permanent_settings()
         elif not scan.servos:
             self._which_port()
-        imus = [(str(found), imu_settings(found)) for found in scan.imus]
-        imus += [(f"on the rig head at {port.path}", head_settings(port)) for port in scan.heads]
-        imu = self._pick("IMU", imus, [shown for shown, _ in imus])
-        if imu is not None:
-            self.wanted |= imu[1]
-            if self.context.config.imu.connection == "head" and ("imu", "connection") not in imu[1]:
+        if (imu := self._pick("IMU", found["IMU"])) is not None:
+            if config.imu.connection == "head":
                 self.wanted[("imu", "connection")] = "i2c"
-        shown = [f"{c.node.path}: {c.node.name}, {c.width}x{c.height}" for c in scan.cameras]
-        if not scan.ribbons:
-            camera = self._pick("camera", scan.cameras, shown, lambda found: found.node)
-            self.wanted |= {} if camera is None else camera_settings(camera)
-        else:
-            cameras = [camera_settings(found) for found in scan.cameras]
-            ribbons = [ribbon_settings(number) for number in scan.ribbons]
-            names = [f"on ribbon cable {number}" for number in scan.ribbons]
-            self.wanted |= self._pick("camera", [*cameras, *ribbons], [*shown, *names]) or {}
+            self.wanted |= imu.settings
+        if (camera := self._pick("camera", found["camera"])) is not None:
+            self.wanted |= camera.settings
         self._cable_budget()
         return self.wanted
 
-    def _scan(self, scan: "DeviceScan") -> None:
-        from rig.cli.bench.findings import print_finding, show_progress
+    def _scan(self) -> "DeviceScan":
         from rig.cli.ui.present import console
-        from rig.doctor.examination import run_checks
+        from rig.doctor.device_scan import DeviceScan
 
-        screen = console(stderr=self.out is sys.stderr)
-        for finding in run_checks(self.context, scan.checks, show_progress):
-            print_finding(screen, finding)
+        scan = DeviceScan()
+        show_findings(console(stderr=self.out is sys.stderr), self.context, scan.checks)
+        return scan
 
     def _search_again(self, what: str) -> bool:
         if self.ask_nothing:
             return False
         return prompts.ask_yes_no(f"{what} Check cables and supply. Search again?", default=False)
 
-    def _pick(
-        self, what: str, found: Sequence[T], shown: Sequence[str], node: "Callable[[T], DeviceFile] | None" = None
-    ) -> T | None:
+    def _pick(self, what: str, found: "Sequence[Candidate]") -> "Candidate | None":
         """Return the only device, or the one that the operator chooses; None without a choice."""
         if len(found) <= 1:
             return found[0] if found else None
         if self.ask_nothing:
             print(f"! {len(found)} devices could be the {what}; its configuration is unchanged.", file=self.out)
             return None
-        nodes = [node(each) for each in found] if node else []
-        several = len({each.path for each in nodes}) > 1
+        files = [one.file for one in found if one.file is not None]
+        can_unplug = len(files) == len(found) and len({file.path for file in files}) > 1
         index = prompts.ask_choice(
-            f"Which is the table's {what}?", shown, other="find out by unplugging it" if several else ""
+            f"Which is the table's {what}?",
+            [one.words for one in found],
+            other="find out by unplugging it" if can_unplug else "",
         )
         if index is not None:
             return found[index]
-        unplugged = self._unplugged(
-            what, lambda: [*self.context.computer.serial_ports(), *self.context.computer.cameras()]
-        )
-        return next(
-            (each for each, its in zip(found, nodes, strict=True) if unplugged and its.path == unplugged.path), None
-        )
+        computer = self.context.computer
+        gone = self._unplugged(what, lambda: [*computer.serial_ports(), *computer.cameras()])
+        return next((one for one, file in zip(found, files, strict=True) if gone and file.path == gone.path), None)
 
     def _unplugged(self, what: str, there: "Callable[[], Sequence[DeviceFile]]") -> "DeviceFile | None":
         """Find a device's file: the operator unplugs the device and plugs it in again."""
@@ -203,18 +178,15 @@ class Dialogue:
             )
             port = ports[index] if index is not None else self._unplugged("adapter", self.context.computer.serial_ports)
         if port is not None and not self.context.computer.same_file(port.path, self.context.config.servo.port):
-            self.wanted[("servo", "port")] = port.stable or port.path
+            self.wanted[_PORT] = port.stable or port.path
 
     def _permanent_settings(self) -> None:
         """Show the differing settings of the servo's EEPROM, and write them if the operator agrees."""
-        from rig.config.toml_file import Key
-        from rig.core.errors import SeveralServos
         from rig.devices.dynamixel.settings import ServoMode, compare, write
         from rig.doctor.single_servo import single_servo
 
-        key: Key = ("servo", "port")
         config = self.context.config
-        found = config.servo.model_copy(update={"port": self.wanted[key]})
+        found = config.servo.model_copy(update={"port": self.wanted[_PORT]})
         context = replace(self.context, config=config.model_copy(update={"servo": found}))
         with suppress(SeveralServos), single_servo(context) as servo:
             differences = compare(servo.bus, servo.found.bus_id, servo.table, ServoMode(config.table.mode))

@@ -1,6 +1,7 @@
 """`rig snapshot`."""
 
 import sys
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -31,7 +32,6 @@ def snapshot(
 
     Example: rig snapshot table.png --bench sim
     """
-    from rig.events.events import plain
     from rig.views.image_files import encode
 
     check_new(file, ".png")
@@ -40,7 +40,7 @@ def snapshot(
     frame, identity, locks = take(settings, refocus=refocus)
     write_new(file, encode(frame.image_bgr))
     size = f"{identity.width}x{identity.height}"
-    report = {"file": str(file), "camera": plain(identity), "locks": plain(locks)}
+    report = {"file": str(file), "camera": identity, "locks": locks}
     settings.say(f"{file}: {size} pixels, mean level {frame.image_bgr.mean():.0f}.", report)
     if refocus:
         focus = "The camera reports no focus" if locks.focus is None else f"The focus is {locks.focus:g} now"
@@ -57,8 +57,6 @@ def take(settings: Settings, *, refocus: bool = False) -> "tuple[Frame, CameraId
     DeviceNotFound, DeviceSilent
         The camera is missing, or delivers no frames.
     """
-    from contextlib import closing
-
     from rig.doctor.camera import open_camera
 
     with doctor_context(settings) as context:

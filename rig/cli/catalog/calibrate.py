@@ -2,15 +2,18 @@
 
 import os
 import sys
-from contextlib import contextmanager
+from math import isfinite
 from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from rig.cli.ui.cluster import ClusterOption, jobs_of
 from rig.cli.ui.command import command
-from rig.cli.ui.exit_codes import EXIT_INTERRUPTED
+from rig.cli.ui.jobs import interruptible
+from rig.cli.ui.options import ClusterOption, jobs_of
 from rig.cli.ui.settings import Settings
+from rig.core.clock import SystemClock, seconds_between
+from rig.core.errors import CatalogError
+from rig.core.phrases import counted, percent, percent_words, sentence
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -47,17 +50,15 @@ def calibrate(
     from rig.catalog.jobs import JobProgress
     from rig.catalog.prepared import prepared_views
     from rig.catalog.unfinished import UnfinishedJob
-    from rig.cli.ui.jobs import progress_bar
-    from rig.core.clock import SystemClock, seconds_between
-    from rig.core.errors import CatalogError
+    from rig.cli.ui.present import Progress
+    from rig.core.json_form import plain
     from rig.core.processes import map_in_processes
-    from rig.events.events import plain
     from rig.search.stopping_rules import FILE, digest, stopping_rule_values, write_stopping_rule
     from rig.views.description import BENCH_DESCRIPTOR
 
     clock = SystemClock()
     with settings.open_catalog(read_only=True) as catalog:
-        with progress_bar("Preparing objects for searches") as progress:
+        with Progress("Preparing objects for searches") as progress:
             views = prepared_views(catalog, BENCH_DESCRIPTOR, progress)
         if not len(views):
             raise CatalogError("The catalog is empty.", next_step="Enroll at least one object: rig enroll NAME.")
@@ -67,11 +68,12 @@ def calibrate(
     index = DenseIndex(views)
     unfinished = UnfinishedJob(path.with_name("calibrate.unfinished"), digest(index))
     unfinished.load()
-    with unfinished, _interruptible(unfinished), progress_bar("Searching") as progress:
 
-        def show(done: int, total: int) -> None:
-            progress(JobProgress(done, total))
+    def interrupted() -> str:
+        kept = "the searches so far are stored. The same command continues."
+        return f"Interrupted; {kept if unfinished.is_stored else 'nothing changed.'}"
 
+    with unfinished, interruptible(interrupted), Progress("Searching") as progress:
         where = jobs_of(None, cluster)
         if where is None and len(views) >= _SEVERAL_PROCESSES:
             where = os.cpu_count() or 1
@@ -79,7 +81,7 @@ def calibrate(
             index,
             error_rate=error_rate,
             false_reject=false_reject,
-            progress=show,
+            progress=lambda done, total: progress(JobProgress(done, total)),
             tasks=lambda work, tasks: _continued(
                 unfinished, tasks, lambda left: map_in_processes(work, left, where or 1)
             ),
@@ -122,25 +124,7 @@ def _continued(
         yield task, found
 
 
-@contextmanager
-def _interruptible(unfinished: "UnfinishedJob") -> "Iterator[None]":
-    """Say after Ctrl+C how to continue."""
-    try:
-        yield
-    except KeyboardInterrupt:
-        kept = (
-            "the searches so far are stored. The same command continues."
-            if unfinished.is_stored
-            else "nothing changed."
-        )
-        print(f"Interrupted; {kept}", file=sys.stderr)
-        raise typer.Exit(EXIT_INTERRUPTED) from None
-
-
 def _lines(found: "CalibratedRule", objects: int, seconds: float) -> list[str]:
-    from math import isfinite
-
-    from rig.core.phrases import counted, percent, percent_words, sentence
     from rig.events.note_wording import limitation_words
 
     rule = found.rule

@@ -7,9 +7,11 @@ import typer
 
 from rig.cli.ui.command import command
 from rig.cli.ui.complete import object_names
-from rig.cli.ui.jobs import confirm, print_table, size_words
+from rig.cli.ui.jobs import confirm, size_words
+from rig.cli.ui.options import YesOption
 from rig.cli.ui.settings import Settings
-from rig.core.phrases import number
+from rig.core.errors import UsageError
+from rig.core.phrases import counted, number
 
 if TYPE_CHECKING:
     from rig.catalog import ObjectDetails, ObjectSummary
@@ -17,7 +19,6 @@ if TYPE_CHECKING:
 app = typer.Typer(help="Manage the enrolled objects.", no_args_is_help=True)
 
 NameArgument = Annotated[str, typer.Argument(metavar="NAME", help="Name of the object.", autocompletion=object_names)]
-YesOption = Annotated[bool, typer.Option("--yes", "-y", help="Do not ask for confirmation.")]
 
 
 @app.command("list")
@@ -39,7 +40,6 @@ def list_(
     Example: rig catalog list 'mug-*' --label kitchen --bench sim
     """
     from rig.catalog.edit import deleted_objects
-    from rig.events.events import plain
 
     with settings.open_catalog(read_only=True) as catalog:
         found = deleted_objects(catalog) if deleted else catalog.objects()
@@ -51,7 +51,7 @@ def list_(
             and (not unfinished or item.unfinished_views is not None)
         ]
         if settings.json:
-            settings.print_json({"catalog": str(catalog.place), "objects": plain(objects)})
+            settings.print_json({"catalog": str(catalog.place), "objects": objects})
         elif objects:
             _print_objects(objects)
         else:
@@ -63,6 +63,8 @@ def list_(
 
 
 def _print_objects(objects: "list[ObjectSummary]") -> None:
+    from rig.cli.ui.present import print_table
+
     rows = []
     for item in objects:
         views = str(item.views)
@@ -88,7 +90,7 @@ def show(
 
     Example: rig catalog show mug-white --bench sim
     """
-    from rig.events.events import plain
+    from rig.core.json_form import plain
     from rig.views.segmentation_evidence import SegmentationSummary
 
     with settings.open_catalog(read_only=True) as catalog:
@@ -108,7 +110,6 @@ def show(
 
 
 def _print_object(details: "ObjectDetails", folder: str, *, full: bool) -> None:
-    from rig.core.phrases import counted
     from rig.views.segmentation_evidence import SegmentationSummary
 
     summary = details.summary
@@ -174,7 +175,6 @@ def label_(
     Example: rig catalog label mug-white kitchen --note "a chip at the rim" --bench sim
     """
     from rig.catalog.edit import set_texts
-    from rig.core.errors import UsageError
 
     if label is None and note is None:
         raise UsageError("Neither a label nor a note is given.", next_step="Give a label, --note, or both.")
@@ -201,7 +201,6 @@ def delete_(
     Example: rig catalog delete mug-white --yes --bench sim
     """
     from rig.catalog.edit import delete
-    from rig.core.phrases import counted
 
     with settings.open_catalog() as catalog:
         found = [catalog.summary(name) for name in dict.fromkeys(names)]
@@ -226,7 +225,6 @@ def undelete_(
     Example: rig catalog undelete mug-white --bench sim
     """
     from rig.catalog.edit import undelete
-    from rig.core.phrases import counted
 
     with settings.open_catalog() as catalog:
         undelete(catalog, name)
@@ -242,7 +240,7 @@ def stats(settings: Settings) -> None:
     Example: rig catalog stats --bench sim --json
     """
     from rig.catalog.upkeep import statistics
-    from rig.events.events import plain
+    from rig.core.json_form import plain
 
     with settings.open_catalog(read_only=True) as catalog:
         found = statistics(catalog)

@@ -1,13 +1,15 @@
 """`rig catalog deliver`: bring the journal of this computer to the server."""
 
+import sys
 from typing import Annotated
 
 import typer
 
 from rig.cli.ui.command import command
+from rig.cli.ui.exit_codes import EXIT_CATALOG
 from rig.cli.ui.settings import Settings
-
-EXIT_CATALOG = 7
+from rig.core.clock import SystemClock
+from rig.core.errors import UsageError
 
 
 @command
@@ -34,10 +36,9 @@ def deliver(
     from rig.catalog import edit
     from rig.catalog.journal import Journal
     from rig.catalog.journal import discard as remove
-    from rig.core.clock import SystemClock
-    from rig.core.errors import UsageError
+    from rig.catalog.shared import deliver_journal, delivery_words
 
-    place = settings.load().catalog_place(settings.bench_name)
+    place = settings.place
     if place.url is None:
         raise UsageError(
             "The catalog is in a folder of this computer.",
@@ -51,7 +52,9 @@ def deliver(
                 edit.rename(journal, *rename)
             if discard is not None:
                 remove(journal, discard)
-    done = settings.deliver(replacing=replace or (), now=True)
+    done = deliver_journal(place, SystemClock(), replacing=replace or ())
+    for one in done:
+        print(f"{'' if one.conflict is None else 'Note: '}{delivery_words(one, place)}", file=sys.stderr)
     conflicts = [one for one in done if one.conflict is not None]
     if settings.json:
         rows = [{"name": one.name, "views": one.views, "conflict": one.conflict and one.conflict.what} for one in done]

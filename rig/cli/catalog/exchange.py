@@ -1,19 +1,23 @@
 """`rig import` and `rig export`."""
 
 import sys
+from contextlib import nullcontext
 from dataclasses import replace
 from enum import StrEnum
+from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from rig.cli.ui.cluster import ClusterOption, jobs_of
 from rig.cli.ui.command import command
 from rig.cli.ui.complete import object_names
 from rig.cli.ui.jobs import run_job, size_words
-from rig.cli.ui.models import descriptor_name
+from rig.cli.ui.options import ClusterOption, DryImportOption, JobsOption, descriptor_name, jobs_of
 from rig.cli.ui.settings import Settings
+from rig.core.clock import SystemClock, seconds_between
+from rig.core.errors import ExportFailed, ImportRejected, UsageError
+from rig.core.phrases import counted
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -38,6 +42,16 @@ class Format(StrEnum):
     HTML = "html"
     COCO = "coco"
     YOLO = "yolo"
+
+
+_FORMAT_OF: Final = {
+    "": Format.COIL,
+    ".zip": Format.BUNDLE,
+    ".csv": Format.CSV,
+    ".parquet": Format.PARQUET,
+    ".html": Format.HTML,
+}
+"""The format that the suffix of a target names."""
 
 
 @command
@@ -72,8 +86,8 @@ def import_(
             "rig catalog redescribe can do it later.",
         ),
     ] = None,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only report what would be imported.")] = False,
-    jobs: Annotated[int | None, typer.Option(min=1, help="Number of processes (default: one per core).")] = None,
+    dry_run: DryImportOption = False,
+    jobs: JobsOption = None,
     cluster: ClusterOption = None,
 ) -> None:
     """Import photographs with known angles, or objects of another bench; all or nothing.
@@ -104,11 +118,7 @@ def run_import(
     jobs: "Jobs | None",
 ) -> None:
     """Import a batch, or check it, and report."""
-    from contextlib import nullcontext
-
     from rig.catalog.exchange import Conflict, import_objects, plan_import, preview_import
-    from rig.core.clock import SystemClock, seconds_between
-    from rig.core.errors import UsageError
 
     try:
         conflict = Conflict(on_conflict)
@@ -134,8 +144,6 @@ def run_import(
 def _read_batch(source: Path, pattern: str | None, table_angles: bool) -> "ImportBatch":
     from rig.catalog.exchange import DEFAULT_PATTERN, read_bundle, read_folder, read_table, read_unpacked
     from rig.catalog.exchange.bundle import MANIFEST
-    from rig.core.clock import SystemClock
-    from rig.core.errors import ImportRejected, UsageError
 
     now = SystemClock().utc()
     if source.is_dir():
@@ -158,10 +166,8 @@ def _read_batch(source: Path, pattern: str | None, table_angles: bool) -> "Impor
 
 
 def _report(settings: Settings, done: "Imported", seconds: float, *, dry_run: bool) -> None:
-    from rig.core.phrases import counted
-
     if settings.json:
-        from rig.events.events import plain
+        from rig.core.json_form import plain
 
         values = {**plain(replace(done, rejected=())), "rejected": [file.as_json() for file in done.rejected]}
         settings.print_json({"dry_run": dry_run, "seconds": round(seconds, 3), **values})
@@ -229,10 +235,16 @@ def export(
     Example: rig export training --format coco --split view --bench sim
     """
     from rig.catalog.exchange import read_objects, write_bundle, write_folder, write_parquet, write_table
-    from rig.core.errors import ExportFailed
-    from rig.core.phrases import counted
     from rig.report.catalog_page import write_catalog_page, write_sheets
 
+    writers = {
+        Format.BUNDLE: write_bundle,
+        Format.COIL: write_folder,
+        Format.CSV: write_table,
+        Format.PARQUET: write_parquet,
+        Format.SHEETS: write_sheets,
+        Format.HTML: write_catalog_page,
+    }
     form = format_ or _format(target)
     with settings.open_catalog(read_only=True) as catalog:
         wanted = list(names or [])
@@ -242,22 +254,10 @@ def export(
         if label is not None and not wanted:
             raise ExportFailed(f"No object has the label {label!r}.", next_step="List the objects: rig catalog list")
         objects = read_objects(catalog, wanted)
-        match form:
-            case Format.BUNDLE:
-                count = write_bundle(target, objects)
-            case Format.COIL:
-                count = write_folder(target, objects)
-            case Format.CSV:
-                count = write_table(target, objects)
-            case Format.PARQUET:
-                count = write_parquet(target, objects)
-            case Format.SHEETS:
-                count = write_sheets(target, objects)
-            case Format.HTML:
-                count = write_catalog_page(target, objects)
-            case Format.COCO | Format.YOLO:
-                _export_training(settings, target, list(objects), form, split, fractions, jobs)
-                return
+        if form in (Format.COCO, Format.YOLO):
+            _export_training(settings, target, list(objects), form, split, fractions, jobs)
+            return
+        count = writers[form](target, objects)
     settings.say(
         f"Exported {counted(count, 'object')} to {target} ({form}).",
         {"target": str(target), "format": form, "objects": count},
@@ -274,9 +274,7 @@ def _export_training(
     jobs: int | None,
 ) -> None:
     from rig.catalog.exchange.training import Annotations, Split, write_training
-    from rig.core.errors import UsageError
-    from rig.core.phrases import counted
-    from rig.events.events import plain
+    from rig.core.json_form import plain
 
     try:
         shares = [float(part) for part in fractions.split(",")]
@@ -305,8 +303,6 @@ def _export_training(
 
 def _intrinsics(settings: Settings) -> "Intrinsics":
     """Return a function that finds the calibrated camera of a session among the calibration results of its bench."""
-    from functools import cache
-
     from rig.calibrations import CalibrationStore
     from rig.calibrations.store import CALIBRATIONS
 
@@ -324,20 +320,11 @@ def _intrinsics(settings: Settings) -> "Intrinsics":
 
 
 def _format(target: Path) -> Format:
-    from rig.core.errors import UsageError
-
-    suffix = target.suffix.lower()
-    known = {
-        "": Format.COIL,
-        ".zip": Format.BUNDLE,
-        ".csv": Format.CSV,
-        ".parquet": Format.PARQUET,
-        ".html": Format.HTML,
-    }
-    if suffix not in known:
-        suffixes = ", ".join(f"{suffix or 'no suffix'} ({form})" for suffix, form in known.items())
+    form = _FORMAT_OF.get(target.suffix.lower())
+    if form is None:
+        suffixes = ", ".join(f"{suffix or 'no suffix'} ({form})" for suffix, form in _FORMAT_OF.items())
         raise UsageError(
             f"The suffix of {target} does not name a format.",
             next_step=f"Use one of these suffixes: {suffixes}. Or give --format.",
         )
-    return known[suffix]
+    return form

@@ -1,15 +1,16 @@
 """`rig results ...`: the recorded answers of identifications."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, TypedDict, Unpack
 
 import typer
 
 from rig.cli.catalog.upkeep import parse_time
 from rig.cli.ui.command import command
 from rig.cli.ui.complete import object_names
-from rig.cli.ui.jobs import print_table
 from rig.cli.ui.settings import Settings
+from rig.core.errors import UsageError
+from rig.core.phrases import counted
 
 if TYPE_CHECKING:
     from rig.catalog.results import Answer, Result
@@ -17,39 +18,33 @@ if TYPE_CHECKING:
 
 app = typer.Typer(help="Show, export and correct the recorded answers of identifications.", no_args_is_help=True)
 
-SampleOption = Annotated[str | None, typer.Option("--sample", metavar="ID", help="Only this sample.")]
-ObjectOption = Annotated[
-    str | None, typer.Option("--object", metavar="NAME", help="Only this object.", autocompletion=object_names)
-]
-OutcomeOption = Annotated[
-    str | None, typer.Option("--outcome", metavar="found|ambiguous|unknown", help="Only this outcome.")
-]
-TakenOnOption = Annotated[str | None, typer.Option("--taken-on", metavar="BENCH", help="Only answers of this bench.")]
-SinceOption = Annotated[
-    str | None,
-    typer.Option(
-        "--since",
-        metavar="WHEN",
-        help="Only answers since this time: 2026-01-31, 2026-01-31T14:00 (UTC), or a time ago: 30m, 12h, 7d, 4w.",
-    ),
-]
-BeforeOption = Annotated[str | None, typer.Option("--before", metavar="WHEN", help="Only answers before this time.")]
-CorrectedOption = Annotated[bool, typer.Option("--corrected", help="Only corrected results.")]
+
+class Filters(TypedDict):
+    """The options that select results."""
+
+    sample: Annotated[str | None, typer.Option(metavar="ID", help="Only this sample.")]
+    name: Annotated[
+        str | None, typer.Option("--object", metavar="NAME", help="Only this object.", autocompletion=object_names)
+    ]
+    outcome: Annotated[str | None, typer.Option(metavar="found|ambiguous|unknown", help="Only this outcome.")]
+    taken_on: Annotated[str | None, typer.Option(metavar="BENCH", help="Only answers of this bench.")]
+    since: Annotated[
+        str | None,
+        typer.Option(
+            metavar="WHEN",
+            help="Only answers since this time: 2026-01-31, 2026-01-31T14:00 (UTC), or a time ago: 30m, 12h, 7d, 4w.",
+        ),
+    ]
+    before: Annotated[str | None, typer.Option(metavar="WHEN", help="Only answers before this time.")]
+    corrected: Annotated[bool, typer.Option("--corrected", help="Only corrected results.")]
+
+
 ResultArgument = Annotated[int, typer.Argument(metavar="RESULT", min=1, help="Number of the result.")]
 
 
 @app.command("list")
 @command
-def list_(
-    settings: Settings,
-    sample: SampleOption = None,
-    name: ObjectOption = None,
-    outcome: OutcomeOption = None,
-    taken_on: TakenOnOption = None,
-    since: SinceOption = None,
-    before: BeforeOption = None,
-    corrected: CorrectedOption = False,
-) -> None:
+def list_(settings: Settings, **filters: Unpack[Filters]) -> None:
     """List results, oldest first. Filters use the corrected values.
 
     Columns: number of the result, time, operator, sample, answer (a star marks a corrected one), views, and bench.
@@ -57,8 +52,9 @@ def list_(
     Example: rig results list --sample S-0042 --since 7d --bench sim
     """
     from rig.catalog.exchange.results_table import plain_row
+    from rig.cli.ui.present import print_table
 
-    found = _find(settings, sample, name, outcome, taken_on, since, before, corrected)
+    found = _find(settings, filters)
     if settings.json:
         for result in found:
             settings.print_json(plain_row(result))
@@ -89,7 +85,7 @@ def show(settings: Settings, result: ResultArgument) -> None:
     Example: rig results show 12 --bench sim
     """
     from rig.catalog.results import find_result
-    from rig.events.events import plain
+    from rig.core.json_form import plain
 
     with settings.open_catalog(read_only=True) as catalog:
         found = find_result(catalog, result)
@@ -126,28 +122,20 @@ def show(settings: Settings, result: ResultArgument) -> None:
 def export(
     settings: Settings,
     target: Annotated[Path, typer.Argument(metavar="TARGET", help="File to write: .csv, .json or .parquet.")],
-    sample: SampleOption = None,
-    name: ObjectOption = None,
-    outcome: OutcomeOption = None,
-    taken_on: TakenOnOption = None,
-    since: SinceOption = None,
-    before: BeforeOption = None,
-    corrected: CorrectedOption = False,
+    **filters: Unpack[Filters],
 ) -> None:
     """Export results as a table. The suffix of the file chooses the format.
 
     Example: rig results export june.csv --since 2026-06-01 --before 2026-07-01 --bench sim
     """
     from rig.catalog.exchange.results_table import TableFormat, write_results
-    from rig.core.errors import UsageError
-    from rig.core.phrases import counted
 
     try:
         form = TableFormat(target.suffix.lower().removeprefix("."))
     except ValueError as error:
         known = ", ".join(f".{one}" for one in TableFormat)
         raise UsageError(f"The format of {target} is unknown.", next_step=f"Give a file with {known}.") from error
-    found = _find(settings, sample, name, outcome, taken_on, since, before, corrected)
+    found = _find(settings, filters)
     write_results(target, found, form)
     settings.say(
         f"Exported {counted(len(found), 'result')} to {target}.",
@@ -184,27 +172,26 @@ def correct(
     settings.say(text, {"result": result, **now._asdict()})
 
 
-def _find(
-    settings: Settings,
-    sample: str | None,
-    name: str | None,
-    outcome: str | None,
-    taken_on: str | None,
-    since: str | None,
-    before: str | None,
-    corrected: bool,
-) -> "list[Result]":
+def _find(settings: Settings, filters: Filters) -> "list[Result]":
     from rig.catalog.records import Outcome
     from rig.catalog.results import ResultFilter, find_results
-    from rig.core.errors import UsageError
 
+    given = filters["outcome"]
     try:
-        wanted = None if outcome is None else Outcome(outcome)
+        outcome = None if given is None else Outcome(given)
     except ValueError as error:
-        raise UsageError(f"--outcome {outcome!r} is unknown.", next_step=f"Give {', '.join(Outcome)}.") from error
-    begin, end = parse_time(since, "--since"), parse_time(before, "--before")
+        raise UsageError(f"--outcome {given!r} is unknown.", next_step=f"Give {', '.join(Outcome)}.") from error
+    wanted = ResultFilter(
+        filters["sample"],
+        filters["name"],
+        outcome,
+        filters["taken_on"],
+        parse_time(filters["since"], "--since"),
+        parse_time(filters["before"], "--before"),
+        filters["corrected"],
+    )
     with settings.open_catalog(read_only=True) as catalog:
-        return find_results(catalog, ResultFilter(sample, name, wanted, taken_on, begin, end, corrected))
+        return find_results(catalog, wanted)
 
 
 def _words(answer: "Answer") -> str:

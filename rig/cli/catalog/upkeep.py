@@ -1,23 +1,22 @@
 """`rig catalog verify`, `redescribe`, `gc` and `merge`, and `rig log`."""
 
 import sys
-from datetime import datetime, timedelta
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from rig.cli.catalog.catalog import YesOption, app
-from rig.cli.ui.cluster import ClusterOption, jobs_of
+from rig.cli.catalog.catalog import app
 from rig.cli.ui.command import command
 from rig.cli.ui.complete import object_names
-from rig.cli.ui.jobs import confirm, print_table, run_job, size_words
-from rig.cli.ui.models import descriptor_name
+from rig.cli.ui.exit_codes import EXIT_CATALOG
+from rig.cli.ui.jobs import confirm, run_job, size_words
+from rig.cli.ui.options import ClusterOption, DryImportOption, JobsOption, YesOption, descriptor_name, jobs_of
 from rig.cli.ui.settings import Settings
-from rig.core.phrases import angle_words
-
-JobsOption = Annotated[int | None, typer.Option(min=1, help="Number of processes (default: one per core).")]
-EXIT_CATALOG = 7
+from rig.core.clock import SystemClock
+from rig.core.errors import UsageError
+from rig.core.phrases import angle_words, counted
 
 
 @app.command("verify")
@@ -39,8 +38,6 @@ def verify(
     from rig.catalog.unfinished import UnfinishedJob
     from rig.catalog.verify import verify as job
     from rig.cli.catalog.findings import finding_text
-    from rig.core.phrases import counted
-    from rig.events.events import plain
 
     with (
         settings.open_catalog(read_only=not repair) as catalog,
@@ -65,7 +62,7 @@ def verify(
         )
         unfinished.remove()
     if settings.json:
-        settings.print_json(plain(found))
+        settings.print_json(found)
     else:
         for finding in found.findings:
             print(finding_text(finding))
@@ -109,8 +106,6 @@ def redescribe(
     """
     from rig.catalog.redescribe import redescribe as job
     from rig.catalog.unfinished import UnfinishedJob
-    from rig.core.phrases import counted
-    from rig.events.events import plain
 
     part, name = _region(settings, region), descriptor_name(descriptor)
     with (
@@ -136,7 +131,7 @@ def redescribe(
         if again:
             unfinished.remove()
     if settings.json:
-        settings.print_json(plain(done))
+        settings.print_json(done)
     else:
         print(
             f"{done.descriptor} {done.version}: {counted(done.described, 'view')} described, "
@@ -161,8 +156,7 @@ def gc(
     Example: rig catalog gc --dry-run --bench sim
     """
     from rig.catalog.upkeep import GarbageReport, collect_garbage
-    from rig.core.phrases import counted
-    from rig.events.events import plain
+    from rig.core.json_form import plain
 
     def words(found: GarbageReport) -> str:
         names = ", ".join(found.objects[:10]) + (" and others" if len(found.objects) > 10 else "")
@@ -202,8 +196,6 @@ def copy(
     from rig.catalog import Catalog
     from rig.catalog.copying import copy_catalog
     from rig.config.catalog_place import CatalogPlace
-    from rig.core.clock import SystemClock
-    from rig.core.phrases import counted
 
     def place(text: str) -> CatalogPlace:
         if "://" not in text:
@@ -246,7 +238,8 @@ def log(
 
     Example: rig log --since 7d --bench sim
     """
-    from rig.events.events import plain
+    from rig.cli.ui.present import print_table
+    from rig.core.json_form import plain
 
     begin = parse_time(since, "--since")
     with settings.open_catalog(read_only=True) as catalog:
@@ -289,7 +282,6 @@ def _short(value: Any) -> str:
 def _region(settings: Settings, text: str) -> Any:
     from rig.catalog.exchange.batch import parse_region
     from rig.catalog.redescribe import Stored
-    from rig.core.errors import UsageError
 
     match text:
         case "stored":
@@ -306,11 +298,6 @@ def _region(settings: Settings, text: str) -> Any:
 
 def parse_time(text: str | None, option: str) -> datetime | None:
     """Return the time that an option gives: a date, a time in UTC, or how long ago."""
-    from datetime import UTC
-
-    from rig.core.clock import SystemClock
-    from rig.core.errors import UsageError
-
     if text is None:
         return None
     units = {"m": "minutes", "h": "hours", "d": "days", "w": "weeks"}
@@ -333,7 +320,7 @@ def merge(
     on_conflict: Annotated[
         str, typer.Option(metavar="reject|skip|replace", help="What to do with objects that are in both.")
     ] = "reject",
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only report what would be imported.")] = False,
+    dry_run: DryImportOption = False,
     jobs: JobsOption = None,
 ) -> None:
     """Import the objects of another catalog with all their enrollments; all or nothing.
@@ -343,7 +330,6 @@ def merge(
     from rig.catalog import Catalog
     from rig.catalog.exchange import read_catalog
     from rig.cli.catalog.exchange import run_import
-    from rig.core.clock import SystemClock
 
     with Catalog.open(other, clock=SystemClock(), create=False, read_only=True) as source:
         batch = read_catalog(source)

@@ -7,6 +7,8 @@ import typer
 
 from rig.cli.ui.command import command
 from rig.cli.ui.settings import Settings
+from rig.core.errors import UsageError, os_errors_as
+from rig.core.files import write
 
 if TYPE_CHECKING:
     from rig.bench import Bench
@@ -33,7 +35,6 @@ def empty_table(
     Example: rig empty-table --show empty.png
     """
     from rig.cli.ui.desk import CommandDesk
-    from rig.core.errors import UsageError
     from rig.jobs.table_image import take_table_image
 
     if show is not None and anyway:
@@ -47,8 +48,6 @@ def empty_table(
 
 
 def _show(settings: Settings, bench: "Bench", path: Path) -> None:
-    from rig.core.errors import UsageError, os_errors_as
-    from rig.core.files import write
     from rig.views import image_files as images
     from rig.views.empty_table import empty_table_status
 

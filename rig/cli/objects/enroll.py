@@ -3,7 +3,6 @@
 import os
 import shlex
 import sys
-from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -12,14 +11,17 @@ import typer
 from rig.cli.ui.command import command
 from rig.cli.ui.complete import object_names
 from rig.cli.ui.settings import Settings
+from rig.core.errors import UsageError
+from rig.core.phrases import counted
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from rig.cli.ui.desk import CommandDesk
     from rig.cli.ui.live import EnrollView
     from rig.events.events import Event
     from rig.jobs.desk import Steps
+    from rig.plans.estimate import DryRun
     from rig.report import EnrollmentRecord
 
 
@@ -87,6 +89,7 @@ def enroll(
     from rig.cli.ui.desk import CommandDesk
     from rig.jobs.enroll import enroll as enroll_job
     from rig.jobs.enroll import enroll_list
+    from rig.jobs.enroll import plan as planned
     from rig.plans.tray import read_tray
 
     # Reject wrong options before a device is opened.
@@ -99,28 +102,20 @@ def enroll(
     items = read_tray(tray) if tray else ()
     if dry_run:
         names = {name: None} if name else {item.name: item.views for item in items}
-        _dry_run(settings, names, views, resume=resume, replace=replace, fly=fly)
+        plan = planned(CommandDesk(settings), names, views=views, resume=resume, replace=replace, fly=fly)
+        _print_plan(settings, plan)
         return
 
-    settings.deliver_waiting()
     continued = [name, "--resume"] if name is not None else ["--list", str(tray)]
     others = "" if name is not None else " with the other objects"
     shown = _Shown(settings, report, [f"To continue{others}:", _command(settings, given, *continued)])
     desk = shown.desk = CommandDesk(settings, shown.close_view, yes=yes)
-    with settings.background_check():
+    desk.deliver_waiting()
+    with desk.background_check():
         if name is not None:
             labels = ", ".join(label) if label else None
-            job = enroll_job(
-                desk,
-                name,
-                views=views,
-                label=labels,
-                note=note,
-                resume=resume,
-                replace=replace,
-                fly=fly,
-                ask=not yes,
-            )
+            texts = {"label": labels, "note": note}
+            job = enroll_job(desk, name, views=views, **texts, resume=resume, replace=replace, fly=fly, ask=not yes)
             shown.run(job)
         else:
             shown.run(enroll_list(desk, items, views=views, fly=fly, ask=not yes))
@@ -217,7 +212,6 @@ class _Shown:
             record.complete((view.record, catalog.read_image(view)) for view in stored)
 
     def _write(self, path: Path) -> None:
-        from rig.core.phrases import counted
         from rig.report import Meta, render_report, write_report
 
         names = ", ".join(record.name for record in self._records[:3])
@@ -228,8 +222,6 @@ class _Shown:
 
 
 def _views(views: int | None, step: float | None) -> int | None:
-    from rig.core.errors import UsageError
-
     if step is None:
         return views
     if views is not None:
@@ -244,8 +236,6 @@ def _views(views: int | None, step: float | None) -> int | None:
 
 
 def _check(name: str | None, tray: Path | None, *, resume: bool, replace: bool, **texts: Any) -> None:
-    from rig.core.errors import UsageError
-
     if (name is None) == (tray is None):
         raise UsageError(
             "No object is given." if name is None else "NAME and --list cannot be used together.",
@@ -262,8 +252,6 @@ def _check(name: str | None, tray: Path | None, *, resume: bool, replace: bool, 
 
 def _check_writable(report: Path) -> None:
     """Reject a report that cannot be written now rather than after hours of enrollment."""
-    from rig.core.errors import UsageError
-
     reason = "it is a folder" if report.is_dir() else ""
     try:
         report.parent.mkdir(parents=True, exist_ok=True)
@@ -279,24 +267,11 @@ def _check_writable(report: Path) -> None:
         )
 
 
-def _dry_run(
-    settings: Settings,
-    names: "Mapping[str, int | None]",
-    views: int | None,
-    *,
-    resume: bool,
-    replace: bool,
-    fly: bool | None,
-) -> None:
-    """Print the plan of an enrollment; nothing moves and nothing is stored."""
+def _print_plan(settings: Settings, found: "Sequence[DryRun]") -> None:
     from rig.cli.ui.present import console, dry_run_lines
-    from rig.events.events import plain
-    from rig.plans.estimate import dry_run
 
-    with settings.open_bench() as bench, settings.catalog_to_plan(bench.clock) or nullcontext() as catalog:
-        found = dry_run(bench, catalog, names, views=views, resume=resume, replace=replace, fly=fly)
     if settings.json:
-        settings.print_json({"dry_run": plain(found)})
+        settings.print_json({"dry_run": found})
         return
     screen = console()
     for line in dry_run_lines(found):

@@ -4,16 +4,18 @@ import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import asdict
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rig.cli.ui.cluster import ClusterOption, jobs_of
 from rig.cli.ui.command import command
 from rig.cli.ui.exit_codes import EXIT_INTERRUPTED
-from rig.cli.ui.models import descriptor_name
+from rig.cli.ui.options import ClusterOption, JobsOption, descriptor_name, jobs_of
 from rig.cli.ui.settings import Settings
+from rig.core.errors import UsageError
 
 if TYPE_CHECKING:
     from hbr.evaluation.datasets import Dataset
@@ -23,6 +25,7 @@ if TYPE_CHECKING:
 
 #: Draws of left-out objects.
 _DRAWS = 5
+_BOTH = "enrolling, searching"
 
 
 @command
@@ -130,7 +133,7 @@ def evaluate(
         float | None,
         typer.Option(min=0, help="Margin per view that ends a search of the paper (default: identify.margin)."),
     ] = None,
-    jobs: Annotated[int | None, typer.Option(min=1, help="Number of processes (default: one per core).")] = None,
+    jobs: JobsOption = None,
     cluster: ClusterOption = None,
     out: Annotated[
         Path | None,
@@ -148,8 +151,6 @@ def evaluate(
     from hbr.evaluation.noise import Noise
     from hbr.evaluation.perturb import Perturbations
     from hbr.evaluation.protocol import Protocol
-    from rig.cli.ui.present import Progress
-    from rig.core.errors import UsageError
     from rig.evaluation.plan import Plan
     from rig.evaluation.report import contest_sentences, curve_rows, decision_rows
     from rig.evaluation.run import enrolled_views, run_plan
@@ -203,20 +204,13 @@ def evaluate(
         out = out or own_folder(f"{dataset.name}-{plan.condition.noise}", plan.settings())
         store = Store(out / "runs", plan.settings(), resume=resume)
 
-        def started(progress: Progress, event: str) -> Callable[[str], None]:
-            progress.start(len(dataset.objects))
+        def tell(event: str) -> Callable[[str], None]:
+            return lambda name: settings.print_json({"event": event, "object": name}) if settings.json else None
 
-            def advance(name: str) -> None:
-                progress.advance()
-                if settings.json:
-                    settings.print_json({"event": event, "object": name})
-
-            return advance
-
-        with Progress("describing") as progress:
-            model = enrolled_views(plan, workers, started(progress, "described"))
-        with Progress("searching") as progress:
-            runs = run_plan(plan, model, store, workers, started(progress, "searched"))
+        with _progress("describing", len(dataset.objects), tell("described")) as advance:
+            model = enrolled_views(plan, workers, advance)
+        with _progress("searching", len(dataset.objects), tell("searched")) as advance:
+            runs = run_plan(plan, model, store, workers, advance)
     except ValueError as error:
         raise UsageError(
             str(error), next_step="Correct the options or the data set, then continue with --resume."
@@ -253,8 +247,6 @@ def _bench_change(
     jobs: "Jobs",
     out: Path | None,
 ) -> None:
-    from dataclasses import asdict
-
     from hbr.evaluation.changes import Changes
     from rig.evaluation.changes import change_rows, run_changes
     from rig.evaluation.store import own_folder
@@ -263,7 +255,7 @@ def _bench_change(
         raise ValueError(f"bench change {kind!r} is unknown; use mild or hard")
     changes = Changes(kind, picture, enrolled, seed=settings.seed or 0)  # type: ignore[arg-type]
     reported = None if report is None else [item.name for item in dataset.subset(*_range(report)).objects]
-    with _progress(dataset) as advance:
+    with _progress(_BOTH, 2 * len(dataset.objects)) as advance:
         results = run_changes(dataset, changes, jobs, advance, reported)
     names = [item.name for item in dataset.objects]
     out = out or own_folder(f"{dataset.name}-{kind}-change", asdict(changes) | {"objects": names, "reported": reported})
@@ -276,31 +268,37 @@ def _matrix(settings: Settings, plan: "Plan", jobs: "Jobs", out: Path | None) ->
 
     if plan.protocol.enrolled is None:
         raise ValueError("--matrix needs views that are not enrolled for its queries; give --enrolled 18 or fewer")
-    with _progress(plan.dataset) as advance:
+    with _progress(_BOTH, 2 * len(plan.dataset.objects)) as advance:
         results = run_matrix(plan, jobs, advance)
     out = out or own_folder(f"{plan.dataset.name}-matrix", plan.settings())
     _write(settings, results, matrix_rows(results), out / "matrix.json", ", with Wilson's intervals.")
 
 
-def _unknown_objects(settings: Settings, plan: "Plan", count: int, jobs: "Jobs", out: Path | None) -> None:
+def _unknown_objects(settings: Settings, plan: "Plan", left_out: int, jobs: "Jobs", out: Path | None) -> None:
     from rig.evaluation.run import enrolled_views
     from rig.evaluation.store import own_folder
     from rig.evaluation.unknown_objects import run_unknown_objects, unknown_object_rows
 
-    with _progress(plan.dataset) as advance:
-        results = run_unknown_objects(plan, enrolled_views(plan, jobs, advance), count, _DRAWS, jobs, advance)
-    out = out or own_folder(f"{plan.dataset.name}-leave-out-{count}", plan.settings())
+    with _progress(_BOTH, 2 * len(plan.dataset.objects)) as advance:
+        results = run_unknown_objects(plan, enrolled_views(plan, jobs, advance), left_out, _DRAWS, jobs, advance)
+    out = out or own_folder(f"{plan.dataset.name}-leave-out-{left_out}", plan.settings())
     _write(settings, results, unknown_object_rows(results), out / "unknown_objects.json", ", with Wilson's intervals.")
 
 
 @contextmanager
-def _progress(dataset: "Dataset") -> Iterator[Callable[[str], None]]:
-    """Yield what shows that an object is enrolled or searched for."""
+def _progress(title: str, total: int, tell: Callable[[str], None] = lambda _: None) -> Iterator[Callable[[str], None]]:
+    """Show a progress bar, and yield what is to be called with the name of each object that is done."""
+    from rig.catalog.jobs import JobProgress
     from rig.cli.ui.present import Progress
 
-    with Progress("enrolling, searching") as progress:
-        progress.start(2 * len(dataset.objects))
-        yield lambda _name: progress.advance()
+    done = count(1)
+    with Progress(title) as progress:
+
+        def advance(name: str) -> None:
+            progress(JobProgress(next(done), total))
+            tell(name)
+
+        yield advance
 
 
 def _write(settings: Settings, results: dict[str, Any], rows: "Rows", path: Path, note: str) -> None:

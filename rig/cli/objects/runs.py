@@ -6,8 +6,10 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 
 from rig.cli.ui.command import command
-from rig.cli.ui.models import ModelOption, load_model_file
+from rig.cli.ui.options import ModelOption, load_model_file
 from rig.cli.ui.settings import Settings
+from rig.core.errors import ReplayMismatch, RunIncomplete
+from rig.core.phrases import counted
 
 if TYPE_CHECKING:
     from rig.search.saved_run import SavedRun
@@ -42,7 +44,6 @@ def replay(
         return
     from rig.cli.ui.live import IdentifyView
     from rig.cli.ui.present import console
-    from rig.core.phrases import counted
     from rig.events.events import event_dict
 
     if settings.json:
@@ -85,9 +86,7 @@ def report(
 
 
 def _check(settings: Settings, saved: "SavedRun", *, every: bool) -> None:
-    from rig.core.errors import ReplayMismatch, RunIncomplete
-    from rig.core.phrases import counted
-    from rig.events.events import plain
+    from rig.core.json_form import plain
     from rig.search.replay import check
 
     with saved.damage():

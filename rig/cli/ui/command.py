@@ -11,53 +11,16 @@ import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import typer
 
-from rig.cli.ui.complete import bench_names
 from rig.cli.ui.exit_codes import EXIT_INTERRUPTED
+from rig.cli.ui.options import CommonOptions, options_of, show_parameters, spread
 from rig.cli.ui.settings import Settings
 from rig.cli.ui.terminal import discard, guarded_output
 from rig.core.errors import OutputFailed, RigError, UsageError
 from rig.core.signals import EXIT_BY_SIGNAL, handle_signals
-
-COMMON: str = "Common options"
-"""Panel of the help."""
-
-BenchOption = Annotated[
-    str | None,
-    typer.Option(
-        "--bench",
-        metavar="NAME",
-        help="Bench to use: hardware, sim, sim-bench or the bench of a plug-in (default: default_bench).",
-        autocompletion=bench_names,
-        rich_help_panel=COMMON,
-    ),
-]
-ConfigOption = Annotated[
-    Path | None,
-    typer.Option("--config", metavar="FILE", help="Configuration file (default: rig.toml).", rich_help_panel=COMMON),
-]
-SetOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--set",
-        metavar="KEY=VALUE",
-        help="Replace one setting, for example identify.max_views=4. Repeatable.",
-        rich_help_panel=COMMON,
-    ),
-]
-SeedOption = Annotated[
-    int | None, typer.Option("--seed", min=0, metavar="N", help="Seed of the simulated bench.", rich_help_panel=COMMON)
-]
-NoColorOption = Annotated[
-    bool, typer.Option("--no-color", help="Print without colours, as with NO_COLOR=1.", rich_help_panel=COMMON)
-]
-JsonOption = Annotated[
-    bool, typer.Option("--json", help="Print JSON on stdout and text on stderr.", rich_help_panel=COMMON)
-]
 
 
 def command(function: Callable[..., None]) -> Callable[..., None]:
@@ -67,27 +30,15 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
     error's exit code. Ctrl+C and every other signal that can be handled unwind the stack, so that every open device is
     closed (torque off) before the program ends; see `rig.core.signals`.
     """
-    signature = inspect.signature(function, eval_str=True)
-    own = list(signature.parameters.values())[1:]
-    shared = [
-        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
-        for name, default, annotation in (
-            ("bench", None, BenchOption),
-            ("config", None, ConfigOption),
-            ("overrides", None, SetOption),
-            ("seed", None, SeedOption),
-            ("json_", False, JsonOption),
-            ("no_color", False, NoColorOption),
-        )
-    ]
+    _, *own = spread(function)
     context = inspect.Parameter("ctx", inspect.Parameter.POSITIONAL_OR_KEYWORD, annotation=typer.Context)
 
     @functools.wraps(function)
     def run(ctx: typer.Context, **values: Any) -> None:
-        given = [values.pop(name) for name in ("bench", "config", "overrides", "seed", "json_")]
-        settings = (ctx.obj or Settings()).merged(*given)
-        if values.pop("no_color"):
+        given = {name: values.pop(name) for name in CommonOptions.__annotations__}
+        if given.pop("no_color"):
             without_color()
+        settings = (ctx.obj or Settings()).merged(**given)
         handle_signals()
         try:
             with guarded_output():
@@ -110,9 +61,7 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
             print(f"Interrupted.{torque}", file=sys.stderr)
             raise typer.Exit(EXIT_INTERRUPTED) from None
 
-    run.__signature__ = inspect.Signature([context, *own, *shared])  # type: ignore[attr-defined]
-    # Typer also reads the annotations; those of the wrapped function do not have the common options.
-    run.__annotations__ = {p.name: p.annotation for p in [context, *own, *shared]}
+    show_parameters(run, [context, *own, *options_of(CommonOptions)])
     # Typer prints single line breaks of a docstring as they are; let it wrap paragraphs to the terminal instead.
     run.__doc__ = "\n\n".join(" ".join(part.split()) for part in (function.__doc__ or "").split("\n\n"))
     return run

@@ -17,8 +17,9 @@ def object_names(ctx: typer.Context, incomplete: str) -> list[str]:
     # An unfinished command line can hold anything, such as an unknown bench or a file that is not a configuration.
     with suppress(Exception):
         given = {**(ctx.parent.params if ctx.parent else {}), **ctx.params}
-        settings = Settings().merged(given.get("bench"), given.get("config"), given.get("overrides"), None, False)
-        place = settings.load().catalog_place(settings.bench_name)
+        options = {name: given[name] for name in ("bench", "config", "overrides") if name in given}
+        settings = Settings().merged(**options)
+        place = settings.place
         # A server may take long to answer, so its names are those of the last search on this computer.
         path = place.database_file if place.url is None else place.copy_folder / DATABASE_NAME
         # sqlite3 directly: importing SQLAlchemy, and with it the check of the folder, takes too long for completion.

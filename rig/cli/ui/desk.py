@@ -1,18 +1,23 @@
 """The desk of a command: its options open bench and catalog, and the terminal asks and shows."""
 
 import sys
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterable
+from contextlib import AbstractContextManager, nullcontext, suppress
 
 from rig.bench import Bench
 from rig.bench.bench import DEVICES
 from rig.catalog import Catalog
+from rig.catalog.background import BackgroundCheck
 from rig.catalog.jobs import JobProgress
-from rig.catalog.journal import Journal
-from rig.cli.ui.jobs import is_interactive, progress_bar
+from rig.catalog.journal import waiting
+from rig.catalog.local_copy import open_or_copy
+from rig.catalog.shared import BackgroundDelivery
+from rig.cli.ui import jobs
 from rig.cli.ui.operator import TerminalOperator
+from rig.cli.ui.present import Progress as ProgressBar
 from rig.cli.ui.settings import Settings
-from rig.core.clock import Clock
+from rig.core.clock import Clock, SystemClock
+from rig.core.errors import RigError
 from rig.events.events import Event, event_dict
 from rig.events.lines import line
 from rig.jobs.desk import Desk, Progress, Remark, Result, Steps
@@ -28,8 +33,8 @@ class CommandDesk(Desk):
         The options of the command.
     before
         Called before each question and each note: removes the live display.
-    yes
-        Do not ask.
+    yes, with_json
+        Do not ask; ask at a terminal also with ``--json``, because a person must do something.
 
     Attributes
     ----------
@@ -40,12 +45,18 @@ class CommandDesk(Desk):
     bench: Bench
     catalog: Catalog
 
-    def __init__(self, settings: Settings, before: Callable[[], None] = lambda: None, *, yes: bool = False) -> None:
+    def __init__(
+        self,
+        settings: Settings,
+        before: Callable[[], None] = lambda: None,
+        *,
+        yes: bool = False,
+        with_json: bool = False,
+    ) -> None:
         self.config = settings.load()
-        self.place = self.config.catalog_place(settings.bench_name)
-        self.operator: Operator = (
-            Unattended() if yes else TerminalOperator(is_there=not settings.json and is_interactive(), before=before)
-        )
+        self.place = settings.place
+        is_there = (with_json or not settings.json) and jobs.is_interactive()
+        self.operator: Operator = Unattended() if yes else TerminalOperator(is_there=is_there, before=before)
         self._settings = settings
         self._before = before
 
@@ -54,20 +65,37 @@ class CommandDesk(Desk):
         return self.bench
 
     def open_to_read(self) -> Catalog:
-        return self._settings.open_for_search()
+        self.deliver_waiting()
+        if self.place.url is None:
+            return self._settings.open_catalog(read_only=True)
+        return open_or_copy(self.place, SystemClock())
 
     def open_to_enroll(self, clock: Clock) -> Catalog:
-        self.catalog = self._settings.open_for_enrollment(clock)
+        self.catalog = super().open_to_enroll(clock)
         return self.catalog
 
-    def deliver(self) -> Iterator[Remark]:
-        if isinstance(self.catalog, Journal):
-            self._before()
-            self._settings.deliver()
-        yield from ()
+    def deliver_waiting(self) -> None:
+        """Deliver the journal if something is in it."""
+        if waiting(self.place, SystemClock()):
+            for remark in self.deliver():
+                self.note(remark)
+
+    def background_delivery(self) -> BackgroundDelivery:
+        """Return a delivery of the journal during the work of a ``with`` block; its results are printed on stderr."""
+        return BackgroundDelivery(self.place, SystemClock(), _print_note)
+
+    def background_check(self) -> AbstractContextManager[object]:
+        """Return a check of the bench's catalog during the work of a ``with`` block; damage is printed on stderr."""
+        if not self.place.may_exist():
+            return nullcontext()
+
+        def report(damage: RigError) -> None:
+            _print_note(f"{damage.what} Next step: {damage.next_step}")
+
+        return BackgroundCheck(self.place, SystemClock(), report)
 
     def preparing(self) -> AbstractContextManager[Callable[[JobProgress], None]]:
-        return progress_bar("Preparing objects for searches")
+        return ProgressBar("Preparing objects for searches")
 
     def note(self, remark: Remark) -> None:
         """Print a remark of a job on stderr."""
@@ -95,3 +123,9 @@ class CommandDesk(Desk):
             return end.value
         finally:
             steps.close()
+
+
+def _print_note(text: str) -> None:
+    """Print a note from another thread, unless stderr is closed."""
+    with suppress(OSError):
+        print(f"Note: {text}", file=sys.stderr, flush=True)

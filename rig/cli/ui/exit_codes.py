@@ -3,7 +3,9 @@
 from typing import Final
 
 EXIT_DECLINED: Final = 1
+EXIT_DEVICE: Final = 4
 EXIT_QUALITY: Final = 6
+EXIT_CATALOG: Final = 7
 EXIT_UNKNOWN: Final = 8
 EXIT_AMBIGUOUS: Final = 10
 EXIT_INTERRUPTED: Final = 130
@@ -13,10 +15,10 @@ EXIT_CODES: Final = {
     EXIT_DECLINED: "You answered no to a question, or the program has a bug.",
     2: "The command, an option or an argument is wrong.",
     3: "The configuration has a mistake.",
-    4: "A device does not answer, or it reports a fault.",
+    EXIT_DEVICE: "A device does not answer, or it reports a fault.",
     5: "Motion or safety: the table did not start, or it was stopped.",
     EXIT_QUALITY: "No object is on the table; or a view, a calibration, a replay or a demo is not good enough.",
-    7: "The catalog cannot do this, or it is damaged.",
+    EXIT_CATALOG: "The catalog cannot do this, or it is damaged.",
     EXIT_UNKNOWN: "The object is unknown.",
     9: "Another program uses the bench or the catalog.",
     EXIT_AMBIGUOUS: "The object is ambiguous: it may be one of several enrolled objects.",

@@ -17,6 +17,16 @@ WAIT_S: Final = 0.1
 """Longest wait for a key: Python handles a signal that came just before a wait only after it."""
 
 
+def read_keys(wait_s: float) -> bytes | None:
+    """Return keys that are pressed within a time: none if it ends, and None if the terminal is gone."""
+    if not select.select([sys.stdin], [], [], wait_s)[0]:
+        return b""
+    try:
+        return os.read(sys.stdin.fileno(), 64) or None
+    except OSError:
+        return None
+
+
 class Pause(AbstractContextManager["Pause"]):
     """Watches for a request to pause, in a ``with`` block.
 
@@ -71,15 +81,12 @@ class Pause(AbstractContextManager["Pause"]):
                 show("")
 
     def _pressed(self) -> bool:
-        if self._terminal is None:
-            return False
         pressed = b""
-        while select.select([sys.stdin], [], [], 0)[0]:
-            key = os.read(sys.stdin.fileno(), 64)
-            if not key:  # the terminal was closed
+        while self._terminal is not None and (keys := read_keys(0.0)) != b"":
+            if keys is None:
                 self._terminal = None
-                break
-            pressed += key
+            else:
+                pressed += keys
         return any(key in pressed for key in PAUSE_KEYS)
 
     def _on_stop(self, _number: int, _frame: FrameType | None) -> None:

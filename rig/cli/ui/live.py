@@ -1,7 +1,9 @@
 """The display of a running plan: a live table on a terminal, one line for each view in a pipe."""
 
 from abc import abstractmethod
+from collections.abc import Callable
 from contextlib import AbstractContextManager
+from dataclasses import dataclass
 from types import TracebackType
 from typing import Final, Self
 
@@ -12,9 +14,8 @@ from rich.table import Table
 from rich.text import Text
 
 from rig.cli.ui.keys import HINT, Pause
-from rig.cli.ui.view_rows import COLUMNS, COLUMNS_IN_MOTION, NARROW, WIDE, Columns, ViewRow
 from rig.config import RigConfig
-from rig.core.phrases import azimuth_words, counted, duration_words, signed
+from rig.core.phrases import angle_words, azimuth_words, counted, duration_words, percent, signed
 from rig.events.events import (
     Accepted,
     Candidate,
@@ -118,6 +119,66 @@ class LiveView(AbstractContextManager["LiveView"]):
             return Text(self._paused, style="bold yellow")
         stop = "Ctrl+C: stop"
         return Text(f"{HINT}, {stop}" if self._pause.listens else stop, style="dim")
+
+
+WIDE, NARROW = 88, 60
+"""Width of a terminal, in characters, that fits all columns of a table, and most of them."""
+
+
+@dataclass(frozen=True, slots=True)
+class ViewRow:
+    """An image of an enrollment, accepted or rejected."""
+
+    number: int
+    move: Moved | None
+    evidence: ViewEvidence
+    result: str
+    accepted: bool
+
+    @property
+    def imu(self) -> str:
+        """The table angle by the gyro, with its uncertainty."""
+        if self.move is None or self.move.rotation_imu_deg is None:
+            return "–"
+        angle_deg = self.move.encoder_deg - self.move.rotation_encoder_deg + self.move.rotation_imu_deg
+        sigma = "" if self.move.imu_sigma_deg is None else f" ± {self.move.imu_sigma_deg:.2f}"
+        return f"{angle_words(angle_deg, 2).removesuffix('°')}{sigma}°"
+
+    @property
+    def angle(self) -> str:
+        """The table angle of a view in motion with its uncertainty, by encoder and gyro together."""
+        if self.evidence.motion is None:
+            return "–" if self.move is None else angle_words(self.move.encoder_deg, 2)
+        motion = self.evidence.motion
+        return f"{angle_words(motion.angle_deg, 2).removesuffix('°')} ± {motion.angle_sigma_deg:.2f}°"
+
+    @property
+    def motion(self) -> str:
+        """The table's speed, and how far the edge of the region moved during the exposure."""
+        motion = self.evidence.motion
+        return "at rest" if motion is None else f"{motion.speed_dps:.0f} °/s, {motion.smear_px:.1f} px"
+
+
+Columns = tuple[tuple[str, int, Callable[[ViewRow], str]], ...]
+
+COLUMNS: Final[Columns] = (
+    ("view", 0, lambda row: str(row.number)),
+    ("asked", NARROW, lambda row: "–" if row.move is None else angle_words(row.move.commanded_deg, 2)),
+    ("encoder", 0, lambda row: "–" if row.move is None else angle_words(row.move.encoder_deg, 2)),
+    ("IMU", NARROW, lambda row: row.imu),
+    ("sharpness", NARROW, lambda row: f"{row.evidence.sharpness:.1f}"),
+    ("brightness", WIDE, lambda row: f"{row.evidence.mean_level:.0f}"),
+    ("saturated", WIDE, lambda row: percent(row.evidence.saturated_share, 0)),
+)
+"""Columns of an enrollment's table: heading, width that the terminal needs to show it, and cell."""
+
+COLUMNS_IN_MOTION: Final[Columns] = (
+    COLUMNS[0],
+    ("table angle", 0, lambda row: row.angle),
+    ("speed and smear", NARROW, lambda row: row.motion),
+    *COLUMNS[4:],
+)
+"""The columns if views are taken in motion."""
 
 
 class EnrollView(LiveView):
@@ -242,48 +303,47 @@ class IdentifyView(LiveView):
         self._ended = False
 
     def show(self, event: Event) -> bool:
-        plain = not self._console.is_terminal
         match event:
             case Started():
                 self._ranked, self._taken, self._of, self._ended = None, 0, event.views, False
                 self._start()
-                if event.notes != self._notes:  # of one search after the other, once
-                    self._notes = event.notes
-                    self.note(line(event))
             case Moved():
                 self._used = None
-                if plain:
-                    self.note(line(event))
-                elif not event.agrees:
-                    self.note(f"  {move_words(event)}")
             case Accepted():
                 self._taken, self._azimuth_deg = event.index + 1, event.azimuth_deg
-                if plain and event.evidence.motion is None:  # a frame in motion has its own line
-                    self.note(line(event))
-            case FrameUsed() if plain:
-                self.note(line(event))
             case FrameUsed():
                 self._used = event
             case Ranked():
                 self._ranked = event
-                if plain:
-                    self.note(line(event))
-            case Decided() if plain:
-                self.note(f"  {self._decision}" if self._decision else "")
-                self.note(line(event))
-            case Decided():
-                decision = f"{self._decision}; " if self._decision else ""
-                self.note(f"view {self._taken}  {self._leading}  {decision}{decision_words(event)}")
             case Identified():
                 self._ended = True
                 self._stop()
-                self.note(line(event))
             case Waiting():
                 self._stop()
-                self.note(line(event))
-            case _:
-                self.note(line(event))
+        for text in self._lines(event):
+            self.note(text)
         return isinstance(event, Decided)
+
+    def _lines(self, event: Event) -> list[str]:
+        """Return the lines about an event that stay on the screen."""
+        plain = not self._console.is_terminal
+        match event:
+            case Started() if event.notes == self._notes:  # of one search after the other, once
+                return []
+            case Started():
+                self._notes = event.notes
+            case Accepted() if plain and event.evidence.motion is not None:  # a frame in motion has its own line
+                return []
+            case Decided() if plain:
+                return [f"  {self._decision}" if self._decision else "", line(event)]
+            case Decided():
+                decision = f"{self._decision}; " if self._decision else ""
+                return [f"view {self._taken}  {self._leading}  {decision}{decision_words(event)}"]
+            case Moved() if not plain:
+                return [] if event.agrees else [f"  {move_words(event)}"]
+            case Accepted() | FrameUsed() | Ranked() if not plain:
+                return []
+        return [line(event)]
 
     @property
     def _leading(self) -> str:

@@ -4,6 +4,7 @@ import sys
 from collections.abc import Callable
 from typing import Final, TextIO
 
+from rig.cli.ui import prompts
 from rig.cli.ui.terminal import unguarded
 from rig.core.errors import UsageError
 from rig.plans.operator import Choice, Question
@@ -71,6 +72,4 @@ class TerminalOperator:
                 return choice
 
     def ask_sample(self) -> str | None:
-        from rig.cli.ui.prompts import ask_sample
-
-        return ask_sample()
+        return prompts.ask_sample()

@@ -1,16 +1,20 @@
-"""The text of dry runs on a terminal, and progress bars."""
+"""Tables, progress bars and the text of dry runs on a terminal."""
 
 import os
 import sys
 from collections.abc import Iterable, Sequence
-from types import TracebackType
-from typing import Final, Self
+from contextlib import AbstractContextManager
+from typing import Final
 
+from rich.cells import cell_len
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as RichProgress
 from rich.segment import Segment
+from rich.table import Table
+from rich.text import Text
 
+from rig.catalog.jobs import JobProgress
 from rig.cli.ui.terminal import unguarded
 from rig.core.control_characters import neutral
 from rig.core.phrases import angle_range, angle_words, azimuth_words, counted, duration_words
@@ -38,6 +42,27 @@ def console(*, stderr: bool = False, plain: bool = False) -> Console:
     if not screen.is_terminal and "COLUMNS" not in os.environ:
         screen.width = _PIPE_COLUMNS
     return screen
+
+
+def print_table(columns: Sequence[str], rows: Iterable[Sequence[str]], *, right: Sequence[str] = ()) -> None:
+    """Print a table as wide as the terminal; in a pipe print every row in full, as one line."""
+    screen = console()
+    if screen.is_terminal:
+        table: Table = Table(box=None, pad_edge=False)
+        for column in columns:
+            table.add_column(column, justify="right" if column in right else "left", overflow="fold")
+        for row in rows:
+            table.add_row(*map(Text, row))  # a name can contain what Rich would read as markup
+        screen.print(table)
+        return
+    # Rich takes milliseconds for each row
+    lines = [[neutral(cell) for cell in row] for row in (columns, *rows)]
+    widths = [max(map(cell_len, cells)) for cells in zip(*lines, strict=True)]
+    for line in lines:
+        spaces = [" " * (width - cell_len(cell)) for cell, width in zip(line, widths, strict=True)]
+        cells = zip(columns, line, spaces, strict=True)
+        print("  ".join(space + cell if name in right else cell + space for name, cell, space in cells).rstrip())
+    sys.stdout.flush()
 
 
 def dry_run_lines(found: Sequence[DryRun]) -> list[str]:
@@ -85,8 +110,8 @@ def _beginning(table_deg: float, first_deg: float) -> str:
     return f"It first {verb} to {angle_words(first_deg)}"
 
 
-class Progress:
-    """A progress bar on stderr; only its notes if stderr is not a terminal."""
+class Progress(AbstractContextManager["Progress"]):
+    """A progress bar on stderr, shown from its first call on; only its notes if stderr is not a terminal."""
 
     def __init__(self, title: str) -> None:
         self._bar = RichProgress(
@@ -101,25 +126,15 @@ class Progress:
         )
         self._task = self._bar.add_task(title, total=None, start=False)
 
-    def __enter__(self) -> Self:
-        self._bar.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._bar.stop()
 
-    def start(self, total: int) -> None:
+    def __call__(self, at: JobProgress) -> None:
+        """Show how much is done."""
+        self._bar.start()
         self._bar.start_task(self._task)
-        self._bar.update(self._task, total=total)
-
-    def advance(self) -> None:
-        self._bar.advance(self._task)
-
-    def at(self, done: int) -> None:
-        """Show that ``done`` items are done."""
-        self._bar.update(self._task, completed=done)
+        self._bar.update(self._task, total=at.total, completed=at.done)
 
     def note(self, text: str) -> None:
+        """Print a line above the bar."""
         self._bar.console.print(text, markup=False, highlight=False, soft_wrap=not self._bar.console.is_terminal)

@@ -5,24 +5,21 @@ This module imports none of numpy, cv2, scipy and sqlalchemy: `rig --help` must 
 
 import json
 import sys
-from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rig.core.errors import RigError
+from rig.core.clock import SystemClock
+from rig.core.errors import CatalogError, RigError
 from rig.core.masking import masked
 
 if TYPE_CHECKING:
     from collections.abc import Collection
-    from contextlib import AbstractContextManager
 
     from rig.bench import Bench
     from rig.catalog import Catalog
-    from rig.catalog.delivery import Delivery
-    from rig.catalog.shared import BackgroundDelivery
     from rig.config import RigConfig
-    from rig.core.clock import Clock
+    from rig.config.catalog_place import CatalogPlace
 
 
 @dataclass(frozen=True)
@@ -39,7 +36,13 @@ class Settings:
     """Benches that the command has opened."""
 
     def merged(
-        self, bench: str | None, config: Path | None, overrides: list[str] | None, seed: int | None, json: bool
+        self,
+        *,
+        bench: str | None = None,
+        config: Path | None = None,
+        overrides: list[str] | None = None,
+        seed: int | None = None,
+        json: bool = False,
     ) -> "Settings":
         """Return these settings, replaced by those that follow the command."""
         return replace(
@@ -72,6 +75,11 @@ class Settings:
     def bench_name(self) -> str:
         return self.bench or self.load().default_bench
 
+    @property
+    def place(self) -> "CatalogPlace":
+        """Place of the bench's catalog."""
+        return self.load().catalog_place(self.bench_name)
+
     def open_bench(self, *, tell: bool = True, devices: "Collection[str]" = ("imu", "camera")) -> "Bench":
         """Open the bench and print its notes; with ``tell`` false, the caller prints those on calibration.
 
@@ -85,99 +93,18 @@ class Settings:
             print(f"Note: {finding}.", file=sys.stderr)
         return bench
 
-    def open_catalog(self, *, clock: "Clock | None" = None, create: bool = False, read_only: bool = False) -> "Catalog":
-        """Open the bench's catalog; to add views, pass the ``clock`` of the bench that captures them."""
+    def open_catalog(self, *, create: bool = False, read_only: bool = False) -> "Catalog":
+        """Open the bench's catalog, but not to enroll."""
         from rig.catalog import Catalog
-        from rig.core.clock import SystemClock
 
-        place = self.load().catalog_place(self.bench_name)
+        place = self.place
         if not create and self.load().catalog.path is None and place.url is None and not place.path.exists():
             raise self._no_catalog(place.path)
-        return Catalog.open(place, clock=clock or SystemClock(), create=create, read_only=read_only)
-
-    def open_for_search(self) -> "Catalog":
-        """Open the bench's catalog for reading; if its server does not answer, the local copy.
-
-        The journal is delivered before, if there is something in it.
-        """
-        self.deliver_waiting()
-        return self.open_shared()
-
-    def open_shared(self) -> "Catalog":
-        """Open the bench's catalog for reading; if its server does not answer, the local copy."""
-        from rig.catalog.local_copy import open_or_copy
-        from rig.core.clock import SystemClock
-
-        place = self.load().catalog_place(self.bench_name)
-        return self.open_catalog(read_only=True) if place.url is None else open_or_copy(place, SystemClock())
-
-    def open_for_enrollment(self, clock: "Clock") -> "Catalog":
-        """Open the catalog for new views: the journal of this computer if the catalog is on a server."""
-        from rig.catalog.shared import open_for_enrollment
-
-        return open_for_enrollment(self.load().catalog_place(self.bench_name), clock)
-
-    def catalog_to_plan(self, clock: "Clock") -> "Catalog | None":
-        """Open the catalog that an enrollment would use; None if there is none yet."""
-        place = self.load().catalog_place(self.bench_name)
-        return self.existing_catalog() if place.url is None else self.open_for_enrollment(clock)
-
-    def deliver_waiting(self) -> None:
-        """Deliver the journal if something is in it."""
-        from rig.catalog.journal import waiting
-        from rig.core.clock import SystemClock
-
-        if waiting(self.load().catalog_place(self.bench_name), SystemClock()):
-            self.deliver()
-
-    def deliver(self, *, replacing: "Collection[str]" = (), now: bool = False) -> "list[Delivery]":
-        """Deliver the journal to the server of the catalog; print the delivered objects, and reasons for the others.
-
-        If the server cannot be used, print a note: the journal keeps everything. With ``now`` raise the error.
-        """
-        from rig.catalog.shared import deliver_journal, delivery_words, failure_words
-        from rig.core.clock import SystemClock
-        from rig.core.errors import CatalogBusy, CatalogError
-
-        place = self.load().catalog_place(self.bench_name)
-        if place.url is None:
-            return []
-        try:
-            done = deliver_journal(place, SystemClock(), replacing=replacing)
-        except (CatalogError, CatalogBusy) as error:
-            if now:
-                raise
-            print(f"Note: {failure_words(error)}", file=sys.stderr)
-            return []
-        for one in done:
-            print(f"{'' if one.conflict is None else 'Note: '}{delivery_words(one, place)}", file=sys.stderr)
-        return done
-
-    def background_delivery(self) -> "BackgroundDelivery":
-        """Return a delivery of the journal during the work of a ``with`` block; its results are printed on stderr."""
-        from rig.catalog.shared import BackgroundDelivery
-        from rig.core.clock import SystemClock
-
-        return BackgroundDelivery(self.load().catalog_place(self.bench_name), SystemClock(), _report)
-
-    def background_check(self) -> "AbstractContextManager[object]":
-        """Return a check of the bench's catalog during the work of a ``with`` block; damage is printed on stderr."""
-        from rig.catalog.background import BackgroundCheck
-        from rig.core.clock import SystemClock
-
-        place = self.load().catalog_place(self.bench_name)
-        if not place.may_exist():
-            return nullcontext()
-
-        def report(damage: RigError) -> None:
-            _report(f"{damage.what} Next step: {damage.next_step}")
-
-        return BackgroundCheck(place, SystemClock(), report)
+        return Catalog.open(place, clock=SystemClock(), create=create, read_only=read_only)
 
     def _no_catalog(self, path: Path) -> RigError:
         """Return the error that the bench has no catalog; it names the benches that have one."""
         from rig.bench import bench_names
-        from rig.core.errors import CatalogError
 
         others = [name for name in bench_names() if self.load().catalog_place(name).database_file.exists()]
         enroll = f"Enroll an object: rig enroll NAME --bench {self.bench_name}"
@@ -189,8 +116,7 @@ class Settings:
 
     def existing_catalog(self) -> "Catalog | None":
         """Return the bench's catalog, opened for reading; None if there is none yet."""
-        place = self.load().catalog_place(self.bench_name)
-        return self.open_catalog(read_only=True) if place.may_exist() else None
+        return self.open_catalog(read_only=True) if self.place.may_exist() else None
 
     def say(self, text: str, data: Any) -> None:
         """Print ``text``, or with ``--json`` ``data`` as one line of JSON."""
@@ -200,10 +126,7 @@ class Settings:
             print(text, flush=True)
 
     def print_json(self, value: Any) -> None:
-        """Print one line of JSON on stdout, at once."""
-        print(json.dumps(value, ensure_ascii=False, allow_nan=False, default=str), flush=True)
+        """Print one line of JSON on stdout, at once; dataclasses are printed as objects."""
+        from rig.core.json_form import plain
 
-
-def _report(text: str) -> None:
-    with suppress(OSError):  # stderr is closed
-        print(f"Note: {text}", file=sys.stderr, flush=True)
+        print(json.dumps(plain(value), ensure_ascii=False, allow_nan=False, default=str), flush=True)

@@ -5,7 +5,7 @@ from math import atan2, degrees, hypot
 from xml.etree import ElementTree as ET
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from rig.charts.azimuth_ring import RingView, azimuth_ring
@@ -231,13 +231,18 @@ class TestScoreChart:
     @examples(10)
     @given(
         rounds=st.lists(
-            st.dictionaries(st.sampled_from("abcdefg"), st.floats(-1, 1), min_size=1), min_size=1, max_size=9
+            st.dictionaries(st.sampled_from("abcdefg"), st.floats(-1, 1) | st.floats(-1e300, 1e300), min_size=1),
+            min_size=1,
+            max_size=9,
         ),
         min_score=st.none() | st.floats(0, 1),
     )
+    @example(rounds=[{"a": 1e17}], min_score=None)
+    @example(rounds=[{"a": 728640.0, "b": 0.5}], min_score=None)
     def test_all_elements_are_inside_the_chart(self, rounds: list[dict[str, float]], min_score: float | None) -> None:
         root = ET.fromstring(score_chart(rounds, min_score=min_score))
         _, _, width, height = map(float, root.get("viewBox", "").split())
+        assert sum(e.get("class") == "grid" for e in root.iter()) <= 8
         for e in root.iter():
             for key, limit in (
                 ("cx", width),

@@ -21,7 +21,6 @@ from rig.config import load_config
 from rig.core.clock import SystemClock
 from rig.web.bench_side import BenchSide
 from rig.web.front import guarded, make_server
-from rig.web.link import Link
 from rig.web.server import Server
 from rig.web.setup import Listening, Setup
 from tests.small import SMALL
@@ -60,14 +59,11 @@ def connected(setup: Setup) -> tuple[BenchSide, Server, Callable[[], None]]:
     side = BenchSide(setup, setup.state_folder / "web", SystemClock(), lambda _text: None)
     server = make_server(setup, SystemClock())
     ours, theirs = socket.socketpair()
-    bench_link, web_link = Link(ours, side.received), Link(theirs, server.remote.received)
-    server.remote.calls.link = web_link
-    bench_link.start()
-    web_link.start()
-    side.connect(bench_link)
+    server.remote.connect(theirs)
+    bench_link = side.connect(ours)
 
     def disconnect() -> None:
-        for link in (web_link, bench_link):
+        for link in (server.remote.link, bench_link):
             link.close()
         side.close()
 

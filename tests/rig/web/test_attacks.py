@@ -133,7 +133,11 @@ def test_error_of_a_job_names_the_next_step_and_the_server_continues(serve):
     assert job["error"]["code"] == 500
     assert "within" in job["error"]["next_step"]
     assert served.run(kind="identify")["error"]["code"] // 100 == 7
-    assert served.run(kind="home")["state"] == "done"
+    home = served.run(kind="home")
+    assert home["state"] == "done"
+    for change in ("pause", "resume", "cancel"):
+        assert served.client.post(f"{API}/jobs/{home['id']}/{change}").status_code == 409
+    assert served.client.post(f"{API}/jobs/{home['id']}/answer", json={"choice": "skip"}).status_code == 409
 
 
 def test_lists_have_pages_and_etags(serve):

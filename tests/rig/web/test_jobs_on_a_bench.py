@@ -4,18 +4,24 @@ import asyncio
 import json
 import threading
 from dataclasses import dataclass, field
-from typing import Any
+from inspect import signature
+from typing import Any, get_args
 
 import pytest
 
 from rig.bench import Bench, open_bench
 from rig.catalog import Catalog
+from rig.config import load_config
 from rig.core.clock import SystemClock
+from rig.core.errors import DeviceNotFound
 from rig.devices.servo import ServoState
+from rig.doctor.examination import run_checks
+from rig.safety.saved_state import SESSION
 from rig.safety.stop_channel import StopAnswer, StopRequest
-from rig.web.work import doctor_findings
-from sim.bench import ShelfOperator
-from tests.rig.web.conftest import Served
+from rig.web.requests import GotoRequest, JobRequest
+from rig.web.setup import Listening, Setup
+from rig.web.work import JOBS
+from tests.rig.web.conftest import Served, connected
 
 
 @dataclass
@@ -47,19 +53,6 @@ def halted(monkeypatch) -> Halted:
 
     monkeypatch.setattr("rig.web.bench_side.open_bench", opened)
     return halt
-
-
-def request_after_views(served: Served, requests: dict[int, str]) -> None:
-    """Send a request about the running job right after its view of a number, before the job does anything else."""
-    worker, left = served.side.worker, dict(requests)
-    publish = worker._publish
-
-    def published(kind: str, data: Any) -> None:
-        publish(kind, data)
-        if kind == "plan" and data["event"] == "accepted" and (request := left.pop(data["picture"] + 1, None)):
-            assert served.client.post(f"/api/v1/jobs/{data['job']}/{request}").status_code == 200
-
-    worker._publish = published
 
 
 def test_enrolled_object_is_identified_and_its_run_is_saved(serve):
@@ -94,57 +87,6 @@ def test_sample_is_not_accepted_for_several_objects(serve):
     assert "sample names one object" in mistake
     assert "rig identify --watch --scan" in mistake
     assert served.client.get("/api/v1/jobs").json()["items"] == []
-
-
-def test_empty_table_is_neither_enrolled_nor_unknown(serve, monkeypatch):
-    served = serve()
-    assert served.run(kind="enroll", name="lamp", views=4)["state"] == "done"
-    monkeypatch.setattr(ShelfOperator, "place", lambda self, _: self.world.put(None))
-    for request in ({"kind": "identify", "sample": "S-1"}, {"kind": "enroll", "name": "nothing", "views": 4}):
-        job = served.run(**request)
-        assert (job["state"], job["error"]["code"], job["result"]) == ("failed", 606, None)
-        assert job["error"]["next_step"].startswith("Put the object on the table")
-    assert served.client.get("/api/v1/results").json()["items"] == []
-    assert [one["name"] for one in served.client.get("/api/v1/objects").json()["items"]] == ["lamp"]
-
-
-def test_name_in_use_is_rejected_before_the_table_moves(serve):
-    served = serve()
-    assert served.run(kind="enroll", name="lamp", views=4)["state"] == "done"
-    angle_deg = served.client.get("/api/v1/status").json()["table_deg"]
-    job = served.run(kind="enroll", name="lamp", views=4)
-    assert (job["state"], job["error"]["code"], job["views"]) == ("failed", 701, 0)
-    assert served.client.get("/api/v1/status").json()["table_deg"] == angle_deg
-
-
-def test_paused_job_resumes_and_a_cancelled_one_can_be_continued(serve):
-    served = serve()
-    request_after_views(served, {2: "pause", 5: "cancel"})
-    job = served.client.post("/api/v1/jobs", json={"kind": "enroll", "name": "lamp", "views": 8}).json()
-    assert served.wait(job["id"], "paused")["views"] == 2
-    served.client.post(f"/api/v1/jobs/{job['id']}/resume")
-    ended = served.wait(job["id"])
-    assert (ended["state"], ended["views"]) == ("cancelled", 5)
-    assert ended["command"] == "rig enroll lamp --resume --bench sim"
-    done = served.run(**ended["resume"])
-    assert done["state"] == "done"
-    assert ended["views"] + done["views"] == 8
-
-
-def test_tray_asks_for_each_object_and_skips_one(serve):
-    served = serve()
-    tray = {"kind": "tray", "objects": [{"name": "lamp", "views": 4}, {"name": "mug-star", "views": 4}]}
-    job = served.client.post("/api/v1/jobs", json=tray).json()
-    asked = served.wait(job["id"], "waiting")
-    assert "lamp" in asked["question"]["text"]
-    assert served.client.post(f"/api/v1/jobs/{job['id']}/answer", json={"choice": "restart"}).status_code == 409
-    served.client.post(f"/api/v1/jobs/{job['id']}/answer", json={"choice": "skip"})
-    while "mug-star" not in (served.wait(job["id"], "waiting")["question"] or {"text": ""})["text"]:
-        SystemClock().sleep(0.01)
-    served.client.post(f"/api/v1/jobs/{job['id']}/answer", json={"choice": "continue"})
-    assert served.wait(job["id"])["state"] == "done"
-    names = [one["name"] for one in served.client.get("/api/v1/objects").json()["items"]]
-    assert names == ["mug-star"]
 
 
 def test_stop_in_a_motion_stops_the_table_and_cancels_all_jobs(serve, halted):
@@ -209,15 +151,6 @@ def test_angle_is_set_after_the_operator_looked_at_the_cable(serve):
     assert round(served.client.get("/api/v1/status").json()["table_deg"]) == 0
 
 
-def test_dry_run_and_doctor_move_nothing(serve):
-    served = serve()
-    job = served.run(kind="dry-run", objects=[{"name": "lamp"}, {"name": "mug-star", "views": 8}])
-    assert [one["views"] for one in job["result"]["dry_run"]] == [72, 8]
-    job = served.run(kind="doctor")
-    assert {"servo", "camera"} <= {one["topic"] for one in job["result"]["findings"]}
-    assert served.client.get("/api/v1/objects").json()["total"] == 0
-
-
 def test_calibrations_are_offered_and_others_rejected(serve):
     served = serve()
     offered = served.client.get("/api/v1/calibrations").json()["available"]
@@ -276,13 +209,60 @@ def test_doctor_finds_the_bench_closed_at_each_check(serve, monkeypatch):
     closed = []
 
     def watched(*arguments: Any) -> Any:
-        for finding in doctor_findings(*arguments):
-            closed.append(served.side.worker._held.bench is None)
+        for finding in run_checks(*arguments):
+            closed.append(served.side.worker._bench is None)
             yield finding
 
-    monkeypatch.setattr("rig.web.bench_side.doctor_findings", watched)
+    monkeypatch.setattr("rig.doctor.examination.run_checks", watched)
     served = serve()
-    assert served.run(kind="doctor")["state"] == "done"
+    job = served.run(kind="doctor")
+    assert job["state"] == "done"
+    assert {"servo", "camera"} <= {one["topic"] for one in job["result"]["findings"]}
     assert len(closed) > 5
     assert all(closed)
     assert served.run(kind="home")["state"] == "done"  # and it is opened again afterwards
+
+
+def test_doctor_examines_a_bench_that_cannot_be_opened(serve, monkeypatch):
+    def missing(*_arguments: Any, **_options: Any) -> Bench:
+        raise DeviceNotFound("The camera is missing.", next_step="Connect it.")
+
+    monkeypatch.setattr("rig.web.bench_side.open_bench", missing)
+    served = serve()
+    assert served.run(kind="home")["error"]["what"] == "The camera is missing."
+    assert served.run(kind="doctor")["state"] == "done"
+
+
+def test_rotation_waits_for_no_server_of_the_catalog(serve):
+    """The log of the catalog would have to be on its server, which may not answer for a long time."""
+    served = serve("catalog.url='postgresql+psycopg://ada:w0rd@host.invalid/rig'")
+    assert served.run(kind="goto", angle_deg=30)["state"] == "done"
+    plans = [json.loads(one.data) for one in served.server.hub.since(0)[0] if one.kind == "plan"]
+    assert [one["event"] for one in plans] == ["moved"]
+
+
+def test_request_has_the_parameters_of_its_job():
+    union, _ = get_args(JobRequest)
+    assert set(JOBS) == set(get_args(union))
+    for request, job in JOBS.items():
+        signature(job).bind(None, **{name: None for name in request.model_fields if name != "kind"})
+
+
+@pytest.mark.parametrize(
+    ("error", "state", "session"),
+    [(RuntimeError("a defect"), "failed", "failed"), (KeyboardInterrupt(), "interrupted", "interrupted")],
+)
+def test_server_that_ends_in_a_job_stores_how_it_ended(tmp_path, monkeypatch, error, state, session):
+    def fail(_event: Any) -> str:
+        raise error
+
+    monkeypatch.setattr("rig.web.work.line", fail)
+    config = load_config(None, [f"catalog.path={tmp_path}/catalog", f"state_dir={tmp_path}/state"])
+    setup = Setup(bench="sim", config=config, listening=Listening(host="127.0.0.1", port=0))
+    side, _, disconnect = connected(setup)
+    job = side.queue.submit(GotoRequest(angle_deg=30), "anna")
+    with pytest.raises(type(error)):
+        side.worker.run()
+    disconnect()
+    assert side.queue.job(job.id).state == state
+    assert json.loads((setup.state_folder / SESSION).read_text())["ended"] == session

@@ -223,7 +223,7 @@ def test_stop_during_a_pause_within_a_search_holds_the_cable_budget(serve):
     for name in ("mug-white", "mug-star"):
         assert served.run(kind="enroll", name=name, views=6)["state"] == "done"
     worker = served.side.worker
-    publish, moved = worker._publish, []
+    publish, moved = worker.publish, []
 
     def published(kind: str, data: Any) -> None:
         publish(kind, data)
@@ -231,7 +231,7 @@ def test_stop_during_a_pause_within_a_search_holds_the_cable_budget(serve):
             moved.append(data["event"])
             assert served.client.post(f"/api/v1/jobs/{data['job']}/pause").status_code == 200
 
-    worker._publish = published
+    worker.publish = published
     job = served.client.post("/api/v1/jobs", json={"kind": "identify"}).json()
     assert served.wait(job["id"], "paused")["state"] == "paused"
     before_deg = table_deg(served)

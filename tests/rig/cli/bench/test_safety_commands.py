@@ -140,12 +140,6 @@ def test_every_command_reports_a_fault_until_it_is_acknowledged(rig):
     assert rig("goto", "0").exit_code == 0
 
 
-def test_acknowledge_reboots_the_servo(rig):
-    jammed = rig("goto", "300", "--set", 'bench.sim.faults=["overload@move0+0.2s"]')
-    assert jammed.exit_code == 4
-    assert json.loads(rig("acknowledge", "--reboot", "--json").stdout)["acknowledged"]["code"] == 404
-
-
 def test_running_plan_blocks_the_bench_and_stop_ends_it(rig, running):
     process = running()
     rejected = rig("goto", "0")

@@ -39,20 +39,6 @@ def names(rig: Rig, *options: str) -> list[str]:
     return [item["name"] for item in result(rig("catalog", "list", "--json", *options))["objects"]]
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        *("import", "export", "log"),
-        *(f"catalog {name}" for name in ["list", "show", "rename", "label", "delete", "undelete", "stats"]),
-        *(f"catalog {name}" for name in ["verify", "redescribe", "gc", "merge"]),
-    ],
-)
-def test_help_of_every_command_has_an_example(rig: Rig, name: str) -> None:
-    done = rig(*name.split(), "--help")
-    assert done.exit_code == 0
-    assert f"Example: rig {name}" in " ".join(done.output.split())
-
-
 def test_list_filters_by_name_label_and_state(two: Rig) -> None:
     assert names(two) == ["mug", "tin"]
     assert names(two, "m*") == ["mug"]

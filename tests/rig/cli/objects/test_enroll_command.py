@@ -64,9 +64,7 @@ def test_dry_run_shows_the_plan_and_stores_nothing(rig):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("enroll",), "No object is given"),
         (("enroll", "clock", "--list", "x.csv"), "NAME and --list cannot be used together"),
-        (("enroll", "clock", "--views", "8", "--step", "45"), "--views and --step cannot be used together"),
         (("enroll", "clock", "--step", "50"), "--views 7"),
         (("enroll", "--list", "x.csv", "--replace", "--label", "a"), "--label, --replace"),
         (("enroll", "--list", "x.csv"), "cannot be read"),

@@ -8,7 +8,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
 from typer.testing import CliRunner
 
 from rig.catalog import Catalog
@@ -116,18 +115,6 @@ def test_answer_is_printed_even_if_it_cannot_be_recorded(rig, tmp_path):
     assert "Recorded" not in done.output
 
 
-@pytest.mark.parametrize("strategy", ["hbr", "ahbr", "sweep", "random"])
-def test_every_strategy_finds_the_object(rig, strategy):
-    done = rig(
-        "identify", "--strategy", strategy, "--max-views", "3", "--top", "1", "--json", "--set", "bench.sim.object=lamp"
-    )
-    events = [json.loads(line) for line in done.stdout.splitlines()]
-    assert events[0]["strategy"] == strategy
-    assert (events[-2]["event"], events[-2]["name"]) == ("identified", "lamp")
-    assert all(len(e["candidates"]) == 1 for e in events if e["event"] == "ranked")
-    assert len([e for e in events if e["event"] == "accepted"]) == (3 if strategy == "hbr" else 2)
-
-
 def test_dense_is_the_default_strategy(rig, enrolled):
     def searched(*words: str) -> tuple[list[dict], str]:
         done = rig("identify", "--json", "--set", "bench.sim.object=lamp", *words)
@@ -136,6 +123,7 @@ def test_dense_is_the_default_strategy(rig, enrolled):
     events, _ = searched("--top", "1", "--save-run", "runs/own")
     started, *_, answer, _ = (event for event in events if event["event"] != "empty_table_image")
     assert (started["strategy"], started["descriptor"], answer["name"]) == ("dense", "edges+colours", "lamp")
+    assert all(len(event["candidates"]) == 1 for event in events if event["event"] == "ranked")
     assert 0.9 < answer["confidence"] <= 1
     assert answer["open_set_score"] >= answer["open_set_threshold"]
     assert started["notes"][0]["code"] == "rates-not-guaranteed"

@@ -2,7 +2,7 @@
 
 import pytest
 
-from rig.cli.ui.jobs import print_table
+from rig.cli.ui.present import print_table
 
 
 def test_rows_in_a_pipe_are_aligned_and_complete(capsys: pytest.CaptureFixture[str]) -> None:

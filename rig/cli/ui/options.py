@@ -1,0 +1,146 @@
+"""Options that several commands share, and their values."""
+
+import inspect
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, TypedDict, get_args, get_type_hints
+
+import typer
+
+from rig.cli.ui.complete import bench_names
+from rig.core.errors import UsageError
+
+if TYPE_CHECKING:
+    from rig.core.processes import Jobs
+
+COMMON: str = "Common options"
+"""Panel of the help."""
+
+
+class CommonOptions(TypedDict):
+    """The options of every command, given before or after it."""
+
+    bench: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="Bench to use: hardware, sim, sim-bench or the bench of a plug-in (default: default_bench).",
+            autocompletion=bench_names,
+            rich_help_panel=COMMON,
+        ),
+    ]
+    config: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Configuration file (default: rig.toml).", rich_help_panel=COMMON),
+    ]
+    overrides: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="KEY=VALUE",
+            help="Replace one setting, for example identify.max_views=4. Repeatable.",
+            rich_help_panel=COMMON,
+        ),
+    ]
+    seed: Annotated[
+        int | None, typer.Option(min=0, metavar="N", help="Seed of the simulated bench.", rich_help_panel=COMMON)
+    ]
+    json: Annotated[
+        bool, typer.Option("--json", help="Print JSON on stdout and text on stderr.", rich_help_panel=COMMON)
+    ]
+    no_color: Annotated[
+        bool, typer.Option("--no-color", help="Print without colours, as with NO_COLOR=1.", rich_help_panel=COMMON)
+    ]
+
+
+YesOption = Annotated[bool, typer.Option("--yes", "-y", help="Do not ask for confirmation.")]
+DryImportOption = Annotated[bool, typer.Option("--dry-run", help="Only report what would be imported.")]
+JobsOption = Annotated[int | None, typer.Option(min=1, help="Number of processes (default: one per core).")]
+ClusterOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="ADDRESS",
+        help="Work on a Dask cluster: the address of its scheduler, or local, or local:WORKERS.",
+    ),
+]
+ModelOption = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE",
+        help="ONNX file of the run's descriptor, if it is a network. It must match the digest in the run.",
+    ),
+]
+
+
+def spread(function: Callable[..., Any]) -> list[inspect.Parameter]:
+    """Return the parameters of a command; each field of ``**values: Unpack[TypedDict]`` becomes an option."""
+    found: list[inspect.Parameter] = []
+    for parameter in inspect.signature(function, eval_str=True).parameters.values():
+        is_bundle = parameter.kind is inspect.Parameter.VAR_KEYWORD
+        found += options_of(*get_args(parameter.annotation)) if is_bundle else [parameter]
+    return found
+
+
+def options_of(bundle: type) -> list[inspect.Parameter]:
+    """Return the fields of a `TypedDict` as options; one that is not given is False or None."""
+    return [
+        inspect.Parameter(
+            name, inspect.Parameter.KEYWORD_ONLY, default=False if get_args(kind)[0] is bool else None, annotation=kind
+        )
+        for name, kind in get_type_hints(bundle, include_extras=True).items()
+    ]
+
+
+def show_parameters(command: Callable[..., Any], parameters: Sequence[inspect.Parameter]) -> None:
+    """Let Typer take these parameters for those of a command: it reads the signature and the annotations."""
+    command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    command.__annotations__ = {one.name: one.annotation for one in parameters}
+
+
+def jobs_of(jobs: int | None, cluster: str | None) -> "Jobs | None":
+    """Return where the work is done.
+
+    Raises
+    ------
+    UsageError
+        Both are given.
+    """
+    from rig.core.cluster import Cluster
+
+    if cluster is None:
+        return jobs
+    if jobs is not None:
+        raise UsageError("--jobs and --cluster are both given.", next_step="Give one of them; local:2 has 2 workers.")
+    return Cluster(cluster)
+
+
+def descriptor_name(given: str) -> str:
+    """Return the name of the descriptor that the operator named; ``onnx:FILE`` loads the file.
+
+    Raises
+    ------
+    UsageError
+        There is no such descriptor, or the file is no model.
+    """
+    from hbr.descriptors import load_descriptor, names
+
+    try:
+        return load_descriptor(given).name
+    except ValueError as error:
+        raise UsageError(
+            f"The descriptor {given} cannot be used.",
+            next_step=f"Choose one of {', '.join(names())}, or onnx:FILE.",
+            evidence={"reason": str(error)},
+        ) from error
+
+
+def load_model_file(path: Path | None) -> None:
+    """Load the model that the operator gives for a saved run, if any: a saved run names a model by its digest only.
+
+    Raises
+    ------
+    UsageError
+        The file is no model.
+    """
+    if path is not None:
+        descriptor_name(f"onnx:{path}")
