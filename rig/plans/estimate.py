@@ -1,7 +1,7 @@
 """The plan of an enrollment before anything moves: table angles, duration, and whether it is possible."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 from itertools import pairwise
 from math import ceil, floor
@@ -197,6 +197,7 @@ def planned_action(
     return "enroll", None
 
 
+@dataclass(eq=False)
 class TimeLeft:
     """Remaining time of an enrollment: the motion model, scaled by the time that the views so far really took.
 
@@ -210,28 +211,25 @@ class TimeLeft:
         Whether they are taken in one revolution; they are reported after it.
     """
 
-    def __init__(self, model: MotionModel, angles_deg: Sequence[float], *, in_motion: bool = False) -> None:
-        self._model = model
-        self._angles_deg = angles_deg
-        self._in_motion = in_motion
-        self._done = 0
-        self._exposed_ns: list[int] = []
+    model: MotionModel
+    angles_deg: Sequence[float]
+    in_motion: bool = False
+    _exposed_ns: list[int] = field(default_factory=list, init=False)
 
     def add(self, event: Event) -> None:
         """Take the next event of the plan."""
         if isinstance(event, Accepted):
-            self._done += 1
             self._exposed_ns.append(event.evidence.exposed_ns)
 
     @property
     def seconds(self) -> float:
         """Remaining time in the bench's clock, until the table is back at 0."""
-        model, done, angles = self._model, self._done, self._angles_deg
+        model, done, angles = self.model, len(self._exposed_ns), self.angles_deg
         if not angles:
             return 0.0
         if not done:
-            return model.enrollment_s(angles[0], angles, in_motion=self._in_motion)
-        if self._in_motion:
+            return model.enrollment_s(angles[0], angles, in_motion=self.in_motion)
+        if self.in_motion:
             return model.park_s(angles[0] + 360.0)
         left, expected = model.views_s(angles[done - 1 :]), model.views_s(angles[:done])
         if expected > 0:
