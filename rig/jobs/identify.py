@@ -91,8 +91,9 @@ def identify(
                 yield from refresh_table_image(desk, bench, placer, ask=False)
 
             def one() -> Generator[Event, None, Identified]:
+                enrolled = model() if watch else known  # objects enrolled meanwhile are found
                 return identify_one(
-                    bench, model(), config=settings, watcher=watcher, strategy=chosen, seed=seed, top=top, live=live
+                    bench, enrolled, config=settings, watcher=watcher, strategy=chosen, seed=seed, top=top, live=live
                 )
 
             events: Generator[Event, None, object] = watch_table(bench, one) if watch else one()
