@@ -10,6 +10,7 @@ from calibration.outcome import as_json, plain_value, stored_results
 from rig.cli.ui.command import command
 from rig.cli.ui.exit_codes import EXIT_QUALITY
 from rig.cli.ui.settings import Settings
+from rig.core.next_steps import Do, in_words
 
 if TYPE_CHECKING:
     from calibration.procedure import Procedure
@@ -210,7 +211,7 @@ def everything(
     repeated = () if thing is None else (p.Repeatability(thing),)
     run(settings, *servo_and_imu, p.GyroRotation(), *camera_and_table, *repeated)
     if thing is None:
-        print("Next: run `rig calibrate noise NAME` with an object.", file=sys.stderr)
+        print(f"Next: {Do.CALIBRATE(name='noise').command} NAME, with an object.", file=sys.stderr)
 
 
 @app.command("report")
@@ -250,6 +251,8 @@ def show(settings: Settings) -> None:
             return
         for finding in bench.findings:
             print(f"! {finding}")
+        if bench.calibration_steps:
+            print(f"  {in_words(bench.calibration_steps)}")
         for calibration in calibrations:
             if calibration.status is CalibrationStatus.IN_FORCE:
                 print(f"✓ {calibration}")
@@ -257,7 +260,7 @@ def show(settings: Settings) -> None:
                 for key, value in calibration.result.settings.items():
                     print(f"    sets {key} = {plain_value(value)}")
         if not calibrations:
-            print(f"No calibrations in {store.folder} yet: run `rig calibrate all`.")
+            print(f"No calibrations in {store.folder} yet. {in_words(Do.CALIBRATE(name='all'))}")
 
 
 @app.command("history")

@@ -3,6 +3,7 @@
 from typing import TYPE_CHECKING, Any
 
 from rig.core.errors import UsageError
+from rig.core.next_steps import Do
 from rig.core.phrases import in_unit
 
 if TYPE_CHECKING:
@@ -25,9 +26,7 @@ def in_force(bench: "Bench", name: str) -> "CalibrationResult":
     for calibration in stored_results(bench)[1]:
         if calibration.result.name == name and calibration.status is CalibrationStatus.IN_FORCE:
             return calibration.result
-    raise UsageError(
-        f"{name} is not calibrated on this bench.", next_step=f"Run `rig calibrate {name.partition('.')[0]}` first."
-    )
+    raise UsageError(f"{name} is not calibrated on this bench.", next_step=Do.CALIBRATE(name=name.partition(".")[0]))
 
 
 def as_json(result: "CalibrationResult") -> dict[str, Any]:

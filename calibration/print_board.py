@@ -31,7 +31,7 @@ def write_board(board: Board, path: Path) -> str:
     if suffix == ".pdf" and (width > PAGE_MM[0] or height + 15 > PAGE_MM[1]):
         raise UsageError(
             f"A board of {width:.0f} x {height:.0f} mm does not fit a page of {PAGE_MM[0]:g} x {PAGE_MM[1]:g} mm.",
-            next_step="Give fewer --columns and --rows, or a smaller --square-mm.",
+            next_step="Give fewer columns and rows, or smaller squares.",
         )
     if suffix == ".pdf":
         content = _pdf(board)

@@ -27,6 +27,7 @@ from rig.bench import Bench
 from rig.calibrations import CalibrationResult, RejectionCode
 from rig.charts.xy import LIMIT, OTHER, Axis, Chart, Series
 from rig.core.errors import UsageError
+from rig.core.next_steps import Do
 from rig.core.phrases import percent
 from rig.events.events import Accepted
 from rig.motion.turntable import Turntable
@@ -84,7 +85,11 @@ class Repeatability(Procedure):
         if self.placements < needed:
             raise UsageError(
                 f"{self.placements} placements are too few for an error rate of {percent(self.error_rate)}.",
-                next_step=f"Place the object {needed} times (--placements {needed}), or give a larger --error-rate.",
+                next_step=(
+                    f"Place the object {needed} times.",
+                    Do.RUN_AGAIN(placements=needed),
+                    "Or give a larger error rate.",
+                ),
             )
         viewer = Viewer(bench.camera, bench.config)
         describe = ViewDescriber(bench.config.view, (PAPER_DESCRIPTOR,))

@@ -13,6 +13,7 @@ from rig.calibrations import BenchCalibration, CalibrationResult, CalibrationSta
 from rig.charts.xy import Chart
 from rig.core.errors import UsageError, os_errors_as
 from rig.core.files import write
+from rig.core.next_steps import Do
 from rig.core.phrases import filled
 from rig.core.templates import environment
 
@@ -95,7 +96,7 @@ def write_page(
         notes=notes,
         shown=shown,
     )
-    step = "Give --out a file in an existing folder that you may write to."
+    step = ("Give a file in an existing folder that you may write to.", Do.RUN_AGAIN(out="FILE"))
     with os_errors_as(UsageError, f"Cannot write the report {path}.", next_step=step):
         write(path, page.encode())
 
@@ -108,7 +109,7 @@ def _shown(calibration: BenchCalibration, history: Sequence[CalibrationResult]) 
         calibration.status is CalibrationStatus.IN_FORCE,
         str(calibration.status),
         str(calibration),
-        calibration.command,
+        calibration.repetition.command,
         [f"Rejected on {latest.when_utc:%Y-%m-%d %H:%M} UTC: {rejection}" for rejection in latest.rejections],
         # Trusted markup: the SVG escapes its texts.
         [Markup(figure.svg(themed=True)) for figure in plots(result)],

@@ -192,7 +192,27 @@ def errors_page() -> str:
     for kind in sorted(set(kinds) - {RigError}, key=lambda kind: kind.code):
         summary = (kind.__doc__ or "").partition("\n\n")[0]
         lines.append(f"| {kind.code} | {kind.title} | {_cell(summary)} | `{kind.__name__}` |")
-    return "\n".join([*lines, ""])
+    return "\n".join([*lines, "", *_next_steps()])
+
+
+def _next_steps() -> list[str]:
+    """Return a section with the actions of next steps."""
+    from rig.core.next_steps import Do
+    from rig.web.next_steps import JOBS, PAGES
+
+    lines = [
+        "## Next steps\n",
+        "Each presenter words the next step of an error in its own way. In JSON, `steps` is a list, in order: a text "
+        "is a sentence for the operator; an object is an action of the rig with `action`, `parameters` and `command` "
+        "(null if no command does it). `next_step` is the same in words, as a terminal shows it.\n",
+        "| action | meaning | command | on a page |",
+        "|---|---|---|---|",
+    ]
+    for action in Do:
+        page = "a button" if action in JOBS else f"a link to `{PAGES[action]}`" if action in PAGES else ""
+        command = f"`{action().command}`" if action.command else ""
+        lines.append(f"| `{action}` | {action().text} | {command} | {page} |")
+    return [*lines, ""]
 
 
 def exit_codes_page() -> str:

@@ -134,7 +134,7 @@ class ShelfOperator:
         if name not in self.objects:
             raise ObjectNotFound(
                 f"The simulated bench has no object {name!r}.",
-                next_step="Choose a listed object, or give a folder of photographs: --set bench.sim.objects=FOLDER",
+                next_step="Choose a listed object, or set bench.sim.objects to a folder of photographs.",
                 evidence={"objects": list(self.objects)},
             )
         if self.change is not None:

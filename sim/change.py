@@ -53,9 +53,7 @@ class Change:
         wanted = list(dict.fromkeys(names))
         for name in wanted:
             if name not in CHANGES:
-                raise UsageError(
-                    f"There is no change {name!r}.", next_step=f"Give --change one of {', '.join(CHANGES)}."
-                )
+                raise UsageError(f"There is no change {name!r}.", next_step=f"Choose one of {', '.join(CHANGES)}.")
         if not wanted:
             return None
         return cls(**{f.name: max(getattr(CHANGES[name], f.name) for name in wanted) for f in fields(cls)})

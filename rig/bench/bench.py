@@ -21,6 +21,7 @@ from rig.config import RigConfig
 from rig.config.values import Values, config_mistakes, validate
 from rig.core.clock import Clock
 from rig.core.errors import ConfigError, RigError, TorqueStaysOn
+from rig.core.next_steps import NextSteps
 from rig.core.signals import uninterrupted
 from rig.devices.camera import Camera, ShownCamera
 from rig.devices.head.head import RigHead
@@ -59,6 +60,8 @@ class Bench(AbstractContextManager["Bench"]):
         Notes for the operator from the opening of the bench; stored with every enrollment.
     calibration_findings
         The findings about calibrations that are not in force, or only in part.
+    calibration_steps
+        The next step: the calibrations to be repeated.
     state
         Stores the table's revolutions and faults for the next program.
     head
@@ -77,6 +80,7 @@ class Bench(AbstractContextManager["Bench"]):
     conditions: Mapping[str, Any] = field(default_factory=dict)
     findings: tuple[str, ...] = ()
     calibration_findings: tuple[str, ...] = field(default=(), init=False)
+    calibration_steps: NextSteps = field(default=(), init=False)
     state: StateStore = field(default_factory=MemoryStore, repr=False)
     head: RigHead | None = None
     connections: ExitStack = field(default_factory=ExitStack, repr=False)
@@ -279,10 +283,13 @@ def calibrate(bench: Bench, store: CalibrationStore) -> None:
         *notes,
         *(error.what for error in store.unreadable),
         *(
-            f"{str(calibration).removesuffix('.')}. To calibrate again: `{calibration.command}`"
+            str(calibration).removesuffix(".")
             for calibration in calibrations
             if calibration.status is not CalibrationStatus.IN_FORCE
         ),
+    )
+    bench.calibration_steps = tuple(
+        calibration.repetition for calibration in calibrations if calibration.status is not CalibrationStatus.IN_FORCE
     )
     bench.findings = (*findings, *bench.calibration_findings)
 

@@ -37,7 +37,7 @@ class RejectionCode(Enum):
         "pulls, and calibrate again."
     )
     BACKLASH_UNCERTAIN = (
-        "The uncertainty of the backlash is {uncertainty_deg:.3f}°, more than {limit_deg:g}°. Give more --reversals, "
+        "The uncertainty of the backlash is {uncertainty_deg:.3f}°, more than {limit_deg:g}°. Give more reversals, "
         "and keep vibration off the bench."
     )
     ENCODER_ERROR_TOO_LARGE = (
@@ -46,7 +46,7 @@ class RejectionCode(Enum):
     )
     ENCODER_UNCERTAIN = (
         "The uncertainty of the harmonics is {uncertainty_deg:.3f}°, more than {limit_deg:g}°. Give more "
-        "--revolutions, and keep vibration off the bench."
+        "revolutions, and keep vibration off the bench."
     )
     MOVE_HINDERED = (
         "The rotation by {distance_deg:.0f}° took {seconds:.2f} s, {residual_s:.2f} s off the others: something "
@@ -54,8 +54,8 @@ class RejectionCode(Enum):
     )
     CABLE_ENDS_SWAPPED = (
         "The counter-clockwise end ({high_deg:.0f}°) lies below the clockwise end ({low_deg:.0f}°): the ends were "
-        "shown in the wrong order, or table.direction has the wrong sign. Check the direction with `rig calibrate "
-        "servo`."
+        "shown in the wrong order, or table.direction has the wrong sign. Check the direction with the "
+        "calibration of the servo."
     )
     CABLE_TOO_SHORT = (
         "Between the ends, less {margin_deg:g}° at each, the cable leaves {span_deg:.0f}°: less than one revolution. "
@@ -63,12 +63,12 @@ class RejectionCode(Enum):
     )
     HOME_OUTSIDE_CABLE = (
         "Home (0°) does not lie between {low_deg:.0f}° and {high_deg:.0f}°. Rotate the table until the cable hangs "
-        "free, run `rig home --here`, and show the ends again."
+        "free, make that angle home, and show the ends again."
     )
     # -- IMU --
     TOO_FEW_REVOLUTIONS = (
         "Only {up} revolutions upwards and {down} downwards can be used, {needed} in each direction are "
-        "needed{reasons}. Give more --revolutions. If the rate is too high, lower table.velocity_dps or raise "
+        "needed{reasons}. Give more revolutions. If the rate is too high, lower table.velocity_dps or raise "
         "imu.range_dps."
     )
     GYRO_IMPLAUSIBLE = (
@@ -81,7 +81,7 @@ class RejectionCode(Enum):
     )
     SCALE_UNCERTAIN = (
         "The uncertainty of the scale is {uncertainty:.2%}, more than {limit:.1%}: the gyro is noisy. Keep vibration "
-        "off the bench, or give more --revolutions."
+        "off the bench, or give more revolutions."
     )
     TOO_FEW_RECORDED_MOVES = (
         "Only {used} of {planned} rotations can be used: the sensor lost samples. Close other programs, and calibrate "
@@ -191,15 +191,15 @@ class RejectionCode(Enum):
     # -- board and table --
     FOREIGN_MARKERS = (
         "Markers were seen that are not on a board of {columns} columns and {rows} rows{markers}. Give the board's own"
-        " --columns and --rows, or print it again with --print-board."
+        " columns and rows, or print it again."
     )
     WRONG_BOARD_LAYOUT = (
         "In {views} views markers were seen, but not where a board of {columns} columns and {rows} rows has them. Give"
-        " the board's own --columns and --rows, or print it again with --print-board."
+        " the board's own columns and rows, or print it again."
     )
     TOO_FEW_VIEWS = (
         "The board was found in {found} views over {span_deg:.0f}°, {needed} over {needed_deg:g}° are needed. Light "
-        "and focus the board, keep it in the frame, and use the one that --print-board printed."
+        "and focus the board, keep it in the frame, and use a board that this program printed."
     )
     BOARD_LOOSE = (
         "Between two views the board rotated by {difference_deg:.1f}° more or less than the table: it is loose, the "
@@ -221,18 +221,18 @@ class RejectionCode(Enum):
     OBJECTS_CUT_OFF = (
         "The frame cuts off objects of {radius_mm:g} mm radius and {height_mm:g} mm height: {left_px} px at the left, "
         "{top_px} px at the top, {right_px} px at the right, {bottom_px} px at the bottom. Aim the camera again or "
-        "move it away, or give the size of your objects with --radius-mm and --height-mm. Check that the middle of the"
-        " board is {board_mm:g} mm above the platter (--middle-mm)."
+        "move it away, or give the radius and the height of your objects. Check that the middle of the"
+        " board is {board_mm:g} mm above the platter."
     )
     BOARD_SIZE_WRONG = (
-        "By the board the lens is {found_mm:.0f} mm from the axis, by --lens-mm {lens_mm:.0f} mm: its squares would be"
-        " {true_square_mm:.1f} mm wide, not {square_mm:g} mm. Measure a square on the print and give --square-mm, or "
-        "print the board true to scale."
+        "By the board the lens is {found_mm:.0f} mm from the axis, by the given distance {lens_mm:.0f} mm: its squares "
+        "would be {true_square_mm:.1f} mm wide, not {square_mm:g} mm. Measure a square on the print and give its "
+        "width, or print the board true to scale."
     )
     CIRCLES_OFF = (
         "The corners deviate from the circles by {rms_px:.2f} px (RMS), more than {limit_px:g} px: the board is loose,"
-        " the table moved during the views, or the camera was touched since its calibration. Fix them, run `rig "
-        "calibrate camera` if the lens was touched, and calibrate again."
+        " the table moved during the views, or the camera was touched since its calibration. Fix them, calibrate "
+        "the camera if the lens was touched, and calibrate again."
     )
     AXIS_UNCERTAIN = (
         "The uncertainty of the axis is {uncertainty_px:.2f} px in the image, more than {limit_px:g} px. Bring the "
@@ -244,7 +244,7 @@ class RejectionCode(Enum):
     # -- repeatability --
     TOO_FEW_PLACEMENTS = (
         "{placements} placements are too few for an error rate of {error_rate:.1%}: {needed} are needed. Give more "
-        "--placements, or a larger --error-rate."
+        "placements, or a larger error rate."
     )
     SIMILARITY_TOO_LOW = (
         "Views of the same azimuth have a similarity of only {similarity:.2f}, below {needed:g}: the object was not "

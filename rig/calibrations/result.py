@@ -141,7 +141,7 @@ class CalibrationResult:
             return result
         raise ConfigError(
             f"Cannot read the calibration {path}.",
-            next_step="Give a file that `rig calibrate ...` wrote, or remove it and calibrate again.",
+            next_step="Give a file that a calibration wrote, or remove it and calibrate again.",
             evidence={"mistakes": mistakes},
         )
 

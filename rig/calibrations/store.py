@@ -11,6 +11,7 @@ from typing import Any
 from rig.calibrations.result import CalibrationResult
 from rig.config import RigConfig
 from rig.core.errors import ConfigError, UsageError, os_errors_as
+from rig.core.next_steps import Do, NextStep
 from rig.core.phrases import counted
 
 CALIBRATIONS = "calibrations"
@@ -58,9 +59,9 @@ class BenchCalibration:
                 return age
 
     @property
-    def command(self) -> str:
-        """The command that calibrates again."""
-        return f"rig calibrate {_COMMANDS.get(self.result.name, self.result.name.partition('.')[0])}"
+    def repetition(self) -> NextStep:
+        """The step that calibrates again."""
+        return Do.CALIBRATE(name=_COMMANDS.get(self.result.name, self.result.name.partition(".")[0]))
 
 
 class CalibrationStore:

@@ -18,7 +18,7 @@ from rig.core.errors import CatalogDamaged
 from rig.views.image_files import IMAGE_FOLDER
 from rig.views.segmentation_evidence import check_evidence
 
-FIX = "Use a backup of the catalog; if you received it, ask the sender for an export (rig export) instead."
+FIX = "Use a backup of the catalog; if you received it, ask the sender for an exported bundle instead."
 
 
 def damaged(what: str, found: object) -> CatalogDamaged:

@@ -16,6 +16,7 @@ from rig.catalog.rows import copied_columns, insert_copies
 from rig.catalog.schema import APPEND_ONLY, METADATA, objects, results, sessions, views
 from rig.catalog.seal import appended_digests, damage_of, enrollment_digests, object_digests
 from rig.core.errors import CatalogDamaged, CatalogError
+from rig.core.next_steps import Do
 from rig.views import image_files as images
 
 _AT_ONCE = 500
@@ -80,7 +81,7 @@ def _check_empty(connection: Connection, target: Catalog) -> None:
     if any(_count(connection, table) for table in _TABLES):
         raise CatalogError(
             f"The catalog {target.place} is not empty.",
-            next_step="Give a new place. To add objects to a catalog: rig catalog merge",
+            next_step=("Give a new place, or", Do.MERGE()),
         )
 
 
@@ -94,7 +95,7 @@ def _check_appended(connection: Connection, table: Table, source: Catalog) -> No
         if sealed != found or row_id != expected:
             raise CatalogDamaged(
                 f"Row {expected} of {table.name} in the catalog {source.place} is not the one that was written.",
-                next_step="Check the catalog: rig catalog verify",
+                next_step=Do.VERIFY_CATALOG(),
             )
 
 
@@ -120,7 +121,7 @@ def _copy_image(source: Catalog, target: Catalog, name: str, sha256: str) -> int
     if images.digest(content) != sha256:
         raise CatalogDamaged(
             f"The image {source.database.images.where(name)} is not the one that was stored.",
-            next_step="Run rig catalog verify --repair to find a copy.",
+            next_step=Do.REPAIR_CATALOG(),
         )
     with target.database.catalog_errors():
         target.database.images.write(name, content)
@@ -165,5 +166,5 @@ def _compare(reading: Connection, writing: Connection) -> None:
     if before != after or any(sealed != found for _, sealed, found in after):
         raise CatalogError(
             "The copy is not equal to the catalog. Nothing was stored.",
-            next_step="Report this with the output of `rig doctor --json`.",
+            next_step=Do.REPORT_DEFECT(),
         )

@@ -39,6 +39,7 @@ from rig.catalog.seal import changing_enrollments, seal_appended, seal_enrollmen
 from rig.catalog.upkeep import collect_garbage
 from rig.core.errors import CatalogBusy, CatalogDamaged, ObjectExists, RigError
 from rig.core.files import no_follow, write
+from rig.core.next_steps import Do
 from rig.views import image_files as images
 
 _LOCK: Final = "delivering"
@@ -201,8 +202,7 @@ def _checked(journal: Catalog, name: str, sha256: str) -> bytes:
     if content is None or images.digest(content) != sha256:
         raise CatalogDamaged(
             f"The image {journal.database.images.where(name)} of the journal is not the one that was stored.",
-            next_step="Restore it from a backup. Or run `rig catalog deliver --discard NAME` and enroll the "
-            "object again.",
+            next_step=("Restore it from a backup, or", Do.DISCARD(), "Then enroll the object again."),
         )
     return content
 
@@ -242,7 +242,13 @@ def _check_name(connection: Connection, name: str, key: str, replaces: bool) -> 
     if statuses & {EnrollmentStatus.COMPLETE, EnrollmentStatus.IN_PROGRESS}:
         raise ObjectExists(
             f"The journal has {name!r}, and the catalog has another object of that name. Nothing is lost.",
-            next_step=f"Choose: rig catalog deliver --rename {name} NEW-NAME, --replace {name}, or --discard {name}",
+            next_step=(
+                Do.DELIVER_RENAMED(name=name),
+                "Or",
+                Do.DELIVER_REPLACING(name=name),
+                "Or",
+                Do.DISCARD(name=name),
+            ),
         )
     return object_id
 

@@ -13,6 +13,7 @@ from rig.catalog.image_store import ImageStore
 from rig.catalog.records import JsonObject, PackedDescriptor, Region, is_region
 from rig.config import ViewConfig
 from rig.core.errors import CatalogError, UsageError
+from rig.core.next_steps import Do
 from rig.views.description import ViewDescriber
 
 ROUNDED: Final = 0.02
@@ -69,7 +70,7 @@ def region_of(settings: JsonObject) -> Region | None:
             return x, y, width, height
     raise CatalogError(
         f"A view is described with settings that this program does not know: {dict(settings)}.",
-        next_step="Update hbr-rig on this computer, or describe the views again: rig catalog redescribe",
+        next_step=("Update hbr-rig on this computer, or", Do.REDESCRIBE()),
     )
 
 

@@ -28,6 +28,7 @@ from rig.catalog.together import (
 )
 from rig.core.clock import Clock
 from rig.core.errors import CatalogError, UsageError
+from rig.core.next_steps import Do
 from rig.views import image_files as images
 from rig.views.description import PAPER_DESCRIPTOR, Segmented
 
@@ -182,7 +183,7 @@ class Enrollment:
             if one.reason:
                 raise CatalogError(
                     f"A view of {self.object_name!r} cannot be segmented: {one.reason}.",
-                    next_step="Check the disk, then continue the enrollment with --resume.",
+                    next_step=("Check the disk.", Do.CONTINUE_ENROLLMENT(name=self.object_name)),
                 )
         with self._database.write(self.id) as connection:
             self._check_in_progress(connection)
@@ -203,7 +204,7 @@ class Enrollment:
                 raise CatalogError(
                     f"{len(missing)} of the {len(self.planned_azimuth_deg)} planned views of {self.object_name!r} "
                     "are missing.",
-                    next_step="Resume the enrollment (--resume), or abandon it.",
+                    next_step=(Do.CONTINUE_ENROLLMENT(name=self.object_name), "Or abandon it."),
                     evidence={"missing_views": list(missing)},
                 )
             with changing_enrollments(connection, unfinished_and_complete(connection, self.object_id)):
@@ -270,7 +271,7 @@ class Enrollment:
         if deleted_utc is not None:
             raise CatalogError(
                 f"{self.object_name!r} was deleted during its enrollment.",
-                next_step=f"Restore it and continue: rig catalog undelete {self.object_name}",
+                next_step=(Do.UNDELETE(name=self.object_name), Do.CONTINUE_ENROLLMENT(name=self.object_name)),
             )
         if status != EnrollmentStatus.IN_PROGRESS:
             raise CatalogError(

@@ -13,6 +13,7 @@ from sqlalchemy.exc import TimeoutError as PoolTimeout
 
 from rig.config.catalog_place import DATABASE_NAME, CatalogPlace
 from rig.core.errors import CatalogBusy, CatalogDamaged, CatalogError, CatalogUnavailable, RigError
+from rig.core.next_steps import Do
 
 
 @contextmanager
@@ -157,7 +158,7 @@ def _of_system(error: OSError, root: object) -> CatalogError:
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         return CatalogError(
             f"The disk of the catalog {root} is full. This change was not stored. All earlier ones are safe.",
-            next_step="Free some space, then continue.",
+            next_step=(Do.FREE_DISK(), "Then continue."),
             evidence=evidence,
         )
     if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):

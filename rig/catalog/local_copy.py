@@ -127,7 +127,7 @@ def open_or_copy(
         except CatalogUnavailable as missing:
             raise CatalogUnavailable(
                 f"{error.what} {missing.what}",
-                next_step=f"{error.next_step} {missing.next_step}",
+                next_step=(*error.steps, *missing.steps),
                 evidence=error.evidence,
             ) from error
 

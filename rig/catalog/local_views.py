@@ -10,6 +10,7 @@ from rig.catalog.catalog import Catalog
 from rig.catalog.describing import stored_describer
 from rig.catalog.schema import sessions
 from rig.core.errors import CatalogDamaged
+from rig.core.next_steps import Do
 from rig.views.description import BENCH_DESCRIPTOR
 
 
@@ -40,7 +41,7 @@ def local_views(catalog: Catalog, name: str, azimuths_deg: Sequence[float]) -> l
             cut = describer.segment(catalog.read_image(view), view.record.segmentation)
         except ValueError as error:
             raise CatalogDamaged(
-                f"The view {view.id} of {name} cannot be segmented: {error}.", next_step="Check it: rig catalog verify"
+                f"The view {view.id} of {name} cannot be segmented: {error}.", next_step=Do.VERIFY_CATALOG()
             ) from error
         found.append(LocalView(cut.crop, cut.mask, view.record.azimuth_deg))
     return found

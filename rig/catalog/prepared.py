@@ -36,6 +36,7 @@ from rig.catalog.schema import enrollments, objects
 from rig.catalog.seal import check_loaded
 from rig.core.errors import CatalogError, DescriptorOutdated
 from rig.core.files import json_values, no_follow, open_new, read, write
+from rig.core.next_steps import Do
 from rig.views.description import BENCH_DESCRIPTOR, PAPER_DESCRIPTOR
 
 FORMAT: Final = "hbr-rig prepared views"
@@ -155,9 +156,7 @@ def _read(catalog: Catalog, kind: Descriptor, part: Sequence[_Wanted]) -> tuple[
             raise
     counts = np.bincount(views.object_index, minlength=len(views.object_names)).tolist()
     if views.object_names != tuple(one.name for one in part):
-        raise CatalogError(
-            "The catalog was changed while it was read.", next_step="Start the command again.", evidence={}
-        )
+        raise CatalogError("The catalog was changed while it was read.", next_step=Do.RUN_AGAIN(), evidence={})
     records = np.empty(len(views), _record(kind))
     records["packed"], records["azimuth_deg"], records["view_id"] = views.packed(), views.azimuth_deg, view_ids
     return records, counts

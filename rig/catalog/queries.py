@@ -30,6 +30,7 @@ from rig.catalog.rows import measured, of_status
 from rig.catalog.schema import descriptors, enrollments, objects, sessions, views
 from rig.catalog.seal import check_loaded
 from rig.core.errors import CatalogError, DescriptorOutdated, ObjectExists, ObjectNotFound
+from rig.core.next_steps import Do
 from rig.views.description import PAPER_DESCRIPTOR
 
 
@@ -65,9 +66,7 @@ def find(connection: Connection, name: str, *, deleted: bool = False) -> tuple[i
     state = "deleted object" if deleted else "object"
     raise ObjectNotFound(
         f"There is no {state} {name!r} in the catalog.",
-        next_step=f"Did you mean {' or '.join(map(repr, near))}?"
-        if near
-        else f"List the {state}s: rig catalog list{' --deleted' if deleted else ''}",
+        next_step=f"Did you mean {' or '.join(map(repr, near))}?" if near else Do.LIST_OBJECTS(deleted=deleted),
         evidence={"near": near},
     )
 
@@ -77,7 +76,7 @@ def check_free(connection: Connection, name: str) -> None:
     if connection.scalar(select(objects.c.id).where(in_use(name))) is not None:
         raise ObjectExists(
             f"There is another object {name!r} in the catalog.",
-            next_step="Choose another name, or rename the other object: rig catalog rename",
+            next_step=("Choose another name, or", Do.RENAME(name=name)),
         )
 
 
@@ -148,7 +147,7 @@ def unfinished(connection: Connection, object_id: int, name: str) -> Row[Any]:
     """Return the unfinished enrollment of an object; a `CatalogError` if there is none."""
     found = connection.execute(select(enrollments).where(of_status(object_id, EnrollmentStatus.IN_PROGRESS))).first()
     if found is None:
-        raise CatalogError(f"{name!r} has no unfinished enrollment.", next_step="Enroll it without --resume.")
+        raise CatalogError(f"{name!r} has no unfinished enrollment.", next_step=Do.ENROLL(name=name))
     return found
 
 
@@ -159,13 +158,16 @@ def check_not_enrolled(connection: Connection, object_id: int, name: str) -> Non
             raise CatalogError(
                 f"The enrollment of {name!r} is unfinished, with {len(enrollment.present)} of "
                 f"{len(enrollment.planned_azimuth_deg)} views.",
-                next_step="Continue it (--resume), or start again (--replace).",
+                next_step=(Do.CONTINUE_ENROLLMENT(name=name), "Or", Do.ENROLL_AGAIN(name=name)),
             )
         if enrollment.status == EnrollmentStatus.COMPLETE:
             raise ObjectExists(
                 f"{name!r} is enrolled already, with {len(enrollment.present)} views.",
-                next_step="Choose another name, or enroll it again (--replace); "
-                "the old views stay in use until the new ones are complete.",
+                next_step=(
+                    "Choose another name, or",
+                    Do.ENROLL_AGAIN(name=name),
+                    "The old views stay in use until the new ones are complete.",
+                ),
             )
 
 
@@ -301,12 +303,11 @@ def _outdated(
     shown = ", ".join(map(repr, lacking[:3])) + (f" and {len(lacking) - 3} more" if len(lacking) > 3 else "")
     others = [str(version) for version in versions if version != kind.version]
     also = f" Other views have version {' or '.join(others)}." if others else ""
-    option = "" if kind.name == PAPER_DESCRIPTOR else f" --descriptor {kind.name}"
     views, described = len(names), len(names) - sum(is_missing)
     return DescriptorOutdated(
         f"{described} of {views} views have the descriptor {kind.name} {kind.version}; it is missing for {shown}."
         f"{also}",
-        next_step=f"Describe the stored images again: rig catalog redescribe{option}",
+        next_step=Do.REDESCRIBE(descriptor=None if kind.name == PAPER_DESCRIPTOR else kind.name),
         evidence={
             "views": views,
             "described": described,

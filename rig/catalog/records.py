@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from rig.core.control_characters import has_control_characters
 from rig.core.errors import UsageError
+from rig.core.next_steps import Do
 
 MAX_NAME_LENGTH: Final = 100
 
@@ -281,7 +282,7 @@ def check_text(text: str, what: str) -> None:
     if has_control_characters(text):
         raise UsageError(
             f"The {what} {text!r} contains control characters.",
-            next_step="Remove them; `rig catalog label` changes the label and the note of an object.",
+            next_step=("Remove them. Of an enrolled object,", Do.LABEL()),
         )
 
 

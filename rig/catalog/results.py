@@ -22,6 +22,7 @@ from rig.catalog.records import JsonObject, Outcome, Provenance, as_json
 from rig.catalog.schema import corrections, results
 from rig.catalog.seal import seal_appended
 from rig.core.errors import CatalogError, UsageError
+from rig.core.next_steps import Do
 from rig.views import image_files as images
 
 MAX_TEXT_LENGTH: Final = 1000
@@ -306,7 +307,7 @@ def correct(
         if now == before:
             raise UsageError(
                 f"Result {result_id} has these values already.",
-                next_step="Give the right --object NAME, --unknown, or --sample ID.",
+                next_step="Give the right object, unknown, or the right sample.",
             )
         insert_row(
             connection,
@@ -351,7 +352,7 @@ def _write_image(catalog: Catalog, result_id: int, png: bytes) -> str:
 def _find(connection: Connection, result_id: int) -> Result:
     found = _load(connection, results.c.id == result_id)
     if not found:
-        raise CatalogError(f"There is no result {result_id} in the catalog.", next_step="List them: rig results list")
+        raise CatalogError(f"There is no result {result_id} in the catalog.", next_step=Do.LIST_RESULTS())
     return found[0]
 
 

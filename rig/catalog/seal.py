@@ -20,6 +20,7 @@ from sqlalchemy import Connection, Table, text
 from rig.catalog.columns import JsonText, Utc
 from rig.catalog.schema import descriptors, enrollments, objects, sessions, views
 from rig.core.errors import CatalogDamaged
+from rig.core.next_steps import Do
 
 _PARTS: Final = (
     (sessions, "sessions", "enrollment_id, id"),
@@ -113,8 +114,7 @@ def damage_of(
     return CatalogDamaged(
         f"{', '.join(map(repr, shown[:3]))}{' and others' if len(shown) > 3 else ''} in the catalog changed after they "
         "were stored.",
-        next_step="Check the catalog: `rig catalog verify`. Then use a backup, or delete these objects and enroll them "
-        "again.",
+        next_step=(Do.VERIFY_CATALOG(), "Then use a backup, or delete these objects and enroll them again."),
         evidence={"objects": shown[:20]},
     )
 

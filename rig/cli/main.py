@@ -185,6 +185,6 @@ def main() -> None:
             sys.exit(EXIT_BY_SIGNAL + signal.SIGPIPE)
         except Exception:  # a mistake in this program; its text can contain anything
             print(neutral(traceback.format_exc()), file=sys.stderr, end="")
-            step = "Report this text and the command; `rig --version` prints the version."
+            step = "Report this text, the command, and the version (rig --version)."
             print(f"Error {RigError.code} ({RigError.title}).\nNext step: {step}", file=sys.stderr)
             sys.exit(RigError.code // 100)

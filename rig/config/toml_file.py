@@ -17,6 +17,7 @@ from typing import Any, Final
 
 from rig.core.errors import ConfigError, os_errors_as
 from rig.core.files import read, write
+from rig.core.next_steps import Do
 
 Key = tuple[str, ...]
 
@@ -168,7 +169,7 @@ def read_text(path: Path) -> str:
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(
             f"Cannot read the configuration {path}.",
-            next_step="Give an existing file with --config, or omit the option to use the defaults.",
+            next_step="Give an existing file, or none to use the defaults.",
             evidence={"reason": getattr(error, "strerror", None) or str(error)},
         ) from error
 
@@ -182,7 +183,7 @@ def save(path: Path, text: str) -> None:
         The file cannot be written.
     """
     target = path.resolve()
-    step = "Give a file in a writable folder: --config FILE."
+    step = ("Give a file in a writable folder.", Do.RUN_AGAIN(config="FILE"))
     with os_errors_as(ConfigError, f"Cannot write the configuration {path}.", next_step=step):
         target.parent.mkdir(parents=True, exist_ok=True)
         write(target, text.encode("utf-8"))

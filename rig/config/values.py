@@ -14,6 +14,7 @@ from pydantic import BaseModel, ValidationError
 from rig.config.toml_file import MAX_DEPTH, NONE, Key, line_numbers, loads, read_text
 from rig.config.wording import mistakes
 from rig.core.errors import ConfigError
+from rig.core.next_steps import Do
 
 M = TypeVar("M", bound=BaseModel)
 
@@ -101,7 +102,7 @@ def config_mistakes(found: list[str], where: str) -> ConfigError:
     """Return the error for a configuration with mistakes."""
     return ConfigError(
         f"{len(found)} mistake{'s' if len(found) > 1 else ''} in {where}.",
-        next_step="Fix the listed keys, then run `rig config check`.",
+        next_step=("Fix the listed keys.", Do.CHECK_CONFIGURATION()),
         evidence={"mistakes": found},
     )
 
@@ -140,7 +141,7 @@ def _apply(values: dict[str, Any], override: str) -> Key:
     if not sign or not all(parts) or len(parts) > MAX_DEPTH:
         raise ConfigError(
             f"Cannot read the setting {override!r}.",
-            next_step="Write SECTION.KEY=VALUE, e.g. --set identify.max_views=4.",
+            next_step="Write SECTION.KEY=VALUE, for example identify.max_views=4.",
         )
     here = values
     for part in parts[:-1]:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Final, TypeVar
 
 from rig.core.errors import ClusterFailed, ExtraMissing, UsageError
+from rig.core.next_steps import Do
 from rig.core.phrases import whole
 
 _Item = TypeVar("_Item")
@@ -85,7 +86,10 @@ def map_on_cluster(work: Callable[[_Item], _T], items: Iterable[_Item], cluster:
         except (OSError, TimeoutError, ValueError) as error:
             raise ClusterFailed(
                 f"The cluster {cluster.address} does not answer.",
-                next_step="Start its scheduler and workers (dask scheduler, dask worker), or use --cluster local.",
+                next_step=(
+                    "Start its scheduler and workers (dask scheduler, dask worker), or",
+                    Do.RUN_AGAIN(cluster="local"),
+                ),
                 evidence={"error": str(error)},
             ) from error
         models = tuple(str(model.path) for model in loaded_models())

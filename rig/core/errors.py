@@ -6,9 +6,10 @@ The hundreds of a code are the exit code of the command line: 2 usage, 3 configu
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 from rig.core.masking import masked
+from rig.core.next_steps import Do, NextSteps, SomeSteps, as_steps, in_words, steps_as_json
 
 Evidence = Mapping[str, Any]
 
@@ -21,11 +22,15 @@ class RigError(Exception):
     what
         What happened, in a sentence.
     next_step
-        What the operator does now: an imperative.
+        What the operator does now: sentences in the imperative for what only hands can do, and actions of the rig
+        (`rig.core.next_steps`), in order.
     evidence
         The numbers that led to the error, with units in the keys.
-    afterwards
-        What the operator does when a latched fault is acknowledged.
+
+    Attributes
+    ----------
+    steps
+        The next step as sentences and actions.
     """
 
     code: ClassVar[int] = 100
@@ -39,40 +44,21 @@ class RigError(Exception):
         if latches is not None:
             cls.latches = latches
 
-    def __init__(self, what: str, *, next_step: str, evidence: Evidence | None = None, afterwards: str = "") -> None:
+    def __init__(self, what: str, *, next_step: SomeSteps, evidence: Evidence | None = None) -> None:
         what = masked(what)
         super().__init__(what)
         self.what: str = what
         self.evidence: dict[str, Any] = masked(evidence or {})
-        self._next_step, self._acknowledge, self._afterwards = masked(next_step), "", afterwards
-        self._reboot = False
+        self.steps: NextSteps = as_steps(next_step)
 
     @property
     def next_step(self) -> str:
-        """What the operator does now; of a latched fault, how it is acknowledged, too."""
-        return " ".join(filter(None, (self._next_step, self._acknowledge, self._afterwards)))
+        """The next step as a terminal shows it."""
+        return in_words(self.steps)
 
     @property
     def exit_code(self) -> int:
         return self.code // 100
-
-    def ask_to_acknowledge(self, *, reboot: bool = False, outlasts_program: bool = True) -> Self:
-        """Add to the next step how the latched fault is acknowledged.
-
-        Parameters
-        ----------
-        reboot
-            Only a restart of the servo clears the fault. A later call does not take this back.
-        outlasts_program
-            Whether the fault stays latched when the program ends, so that a command can acknowledge it.
-        """
-        self._reboot |= reboot
-        self._acknowledge = (
-            f"Then run `rig acknowledge{' --reboot' * self._reboot}`."
-            if outlasts_program
-            else "Then start the program again: this bench keeps the fault only while its program runs."
-        )
-        return self
 
     def as_dict(self) -> dict[str, Any]:
         """Return the error as `--json` prints it."""
@@ -82,11 +68,12 @@ class RigError(Exception):
             "what": self.what,
             "evidence": self.evidence,
             "next_step": self.next_step,
+            "steps": steps_as_json(self.steps),
         }
 
 
 @contextmanager
-def os_errors_as(kind: type[RigError], what: str, *, next_step: str) -> Iterator[None]:
+def os_errors_as(kind: type[RigError], what: str, *, next_step: SomeSteps) -> Iterator[None]:
     """Raise an `OSError` in the ``with`` block as an error of ``kind``, with the system's reason as evidence."""
     try:
         yield
@@ -130,7 +117,7 @@ class ExtraMissing(ConfigError, code=301, title="package missing"):
         """Return the error that ``what`` needs the packages of an extra."""
         return cls(
             f"{what} need packages that are not installed.",
-            next_step=f"Install them: pip install 'hbr-rig[{extra}]'",
+            next_step=Do.INSTALL_EXTRA(extra=extra),
             evidence={"missing": error.name or str(error)},
         )
 
@@ -216,7 +203,7 @@ class SupplyLost(RigError, code=511, title="supply lost"):
 
 
 class MotionStopped(RigError, code=512, title="stopped"):
-    """The operator stopped the table with `rig stop`."""
+    """The operator stopped the table."""
 
 
 class Unreferenced(NotReady, code=513, title="not referenced"):

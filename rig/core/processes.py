@@ -13,6 +13,7 @@ from typing import Any, Final, TypeVar
 
 from rig.core.cluster import Cluster, map_on_cluster
 from rig.core.errors import RigError
+from rig.core.next_steps import Do
 
 _Item = TypeVar("_Item")
 _T = TypeVar("_T")
@@ -68,7 +69,10 @@ def map_in_processes(work: Callable[[_Item], _T], items: Iterable[_Item], jobs: 
     except BrokenProcessPool as error:
         raise RigError(
             "A process that worked on the images ended before it was done.",
-            next_step="Check whether the computer ran out of memory, and try again with fewer processes (--jobs 1).",
+            next_step=(
+                "Check whether the computer ran out of memory. Try it with fewer processes:",
+                Do.RUN_AGAIN(jobs=1),
+            ),
         ) from error
     finally:
         pool.shutdown(wait=True, cancel_futures=True)

@@ -10,6 +10,7 @@ from smbus2 import SMBus, i2c_msg
 
 from rig.core.clock import Clock
 from rig.core.errors import DeviceNotFound, DeviceSilent
+from rig.core.next_steps import Do
 
 ATTEMPTS, RETRY_PAUSE_S = 3, 0.002
 
@@ -117,7 +118,7 @@ class I2cRegisters:
             f"The kernel driver {driver or '(unknown)'} uses I2C address {self.address:#04x} of {self.name}.",
             next_step=f"Unbind it: `{unbind_command(bus, self.address, driver)}`."
             if driver
-            else "`rig doctor` names the driver and the command that unbinds it.",
+            else (Do.DOCTOR(), "It names the driver and the command that unbinds it."),
             evidence={"errno": EBUSY, "driver": driver},
         )
 

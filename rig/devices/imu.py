@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from rig.config.imus import ImuKind, likely_device, recognised
 from rig.core.clock import Clock
 from rig.core.errors import DeviceMismatch
+from rig.core.next_steps import Do
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,7 +121,7 @@ def identified(kind: ImuKind, got: int, address: int, bus: str, gyro_noise_dps_r
         raise DeviceMismatch(
             f"The identity register {kind.register:#04x} at I2C address {address:#04x} of {bus} is {got:#04x}, "
             f"expected {expected} ({kind.name}): probably {likely_device(kind, address, got)}.",
-            next_step=f"Run `rig config set imu.model {other.key}`."
+            next_step=Do.SET_KEY(key="imu.model", value=other.key)
             if other is not None and other.driver
             else "Check the wiring, or give the address and model of the sensor (imu.address, imu.model).",
             evidence={"got": got, "expected": kind.identities[0]},

@@ -338,7 +338,7 @@ class OpenCvCamera:
                 if self._clock.now_ns() > end_ns:
                     raise DeviceSilent(
                         f"{self.identity.name} was disconnected for more than {self._timeout_s:g} s.",
-                        next_step=missing.next_step,
+                        next_step=missing.steps,
                         evidence=missing.evidence,
                     ) from missing
                 self._clock.sleep(_REPLUG_PAUSE_S)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from rig.bench.hardware import camera_settings, store_focus
 from rig.core.clock import seconds_between
+from rig.core.next_steps import Do, SomeSteps
 from rig.devices.camera import CameraLocks
 from rig.devices.opencv_camera import OpenCvCamera
 from rig.devices.v4l2 import choose_mode
@@ -57,7 +58,7 @@ MAX_FLICKER = 0.05  # largest spread of the mean level of frames of one scene
 def camera(context: DoctorContext) -> Iterator[Finding]:
     """Open the camera, lock its settings, and take some frames."""
     if context.holder is not None:
-        yield warning("camera", FindingCode.NOT_CHECKED, context.rig("stop"))
+        yield warning("camera", FindingCode.NOT_CHECKED, Do.STOP())
         return
     with closing(open_camera(context)) as source:
         identity = source.identity
@@ -110,7 +111,7 @@ def _mode(context: DoctorContext, source: OpenCvCamera) -> Iterator[Finding]:
         return
     if (nearest.width, nearest.height) != (wanted.width, wanted.height) or 0 < nearest.fps < 0.9 * wanted.fps:
         size = f"{wanted.width}x{wanted.height} at {wanted.fps:.3g} frames/s"
-        yield warning("camera", FindingCode.MODE_NOT_OFFERED, context.rig("setup"), wanted=size, nearest=nearest)
+        yield warning("camera", FindingCode.MODE_NOT_OFFERED, Do.SETUP(), wanted=size, nearest=nearest)
 
 
 def _locks(context: DoctorContext, source: OpenCvCamera) -> Iterator[Finding]:
@@ -171,7 +172,7 @@ def _mains(value: float | None) -> str | None:
 
 def _frames(context: DoctorContext, source: OpenCvCamera) -> Iterator[Finding]:
     clock = context.computer.clock
-    again = "Unplug the camera, plug it in again, then: " + context.rig("doctor")
+    again = ("Unplug the camera, plug it in again, then", Do.DOCTOR())
     frames: list[NDArray[np.uint8]] = []
     times_ns = []
     ages = []
@@ -189,7 +190,7 @@ def _frames(context: DoctorContext, source: OpenCvCamera) -> Iterator[Finding]:
     levels = [each.mean_level for each in seen]
     evidence: dict[str, Any] = {"frame_age_ms": 1e3 * max(ages), "frames_per_s": rate, "mean_levels": levels}
     if max(levels) < context.config.view.min_mean:
-        fix = "Take the lens cap off and switch the light on, then: " + context.rig("doctor")
+        fix: SomeSteps = ("Take the lens cap off and switch the light on, then", Do.DOCTOR())
         yield bad("camera", FindingCode.BLACK, fix, mean_level=max(levels), **evidence)
         return
     if all(np.array_equal(frames[0], frame) for frame in frames[1:]):
@@ -202,10 +203,13 @@ def _frames(context: DoctorContext, source: OpenCvCamera) -> Iterator[Finding]:
         yield warning("camera", FindingCode.FEW_FRAMES, fix, fps=source.identity.fps, **evidence)
     else:
         yield fine("camera", FindingCode.FRAMES, **evidence)
-    yield from _flicker(context, source, frames, np.array(times_ns), evidence)
+    yield from _flicker(source, frames, np.array(times_ns), evidence)
     quality = asdict(seen[-1])
     if reasons := seen[-1].reasons(context.config.view):
-        fix = "Check light, exposure and focus (an empty table may look blurred): " + context.rig("config show view")
+        fix = (
+            "Check light, exposure and focus (an empty table may look blurred). The limits are in [view].",
+            Do.SHOW_CONFIGURATION(),
+        )
         texts = [rejection_text(reason, seen[-1]) for reason in reasons]
         yield warning("camera", FindingCode.VIEW_REJECTED, fix, reasons=texts, codes=reasons, **quality)
     else:
@@ -218,7 +222,6 @@ def green(image_bgr: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def _flicker(
-    context: DoctorContext,
     source: OpenCvCamera,
     frames: list[NDArray[np.uint8]],
     times_ns: NDArray[np.int64],
@@ -228,7 +231,10 @@ def _flicker(
     spread = (max(levels) - min(levels)) / max(levels)
     lamp = mains_flicker(np.array([green(frame).mean(axis=1) for frame in frames]), times_ns)
     if lamp is None and spread > MAX_FLICKER:
-        fix = "Use a lamp that does not flicker, and keep daylight and shadows away, then: " + context.rig("doctor")
+        fix: SomeSteps = (
+            "Use a lamp that does not flicker, and keep daylight and shadows away, then",
+            Do.DOCTOR(),
+        )
         yield warning("camera", FindingCode.FLICKER, fix, spread=spread, seconds=SPACED * SPACING_S, **evidence)
         return
     exposure_us = source.read_locks().exposure_us
@@ -240,7 +246,7 @@ def _flicker(
             reason = "several mains frequencies are possible" if exposure_us else "its exposure time is not known"
             yield fine("camera", FindingCode.STANDING_FLICKER_NOT_CHECKED, mains_hz=standing, reason=reason)
     if lamp is not None:
-        fix = context.set("camera.exposure_us", f"{lamp.exposure_us(exposure_us or 1e4):g}")
+        fix = Do.SET_KEY(key="camera.exposure_us", value=f"{lamp.exposure_us(exposure_us or 1e4):g}")
         yield warning("camera", FindingCode.MAINS_FLICKER, fix, mains_hz=lamp.mains_hz, depth=lamp.depth)
 
 

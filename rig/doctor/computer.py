@@ -6,6 +6,7 @@ from datetime import UTC, datetime, timedelta
 from rig.bench.computer import DeviceFile, SerialPort
 from rig.core.camera_node import camera_node
 from rig.core.clock import seconds_between
+from rig.core.next_steps import Do, SomeSteps
 from rig.doctor.context import DoctorContext
 from rig.doctor.finding import Finding, FindingCode, bad, fine, warning
 from rig.safety.saved_state import FileStore
@@ -35,20 +36,25 @@ def bench_state(context: DoctorContext) -> Iterator[Finding]:
     path = context.config.state_path(context.bench)
     if context.holder is not None:
         who = f"process {context.holder.pid} ({context.holder.command})" if context.holder.pid else "another process"
-        yield warning("bench", FindingCode.BENCH_IN_USE, context.rig("stop"), holder=who, pid=context.holder.pid)
+        yield warning("bench", FindingCode.BENCH_IN_USE, Do.STOP(), holder=who, pid=context.holder.pid)
     state = FileStore(path).load()
     if state.damage:
         yield bad(
             "bench",
             FindingCode.STATE_DAMAGED,
-            "Check how far the cable is wound up, then: "
-            f"{context.rig('acknowledge')} and {context.rig('home --revolutions N')}",
+            (
+                "Check how far the cable is wound up, then",
+                Do.ACKNOWLEDGE(),
+                "If it hangs free,",
+                Do.SET_REVOLUTIONS(revolutions=0),
+                "Otherwise, give the revolutions that it is wound up.",
+            ),
             5,
             what=state.fault.what if state.fault else state.damage,
             damage=state.damage,
         )
     elif state.fault is not None:
-        yield bad("bench", FindingCode.FAULT_LATCHED, context.rig("acknowledge"), 5, **state.fault.model_dump())
+        yield bad("bench", FindingCode.FAULT_LATCHED, Do.ACKNOWLEDGE(), 5, **state.fault.as_dict())
     if context.holder is None and not state.damage and state.fault is None:
         yield fine("bench", FindingCode.BENCH_FREE, bench=context.bench, state=path)
 
@@ -79,7 +85,7 @@ def _i2c(context: DoctorContext) -> Iterator[Finding]:
     if node is not None:
         yield from access(context, "port", node, "i2c")
     elif buses:
-        fix = context.set("imu.bus", buses[0].path.removeprefix("/dev/i2c-"))
+        fix = Do.SET_KEY(key="imu.bus", value=buses[0].path.removeprefix("/dev/i2c-"))
         yield bad("port", FindingCode.NO_I2C_BUS, fix, wanted=bus, found=_names(buses))
     else:
         yield bad("port", FindingCode.NO_I2C_BUS, i2c_command(context), wanted=bus, found=[])
@@ -94,9 +100,9 @@ def _video(context: DoctorContext) -> Iterator[Finding]:
     if node is not None:
         yield from access(context, "port", node, "video")
     else:
-        fix = "Connect the camera, then: " + context.rig("find")
+        fix: SomeSteps = ("Connect the camera, then", Do.FIND())
         if cameras:
-            fix = context.set("camera.source", cameras[0].stable or cameras[0].path)
+            fix = Do.SET_KEY(key="camera.source", value=cameras[0].stable or cameras[0].path)
         yield bad("port", FindingCode.NO_CAMERA_DEVICE, fix, wanted=camera, found=_names(cameras))
 
 
@@ -107,20 +113,20 @@ def disk(context: DoctorContext) -> Iterator[Finding]:
     views = there.free_bytes // VIEW_BYTES
     free = {"free_gb": there.free_bytes / 1e9, "path": path, "objects": views // context.config.enroll.views}
     if there.free_bytes < TOO_LITTLE_ROOM:
-        yield bad("disk", FindingCode.FREE_SPACE, context.rig("catalog gc"), 7, **free)
+        yield bad("disk", FindingCode.FREE_SPACE, Do.REMOVE_DELETED(), 7, **free)
     elif there.free_bytes < LITTLE_ROOM:
-        yield warning("disk", FindingCode.FREE_SPACE, context.rig("catalog gc"), **free)
+        yield warning("disk", FindingCode.FREE_SPACE, Do.REMOVE_DELETED(), **free)
     else:
         yield fine("disk", FindingCode.FREE_SPACE, **free)
     if not there.writable:
-        fix = (
+        fix: SomeSteps = (
             f"sudo chown -R {context.computer.user.name} {path}"
             if path.exists()
-            else context.set("catalog.path", "FOLDER")
+            else Do.SET_KEY(key="catalog.path", value="FOLDER")
         )
         yield bad("disk", FindingCode.NOT_WRITABLE, fix, 7, user=context.computer.user.name, path=path)
     if there.network:
-        fix = context.set("catalog.path", "FOLDER-ON-A-LOCAL-DISK")
+        fix = Do.SET_KEY(key="catalog.path", value="FOLDER-ON-A-LOCAL-DISK")
         yield warning("disk", FindingCode.NETWORK_DISK, fix, path=path)
 
 
@@ -133,7 +139,7 @@ def clock(context: DoctorContext) -> Iterator[Finding]:
     civil_s = (timer.utc() - start_utc).total_seconds()
     pause = {"wanted_ms": 1e3 * _PAUSE_S, "pause_ms": 1e3 * passed_s}
     if not _PAUSE_S * 0.9 <= passed_s <= _PAUSE_S + _PAUSE_ERROR_S:
-        fix = "Close other programs and switch power saving off, then: " + context.rig("doctor")
+        fix: SomeSteps = ("Close other programs and switch power saving off, then", Do.DOCTOR())
         yield warning("clock", FindingCode.LONG_PAUSE, fix, **pause)
     else:
         yield fine("clock", FindingCode.PAUSE, **pause)
@@ -186,7 +192,7 @@ def udev_rules(ports_found: list[SerialPort]) -> str:
 def udev_command(context: DoctorContext) -> str:
     """Return the command that installs the rules."""
     return (
-        f"{context.rig('doctor --udev')} | sudo tee {' '.join(RULES_FILES)} && "
+        f"{context.step(Do.UDEV_RULES()).command} | sudo tee {' '.join(RULES_FILES)} && "
         "sudo udevadm control --reload && sudo udevadm trigger --action=add"
     )
 
@@ -197,16 +203,17 @@ def i2c_command(context: DoctorContext) -> str:
 
 
 def _missing(context: DoctorContext, key: str, wanted: str, found: list[SerialPort]) -> Finding:
+    fix: SomeSteps
     match [port for port in found if port.usb]:
         case [] if (program := context.computer.running("brltty")) is not None:
             fix = PORT_GRABBERS["brltty"]
             return bad("port", FindingCode.BRLTTY_TAKES_PORT, fix, wanted=wanted, pid=program.pid)
         case []:
-            fix = "Plug the adapter in, then: " + context.rig("find")
+            fix = ("Plug the adapter in, then", Do.FIND())
         case [one]:
-            fix = context.set(key, one.stable or one.path)
+            fix = Do.SET_KEY(key=key, value=one.stable or one.path)
         case _:
-            fix = context.rig("setup")
+            fix = Do.SETUP()
     return bad("port", FindingCode.NO_SERIAL_PORT, fix, wanted=wanted, found=_names(found))
 
 
@@ -214,7 +221,9 @@ def access(context: DoctorContext, topic: str, node: DeviceFile, usual_group: st
     """Check that a device file can be opened: no other program uses it, and the user has permission."""
     if node.holders and not (context.holder and context.holder.pid in {process.pid for process in node.holders}):
         command = node.holders[0].command
-        fix = next((fix for name, fix in PORT_GRABBERS.items() if name in command), f"kill {node.holders[0].pid}")
+        fix: SomeSteps = next(
+            (fix for name, fix in PORT_GRABBERS.items() if name in command), f"kill {node.holders[0].pid}"
+        )
         yield bad(topic, FindingCode.DEVICE_FILE_IN_USE, fix, path=node.path, holders=node.holders)
         return
     if node.usable:
@@ -234,7 +243,7 @@ def _latency(context: DoctorContext, port: SerialPort) -> Finding:
     now = {"path": port.path, "latency_ms": port.latency_ms}
     if port.latency_ms is None or port.latency_ms <= LATENCY_MS:
         return fine("port", FindingCode.LATENCY, **now)
-    fix, permanently = f"echo {LATENCY_MS} | sudo tee {port.latency_file}", context.rig("doctor --udev")
+    fix, permanently = f"echo {LATENCY_MS} | sudo tee {port.latency_file}", context.step(Do.UDEV_RULES()).command
     return warning("port", FindingCode.HIGH_LATENCY, fix, permanently=permanently, **now)
 
 

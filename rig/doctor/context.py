@@ -2,15 +2,15 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from shlex import quote
 from typing import Any
 
 from rig.bench import bench_kind
 from rig.bench.computer import Computer, ComputerProvider
 from rig.config import RigConfig
 from rig.config.values import validate
+from rig.core.next_steps import Do, NextStep
 from rig.safety.bench_lock import busy, holder
 from rig.safety.saved_state import Holder
 
@@ -39,13 +39,9 @@ class DoctorContext:
     holder: Holder | None = None
     identities: dict[str, dict[str, Any]] = field(default_factory=dict)
 
-    def rig(self, command: str) -> str:
-        """Return a command line for this bench."""
-        return " ".join(["rig", command, *map(quote, self.options)])
-
-    def set(self, key: str, value: Any) -> str:
-        """Return the command that changes one key of the configuration."""
-        return " ".join(["rig config set", key, quote(str(value)), *map(quote, self.file_options)])
+    def step(self, step: NextStep) -> NextStep:
+        """Return a step whose command is for this bench."""
+        return replace(step, options=self.file_options if step.action is Do.SET_KEY else self.options)
 
     @property
     def catalog_path(self) -> Path:

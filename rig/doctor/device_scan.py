@@ -14,6 +14,7 @@ from rig.config import CameraConfig
 from rig.config.servos import USE_ANOTHER
 from rig.config.toml_file import Key
 from rig.core.errors import DeviceNotFound, RigError
+from rig.core.next_steps import Do, SomeSteps
 from rig.devices.head.opening import open_head
 from rig.devices.head.protocol import BAUD
 from rig.devices.opencv_capture import modes_of
@@ -144,7 +145,7 @@ class DeviceScan:
             known = [port for port in known if port.path in self.ports]
         asked = [p for p in known if p.usb or context.computer.same_file(p.path, context.config.servo.port)]
         if not asked:
-            fix = "Connect the U2D2, then: " + context.rig("find")
+            fix = ("Connect the U2D2, then", Do.FIND())
             yield bad("servo", FindingCode.NO_USB_PORT, fix, found=[port.path for port in known])
         for port in asked:
             yield from self._on_port(context, port)
@@ -165,11 +166,11 @@ class DeviceScan:
         except DeviceNotFound as error:
             yield of_error("servo", error)
         except (serial.SerialException, OSError) as error:
-            fix = "Connect the adapter again, then: " + context.rig("find")
+            fix: SomeSteps = ("Connect the adapter again, then", Do.FIND())
             yield bad("servo", FindingCode.PORT_FAILED, fix, port=port.path, reason=str(error))
         else:
             if not (servos or head or self.duplicate_ids):
-                fix = "Check the servo's cable and switch on its supply, then: " + context.rig("find")
+                fix = ("Check the servo's cable and switch on its supply, then", Do.FIND())
                 yield warning("servo", FindingCode.NOTHING_ON_PORT, fix, port=port.path, name=port.name)
 
     def _servos(
@@ -181,7 +182,7 @@ class DeviceScan:
                 yield f"{port.path}: scanning at {rate} baud, protocol {protocol}.0 ..."
                 answered += scan_servos(wire, context.computer.clock, [rate], protocol=protocol)
         for scan in without_echoes(answered, context.config.servo.baud):
-            yield from self._found(context, port, scan)
+            yield from self._found(port, scan)
         return any(scan.answered for scan in answered)
 
     def _head(self, context: DoctorContext, port: SerialPort) -> Generator[Finding | str, None, bool]:
@@ -202,7 +203,7 @@ class DeviceScan:
         yield fine("imu", FindingCode.HEAD, port=port.path, **parts)
         return True
 
-    def _found(self, context: DoctorContext, port: SerialPort, scan: BaudScan) -> Iterator[Finding]:
+    def _found(self, port: SerialPort, scan: BaudScan) -> Iterator[Finding]:
         for found in scan.servos:
             place = {"port": port.path, "id": found.bus_id, "baud": found.baud}
             if found.obstacle:
@@ -214,9 +215,9 @@ class DeviceScan:
             yield fine("servo", FindingCode.SERVO_FOUND, found=found, **place)
         if scan.duplicate_ids:
             self.duplicate_ids = True
-            yield duplicate_id(context, port.path, scan)
+            yield duplicate_id(port.path, scan)
         if scan.noise:
-            yield foreign_bytes(context, port.path, scan)
+            yield foreign_bytes(port.path, scan)
 
     def find_imus(self, context: DoctorContext) -> Iterator[Finding | str]:
         asked = 0
@@ -230,7 +231,7 @@ class DeviceScan:
             try:
                 there = scan_imus(context.computer, node.path)
             except OSError as error:
-                yield bad("imu", FindingCode.I2C_NOT_OPENED, context.rig("find"), bus=node.path, reason=error.strerror)
+                yield bad("imu", FindingCode.I2C_NOT_OPENED, Do.FIND(), bus=node.path, reason=error.strerror)
                 continue
             failures = {found.errno for found in there if found.errno}
             for found in there:
@@ -242,12 +243,12 @@ class DeviceScan:
                     self.imus.append(found)
                     yield fine("imu", FindingCode.IMU_FOUND, found=found, bus=found.bus, address=found.address)
                 else:
-                    fix = use_another_imu()
+                    fix: SomeSteps = use_another_imu()
                     yield warning("imu", FindingCode.NO_DRIVER, fix, found=found, address=found.address)
         if not asked and not self.heads:
             yield bad("imu", FindingCode.NO_I2C, i2c_command(context))
         elif len(self.imus) == before and not self.heads:
-            fix = "Check the sensor's 3.3 V, ground, SDA and SCL, then: " + context.rig("find")
+            fix = ("Check the sensor's 3.3 V, ground, SDA and SCL, then", Do.FIND())
             yield warning("imu", FindingCode.NO_IMU_FOUND, fix)
 
     def find_cameras(self, context: DoctorContext) -> Iterator[Finding | str]:
@@ -257,7 +258,7 @@ class DeviceScan:
             self.ribbons.append(number)
             yield ribbon_camera(name, number)
         if not nodes and not ribbons:
-            yield warning("camera", FindingCode.NO_CAMERA, "Connect the camera, then: " + context.rig("find"))
+            yield warning("camera", FindingCode.NO_CAMERA, ("Connect the camera, then", Do.FIND()))
         for node in nodes:
             if problems := [finding for finding in access(context, "camera", node, "video") if finding.fix]:
                 yield from problems
@@ -283,7 +284,7 @@ def ribbon_camera(name: str, number: int) -> Finding:
         import_picamera2()
     except DeviceNotFound as error:
         parameters = place | {"what": error.what.rstrip("."), **error.evidence}
-        return warning("camera", FindingCode.RIBBON_CAMERA_UNREACHABLE, error.next_step, **parameters)
+        return warning("camera", FindingCode.RIBBON_CAMERA_UNREACHABLE, error.steps, **parameters)
     return fine("camera", FindingCode.RIBBON_CAMERA, **place)
 
 

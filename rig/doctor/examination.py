@@ -5,11 +5,12 @@ Decision: docs/decisions/0013.
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from queue import Empty, SimpleQueue
 from threading import Thread
 
 from rig.core.errors import RigError
+from rig.core.next_steps import Do
 from rig.doctor.context import DoctorContext
 from rig.doctor.finding import Finding, FindingCode, bad, of_error
 
@@ -50,7 +51,8 @@ def run_checks(
             if item is None:
                 break
             if isinstance(item, Finding):
-                yield item
+                steps = (step if isinstance(step, str) else context.step(step) for step in item.steps)
+                yield replace(item, steps=tuple(steps))
 
 
 def _run(context: DoctorContext, check: Check, put: Callable[[Finding | str | None], None]) -> None:
@@ -60,9 +62,9 @@ def _run(context: DoctorContext, check: Check, put: Callable[[Finding | str | No
     except RigError as error:
         put(of_error(check.topic, error))
     except OSError as error:  # a device was unplugged, or a file cannot be read
-        put(bad(check.topic, FindingCode.CHECK_INTERRUPTED, context.rig("doctor"), reason=str(error)))
+        put(bad(check.topic, FindingCode.CHECK_INTERRUPTED, Do.DOCTOR(), reason=str(error)))
     except Exception as error:  # a bug: report it as one, and continue with the other checks
-        fix = "Report this with the output of `rig doctor --json`"
+        fix = Do.REPORT_DEFECT()
         put(bad(check.topic, FindingCode.CHECK_FAILED, fix, 1, error=repr(error)))
     finally:
         with suppress(RuntimeError):  # the interpreter is shutting down

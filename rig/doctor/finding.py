@@ -7,6 +7,7 @@ from typing import Any
 
 from rig.core.errors import RigError
 from rig.core.masking import masked
+from rig.core.next_steps import NextSteps, SomeSteps, as_steps, in_words, steps_as_json
 from rig.core.phrases import filled
 
 
@@ -146,7 +147,7 @@ class FindingCode(Enum):
         "views wait {delay_ms:.0f} ms longer: by camera.time, exposures begin that long before their time stamp"
     )
     CAMERA_DELAY_UNKNOWN = (
-        "a delay inside the camera does not show in its time stamps; to measure it: {command} (table rotates)"
+        "a delay inside the camera does not show in its time stamps; a calibration measures it (the table rotates)"
     )
     # the scan of all devices
     NO_USB_PORT = "no serial port on USB (found: {found})"
@@ -176,8 +177,8 @@ class Finding:
         What was found.
     parameters
         The values in its text and other evidence, units in the keys.
-    fix
-        The command or the action that fixes the problem; empty if there is none.
+    steps
+        What fixes the problem, as the next step of an error; empty if nothing does.
     exit_code
         The exit code of `rig doctor` for this finding; 0 unless it is bad.
     """
@@ -186,12 +187,16 @@ class Finding:
     level: Severity
     code: FindingCode
     parameters: Mapping[str, Any] = field(default_factory=dict)
-    fix: str = ""
+    steps: NextSteps = ()
     exit_code: int = 0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "parameters", masked(self.parameters))
-        object.__setattr__(self, "fix", masked(self.fix))
+
+    @property
+    def fix(self) -> str:
+        """What fixes the problem, as a terminal shows it."""
+        return in_words(self.steps)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the finding as `--json` prints it."""
@@ -201,6 +206,7 @@ class Finding:
             "code": self.code.name.lower(),
             "finding": finding_words(self),
             "fix": self.fix or None,
+            "steps": steps_as_json(self.steps),
             "evidence": {key: _plain(value) for key, value in self.parameters.items()},
         }
 
@@ -209,20 +215,20 @@ def fine(topic: str, code: FindingCode, /, **parameters: Any) -> Finding:
     return Finding(topic, Severity.FINE, code, parameters)
 
 
-def warning(topic: str, code: FindingCode, fix: str, /, **parameters: Any) -> Finding:
-    return Finding(topic, Severity.WARNING, code, parameters, fix)
+def warning(topic: str, code: FindingCode, fix: SomeSteps, /, **parameters: Any) -> Finding:
+    return Finding(topic, Severity.WARNING, code, parameters, as_steps(fix))
 
 
-def bad(topic: str, code: FindingCode, fix: str, exit_code: int = 4, /, **parameters: Any) -> Finding:
-    return Finding(topic, Severity.BAD, code, parameters, fix, exit_code)
+def bad(topic: str, code: FindingCode, fix: SomeSteps, exit_code: int = 4, /, **parameters: Any) -> Finding:
+    return Finding(topic, Severity.BAD, code, parameters, as_steps(fix), exit_code)
 
 
-def of_error(topic: str, error: RigError, fix: str = "") -> Finding:
+def of_error(topic: str, error: RigError, fix: SomeSteps = ()) -> Finding:
     """Return an error as a finding; the parameter ``error_code`` is the code of the error."""
     reason = error.evidence.get("reason")
     what = f"{error.what.rstrip('.')}: {reason}" if reason else error.what
     parameters = {**error.evidence, "what": what, "error_code": error.code}
-    return Finding(topic, Severity.BAD, FindingCode.ERROR, parameters, fix or error.next_step, error.exit_code)
+    return Finding(topic, Severity.BAD, FindingCode.ERROR, parameters, as_steps(fix) or error.steps, error.exit_code)
 
 
 def finding_words(finding: Finding) -> str:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from rig.config import ImuConfig
+from rig.core.next_steps import Do, SomeSteps
 from rig.devices.bno055 import SLOW_BUS
 from rig.devices.head.opening import open_head
 from rig.devices.head.protocol import BAUD
@@ -30,7 +31,7 @@ UPRIGHT = 0.94  # share of gravity along the table's axis when the sensor lies w
 def imu(context: DoctorContext) -> Iterator[Finding]:
     """Identify the sensor, then check its noise, its zero, and its orientation."""
     if context.holder is not None:
-        yield warning("imu", FindingCode.NOT_CHECKED, context.rig("stop"))
+        yield warning("imu", FindingCode.NOT_CHECKED, Do.STOP())
         return
     config, clock = context.config, context.computer.clock
     if config.imu.connection == "head":
@@ -40,7 +41,7 @@ def imu(context: DoctorContext) -> Iterator[Finding]:
             parts = {"model": who.model, "board": who.board, "firmware": who.firmware, "serial": who.serial}
             yield fine("imu", FindingCode.HEAD, port=config.head.port, **parts)
             if (fault := head.fault) is not None:
-                yield of_error("imu", fault, context.rig("acknowledge"))
+                yield of_error("imu", fault, Do.ACKNOWLEDGE())
             yield from _at_rest(context, head)
         return
     khz = context.computer.cannot_stretch_khz(config.imu.bus)
@@ -65,7 +66,7 @@ def imu(context: DoctorContext) -> Iterator[Finding]:
         yield from _at_rest(context, sensor)
         corrupt = getattr(getattr(sensor, "statistics", None), "corrupt", 0)
         if corrupt:
-            fix = SLOW_BUS if config.imu.model == "bno055" else "Shorten the I2C cable, then: " + context.rig("doctor")
+            fix = SLOW_BUS if config.imu.model == "bno055" else ("Shorten the I2C cable, then", Do.DOCTOR())
             yield warning("imu", FindingCode.CORRUPT_READINGS, fix, corrupt=corrupt)
 
 
@@ -95,7 +96,10 @@ def _rest(context: DoctorContext, sensor: Imu, samples: ImuSamples) -> Iterator[
     axis = "xyz".index(context.config.imu.axis)
     wanted = SECONDS * sensor.rate_hz
     if len(samples.time_ns) < 0.8 * wanted:
-        fix = "Shorten the I2C cable and remove other devices from the bus, then: " + context.rig("doctor")
+        fix: SomeSteps = (
+            "Shorten the I2C cable and remove other devices from the bus, then",
+            Do.DOCTOR(),
+        )
         counts = {"samples": len(samples.time_ns), "seconds": SECONDS, "wanted": wanted, "lost": samples.lost}
         yield bad("imu", FindingCode.SAMPLES_MISSING, fix, **counts)
         return
@@ -105,16 +109,16 @@ def _rest(context: DoctorContext, sensor: Imu, samples: ImuSamples) -> Iterator[
     expected = sensor.identity.gyro_noise_dps_rthz * np.sqrt(sensor.rate_hz / 2)
     evidence: dict[str, Any] = {"noise_dps": float(spread[axis]), "bias_dps": bias, "samples": len(rates)}
     if (np.abs(rates) >= sensor.range_dps * 0.999).any():
-        fix = "Check the sensor's supply and cable, then: " + context.rig("doctor")
+        fix = ("Check the sensor's supply and cable, then", Do.DOCTOR())
         yield bad("imu", FindingCode.SATURATED, fix, range_dps=sensor.range_dps, **evidence)
     elif (rates == rates[0]).all():
-        fix = "Switch the sensor's supply off and on, then: " + context.rig("doctor")
+        fix = ("Switch the sensor's supply off and on, then", Do.DOCTOR())
         yield bad("imu", FindingCode.IMU_FROZEN, fix, **evidence)
     elif spread.max() > NO_REST_DPS:
-        fix = "Check the sensor's supply, ground and cable, then: " + context.rig("doctor")
+        fix = ("Check the sensor's supply, ground and cable, then", Do.DOCTOR())
         yield bad("imu", FindingCode.NOT_AT_REST, fix, **evidence)
     elif spread.max() > NOISY * expected:
-        fix = "Keep hands and vibration away from the bench, then: " + context.rig("doctor")
+        fix = ("Keep hands and vibration away from the bench, then", Do.DOCTOR())
         yield warning("imu", FindingCode.NOISY, fix, expected_dps=expected, **evidence)
     elif abs(bias) > MAX_BIAS_DPS:
         yield bad("imu", FindingCode.LARGE_BIAS, "Replace the sensor", **evidence)
@@ -129,11 +133,11 @@ def _gravity(context: DoctorContext, sensor: Imu) -> Iterator[Finding]:
     along = float(gravity["xyz".index(axis)])
     evidence: dict[str, Any] = {"gravity_g": [round(float(g), 4) for g in gravity], "size_g": size, "axis": axis}
     if not 0.8 < size < 1.2:
-        fix = "Check the sensor's supply, then: " + context.rig("doctor")
+        fix: SomeSteps = ("Check the sensor's supply, then", Do.DOCTOR())
         yield bad("imu", FindingCode.WRONG_GRAVITY, fix, **evidence)
     elif abs(along) < UPRIGHT * size:
         upright = "xyz"[int(np.abs(gravity).argmax())]
-        fix = context.set("imu.axis", upright) if upright != axis else "Mount the sensor flat on the platter"
+        fix = Do.SET_KEY(key="imu.axis", value=upright) if upright != axis else "Mount the sensor flat on the platter"
         yield warning("imu", FindingCode.TILTED, fix, along=along / size, **evidence)
     else:
         yield fine("imu", FindingCode.GRAVITY, along=abs(along / size), **evidence)
@@ -146,15 +150,15 @@ def _wrong(context: DoctorContext, config: ImuConfig, here: FoundImu | None, the
     if here is not None and here.driver is None:
         return bad("imu", FindingCode.NO_DRIVER, use_another_imu(), found=here, address=here.address)
     if here is not None:
-        fix = context.set("imu.model", here.driver)
+        fix: SomeSteps = Do.SET_KEY(key="imu.model", value=here.driver)
         return bad("imu", FindingCode.OTHER_IMU, fix, found=here, address=here.address, model=config.model)
     usable = [found for found in there if found.driver]
-    fix = "Check the sensor's 3.3 V, ground, SDA and SCL, then: " + context.rig("find")
+    fix = ("Check the sensor's 3.3 V, ground, SDA and SCL, then", Do.FIND())
     if usable:
-        fix = context.set("imu.address", f"{usable[0].address:#04x}")
+        fix = Do.SET_KEY(key="imu.address", value=f"{usable[0].address:#04x}")
     return bad("imu", FindingCode.NO_IMU, fix, address=config.address, bus=bus, found=usable)
 
 
 def _bus_failed(context: DoctorContext, error: OSError) -> Finding:
     bus = context.computer.i2c_name(context.config.imu.bus)
-    return bad("imu", FindingCode.I2C_NOT_OPENED, context.rig("find"), bus=bus, reason=error.strerror)
+    return bad("imu", FindingCode.I2C_NOT_OPENED, Do.FIND(), bus=bus, reason=error.strerror)

@@ -8,6 +8,7 @@ from rig.config import ServoConfig
 from rig.config.servos import USE_ANOTHER
 from rig.core.clock import seconds_between
 from rig.core.errors import DeviceMismatch, DeviceNotFound, DeviceSilent
+from rig.core.next_steps import Do, SomeSteps
 from rig.devices.dynamixel.opening import open_servo
 from rig.devices.dynamixel.port import SerialConnection
 from rig.devices.dynamixel.register_servo import RegisterServo
@@ -28,17 +29,17 @@ READS = 100
 REPEATED = 2  # number of repeated readings on a good bus
 SLOW = 1 / 3  # share of the control loop's period that a reading may take; the usual cause of more is the latency timer
 IMPOSSIBLE_C = 150
-POWER = "Check the servo's cable and switch on its 12 V supply (its LED blinks once), then: "
+POWER = "Check the servo's cable and switch on its 12 V supply (its LED blinks once), then"
 
 
 def servo(context: DoctorContext) -> Iterator[Finding | str]:
     """Find the configured servo and others on its bus, and check its settings, supply and temperature."""
     if context.holder is not None:
-        yield warning("servo", FindingCode.NOT_CHECKED, context.rig("stop"))
+        yield warning("servo", FindingCode.NOT_CHECKED, Do.STOP())
         return
     config = context.config.servo
     if context.config.imu.connection == "head" and context.config.head.power:
-        yield warning("servo", FindingCode.SUPPLY_SWITCHED, context.rig("status"))
+        yield warning("servo", FindingCode.SUPPLY_SWITCHED, Do.STATUS())
         return
     with ExitStack() as opened:
         try:
@@ -57,7 +58,7 @@ def servo(context: DoctorContext) -> Iterator[Finding | str]:
         except DeviceMismatch as error:
             number = error.evidence.get("model_number")  # another maker's driver may not report it
             model = None if number is None or obstacle(number) else model_of(number)
-            yield of_error("servo", error, context.set("servo.model", model) if model else "")
+            yield of_error("servo", error, Do.SET_KEY(key="servo.model", value=model) if model else "")
             return
         except DeviceSilent as error:
             yield from () if foreign else _others_on_bus(context, wire)
@@ -72,7 +73,7 @@ def servo(context: DoctorContext) -> Iterator[Finding | str]:
             yield warning("servo", FindingCode.SERVO_LIMITATION, fix, remark=remark)
         if isinstance(found, RegisterServo):
             yield from _others_on_bus(context, wire)
-            yield from _settings(context, found)
+            yield from _settings(found)
         yield from _condition(context, found)
         if isinstance(found, RegisterServo):
             yield from _bus_quality(context, found)
@@ -88,14 +89,14 @@ def _scan_rates(context: DoctorContext, wire: SerialConnection) -> Iterator[Find
         yield f"{config.port}: no servo at id {config.id}; scanning at {rate} baud ..."
         for scan in scan_servos(wire, context.computer.clock, [rate], protocol=protocol):
             if scan.duplicate_ids:
-                yield duplicate_id(context, config.port, scan)
+                yield duplicate_id(config.port, scan)
                 return
             answered.append(scan)
     there = [found for scan in without_echoes(answered, config.baud) for found in scan.servos]
     if not there:
-        yield bad("servo", FindingCode.NO_SERVO, POWER + context.rig("doctor"), **_place(config))
+        yield bad("servo", FindingCode.NO_SERVO, (POWER, Do.DOCTOR()), **_place(config))
         return
-    fix = context.rig("setup") if len(there) > 1 else _use(context, config, there[0])
+    fix = Do.SETUP() if len(there) > 1 else _use(config, there[0])
     yield bad("servo", FindingCode.OTHER_SERVOS, fix, found=there, **_place(config))
 
 
@@ -103,7 +104,7 @@ def _place(config: ServoConfig) -> dict[str, Any]:
     return {"id": config.id, "baud": config.baud, "port": config.port}
 
 
-def _use(context: DoctorContext, config: ServoConfig, there: FoundServo) -> str:
+def _use(config: ServoConfig, there: FoundServo) -> SomeSteps:
     """Return the command that changes the configuration to the servo found, if the rig can drive it."""
     if there.obstacle:
         return USE_ANOTHER
@@ -112,8 +113,8 @@ def _use(context: DoctorContext, config: ServoConfig, there: FoundServo) -> str:
         "servo.baud": (config.baud, there.baud),
         "servo.model": (config.model, there.model),
     }
-    changes = [context.set(key, now) for key, (was, now) in differing.items() if was != now]
-    return changes[0] if len(changes) == 1 else context.rig("setup")
+    changes = [Do.SET_KEY(key=key, value=now) for key, (was, now) in differing.items() if was != now]
+    return changes[0] if len(changes) == 1 else Do.SETUP()
 
 
 def _others_on_bus(context: DoctorContext, wire: SerialConnection) -> Iterator[Finding]:
@@ -124,36 +125,36 @@ def _others_on_bus(context: DoctorContext, wire: SerialConnection) -> Iterator[F
     for scan in scan_servos(wire, context.computer.clock, [config.baud]):
         others = [servo for servo in scan.servos if servo.bus_id != config.id]
         if scan.duplicate_ids:
-            yield duplicate_id(context, config.port, scan)
+            yield duplicate_id(config.port, scan)
         elif scan.noise:
-            yield foreign_bytes(context, config.port, scan)
+            yield foreign_bytes(config.port, scan)
         elif others:
             yield fine("servo", FindingCode.MORE_SERVOS, found=others)
         else:
             yield fine("servo", FindingCode.ONLY_SERVO)
 
 
-def duplicate_id(context: DoctorContext, port: str, scan: BaudScan) -> Finding:
+def duplicate_id(port: str, scan: BaudScan) -> Finding:
     """Return the finding that two servos have the same id."""
     taken = {servo.bus_id for servo in scan.servos} | set(scan.duplicate_ids)
     free_id = next(bus_id for bus_id in range(1, 253) if bus_id not in taken)
-    fix = f"Unplug one of the two, then: {context.rig(f'servo set-id {free_id}')}"
+    fix = ("Unplug one of the two, then", Do.SERVO_ID(id=free_id))
     return bad("servo", FindingCode.DUPLICATE_ID, fix, port=port, ids=scan.duplicate_ids, baud=scan.baud)
 
 
-def foreign_bytes(context: DoctorContext, port: str, scan: BaudScan) -> Finding:
+def foreign_bytes(port: str, scan: BaudScan) -> Finding:
     """Return the finding that bytes of no servo arrive."""
-    fix = "Remove everything but servos from the bus, then: " + context.rig("doctor")
+    fix = ("Remove everything but servos from the bus, then", Do.DOCTOR())
     return warning("servo", FindingCode.FOREIGN_BYTES, fix, port=port, baud=scan.baud)
 
 
-def _settings(context: DoctorContext, found: RegisterServo) -> Iterator[Finding]:
+def _settings(found: RegisterServo) -> Iterator[Finding]:
     differences = found.setting_differences()
     if not differences:
         yield fine("servo", FindingCode.SETTINGS_CORRECT)
     for difference in differences:
         values = {"register": difference.register, "found": difference.found, "wanted": difference.wanted}
-        fix = context.rig("servo settings --write")
+        fix = Do.SERVO_SETTINGS()
         yield bad("servo", FindingCode.SETTING_DIFFERS, fix, difference=difference, **values)
 
 
@@ -161,12 +162,12 @@ def _condition(context: DoctorContext, found: Servo) -> Iterator[Finding]:
     state, limits, safety = found.read_state(), found.limits, context.config.safety
     condition = found.read_condition()
     if condition.hardware_errors:
-        fix = context.rig("acknowledge --reboot")
+        fix: SomeSteps = Do.ACKNOWLEDGE(reboot=True)
         yield bad("servo", FindingCode.HARDWARE_ERROR, fix, hardware_errors=condition.hardware_errors)
     if condition.watchdog_tripped:
-        yield warning("servo", FindingCode.WATCHDOG_TRIPPED, context.rig("status"))
+        yield warning("servo", FindingCode.WATCHDOG_TRIPPED, Do.STATUS())
     if condition.torque:
-        yield warning("servo", FindingCode.TORQUE_ON, context.rig("stop"))
+        yield warning("servo", FindingCode.TORQUE_ON, Do.STOP())
     low, high = limits.voltage_v
     if state.voltage_v > 2 * high or state.temperature_c > IMPOSSIBLE_C:
         fix = "Replace the servo, or its cable if another servo reports the same"
@@ -199,7 +200,7 @@ def _bus_quality(context: DoctorContext, found: RegisterServo) -> Iterator[Findi
     each_ms = seconds_between(start_ns, clock.now_ns()) * 1e3 / READS
     after = found.bus_statistics
     if ticks is not None and ticks == _ticks(found):
-        fix = "Switch the servo's supply off and on, then: " + context.rig("doctor")
+        fix: SomeSteps = ("Switch the servo's supply off and on, then", Do.DOCTOR())
         yield bad("servo", FindingCode.SERVO_FROZEN, fix, tick_ms=ticks, readings=READS)
         return
     again = after["retries"] - before["retries"]
@@ -209,7 +210,7 @@ def _bus_quality(context: DoctorContext, found: RegisterServo) -> Iterator[Findi
     elif each_ms > SLOW * 1e3 * context.config.table.poll_s:
         port = context.computer.serial_port(context.config.servo.port)
         fix = f"echo 1 | sudo tee {port.latency_file}" if port and (port.latency_ms or 0) > 1 else ""
-        fix = fix or context.rig("servo set-baud 1000000")
+        fix = fix or Do.SERVO_BAUD(baud=1000000)
         yield warning("servo", FindingCode.SLOW_READINGS, fix, **quality)
     else:
         yield fine("servo", FindingCode.READINGS, **quality)

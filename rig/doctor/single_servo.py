@@ -7,6 +7,7 @@ from dataclasses import replace
 import serial
 
 from rig.core.errors import DeviceNotFound, DeviceSilent, RequestRejected, SeveralServos, UsageError
+from rig.core.next_steps import Do
 from rig.devices.dynamixel.bus import DynamixelBus
 from rig.devices.dynamixel.port import ClockedPort, SerialConnection
 from rig.devices.dynamixel.registers import ControlTable, control_table, require_driven
@@ -125,7 +126,7 @@ class SingleServo:
         if not kept:
             raise RequestRejected(
                 f"The servo did not accept {what}.",
-                next_step="Switch its supply off and on, then run `rig find`.",
+                next_step=("Switch its supply off and on.", Do.FIND()),
                 evidence={"register": name, "wrote": value, "id": bus_id},
             )
 

@@ -6,8 +6,9 @@ from rig.calibrations import CalibrationStatus, CalibrationStore, apparatus, app
 from rig.calibrations.store import BenchCalibration
 from rig.catalog import Catalog
 from rig.core.errors import CatalogError
+from rig.core.next_steps import Do, SomeSteps
 from rig.doctor.context import DoctorContext
-from rig.doctor.finding import Finding, FindingCode, bad, fine, of_error, warning
+from rig.doctor.finding import Finding, FindingCode, Severity, bad, fine, of_error, warning
 from rig.views.stream import exposed_before_stamp_ns
 
 IMAGES = 24  # number of images that are verified; `rig catalog verify` verifies all
@@ -28,7 +29,7 @@ def catalog(context: DoctorContext) -> Iterator[Finding]:
             checked = opened.database.damage(connection)
             orphans = len(opened.database.orphans(connection))
         if checked or orphans:
-            fix = context.rig("catalog verify --repair")
+            fix: SomeSteps = Do.REPAIR_CATALOG()
             yield bad("catalog", FindingCode.DATABASE_DAMAGED, fix, 7, path=path, damage=checked, orphans=orphans)
         objects = opened.objects()
         ids = opened.views().view_ids.tolist()
@@ -41,10 +42,10 @@ def catalog(context: DoctorContext) -> Iterator[Finding]:
                 broken.append(error)
         if broken:
             found = {"broken": len(broken), "images": len(chosen), "first": broken[0].what}
-            yield bad("catalog", FindingCode.IMAGES_DAMAGED, context.rig("catalog verify --repair"), 7, **found)
+            yield bad("catalog", FindingCode.IMAGES_DAMAGED, Do.REPAIR_CATALOG(), 7, **found)
         unfinished = [item.name for item in objects if item.unfinished_views is not None]
         if unfinished:
-            fix = context.rig(f"enroll {unfinished[0]} --resume")
+            fix = Do.CONTINUE_ENROLLMENT(name=unfinished[0])
             yield warning("catalog", FindingCode.UNFINISHED, fix, objects=unfinished)
         if not checked and not orphans and not broken:
             counts = {"objects": len(objects), "views": len(ids), "images": len(chosen)}
@@ -65,7 +66,7 @@ def calibrations(context: DoctorContext) -> Iterator[Finding]:
             "status": calibration.status,
             "id": calibration.result.id,
         }
-        recalibrate = context.rig(calibration.command.removeprefix("rig "))
+        recalibrate = calibration.repetition
         if calibration.status is CalibrationStatus.IN_FORCE:
             yield fine("calibration", FindingCode.CALIBRATION, **found)
         else:
@@ -73,7 +74,7 @@ def calibrations(context: DoctorContext) -> Iterator[Finding]:
     yield _camera_delay(context, calibrations)
     for name, without in WANTED.items():
         if name not in {calibration.result.name for calibration in calibrations} and not _configured(context, name):
-            fix = context.rig(f"calibrate {name.partition('.')[0]}")
+            fix = Do.CALIBRATE(name=name.partition(".")[0])
             yield warning("calibration", FindingCode.NEVER_CALIBRATED, fix, name=name, consequence=without)
 
 
@@ -82,7 +83,8 @@ def _camera_delay(context: DoctorContext, calibrations: Iterable[BenchCalibratio
     in_force = (one.result for one in calibrations if one.status is CalibrationStatus.IN_FORCE)
     config, _ = apply_results(context.config, in_force)
     if config.camera_time.offset_ms is None:
-        return fine("calibration", FindingCode.CAMERA_DELAY_UNKNOWN, command=context.rig("calibrate camera-time"))
+        measure = Do.CALIBRATE(name="camera-time")
+        return Finding("calibration", Severity.FINE, FindingCode.CAMERA_DELAY_UNKNOWN, steps=(measure,))
     delay_ms = exposed_before_stamp_ns(config) * 1e-6
     found = config.camera_time.model_dump()
     return fine("calibration", FindingCode.CAMERA_DELAY, delay_ms=delay_ms, **found)

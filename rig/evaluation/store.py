@@ -15,6 +15,7 @@ import numpy as np
 from hbr.evaluation.protocol import Runs
 from rig.core import files
 from rig.core.errors import UsageError
+from rig.core.next_steps import Do
 
 FOLDER = Path("rig-eval")
 """The folder of all evaluations without a folder of their own choice."""
@@ -64,7 +65,7 @@ class Store:
         except (OSError, json.JSONDecodeError) as error:
             raise UsageError(
                 f"The runs cannot be stored in {folder}.",
-                next_step="Name another folder with --out.",
+                next_step=Do.RUN_AGAIN(out="FOLDER"),
                 evidence={"reason": str(error)},
             ) from error
 
@@ -73,14 +74,14 @@ class Store:
         if different:
             raise UsageError(
                 f"{self._folder} contains runs with other settings.",
-                next_step="Name another folder with --out, or give the same options again.",
+                next_step=("Give the same options again, or", Do.RUN_AGAIN(out="FOLDER")),
                 evidence={f"{key} there": found.get(key) for key in different if key not in ("dataset", "methods")}
                 | {"different": different},
             )
         if not resume:
             raise UsageError(
                 f"{self._folder} already contains runs.",
-                next_step="Continue with --resume, or name another folder with --out.",
+                next_step=(Do.RUN_AGAIN(resume=True), "Or", Do.RUN_AGAIN(out="FOLDER")),
             )
 
     def load(self, name: str) -> Runs | None:

@@ -12,6 +12,7 @@ from rig.charts.evaluation_figures import figures
 from rig.charts.xy import Chart
 from rig.core.errors import UsageError, os_errors_as
 from rig.core.files import write
+from rig.core.next_steps import Do
 from rig.core.templates import environment
 from rig.evaluation.plan import Plan
 from rig.evaluation.report import contest_sentences, csv_text, curve_rows, decision_rows, evaluate
@@ -37,7 +38,7 @@ def write_json(results: Mapping[str, Any], path: Path) -> None:
     UsageError
         The file cannot be written.
     """
-    step = "Name another folder with --out."
+    step = Do.RUN_AGAIN(out="FOLDER")
     with os_errors_as(UsageError, f"The results cannot be written to {path}.", next_step=step):
         path.parent.mkdir(parents=True, exist_ok=True)
         write(path, _json(results))
@@ -62,7 +63,7 @@ def write_results(
     }
     for name, figure in drawn.items():
         files |= {f"{name}.svg": figure.svg().encode(), f"{name}.png": figure.png()}
-    step = "Free some disk space, then give the same command with --resume: the runs are stored."
+    step = (Do.FREE_DISK(), Do.RUN_AGAIN(resume=True), "The runs are stored.")
     with os_errors_as(UsageError, f"The results cannot be written to {folder}.", next_step=step):
         for name, data in files.items():
             write(folder / name, data)

@@ -458,7 +458,9 @@ class Failed:
     evidence: dict[str, Any]
     """Measurements and names that show the error."""
     next_step: str
-    """What the operator should do."""
+    """What the operator should do, as a terminal shows it."""
+    steps: list[str | dict[str, Any]]
+    """The same as data, in order: sentences, and actions (``action``, ``parameters``, ``command``)."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,6 +3,7 @@
 from typing import Final
 
 from hbr import Outcome
+from rig.core.next_steps import NextStep, NextSteps, in_words, steps_from_json
 from rig.core.phrases import (
     angle_words,
     azimuth_words,
@@ -37,7 +38,7 @@ from rig.events.events import (
     Waiting,
     Warned,
 )
-from rig.events.note_wording import next_step_words, note_words, wait_words
+from rig.events.note_wording import note_steps, note_words, wait_words
 from rig.events.wording import (
     answer_lines,
     comparison_words,
@@ -61,8 +62,38 @@ _ENOUGH: Final = {
 }
 
 
+def next_steps(event: Event) -> NextSteps:
+    """Return what the operator should do about an event; empty if nothing."""
+    match event:
+        case Started():
+            found: list[str | NextStep] = []
+            for note in event.notes:
+                found += (step for step in note_steps(note) if step not in found)
+            return tuple(found)
+        case Warned():
+            return note_steps(event.note)
+        case Failed():
+            return steps_from_json(event.steps)
+        case _:
+            return ()
+
+
 def line(event: Event) -> str:
-    """Return the text of an event for the operator; empty if it has none."""
+    """Return the text of an event for a terminal; empty if it has none."""
+    match event:
+        case Started():
+            notes = [(f"Note: {note_words(note)}.", in_words(note_steps(note))) for note in event.notes]
+            return "\n".join(" ".join(filter(None, note)) for note in notes)
+        case Waiting():
+            return f"{page_line(event)[:-1]}; Ctrl+C ends."
+        case Warned() | Failed():
+            return f"{page_line(event)}\nNext step: {in_words(next_steps(event))}"
+        case _:
+            return page_line(event)
+
+
+def page_line(event: Event) -> str:
+    """Return the text of an event for a page or a file, which show its next steps in their own way."""
     match event:
         case Started():
             return "\n".join(f"Note: {note_words(note)}." for note in event.notes)
@@ -111,13 +142,13 @@ def line(event: Event) -> str:
             share = "" if event.turning_share is None else f", {percent(event.turning_share)} rotates with the table"
             return f"Empty-table image: {event.width} × {event.height} pixels{share}"
         case Warned():
-            return f"Warning: {note_words(event.note)}.\nNext step: {next_step_words(event.note)}"
+            return f"Warning: {note_words(event.note)}."
         case Waiting():
-            return f"Waiting for {wait_words(event.reason)}; Ctrl+C ends."
+            return f"Waiting for {wait_words(event.reason)}."
         case Recorded():
             return f"Recorded as result {event.result}{f', sample {event.sample}' if event.sample else ''}."
         case Failed():
-            return f"Error {event.code} ({event.error}): {event.what}\nNext step: {event.next_step}"
+            return f"Error {event.code} ({event.error}): {event.what}"
 
 
 def _leader(one: Candidate, ranked: Ranked) -> str:

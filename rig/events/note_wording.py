@@ -3,11 +3,11 @@
 from typing import Any
 
 from hbr.dense.stopping import Limitation, LimitationCode
+from rig.core.next_steps import Do, NextSteps, steps_from_json
 from rig.core.phrases import counted, joined, percent
 from rig.events.events import Note, NoteCode, WaitReason
+from rig.views.description import BENCH_DESCRIPTOR
 from rig.views.table_problems import problem_text
-
-_NEXT_IMAGE = "to take one: rig empty-table"
 
 
 def note_words(note: Note) -> str:
@@ -18,53 +18,41 @@ def note_words(note: Note) -> str:
             missing = (
                 f"{counted(v['objects'], 'object')} without it" if v.get("objects") else "the catalog is without it"
             )
-            return (
-                f"the search compares whole images by {v['used']} because {v['missing']} is missing ({missing}); to "
-                f"add it from the stored images: rig catalog redescribe --descriptor {v['missing']}"
-            )
+            return f"the search compares whole images by {v['used']} because {v['missing']} is missing ({missing})"
         case NoteCode.MIXED_EMPTY_TABLE:
             names, one = v["objects"], len(v["objects"]) == 1
             return (
                 f"{_some(names)} {'was' if one else 'were'} enrolled {'with' if v['with_image'] else 'without'} an "
-                "empty-table image, unlike the other objects, and such views compare badly; to repeat the enrollment: "
-                "rig enroll --replace"
+                "empty-table image, unlike the other objects, and such views compare badly"
             )
         case NoteCode.ENROLLED_WITHOUT_EMPTY_TABLE:
-            return (
-                "most objects were enrolled without an empty-table image, so the search does not use it; to repeat the "
-                "enrollment: rig enroll --replace"
-            )
+            return "most objects were enrolled without an empty-table image, so the search does not use it"
         case NoteCode.ENROLLED_BY_GUESS:
-            return (
-                f"the views of {_some(v['objects'])} were segmented one by one, by a guess, unlike those of a "
-                "search; to segment them together from their stored images: rig catalog redescribe --descriptor "
-                "edges+colours"
-            )
+            return f"the views of {_some(v['objects'])} were segmented one by one, by a guess, unlike those of a search"
         case NoteCode.EMPTY_TABLE_DOUBTED:
-            return f"the empty-table image may be outdated ({_problems(v)}); {_NEXT_IMAGE}"
+            return f"the empty-table image may be outdated ({_problems(v)})"
         case NoteCode.EMPTY_TABLE_MISSING:
-            return f"the search has no empty-table image ({_problems(v)}); {_NEXT_IMAGE}"
+            return f"the search has no empty-table image ({_problems(v)})"
         case NoteCode.EMPTY_TABLE_OF_ENROLLMENT:
-            return f"the empty-table image of the enrollment is used ({_problems(v)}); {_NEXT_IMAGE}"
+            return f"the empty-table image of the enrollment is used ({_problems(v)})"
         case NoteCode.EMPTY_TABLE_CHANGED:
             return f"the bench no longer looks like its empty-table image: {problem_text(v['problem'])}"
         case NoteCode.TABLE_DIFFERS:
             return f"the table does not look as it did at {v['taken_utc']}; an object that is round may be on it"
         case NoteCode.STOPPING_RULE_UNREADABLE:
-            return f"the stored stopping rule cannot be read ({v['reason']}); to renew it: rig catalog calibrate"
+            return f"the stored stopping rule cannot be read ({v['reason']})"
         case NoteCode.STOPPING_RULE_OUTDATED:
             changes = [f"{counted(v[key], 'object')} {key}" for key in ("added", "removed") if v[key]]
             changed = ", ".join(changes) or "other views, or another version of this program"
             return (
                 f"the stopping rule is from {v['made']}, and the catalog has changed since ({changed}), so it "
-                "guarantees no error rate; to renew it: rig catalog calibrate"
+                "guarantees no error rate"
             )
         case NoteCode.RATES_NOT_GUARANTEED:
             accepted = f" and {percent(v['false_accept'])} of other objects accepted" if "false_accept" in v else ""
             return (
                 f"{v['searches']} leave-one-out searches cannot guarantee at most {percent(v['error_rate'])} wrong "
-                f"answers and {percent(v['false_reject'])} of the enrolled objects called unknown{accepted}; for the "
-                "reasons: rig catalog calibrate"
+                f"answers and {percent(v['false_reject'])} of the enrolled objects called unknown{accepted}"
             )
         case NoteCode.NOT_RECORDED:
             return f"the answer is not recorded: {v['what'].rstrip('.')}"
@@ -78,15 +66,25 @@ def _problems(values: dict[str, Any]) -> str:
     return "; ".join(problem_text(problem) for problem in values["problems"])
 
 
-def next_step_words(note: Note) -> str:
-    """Return what the operator should do about a warning."""
+def note_steps(note: Note) -> NextSteps:
+    """Return what the operator should do about a note; empty if nothing."""
     match note.code:
+        case NoteCode.PAPER_SEARCH:
+            return (Do.REDESCRIBE(descriptor=note.values["missing"]),)
+        case NoteCode.ENROLLED_BY_GUESS:
+            return (Do.REDESCRIBE(descriptor=BENCH_DESCRIPTOR),)
+        case NoteCode.MIXED_EMPTY_TABLE | NoteCode.ENROLLED_WITHOUT_EMPTY_TABLE:
+            return (Do.ENROLL_AGAIN(),)
+        case NoteCode.EMPTY_TABLE_DOUBTED | NoteCode.EMPTY_TABLE_MISSING | NoteCode.EMPTY_TABLE_OF_ENROLLMENT:
+            return (Do.EMPTY_TABLE(),)
         case NoteCode.EMPTY_TABLE_CHANGED:
-            return "Continue; these views do not use the image. Then take a new one: rig empty-table"
+            return ("Continue; these views do not use the image.", Do.EMPTY_TABLE())
         case NoteCode.TABLE_DIFFERS:
-            return "Check that the table is empty. If it is not, remove the object and repeat: rig empty-table"
+            return ("Check that the table is empty. If it is not, remove the object, and", Do.EMPTY_TABLE())
+        case NoteCode.STOPPING_RULE_UNREADABLE | NoteCode.STOPPING_RULE_OUTDATED | NoteCode.RATES_NOT_GUARANTEED:
+            return (Do.FIT_STOPPING_RULE(),)
         case _:
-            return str(note.values.get("next_step", ""))
+            return steps_from_json(note.values.get("steps", ()))
 
 
 def wait_words(reason: WaitReason) -> str:
@@ -101,7 +99,7 @@ def limitation_words(limitation: Limitation) -> str:
         case LimitationCode.SAMPLED:
             return (
                 f"only {v['searched']} of {counted(v['objects'], 'object')} were searched for, so no rate is "
-                "guaranteed; to search for all: rig catalog calibrate"
+                "guaranteed; fit the rule to all of them"
             )
         case LimitationCode.FALSE_REJECT_RATE:
             return (

@@ -15,6 +15,7 @@ from rig.config import RigConfig
 from rig.config.catalog_place import CatalogPlace
 from rig.core.clock import Clock, SystemClock
 from rig.core.errors import CatalogBusy, CatalogError, RigError
+from rig.core.next_steps import SomeSteps
 from rig.events.events import Event
 from rig.plans.operator import Operator, Unattended
 
@@ -23,13 +24,14 @@ from rig.plans.operator import Operator, Unattended
 class Remark:
     """A sentence for the operator: about the catalog, the journal, the log, or an ``event`` that prepares the job.
 
-    ``picture`` is a drawing of letters for a terminal.
+    ``steps`` says what to do about it. ``picture`` is a drawing of letters for a terminal.
     """
 
     text: str
     is_warning: bool = True
     event: Event | None = None
     picture: str = ""
+    steps: SomeSteps = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,6 +7,7 @@ from pathlib import Path
 from rig.catalog.results import clean_text
 from rig.core.clock import SystemClock
 from rig.core.errors import UsageError
+from rig.core.next_steps import Do
 from rig.events.events import Event, FrameUsed, Identified, Started
 from rig.jobs.desk import Desk, Steps
 from rig.jobs.regions import warn_of_other_regions
@@ -121,11 +122,11 @@ def _checked(sample: str | None, *, scan: bool, watch: bool, records: bool) -> s
     if sample is not None and (watch or scan):
         raise UsageError(
             "--sample names the sample of one object; --watch and --scan are for several.",
-            next_step="Remove --sample, and use --scan to give the sample of each object.",
+            next_step=("Leave the sample out. To give the sample of each object,", Do.RUN_AGAIN(scan=True)),
         )
     if (sample is not None or scan) and not records:
         raise UsageError(
             "The answer is not recorded, because identify.record is none.",
-            next_step="Allow it: rig config set identify.record image",
+            next_step=Do.SET_KEY(key="identify.record", value="image"),
         )
     return None if sample is None else clean_text(sample, "sample")

@@ -8,6 +8,7 @@ from rig.calibrations import CalibrationStore
 from rig.calibrations.store import CALIBRATIONS
 from rig.catalog import Catalog
 from rig.catalog.descriptions import described_regions
+from rig.core.next_steps import Do
 from rig.jobs.desk import Remark
 
 
@@ -35,6 +36,11 @@ def warn_of_other_regions(bench: Bench, catalog: Catalog) -> Iterator[Remark]:
         yield Remark(
             f"objects of this bench were enrolled with view.roi = {enrolled}; now it is "
             f"{'the whole image' if region is None else list(region)}"
-            f"{' (axis calibration)' if calibrated_now else ''}. If the camera was not moved: "
-            f"rig catalog redescribe --region {argument}. If it was moved: enroll these objects again (--replace)."
+            f"{' (axis calibration)' if calibrated_now else ''}.",
+            steps=(
+                "If the camera was not moved,",
+                Do.REDESCRIBE(region=argument),
+                "If it was moved,",
+                Do.ENROLL_AGAIN(),
+            ),
         )

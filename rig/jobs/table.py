@@ -101,7 +101,7 @@ def acknowledge(desk: Desk, *, reboot: bool = False) -> Steps[None]:
         state, doubt = bench.safety.acknowledge(reboot=reboot), bench.safety.doubt
     text = f"Acknowledged: {fault.what}" if fault else "No fault was latched."
     values = {
-        "acknowledged": fault.model_dump() if fault else None,
+        "acknowledged": fault.as_dict() if fault else None,
         "state": str(state),
         "doubt": str(doubt) if doubt else None,
     }

@@ -6,12 +6,13 @@ from typing import Final
 from rig.bench import Bench, Placer
 from rig.catalog import Action
 from rig.core.errors import TableNotEmpty, ViewRejected
+from rig.core.next_steps import Do, SomeSteps
 from rig.core.phrases import sentence
 from rig.events.lines import line
 from rig.jobs.desk import Desk, Remark, Steps
 from rig.plans.operator import Choice, Question, Subject
 from rig.plans.photograph_table import photograph_table
-from rig.views.empty_table import COMMAND, empty_table_status
+from rig.views.empty_table import empty_table_status
 
 WITHOUT_IMAGE: Final = "without it, objects are found only before a plain background, and less well in other light"
 OLD_IMAGE: Final = "the old image is used for the frames that still match it"
@@ -41,27 +42,28 @@ def refresh_table_image(
             try:
                 yield from _photographed(bench)
             except (TableNotEmpty, ViewRejected) as error:  # enrollment can continue without the image
-                yield Remark(f"{error.what} {error.next_step}")
+                yield Remark(error.what, steps=error.steps)
         return
     consequence = WITHOUT_IMAGE if status.table is None else OLD_IMAGE
     if not (ask and desk.operator.is_there):
-        yield Remark(f"{status.text}; {consequence}. To take a new one: {COMMAND}")
+        yield Remark(f"{status.text}; {consequence}.", steps=Do.EMPTY_TABLE())
         return
     # Ask until the image is taken, or the operator continues without it.
     text = f"{sentence(status.text)} Take everything off the table."
+    steps: SomeSteps = ()
     skip = f"continue without\n  ({consequence})"
     keep: dict[Choice, str] = {}  # offered only after the check has failed
     while True:
         choices = {Choice.CONTINUE: "take the image", **keep, Choice.SKIP: skip}
-        answer = desk.operator.choose(Question(Subject.EMPTY_TABLE, text, choices))
+        answer = desk.operator.choose(Question(Subject.EMPTY_TABLE, text, choices, steps=steps))
         if answer is Choice.SKIP:
             return
         try:
             yield from _photographed(bench, anyway=answer is Choice.KEEP)
         except ViewRejected as error:
-            text = f"{error.what}\n{error.next_step}"
+            text, steps = error.what, error.steps
         except TableNotEmpty as error:
-            text = f"{error.what} Take it off the table and stand back."
+            text, steps = f"{error.what} Take it off the table and stand back.", ()
             keep = {Choice.KEEP: "keep what is there because it always stays on the table (a pattern, a screw)"}
         else:
             break

@@ -21,6 +21,7 @@ from rig.core.errors import (
     SupplyLost,
     WatchdogTripped,
 )
+from rig.core.next_steps import START_AGAIN
 from rig.core.phrases import angle_words
 from rig.devices.servo import Servo, ServoState
 from rig.motion.halt import QUIET_COUNTS
@@ -137,8 +138,7 @@ def _find_cause(symptom: RigError, servo: Servo, config: SafetyConfig) -> RigErr
         if condition.watchdog_tripped:
             return WatchdogTripped(
                 "The servo received nothing from the computer for too long, and its watchdog stopped the table.",
-                next_step="Check whether the computer slept or was too busy, then start again; continue an enrollment "
-                "with --resume.",
+                next_step=("Check whether the computer slept or was too busy.", *START_AGAIN),
                 evidence=symptom.evidence,
             )
         if condition.power_lost:

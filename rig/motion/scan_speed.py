@@ -7,6 +7,7 @@ from typing import Final
 
 from rig.config import RigConfig
 from rig.core.errors import UsageError
+from rig.core.next_steps import Do
 
 GYRO_SHARE: Final = 0.9
 """Share of the gyro's range that a scan uses, because the table vibrates and the scale may be wrong."""
@@ -46,7 +47,10 @@ def exposure_s(config: RigConfig) -> float:
     if config.camera.exposure_us is None:
         raise UsageError(
             "The exposure time of the camera is not locked, so the smear of views in motion is not known.",
-            next_step="Set camera.exposure_us to a number and run rig calibrate camera-time, or take views at rest.",
+            next_step=(
+                "Take views at rest. Or set camera.exposure_us to a number, and",
+                Do.CALIBRATE(name="camera-time"),
+            ),
         )
     return config.camera.exposure_us * 1e-6
 
@@ -79,7 +83,7 @@ def require_camera_time(config: RigConfig) -> None:
     if config.camera_time.offset_ms is None:
         raise UsageError(
             "The time of the camera's frames is not calibrated, so their angles in motion are not known.",
-            next_step="Run rig calibrate camera-time, or take the views at rest.",
+            next_step=("Take the views at rest, or", Do.CALIBRATE(name="camera-time")),
         )
 
 

@@ -10,6 +10,7 @@ from rig.bench import open_servo
 from rig.config import RigConfig
 from rig.core.clock import Clock, seconds_between
 from rig.core.errors import BenchBusy, DeviceSilent, StateNotStored, TorqueStaysOn
+from rig.core.next_steps import Do
 from rig.safety.bench_lock import holder
 from rig.safety.saved_state import SERVER_FOLDER, FileStore, Holder, LatchedFault
 from rig.safety.stop_channel import StopAnswer, StopRequest
@@ -105,7 +106,9 @@ def _not_reacting(who: Holder, config: RigConfig) -> BenchBusy:
     end_it = f"End it with `kill -9 {who.pid}`" if who.pid else "End that program"
     return BenchBusy(
         "The program that uses the bench does not react.",
-        next_step=f"{end_it}; a moving table then stops by its watchdog within {config.table.watchdog_s:g} s. "
-        "Then run `rig stop` again to switch the torque off.",
+        next_step=(
+            f"{end_it}; a moving table then stops by its watchdog within {config.table.watchdog_s:g} s.",
+            Do.STOP(),
+        ),
         evidence={"pid": who.pid, "command": who.command, "since_utc": who.since_utc},
     )

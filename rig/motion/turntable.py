@@ -13,6 +13,7 @@ from typing import Self
 from rig.bench import Bench
 from rig.core.clock import seconds_between
 from rig.core.errors import LimitExceeded, NotReady, RigError, RotationDisagreement, TorqueStaysOn, UsageError
+from rig.core.next_steps import START_AGAIN
 from rig.core.phrases import angle_words, budget_words
 from rig.core.signals import uninterrupted
 from rig.devices.servo import MotionProfile, ServoState
@@ -362,7 +363,7 @@ class Turntable(AbstractContextManager["Turntable"]):
         if by_gyro and not gyro.valid:
             raise RotationDisagreement(
                 f"The platter's rotation is unknown: {gyro.reason}. By table.orientation, only the gyro measures it.",
-                next_step="Check the IMU's cable and range, then start again; continue an enrollment with --resume.",
+                next_step=("Check the IMU's cable and range.", *START_AGAIN),
                 evidence={"table_deg": round(self._rest_deg, 2)},
             )
         return Move(

@@ -9,13 +9,14 @@ from numpy.typing import NDArray
 
 from rig.bench import Bench
 from rig.core.errors import CameraSettingsDiffer, NoObject, ViewRejected
+from rig.core.next_steps import Do, SomeSteps
 from rig.events.events import Accepted, Event, Moved, Note, NoteCode, Rejected, Unwinding, Warned
 from rig.motion.move import Move
 from rig.motion.turntable import Turntable
 from rig.safety.gyro_rotation import finite
 from rig.views.capture import Attempt, RejectReason, Viewer, rejection_text
 from rig.views.description import DescribedView
-from rig.views.empty_table import COMMAND, store_table_problem
+from rig.views.empty_table import store_table_problem
 from rig.views.object_presence import is_empty_table
 
 
@@ -69,11 +70,10 @@ def check_camera(bench: Bench, settings: Collection[Mapping[str, Any]]) -> None:
         return
     nearest = min(differing, key=len)
     keys = type(bench.config.camera).model_fields
-    commands = [f"`rig config set camera.{key} {value:g}`" for key, value in nearest.items() if key in keys]
-    again = "Otherwise enroll the objects again."
+    changes = [Do.SET_KEY(key=f"camera.{key}", value=f"{value:g}") for key, value in nearest.items() if key in keys]
     raise CameraSettingsDiffer(
         "The camera has other settings than at the enrollment.",
-        next_step=f"Set it as it was: {', '.join(commands)}. {again}" if commands else f"Lock the camera. {again}",
+        next_step=(*(changes or ("Lock the camera.",)), "Otherwise enroll the objects again."),
         evidence={key: f"{now[key]} now, {value} at the enrollment" for key, value in nearest.items()},
     )
 
@@ -89,8 +89,11 @@ def check_object(bench: Bench, image_bgr: NDArray[np.uint8], empty_table: NDArra
     if is_empty_table(image_bgr, empty_table, bench.config.view):
         raise NoObject(
             "No object is on the table: nothing in the image differs from the background.",
-            next_step="Put the object on the table, where the camera sees it, and repeat. If it is there already, take "
-            f"it off and take a new empty-table image: {COMMAND}",
+            next_step=(
+                "Put the object on the table, where the camera sees it, and repeat. If it is there already, take it "
+                "off, and",
+                Do.EMPTY_TABLE(),
+            ),
         )
 
 
@@ -124,11 +127,9 @@ def capture(index: int, viewer: Viewer, table: Turntable, settled_ns: int) -> Ge
     evidence = attempt.evidence
     assert evidence.stillness is not None
     texts = "; ".join(rejection_text(reason, evidence) for reason in attempt.reasons)
-    next_step = "Check the light, the focus and the scene. The limits and view.retakes are in [view]."
+    next_step: SomeSteps = "Check the light, the focus and the scene. The limits and view.retakes are in [view]."
     if RejectReason.LOCKS_CHANGED in attempt.reasons:
-        next_step = (
-            "Lock the camera: set camera.exposure_us and camera.white_balance_k to numbers, then run rig doctor."
-        )
+        next_step = ("Lock the camera: set camera.exposure_us and camera.white_balance_k to numbers.", Do.DOCTOR())
     elif attempt.reasons == (RejectReason.REPEATED_FRAME,):
         next_step = "Reconnect the camera. If it happens again, use another USB port, without a hub."
     raise ViewRejected(

@@ -22,6 +22,7 @@ from rig.bench import Bench
 from rig.catalog import Enrollment, ViewRecord
 from rig.core.errors import LimitExceeded, ObjectMoved, RotationDisagreement
 from rig.core.json_form import plain
+from rig.core.next_steps import Do
 from rig.core.phrases import angle_words
 from rig.events.events import Event, Rejected, ScanStarted
 from rig.motion.flight_views import FlightFrames
@@ -245,7 +246,10 @@ class EnrollmentViews:
             raise ObjectMoved(
                 f"{self.enrollment.object_name} is not where it was for view {first.index + 1}: it fell, was pushed, "
                 "or slid on the platter. The views of this session are abandoned.",
-                next_step="Put the object back on its mark, fasten it, and enroll it again with --replace.",
+                next_step=(
+                    "Put the object back on its mark, and fasten it.",
+                    Do.ENROLL_AGAIN(name=self.enrollment.object_name),
+                ),
                 evidence={
                     "similarity": round(alike, 3),
                     "smallest_similarity": SAME_SIMILARITY,
@@ -266,15 +270,18 @@ def _disagreement(move: Move) -> RotationDisagreement:
         return RotationDisagreement(
             "It is not known whether the platter followed the servo's rotation of "
             f"{angle_words(move.rotation_encoder_deg, 2)}: {move.gyro.reason}.",
-            next_step="If nothing hit the table, continue with --resume. Otherwise enroll the object again with "
-            "--replace.",
+            next_step=("If nothing hit the table,", Do.CONTINUE_ENROLLMENT(), "Otherwise,", Do.ENROLL_AGAIN()),
             evidence={"table_deg": round(move.encoder_deg, 2)},
         )
     return RotationDisagreement(
         f"The servo rotated {angle_words(move.rotation_encoder_deg, 2)}, but the platter "
         f"{angle_words(move.gyro.angle_deg, 2)}.",
-        next_step="Tighten the platter.",
-        afterwards="Enroll the object again with --replace: views from before and after a slip do not fit together.",
+        next_step=(
+            "Tighten the platter.",
+            Do.ACKNOWLEDGE(),
+            Do.ENROLL_AGAIN(),
+            "Views from before and after a slip do not fit together.",
+        ),
         evidence={
             "difference_deg": round(move.agreement.difference_deg, 3),
             "bound_deg": round(move.agreement.bound_deg, 3),
@@ -290,9 +297,13 @@ def _flight_disagreement(move: Move, residual_deg: float | None) -> RotationDisa
         what += f", and on the way they differed by up to {residual_deg:.2f}°"
     return RotationDisagreement(
         f"{what}. No view of this revolution is stored.",
-        next_step="Tighten the platter.",
-        afterwards="Enroll the object again with --replace. If the gyro lost samples, check the IMU's cable and "
-        "continue with --resume.",
+        next_step=(
+            "Tighten the platter.",
+            Do.ACKNOWLEDGE(),
+            Do.ENROLL_AGAIN(),
+            "If the gyro lost samples, check the IMU's cable, and",
+            Do.CONTINUE_ENROLLMENT(),
+        ),
         evidence={
             "table_deg": round(move.encoder_deg, 2),
             "residual_deg": None if residual_deg is None else round(residual_deg, 3),

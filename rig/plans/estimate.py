@@ -12,6 +12,7 @@ from rig.bench import Bench
 from rig.catalog import Catalog, ObjectSummary, clean_name
 from rig.core.clock import seconds_between
 from rig.core.errors import LimitExceeded
+from rig.core.next_steps import Do
 from rig.events.events import Accepted, Event
 from rig.motion.motion_model import MotionModel
 from rig.motion.scan_speed import takes_in_motion
@@ -71,8 +72,11 @@ def table_angles(azimuth_deg: Sequence[float], limits_deg: tuple[float, float], 
     if not revolutions:
         raise LimitExceeded(
             f"The views need {angles[-1] - angles[0]:.0f}° in one direction. The cable budget does not allow that.",
-            next_step="Increase table.limits_deg if the cable is long enough. Otherwise enroll the object again with "
-            "--replace: the views are then planned for this bench.",
+            next_step=(
+                "Increase table.limits_deg if the cable is long enough. Otherwise,",
+                Do.ENROLL_AGAIN(),
+                "The views are then planned for this bench.",
+            ),
             evidence={"from_deg": angles[0], "to_deg": angles[-1], "limits_deg": list(limits_deg)},
         )
     nearest = min(revolutions, key=lambda whole: (abs(angles[0] + 360.0 * whole), whole))

@@ -189,7 +189,7 @@ def _last_steps(model: Model, search: Search, hypotheses: Hypotheses) -> Generat
     for step in search.last_steps(hypotheses):
         event = answered(step, enrolled)
         for error in missing:
-            values = {"what": error.what, "next_step": error.next_step}
+            values = {key: value for key, value in error.as_dict().items() if key in ("what", "next_step", "steps")}
             yield Warned(search.ranked.index, Note(NoteCode.NOT_COMPARED, values))
         missing.clear()
         if event is not None:
@@ -226,7 +226,7 @@ def watch(
         try:
             views = (yield from identify_next()).views
         except (NoObject, ViewRejected) as error:
-            yield Failed(**{key: error.as_dict()[key] for key in ("error", "code", "what", "evidence", "next_step")})
+            yield Failed(**error.as_dict())
             views = 0
         with Turntable(bench) as table:
             if abs(table.rest_deg - home_deg) > bench.config.table.tolerance_deg:

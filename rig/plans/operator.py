@@ -8,6 +8,8 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Protocol
 
+from rig.core.next_steps import SomeSteps
+
 
 class Choice(StrEnum):
     """The answers of the operator."""
@@ -52,6 +54,8 @@ class Question:
         The answer if there is no operator.
     picture
         A drawing of letters for a terminal.
+    steps
+        What is to be done before the answer, as the next step of an error.
     """
 
     subject: Subject
@@ -60,6 +64,7 @@ class Question:
     default: Choice = Choice.CONTINUE
     unattended: Choice = Choice.CONTINUE
     picture: str = ""
+    steps: SomeSteps = ()
 
 
 class Operator(Protocol):

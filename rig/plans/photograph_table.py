@@ -9,6 +9,7 @@ from rig.bench import Bench
 from rig.core.clock import seconds_between
 from rig.core.errors import TableNotEmpty, UsageError
 from rig.core.json_form import plain
+from rig.core.next_steps import Do
 from rig.core.phrases import percent
 from rig.events.events import EmptyTableImage, Event, Note, NoteCode, Warned
 from rig.motion.turntable import Turntable
@@ -16,7 +17,7 @@ from rig.plans.capture import announced, capture
 from rig.plans.enroll_views import SAME_SIMILARITY
 from rig.views.capture import Viewer, image_similarity
 from rig.views.description import within
-from rig.views.empty_table import COMMAND, EmptyTable, empty_table_status, store_empty_table
+from rig.views.empty_table import EmptyTable, empty_table_status, store_empty_table
 from rig.views.object_presence import GRID, changed_cells, shrunk
 
 ROTATION_DEG: Final = 25.0
@@ -126,13 +127,17 @@ def _check(share: float, agreement: float | None) -> None:
         raise TableNotEmpty(
             "The surroundings of the table differ between two images: something moved there, or the table reaches the "
             "border of the image.",
-            next_step=f"Stand back and run `{COMMAND}` again. Choose view.roi with background on all sides.",
+            next_step=("Stand back.", Do.EMPTY_TABLE(), "Choose view.roi with background on all sides."),
             evidence={"agreement": round(agreement, 3), "least_agreement": MIN_AGREEMENT, **numbers},
         )
     if share > MAX_CHANGED_SHARE:
         raise TableNotEmpty(
             f"Something is on the table: {percent(share)} of the image changes as the table rotates.",
-            next_step=f"Clear the table and run `{COMMAND}` again. If it always stays there, such as a pattern or a "
-            f"screw: {COMMAND} --anyway",
+            next_step=(
+                "Clear the table.",
+                Do.EMPTY_TABLE(),
+                "If it always stays there, such as a pattern or a screw,",
+                Do.EMPTY_TABLE(anyway=True),
+            ),
             evidence=numbers,
         )

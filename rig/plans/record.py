@@ -14,6 +14,7 @@ from rig.catalog.results import Answer, NewResult, record
 from rig.config.catalog_place import CatalogPlace
 from rig.core.clock import Clock
 from rig.core.errors import CatalogUnavailable, RigError
+from rig.core.next_steps import steps_as_json
 from rig.events.events import Accepted, Event, Failed, Identified, Note, NoteCode, Recorded, Started, Warned, event_dict
 
 
@@ -99,4 +100,10 @@ class ResultRecorder:
                 with Journal.of(CatalogPlace.of(self._place), self._clock) as journal:
                     return Recorded(record(journal, new, self._image), self.sample)
         except RigError as error:
-            return Warned(None, Note(NoteCode.NOT_RECORDED, {"what": error.what, "next_step": error.next_step}))
+            return Warned(
+                None,
+                Note(
+                    NoteCode.NOT_RECORDED,
+                    {"what": error.what, "next_step": error.next_step, "steps": steps_as_json(error.steps)},
+                ),
+            )

@@ -3,6 +3,7 @@
 from hbr.model import symmetry
 from hbr.model.views import Views
 from rig.core.errors import ObjectNotFound
+from rig.core.next_steps import Do
 from rig.events.events import SimilarObject, SimilarObjects
 
 SHOWN = 3
@@ -19,7 +20,8 @@ def similar_objects(views: Views, name: str) -> SimilarObjects:
     """
     if name not in views.object_names:
         raise ObjectNotFound(
-            f"{name!r} has no complete enrollment.", next_step="Enroll it, or complete its enrollment with --resume."
+            f"{name!r} has no complete enrollment.",
+            next_step=(Do.ENROLL(name=name), "Or", Do.CONTINUE_ENROLLMENT(name=name)),
         )
     number = views.object_names.index(name)
     own = symmetry.symmetry(views, number)

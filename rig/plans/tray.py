@@ -55,7 +55,7 @@ def read_tray(path: Path) -> tuple[TrayItem, ...]:
     UsageError
         The file cannot be read, or it has mistakes; the evidence lists all of them with their lines.
     """
-    step = "Choose a CSV file with --list."
+    step = "Choose a CSV file."
     with os_errors_as(UsageError, f"The list {path} cannot be read.", next_step=step):
         content = read(path, max_bytes=MAX_FILE_BYTES)
     try:
@@ -198,7 +198,8 @@ def next_object(item: TrayItem, number: int, of: int, interrupted: ObjectSummary
 def after_error(error: RigError, item: TrayItem) -> Question:
     """Return the question after an error that concerns one object."""
     choices = {Choice.CONTINUE: "try again", Choice.SKIP: "skip", Choice.STOP: "stop"}
-    return Question(Subject.FAILURE, f"{item.name}: {error.what}\n{error.next_step}", choices, unattended=Choice.STOP)
+    text = f"{item.name}: {error.what}"
+    return Question(Subject.FAILURE, text, choices, unattended=Choice.STOP, steps=error.steps)
 
 
 def _rows(text: str) -> Generator[tuple[int, list[str]], None, None]:

@@ -19,10 +19,11 @@ from rig.charts.polar_path import polar_path
 from rig.charts.score_chart import score_chart
 from rig.core.errors import UsageError, os_errors_as
 from rig.core.files import write
+from rig.core.next_steps import Do, in_words
 from rig.core.phrases import azimuth_words, counted, listed, sentence, signed
 from rig.core.templates import environment
 from rig.events.events import Candidate, Ranked
-from rig.events.note_wording import note_words
+from rig.events.note_wording import note_steps, note_words
 from rig.events.wording import (
     answer_words,
     comparison_words,
@@ -122,7 +123,7 @@ def write_report(path: Path, html: str) -> None:
     UsageError
         The file cannot be written there.
     """
-    step = "Choose a folder that you may write to with --out, on a disk with free space."
+    step = ("Choose a folder that you may write to, on a disk with free space.", Do.RUN_AGAIN(out="FILE"))
     with os_errors_as(UsageError, f"The report cannot be written to {path}.", next_step=step):
         path.parent.mkdir(parents=True, exist_ok=True)
         write(path, html.encode())
@@ -217,7 +218,7 @@ def _retrieval(number: int, record: IdentificationRecord, *, unfold: bool) -> _R
         compared=any(event.s_left is not None for event in record.decided),
         scores=scores,
         arc=arc_figure(record),
-        notes=[sentence(note_words(note)) for note in record.notes],
+        notes=[f"{sentence(note_words(note))} {in_words(note_steps(note))}" for note in record.notes],
         decisions=_decisions(record),
         differs="" if compared is None or compared.picture_bgr is None else _data_uri(compared.picture_bgr),
         verification="" if record.verified is None else sentence(verification_words(record.verified)),

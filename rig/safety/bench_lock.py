@@ -16,6 +16,7 @@ from pydantic import ValidationError
 from rig.core.clock import Clock
 from rig.core.errors import BenchBusy
 from rig.core.files import no_follow
+from rig.core.next_steps import Do
 from rig.safety.saved_state import (
     SERVER_FILE,
     SERVER_FOLDER,
@@ -122,7 +123,6 @@ def busy(path: Path, who: Holder | None) -> BenchBusy:
         )
     return BenchBusy(
         f"The bench is in use by {name}.",
-        next_step="Wait until it ends, or run `rig stop` (stops the table, torque off). "
-        "A second bench on this computer needs its own state_dir.",
+        next_step=("Wait until it ends, or", Do.STOP(), "A second bench on this computer needs its own state_dir."),
         evidence={"state": str(path)},
     )

@@ -19,6 +19,7 @@ from rig.core.errors import (
     Stalled,
     SupplyOutOfRange,
 )
+from rig.core.next_steps import Do
 from rig.core.phrases import angle_words
 from rig.devices.servo import ServoLimits, ServoState
 from rig.safety.gyro_rotation import Rotation
@@ -65,15 +66,15 @@ def find_servo_fault(
     if nonsense := implausible_readings(state):
         return DeviceFault(
             f"The servo's readings are impossible: {nonsense[0]}.",
-            next_step="Check its cable. If this repeats, replace the servo.",
+            next_step=("Check its cable. If this repeats, replace the servo.", Do.ACKNOWLEDGE(reboot=True)),
             evidence={"readings": nonsense},
-        ).ask_to_acknowledge(reboot=True)
+        )
     if state.hardware_errors:
         return DeviceFault(
             f"The servo reports a hardware error: {', '.join(state.hardware_errors)}.",
-            next_step="Remove the cause (jam, heat, supply).",
+            next_step=("Remove the cause (jam, heat, supply).", Do.ACKNOWLEDGE(reboot=True)),
             evidence={"hardware_errors": list(state.hardware_errors), **evidence},
-        ).ask_to_acknowledge(reboot=True)
+        )
     hottest_c = limits.temperature_c - config.temperature_margin_c
     if state.temperature_c >= hottest_c - (COOLER_C if again else 0.0):
         return Overheated(
@@ -183,7 +184,7 @@ class MotionMonitor:
         if beyond_deg > config.following_error_deg:
             raise FollowingError(
                 f"The table is at {angle_words(angle_deg)}, which is not on its path to {angle_words(self._goal_deg)}.",
-                next_step="Find out what rotated the table, and check its angle with `rig status`.",
+                next_step=("Find out what rotated the table.", Do.STATUS()),
                 evidence=evidence,
             )
         # Progress: at rest away from the goal.

@@ -18,6 +18,7 @@ from rig.core import files
 from rig.core.clock import Clock
 from rig.core.errors import MotionStopped, RigError, StateNotStored, os_errors_as
 from rig.core.masking import masked
+from rig.core.next_steps import Do, NextSteps, in_words, steps_as_json
 from rig.safety.stop_channel import StopAnswer, StopListener, StopRequest, listen
 
 VERSION = 1
@@ -26,7 +27,7 @@ LATCH_BYTES = 8192
 SESSION = "session.json"
 SERVER_FOLDER = "web"
 SERVER_FILE = "server.json"
-_MAKE_ROOM = "Make room on the disk, or set state_dir to a folder that you may write to."
+_MAKE_ROOM = (Do.FREE_DISK(), "Or set state_dir to a folder that you may write to.")
 
 
 class _Saved(BaseModel):
@@ -58,7 +59,7 @@ class LatchedFault(_Saved):
     code: int
     title: str
     what: str
-    next_step: str
+    steps: NextSteps
     evidence: dict[str, Any] = {}
     utc: str
 
@@ -66,9 +67,11 @@ class LatchedFault(_Saved):
     def of(cls, error: RigError, utc: str) -> "LatchedFault":
         """Return ``error`` as a fault that can be stored."""
         evidence = json.loads(json.dumps(error.evidence, default=str))
-        return cls(
-            code=error.code, title=error.title, what=error.what, next_step=error.next_step, evidence=evidence, utc=utc
-        )
+        return cls(code=error.code, title=error.title, what=error.what, steps=error.steps, evidence=evidence, utc=utc)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the fault as `--json` prints it."""
+        return {**self.model_dump(), "next_step": in_words(self.steps), "steps": steps_as_json(self.steps)}
 
 
 class BenchState(_Saved):
@@ -290,7 +293,8 @@ class FileStore:
     def _write_latch(self, fault: LatchedFault | None) -> None:
         text = b"" if fault is None else fault.model_dump_json().encode()
         if fault is not None and len(text) >= LATCH_BYTES:
-            short = fault.model_copy(update={"what": fault.what[:500], "next_step": fault.next_step[:500]})
+            steps = tuple(step[:500] if isinstance(step, str) else step for step in fault.steps)
+            short = fault.model_copy(update={"what": fault.what[:500], "steps": steps})
             text = short.model_copy(update={"evidence": {}}).model_dump_json().encode()
         content = text.ljust(LATCH_BYTES - 1) + b"\n"
         if not self._latch_is_reserved():
@@ -396,7 +400,7 @@ def _fault_of_damage(damage: str) -> LatchedFault:
         code=StateNotStored.code,
         title=StateNotStored.title,
         what=f"The bench's stored state is lost, and a fault may be lost with it: {damage}.",
-        next_step="Look at the table and its cable. Then run `rig acknowledge`.",
+        steps=("Look at the table and its cable.", Do.ACKNOWLEDGE()),
         utc="an unknown time",
     )
 

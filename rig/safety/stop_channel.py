@@ -21,6 +21,7 @@ from weakref import WeakValueDictionary
 
 from rig.core.clock import Clock, seconds_between
 from rig.core.errors import StateNotStored, os_errors_as
+from rig.core.next_steps import Do
 
 NAME: Final = "stop"
 BACKLOG: Final = 64
@@ -57,7 +58,7 @@ class StopListener:
         self._waiting: list[socket.socket] = []
         self._requests = 0
         self.users = 0
-        step = "Make room on the disk, or set state_dir to a local folder that you may write to."
+        step = (Do.FREE_DISK(), "Or set state_dir to a local folder that you may write to.")
         with os_errors_as(StateNotStored, f"No requests to stop can be received in {folder}.", next_step=step):
             folder.mkdir(parents=True, exist_ok=True)
             self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)

@@ -9,7 +9,8 @@ Decision: docs/decisions/0008.
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from typing import Final
+from dataclasses import replace
+from typing import Final, TypeGuard
 
 from rig.config import RigConfig
 from rig.core.clock import Clock
@@ -23,6 +24,7 @@ from rig.core.errors import (
     Unreferenced,
     UsageError,
 )
+from rig.core.next_steps import START_AGAIN, Do, NextStep, NextSteps
 from rig.core.phrases import angle_range, angle_words
 from rig.core.signals import uninterrupted
 from rig.devices.servo import Servo, ServoCondition, ServoState
@@ -41,15 +43,19 @@ from rig.safety.state_machine import StateEvent, StateMachine
 from rig.safety.state_machine import TableState as TableState
 from rig.safety.table_record import TableRecord
 
-_CHECK_CABLE: Final = (
-    "Look at the cable. If it hangs free, run `rig home --revolutions 0`. Otherwise, give the revolutions that it is "
-    "wound up. Or rotate the table by hand to its home and run `rig home --here`."
+_CHECK_CABLE: Final[NextSteps] = (
+    "Look at the cable. If it hangs free,",
+    Do.SET_REVOLUTIONS(revolutions=0),
+    "Otherwise, give the revolutions that it is wound up. Or rotate the table by hand to its home, and",
+    Do.HOME_HERE(),
 )
-_SET_HOME: Final = "Rotate the table by hand to its home with the cable hanging free, then run `rig home --here`."
-_WAYS_OUT: Final = {
-    AngleFinding.SETTINGS_CHANGED: f"{_SET_HOME} Or restore the settings.",
-    AngleFinding.BEYOND_LIMITS: "Rotate the table by hand back into its limits, with the servo's supply on. Then run "
-    "the command again.",
+_SET_HOME: Final[NextSteps] = ("Rotate the table by hand to its home, with the cable hanging free.", Do.HOME_HERE())
+_WAYS_OUT: Final[dict[AngleFinding, NextSteps]] = {
+    AngleFinding.SETTINGS_CHANGED: (*_SET_HOME, "Or restore the settings."),
+    AngleFinding.BEYOND_LIMITS: (
+        "Rotate the table by hand back into its limits, with the servo's supply on.",
+        Do.RUN_AGAIN(),
+    ),
 }
 
 
@@ -114,6 +120,11 @@ class Safety:
     def doubt(self) -> SavedAngleCheck | None:
         """The reason why the table is `TableState.UNREFERENCED`; None if it is not."""
         return self._record.doubt
+
+    @property
+    def next_step(self) -> NextSteps:
+        """What is to be done before the table may move; empty without a fault and a doubt."""
+        return self._not_ready().steps if self.state in (TableState.FAULT, TableState.UNREFERENCED) else ()
 
     @property
     def findings(self) -> tuple[str, ...]:
@@ -273,13 +284,24 @@ class Safety:
     def latch(self, error: RigError) -> None:
         """Latch a fault: nothing moves until it is acknowledged. An earlier fault stays."""
         self._apply(StateEvent.LATCH)
-        error.ask_to_acknowledge(outlasts_program=self._store.outlasts_program)
+        self._add_acknowledgement(error)
         if self.fault is None:
             try:
                 self._record.save_fault(LatchedFault.of(error, self._clock.utc().isoformat(timespec="seconds")))
             except StateNotStored as not_stored:
-                error.ask_to_acknowledge(outlasts_program=False)
+                self._add_acknowledgement(error, is_stored=False)
                 error.add_note(f"The fault is latched in this program only. {not_stored.what}")
+
+    def _add_acknowledgement(self, error: RigError, *, is_stored: bool = True) -> None:
+        """Add to the next step of a fault that it is acknowledged at the end, unless the error says when."""
+        kinds = (Do.ACKNOWLEDGE, Do.ACKNOWLEDGE_IN_PROGRAM)
+        kind = kinds[0] if is_stored and self._store.outlasts_program else kinds[1]
+
+        def is_acknowledgement(step: str | NextStep) -> TypeGuard[NextStep]:
+            return isinstance(step, NextStep) and step.action in kinds
+
+        steps = error.steps if any(map(is_acknowledgement, error.steps)) else (*error.steps, kind())
+        error.steps = tuple(replace(step, action=kind) if is_acknowledgement(step) else step for step in steps)
 
     def acknowledge(self, *, reboot: bool = False) -> TableState:
         """Acknowledge the latched fault after its cause is gone: servo, settings, supply and angle are checked.
@@ -312,7 +334,8 @@ class Safety:
         else:
             self._servo.verify()
         if cause := find_servo_fault(self._servo.read_state(), self._config.safety, self._servo.limits, again=True):
-            raise cause.ask_to_acknowledge(outlasts_program=self._store.outlasts_program)
+            self._add_acknowledgement(cause)
+            raise cause
         for check in self.acknowledge_checks:
             check()
         if self.state is TableState.FAULT:
@@ -335,7 +358,7 @@ class Safety:
             raise UsageError(
                 f"The table cannot be at {angle_words(table_deg)}: its cable budget is "
                 f"{angle_range(self._config.table.limits_deg)}.",
-                next_step=f"Check the revolutions that you gave. {_SET_HOME}",
+                next_step=("Check the revolutions that you gave.", *_SET_HOME),
             )
         if not self._machine.accepts(StateEvent.REFER):
             raise self._not_ready()
@@ -400,7 +423,7 @@ class Safety:
             fault = self.fault
             return FaultLatched(
                 f"A fault is latched since {fault.utc}: {fault.what}",
-                next_step=fault.next_step,
+                next_step=fault.steps,
                 evidence={"code": fault.code, **fault.evidence},
             )
         match self.state:
@@ -437,6 +460,6 @@ def _watchdog_finding(condition: ServoCondition, last: SavedSession | None) -> s
 def stopped() -> MotionStopped:
     """Return the error of a motion that the operator stopped."""
     return MotionStopped(
-        "STOP or `rig stop` stopped the table; its torque is off.",
-        next_step="Run the command again when the table may move; continue an enrollment with --resume.",
+        "The operator stopped the table; its torque is off.",
+        next_step=("When the table may move,", *START_AGAIN),
     )

@@ -31,6 +31,7 @@ from rig.catalog.local_views import local_views
 from rig.catalog.prepared import prepared_views
 from rig.config import RigConfig
 from rig.core.errors import CatalogError, DescriptorOutdated, UsageError
+from rig.core.next_steps import Do
 from rig.events.events import Note, NoteCode
 from rig.search.comparison import EnrolledViews
 from rig.search.session import SHOWN, ArcSearch, DenseSearch, HoughSearch, Search
@@ -165,7 +166,7 @@ def begin_search(
     if isinstance(chosen, str):
         chosen = strategy_named(chosen)
     if not len(model.views):
-        raise CatalogError("The catalog is empty.", next_step="Enroll at least one object: rig enroll NAME.")
+        raise CatalogError("The catalog is empty.", next_step=Do.ENROLL())
     wanted = descriptor_for(chosen)
     if wanted != model.descriptor:
         raise UsageError(

@@ -29,6 +29,7 @@ from rig.config import RigConfig
 from rig.config.values import validate
 from rig.core.errors import CatalogError, RigError, UsageError, os_errors_as
 from rig.core.files import json_values, read, write
+from rig.core.next_steps import Do
 from rig.events.compared import Compared
 from rig.events.events import Accepted, Event, Failed, Identified, Started, event_dict, event_of
 from rig.search.model import Model, empty_table_for, model_of
@@ -88,9 +89,7 @@ class RunWriter:
         with _writing(folder):
             (folder / "frames").mkdir(parents=True, exist_ok=True)
             if len(list(folder.iterdir())) > 1:
-                raise UsageError(
-                    f"The folder {folder} is not empty.", next_step="Give a new folder for each run with --save-run."
-                )
+                raise UsageError(f"The folder {folder} is not empty.", next_step="Give a new folder for each run.")
             write(folder / "model.jsonl", "".join(_model_lines(views)).encode())
             model.write_rule(folder / STOPPING_RULE, made_utc=started_utc)
             empty_table, _ = empty_table_for(bench, model)
@@ -355,7 +354,7 @@ def _descriptor(folder: Path, used: dict[str, Any]) -> Descriptor:
     if name.startswith(PREFIX) and name not in {model.name for model in loaded_models()}:
         raise UsageError(
             f"The run {folder} needs the model {name}.",
-            next_step="Give the ONNX file with this SHA-256: --model FILE.",
+            next_step=("Give the ONNX file with this SHA-256.", Do.RUN_AGAIN(model="FILE")),
         )
     kind = descriptor(name)
     if number != kind.version:
@@ -392,7 +391,7 @@ def _bytes(folder: Path, name: str) -> bytes:
     except (OSError, RuntimeError) as error:  # RuntimeError: links in a circle
         raise UsageError(
             f"There is no saved run in {folder}: {name} cannot be read.",
-            next_step="Give a folder that rig identify --save-run has written.",
+            next_step="Give a folder in which a run was saved.",
             evidence={"reason": getattr(error, "strerror", None) or str(error)},
         ) from error
 
@@ -414,5 +413,5 @@ def _damaged(folder: Path, reason: str) -> UsageError:
 
 def _writing(folder: Path) -> AbstractContextManager[None]:
     """Return a context in which an error of the system says that the run cannot be saved."""
-    step = "Give a new folder, on a disk with space, with --save-run."
+    step = ("Give a new folder, on a disk with space.", Do.RUN_AGAIN(save_run="FOLDER"))
     return os_errors_as(UsageError, f"The run cannot be saved in {folder}.", next_step=step)

@@ -21,6 +21,7 @@ from hbr.descriptors import descriptor
 from rig.core.errors import CatalogError, os_errors_as
 from rig.core.files import json_values, read, write
 from rig.core.json_form import plain
+from rig.core.next_steps import Do
 from rig.events.events import Note, NoteCode
 
 FILE: Final = "search_rules.json"
@@ -196,7 +197,7 @@ def write_stopping_rule(path: Path, rule: hbr.StoppingRule, index: hbr.DenseInde
     """
     values = stopping_rule_values(rule, index, made_utc=made_utc)
     text = json.dumps(values, ensure_ascii=False, indent=1, allow_nan=False)
-    step = "Free space on the disk, or make the folder writable for this user."
+    step = (Do.FREE_DISK(), "Or make the folder writable for this user.")
     with os_errors_as(CatalogError, f"The stopping rule cannot be written to {path}.", next_step=step):
         write(path, (text + "\n").encode())
 
@@ -245,7 +246,7 @@ def read_stopping_rule(folder: Path) -> StoredRule | None:
     except (OSError, ValueError, KeyError, TypeError, AttributeError, ArithmeticError) as error:
         raise CatalogError(
             f"The stopping rule in {path} cannot be read.",
-            next_step="Renew it: rig catalog calibrate",
+            next_step=Do.FIT_STOPPING_RULE(),
             evidence={"reason": str(error)},
         ) from error
 

@@ -20,7 +20,6 @@ from rig.devices.camera import CameraIdentity, CameraLocks
 from rig.views import image_files as images
 from rig.views.table_problems import TableProblem, TableProblemCode
 
-COMMAND: Final = "rig empty-table"
 MAX_AGE_H: Final = 12.0
 """A working day. On another day the illumination is different."""
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from rig.core import files
 from rig.core.errors import CatalogError, UsageError
+from rig.core.next_steps import Do
 from rig.views import jpeg_files
 
 IMAGE_FOLDER: Final = "images"
@@ -143,7 +144,7 @@ def checked(fetch: Callable[[], bytes], where: str, sha256: str) -> NDArray[np.u
     CatalogError
         The file is missing or differs from the one that was stored.
     """
-    fix = "Run rig catalog verify --repair to find a copy; otherwise enroll the object again with --replace."
+    fix = ("To find a copy,", Do.REPAIR_CATALOG(), "Otherwise,", Do.ENROLL_AGAIN())
     try:
         content = fetch()
     except FileNotFoundError as error:

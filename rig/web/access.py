@@ -28,6 +28,7 @@ from rig.core.errors import (
     os_errors_as,
 )
 from rig.core.files import read, write
+from rig.core.next_steps import Do
 
 TOKENS: Final = "tokens.json"
 PREFIX: Final = "rig_"
@@ -171,13 +172,13 @@ class Tokens:
             self._read_at = None
             self._damage = ConfigError(
                 f"The tokens in {self._file} cannot be read.",
-                next_step="Delete the file, and make new tokens with rig serve --new-token NAME.",
+                next_step=("Delete the file.", Do.NEW_TOKEN()),
                 evidence={"reason": str(error)},
             )
 
     def _store(self, tokens: list[StoredToken]) -> None:
         content = json.dumps([token.model_dump(mode="json") for token in tokens], indent=1).encode()
-        step = "Make room on the disk, or set state_dir to a folder that you may write to."
+        step = (Do.FREE_DISK(), "Or set state_dir to a folder that you may write to.")
         with os_errors_as(StateNotStored, f"The tokens cannot be stored in {self._file}.", next_step=step):
             self._file.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
             write(self._file, content, mode=0o600)
@@ -228,9 +229,7 @@ class Sessions:
             return StoredToken(name=LOCAL, role=Role.WATCH, sha256=_hash(token), created_utc=self.clock.utc())
         stored = self.tokens.valid(_hash(token))
         if stored is None:
-            raise LoginRequired(
-                "The token is unknown or has expired.", next_step="Make a new one: rig serve --new-token NAME"
-            )
+            raise LoginRequired("The token is unknown or has expired.", next_step=Do.NEW_TOKEN())
         return stored
 
     def find(self, secret: str) -> Person | None:

@@ -39,11 +39,11 @@ def add_records(routes: Routes, server: Server) -> None:
     @routes.watch.get("/runs/{name}", tags=["runs"], responses={200: {"model": SavedRunBody}})
     def run(name: str) -> Response:
         """Return the events of a saved run."""
-        from rig.events.lines import line
+        from rig.events.lines import page_line
 
         saved = load(name)
         with saved.damage():
-            events = [{**event_dict(event), "text": line(event)} for event in saved.events()]
+            events = [{**event_dict(event), "text": page_line(event)} for event in saved.events()]
         about = {"started_utc": saved.about["started_utc"], "bench": saved.about["bench"]}
         return JSONResponse({"name": name, **about, "events": events})
 

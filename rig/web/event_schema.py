@@ -22,7 +22,7 @@ class SavedRunBody(BaseModel):
 
 @dataclass(frozen=True, slots=True)
 class Remark:
-    """A remark of a job, with its words in ``text``."""
+    """A remark of a job, with its words in ``text`` and ``steps``."""
 
     event: Literal["note"] = field(default="note", init=False)
 
@@ -30,7 +30,8 @@ class Remark:
 class JobMessage(RootModel[Annotated[Event | Remark, Discriminator("event")]]):
     """An event of the running job: the data of the messages ``plan`` of the stream, as JSON text.
 
-    It also has ``job`` (the id) and ``text`` (the event in words). ``accepted`` also has ``picture`` (the number of the
+    It also has ``job`` (the id) and ``text`` (the event in words), and if the operator should do something, ``steps``
+    as an error has them. ``accepted`` also has ``picture`` (the number of the
     view in ``/jobs/{job_id}/views/{number}``) and ``outline_px`` of the object: ``box`` (x, y, width, height) and
     ``points``, or null.
     """

@@ -15,6 +15,7 @@ from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol, RequestResponseCycle
 
+from rig.core.next_steps import Do, SomeSteps
 from rig.core.phrases import whole
 from rig.web.problems import MEDIA_TYPE, problem_body
 
@@ -110,10 +111,13 @@ class Guard:
             body, status = problem_body(*rejection), rejection[0]
             await Response(body, status, media_type=MEDIA_TYPE)(scope, receive, guarded)
 
-    def _rejection(self, method: str, path: str, headers: Headers) -> tuple[int, str, str] | None:
+    def _rejection(self, method: str, path: str, headers: Headers) -> tuple[int, str, SomeSteps] | None:
         host = headers.get("host", "")
         if _host_name(host) not in self._hosts:
-            step = "Use an address that rig serve prints, or allow this name with --allow-host."
+            step = (
+                "Use an address that the server prints at its start, or allow this name:",
+                Do.SERVE_AGAIN(allow_host="NAME"),
+            )
             return 421, "The server does not answer to this host name.", step
         site = headers.get("sec-fetch-site", "none")
         navigates = method == "GET" and headers.get("sec-fetch-mode") == "navigate" and not path.startswith("/api/")

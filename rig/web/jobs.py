@@ -15,6 +15,7 @@ from rig.core.clock import Clock
 from rig.core.errors import JobNotFound, JobRejected, RigError, StateNotStored, os_errors_as
 from rig.core.files import read, write
 from rig.core.masking import masked
+from rig.core.next_steps import Do
 from rig.plans.operator import Choice
 from rig.web.requests import EnrollRequest, IdentifyRequest, Job, JobRequest, JobState, Question, TrayRequest
 
@@ -275,7 +276,7 @@ class JobQueue:
             self._texts[job.id] = job.model_dump_json()
         self._drop_old()
         content = f"[{','.join(self._texts.values())}]".encode()
-        step = "Make room on the disk. The bench works, but the list of jobs does not survive the server."
+        step = (Do.FREE_DISK(), "The bench works, but the list of jobs does not survive the server.")
         try:
             with os_errors_as(StateNotStored, f"The jobs cannot be stored in {self._file}.", next_step=step):
                 self._file.parent.mkdir(parents=True, exist_ok=True, mode=0o700)

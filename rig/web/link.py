@@ -18,6 +18,7 @@ from pydantic_core import to_jsonable_python
 
 from rig.core import errors
 from rig.core.errors import BenchBusy, RigError
+from rig.core.next_steps import Do, steps_as_json, steps_from_json
 
 MAX_BYTES: Final = 64_000_000
 MAX_UNSENT: Final = 20_000
@@ -80,7 +81,7 @@ class Link:
         except TimeoutError as error:
             raise BenchBusy(
                 "The process that owns the bench does not answer.",
-                next_step="Look at the table. If this stays so, end rig serve and start it again.",
+                next_step=("Look at the table. If this stays so,", Do.SERVE_AGAIN()),
             ) from error
         finally:
             del self._waiting[number]
@@ -140,8 +141,9 @@ class Link:
         if future is None or future.done():  # the call has ended already
             return
         if "error" in message:
-            kind, values = message["error"]
-            future.set_exception(getattr(errors, kind, RigError)(**values))
+            kind, what, steps, evidence = message["error"]
+            error = getattr(errors, kind, RigError)
+            future.set_exception(error(what, next_step=steps_from_json(steps), evidence=evidence))
         else:
             future.set_result((message["result"], content))
 
@@ -150,8 +152,7 @@ class Link:
         try:
             result = self._functions[message["call"]](**message["values"])
         except RigError as error:
-            values = {key: getattr(error, key) for key in ("what", "next_step", "evidence")}
-            return {"error": [type(error).__name__, values]}, b""
+            return {"error": [type(error).__name__, error.what, steps_as_json(error.steps), error.evidence]}, b""
         result, content = result if isinstance(result, tuple) else (result, b"")
         return {"result": result}, content
 

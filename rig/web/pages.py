@@ -6,6 +6,7 @@ from fastapi import APIRouter, Request
 from fastapi.responses import HTMLResponse
 
 from rig.core.templates import environment
+from rig.web.next_steps import page_actions
 
 if TYPE_CHECKING:
     from rig.web.server import Server
@@ -25,6 +26,7 @@ PAGES: Final = {
 def pages(server: "Server") -> APIRouter:
     """Return the routes of the pages."""
     templates = environment("rig.web", folder="templates")
+    shared = {"bench": server.bench, "actions": page_actions()}
     router = APIRouter(include_in_schema=False)
 
     def page(name: str) -> None:
@@ -32,7 +34,7 @@ def pages(server: "Server") -> APIRouter:
 
         @router.get(f"/{name}", response_class=HTMLResponse, name=f"page-{name or 'bench'}")
         def show(request: Request) -> HTMLResponse:  # noqa: ARG001
-            content = template.render(pages=PAGES, current=name, title=PAGES[name], bench=server.bench)
+            content = template.render(pages=PAGES, current=name, title=PAGES[name], **shared)
             return HTMLResponse(content, headers={"Cache-Control": "no-cache"})
 
     for name in PAGES:
@@ -40,6 +42,6 @@ def pages(server: "Server") -> APIRouter:
 
     @router.get("/login", response_class=HTMLResponse)
     def login() -> HTMLResponse:
-        return HTMLResponse(templates.get_template("login.html.j2").render(bench=server.bench))
+        return HTMLResponse(templates.get_template("login.html.j2").render(shared))
 
     return router

@@ -17,6 +17,7 @@ from rig.core.errors import (
     RigError,
     TooManyListeners,
 )
+from rig.core.next_steps import SomeSteps, as_steps, in_words, steps_as_json
 
 MEDIA_TYPE: Final = "application/problem+json"
 
@@ -45,7 +46,7 @@ def status_of(error: RigError) -> int:
 
 
 def problem(error: RigError) -> dict[str, Any]:
-    """Return an error as problem details: ``code``, ``next_step`` and ``evidence`` are extensions."""
+    """Return an error as problem details: ``code``, ``next_step``, ``steps`` and ``evidence`` are extensions."""
     values = error.as_dict()
     return {
         "type": f"urn:hbr-rig:error:{error.code}",
@@ -54,11 +55,14 @@ def problem(error: RigError) -> dict[str, Any]:
         "detail": error.what,
         "code": error.code,
         "next_step": error.next_step,
+        "steps": values["steps"],
         "evidence": json.loads(json.dumps(values["evidence"], default=str)),
     }
 
 
-def problem_body(status: int, what: str, next_step: str, **more: Any) -> bytes:
+def problem_body(status: int, what: str, next_step: SomeSteps, **more: Any) -> bytes:
     """Return the JSON text of a problem that is not one of our errors."""
-    values = {"type": "about:blank", "title": "request", "status": status, "detail": what, "next_step": next_step}
+    steps = as_steps(next_step)
+    values = {"type": "about:blank", "title": "request", "status": status, "detail": what}
+    values |= {"next_step": in_words(steps), "steps": steps_as_json(steps)}
     return json.dumps({**values, **more}, ensure_ascii=False).encode()

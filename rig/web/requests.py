@@ -149,6 +149,7 @@ class Question(_Request):
 
     text: str
     choices: tuple[Choice, ...]
+    steps: Annotated[list[str | dict[str, Any]], Field(description="what to do first, as the steps of an error")] = []
 
 
 class JobState(StrEnum):

@@ -23,6 +23,7 @@ from rig.config import RigConfig
 from rig.core.clock import SystemClock, seconds_between
 from rig.core.errors import RigError, UsageError, WebEnded, os_errors_as
 from rig.core.files import write
+from rig.core.next_steps import Do
 from rig.safety.bench_lock import BenchLock
 from rig.safety.saved_state import SERVER_FILE, SERVER_FOLDER, ServerAddress
 from rig.web.bench_side import BenchSide
@@ -188,7 +189,7 @@ class WebProcess:
             if full and seconds_between(self._starts[0], self._clock.now_ns()) < STARTS_WITHIN_S:
                 self.failure = WebEnded(
                     f"The web process has ended {MAX_STARTS} times within a minute. The running job has stopped.",
-                    next_step="Look at the messages above, and start rig serve again.",
+                    next_step=("Look at the messages above.", Do.SERVE_AGAIN()),
                 )
                 self._side.worker.end()
                 return
@@ -209,7 +210,7 @@ class WebProcess:
 
 
 def _check_certificate(listening: Listening) -> None:
-    step = "Check the files of --certfile and --keyfile: PEM, and the key without a passphrase."
+    step = "Check the files of the certificate and of its key: PEM, and the key without a passphrase."
     if listening.certfile is not None:
         with os_errors_as(UsageError, "The certificate cannot be used.", next_step=step):
             context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
@@ -224,7 +225,7 @@ def _url(listening: Listening, connection: socket.socket) -> str:
 
 def _socket(listening: Listening) -> socket.socket:
     host = listening.host.strip("[]")
-    step = "Choose another --port, or another --host."
+    step = "Choose another port, or another host."
     with os_errors_as(UsageError, f"The server cannot listen to {host}, port {listening.port}.", next_step=step):
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         return socket.create_server((host, listening.port), family=family, backlog=128)

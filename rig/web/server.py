@@ -17,6 +17,7 @@ from starlette.requests import HTTPConnection
 from rig.config import RigConfig
 from rig.core.clock import SystemClock
 from rig.core.errors import Forbidden, LoginRequired, RigError, UsageError
+from rig.core.next_steps import Do
 from rig.plans.operator import Choice
 from rig.web.access import LOCAL, Lease, Person, Role, Sessions
 from rig.web.bench_catalog import BenchCatalog
@@ -150,6 +151,7 @@ class Problem(BaseModel):
     detail: str
     code: int | None = None
     next_step: str | None = None
+    steps: list[str | dict[str, Any]] = []
     evidence: dict[str, Any] | None = None
 
 
@@ -177,7 +179,7 @@ def require_operate(person: Person) -> None:
     if person.role is not Role.OPERATE:
         raise Forbidden(
             f"The token {person.name} may only watch.",
-            next_step="Use a token with the role operate: rig serve --new-token NAME --role operate",
+            next_step=("Use a token with the role operate.", Do.NEW_TOKEN(role="operate")),
         )
 
 

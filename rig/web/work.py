@@ -13,9 +13,10 @@ from rig.bench.bench import DEVICES
 from rig.catalog import Catalog
 from rig.core.errors import UsageError
 from rig.core.json_form import plain
+from rig.core.next_steps import NextSteps, as_steps, steps_as_json
 from rig.core.phrases import counted, duration_words
 from rig.events.events import Accepted, Decided, Enrolled, Event, Identified, Started, event_dict
-from rig.events.lines import line
+from rig.events.lines import next_steps, page_line
 from rig.jobs.desk import Desk, Progress, Remark, Result, Step, Steps
 from rig.jobs.doctor import examine
 from rig.jobs.enroll import enroll, enroll_list, plan
@@ -29,7 +30,11 @@ from rig.plans.tray import TrayItem
 from rig.web import requests
 from rig.web.bench_catalog import BenchCatalog
 from rig.web.picture import Outliner, jpeg
-from rig.web.requests import Job, JobState, TrayObject
+from rig.web.requests import (
+    Job,
+    JobState,
+    TrayObject,
+)
 from rig.web.setup import Setup
 from rig.web.worker import BenchWorker
 
@@ -106,7 +111,8 @@ class ServedDesk(Desk):
 
     def choose(self, question: Question) -> Choice:
         queue, job = self._worker.queue, self.job
-        queue.ask(job, requests.Question(text=question.text, choices=tuple(question.choices)))
+        steps = steps_as_json(as_steps(question.steps))
+        queue.ask(job, requests.Question(text=question.text, choices=tuple(question.choices), steps=steps))
         while (choice := queue.answered(job)) is None:
             self._worker.wait(job)
         queue.ask(job, None)
@@ -126,8 +132,8 @@ class ServedDesk(Desk):
 
     def _show(self, step: Step) -> None:
         match step:
-            case Remark(text=text, event=event):
-                self._note(text) if event is None else self.show(event)
+            case Remark(text=text, event=event, steps=steps):
+                self._note(text, as_steps(steps)) if event is None else self.show(event)
             case Progress(words=text):
                 self._note(text)
             case Result():
@@ -135,13 +141,18 @@ class ServedDesk(Desk):
             case _:
                 self.show(step)
 
-    def _note(self, text: str) -> None:
-        self._worker.publish("plan", {"job": self.job.id, "event": "note", "text": text})
+    def _note(self, text: str, steps: NextSteps = ()) -> None:
+        self._publish(text, steps, {"event": "note"})
         self._worker.check(self.job)
+
+    def _publish(self, text: str, steps: NextSteps, values: dict[str, Any]) -> None:
+        if steps:
+            values["steps"] = steps_as_json(steps)
+        self._worker.publish("plan", {"job": self.job.id, "text": text, **values})
 
     def show(self, event: Event) -> None:
         """Show an event; then pause or cancel the job if the operator asked for it."""
-        job, values, text = self.job, event_dict(event), line(event)
+        job, values, text = self.job, event_dict(event), page_line(event)
         if isinstance(event, Started):
             bench = self._worker.bench()
             job.progress = requests.Progress(done=0, total=event.views)
@@ -160,7 +171,7 @@ class ServedDesk(Desk):
                 job.progress = job.progress.model_copy(update={"done": job.progress.done + 1, "seconds_left": left_s})
         if isinstance(event, Enrolled | Identified):
             job.result, job.result_text = event_dict(event), text
-        self._worker.publish("plan", {"job": job.id, "text": text, **values})
+        self._publish(text, next_steps(event), values)
         if isinstance(event, Started | Accepted):
             self._worker.queue.update(job, durable=job.views == 1)
         self._worker.check(job)

@@ -14,6 +14,7 @@ from rig.bench import Bench
 from rig.core.clock import SystemClock, seconds_between
 from rig.core.errors import DeviceMismatch, DeviceNotFound, DeviceSilent, RigError
 from rig.core.json_form import plain
+from rig.core.next_steps import steps_as_json
 from rig.devices.servo import ServoState
 from rig.safety.stop_channel import StopAnswer, StopListener
 from rig.safety.supervisor import stopped
@@ -273,8 +274,9 @@ class BenchWorker:
             values |= {
                 "bench": bench.name,
                 "state": str(safety.state),
-                "fault": safety.fault.model_dump() if safety.fault else None,
+                "fault": safety.fault.as_dict() if safety.fault else None,
                 "doubt": str(safety.doubt) if safety.doubt else None,
+                "steps": steps_as_json(safety.next_step or bench.calibration_steps),
                 "limits_deg": list(config.table.limits_deg),
                 "findings": list(bench.findings),
                 "camera": plain(bench.camera.identity),

@@ -152,7 +152,7 @@ def run_demo(
     if settings.bench not in (None, "sim"):
         raise UsageError(
             f"The demo runs on the simulated bench only, not on {settings.bench!r}.",
-            next_step="Remove --bench. On a real bench, use rig enroll and rig identify.",
+            next_step="Remove --bench. On a real bench, enroll and identify objects.",
         )
     # Build the simulated world.
     system = SystemClock()

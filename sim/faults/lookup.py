@@ -7,6 +7,7 @@ from itertools import product
 from types import MappingProxyType
 
 from rig.core.errors import UsageError
+from rig.core.next_steps import Do
 from sim.faults import camera, environment, imu, servo  # noqa: F401 - each module registers its faults
 from sim.faults.kind import DEVICES, FaultKind, registry
 
@@ -33,5 +34,5 @@ def find_fault(name: str) -> FaultKind:
     near = of_devices or get_close_matches(name, fault_kinds(), n=2, cutoff=0.5)
     raise UsageError(
         f"There is no fault {name!r}.",
-        next_step=f"Did you mean {' or '.join(near)}?" if near else "List the faults: rig faults",
+        next_step=f"Did you mean {' or '.join(near)}?" if near else Do.LIST_FAULTS(),
     )

@@ -10,6 +10,7 @@ from typing import Any, Self
 from rig.config.toml_file import MAX_FILE_BYTES, loads
 from rig.core.errors import UsageError, os_errors_as
 from rig.core.files import read
+from rig.core.next_steps import Do
 from sim.faults.kind import FaultKind
 from sim.faults.lookup import find_fault
 
@@ -91,7 +92,7 @@ class Fault:
         name = table.get("name")
         if not isinstance(name, str):
             raise UsageError(
-                "A fault has no name.", next_step='Add a name, for example name = "jam". List the names: rig faults'
+                "A fault has no name.", next_step=('Add a name, for example name = "jam".', Do.LIST_FAULTS())
             )
         kind = find_fault(name)
         triggers = [trigger for trigger in Trigger if trigger.value in table]
@@ -152,7 +153,7 @@ def _entry(entry: Any, where: str) -> Fault:
             return Fault.from_table(entry)
         raise _unreadable(str(entry))
     except UsageError as error:
-        raise UsageError(where + error.what, next_step=error.next_step, evidence=error.evidence) from error
+        raise UsageError(where + error.what, next_step=error.steps, evidence=error.evidence) from error
 
 
 def _number(name: str, key: str, value: Any) -> float:

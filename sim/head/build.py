@@ -85,7 +85,7 @@ def _require(kind: str) -> None:
         raise ConfigError(
             f"The simulated rig head cannot be built: {lacking.partition(':')[0]}.",
             next_step=f"{lacking.partition(': ')[2][:1].upper()}{lacking.partition(': ')[2][1:]}; or leave the head "
-            "out: --set imu.connection=i2c.",
+            "out: imu.connection=i2c.",
         )
 
 

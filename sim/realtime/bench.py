@@ -12,6 +12,7 @@ from rig.bench.computer import Computer
 from rig.bench.hardware import HardwareBench
 from rig.config import RigConfig, Section
 from rig.core.errors import ConfigError, DeviceNotFound
+from rig.core.next_steps import Do
 from rig.devices.dynamixel.port import SerialConnection
 from rig.devices.opencv_capture import Capture
 from rig.safety.bench_lock import holder
@@ -95,7 +96,7 @@ class RunningSimBench(HardwareBench):
         if (config.servo.port, config.state_dir) != (str(folder / SERVO), folder / STATE):
             raise ConfigError(
                 f"This configuration does not belong to the simulated bench in {folder}.",
-                next_step=f"Run the command in that folder, or with --config {folder / CONFIG}.",
+                next_step=("Run the command in that folder, or", Do.RUN_AGAIN(config=str(folder / CONFIG))),
                 evidence={"servo.port": config.servo.port, "state_dir": config.state_dir},
             )
         computer = SimBenchComputer(folder, config)

@@ -5,6 +5,7 @@ from dataclasses import replace
 from typing import Any, Final
 
 from rig.core.errors import RigError, UsageError
+from rig.core.next_steps import Do
 from rig.core.phrases import angle_words, percent
 from sim.bench import ShelfOperator
 from sim.calibration_board import calibration_targets
@@ -129,13 +130,13 @@ class Commands:
         try:
             seconds = self._devices.servo.rotate_by_hand(angle_deg)
         except ValueError as held:
-            raise UsageError("The servo holds the table.", next_step="Switch the torque off first: rig stop") from held
+            raise UsageError("The servo holds the table.", next_step=Do.STOP()) from held
         return f"The table is rotated by {angle_words(angle_deg, None)} by hand, in {seconds:.1f} s."
 
     def _head(self, part: str, action: str) -> str:
         head = self._devices.head
         if head is None:
-            step = "Start it with one: rig sim-bench --set imu.connection=head"
+            step = Do.SIM_BENCH(set="imu.connection=head")
             raise UsageError("This bench has no rig head.", next_step=step)
         match part, action:
             case "estop", "press" | "release":
@@ -151,8 +152,10 @@ class Commands:
         try:
             fault = Fault.parse(command)
         except UsageError as error:
-            step = f"{error.next_step} For a list of all commands: rig sim-bench help"
-            raise UsageError(f"There is no command or fault {command!r}.", next_step=step) from error
+            raise UsageError(
+                f"There is no command or fault {command!r}.",
+                next_step=(*error.steps, "For a list of all commands: rig sim-bench help"),
+            ) from error
         _arguments(command, given)
         name = fault.kind.name
         if name in _OF_ONE_PROGRAM:

@@ -14,6 +14,7 @@ from rig.config.values import default_path, parsed, read_values
 from rig.config.wording import blank_file
 from rig.core.clock import SystemClock
 from rig.core.errors import BenchBusy, UsageError, os_errors_as
+from rig.core.next_steps import Do
 from rig.safety.bench_lock import BenchLock, holder
 from sim.bench import SimOptions
 from sim.realtime.wire import COMPUTER, CONFIG, DEFAULT_FOLDER, HEAD, SERVO, SOCKET, STATE
@@ -39,7 +40,7 @@ def reserve(folder: Path | None, ends: ExitStack) -> Path:
         while holder(folder) is not None:
             folder = next(names)
     folder = folder.absolute()
-    step = "Choose another folder: rig sim-bench --folder FOLDER"
+    step = Do.SIM_BENCH(folder="FOLDER")
     with os_errors_as(UsageError, f"The folder {folder} cannot be written.", next_step=step):
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
         there = {path.name for path in folder.iterdir()} - {LOCK}
@@ -51,8 +52,7 @@ def reserve(folder: Path | None, ends: ExitStack) -> Path:
         who = holder(folder)
         raise BenchBusy(
             f"The simulated bench in {folder} is running already{f', in process {who.pid}' if who else ''}.",
-            next_step=f"Use it, or end it with Ctrl+C or `rig sim-bench --folder {folder} quit`. A second bench needs "
-            "its own folder.",
+            next_step=("Use it, or", Do.END_SIM_BENCH(folder=str(folder)), "A second bench needs its own folder."),
             evidence=busy.evidence,
         ) from busy
     _clean(folder)

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from rig.core.errors import DeviceNotFound, UsageError
+from rig.core.next_steps import Do, steps_from_json
 
 DEFAULT_FOLDER: Final = Path("sim-bench")
 SOCKET, SERVO, HEAD, COMPUTER, CONFIG, STATE = "socket", "servo", "head", "computer", "rig.toml", "state"
@@ -77,7 +78,7 @@ def send_command(folder: Path, *words: str) -> dict[str, Any]:
     finally:
         wire.close()
     if failed := answer.get("failed"):
-        raise UsageError(failed["what"], next_step=failed["next_step"], evidence=failed["evidence"])
+        raise UsageError(failed["what"], next_step=steps_from_json(failed["steps"]), evidence=failed["evidence"])
     return answer
 
 
@@ -85,7 +86,7 @@ def not_running(folder: Path) -> DeviceNotFound:
     """Return the error that no simulated bench runs in ``folder``."""
     return DeviceNotFound(
         f"No simulated bench is running in {folder}.",
-        next_step=f"Start it in another terminal: rig sim-bench --folder {folder}",
+        next_step=Do.SIM_BENCH(folder=str(folder)),
     )
 
 

@@ -132,7 +132,7 @@ def test_page_of_a_search_says_what_its_numbers_mean(page, serve_process):
         "#shares:has-text('Shares among the enrolled objects. The object on the table is none of them.')"
     )
     # An empty table is no object, and no unknown one.
-    error = {"what": "No object is on the table.", "next_step": "Put the object on the table.", "code": 606}
+    error = {"what": "No object is on the table.", "steps": ["Put the object on the table."], "code": 606}
     script = "async (error) => (await import('/static/identify.js')).noAnswer(error)"
     page.evaluate(script, error)
     assert page.text_content("#answer") == "No object on the table"

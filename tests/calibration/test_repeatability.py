@@ -10,6 +10,7 @@ from calibration.procedure import Evaluation
 from calibration.repeatability import AZIMUTHS, Placement, Repeatability, evaluate, needed_placements
 from rig.calibrations import CalibrationResult, RejectionCode, apply_results
 from rig.core.errors import UsageError
+from rig.core.next_steps import Do
 from rig.events.events import Accepted
 from tests.calibration.rejected import codes
 
@@ -56,7 +57,7 @@ def test_too_few_placements_are_rejected(simulated):
     assert not result.settings
     with pytest.raises(UsageError, match="too few") as caught:
         next(Repeatability("bowl", placements=2, error_rate=0.01).live(simulated().bench))
-    assert "--placements 5" in caught.value.next_step
+    assert Do.RUN_AGAIN(placements=5) in caught.value.steps
 
 
 def test_drifting_light_and_another_object_are_rejected():

@@ -22,6 +22,7 @@ from rig.catalog.verify import verify
 from rig.config.catalog_place import CatalogPlace
 from rig.core.clock import SystemClock
 from rig.core.errors import CatalogError
+from rig.core.next_steps import Do
 from tests.rig.catalog.catalog_samples import PROVENANCE, described, finished, image, new_result, plan
 from tests.servers.postgres import place_in, server
 
@@ -53,7 +54,7 @@ def full(action: Callable[[], object]) -> bool:
     try:
         action()
     except CatalogError as error:
-        if "is full" in error.what and "earlier ones are safe" in error.what and "Free some space" in error.next_step:
+        if "is full" in error.what and "earlier ones are safe" in error.what and Do.FREE_DISK() in error.steps:
             return True
         raise
     return False

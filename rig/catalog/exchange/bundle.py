@@ -22,6 +22,7 @@ from rig.catalog.exchange.batch import ExportedObject, ImageSource, ImportBatch,
 from rig.catalog.places import files_within
 from rig.core.errors import CatalogDamaged, ExportFailed, ImportRejected, RigError
 from rig.core.files import no_follow, open_new, sync_file, sync_folder
+from rig.core.next_steps import Do
 from rig.views import image_files as images
 
 FORMAT: Final = "rigcat"
@@ -94,7 +95,7 @@ def _check_readable(path: Path, part: Path) -> None:
     except ImportRejected as error:
         raise ExportFailed(
             f"{path} was not written, because no import would accept it: {error.what}",
-            next_step="Check the catalog with `rig catalog verify`, or export fewer objects into each bundle.",
+            next_step=(Do.VERIFY_CATALOG(), "Or export fewer objects into each bundle."),
         ) from error
 
 
@@ -128,7 +129,7 @@ def new_file(path: Path) -> Iterator[IO[bytes]]:
 
 def read_stored(path: Path, sha256: str | None) -> bytes:
     """Return the bytes of an image of the catalog. `ExportFailed` if it is not the stored one."""
-    fix = "Check the catalog: rig catalog verify --repair"
+    fix = Do.REPAIR_CATALOG()
     try:
         content = images.read_file(path)
     except OSError as error:

@@ -25,6 +25,7 @@ from rig.catalog.exchange.new_folder import new_folder
 from rig.catalog.exchange.photographs import Photograph, assemble
 from rig.catalog.records import EnrollmentStatus, this_software
 from rig.core.errors import ExportFailed, ImportRejected, UsageError
+from rig.core.next_steps import Do
 
 DEFAULT_PATTERN: Final = "{object}__{angle}"
 NAMES: Final = "objects.csv"
@@ -84,7 +85,7 @@ def read_folder(
     if not photographs:
         raise ImportRejected(
             f"No photograph in {folder} matches the pattern {pattern}.png.",
-            next_step="Give the pattern of their names, e.g. --pattern '{object}/{angle}'",
+            next_step=("Give the pattern of their names.", Do.RUN_AGAIN(pattern="{object}/{angle}")),
             evidence={"rejected": [f"{file.path} {file.reason}" for file in rejected[:5]]},
         )
     in_order = [photograph for _, photograph in sorted(photographs, key=lambda pair: _natural(pair[0]))]

@@ -10,6 +10,7 @@ from rig.catalog.catalog import Catalog
 from rig.catalog.exchange.batch import ImportBatch, Object
 from rig.catalog.schema import objects
 from rig.core.errors import ObjectExists
+from rig.core.next_steps import Do
 
 
 class Conflict(StrEnum):
@@ -63,7 +64,12 @@ def make_plan(batch: ImportBatch, conflict: Conflict, known: Set[str]) -> Plan:
         raise ObjectExists(
             f"{len(both)} of {len(batch.objects)} objects {'is' if len(both) == 1 else 'are'} in the catalog already; "
             "nothing was imported.",
-            next_step="Skip them (--on-conflict skip), or import them as new enrollments (--on-conflict replace).",
+            next_step=(
+                "To skip them,",
+                Do.RUN_AGAIN(on_conflict="skip"),
+                "To import them as new enrollments,",
+                Do.RUN_AGAIN(on_conflict="replace"),
+            ),
             evidence={"objects": list(both[:20])},
         )
     skipped, replaced = (both, ()) if conflict == Conflict.SKIP else ((), both)

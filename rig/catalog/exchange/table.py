@@ -29,6 +29,7 @@ from rig.catalog.exchange.new_folder import new_folder
 from rig.catalog.exchange.photographs import Photograph, assemble
 from rig.catalog.records import EnrollmentStatus, this_software
 from rig.core.errors import ExportFailed, ImportRejected
+from rig.core.next_steps import Do
 from rig.views.description import PAPER_DESCRIPTOR
 from rig.views.image_files import IMAGE_FOLDER
 
@@ -159,7 +160,7 @@ def pyarrow() -> tuple[Any, Any]:
         import pyarrow.parquet as pq
     except ImportError as error:
         raise ExportFailed(
-            "Parquet needs pyarrow, which is not installed.", next_step="Install it: pip install 'hbr-rig[parquet]'"
+            "Parquet needs pyarrow, which is not installed.", next_step=Do.INSTALL_EXTRA(extra="parquet")
         ) from error
     return pa, pq
 

@@ -25,6 +25,7 @@ from rig.catalog.jobs import JobProgress, portions, processes
 from rig.catalog.records import EnrollmentStatus, Region, this_software
 from rig.config import ViewConfig
 from rig.core.errors import ExportFailed, UsageError
+from rig.core.next_steps import Do
 from rig.core.processes import Jobs, map_in_processes
 from rig.views import image_files as images
 from rig.views.description import BENCH_DESCRIPTOR, ViewDescriber, within
@@ -115,9 +116,7 @@ def write_training(
     complete = [(_complete(item), files) for item, files in objects]
     complete = [(item, files) for item, files in complete if item.enrollments]
     if not complete:
-        raise ExportFailed(
-            "There are no complete enrollments to export.", next_step="Enroll an object: rig enroll NAME"
-        )
+        raise ExportFailed("There are no complete enrollments to export.", next_step=Do.ENROLL())
     kept = [item for item, _ in complete]
     items = [one for item, files in complete for one in _items(item, files)]
     part_of = _divided(kept, split, fractions, seed)

@@ -11,6 +11,7 @@ from urllib.request import Request, urlopen
 from rig.bench import Bench
 from rig.core.errors import BenchBusy, RigError
 from rig.core.json_form import plain
+from rig.core.next_steps import Do, in_words, steps_as_json, steps_from_json
 from rig.core.phrases import angle_words, budget_words, filled
 from rig.devices.camera import Camera, CameraLocks
 from rig.devices.imu import Imu
@@ -26,7 +27,7 @@ def report_of(bench: Bench) -> dict[str, Any]:
     report: dict[str, Any] = {
         "bench": bench.name,
         "state": str(safety.state),
-        "fault": safety.fault.model_dump() if safety.fault else None,
+        "fault": safety.fault.as_dict() if safety.fault else None,
         "doubt": str(safety.doubt) if safety.doubt else None,
         "table_deg": None if safety.doubt else safety.angle_reference.to_table(state.position_deg),
         "limits_deg": list(bench.config.table.limits_deg),
@@ -35,7 +36,8 @@ def report_of(bench: Bench) -> dict[str, Any]:
         **({"head": bench.head.report()} if bench.head else {}),
         "camera": _read(lambda: _camera_values(bench.camera)),
     }
-    return {**report, "findings": list(bench.findings)}  # opening the camera adds some
+    steps = steps_as_json(safety.next_step or bench.calibration_steps)
+    return {**report, "findings": list(bench.findings), "steps": steps}  # opening the camera adds some findings
 
 
 def report_without_servo(context: DoctorContext, missing: RigError) -> dict[str, Any]:
@@ -79,7 +81,7 @@ def report_of_server(server: ServerAddress) -> dict[str, Any]:
     except (OSError, ValueError) as error:
         raise BenchBusy(
             f"The server at {server.url} uses the bench and does not answer.",
-            next_step=f"If it hangs: `rig stop`, or end process {server.pid}.",
+            next_step=("If it hangs,", Do.STOP(), f"Or end process {server.pid}."),
             evidence={"reason": str(error)},
         ) from error
 
@@ -121,6 +123,8 @@ def report_lines(report: Mapping[str, Any]) -> Iterator[str]:
             shown = [f"error {error['code']}: {error['what']} {error['next_step']}"] if error else lines(values)
             yield from (f"{'' if n else device:8s} {line}" for n, line in enumerate(shown))
     yield from (f"note     {finding}" for finding in report.get("findings", ()))
+    if not report.get("fault") and not report.get("doubt") and (steps := report.get("steps")):
+        yield f"         {in_words(steps_from_json(steps))}"
 
 
 def _state_words(report: Mapping[str, Any]) -> str:

@@ -11,6 +11,7 @@ from rig.cli.ui.settings import Settings
 from rig.core.clock import SystemClock
 from rig.core.errors import ConfigError, UsageError
 from rig.core.masking import masked
+from rig.core.next_steps import Do
 from rig.core.phrases import counted
 
 if TYPE_CHECKING:
@@ -132,7 +133,7 @@ def init(settings: Settings) -> None:
     if target.exists():
         raise ConfigError(
             f"{target} exists already.",
-            next_step="Change single values with `rig config set KEY VALUE`, or write another file with --config FILE.",
+            next_step=(Do.SET_KEY(), "Or write another file with --config FILE."),
         )
     save(target, blank_file(RigConfig))
     settings.say(f"Wrote {target}: all keys with their defaults, as comments. Next: rig setup", {"path": target})
@@ -164,7 +165,8 @@ def set_(
     old = read_text(target) if target.exists() else ""
     if "." not in key and key not in {info.name for info in key_info(RigConfig)} - {"bench"}:
         raise UsageError(
-            f"{key!r} has no section.", next_step="Write SECTION.KEY, for example: rig config set servo.id 2."
+            f"{key!r} has no section.",
+            next_step=("Write SECTION.KEY. For example,", Do.SET_KEY(key="servo.id", value=2)),
         )
     try:
         load_config(target if target.exists() else None, [*settings.overrides, f"{key}={value}"])
@@ -172,7 +174,7 @@ def set_(
         mistakes = [mistake.removeprefix("--set: ") for mistake in error.evidence.get("mistakes", ())]
         raise ConfigError(
             f"{target} is unchanged: it would have mistakes.",
-            next_step="Give another value. For the keys and their values: rig config show",
+            next_step=("Give another value. For the keys and their values,", Do.SHOW_CONFIGURATION()),
             evidence={"mistakes": mistakes} if mistakes else error.evidence,
         ) from error
     new = with_values(old, {tuple(key.split(".")): parsed(value)})
@@ -282,5 +284,5 @@ def _unknown(wanted: str, names: list[str]) -> ConfigError:
     near = get_close_matches(wanted, names, n=1)
     return ConfigError(
         f"There is no key {wanted!r}.",
-        next_step=f"Did you mean {near[0]}?" if near else "Run `rig config show` for a list of all keys.",
+        next_step=f"Did you mean {near[0]}?" if near else Do.SHOW_CONFIGURATION(),
     )

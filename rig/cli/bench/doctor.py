@@ -11,6 +11,7 @@ from rig.cli.bench.snapshot import check_new
 from rig.cli.ui.command import command
 from rig.cli.ui.settings import Settings
 from rig.core.errors import ConfigError, RigError, UsageError
+from rig.core.next_steps import Do
 
 if TYPE_CHECKING:
     from rig.doctor.finding import Finding
@@ -82,7 +83,7 @@ def print_findings(settings: Settings, findings: "list[Finding] | None" = None) 
         mistakes = error.evidence.get("mistakes") or [f"{key}: {value}" for key, value in error.evidence.items()]
         for mistake in mistakes or [error.what]:
             found = {"what": error.what.rstrip("."), "mistake": mistake}
-            add(bad("config", FindingCode.CONFIG_MISTAKE, "rig config check", error.exit_code, **found))
+            add(bad("config", FindingCode.CONFIG_MISTAKE, Do.CHECK_CONFIGURATION(), error.exit_code, **found))
         config = None
     try:
         with doctor_context(settings, default=config is None) as context:

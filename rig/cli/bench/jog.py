@@ -13,6 +13,7 @@ from rig.cli.ui.command import command
 from rig.cli.ui.keys import read_keys
 from rig.cli.ui.settings import Settings
 from rig.core.errors import UsageError
+from rig.core.next_steps import Do
 
 if TYPE_CHECKING:
     from rig.events.events import Event
@@ -52,7 +53,7 @@ def jog(
     from rig.jobs.table import jog as jog_job
 
     if not sys.stdin.isatty():
-        raise UsageError("rig jog needs a terminal.", next_step="Use `rig goto ANGLE` in scripts.")
+        raise UsageError("rig jog needs a terminal.", next_step=("In scripts,", Do.GOTO()))
 
     def show(event: "Event") -> None:
         termios.tcflush(sys.stdin, termios.TCIFLUSH)  # a key held down must not rotate the table after its end

@@ -11,6 +11,7 @@ from rig.cli.ui.command import command
 from rig.cli.ui.settings import Settings
 from rig.core.clock import SystemClock
 from rig.core.errors import UsageError
+from rig.core.next_steps import Do
 
 if TYPE_CHECKING:
     from rig.web.access import Tokens
@@ -61,7 +62,7 @@ def serve(
     except ImportError as error:
         raise UsageError(
             f"rig serve needs packages that are not installed ({error.name}).",
-            next_step="Install them: pip install 'hbr-rig[web]'",
+            next_step=Do.INSTALL_EXTRA(extra="web"),
         ) from error
     from rig.safety.saved_state import SERVER_FOLDER
     from rig.web.access import Role, Tokens
@@ -123,5 +124,5 @@ def _require_tokens(tokens: "Tokens", host: str) -> None:
     if not tokens.stored():
         raise UsageError(
             f"Everybody at {host} needs a token, and there is none.",
-            next_step="Make one first: rig serve --new-token NAME --role operate",
+            next_step=Do.NEW_TOKEN(role="operate"),
         )

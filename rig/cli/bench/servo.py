@@ -10,6 +10,7 @@ from rig.cli.ui.exit_codes import EXIT_DEVICE
 from rig.cli.ui.options import YesOption
 from rig.cli.ui.prompts import ask_yes_no
 from rig.cli.ui.settings import Settings
+from rig.core.next_steps import Do
 
 if TYPE_CHECKING:
     from rig.doctor.context import DoctorContext
@@ -89,7 +90,7 @@ def settings_(
     elif written:
         print("Written and verified.")
     elif differences:
-        print(f"To write them: {context.rig('servo settings --write')}")
+        print(f"To write them: {context.step(Do.SERVO_SETTINGS()).command}")
     if differences and not written:
         raise typer.Exit(EXIT_DEVICE)
 
@@ -146,7 +147,7 @@ def _change(settings: Settings, what: str, new: int, yes: bool) -> None:
     if followed:
         print(f"{followed}: servo.{what} = {new}")
     elif getattr(context.config.servo, what) != new:
-        print(f"To use it: {context.set(f'servo.{what}', new)}")
+        print(f"To use it: {context.step(Do.SET_KEY(key=f'servo.{what}', value=new)).command}")
 
 
 def _follow(settings: Settings, context: "DoctorContext", what: str, old: int, new: int) -> str:

@@ -14,6 +14,7 @@ from rig.cli.ui import prompts
 from rig.cli.ui.command import command
 from rig.cli.ui.settings import Settings
 from rig.core.errors import SeveralServos
+from rig.core.next_steps import Do
 
 if TYPE_CHECKING:
     from rig.bench.computer import DeviceFile
@@ -195,7 +196,7 @@ class Dialogue:
             print("Some permanent settings of the servo (EEPROM) differ from the required ones:", file=self.out)
             print("\n".join(f"  {difference}" for difference in differences), file=self.out)
             if self.ask_nothing:
-                print(f"  not changed; to write them: {context.rig('servo settings --write')}", file=self.out)
+                print(f"  not changed; to write them: {context.step(Do.SERVO_SETTINGS()).command}", file=self.out)
             elif prompts.ask_yes_no("Write them now, with the servo's torque off?", default=True):
                 write(servo.bus, servo.found.bus_id, servo.table, differences)
                 print("Written and verified.", file=self.out)
@@ -247,5 +248,6 @@ def _in_force(config: Any, key: "Key") -> Any:
 
 def _next(context: "DoctorContext", code: int) -> str:
     if code:
-        return f"\nNext: fix the findings marked ✗, then run {context.rig('doctor')}."
-    return f"\nNext: rotate the table with {context.rig('goto 90')}, then enroll with {context.rig('enroll NAME')}."
+        return f"\nNext: fix the findings marked ✗, then run {context.step(Do.DOCTOR()).command}."
+    rotate, enroll = (context.step(step).command for step in (Do.GOTO(angle=90), Do.ENROLL()))
+    return f"\nNext: rotate the table with {rotate}, then enroll with {enroll}."

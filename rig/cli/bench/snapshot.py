@@ -11,6 +11,7 @@ from rig.cli.bench.findings import doctor_context
 from rig.cli.ui.command import command
 from rig.cli.ui.settings import Settings
 from rig.core.errors import UsageError, os_errors_as
+from rig.core.next_steps import Do
 
 if TYPE_CHECKING:
     from rig.devices.camera import CameraIdentity, CameraLocks, Frame
@@ -36,7 +37,9 @@ def snapshot(
 
     check_new(file, ".png")
     if refocus and settings.load().camera.focus is not None:
-        raise UsageError("camera.focus is a number.", next_step="Release it first: rig config set camera.focus none.")
+        raise UsageError(
+            "camera.focus is a number.", next_step=("Release it first.", Do.SET_KEY(key="camera.focus", value="none"))
+        )
     frame, identity, locks = take(settings, refocus=refocus)
     write_new(file, encode(frame.image_bgr))
     size = f"{identity.width}x{identity.height}"

@@ -13,6 +13,7 @@ from rig.cli.ui.options import ClusterOption, jobs_of
 from rig.cli.ui.settings import Settings
 from rig.core.clock import SystemClock, seconds_between
 from rig.core.errors import CatalogError
+from rig.core.next_steps import Do
 from rig.core.phrases import counted, percent, percent_words, sentence
 
 if TYPE_CHECKING:
@@ -61,7 +62,7 @@ def calibrate(
         with Progress("Preparing objects for searches") as progress:
             views = prepared_views(catalog, BENCH_DESCRIPTOR, progress)
         if not len(views):
-            raise CatalogError("The catalog is empty.", next_step="Enroll at least one object: rig enroll NAME.")
+            raise CatalogError("The catalog is empty.", next_step=Do.ENROLL())
         path = catalog.path / FILE
     begun_ns = clock.now_ns()
     print(f"Searching for {len(views.object_names)} objects among each other ...", file=sys.stderr)

@@ -17,6 +17,7 @@ from rig.cli.ui.options import ClusterOption, DryImportOption, JobsOption, descr
 from rig.cli.ui.settings import Settings
 from rig.core.clock import SystemClock, seconds_between
 from rig.core.errors import ExportFailed, ImportRejected, UsageError
+from rig.core.next_steps import Do
 from rig.core.phrases import counted
 
 if TYPE_CHECKING:
@@ -148,7 +149,7 @@ def _read_batch(source: Path, pattern: str | None, table_angles: bool) -> "Impor
     now = SystemClock().utc()
     if source.is_dir():
         if (source / "catalog.sqlite").exists():
-            raise UsageError(f"{source} is a catalog.", next_step=f"Import it: rig catalog merge {source}")
+            raise UsageError(f"{source} is a catalog.", next_step=Do.MERGE(source=str(source)))
         if (source / MANIFEST).exists():
             return read_unpacked(source)
         return read_folder(source, pattern=pattern or DEFAULT_PATTERN, table_angles=table_angles, now=now)
@@ -252,7 +253,7 @@ def export(
             labelled = [item.name for item in catalog.objects() if item.label == label]
             wanted = [name for name in labelled if not wanted or name in wanted]
         if label is not None and not wanted:
-            raise ExportFailed(f"No object has the label {label!r}.", next_step="List the objects: rig catalog list")
+            raise ExportFailed(f"No object has the label {label!r}.", next_step=Do.LIST_OBJECTS())
         objects = read_objects(catalog, wanted)
         if form in (Format.COCO, Format.YOLO):
             _export_training(settings, target, list(objects), form, split, fractions, jobs)

@@ -9,6 +9,7 @@ from rig.cli.ui.command import command
 from rig.cli.ui.settings import Settings
 from rig.core.errors import UsageError, os_errors_as
 from rig.core.files import write
+from rig.core.next_steps import Do
 
 if TYPE_CHECKING:
     from rig.bench import Bench
@@ -53,7 +54,7 @@ def _show(settings: Settings, bench: "Bench", path: Path) -> None:
 
     status = empty_table_status(bench)
     if status.table is None:
-        raise UsageError(f"There is no image to show: {status.text}.", next_step="Take the image with rig empty-table.")
+        raise UsageError(f"There is no image to show: {status.text}.", next_step=Do.EMPTY_TABLE())
     with os_errors_as(UsageError, f"{path} cannot be written.", next_step="Choose another file with --show."):
         write(path, images.encode(status.table.image_bgr))
     settings.say(f"{path}: {status.text}", {"file": str(path), **status.as_json()})

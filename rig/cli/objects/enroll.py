@@ -12,6 +12,7 @@ from rig.cli.ui.command import command
 from rig.cli.ui.complete import object_names
 from rig.cli.ui.settings import Settings
 from rig.core.errors import UsageError
+from rig.core.next_steps import Do
 from rig.core.phrases import counted
 
 if TYPE_CHECKING:
@@ -245,8 +246,11 @@ def _check(name: str | None, tray: Path | None, *, resume: bool, replace: bool, 
     if tray is not None and given:
         raise UsageError(
             f"{', '.join(given)} cannot be used with --list.",
-            next_step="Write labels and notes into the columns of the list. Interrupted enrollments of a list are "
-            "resumed without an option. To replace one object: rig enroll NAME --replace",
+            next_step=(
+                "Write labels and notes into the columns of the list. Interrupted enrollments of a list are resumed "
+                "without an option. To replace one object,",
+                Do.ENROLL_AGAIN(),
+            ),
         )
 
 

@@ -18,6 +18,7 @@ from rig.cli.ui.present import Progress as ProgressBar
 from rig.cli.ui.settings import Settings
 from rig.core.clock import Clock, SystemClock
 from rig.core.errors import RigError
+from rig.core.next_steps import in_words
 from rig.events.events import Event, event_dict
 from rig.events.lines import line
 from rig.jobs.desk import Desk, Progress, Remark, Result, Steps
@@ -100,8 +101,9 @@ class CommandDesk(Desk):
     def note(self, remark: Remark) -> None:
         """Print a remark of a job on stderr."""
         self._before()
+        text = " ".join(filter(None, (remark.text, in_words(remark.steps))))
         picture = "" if self._settings.json else remark.picture
-        print(f"{'Note: ' if remark.is_warning else ''}{remark.text}{picture}", file=sys.stderr, flush=True)
+        print(f"{'Note: ' if remark.is_warning else ''}{text}{picture}", file=sys.stderr, flush=True)
 
     def run(self, steps: Steps[object], show: Callable[[Event], None] | None = None) -> object:
         """Run a job to its end, and return what it returns; by default its events are printed line by line."""

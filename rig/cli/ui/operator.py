@@ -7,6 +7,7 @@ from typing import Final, TextIO
 from rig.cli.ui import prompts
 from rig.cli.ui.terminal import unguarded
 from rig.core.errors import UsageError
+from rig.core.next_steps import in_words
 from rig.plans.operator import Choice, Question
 
 BELL: Final = "\a"
@@ -52,7 +53,8 @@ class TerminalOperator:
         while True:
             if self._questions.isatty():
                 unguarded(self._questions).write(BELL)
-            print(f"{question.text}{question.picture}\n  {hints} ", end="", file=self._questions, flush=True)
+            text = "\n".join(filter(None, (question.text, in_words(question.steps))))
+            print(f"{text}{question.picture}\n  {hints} ", end="", file=self._questions, flush=True)
             try:
                 answer = self._answers.readline()
             except (OSError, UnicodeDecodeError) as error:

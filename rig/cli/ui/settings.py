@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from rig.core.clock import SystemClock
 from rig.core.errors import CatalogError, RigError
 from rig.core.masking import masked
+from rig.core.next_steps import Do, in_words
 
 if TYPE_CHECKING:
     from collections.abc import Collection
@@ -91,6 +92,8 @@ class Settings:
         bench = open_bench(self.bench_name, self.load(), seed=self.seed, devices=devices)
         for finding in (*bench.safety.findings, *(bench.calibration_findings if tell else ())):
             print(f"Note: {finding}.", file=sys.stderr)
+        if tell and bench.calibration_steps:
+            print(in_words(bench.calibration_steps), file=sys.stderr)
         return bench
 
     def open_catalog(self, *, create: bool = False, read_only: bool = False) -> "Catalog":
@@ -107,10 +110,10 @@ class Settings:
         from rig.bench import bench_names
 
         others = [name for name in bench_names() if self.load().catalog_place(name).database_file.exists()]
-        enroll = f"Enroll an object: rig enroll NAME --bench {self.bench_name}"
+        enroll = Do.ENROLL(bench=self.bench_name)
         return CatalogError(
             f"The bench {self.bench_name} has no catalog yet.",
-            next_step=f"Add --bench {others[0]} to use the catalog of that bench. {enroll}" if others else enroll,
+            next_step=(f"Add --bench {others[0]} to use the catalog of that bench, or", enroll) if others else enroll,
             evidence={"folder": str(path), "benches with a catalog": others},
         )
 

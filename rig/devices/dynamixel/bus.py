@@ -13,6 +13,7 @@ from dynamixel_sdk import COMM_RX_CORRUPT, COMM_SUCCESS
 
 from rig.core.clock import seconds_between
 from rig.core.errors import DeviceSilent, RequestRejected, UsageError
+from rig.core.next_steps import Do, SomeSteps
 from rig.devices.dynamixel.packets import PING, READ, REBOOT, WRITE, Packets, Packets1, Packets2, Reply, reason
 from rig.devices.dynamixel.port import BusBabble, ClockedPort
 from rig.devices.dynamixel.registers import Register
@@ -226,13 +227,16 @@ class DynamixelBus:
                     result, replies = COMM_RX_CORRUPT, {}  # the instruction was damaged on its way: send it again
                 self._count(result)
             missing = [device_id for device_id in device_ids if device_id not in replies]
-            step = (
-                "The replies are corrupted: check for two servos with the same id, another program on the bus, or a "
-                "bad cable. `rig find` lists the servos."
+            advice: SomeSteps = (
+                (
+                    "The replies are corrupted: check for two servos with the same id, another program on the bus, or "
+                    "a bad cable.",
+                    Do.FIND(),
+                )
                 if result == COMM_RX_CORRUPT
                 else "Check the servo's cable and its supply (its LED blinks at power-up), then start again."
             )
-            raise self._silent(what, missing or device_ids, reason(result), step)
+            raise self._silent(what, missing or device_ids, reason(result), advice)
 
     def _ask(
         self, target: int, instruction: int, parameters: bytes, size: int, answering: Sequence[int] | None = None
@@ -293,7 +297,7 @@ class DynamixelBus:
         else:
             self.statistics.timeouts += 1
 
-    def _silent(self, what: str, device_ids: Sequence[int], reason: str, next_step: str) -> DeviceSilent:
+    def _silent(self, what: str, device_ids: Sequence[int], reason: str, next_step: SomeSteps) -> DeviceSilent:
         ids = ", ".join(map(str, device_ids))
         return DeviceSilent(
             f"Servo {ids} does not answer ({what}).",
@@ -305,7 +309,7 @@ class DynamixelBus:
         reason = self._packets.rejections.get(reply.error, f"error {reply.error}")
         return RequestRejected(
             f"Servo {reply.bus_id} rejected the {what}: {reason}.",
-            next_step="Check the servo with `rig status`: a tripped watchdog or a hardware error prevents motion.",
+            next_step=(Do.STATUS(), "A tripped watchdog or a hardware error prevents motion."),
             evidence={"status_error": reply.error, "alert": bool(reply.alert)},
         )
 

@@ -15,6 +15,7 @@ from serial.serialutil import Timeout
 
 from rig.core.clock import Clock
 from rig.core.errors import DeviceNotFound
+from rig.core.next_steps import Do, SomeSteps
 
 READ_SLICE_S = 0.005
 """Longest time that one read blocks. It limits the delay of a timeout, and keeps the CPU idle."""
@@ -118,6 +119,7 @@ class _PolledSerial(serial.Serial):  # type: ignore[misc]
 
 
 def _not_opened(path: str, baud: int, device: str, error: Exception, *, guarded: bool) -> DeviceNotFound:
+    step: SomeSteps
     reason = getattr(error, "errno", None)
     if reason == errno.EACCES:
         step = "Join the group dialout (`sudo usermod -aG dialout $USER`), then log in again."
@@ -126,7 +128,7 @@ def _not_opened(path: str, baud: int, device: str, error: Exception, *, guarded:
     elif reason in _BUSY:
         step = "Close the other program that uses this port (for example Dynamixel Wizard)."
     else:
-        step = f"Check the USB cable and {device}.port; `rig find` lists the ports."
+        step = (f"Check the USB cable and {device}.port.", Do.FIND())
     return DeviceNotFound(
         f"Cannot open the {device}'s port {path}.", next_step=step, evidence={"reason": str(error), "baud": baud}
     )

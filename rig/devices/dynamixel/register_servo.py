@@ -5,6 +5,7 @@ from dataclasses import asdict
 
 from rig.core.clock import Clock
 from rig.core.errors import DeviceFault, DeviceMismatch, DeviceNotFound, DeviceSilent, TorqueStaysOn
+from rig.core.next_steps import Do
 from rig.devices.dynamixel import settings
 from rig.devices.dynamixel.bus import DynamixelBus
 from rig.devices.dynamixel.guardian import Guardian
@@ -84,7 +85,11 @@ class RegisterServo(ABC):
             require_driven(number, bus_id)
             raise DeviceMismatch(
                 f"The servo at id {bus_id} is not the configured model.",
-                next_step=f'Set servo.model = "{found}" if this is the right servo; else connect the right one.',
+                next_step=(
+                    "If this is the right servo,",
+                    Do.SET_KEY(key="servo.model", value=found),
+                    "Otherwise connect the right one.",
+                ),
                 evidence={"expected": model, "got": found, "model_number": number},
             )
         try:
@@ -118,8 +123,7 @@ class RegisterServo(ABC):
         if not write:
             raise DeviceMismatch(
                 f"{len(differences)} EEPROM settings of the servo differ from what the rig needs.",
-                next_step="Run `rig servo settings --write` to write these values with the torque off, or open the "
-                "bench once with --set servo.write_settings=true.",
+                next_step=(Do.SERVO_SETTINGS(), "Or open the bench once with servo.write_settings = true."),
                 evidence={d.register: _found_wanted(d) for d in differences},
             )
         self.write_settings(differences)
@@ -161,9 +165,9 @@ class RegisterServo(ABC):
                 return
         raise TorqueStaysOn(
             f"Servo {self._id} accepts the instruction to switch its torque off, but its torque stays on.",
-            next_step="Switch off the servo's supply. If this repeats, replace the servo.",
+            next_step=("Switch off the servo's supply. If this repeats, replace the servo.", Do.ACKNOWLEDGE()),
             evidence={"attempts": TORQUE_OFF_ATTEMPTS},
-        ).ask_to_acknowledge()
+        )
 
     def move_to(self, position_deg: float) -> None:
         self._write("Goal Position", round(position_deg / self.resolution_deg))

@@ -5,6 +5,7 @@ from typing import Any
 
 from rig.core.clock import seconds_between
 from rig.core.errors import DeviceFault, UsageError
+from rig.core.next_steps import Do
 from rig.devices.dynamixel import settings
 from rig.devices.dynamixel.bus import watchdog_units
 from rig.devices.dynamixel.register_servo import RegisterServo, hardware_errors
@@ -148,8 +149,8 @@ class DynamixelServo(RegisterServo):
                 return time_ns, values
         raise DeviceFault(
             f"The servo's readings are impossible: {_FRESH_ATTEMPTS} readings in a row do not agree with its clock.",
-            next_step="Check its cable. If this repeats, replace the servo.",
-        ).ask_to_acknowledge(reboot=True)
+            next_step=("Check its cable. If this repeats, replace the servo.", Do.ACKNOWLEDGE(reboot=True)),
+        )
 
     def _is_fresh(self, reading: tuple[int, int]) -> bool:
         """Return whether a reading is new: its tick has advanced as the computer's clock has since the last one.

@@ -101,7 +101,7 @@ class HeadConnection:
             self.link.replace(self._reopen())
             found = self._greet()
         except DeviceNotFound as gone:
-            raise DeviceSilent(gone.what, next_step=gone.next_step, evidence=gone.evidence) from gone
+            raise DeviceSilent(gone.what, next_step=gone.steps, evidence=gone.evidence) from gone
         same = ("board", "serial", "protocol", "major", "minor", "patch")
         pairs = {name: (getattr(found, name), getattr(self.identity, name)) for name in same}
         if changed := {name: pair for name, pair in pairs.items() if pair[0] != pair[1]}:

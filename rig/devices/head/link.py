@@ -7,6 +7,7 @@ from typing import TypeVar
 
 from rig.core.clock import Clock
 from rig.core.errors import DeviceSilent, DeviceUnplugged, RequestRejected
+from rig.core.next_steps import Do
 from rig.devices.dynamixel.port import SerialConnection
 from rig.devices.head import protocol
 from rig.devices.head.framing import CRC, HEADER, Deframer, Frame, encode
@@ -185,7 +186,7 @@ class HeadLink:
         except (OSError, termios.error) as gone:  # pyserial's exceptions are OSErrors, except those of termios
             raise DeviceUnplugged(
                 f"The rig head's port {self.name} is gone.",
-                next_step="Plug its USB cable in, then run the command again.",
+                next_step=("Plug its USB cable in.", Do.RUN_AGAIN()),
                 evidence={"reason": str(gone)},
             ) from gone
 
@@ -195,14 +196,13 @@ def rejection(name: str, message: Request, reason: int) -> RequestRejected:
     words = _REASONS.get(reason, f"unknown reason {reason}")
     what = type(message).__name__.lower()
     latched = reason in (Rejection.FAULT_LATCHED, Rejection.CAUSE_PERSISTS)
-    error = RequestRejected(
+    return RequestRejected(
         f"The rig head at {name} rejected the request '{what}': {words}.",
-        next_step="Remove the cause of the fault."
+        next_step=("Remove the cause of the fault.", Do.ACKNOWLEDGE())
         if latched
         else "Flash the firmware of this program: make -C firmware flash.",
         evidence={"request": what, "rejection": reason},
     )
-    return error.ask_to_acknowledge() if latched else error
 
 
 def _parse(frame: Frame) -> Answer | None:

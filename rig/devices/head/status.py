@@ -13,6 +13,7 @@ from rig.core.errors import (
     HeartbeatLost,
     RigError,
 )
+from rig.core.next_steps import Do
 from rig.devices.head.protocol import HeadFault, HeadState, HeartbeatReply, ImuStatus, Input, Reset, StatusChanged
 from rig.devices.head.sensors import HeadSensor
 from rig.devices.imu import ImuIdentity
@@ -83,22 +84,25 @@ def head_fault(
     if HeadFault.ESTOP in faults:
         return EmergencyStop(
             "The e-stop is pressed, or its loop is open: light and servo power are off.",
-            next_step="Look at the bench, then release the e-stop or repair its cable.",
+            next_step=("Look at the bench, then release the e-stop or repair its cable.", Do.ACKNOWLEDGE()),
             evidence=evidence,
-        ).ask_to_acknowledge()
+        )
     if restart is not None or faults & (HeadFault.BROWN_OUT | HeadFault.WATCHDOG):
         cause = start if restart is None else restart
         return HeadRestarted(
             f"The rig head at {port} restarted {_RESTARTS[cause]}: light and servo power went off.",
-            next_step="Check its supply and USB cable.",
+            next_step=("Check its supply and USB cable.", Do.ACKNOWLEDGE()),
             evidence={**evidence, "reset_cause": cause.name.lower()},
-        ).ask_to_acknowledge()
+        )
     if HeadFault.DEADMAN in faults:
         return HeartbeatLost(
             f"The rig head received nothing from this computer for {deadman_ms} ms: light and servo power are off.",
-            next_step="Check whether a program was killed or a cable unplugged. If not, increase head.deadman_s.",
+            next_step=(
+                "Check whether a program was killed or a cable unplugged. If not, increase head.deadman_s.",
+                Do.ACKNOWLEDGE(),
+            ),
             evidence={**evidence, "deadman_ms": deadman_ms},
-        ).ask_to_acknowledge()
+        )
     return None
 
 

@@ -1,4 +1,4 @@
-import { $, API, duration, h, listJobs, number, on, start, submit } from "./rig.js";
+import { $, API, duration, h, listJobs, nextSteps, number, on, start, submit } from "./rig.js";
 
 /** Return a point of the dial: 0° is at the top, angles grow counter-clockwise, as the table's do seen from above. */
 const polar = (degrees, radius) => {
@@ -49,7 +49,6 @@ on("status", (status) => {
   $("values").replaceChildren(...values.flatMap(([name, value]) => [h("dt", {}, name), h("dd", {}, value)]));
   $("set-angle").hidden = !status.doubt;
   $("doubt").textContent = status.doubt ? `The table's angle is in doubt: ${status.doubt}.` : "";
-  $("acknowledge").disabled = !status.fault;
 });
 
 on("plan", (event) => {
@@ -80,7 +79,7 @@ function findings(list) {
   const marks = { fine: "✓", warning: "!", bad: "✗" };
   $("findings-section").hidden = false;
   $("findings").replaceChildren(
-    ...list.map((one) => h("li", { class: one.level === "bad" ? "error" : "" }, `${marks[one.level]} ${one.topic}: ${one.finding}`, one.fix ? h("p", { class: "soft" }, `Fix: ${one.fix}`) : null)),
+    ...list.map((one) => h("li", { class: one.level === "bad" ? "error" : "" }, `${marks[one.level]} ${one.topic}: ${one.finding}`, one.steps.length ? h("p", { class: "soft" }, "Fix: ", ...nextSteps(one.steps)) : null)),
   );
 }
 

@@ -35,7 +35,7 @@ $("file").addEventListener("change", () => act(async () => {
   const [head, ...rows] = readCsv((await $("file").files[0].text()).replace(/^\ufeff/, ""));
   const keys = (head || []).map((cell) => cell.trim().toLowerCase());
   const unknown = keys.filter((key) => !["name", "label", "note", "views"].includes(key));
-  if (!keys.includes("name") || unknown.length) throw Object.assign(new Error("The first line of the file must name the columns: name and, optionally, label, note and views."), { next_step: unknown.length ? `Remove the columns ${unknown.join(", ")}.` : "Add the column \"name\"." });
+  if (!keys.includes("name") || unknown.length) throw Object.assign(new Error("The first line of the file must name the columns: name and, optionally, label, note and views."), { steps: [unknown.length ? `Remove the columns ${unknown.join(", ")}.` : "Add the column \"name\"."] });
   objects = rows.map((row) => {
     const one = {};
     keys.forEach((key, k) => { const cell = (row[k] || "").trim(); if (cell) one[key] = key === "views" ? Number(cell) : cell; });

@@ -1,4 +1,4 @@
-import { $, followJobs, h, number, on, percent, start } from "./rig.js";
+import { $, followJobs, h, nextSteps, number, on, percent, start } from "./rig.js";
 
 function oneSample() {
   $("sample").disabled = $("watch").checked;
@@ -7,15 +7,15 @@ function oneSample() {
 $("watch").addEventListener("change", oneSample);
 oneSample(); // a browser that reloads the page can keep the tick
 
-function answer(words, kind, detail) {
+function answer(words, kind, ...detail) {
   $("answer").textContent = words;
   $("answer").className = `answer ${kind}`;
-  $("answer-detail").textContent = detail;
+  $("answer-detail").replaceChildren(...detail);
 }
 
 /** Show an error. Code 606: the table is empty. */
 export function noAnswer(error) {
-  answer(error.code === 606 ? "No object on the table" : "No answer", "unknown", `${error.what} ${error.next_step}`);
+  answer(error.code === 606 ? "No object on the table" : "No answer", "unknown", `${error.what} `, ...nextSteps(error.steps));
 }
 
 function clear() {
@@ -52,6 +52,7 @@ on("shown-plan", (event) => {
   if (event.event === "identified") result(event);
   if (event.event === "failed") noAnswer(event);
   if (event.text) for (const words of event.text.split("\n")) $("steps").append(h("li", {}, words.trim()));
+  if (event.steps?.length) $("steps").append(h("li", {}, "Next step: ", ...nextSteps(event.steps)));
 });
 followJobs(["identify"], (job, isOther) => {
   if (isOther) {

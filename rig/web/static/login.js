@@ -1,4 +1,4 @@
-import { $, request } from "./rig.js";
+import { $, nextSteps, request } from "./rig.js";
 
 $("login").addEventListener("submit", async (event) => {
   event.preventDefault();
@@ -6,6 +6,6 @@ $("login").addEventListener("submit", async (event) => {
     await request("POST", "/login", { token: $("token").value });
     location.assign("/");
   } catch (problem) {
-    $("login-error").textContent = `${problem.message} ${problem.next_step || ""}`;
+    $("login-error").replaceChildren(`${problem.message} `, ...nextSteps(problem.steps));
   }
 });

@@ -39,6 +39,21 @@ export function percent(probability) {
   return probability < 0.001 ? "<0.1 %" : `${(100 * probability).toFixed(1)} %`;
 }
 
+const ACTIONS = JSON.parse($("actions").textContent);
+
+/** Return the next steps of an error: sentences, and buttons or links for what a page can do. */
+export function nextSteps(steps = []) {
+  return steps.flatMap((step) => {
+    if (typeof step === "string") return [`${step} `];
+    const { words, job, page } = ACTIONS[step.action];
+    const text = words.replace(/\{(\w+)\}/g, (_, key) => step.parameters[key] ?? key);
+    const label = text[0].toUpperCase() + text.slice(1);
+    if (job) return [h("button", { onclick: () => submit({ ...job, ...step.parameters }) }, label), " "];
+    if (page) return [h("a", { class: "button", href: page }, label), " "];
+    return [step.command ? `${label}, at a terminal of the bench's computer: ` : `${label}. `, step.command && h("code", {}, step.command), " "];
+  });
+}
+
 /** An error with the fields of the server's problem. */
 export class Problem extends Error {
   constructor(values) {
@@ -62,7 +77,7 @@ export async function request(method, path, body) {
   try {
     answer = await fetch(API + path, options);
   } catch {
-    throw new Problem({ detail: "The server does not answer.", next_step: "Check that rig serve runs." });
+    throw new Problem({ detail: "The server does not answer.", steps: ["Check that the server runs."] });
   }
   if (answer.status === 401 && location.pathname !== "/login") location.assign("/login");
   const text = await answer.text();
@@ -79,7 +94,7 @@ export async function request(method, path, body) {
 /** Show an error until the next action. */
 export function show(problem) {
   const box = $("messages");
-  box.replaceChildren(h("p", {}, `${problem.message} ${problem.next_step || ""}`));
+  box.replaceChildren(h("p", {}, `${problem.message} `, ...nextSteps(problem.steps)));
   const mistakes = problem.evidence && problem.evidence.mistakes;
   if (mistakes) box.append(h("p", {}, mistakes.join("; ")));
   if (problem.code === 902) offerLease();
@@ -172,14 +187,25 @@ export const canOperate = () => me !== null && me.role === "operate";
 
 /** Return the state of the bench in words, and whether it is good or bad. */
 export function stateWords(status) {
-  if (!status.open) return [status.error ? `Bench not available: ${status.error.what} ${status.error.next_step}` : "Opening the bench …", "bad"];
+  if (!status.open) return [status.error ? `Bench not available: ${status.error.what}` : "Opening the bench …", "bad"];
   if (status.fault) return [`Fault ${status.fault.code}: ${status.fault.what}`, "bad"];
   if (status.doubt) return [`The table's angle is in doubt: ${status.doubt}.`, "bad"];
   const angle = status.table_deg === null || status.table_deg === undefined ? "" : `, table at ${number(status.table_deg, 1)}°`;
   return [`${status.job ? "Working" : "Ready"}${angle}`, "good"];
 }
 
+let stepsShown = "";
+
+/** Show what must be done before the bench works. A button that is pressed stays the same element. */
+function showNextSteps(steps) {
+  const values = JSON.stringify(steps);
+  if (values === stepsShown) return;
+  stepsShown = values;
+  $("next-steps").replaceChildren(...(steps.length ? [h("p", {}, ...nextSteps(steps))] : []));
+}
+
 on("status", (status) => {
+  showNextSteps((status.error ? status.error.steps : status.steps) || []);
   const [words, kind] = stateWords(status);
   $("state").textContent = words;
   $("state").className = `state ${kind}`;
@@ -210,7 +236,7 @@ function showLease(lease) {
 on("lease", (lease) => {
   if (me === null) return;
   showLease(lease);
-  if (lease.taken_from && lease.taken_from.name === me.name && lease.taken_from.client === CLIENT) show(new Problem({ detail: `${lease.holder} has taken over the bench.`, next_step: "You can watch." }));
+  if (lease.taken_from && lease.taken_from.name === me.name && lease.taken_from.client === CLIENT) show(new Problem({ detail: `${lease.holder} has taken over the bench.`, steps: ["You can watch."] }));
   if (lease.asked_by && $("lease-button").dataset.mine) {
     const to = lease.asked_by;
     const handOver = h("button", { onclick: () => act(() => request("POST", "/lease/hand-over", to)) }, "Hand over the bench");
@@ -322,7 +348,7 @@ function showJob(box, job) {
   }
   if (job.question) {
     const buttons = job.question.choices.map((choice) => h("button", { class: choice === "continue" ? "big" : "quiet", onclick: post("answer", { choice }) }, CHOICES[choice]));
-    parts.push(h("div", { class: "question" }, h("p", {}, job.question.text), h("div", { class: "row" }, ...buttons)));
+    parts.push(h("div", { class: "question" }, h("p", {}, job.question.text), h("p", {}, ...nextSteps(job.question.steps)), h("div", { class: "row" }, ...buttons)));
   }
   if (!ended) {
     parts.push(
@@ -333,9 +359,9 @@ function showJob(box, job) {
     );
   }
   if (job.result_text) parts.push(...job.result_text.split("\n").map((text) => h("p", {}, text)));
-  if (job.error) parts.push(h("p", { class: "error" }, `Error ${job.error.code}: ${job.error.what}`), h("p", {}, `Next step: ${job.error.next_step}`));
+  if (job.error) parts.push(h("p", { class: "error" }, `Error ${job.error.code}: ${job.error.what}`), h("p", {}, "Next step: ", ...nextSteps(job.error.steps)));
   if (job.resume) {
-    parts.push(h("div", { class: "row" }, h("button", { onclick: () => submit(job.resume) }, "Continue"), job.command && h("code", {}, job.command)));
+    parts.push(h("div", { class: "row" }, h("button", { onclick: () => submit(job.resume) }, "Continue")));
   }
   box.replaceChildren(...parts);
   return undefined;

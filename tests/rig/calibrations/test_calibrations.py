@@ -19,6 +19,7 @@ from rig.calibrations import (
 )
 from rig.config import RigConfig, load_config
 from rig.core.errors import ConfigError, UsageError
+from rig.core.next_steps import Do
 
 RESULT = CalibrationResult(
     name="imu.scale",
@@ -157,7 +158,7 @@ def test_age_other_device_and_failure_are_reported(tmp_path):
     store.add(replace(RESULT, name="b.moved", device={"bench": "sim", "imu": {"model": "MPU-6050", "axis": "y"}}))
     store.add(replace(RESULT, name="c.failed", rejections=(FEW,)))
     old, moved, failed = store.on_bench(HERE, NOW)
-    assert (old.status, old.command) == (CalibrationStatus.EXPIRED, "rig calibrate a")
+    assert (old.status, old.repetition) == (CalibrationStatus.EXPIRED, Do.CALIBRATE(name="a"))
     assert "6 days ago; it is valid for 5 days" in str(old)
     assert moved.status is CalibrationStatus.OTHER_DEVICE
     assert "imu.axis was y, is z" in str(moved)

@@ -14,6 +14,7 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, 
 
 from rig.catalog import Catalog, Enrollment, EnrollmentStatus, Provenance, ViewRecord, clean_name
 from rig.core.errors import CatalogError, ObjectExists, ObjectNotFound, UsageError
+from rig.core.next_steps import Do
 from rig.views.image_files import Encoder
 from sim.clock import EPOCH, VirtualClock
 from tests.fuzzing import examples
@@ -134,7 +135,7 @@ def test_replacement_keeps_the_old_views_until_it_is_complete(catalog: Catalog) 
     fill(catalog, "mug", 2, label="cup", note="chipped")
     with pytest.raises(ObjectExists, match="2 views") as error:
         begin(catalog, "mug")
-    assert "--replace" in error.value.next_step
+    assert Do.ENROLL_AGAIN(name="mug") in error.value.steps
     again = begin(catalog, "mug", 3, replace=True, label="mug")
     for index in range(3):
         assert len(catalog.views().views) == 2
@@ -167,7 +168,7 @@ def test_unfinished_enrollment_is_resumed_on_another_bench(tmp_path: Path, clock
     with Catalog.open(tmp_path, clock=clock) as catalog:
         with pytest.raises(CatalogError, match="2 of 4") as error:
             begin(catalog, "mug", 4)
-        assert "--resume" in error.value.next_step
+        assert Do.CONTINUE_ENROLLMENT(name="mug") in error.value.steps
         unfinished = catalog.resumable("mug")
         assert unfinished is not None
         assert (unfinished.present, unfinished.missing) == ((0, 2), (1, 3))

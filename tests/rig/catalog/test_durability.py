@@ -17,6 +17,7 @@ from rig.catalog import Catalog, Enrollment
 from rig.catalog.sqlite_database import SqliteDatabase
 from rig.config.catalog_place import CatalogPlace
 from rig.core.errors import CatalogBusy, CatalogError
+from rig.core.next_steps import Do
 from sim.clock import VirtualClock
 from tests.rig.catalog.catalog_samples import PROVENANCE, fill, image, other_program, plan, record
 
@@ -125,7 +126,7 @@ def test_full_disk_loses_only_the_present_view(
             patch.setattr(os, call, failure)
             with pytest.raises(CatalogError, match=r"full.*earlier ones are safe") as error:
                 enrollment.add(record(1), image(1))
-        assert "Free some space" in error.value.next_step
+        assert Do.FREE_DISK() in error.value.steps
         assert enrollment.missing() == (1,)
         assert [file.name for file in (tmp_path / enrollment.folder).iterdir()] == ["000.png"]
         enrollment.add(record(1), image(1))

@@ -28,6 +28,7 @@ from rig.catalog.upkeep import collect_garbage, statistics
 from rig.catalog.verify import verify
 from rig.core.errors import CatalogDamaged, ImportRejected, RigError
 from rig.core.files import write
+from rig.core.next_steps import Do
 from rig.views import image_files as images
 from sim.clock import VirtualClock
 from tests.rig.catalog.catalog_samples import (
@@ -134,7 +135,7 @@ def test_image_paths_that_lead_out_are_rejected(root: Path, outside: Path, kind:
     before = content(root)
     with pytest.raises(CatalogDamaged) as error, opened(root) as catalog:
         READERS[reader](catalog, root.parent)
-    assert "rig export" in error.value.next_step
+    assert "exported bundle" in error.value.next_step
     assert content(root) == before
 
 
@@ -206,7 +207,7 @@ def test_journal_that_names_a_file_is_not_played_back(
     result = rig(*command.split())
     assert result.exit_code == 7
     assert "SQLite would delete the file" in result.stderr
-    assert "rig export" in result.stderr
+    assert "exported bundle" in result.stderr
     assert precious.read_bytes() == SECRET
     assert content(root) == before
 
@@ -383,7 +384,7 @@ def test_edited_azimuth_gives_no_answer(root: Path) -> None:
     sql(root, "UPDATE views SET azimuth_deg = 90 WHERE id = 4")
     with opened(root) as catalog, pytest.raises(CatalogDamaged, match="'mug'") as error:
         catalog.views()
-    assert "rig catalog verify" in error.value.next_step
+    assert Do.VERIFY_CATALOG() in error.value.steps
 
 
 def test_damage_stays_noticed_after_later_changes(root: Path) -> None:

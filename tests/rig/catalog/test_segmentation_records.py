@@ -31,6 +31,7 @@ from rig.catalog.verify_images import Problem
 from rig.config import ViewConfig
 from rig.core.clock import SystemClock
 from rig.core.errors import DescriptorOutdated, UsageError
+from rig.core.next_steps import Do
 from rig.search.model import load_model
 from rig.views.description import BENCH_DESCRIPTOR, DESCRIPTORS, PAPER_DESCRIPTOR, EnrollmentDescriber, ViewDescriber
 from rig.views.segmentation_evidence import SegmentationSummary
@@ -74,7 +75,7 @@ def test_redescribe_gives_the_levels_of_the_bench(open_catalog: Callable[[str], 
     enrolled(old, "box", names=(PAPER_DESCRIPTOR,))
     with pytest.raises(DescriptorOutdated, match="box") as caught:
         old.views(BENCH_DESCRIPTOR)
-    assert f"redescribe --descriptor {BENCH_DESCRIPTOR}" in caught.value.next_step
+    assert caught.value.steps == (Do.REDESCRIBE(descriptor=BENCH_DESCRIPTOR),)
     assert segmentations(old, "box").text == ""
     assert finished(redescribe(old, BENCH_DESCRIPTOR, jobs=1)).described == VIEWS
     assert np.array_equal(old.views(BENCH_DESCRIPTOR).views.descriptors, new.views(BENCH_DESCRIPTOR).views.descriptors)

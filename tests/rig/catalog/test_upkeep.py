@@ -13,6 +13,7 @@ from rig.catalog.staging import staging
 from rig.catalog.upkeep import collect_garbage, statistics
 from rig.catalog.verify import verify
 from rig.core.errors import CatalogError, ObjectExists, ObjectNotFound, UsageError
+from rig.core.next_steps import Do
 from sim.clock import VirtualClock
 from tests.rig.catalog.catalog_samples import (
     PROVENANCE,
@@ -97,7 +98,7 @@ class TestEdit:
         delete(catalog, "mug")
         with pytest.raises(CatalogError, match="deleted during") as error:
             enrollment.add(record(1), image(1))
-        assert "undelete mug" in error.value.next_step
+        assert Do.UNDELETE(name="mug") in error.value.steps
         undelete(catalog, "mug")
         enrollment.add(record(1), image(1))
 

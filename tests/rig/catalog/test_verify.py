@@ -17,6 +17,7 @@ from rig.catalog.verify import Verification, verify
 from rig.catalog.verify_images import Problem
 from rig.cli.catalog.findings import finding_text
 from rig.core.errors import CatalogDamaged, CatalogError, DescriptorOutdated, UsageError
+from rig.core.next_steps import Do
 from sim.clock import VirtualClock
 from tests.rig.catalog.catalog_samples import (
     PROVENANCE,
@@ -189,7 +190,7 @@ class TestRedescribe:
         monkeypatch.setitem(registry._KNOWN, "cedd", Cedd(version=2))
         with pytest.raises(DescriptorOutdated, match=r"0 of 5 views have the descriptor cedd 2") as error:
             catalog.views()
-        assert "rig catalog redescribe" in error.value.next_step
+        assert Do.REDESCRIBE() in error.value.steps
         assert "it is missing for 'mug', 'tin'. Other views have version 1." in error.value.what
         assert error.value.evidence["objects"] == 2
         assert catalog.object("mug").views[0].record.descriptors == {}
@@ -206,7 +207,7 @@ class TestRedescribe:
         true_fill(catalog, "mug", 3, 0, (2, 0, 12, 12))
         with pytest.raises(DescriptorOutdated, match="0 of 3 views have the descriptor cedd-blurred") as error:
             catalog.views("cedd-blurred")
-        assert "--descriptor cedd-blurred" in error.value.next_step
+        assert error.value.steps == (Do.REDESCRIBE(descriptor="cedd-blurred"),)
         finished(redescribe(catalog, "cedd-blurred"))
         wanted = descriptor("cedd-blurred").describe(image(1)[:, 2:14])
         assert np.array_equal(catalog.views("cedd-blurred").views.descriptors[1], wanted)
@@ -270,5 +271,5 @@ def test_unknown_settings_are_reported(catalog: Catalog) -> None:
     sql(catalog, """UPDATE descriptors SET settings = '{"lens": "fish"}'""")
     with pytest.raises(CatalogError, match="fish") as error:
         catalog.object("mug")
-    assert "redescribe" in error.value.next_step
+    assert Do.REDESCRIBE() in error.value.steps
     assert problems(finished(verify(catalog, jobs=1))) == [Problem.DESCRIPTOR_DIFFERS, Problem.ENROLLMENT_CHANGED]

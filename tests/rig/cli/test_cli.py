@@ -84,14 +84,14 @@ def test_missing_catalog_names_the_bench_that_has_one(rig, monkeypatch, tmp_path
     small = [word for line in ("width=320", "height=240") for word in ("--set", f"camera.{line}")]
     none = rig("catalog", "list")
     assert none.exit_code == 7
-    assert "Enroll an object: rig enroll NAME --bench hardware" in none.stderr
+    assert "Enroll an object: `rig enroll NAME --bench hardware`" in none.stderr
     roi = ("--set", "view.roi=[40, 0, 240, 240]")
     assert rig("enroll", "dice", "--views", "4", "--bench", "sim", *small, *roi).exit_code == 0
     for arguments in (("catalog", "list"), ("identify",), ("export", "all.zip"), ("log",)):
         done = rig(*arguments)
         assert done.exit_code == 7
         assert "The bench hardware has no catalog yet." in done.stderr
-        assert "Add --bench sim to use the catalog of that bench." in done.stderr
+        assert "Add --bench sim to use the catalog of that bench, or" in done.stderr
     assert "dice" in rig("catalog", "list", "--bench", "sim").stdout
     assert "near:" not in rig("catalog", "show", "zzz", "--bench", "sim").stderr
 

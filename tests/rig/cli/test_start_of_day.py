@@ -152,7 +152,7 @@ def test_automation_is_never_asked(asked: Callable[..., tuple[Any, str]], option
     table, said = asked(Answers("\n\n\n"), **options)
     assert table is None
     assert said.startswith("Note: there is no empty-table image yet;")
-    assert "To take a new one: rig empty-table" in said
+    assert "Take a new empty-table image: `rig empty-table`" in said
 
 
 def test_operator_is_not_asked_without_a_terminal(asked: Callable[..., tuple[Any, str]]) -> None:

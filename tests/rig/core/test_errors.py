@@ -24,4 +24,5 @@ def test_error_has_text_evidence_and_next_step():
         "what": "Servo 1 does not answer.",
         "evidence": {"baud": 57600},
         "next_step": "Check the cable.",
+        "steps": ["Check the cable."],
     }

@@ -6,6 +6,7 @@ import pytest
 
 from hbr.descriptors import load_model
 from rig.core.errors import RigError
+from rig.core.next_steps import Do
 from rig.core.processes import map_in_processes
 from tests.networks import means_network
 from tests.rig.core.work import length, square
@@ -14,7 +15,7 @@ from tests.rig.core.work import length, square
 def test_killed_process_raises_an_error_with_a_next_step() -> None:
     with pytest.raises(RigError, match="ended before it was done") as lost:
         list(map_in_processes(square, range(6), 2))
-    assert "--jobs 1" in lost.value.next_step
+    assert Do.RUN_AGAIN(jobs=1) in lost.value.steps
 
 
 def test_one_job_runs_in_this_process() -> None:

@@ -5,6 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rig.core.errors import ConfigError, DeviceFault, DeviceMismatch, DeviceNotFound
+from rig.core.next_steps import Do
 from rig.devices.dynamixel.registers import control_table, model_numbers
 from rig.devices.dynamixel.servo import DEG_PER_COUNT, DynamixelServo
 from rig.devices.servo import MotionProfile
@@ -43,7 +44,7 @@ def test_wrong_model_is_named():
     with pytest.raises(DeviceMismatch) as caught:
         DynamixelServo(open_bus(wires), bus_id=1, model="xl430_w250", clock=wires.world.clock)
     assert caught.value.evidence["got"] == "xm430_w350"
-    assert 'servo.model = "xm430_w350"' in caught.value.next_step
+    assert Do.SET_KEY(key="servo.model", value="xm430_w350") in caught.value.steps
 
 
 def test_missing_servo_raises_device_not_found(wires):

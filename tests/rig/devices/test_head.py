@@ -13,6 +13,7 @@ from rig.core.errors import (
     HeartbeatLost,
     RequestRejected,
 )
+from rig.core.next_steps import Do
 from rig.devices.head.head import RigHead
 from rig.devices.head.protocol import (
     BAUD,
@@ -161,7 +162,7 @@ def test_silent_computer_switches_outputs_off(opened):
     with pytest.raises(HeartbeatLost) as caught:
         opened.imu.check()
     assert caught.value.exit_code == 5
-    assert "rig acknowledge" in caught.value.next_step
+    assert Do.ACKNOWLEDGE() in caught.value.steps
     with pytest.raises(RequestRejected, match="fault is latched"):
         opened.imu.set_power(True)
     opened.imu.acknowledge()

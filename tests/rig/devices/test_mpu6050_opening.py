@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from rig.config import load_config
 from rig.core.errors import ConfigError, DeviceFault, DeviceMismatch, DeviceNotFound
+from rig.core.next_steps import Do
 from rig.devices.mpu6050 import Mpu6050, Mpu6050Clone, Mpu6500, Mpu9250
 from sim.bench import ShelfOperator, open_sim_bench
 from sim.clock import VirtualClock
@@ -66,7 +67,7 @@ def test_wrong_chip_is_named(who_am_i: int, likely: str) -> None:
 def test_other_sensor_with_a_driver_is_the_next_step(who_am_i: int, model: str) -> None:
     with Bench(who_am_i=who_am_i) as bench, pytest.raises(DeviceMismatch) as caught:
         bench.open()
-    assert caught.value.next_step == f"Run `rig config set imu.model {model}`."
+    assert caught.value.steps == (Do.SET_KEY(key="imu.model", value=model),)
 
 
 # -- sensors with the registers of the MPU-6050 -----------------------------------------------------------------------

@@ -9,6 +9,7 @@ from tempfile import TemporaryDirectory
 
 from rig.bench.computer import User
 from rig.config import load_config
+from rig.core.next_steps import NextSteps
 from rig.doctor.checks import CHECKS
 from rig.doctor.context import DoctorContext
 from rig.doctor.examination import run_checks
@@ -40,9 +41,9 @@ class Bench:
         """Check the bench, or some topics of it."""
         return list(run_checks(self.context, [check for check in CHECKS if not topics or check.topic in topics]))
 
-    def problems(self, *topics: str) -> dict[FindingCode, str]:
-        """Return the warnings and bad findings: the code and the fix of each."""
-        return {f.code: f.fix for f in self.findings(*topics) if f.level is not Severity.FINE}
+    def problems(self, *topics: str) -> dict[FindingCode, NextSteps]:
+        """Return the warnings and bad findings: the code of each, and what fixes it."""
+        return {f.code: f.steps for f in self.findings(*topics) if f.level is not Severity.FINE}
 
     def problem(self, topic: str) -> Finding:
         """Return the only warning or bad finding of a topic."""

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from rig.bench.computer import DeviceFile
 from rig.config.imus import imu_kinds
 from rig.core.errors import DeviceNotFound
+from rig.core.next_steps import Do
 from rig.devices.dynamixel.registers import model_numbers
 from rig.devices.open_imu import open_imu
 from rig.devices.v4l2 import CAPTURE, M2M, M2M_MPLANE, VideoMode, capabilities
@@ -278,7 +279,7 @@ def test_mode_of_a_camera_is_chosen_from_what_it_offers():
 def test_doctor_names_the_nearest_mode():
     with unopened("camera.width=1280", "camera.height=720", "view.roi=none") as bench:
         problems = bench.problems("camera")
-        assert problems[FindingCode.MODE_NOT_OFFERED] == "rig setup --bench sim"
+        assert problems[FindingCode.MODE_NOT_OFFERED] == (Do.SETUP(),)
 
 
 @pytest.mark.parametrize(
@@ -301,4 +302,4 @@ def test_controller_that_cannot_wait_for_a_bno055_is_named(compatible, hertz, wa
         bench.devices.i2c.stretch_errors = 0.2 if warned else 0.0
         bench.devices.world.clock.sleep(2.0)
         again = bench.problems("imu")
-        assert any("i2c_arm_baudrate=10000" in fix for fix in again.values()) == warned
+        assert any("i2c_arm_baudrate=10000" in str(fix) for fix in again.values()) == warned

@@ -10,6 +10,7 @@ from rig.bench.computer import Disk, SerialPort, User
 from rig.bench.hardware import HardwareBench
 from rig.core.clock import SystemClock
 from rig.core.errors import BenchBusy, DeviceSilent
+from rig.core.next_steps import Do
 from rig.doctor.computer import RULES_FILES, udev_rules
 from rig.doctor.finding import FindingCode, Severity, finding_words
 from rig.doctor.single_servo import single_servo
@@ -139,13 +140,14 @@ def test_other_port_is_proposed_by_its_permanent_name():
         bench.computer.i2c_bus(4)
         bench.computer.camera(2, "Cam")
         fixes = list(bench.problems("port").values())
+        port = "/dev/serial/by-id/usb-FTDI_USB__-__Serial_Converter_FT7-if00-port0"
         assert fixes == [
-            "rig config set servo.port /dev/serial/by-id/usb-FTDI_USB__-__Serial_Converter_FT7-if00-port0",
-            "rig config set imu.bus 4",
-            "rig config set camera.source /dev/v4l/by-id/usb-Cam-video-index0",
+            (Do.SET_KEY(key="servo.port", value=port),),
+            (Do.SET_KEY(key="imu.bus", value="4"),),
+            (Do.SET_KEY(key="camera.source", value="/dev/v4l/by-id/usb-Cam-video-index0"),),
         ]
         bench.computer.serial_port("ttyUSB4", serial="B")
-        assert next(iter(bench.problems("port").values())) == "rig setup --bench sim"
+        assert next(iter(bench.problems("port").values())) == (Do.SETUP(),)
 
 
 def test_bench_in_use_is_not_touched(bench):
@@ -158,7 +160,7 @@ def test_bench_in_use_is_not_touched(bench):
     assert warnings["bench"].code is FindingCode.BENCH_IN_USE
     assert warnings["bench"].parameters["pid"] == os.getpid()
     assert {warnings[topic].code for topic in ("servo", "imu", "camera")} == {FindingCode.NOT_CHECKED}
-    assert warnings["servo"].fix == "rig stop --bench sim"
+    assert warnings["servo"].fix == "Stop the table and switch its torque off: `rig stop --bench sim`."
     assert not bench.sent
 
 
@@ -169,12 +171,12 @@ def test_latched_fault_and_damaged_state_are_reported(bench):
     problem = bench.problem("bench")
     assert (problem.code, problem.parameters["code"]) == (FindingCode.FAULT_LATCHED, 402)
     assert problem.parameters["what"] == "Servo 1 is gone."
-    assert problem.fix == "rig acknowledge --bench sim"
+    assert problem.steps == (Do.ACKNOWLEDGE(),)
     store.latch(None)
     (store.path / "state.json").write_text("{")
     problem = bench.problem("bench")
     assert problem.code is FindingCode.STATE_DAMAGED
-    assert "rig home --revolutions" in problem.fix
+    assert problem.steps[1:4:2] == (Do.ACKNOWLEDGE(), Do.SET_REVOLUTIONS(revolutions=0))
 
 
 @pytest.mark.parametrize(("free", "level"), [(50e9, Severity.FINE), (1e9, Severity.WARNING), (1e8, Severity.BAD)])

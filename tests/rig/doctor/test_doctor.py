@@ -11,6 +11,7 @@ from rig.calibrations import CalibrationResult, CalibrationStatus, CalibrationSt
 from rig.catalog import Catalog
 from rig.core.clock import SystemClock
 from rig.core.errors import ConfigError, DeviceNotFound, DeviceSilent
+from rig.core.next_steps import Do
 from rig.doctor.checks import CHECKS
 from rig.doctor.examination import Check, run_checks
 from rig.doctor.finding import Finding, FindingCode, Severity, finding_words, fine
@@ -34,7 +35,7 @@ def test_only_the_missing_calibration_of_a_new_bench_is_reported(bench):
     assert {f.topic for f in findings} == {check.topic for check in CHECKS}
     (problem,) = [f for f in findings if f.level is not Severity.FINE]
     assert (problem.topic, problem.code) == ("calibration", FindingCode.NEVER_CALIBRATED)
-    assert problem.fix == "rig calibrate imu --bench sim"
+    assert problem.steps == (Do.CALIBRATE(name="imu"),)
     assert bench.instructions <= {PING, READ}  # nothing is written, so nothing can move
 
 
@@ -55,7 +56,7 @@ def test_empty_computer_reports_each_missing_device():
 
 def test_torque_watchdog_and_factory_settings_are_reported_and_not_changed(bench):
     memory = bench.devices.servo.memory
-    assert bench.problems("servo") == {FindingCode.SETTING_DIFFERS: "rig servo settings --write --bench sim"}
+    assert bench.problems("servo") == {FindingCode.SETTING_DIFFERS: (Do.SERVO_SETTINGS(),)}
     differing = [f.parameters for f in bench.findings("servo") if f.code is FindingCode.SETTING_DIFFERS]
     values = {one["register"]: (one["found"], one["wanted"]) for one in differing}
     assert (values["Operating Mode"], values["Return Delay Time"]) == ((3, 4), (250, 0))
@@ -65,22 +66,22 @@ def test_torque_watchdog_and_factory_settings_are_reported_and_not_changed(bench
 
 
 @pytest.mark.parametrize(
-    ("place", "fix"),
+    ("place", "step"),
     [
-        ((3, 57_600), "rig config set servo.id 3"),
-        ((1, 1_000_000), "rig config set servo.baud 1000000"),
-        ((3, 1_000_000), "rig setup --bench sim"),
+        ((3, 57_600), Do.SET_KEY(key="servo.id", value=3)),
+        ((1, 1_000_000), Do.SET_KEY(key="servo.baud", value=1000000)),
+        ((3, 1_000_000), Do.SETUP()),
     ],
 )
-def test_servos_at_another_id_or_rate_are_found(place, fix):
+def test_servos_at_another_id_or_rate_are_found(place, step):
     with unopened(servo_at=place) as bench:
         problem = bench.problem("servo")
-        assert (problem.code, problem.fix) == (FindingCode.OTHER_SERVOS, fix)
+        assert (problem.code, problem.steps) == (FindingCode.OTHER_SERVOS, (step,))
         assert [(found.bus_id, found.baud) for found in problem.parameters["found"]] == [place]
         bench.add_servo(4, 115_200)
         problem = bench.problem("servo")
         assert len(problem.parameters["found"]) == 2
-        assert problem.fix == "rig setup --bench sim"
+        assert problem.steps == (Do.SETUP(),)
 
 
 def test_missing_servo_asks_for_power(bench):
@@ -99,14 +100,14 @@ def test_second_servo_is_reported_and_duplicate_id_is_bad(bench):
     bench.add_servo(1, 57_600)
     problem = bench.problem("servo")
     assert (problem.code, problem.parameters["ids"]) == (FindingCode.DUPLICATE_ID, (1,))
-    assert "rig servo set-id 2 --bench sim" in problem.fix
+    assert problem.steps[1:] == (Do.SERVO_ID(id=2),)
 
 
 def test_other_model_can_be_configured():
     with unopened("servo.model=xm430_w350") as bench:
         bench.devices.servo_bus.detach(bench.devices.servo)
         bench.add_servo(1, 57_600, "xl430_w250")
-        assert bench.problem("servo").fix == "rig config set servo.model xl430_w250"
+        assert bench.problem("servo").steps == (Do.SET_KEY(key="servo.model", value="xl430_w250"),)
 
 
 def test_ax_12a_reports_its_missing_functions():
@@ -198,17 +199,17 @@ def test_imu_of_another_address_axis_or_kind_is_found():
     with unopened("imu.address=0x69") as bench:
         device = bench.devices.i2c.detach(0x69)
         bench.devices.i2c.attach(0x68, device)
-        assert bench.problem("imu").fix == "rig config set imu.address 0x68"
+        assert bench.problem("imu").steps == (Do.SET_KEY(key="imu.address", value="0x68"),)
     with unopened("imu.model=bno055") as bench:
         bench.context.computer.clock.sleep(1.0)  # it is silent for a while after power-up
         assert not bench.problems("imu")
     with unopened("imu.axis=x") as bench:
-        assert bench.problem("imu").fix == "rig config set imu.axis z"
+        assert bench.problem("imu").steps == (Do.SET_KEY(key="imu.axis", value="z"),)
     with unopened() as bench:
         bench.devices.imu.who_am_i = 0x70
         problem = bench.problem("imu")
         assert (problem.code, problem.parameters["found"].name) == (FindingCode.OTHER_IMU, "MPU-6500")
-        assert problem.fix == "rig config set imu.model mpu6500"
+        assert problem.steps == (Do.SET_KEY(key="imu.model", value="mpu6500"),)
         bench.devices.imu.who_am_i = 0x73
         assert bench.problem("imu").code is FindingCode.NO_DRIVER
 
@@ -258,7 +259,7 @@ def test_catalog_is_checked(bench):
     problem = bench.problem("catalog")
     assert problem.code is FindingCode.IMAGES_DAMAGED
     assert (problem.parameters["broken"], problem.parameters["images"]) == (1, 6)
-    assert problem.fix == "rig catalog verify --repair --bench sim"
+    assert problem.steps == (Do.REPAIR_CATALOG(),)
     image.unlink()
     (path / "catalog.sqlite").write_bytes(b"SQLite format 3\0" + b"rubbish" * 999)
     (finding,) = bench.findings("catalog")
@@ -294,10 +295,7 @@ def result(bench, days_ago: float, valid_days: float | None = None, **device: ob
 def test_delay_inside_the_camera_is_reported_from_its_calibration():
     with unopened() as bench:
         (found,) = (f for f in bench.findings("calibration") if f.level is Severity.FINE)
-        assert (found.code, found.parameters["command"]) == (
-            FindingCode.CAMERA_DELAY_UNKNOWN,
-            "rig calibrate camera-time --bench sim",
-        )
+        assert (found.code, found.steps) == (FindingCode.CAMERA_DELAY_UNKNOWN, (Do.CALIBRATE(name="camera-time"),))
     with unopened("camera_time.offset_ms=-90", "camera_time.readout_ms=10") as bench:
         (found,) = (f for f in bench.findings("calibration") if f.level is Severity.FINE)
         assert found.code is FindingCode.CAMERA_DELAY
@@ -312,7 +310,7 @@ def test_missing_expired_and_other_device_calibrations_are_warnings(bench):
     problem = bench.problem("calibration")
     assert problem.parameters["status"] is CalibrationStatus.EXPIRED
     assert problem.parameters["calibration"].age_days == pytest.approx(100, abs=0.1)
-    assert problem.fix == "rig calibrate imu --bench sim"
+    assert problem.steps == (Do.CALIBRATE(name="imu"),)
     store.add(result(bench, 1, imu={"who_am_i": 0x99}))
     bench.findings("servo", "imu")  # the devices are known only after their checks
     assert bench.problem("calibration").parameters["status"] is CalibrationStatus.EXPIRED
@@ -361,14 +359,14 @@ def test_hanging_or_failing_check_stops_no_other():
     with unopened() as bench:
         findings = list(run_checks(bench.context, checks))
     released.set()
-    assert [(f.topic, f.code, f.fix, f.exit_code) for f in findings] == [
-        ("hangs", FindingCode.ONLY_SERVO, "", 0),
-        ("hangs", FindingCode.CHECK_TIMED_OUT, "Pull the plug", 9),
-        ("silent", FindingCode.ERROR, "Knock.", 4),
-        ("pulled", FindingCode.ONLY_SERVO, "", 0),
-        ("pulled", FindingCode.CHECK_INTERRUPTED, "rig doctor --bench sim", 4),
-        ("broken", FindingCode.CHECK_FAILED, "Report this with the output of `rig doctor --json`", 1),
-        ("well", FindingCode.ONLY_SERVO, "", 0),
+    assert [(f.topic, f.code, f.steps, f.exit_code) for f in findings] == [
+        ("hangs", FindingCode.ONLY_SERVO, (), 0),
+        ("hangs", FindingCode.CHECK_TIMED_OUT, ("Pull the plug",), 9),
+        ("silent", FindingCode.ERROR, ("Knock.",), 4),
+        ("pulled", FindingCode.ONLY_SERVO, (), 0),
+        ("pulled", FindingCode.CHECK_INTERRUPTED, (Do.DOCTOR(),), 4),
+        ("broken", FindingCode.CHECK_FAILED, (Do.REPORT_DEFECT(),), 1),
+        ("well", FindingCode.ONLY_SERVO, (), 0),
     ]
 
 

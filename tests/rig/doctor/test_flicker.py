@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from rig.core.next_steps import Do
 from rig.doctor.finding import FindingCode
 from rig.doctor.flicker import mains_flicker, standing_flicker, standing_mains_hz
 from sim.faults import Faults
@@ -71,7 +72,7 @@ def test_doctor_names_the_mains_and_the_exposure_that_hides_it():
     with unopened("camera.exposure_us=5000") as bench:
         Faults(bench.devices).schedule(*read_faults(["mains_flicker"]))
         found = bench.problems("camera")
-        assert found == {FindingCode.MAINS_FLICKER: "rig config set camera.exposure_us 10000"}
+        assert found == {FindingCode.MAINS_FLICKER: (Do.SET_KEY(key="camera.exposure_us", value="10000"),)}
     with unopened() as bench:  # the default of 10 ms
         Faults(bench.devices).schedule(*read_faults(["mains_flicker"]))
         assert bench.problems("camera") == {}
@@ -82,7 +83,9 @@ def test_doctor_names_the_mains_whose_bands_stand_still():
     with unopened() as bench:
         Faults(bench.devices).schedule(*read_faults(fault))
         before = bench.devices.camera.exposure
-        assert bench.problems("camera") == {FindingCode.MAINS_FLICKER: "rig config set camera.exposure_us 8333"}
+        assert bench.problems("camera") == {
+            FindingCode.MAINS_FLICKER: (Do.SET_KEY(key="camera.exposure_us", value="8333"),)
+        }
         assert bench.devices.camera.exposure == before
     with unopened("camera.exposure_us=8333") as bench:
         Faults(bench.devices).schedule(*read_faults(fault))

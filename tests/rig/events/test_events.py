@@ -85,6 +85,8 @@ def check(value: Any, kind: str, where: str) -> None:
         assert isinstance(value, list), where
         for item in value:
             check(item, kind.removeprefix("list of "), where)
+    elif " or " in kind:
+        assert isinstance(value, tuple(PLAIN[one] for one in kind.split(" or "))), f"{where}: {value!r} is no {kind}"
     elif kind in PLAIN:
         assert isinstance(value, PLAIN[kind]), f"{where}: {value!r} is no {kind}"
         assert (kind == "boolean") == isinstance(value, bool), f"{where}: {value!r} is no {kind}"

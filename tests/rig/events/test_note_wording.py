@@ -3,26 +3,27 @@
 import pytest
 
 from hbr.dense.stopping import Limitation, LimitationCode
+from rig.core.next_steps import Do, steps_as_json
 from rig.events.events import Note, NoteCode, WaitReason
-from rig.events.note_wording import limitation_words, next_step_words, note_words, wait_words
+from rig.events.note_wording import limitation_words, note_steps, note_words, wait_words
 from tests.rig.report.report_samples import NOTE
 
 
 @pytest.mark.parametrize(
     ("code", "values", "words"),
     [
-        (NoteCode.PAPER_SEARCH, {"used": "cedd", "missing": "edges", "objects": 1}, "--descriptor edges"),
+        (NoteCode.PAPER_SEARCH, {"used": "cedd", "missing": "edges", "objects": 1}, "(1 object without it)"),
         (NoteCode.PAPER_SEARCH, {"used": "cedd", "missing": "edges", "objects": 0}, "the catalog is without it"),
         (NoteCode.ENROLLED_BY_GUESS, {"objects": list("abcde")}, "the views of a, b, c and 2 more were segmented one"),
         (NoteCode.MIXED_EMPTY_TABLE, {"objects": ["a"], "with_image": False}, "a was enrolled without an empty-table"),
         (NoteCode.MIXED_EMPTY_TABLE, {"objects": list("abcde"), "with_image": True}, "a, b, c and 2 more were"),
         (NoteCode.ENROLLED_WITHOUT_EMPTY_TABLE, {}, "most objects were enrolled without"),
-        (NoteCode.EMPTY_TABLE_DOUBTED, {"problems": [{"code": "old", "hours": 72}]}, "(it is 3 days old); to take one"),
+        (NoteCode.EMPTY_TABLE_DOUBTED, {"problems": [{"code": "old", "hours": 72}]}, "(it is 3 days old)"),
         (NoteCode.EMPTY_TABLE_MISSING, {"problems": [{"code": "missing"}]}, "no empty-table image (there is no"),
         (NoteCode.EMPTY_TABLE_OF_ENROLLMENT, {"problems": [{"code": "missing"}]}, "enrollment is used (there is no"),
         (NoteCode.EMPTY_TABLE_CHANGED, {"problem": {"code": "missing"}}, "image: there is no"),
         (NoteCode.TABLE_DIFFERS, {"taken_utc": "2026-01-02"}, "does not look as it did at 2026-01-02"),
-        (NoteCode.STOPPING_RULE_UNREADABLE, {"reason": "no JSON"}, "(no JSON); to renew it: rig catalog calibrate"),
+        (NoteCode.STOPPING_RULE_UNREADABLE, {"reason": "no JSON"}, "(no JSON)"),
         (NoteCode.STOPPING_RULE_OUTDATED, {"made": "2026-01-02", "added": 1, "removed": 2}, "1 object added, 2 obj"),
         (NoteCode.STOPPING_RULE_OUTDATED, {"made": "2026-01-02", "added": 0, "removed": 0}, "(other views, or"),
         (NoteCode.NOT_COMPARED, {"what": "no image"}, "are not compared pixel by pixel: no image"),
@@ -37,8 +38,11 @@ def test_warnings_have_a_next_step() -> None:
         "24 leave-one-out searches cannot guarantee at most 1.0 % wrong answers and 2.0 %"
     )
     for code in (NoteCode.EMPTY_TABLE_CHANGED, NoteCode.TABLE_DIFFERS):
-        assert next_step_words(Note(code)).endswith("rig empty-table")
-    assert next_step_words(Note(NoteCode.NOT_RECORDED, {"next_step": "Wait."})) == "Wait."
+        assert note_steps(Note(code))[-1] == Do.EMPTY_TABLE()
+    for steps in (("Wait.",), (Do.FREE_DISK(), Do.ENROLL(name="cup"))):
+        assert note_steps(Note(NoteCode.NOT_RECORDED, {"steps": steps_as_json(steps)})) == steps
+    missing = Note(NoteCode.PAPER_SEARCH, {"used": "cedd", "missing": "edges", "objects": 1})
+    assert note_steps(missing) == (Do.REDESCRIBE(descriptor="edges"),)
     assert wait_words(WaitReason.NEXT_OBJECT) != wait_words(WaitReason.FIRST_OBJECT)
 
 

@@ -10,6 +10,7 @@ from hbr.core.angles import wrap180, wrap360
 from rig.catalog import Catalog
 from rig.config import load_config
 from rig.core.errors import LimitExceeded
+from rig.core.next_steps import Do
 from rig.events.events import Accepted, Enrolled, Moved, Started
 from rig.motion.motion_model import MotionModel
 from rig.motion.turntable import Turntable
@@ -44,7 +45,7 @@ def test_plan_of_another_bench_is_shifted_by_revolutions_or_rejected():
     assert table_angles(elsewhere, (-400, 400)) == (-180.0, -90.0, 0.0, 90.0)
     with pytest.raises(LimitExceeded) as caught:
         table_angles(even_azimuths(72, (-400, 400)), (-180, 185))
-    assert "--replace" in caught.value.next_step
+    assert Do.ENROLL_AGAIN() in caught.value.steps
 
 
 def test_enrollment_with_a_short_cable_takes_all_views_within_its_limits(simulated, tmp_path):

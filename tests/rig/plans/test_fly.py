@@ -12,6 +12,7 @@ from rig import Catalog, enroll
 from rig.bench import Bench
 from rig.config import load_config
 from rig.core.errors import DeviceSilent, LimitExceeded, ObjectMoved, RigError, RotationDisagreement, UsageError
+from rig.core.next_steps import Do
 from rig.events.events import Accepted, Enrolled, Event, ScanStarted
 from rig.events.lines import line
 from rig.motion.scan_speed import SpeedLimit
@@ -212,7 +213,7 @@ def test_scan_needs_camera_time_and_a_revolution_of_cable(tmp_path: Path) -> Non
         )
         with pytest.raises(UsageError, match="not calibrated") as caught:
             list(enroll(bench, catalog, "block", views=8, fly=True))
-        assert "rig calibrate camera-time" in caught.value.next_step
+        assert Do.CALIBRATE(name="camera-time") in caught.value.steps
         assert not catalog.objects()
 
 

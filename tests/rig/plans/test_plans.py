@@ -17,6 +17,7 @@ from rig.core.errors import (
     RotationDisagreement,
     ViewRejected,
 )
+from rig.core.next_steps import Do
 from rig.events.events import Accepted, Enrolled, Moved, Rejected, Started, event_dict
 from rig.plans.enroll import enroll
 from rig.plans.identify import identify
@@ -82,7 +83,10 @@ def test_identify_is_rejected_if_the_camera_has_other_settings_than_at_the_enrol
         "gain": "6.0 now, 0.0 at the enrollment",
         "sharpness": "90.0 now, 3.0 at the enrollment",
     }
-    assert "`rig config set camera.gain 0`, `rig config set camera.sharpness 3`" in rejected.value.next_step
+    assert rejected.value.steps[:-1] == (
+        Do.SET_KEY(key="camera.gain", value="0"),
+        Do.SET_KEY(key="camera.sharpness", value="3"),
+    )
     next(identify(simulated().bench, load_model(catalog)))
 
 

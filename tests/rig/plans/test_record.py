@@ -9,7 +9,9 @@ import pytest
 
 from rig.catalog import Catalog
 from rig.catalog.results import find_results
+from rig.core.next_steps import Do
 from rig.events.events import Accepted, Identified, NoteCode, Recorded, Warned
+from rig.events.note_wording import note_steps
 from rig.plans.record import ResultRecorder
 from tests.rig.report.report_samples import identifying
 
@@ -63,7 +65,7 @@ def test_answer_is_reported_on_a_full_disk(recorder, monkeypatch):
     assert isinstance(warned, Warned)
     assert warned.note.code is NoteCode.NOT_RECORDED
     assert "full" in warned.note.values["what"]
-    assert "Free some space" in warned.note.values["next_step"]
+    assert Do.FREE_DISK() in note_steps(warned.note)
 
 
 def stream_with(recorder, monkeypatch, fail):

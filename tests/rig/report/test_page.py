@@ -13,6 +13,7 @@ import pytest
 
 from hbr import Outcome
 from rig.core.errors import UsageError
+from rig.core.next_steps import Do
 from rig.events.compared import Compared, ComparedView
 from rig.events.events import Accepted
 from rig.report import EnrollmentRecord, IdentificationRecord, Meta, Truth, render_report, write_report
@@ -279,7 +280,7 @@ def test_folder_that_cannot_be_created_is_a_clear_error(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(UsageError, match=r"cannot be written to .*report\.html") as caught:
         write_report(tmp_path / "file" / "report.html", "x")
-    assert "--out" in caught.value.next_step
+    assert Do.RUN_AGAIN(out="FILE") in caught.value.steps
     assert caught.value.evidence["reason"]
 
 

@@ -22,6 +22,7 @@ from rig.core.errors import (
     UsageError,
     WatchdogTripped,
 )
+from rig.core.next_steps import Do
 from rig.motion.turntable import Turntable
 from rig.safety.angle_reference import AngleFinding
 from rig.safety.saved_state import FileStore
@@ -41,7 +42,7 @@ def bench_of(tmp_path):
             assert bench.safety.state is TableState.UNREFERENCED
             with pytest.raises(Unreferenced) as rejected, Turntable(bench):
                 pass
-            assert "rig home --revolutions 0" in rejected.value.next_step
+            assert Do.SET_REVOLUTIONS(revolutions=0) in rejected.value.steps
             bench.safety.set_revolutions(0)
         yield lambda: program(wires, i2c, FileStore(tmp_path / "state")), wires
 
@@ -257,7 +258,7 @@ def test_fault_survives_the_program_until_it_is_acknowledged(start, wires):
         with pytest.raises(FaultLatched, match="blocked") as rejected, Turntable(bench):
             pass
         assert rejected.value.evidence["code"] == Stalled.code
-        assert "rig acknowledge" in rejected.value.next_step
+        assert Do.ACKNOWLEDGE() in rejected.value.steps
         wires.device.free()
         assert bench.safety.acknowledge() is TableState.READY
     with start() as bench, Turntable(bench) as table:
@@ -275,7 +276,7 @@ def test_hardware_error_needs_a_reboot_that_loses_no_revolution(start, wires):
     with start() as bench:
         with pytest.raises(DeviceFault) as still:
             bench.safety.acknowledge()
-        assert "rig acknowledge --reboot" in still.value.next_step
+        assert Do.ACKNOWLEDGE(reboot=True) in still.value.steps
         assert bench.safety.state is TableState.FAULT
         assert bench.safety.acknowledge(reboot=True) is TableState.READY
         assert wires.world.shaft() == (stands_deg, 0.0)
@@ -331,7 +332,7 @@ def test_changed_settings_of_the_table_need_home_here(change, tmp_path, start, w
         assert bench.safety.doubt.finding is AngleFinding.SETTINGS_CHANGED
         with pytest.raises(Unreferenced) as rejected, Turntable(bench):
             pass
-        assert "rig home --here" in rejected.value.next_step
+        assert Do.HOME_HERE() in rejected.value.steps
         with pytest.raises(Unreferenced):
             bench.safety.set_revolutions(0)
         bench.safety.set_angle(0.0)
@@ -387,7 +388,7 @@ def test_full_disk_does_not_lose_the_fault_of_a_motion(start, wires):
 
 def test_stop_request_ends_the_motion_with_torque_off(tmp_path, start, wires):
     with start() as bench:
-        with pytest.raises(RigError, match="rig stop") as stopped, Turntable(bench) as table:
+        with pytest.raises(RigError, match="operator stopped") as stopped, Turntable(bench) as table:
             after(wires, 1.2, FileStore(tmp_path / "state").request_stop)
             table.goto(300.0)
         assert (stopped.value.code, stopped.value.exit_code) == (512, 5)

@@ -23,6 +23,7 @@ from rig.core.errors import (
     Unreferenced,
     UsageError,
 )
+from rig.core.next_steps import Do
 from rig.devices.servo import ServoCondition, ServoIdentity, ServoLimits, ServoState
 from rig.safety.angle_reference import AngleFinding
 from rig.safety.saved_state import BenchState, FileStore, LatchedFault, MemoryStore, StateStore
@@ -312,22 +313,22 @@ def test_nothing_moves_if_the_state_cannot_be_stored():
     safety.latch(stalled)  # the fault is latched even if the disk is full
     assert safety.state is TableState.FAULT
     assert "in this program only" in stalled.__notes__[0]
-    assert stalled.next_step.endswith(
-        "Then start the program again: this bench keeps the fault only while its program runs."
-    )
+    assert stalled.steps == ("Free it.", Do.ACKNOWLEDGE_IN_PROGRAM())
 
 
 def test_a_fault_is_acknowledged_by_a_command_only_if_its_latch_outlasts_the_program(tmp_path):
     def latched(store: StateStore) -> str:
-        error = Overheated("It is hot.", next_step="Wait.", afterwards="Start again.").ask_to_acknowledge(reboot=True)
+        error = Overheated("It is hot.", next_step=("Wait.", Do.ACKNOWLEDGE(reboot=True), Do.RUN_AGAIN()))
         safety = Safety(Shaft(), RigConfig(), VirtualClock(), store)
         safety.latch(error)
         with pytest.raises(FaultLatched) as rejected:
             safety.require_ready()
-        assert rejected.value.next_step == error.next_step
+        assert rejected.value.steps == error.steps == safety.next_step
         return error.next_step
 
-    assert latched(FileStore(tmp_path)) == "Wait. Then run `rig acknowledge --reboot`. Start again."
+    assert latched(FileStore(tmp_path)) == (
+        "Wait. Then acknowledge the fault: `rig acknowledge --reboot`. Then start again."
+    )
     in_memory = latched(MemoryStore())
     assert in_memory.startswith("Wait. Then start the program again: ")
     assert "rig acknowledge" not in in_memory

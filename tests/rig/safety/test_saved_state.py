@@ -15,6 +15,7 @@ from rig.bench import open_bench
 from rig.config import load_config
 from rig.core.clock import SystemClock
 from rig.core.errors import BenchBusy, Stalled, StateNotStored
+from rig.core.next_steps import Do
 from rig.safety.bench_lock import BenchLock, holder
 from rig.safety.saved_state import LATCH_BYTES, SESSION, BenchState, FileStore, Holder, LatchedFault, SavedTable
 from sim import disk
@@ -219,7 +220,7 @@ def test_second_program_reports_the_one_that_uses_the_bench(tmp_path, other_prog
     with pytest.raises(BenchBusy, match=rf"process {other_program.pid} .*teapot") as caught:
         BenchLock(tmp_path, SystemClock())
     assert caught.value.exit_code == 9
-    assert "rig stop" in caught.value.next_step
+    assert Do.STOP() in caught.value.steps
 
 
 def test_killed_program_releases_the_bench(tmp_path, other_program):

@@ -15,6 +15,7 @@ from typer.testing import CliRunner
 import hbr
 from rig.cli.main import app
 from rig.core.errors import UsageError
+from rig.core.next_steps import Do
 from rig.events.compared import Compared
 from rig.events.events import (
     Accepted,
@@ -267,7 +268,7 @@ def test_run_names_a_network_by_its_digest(saved, tmp_path):
         (folder / "run.json").write_text(json.dumps(about))
         with pytest.raises(UsageError, match="needs the model") as caught:
             load_run(folder)
-        assert "--model" in caught.value.next_step
+        assert Do.RUN_AGAIN(model="FILE") in caught.value.steps
 
 
 def test_name_with_a_line_separator_is_read_again(saved, tmp_path):

@@ -16,8 +16,9 @@ from rig.bench import Bench
 from rig.catalog import Catalog
 from rig.config import RigConfig, load_config
 from rig.core.errors import StateNotStored, TableNotEmpty, UsageError, ViewRejected
+from rig.core.next_steps import Do
 from rig.events.events import EmptyTableImage, NoteCode, Warned
-from rig.events.note_wording import next_step_words, note_words
+from rig.events.note_wording import note_steps, note_words
 from rig.plans.enroll import enroll
 from rig.plans.photograph_table import photograph_table
 from rig.safety.saved_state import FileStore, MemoryStore
@@ -63,7 +64,7 @@ def test_rotation_stays_within_the_cable_limits(simulated: Open, limits: tuple[i
     s.operator.place("toy-house")
     with pytest.raises(TableNotEmpty, match="Something is on the table") as caught:
         photographed(s.bench)
-    assert "--anyway" in caught.value.next_step
+    assert Do.EMPTY_TABLE(anyway=True) in caught.value.steps
 
 
 def test_forgotten_object_is_rejected_and_the_previous_image_stays(simulated: Open) -> None:
@@ -212,7 +213,7 @@ def test_full_disk_is_reported_and_the_previous_image_stays(simulated: Open, tmp
     s.bench.state = Full(tmp_path)
     with pytest.raises(StateNotStored, match="cannot be stored") as caught:
         photographed(s.bench)
-    assert "Make room" in caught.value.next_step
+    assert Do.FREE_DISK() in caught.value.steps
     s.bench.state = store
     table = empty_table_status(s.bench).table
     assert table is not None
@@ -248,7 +249,7 @@ def test_changed_surroundings_are_reported_once_and_stored(simulated: Open, tmp_
         views = catalog.object("toy-car").views
     assert [event.index for event in warned] == [2]
     assert warned[0].note.code is NoteCode.EMPTY_TABLE_CHANGED
-    assert "rig empty-table" in next_step_words(warned[0].note)
+    assert Do.EMPTY_TABLE() in note_steps(warned[0].note)
     assert all(view.record.segmentation["issues"][0]["code"] == "empty-table-differs" for view in views)
     *_, problem = empty_table_status(s.bench).problems
     assert (problem.code, problem.parameters["frames"]) == (TableProblemCode.SURROUNDINGS, 3)

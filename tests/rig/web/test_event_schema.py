@@ -50,5 +50,5 @@ def test_stream_and_saved_run_send_such_events(serve):
     saved = served.client.get(f"/api/v1/runs/{job['run']}").json()["events"]
     assert {"started", "moved", "accepted", "ranked", "identified", "enrolled"} <= {data["event"] for data in sent}
     for data in (*sent, *saved):
-        assert data.keys() - event_dict(event_of(data)).keys() <= {"job", "text", "picture", "outline_px"}
+        assert data.keys() - event_dict(event_of(data)).keys() <= {"job", "text", "steps", "picture", "outline_px"}
         assert event_dict(event_of(data)).items() <= data.items()

@@ -256,7 +256,7 @@ def test_server_that_ends_in_a_job_stores_how_it_ended(tmp_path, monkeypatch, er
     def fail(_event: Any) -> str:
         raise error
 
-    monkeypatch.setattr("rig.web.work.line", fail)
+    monkeypatch.setattr("rig.web.work.page_line", fail)
     config = load_config(None, [f"catalog.path={tmp_path}/catalog", f"state_dir={tmp_path}/state"])
     setup = Setup(bench="sim", config=config, listening=Listening(host="127.0.0.1", port=0))
     side, _, disconnect = connected(setup)

@@ -15,6 +15,7 @@ from rig.catalog.exchange import (
 )
 from rig.catalog.verify import verify
 from rig.core.errors import ImportRejected, UsageError
+from rig.core.next_steps import Do
 from tests.rig.catalog.catalog_samples import (
     finished,
 )
@@ -140,7 +141,7 @@ class TestFolders:
         photograph(tmp_path / "IMG.png", 0)
         with pytest.raises(ImportRejected) as error:
             read_folder(tmp_path, now=NOW)
-        assert "--pattern" in error.value.next_step
+        assert Do.RUN_AGAIN(pattern="{object}/{angle}") in error.value.steps
         with pytest.raises(ImportRejected, match="no folder"):
             read_folder(tmp_path / "nowhere", now=NOW)
 

@@ -253,7 +253,7 @@ def test_doctor_uses_the_defaults_if_the_configuration_is_broken(home):
     (home / "rig.toml").write_text("[servo]\nbaud = 3\nprot = 1\n", encoding="utf-8")
     done = rig("doctor", "--bench", "sim")
     assert done.exit_code == 3
-    assert done.stdout.count("→ rig config check") == 2
+    assert done.stdout.count("→ Check the configuration: `rig config check`.") == 2
     assert "XL430-W250" in done.stdout
 
 

@@ -128,7 +128,7 @@ def test_identify_names_redescribe_for_a_new_descriptor(two: Rig, monkeypatch: p
     monkeypatch.setitem(registry._KNOWN, "cedd", Cedd(version=2))
     stopped = two("identify", "--max-views", "2")
     assert stopped.exit_code == 7
-    assert "Next step: Describe the stored images again: rig catalog redescribe" in stopped.stderr
+    assert "Next step: Describe the stored images again: `rig catalog redescribe`" in stopped.stderr
     assert result(two("catalog", "redescribe", "--json"))["described"] == 8
     assert two("identify", "--max-views", "2").exit_code in (0, 8)
     assert two("catalog", "redescribe", "--descriptor", "sift").exit_code == 2

@@ -149,7 +149,7 @@ def test_stopping_rule_is_calibrated_stored_and_used(rig, enrolled):
     kept.write_text("{", encoding="utf-8")
     done = rig("identify", "--set", "bench.sim.object=lamp")
     assert done.exit_code == 0
-    assert "to renew it: rig catalog calibrate" in done.stdout
+    assert "Fit the stopping rule again: `rig catalog calibrate`" in done.stdout
     kept.unlink()
 
 

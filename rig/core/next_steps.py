@@ -1,0 +1,210 @@
+"""The next step of an error, a note or a finding, as data that each presenter words in its own way.
+
+A next step is a list of sentences, for what only hands can do, and of actions of the rig with their parameters. This
+module words it for a terminal. The page `rig.web.next_steps` words it as buttons and links.
+"""
+
+import re
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from enum import StrEnum, unique
+from shlex import quote
+from typing import Any, Final, Self
+
+from rig.core.masking import masked
+
+
+@unique
+class Do(StrEnum):
+    """The actions that a next step can name. Call one to give it parameters: ``Do.ENROLL(name="lamp")``.
+
+    Attributes
+    ----------
+    words
+        The action in words, without capital and full stop.
+    command
+        The command that does it; empty if no command does. It contains ``{key}`` for parameters in fixed places. All
+        other parameters are options: ``reboot=True`` is ``--reboot``.
+    """
+
+    words: str
+    command: str
+
+    def __new__(cls, value: str, words: str, command: str = "") -> Self:
+        member = str.__new__(cls, value)
+        member._value_, member.words, member.command = value, words, command
+        return member
+
+    def __call__(self, **parameters: Any) -> "NextStep":
+        """Return the action with its parameters; those that are None or False do not apply."""
+        return NextStep(
+            self, {key: value for key, value in parameters.items() if value is not None and value is not False}
+        )
+
+    # the table
+    ACKNOWLEDGE = "acknowledge", "acknowledge the fault", "rig acknowledge"
+    ACKNOWLEDGE_IN_PROGRAM = (
+        "acknowledge-in-program",
+        "start the program again: this bench keeps the fault only while its program runs",
+    )
+    HOME_HERE = "home-here", "make the present angle home", "rig home --here"
+    SET_REVOLUTIONS = (
+        "set-revolutions",
+        "set the revolutions of the cable to {revolutions}",
+        "rig home --revolutions {revolutions}",
+    )
+    GOTO = "goto", "rotate the table to an angle", "rig goto {angle}"
+    STOP = "stop", "stop the table and switch its torque off", "rig stop"
+    STATUS = "status", "look at the state of the bench", "rig status"
+    RUN_AGAIN = "run-again", "start again"
+    # the bench and its devices
+    DOCTOR = "doctor", "check the bench", "rig doctor"
+    UDEV_RULES = "udev-rules", "write the rules of udev", "rig doctor --udev"
+    REPORT_DEFECT = "report-defect", "report this with the output of the check", "rig doctor --json"
+    FIND = "find", "list the connected devices", "rig find"
+    SETUP = "setup", "set the bench up", "rig setup"
+    SERVO_SETTINGS = (
+        "servo-settings",
+        "write the settings of the servo, with its torque off",
+        "rig servo settings --write",
+    )
+    SERVO_ID = "servo-id", "give the servo the id {id}", "rig servo set-id {id}"
+    SERVO_BAUD = "servo-baud", "set the baud rate of the servo", "rig servo set-baud {baud}"
+    CALIBRATE = "calibrate", "run the calibration {name}", "rig calibrate {name}"
+    # the configuration and the computer
+    SET_KEY = "set-key", "set {key} to {value}", "rig config set {key} {value}"
+    CHECK_CONFIGURATION = "check-configuration", "check the configuration", "rig config check"
+    SHOW_CONFIGURATION = "show-configuration", "list the keys of the configuration", "rig config show"
+    FREE_DISK = "free-disk", "free some space on the disk"
+    INSTALL_EXTRA = "install-extra", "install the missing packages", "pip install 'hbr-rig[{extra}]'"
+    NEW_TOKEN = "new-token", "make a token", "rig serve --new-token {name}"
+    SERVE_AGAIN = "serve-again", "end the server and start it again", "rig serve"
+    # objects
+    ENROLL = "enroll", "enroll an object", "rig enroll {name}"
+    ENROLL_AGAIN = "enroll-again", "enroll the object again", "rig enroll {name} --replace"
+    CONTINUE_ENROLLMENT = "continue-enrollment", "continue the enrollment", "rig enroll {name} --resume"
+    EMPTY_TABLE = "empty-table", "take a new empty-table image", "rig empty-table"
+    LIST_RESULTS = "list-results", "list the results", "rig results list"
+    # the catalog
+    LIST_OBJECTS = "list-objects", "list the objects", "rig catalog list"
+    LABEL = "label", "change the label and the note", "rig catalog label {name}"
+    RENAME = "rename", "rename the other object", "rig catalog rename {name} NEW-NAME"
+    UNDELETE = "undelete", "restore the object", "rig catalog undelete {name}"
+    REMOVE_DELETED = "remove-deleted", "remove deleted objects from the disk", "rig catalog gc"
+    VERIFY_CATALOG = "verify-catalog", "check the catalog", "rig catalog verify"
+    REPAIR_CATALOG = "repair-catalog", "repair the catalog", "rig catalog verify --repair"
+    REDESCRIBE = "redescribe", "describe the stored images again", "rig catalog redescribe"
+    FIT_STOPPING_RULE = "fit-stopping-rule", "fit the stopping rule again", "rig catalog calibrate"
+    MERGE = "merge", "add the objects to a catalog", "rig catalog merge {source}"
+    DELIVER_RENAMED = (
+        "deliver-renamed",
+        "deliver the object with another name",
+        "rig catalog deliver --rename {name} NEW-NAME",
+    )
+    DELIVER_REPLACING = "deliver-replacing", "replace the object on the server", "rig catalog deliver --replace {name}"
+    DISCARD = "discard", "discard the object in the journal", "rig catalog deliver --discard {name}"
+    # simulation
+    LIST_FAULTS = "list-faults", "list the simulated faults", "rig faults"
+    SIM_BENCH = "sim-bench", "run the simulated bench in another terminal", "rig sim-bench"
+    END_SIM_BENCH = "end-sim-bench", "end it", "rig sim-bench --folder {folder} quit"
+
+
+_KEY: Final = re.compile(r"{(\w+)}")
+_ACTIONS: Final = {str(action): action for action in Do}
+
+
+@dataclass(frozen=True, slots=True)
+class NextStep:
+    """An action that the operator does next.
+
+    Attributes
+    ----------
+    action
+        What to do.
+    parameters
+        Its parameters. Passwords in them are `masked`.
+    options
+        Options of the command line that select the bench and its configuration: ``--bench sim``.
+    """
+
+    action: Do
+    parameters: dict[str, Any] = field(default_factory=dict)
+    options: tuple[str, ...] = field(default=(), compare=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "parameters", masked(self.parameters))
+
+    @property
+    def command(self) -> str:
+        """The command line; an unknown parameter is in capitals. Empty if no command does the action."""
+        words = _KEY.sub(lambda key: quote(str(self.parameters.get(key[1], key[1].upper()))), self.action.command)
+        if not words.startswith("rig "):
+            return words
+        return " ".join([words, *self._given_options(), *map(quote, self.options)])
+
+    @property
+    def words(self) -> str:
+        """The action in words, for a terminal, without capital and full stop."""
+        if self.action is Do.RUN_AGAIN and self.parameters:
+            return f"{self.text} with {' '.join(self._given_options())}"
+        return f"{self.text}: `{self.command}`" if self.command else self.text
+
+    @property
+    def text(self) -> str:
+        """The action in words, without a command."""
+        return _KEY.sub(lambda key: str(self.parameters.get(key[1], key[1])), self.action.words)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the step as `--json` prints it."""
+        return {"action": str(self.action), "parameters": self.parameters, "command": self.command or None}
+
+    def _given_options(self) -> Iterator[str]:
+        """Yield the words of the parameters that are options of the command."""
+        placed = _KEY.findall(self.action.command)
+        for key, value in self.parameters.items():
+            if key not in placed:
+                yield f"--{key.replace('_', '-')}" + ("" if value is True else f" {quote(str(value))}")
+
+
+NextSteps = tuple[str | NextStep, ...]
+"""Sentences and actions, in order. A sentence may end open before an action: ``"If the cable hangs free,"``."""
+START_AGAIN: Final[NextSteps] = (Do.RUN_AGAIN(), "Or", Do.CONTINUE_ENROLLMENT())
+"""After a motion that was interrupted."""
+SomeSteps = str | NextStep | Iterable[str | NextStep]
+"""What a next step can be given as."""
+
+
+def as_steps(given: SomeSteps) -> NextSteps:
+    """Return a next step as a list; passwords in its sentences are `masked`."""
+    if isinstance(given, str | NextStep):
+        given = (given,)
+    return tuple(masked(step) for step in given if step)
+
+
+def in_words(steps: SomeSteps) -> str:
+    """Return a next step as a terminal shows it, with commands."""
+    words = ""
+    for step in as_steps(steps):
+        if isinstance(step, str):
+            text = step
+        else:
+            text = f"{step.words}."
+            if not words:
+                text = f"{text[0].upper()}{text[1:]}"
+            elif words.endswith((".", "?")):
+                text = f"Then {text}"
+        words = f"{words} {text}".lstrip()
+    return words
+
+
+def steps_as_json(steps: Iterable[str | NextStep]) -> list[Any]:
+    """Return a next step as `--json` prints it: a sentence is a text, an action an object."""
+    return [step if isinstance(step, str) else step.as_dict() for step in steps]
+
+
+def steps_from_json(values: Iterable[Any]) -> NextSteps:
+    """Return the next step of values from `steps_as_json`."""
+    return tuple(
+        value if isinstance(value, str) else NextStep(_ACTIONS[value["action"]], value["parameters"])
+        for value in values
+    )

@@ -1,0 +1,47 @@
+"""The next step of an error in a real Chromium: sentences, and buttons and links that do it."""
+
+import pytest
+
+pytestmark = pytest.mark.nightly  # make test-web runs them
+WAIT_MS = 60_000
+
+
+def rotate(page, server, angle_deg):
+    page.goto(server.url)
+    page.fill("#angle", str(angle_deg))
+    page.click("#goto button")
+
+
+@pytest.mark.parametrize("stored", [True, False], ids=["stored", "only in the program"])
+def test_fault_is_acknowledged_on_any_page(page, serve_process, stored, tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    settings = ['bench.sim.faults=["jam@move1"]']
+    server = serve_process(*settings, *([] if stored else ["state_dir=none"]))
+    rotate(page, server, 90)
+    page.wait_for_selector("#next-steps:has-text('Remove what blocks the table')", timeout=WAIT_MS)
+    page.goto(f"{server.url}enroll")
+    page.click("#next-steps button:has-text('Acknowledge the fault')")
+    page.wait_for_selector("#state:has-text('Ready')", timeout=WAIT_MS)
+    assert page.text_content("#next-steps") == ""
+
+
+def test_errors_name_no_command_that_a_page_can_do(page, serve_process):
+    server = serve_process("bench.sim.speed=20", 'enroll.mode="fly"')
+    page.goto(f"{server.url}enroll")
+    page.fill("#name", "lamp")
+    page.click("#one button:has-text('Enroll')")
+    page.wait_for_selector("#job a[href='/calibrations']:has-text('Run the calibration camera-time')", timeout=WAIT_MS)
+    page.goto(f"{server.url}identify")
+    page.click("#start button:has-text('Identify')")
+    page.wait_for_selector("#answer-detail a[href='/enroll']:has-text('Enroll an object')", timeout=WAIT_MS)
+    page.goto(server.url)
+    page.click("#doctor")
+    page.wait_for_selector("#findings a[href='/calibrations']", timeout=WAIT_MS)
+    assert "rig calibrate" not in page.inner_text("body")
+    page.evaluate(
+        "async (steps) => (await import('/static/rig.js')).show({ message: 'No.', steps })",
+        [
+            {"action": "redescribe", "parameters": {}, "command": "rig catalog redescribe"},
+        ],
+    )
+    assert "at a terminal of the bench's computer: rig catalog redescribe" in page.inner_text("#messages")

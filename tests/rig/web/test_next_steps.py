@@ -1,0 +1,31 @@
+"""The next step of an error on a page: each action has words, and its button or link leads somewhere."""
+
+import pytest
+
+from rig.core.next_steps import Do, in_words
+from rig.web.next_steps import JOBS, PAGES, page_actions
+from rig.web.pages import PAGES as ALL_PAGES
+
+
+def test_each_action_is_worded_for_a_page_and_for_a_terminal():
+    actions = page_actions()
+    assert actions.keys() == {str(action) for action in Do}
+    for action in Do:
+        shown = actions[str(action)]
+        assert shown["words"]
+        assert "rig " not in shown["words"]
+        assert in_words(action()).endswith(".")
+        assert (shown["job"] is None) or (shown["page"] is None)
+
+
+@pytest.mark.parametrize("action", JOBS)
+def test_each_button_is_a_job_that_takes_the_parameters_of_its_step(action):
+    parameters = {Do.SET_REVOLUTIONS: {"revolutions": -1}, Do.EMPTY_TABLE: {"anyway": True}}.get(action, {})
+    if action in (Do.ACKNOWLEDGE, Do.ACKNOWLEDGE_IN_PROGRAM):
+        parameters = {"reboot": True}
+    request = {**page_actions()[str(action)]["job"], **action(**parameters).parameters}
+    assert type(JOBS[action]).model_validate(request)
+
+
+def test_each_link_leads_to_a_page():
+    assert {page.removeprefix("/") for page in PAGES.values()} <= ALL_PAGES.keys()
