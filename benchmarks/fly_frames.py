@@ -83,7 +83,7 @@ def measured(index: hbr.DenseIndex, background: str) -> tuple[dict[str, list[flo
     images: list[Image] = []
     with open_sim_bench(config, operator) as bench:
         assert operator.devices is not None
-        bench.operator.place(None)
+        bench.place(None)
         if background != "plain":
             operator.devices.camera.backdrop = another_bench(np.random.default_rng(1))
         locks = bench.camera.read_locks()

@@ -63,7 +63,7 @@ def record(bench: Bench, operator: ShelfOperator, name: str) -> dict[str, Seen]:
     found: dict[str, Seen] = {}
     for kind in ("enrolled", "rest"):
         operator.next_object, operator.yaw_deg = name, 0.0 if kind == "enrolled" else 5.0
-        bench.operator.place(None)
+        bench.place(None)
         with Turntable(bench) as table:
             start_deg, step_deg = 0.0, 360.0 / VIEWS
             if kind == "rest":

@@ -6,7 +6,7 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-from rig.bench import Bench, ObjectAlreadyPlaced
+from rig.bench import Bench
 from rig.bench.bench import DEVICES
 from rig.catalog import Action, Catalog
 from rig.catalog.jobs import JobProgress
@@ -82,7 +82,7 @@ class Desk(ABC):
 
     def who_places(self, bench: Bench) -> Operator:
         """Return who answers questions about the objects of a tray: no person if the bench places them by itself."""
-        return self.operator if isinstance(bench.operator, ObjectAlreadyPlaced) else Unattended()
+        return self.operator if bench.placer is None else Unattended()
 
     @abstractmethod
     def open_to_read(self) -> Catalog:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from hbr.dense.last_steps import answered
 from hbr.dense.local_difference import LocalView
-from rig.bench import Bench
+from rig.bench import Bench, Placer
 from rig.config import RigConfig
 from rig.core.errors import CatalogError, MotionStopped, NoObject, RigError, ViewRejected
 from rig.events.events import (
@@ -38,7 +38,6 @@ from rig.search.strategies import AnyStrategy, Rotate
 from rig.views.capture import Viewer
 from rig.views.description import SearchDescriber
 from rig.views.empty_table import empty_table_status
-from rig.views.object_presence import TableWatcher
 
 
 def identify(
@@ -46,7 +45,7 @@ def identify(
     model: Model,
     *,
     config: RigConfig | None = None,
-    watcher: TableWatcher | None = None,
+    placer: Placer | None = None,
     strategy: AnyStrategy | str | None = None,
     seed: int = 0,
     top: int = SHOWN,
@@ -71,8 +70,8 @@ def identify(
         The enrolled views, from `rig.search.model.load_model` or `rig.search.model.model_of`.
     config
         The settings of the search, if they are not those of the bench.
-    watcher
-        Waits until the object is on the table; by default the bench's own operator.
+    placer
+        Puts the object on the table, or waits for it; the default is that of the bench.
     strategy
         Its name, or a `Strategy` object. The default is the one that the model is for.
     seed
@@ -121,7 +120,7 @@ def identify(
         bench_image=None if bench.config.table.carries == "camera" else model.bench_image,
     )
     check = partial(check_object, bench, empty_table=empty_table if own is None else own.image_bgr)
-    (watcher or bench.operator).place(None)
+    (placer or bench).place(None)
     yield Started(
         "identify",
         None,
@@ -210,8 +209,8 @@ def watch(
     bench
         An open bench.
     identify_next
-        Begins `identify` for the next object, with a model of what is enrolled then. Its operator brings the objects,
-        or its watcher waits for them.
+        Begins `identify` for the next object, with a model of what is enrolled then. Its placer brings the objects,
+        or waits for them.
 
     Raises
     ------

@@ -45,7 +45,7 @@ def add_bench(routes: Routes, server: Server) -> None:
         headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
         return EventStream(server.hub.stream(last_event_id, lambda: server.still_allowed(request)), headers=headers)
 
-    @routes.anybody.websocket("/socket")
+    @routes.public.websocket("/socket")
     async def socket(socket: WebSocket) -> None:
         """Send the events to a page, and take its STOP: the connection is open already, and no other can occupy it."""
         if not server.still_allowed(socket) or server.hub.listeners >= MAX_LISTENERS:

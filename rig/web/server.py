@@ -203,7 +203,7 @@ class Routes:
     """The routes of the API by the right that they need: none, to watch, or to operate the bench."""
 
     def __init__(self) -> None:
-        self.anybody = APIRouter()
+        self.public = APIRouter()
         self.watch = APIRouter(dependencies=[Depends(watcher)])
         self.operate = APIRouter(dependencies=[Depends(operator)])
 
