@@ -112,7 +112,7 @@ def absent(root: Path) -> CatalogError:
             f"{root} is a file, not the folder of a catalog.", next_step="Give the folder of the catalog."
         )
     return CatalogError(
-        f"There is no catalog in {root}.", next_step="Check the path, or enroll an object to create it."
+        f"There is no catalog in {root}.", next_step=("Check the path, or", Do.ENROLL(), "This creates it.")
     )
 
 

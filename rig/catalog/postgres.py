@@ -23,6 +23,7 @@ from rig.catalog.schema import APPEND_ONLY, METADATA, SCHEMA_VERSION
 from rig.config.catalog_place import CatalogPlace
 from rig.core.errors import CatalogError, CatalogUnavailable, ConfigError, ExtraMissing
 from rig.core.files import make_folder
+from rig.core.next_steps import Do
 
 CHANNEL: Final = "hbr_rig_catalog"
 """Channel of the notifications about changes; the payload is the id of the catalog."""
@@ -198,7 +199,7 @@ class PostgresDatabase(Database):
 def _absent(place: CatalogPlace) -> CatalogError:
     return CatalogError(
         f"The database {place} has no catalog.",
-        next_step="Check catalog.url, or enroll an object to create the catalog.",
+        next_step=("Check catalog.url, or", Do.ENROLL(), "This creates the catalog."),
     )
 
 

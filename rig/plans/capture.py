@@ -73,7 +73,7 @@ def check_camera(bench: Bench, settings: Collection[Mapping[str, Any]]) -> None:
     changes = [Do.SET_KEY(key=f"camera.{key}", value=f"{value:g}") for key, value in nearest.items() if key in keys]
     raise CameraSettingsDiffer(
         "The camera has other settings than at the enrollment.",
-        next_step=(*(changes or ("Lock the camera.",)), "Otherwise enroll the objects again."),
+        next_step=(*(changes or ("Lock the camera.",)), "Otherwise,", Do.ENROLL_AGAIN()),
         evidence={key: f"{now[key]} now, {value} at the enrollment" for key, value in nearest.items()},
     )
 
