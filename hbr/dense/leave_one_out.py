@@ -298,8 +298,8 @@ def _numbers(
     correct = np.zeros(len(queries), np.bool_)
     for n, query in enumerate(queries):
         support += index.support(index.similarity(query), float(azimuth_deg[n] - azimuth_deg[0]))
-        so_far = index, support, azimuth_deg[: n + 1]
-        best, known[n] = evidence(*so_far, units[: n + 1], lambda some: unit_rows(whitened(some)))
-        _, unknown[n] = evidence(*so_far, others[: n + 1], lambda some: left_out(whitened(some)), without=place)
+        belief = Belief(index, support, azimuth_deg[: n + 1])
+        best, known[n] = evidence(belief, units[: n + 1], lambda some: unit_rows(whitened(some)))
+        _, unknown[n] = evidence(belief, others[: n + 1], lambda some: left_out(whitened(some)), place)
         correct[n] = best == place
     return known, unknown, correct
