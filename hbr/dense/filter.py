@@ -15,6 +15,7 @@ import numpy as np
 from hbr.core.angles import wrap180, wrap360
 from hbr.core.arrays import FloatArray, IndexArray, LevelArray
 from hbr.dense.index import BIN_DEG, BINS, POWER, DenseIndex, Floats
+from hbr.descriptors import descriptor
 
 #: As for `Belief.posterior`: fits the similarities of the bench's own descriptor.
 BETA: Final = 30.0
@@ -185,7 +186,7 @@ def update_belief(
     """
     index = so_far.index if isinstance(so_far, Belief) else so_far
     query = np.asarray(query)
-    length = index.length
+    length = descriptor(index.views.descriptor).length
     if query.dtype != np.uint8 or query.ndim not in (1, 2) or query.shape[-1] != length or not query.size:
         raise ValueError(
             f"the query is {query.dtype} of shape {query.shape}; {index.views.descriptor} has uint8 of ({length},)"

@@ -6,7 +6,6 @@
 Decisions: docs/decisions/0026, docs/decisions/0049, docs/decisions/0059, docs/decisions/0060.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from math import ceil, floor, inf, nan
 from typing import Final
@@ -268,7 +267,6 @@ def fit_stopping_rule(
     most_searches: int = MOST_SEARCHES,
     most_shifted_searches: int = MOST_SEARCHES,
     sample: int | None = None,
-    progress: Callable[[int, int], object] | None = None,
     tasks: Tasks | None = None,
 ) -> FittedRule:
     """Search for the enrolled objects among each other, and return the rule that is fitted to these searches.
@@ -286,10 +284,10 @@ def fit_stopping_rule(
         Searches under changes of the bench, from which the open-set score is fitted (`fit_open_set`).
     sample
         Number of objects to search for, among each other; by default all.
-    progress, tasks
+    tasks
         As for `leave_one_out`.
     """
-    searches = fitting_searches(index, most_searches=most_searches, sample=sample, progress=progress, tasks=tasks)
+    searches = fitting_searches(index, most_searches=most_searches, sample=sample, tasks=tasks)
     if searches is None:
         return FittedRule(_rule_without_candidates(index, error_rate, false_reject))
     objects = len(index) if sample is None else min(len(index), max(2, sample))
@@ -327,7 +325,6 @@ def fitting_searches(
     *,
     most_searches: int = MOST_SEARCHES,
     sample: int | None = None,
-    progress: Callable[[int, int], object] | None = None,
     tasks: Tasks | None = None,
 ) -> LeaveOneOut | None:
     """Return the leave-one-out searches of a fit; None if objects cannot be compared with each other."""
@@ -340,7 +337,6 @@ def fitting_searches(
         views=min(FITTED_VIEWS, views),
         searches=each,
         most_objects=MOST_OBJECTS,
-        progress=progress,
         tasks=tasks,
     )
 

@@ -21,7 +21,7 @@ from hbr.core.angles import size_deg
 from hbr.core.arrays import FloatArray, IndexArray, LevelArray
 from hbr.core.segments import lengths, ranges
 from hbr.dense.whitening import Whitening
-from hbr.descriptors import Packed, descriptor
+from hbr.descriptors import Packed
 from hbr.kernels import calls
 from hbr.model.views import Views
 
@@ -142,11 +142,6 @@ class DenseIndex:
             steps_deg = np.diff(ring_deg, axis=1, append=ring_deg[:, :1] + 360)
             spacing_deg[self._segments.lengths == count] = np.median(steps_deg, axis=1)
         return spacing_deg
-
-    @cached_property
-    def length(self) -> int:
-        """Number of levels of a view."""
-        return descriptor(self.views.descriptor).length
 
     def similarity(self, query: LevelArray) -> FloatArray:
         """Return the similarity of every view to a query, (n,): of several segmentations, (h, length), the largest."""

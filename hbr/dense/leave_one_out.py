@@ -86,7 +86,6 @@ def leave_one_out(
     most_objects: int | None = None,
     step_deg: float = _STEP_DEG,
     weight: float | None = None,
-    progress: Callable[[int, int], object] | None = None,
     tasks: Tasks | None = None,
 ) -> LeaveOneOut:
     """Search for every object with its own enrolled views, as if the camera had been beside their azimuths.
@@ -112,8 +111,6 @@ def leave_one_out(
     weight : float, optional
         Weight of each view after the first, if the views are nearly the same evidence. All views of a search then have
         the same distance from their enrolled views, because two sessions differ in all views in the same way.
-    progress : callable, optional
-        Called before each object with the number of objects done, and of all.
     tasks : Tasks, optional
         Applies the search for an object to each task.
 
@@ -138,11 +135,8 @@ def leave_one_out(
             aside = (aside + _GOLDEN) % 1
     # Search, then join the results in the order of the objects.
     work = partial(_searches_for, index, beta, views, searches, step_deg, weight)
-    by_place: dict[int, FloatArray] = {}
-    for (place, _), found in ((one, work(one)) for one in todo) if tasks is None else tasks(work, todo):
-        if progress is not None:
-            progress(len(by_place), len(todo))
-        by_place[place] = found
+    done = ((one, work(one)) for one in todo) if tasks is None else tasks(work, todo)
+    by_place = {place: found for (place, _), found in done}
     numbers = np.concatenate([by_place[place] for place, _ in todo])
     return LeaveOneOut(
         len(index.views.object_names),
@@ -298,8 +292,8 @@ def _numbers(
     correct = np.zeros(len(queries), np.bool_)
     for n, query in enumerate(queries):
         support += index.support(index.similarity(query), float(azimuth_deg[n] - azimuth_deg[0]))
-        so_far = index, support, azimuth_deg[: n + 1]
-        best, known[n] = evidence(*so_far, units[: n + 1], lambda some: unit_rows(whitened(some)))
-        _, unknown[n] = evidence(*so_far, others[: n + 1], lambda some: left_out(whitened(some)), without=place)
+        belief = Belief(index, support, azimuth_deg[: n + 1])
+        best, known[n] = evidence(belief, units[: n + 1], lambda some: unit_rows(whitened(some)))
+        _, unknown[n] = evidence(belief, others[: n + 1], lambda some: left_out(whitened(some)), place)
         correct[n] = best == place
     return known, unknown, correct

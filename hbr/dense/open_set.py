@@ -23,7 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hbr.core.arrays import FloatArray, IndexArray
-from hbr.dense.index import BIN_DEG, POWER, DenseIndex
+from hbr.dense.filter import Belief
+from hbr.dense.index import BIN_DEG
 
 #: Weight of the margin in the open-set score without fitted weights, and of the leader's usual score.
 _MARGIN_WEIGHT: Final = 0.5
@@ -100,9 +101,7 @@ def open_set_score(score: Scores, margin: Scores, usual: Scores, typical: Scores
 
 
 def evidence(
-    index: DenseIndex,
-    support: NDArray[np.float32],
-    orientation_deg: FloatArray,
+    belief: Belief,
     units: Sequence[FloatArray],
     enrolled: Callable[[IndexArray], FloatArray],
     without: int | None = None,
@@ -111,12 +110,8 @@ def evidence(
 
     Parameters
     ----------
-    index : DenseIndex
-        The enrolled views.
-    support : float32 array (k, 72)
-        As `Belief.support`.
-    orientation_deg : float64 array (n,)
-        Orientations of the camera at the queries.
+    belief : Belief
+        After n queries without weights.
     units : sequence of n float64 arrays (h, d)
         The whitened descriptions of each query, of unit length, a row for each segmentation.
     enrolled : callable
@@ -124,20 +119,19 @@ def evidence(
     without : int, optional
         Place of an object that does not count, as if it were not enrolled.
     """
-    count = len(units)
-    scores = np.maximum(support.max(axis=1).astype(np.float64) / count, 0) ** (1 / POWER)
+    scores = belief.scores()
     if without is not None:
         scores[without] = -1.0
     order = np.argsort(-scores, kind="stable")[: COHORT + 1]
     order = order[scores[order] >= 0]
     best = int(order[0])
-    pose_deg = support[order].argmax(axis=1) * BIN_DEG
-    rotated_deg = orientation_deg - orientation_deg[0]
-    rows = index.nearest_views(order, pose_deg[:, None] + rotated_deg, _NEXT)
+    pose_deg = belief.support[order].argmax(axis=1) * BIN_DEG
+    rotated_deg = belief.orientation_deg - belief.orientation_deg[0]
+    rows = belief.index.nearest_views(order, pose_deg[:, None] + rotated_deg, _NEXT)
     near = enrolled(rows.ravel()).reshape(*rows.shape, -1)
     white = np.zeros(len(order))
     for n, unit in enumerate(units):
-        white += (near[:, n] @ unit.T).max(axis=(1, 2)) / count
+        white += (near[:, n] @ unit.T).max(axis=(1, 2)) / belief.queries
     numbers: list[float] = []
     for one in (scores[order], white):
         first, others = one[0], one[1:]

@@ -245,11 +245,9 @@ class StoppingRule:
 
     def _open_set_score(self, belief: Belief, n: int) -> float:
         if self.open_set is not None:
-            index, unit = belief.index, belief.index.whitening.unit
+            levels, unit = belief.index.views.levels, belief.index.whitening.unit
             units = [unit(np.atleast_2d(query)) for query in belief.levels]
-            _, numbers = evidence(
-                index, belief.support, belief.orientation_deg, units, lambda rows: unit(index.views.levels(rows))
-            )
+            _, numbers = evidence(belief, units, lambda rows: unit(levels(rows)))
             return self.open_set.score(numbers, belief.queries)
         return self._leave_one_out_score(belief, n)[1]
 

@@ -79,15 +79,16 @@ def fit(
         where = jobs_of(None, cluster)
         if where is None and len(views) >= _SEVERAL_PROCESSES:
             where = os.cpu_count() or 1
-        found = fit_stopping_rule(
-            index,
-            error_rate=error_rate,
-            false_reject=false_reject,
-            progress=lambda done, total: progress(JobProgress(done, total)),
-            tasks=lambda work, tasks: _continued(
-                unfinished, tasks, lambda left: map_in_processes(work, left, where or 1)
-            ),
-        )
+
+        def searched(
+            work: "Callable[[Task], FloatArray]", tasks: "Sequence[Task]"
+        ) -> "Iterator[tuple[Task, FloatArray]]":
+            found = _continued(unfinished, tasks, lambda left: map_in_processes(work, left, where or 1))
+            for done, one in enumerate(found):
+                progress(JobProgress(done, len(tasks)))
+                yield one
+
+        found = fit_stopping_rule(index, error_rate=error_rate, false_reject=false_reject, tasks=searched)
     unfinished.remove()
     made_utc = f"{clock.utc():%Y-%m-%dT%H:%M:%SZ}"
     write_stopping_rule(path, found.rule, index, made_utc=made_utc)
