@@ -16,7 +16,7 @@ from typer.core import TyperGroup
 from rig.cli.bench import config, doctor, find, head, jog, serve, servo, setup, snapshot, table
 from rig.cli.catalog import calibrate as rules
 from rig.cli.catalog import catalog, exchange, results, upkeep
-from rig.cli.objects import empty_table, enroll, evaluate, identify, runs
+from rig.cli.objects import enroll, evaluate, identify, runs
 from rig.cli.ui.command import show_error, without_color
 from rig.cli.ui.exit_codes import EXIT_CODES
 from rig.cli.ui.options import CommonOptions, show_parameters, spread
@@ -117,7 +117,7 @@ app.command("enroll", rich_help_panel=OBJECTS)(enroll.enroll)
 app.command("identify", rich_help_panel=OBJECTS)(identify.identify)
 app.command("replay", rich_help_panel=OBJECTS)(runs.replay)
 app.command("report", rich_help_panel=OBJECTS)(runs.report)
-app.command("empty-table", rich_help_panel=BENCH)(empty_table.empty_table)
+app.command("empty-table", rich_help_panel=BENCH)(snapshot.empty_table)
 app.command("goto", rich_help_panel=BENCH, context_settings={"ignore_unknown_options": True})(table.goto)
 app.command("home", rich_help_panel=BENCH)(table.home)
 app.command("jog", rich_help_panel=BENCH)(jog.jog)
