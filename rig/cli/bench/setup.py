@@ -75,7 +75,7 @@ def setup(
     if write:
         save(path, new)
     done = f"Wrote {path}." if write else f"{path} is unchanged."
-    after = replace(settings) if path.exists() else now
+    after = replace(settings) if path.exists() else now  # a copy reads the file again
     written = {".".join(key): value for key, value in changes.items()}
     settings.say(f"{done}\n", {"path": path, "written": write, "settings": written})
     code = print_findings(after)["exit_code"]

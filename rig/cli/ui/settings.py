@@ -120,10 +120,6 @@ class Settings:
             evidence={"folder": str(path), "benches with a catalog": others},
         )
 
-    def existing_catalog(self) -> "Catalog | None":
-        """Return the bench's catalog, opened for reading; None if there is none yet."""
-        return self.open_catalog(read_only=True) if self.place.may_exist() else None
-
     def say(self, text: str, data: Any) -> None:
         """Print ``text``, or with ``--json`` ``data`` as one line of JSON."""
         if self.json:
