@@ -81,7 +81,7 @@ def bench(objects: int) -> None:
         f"{name}: later step with decision and next view", milliseconds(lambda: step(second, 90.0, one)), peer, read_ms
     )
     if kept < objects:
-        check_ms = milliseconds(lambda: completed(two, index, [first, second]), 5)
+        check_ms = milliseconds(lambda: completed(two, index), 5)
         record(f"{name}: last check of the objects left out, two views", check_ms, peer, read_ms)
     if objects <= 1_000:
         with without_library():

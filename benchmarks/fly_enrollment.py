@@ -124,7 +124,7 @@ def similar_at_rest(bench: Bench, moving: hbr.Views, name: str) -> list[float]:
     angles_deg = -moving.azimuth_deg[rows] % 360
     describe, viewer = EnrollmentDescriber(bench.config.view, (BENCH_DESCRIPTOR,)), Viewer(bench.camera, bench.config)
     similarity = hbr.descriptors.descriptor(moving.descriptor).similarity
-    bench.operator.place(name)
+    bench.place(name)
     images = []
     with Turntable(bench) as table:
         for number in np.argsort(angles_deg):

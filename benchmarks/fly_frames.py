@@ -23,7 +23,7 @@ import cv2
 import numpy as np
 
 import hbr
-from hbr.dense.arc import ArcRule, ArcSession
+from hbr.dense.arc import ArcSession
 from hbr.dense.stopping import StoppingRule
 from rig.config import RigConfig, load_config
 from rig.core.clock import SystemClock
@@ -83,7 +83,7 @@ def measured(index: hbr.DenseIndex, background: str) -> tuple[dict[str, list[flo
     images: list[Image] = []
     with open_sim_bench(config, operator) as bench:
         assert operator.devices is not None
-        bench.operator.place(None)
+        bench.place(None)
         if background != "plain":
             operator.devices.camera.backdrop = another_bench(np.random.default_rng(1))
         locks = bench.camera.read_locks()
@@ -120,7 +120,7 @@ def measured(index: hbr.DenseIndex, background: str) -> tuple[dict[str, list[flo
 def begun(index: hbr.DenseIndex, config: RigConfig) -> tuple[SearchDescriber, ArcSession]:
     """Return a search that never ends."""
     never = StoppingRule(30.0, 2.0, np.zeros((len(index), 4)), (-9.0,) * 4, 0.01, 0.02, 0.0, 0)
-    return SearchDescriber(config.view, BENCH_DESCRIPTOR, revise=False), ArcSession(index, ArcRule(never, 2.0))
+    return SearchDescriber(config.view, BENCH_DESCRIPTOR, revise=False), ArcSession(index, never, 2.0)
 
 
 class PlayedCamera:

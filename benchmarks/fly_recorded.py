@@ -63,7 +63,7 @@ def record(bench: Bench, operator: ShelfOperator, name: str) -> dict[str, Seen]:
     found: dict[str, Seen] = {}
     for kind in ("enrolled", "rest"):
         operator.next_object, operator.yaw_deg = name, 0.0 if kind == "enrolled" else 5.0
-        bench.operator.place(None)
+        bench.place(None)
         with Turntable(bench) as table:
             start_deg, step_deg = 0.0, 360.0 / VIEWS
             if kind == "rest":
@@ -174,7 +174,7 @@ def main() -> None:
         objects, angles, levels = zip(*seen, strict=True)
         azimuths = config.table.orientation_sign * np.array(angles) % 360
         index = hbr.DenseIndex(hbr.Views(np.array(levels), azimuths, np.array(objects), tuple(known), BENCH_DESCRIPTOR))
-        model = DenseModel(index, hbr.calibrate_stopping_rule(index).rule)
+        model = DenseModel(index, hbr.fit_stopping_rule(index).rule)
         for trial in range(given.trials // CATALOGS):
             name = str(rng.choice(unknown if trial % UNKNOWN_EVERY == UNKNOWN_EVERY - 1 else known))
             shown = changed(recorded[name], rng, given.strength) if given.strength else recorded[name]

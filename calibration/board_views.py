@@ -79,7 +79,7 @@ def take_views(
             f"{board.square_mm:g} mm wide, as measured on the print (--square-mm).",
             PICTURES[stand],
         )
-        bench.operator.place(stand)
+        bench.place(stand)
         with Turntable(bench) as table:
             for angle_deg in angles_deg:
                 move = table.goto(angle_deg)

@@ -143,7 +143,7 @@ class CameraNoise(Procedure):
             "Put the board upright in the middle of the platter, with the usual light. Take your hands off.",
             pictures.BOARD_UPRIGHT,
         )
-        bench.operator.place(BOARD)
+        bench.place(BOARD)
         bench.clock.sleep(HANDS_S)
         frames = [bench.camera.capture(bench.clock.now_ns()).image_bgr for _ in range(PAIRS)]
         yield Progress(1.0, f"{PAIRS} frames of the scene at rest")
@@ -162,7 +162,7 @@ class CameraCard(Procedure):
             "Hold a plain grey or white card in front of the camera so that it fills the frame, with the usual light.",
             pictures.CARD,
         )
-        bench.operator.place(CARD)
+        bench.place(CARD)
         bench.clock.sleep(HANDS_S)
         locks = bench.camera.read_locks()
         levels, seconds, blocks = [], [], []

@@ -92,7 +92,7 @@ class CameraTime(Procedure):
             "Put the board upright in the middle of the platter, or any object with texture. Take your hands off.",
             pictures.BOARD_UPRIGHT,
         )
-        bench.operator.place(self.thing)
+        bench.place(self.thing)
         speeds = [speed for speed in SPEEDS if speed < config.table.velocity_dps] + [config.table.velocity_dps]
         passes: list[Pass] = []
         lost = frames = 0

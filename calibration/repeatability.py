@@ -102,7 +102,7 @@ class Repeatability(Procedure):
                 "your hands off.",
                 pictures.OBJECT_AT_MARK,
             )
-            bench.operator.place(self.name)
+            bench.place(self.name)
             rounds = []
             with Turntable(bench) as table:
                 for _round in range(ROUNDS):

@@ -56,7 +56,7 @@ def main() -> None:
         for name in OBJECTS:
             for _ in enroll(bench, catalog, name, views=12):
                 pass
-        operator = bench.operator
+        operator = bench.placer
         assert isinstance(operator, ShelfOperator)  # simulated; on a real bench the operator places the object
         for strategy in (None, *strategies):
             model = load_model(catalog, descriptor=None if strategy is None else descriptor_for(strategy))

@@ -4,7 +4,6 @@ import argparse
 from pathlib import Path
 
 from rig import Catalog, open_bench, photograph_table
-from rig.bench import TableClearer
 from rig.config import load_config
 from rig.events.events import Enrolled, Item, Rejected
 from rig.plans.tray import enroll_tray, read_tray
@@ -23,7 +22,7 @@ def main() -> None:
         open_bench(arguments.bench, load_config()) as bench,
         Catalog.open(arguments.catalog, clock=bench.clock) as catalog,
     ):
-        if isinstance(bench.operator, TableClearer):  # otherwise the operator runs `rig empty-table`
+        if bench.placer is not None:  # otherwise the operator runs `rig empty-table`
             list(photograph_table(bench))
         for event in enroll_tray(bench, catalog, items, views=arguments.views):
             match event:

@@ -6,7 +6,6 @@ import sys
 from pathlib import Path
 
 from rig import Catalog, identify, load_model, open_bench, photograph_table
-from rig.bench import ObjectAlreadyPlaced, TableClearer
 from rig.config import load_config
 from rig.core.clock import SystemClock
 from rig.core.errors import RigError
@@ -27,14 +26,13 @@ def main() -> int:
             Catalog.open(arguments.catalog, clock=SystemClock(), read_only=True) as catalog,
             open_bench(arguments.bench, load_config()) as bench,
         ):
-            if isinstance(bench.operator, ObjectAlreadyPlaced):  # no operator at the keyboard: use the camera
-                bench.operator = TableWatcher(bench)
-            if isinstance(bench.operator, TableClearer):
+            placer = bench.placer or TableWatcher(bench)  # no operator at the keyboard: use the camera
+            if placer.clear():
                 for taken in photograph_table(bench):  # start with an empty table
                     print(json.dumps(event_dict(taken)), flush=True)
             answers = 0
             # The model is loaded before each search, so that newly enrolled objects are found, too.
-            for event in watch(bench, lambda: identify(bench, load_model(catalog))):
+            for event in watch(bench, lambda: identify(bench, load_model(catalog), placer=placer)):
                 print(json.dumps(event_dict(event)), flush=True)
                 answers += isinstance(event, Identified)
                 if answers == arguments.answers:

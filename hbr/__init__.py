@@ -1,7 +1,7 @@
 """Retrieval: arrays in, decisions out."""
 
-from hbr.dense.calibration import CalibratedRule, calibrate_stopping_rule, fit_stopping_rule
 from hbr.dense.filter import Belief, update_belief
+from hbr.dense.fitting import FittedRule, fit_stopping_rule, rule_from_searches
 from hbr.dense.index import DenseIndex
 from hbr.dense.leave_one_out import LeaveOneOut, leave_one_out
 from hbr.dense.next_view import NextBestView, next_best_view
@@ -24,12 +24,12 @@ from hbr.segmentation import Background, Segmentation, hypotheses, segment
 __all__ = [
     "Background",
     "Belief",
-    "CalibratedRule",
     "Decision",
     "DenseIndex",
     "DenseSession",
     "Descriptor",
     "Extension",
+    "FittedRule",
     "LeaveOneOut",
     "NextBestView",
     "Outcome",
@@ -43,7 +43,6 @@ __all__ = [
     "ViewIndex",
     "Views",
     "ViewsTogether",
-    "calibrate_stopping_rule",
     "cedd",
     "describe",
     "descriptor",
@@ -55,6 +54,7 @@ __all__ = [
     "open_set_threshold",
     "pack",
     "retrieve",
+    "rule_from_searches",
     "score_margin",
     "segment",
     "tanimoto",

@@ -234,7 +234,7 @@ def open_sim_bench(
             bench.close()
             raise
         bench.connections = wires.pop_all()
-    bench.operator = operator
+    bench.placer = operator
     bench.conditions = {"noise": asdict(world.noise), "seed": world.seed}
     return bench
 

@@ -37,7 +37,7 @@ def sim_world(request: pytest.FixtureRequest) -> "World":
 def sim_bench(request: pytest.FixtureRequest, sim_world: "World") -> "Iterator[Bench]":
     """An open bench in `sim_world`: real drivers on simulated wires, on a virtual clock.
 
-    `sim_bench.operator` puts objects on the table: `next_object` is the object and `yaw_deg` its rotation. The marker's
+    `sim_bench.placer` puts objects on the table: `next_object` is the object and `yaw_deg` its rotation. The marker's
     `faults`, such as "jam@move3", are injected.
     """
     from rig.config import RigConfig, load_config

@@ -12,7 +12,7 @@ Decisions: docs/decisions/0047, docs/decisions/0055.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from math import exp
 from typing import Final
 
@@ -21,13 +21,13 @@ from numpy.typing import ArrayLike
 
 from hbr.core.angles import size_deg, wrap360
 from hbr.core.arrays import FloatArray, LevelArray
-from hbr.dense.calibration import fit_min_confidence
 from hbr.dense.filter import Belief, update_belief
+from hbr.dense.fitting import fit_min_confidence, searched_objects
 from hbr.dense.index import DenseIndex
 from hbr.dense.leave_one_out import LeaveOneOut, leave_one_out
-from hbr.dense.next_view import SHARPNESS, NextBestView, expected_similarity, log_confusion, pairs_of, strongest
+from hbr.dense.next_view import SHARPNESS, NextBestView, log_confusion, pairs_after
 from hbr.dense.session import DenseSession
-from hbr.dense.stopping import Limitation, LimitationCode, Outcome, StopDecision, StoppingRule, StopReason
+from hbr.dense.stopping import Outcome, StopDecision, StoppingRule, StopReason, by_confidence
 
 STEP_DEG: Final = 15.0
 """The rule decides each time the frames have covered this much more of the circle."""
@@ -57,71 +57,56 @@ STEP_WEIGHT: Final = STEP_DEG / FRAME_DEG * frame_weight(FRAME_DEG)
 """Sum of the weights of the frames between two decisions."""
 
 
-@dataclass(frozen=True, eq=False)
-class ArcRule:
-    """The rule that ends a search in motion.
-
-    Attributes
-    ----------
-    rest : StoppingRule
-        The rule of searches at rest. It decides after the first view, and decides which objects are unknown.
-    min_confidence : float
-        Confidence that ends a search later.
-    limitations : tuple of Limitation
-        Rates that the rule does not guarantee, in addition to those of ``rest``.
-    """
-
-    rest: StoppingRule
-    min_confidence: float
-    limitations: tuple[Limitation, ...] = ()
-
-
-def calibrate_arc_rule(index: DenseIndex, rest: StoppingRule, *, most_searches: int = MOST_SEARCHES) -> ArcRule:
-    """Return the rule of searches in motion, from leave-one-out searches along arcs of `ARC_DEG`.
+def fit_arc_confidence(index: DenseIndex, rest: StoppingRule, *, most_searches: int = MOST_SEARCHES) -> float:
+    """Return the confidence that ends a search in motion, from leave-one-out searches along arcs of `ARC_DEG`.
 
     Searches that end with the first view count, too, because ``rest.error_rate`` is the error rate of all named
     objects. If there are more objects than searches, a sample of the objects is searched for among each other. A
-    catalog without candidates or with single views has the confidence of searches at rest.
+    catalog without candidates or with single views has the confidence of searches at rest, ``rest.min_confidence``.
     """
-    if len(index) < 2 or int(np.median((~index.left_out).sum(axis=1))) < 2:
-        return ArcRule(rest, rest.min_confidence)
-    limitations = []
-    if len(index) > most_searches:
-        limitations.append(Limitation(LimitationCode.SAMPLED, {"searched": most_searches, "objects": len(index)}))
-        index = index.only(np.unique(np.linspace(0, len(index) - 1, most_searches).astype(int)))
+    chosen = searched_objects(index, most_searches, most_searches if len(index) > most_searches else None)
+    if chosen is None:
+        return rest.min_confidence
+    some, each, _ = chosen
     searches = leave_one_out(
-        index,
-        beta=rest.beta,
-        views=DECISIONS,
-        searches=max(1, min(most_searches // len(index), int(index.rows.shape[1]))),
-        step_deg=STEP_DEG,
-        weight=STEP_WEIGHT,
+        some, beta=rest.beta, views=DECISIONS, searches=each, step_deg=STEP_DEG, weight=STEP_WEIGHT
     )
-    rule = fit_arc_rule(searches, rest)
-    return replace(rule, limitations=(*limitations, *rule.limitations))
+    return arc_confidence(searches, rest)
 
 
-def fit_arc_rule(searches: LeaveOneOut, rest: StoppingRule) -> ArcRule:
-    """Return the rule that keeps ``rest.error_rate`` in searches along arcs, with a decision every `STEP_DEG`."""
+def arc_confidence(searches: LeaveOneOut, rest: StoppingRule) -> float:
+    """Return the confidence that keeps ``rest.error_rate`` in searches along arcs, with a decision every `STEP_DEG`."""
     confidence = searches.confidence.copy()
     confidence[:, 0] = confidence[:, 0] >= rest.min_confidence  # after the first view, the rule at rest decides
     confidence[:, 1 : round(SIDE_DEG / STEP_DEG)] = 0.0  # no object is found this soon
-    found, limitation = fit_min_confidence(replace(searches, confidence=confidence), rest.error_rate)
-    # If no confidence keeps the rate, a search in motion must not end sooner than one at rest.
-    return ArcRule(rest, max(found, rest.min_confidence), () if limitation is None else (limitation,))
+    found, _ = fit_min_confidence(replace(searches, confidence=confidence), rest.error_rate)
+    return max(found, rest.min_confidence)  # even if no confidence keeps the rate: not sooner than at rest
 
 
 class ArcSession(DenseSession):
     """A search in motion.
 
-    All frames give the confidence. The open-set score comes from frames that are `SIDE_DEG` apart, because it was
-    measured on such views. ``decisions`` is the number of decisions so far; the first view is the first one.
+    The rule of searches at rest decides after the first view, and decides which objects are unknown. All frames give
+    the confidence. The open-set score comes from frames that are `SIDE_DEG` apart, because it was measured on such
+    views.
+
+    Parameters
+    ----------
+    index, rule
+        As for a search at rest.
+    min_confidence : float
+        Confidence that ends the search after the first view, from `fit_arc_confidence`.
+
+    Attributes
+    ----------
+    decisions : int
+        Number of decisions so far; the first view is the first one.
     """
 
-    def __init__(self, index: DenseIndex, rule: ArcRule) -> None:
-        super().__init__(index, rule.rest, max_views=DECISIONS)
+    def __init__(self, index: DenseIndex, rule: StoppingRule, min_confidence: float) -> None:
+        super().__init__(index, rule, max_views=DECISIONS)
         self.decisions = 0
-        self._min_confidence = rule.min_confidence
+        self._min_confidence = min_confidence
         self._covered_deg = 0.0
         self._sides: tuple[Belief, int] | None = None
 
@@ -130,7 +115,7 @@ class ArcSession(DenseSession):
         self._sides = None  # these belief and views were described differently
 
     def _begin_view(self, orientation_deg: float) -> None:
-        if self._queries:
+        if self._so_far is not self._index:
             self._covered_deg += min(self._apart_deg(orientation_deg), STEP_DEG)
         decisions = 1 + int(self._covered_deg / STEP_DEG + 1e-9)
         self.is_new_decision = decisions > self.decisions
@@ -145,33 +130,25 @@ class ArcSession(DenseSession):
         return next_arc(self.belief, beta=self.rule.beta, rotations_deg=ends_deg, seconds=times_s)
 
     def _weight(self, orientation_deg: float) -> float | None:
-        return frame_weight(self._apart_deg(orientation_deg)) if self._queries else None
+        return frame_weight(self._apart_deg(orientation_deg)) if isinstance(self._so_far, Belief) else None
 
-    def _decide(self, belief: Belief, *, last: bool = False) -> StopDecision:
-        sides = self._frames_apart(belief)
+    def _decide(self, *, last: bool = False) -> StopDecision:
+        sides = self._frames_apart()
         last = last or self.decisions >= DECISIONS
-        most = sides.queries if last else self.max_views
-        decision = self.rule.decide(sides, max_views=most, reliable=self._reliable, same_bench=self._like_enrollment)
+        decision = self._by_rule(sides, sides.queries if last else self.max_views)
         if decision.outcome is Outcome.UNKNOWN and self.decisions > 1 and self._may_be_smeared(decision):
             return replace(decision, outcome=Outcome.AMBIGUOUS if last else Outcome.CONTINUE)
         if self.decisions == 1 or decision.reason is StopReason.BELOW_OPEN_SET_THRESHOLD:
             return decision
-        enough = sides.queries > 1  # as at rest: an object that is not found by its first view is found by two
-        probabilities = belief.posterior(self.rule.beta).sum(axis=1)
-        best = int(probabilities.argmax())
-        probability = float(probabilities[best])
-        outcome, reason = Outcome.CONTINUE, StopReason.NOT_CONFIDENT
-        if enough and probability >= self._min_confidence:
-            outcome, reason = Outcome.FOUND, StopReason.CONFIDENT
-            if not (self._reliable or last):
-                outcome, reason = Outcome.CONTINUE, StopReason.BADLY_SEGMENTED
-        elif last:
-            outcome, reason = Outcome.AMBIGUOUS, StopReason.MAX_VIEWS
+        best, probability = self.belief.likeliest(self.rule.beta)
+        # as at rest: an object that is not found by its first view is found by two
+        is_enough = sides.queries > 1 and probability >= self._min_confidence
+        outcome, reason = by_confidence(is_enough, last=last, reliable=self._reliable)
         return replace(
             decision,
             outcome=outcome,
             reason=reason,
-            object_index=int(belief.index.object_index[best]),
+            object_index=int(self.belief.index.object_index[best]),
             probability=probability,
             min_confidence=self._min_confidence,
         )
@@ -189,8 +166,9 @@ class ArcSession(DenseSession):
         missing = decision.open_set_threshold - decision.open_set_score
         return self.rule.open_set is None and missing <= MOTION_LOSS
 
-    def _frames_apart(self, belief: Belief) -> Belief:
+    def _frames_apart(self) -> Belief:
         """Return the belief from the frames that are at least `SIDE_DEG` apart from each other."""
+        belief = self.belief
         sides, seen = self._sides if self._sides and self._sides[0].index is belief.index else (None, 0)
         for levels, orientation_deg in zip(belief.levels[seen:], belief.orientation_deg[seen:].tolist(), strict=True):
             if sides is None or size_deg(sides.orientation_deg - orientation_deg).min() >= SIDE_DEG:
@@ -216,28 +194,20 @@ def next_arc(belief: Belief, *, beta: float, rotations_deg: FloatArray, seconds:
     here_deg = float(belief.orientation_deg[-1])
     apart_deg = size_deg(here_deg + rotations_deg[:, None] - belief.orientation_deg).min(axis=1)
     new = np.minimum(apart_deg / STEP_DEG, 1.0) * STEP_WEIGHT
-    probability, place, bin_of = strongest(belief.posterior(beta))
-    first, second = pairs_of(place)
-    pairs = probability[first] * probability[second]
+    pairs = pairs_after(belief, beta, rotations_deg)
+    is_one = not pairs.probability.any()  # one object alone: a new side helps to find its azimuth
+    exponent = np.zeros_like(pairs.similar) if is_one else new[:, None] * pairs.known * (1 - pairs.similar)
     confusion = np.zeros(len(rotations_deg))
-    pair = None
-    if pairs.any():
-        similar, known = expected_similarity(belief, place, bin_of, rotations_deg, first, second)
-        exponent = new[:, None] * np.sqrt(known[:, first] * known[:, second]) * (1 - similar)
     for side in (1.0, -1.0):
         way = np.flatnonzero(np.sign(rotations_deg) == side)
         way = way[np.argsort(np.abs(rotations_deg[way]))]
-        if not len(way):
-            continue
-        if pairs.any():
-            confusion[way] = log_confusion(pairs * np.exp(-SHARPNESS * np.cumsum(exponent[way], axis=0)))
-        else:  # one object alone: a new side helps to find its azimuth
+        if is_one:
             confusion[way] = -SHARPNESS * np.cumsum(new[way])
+        else:
+            remaining = pairs.probability * np.exp(-SHARPNESS * np.cumsum(exponent[way], axis=0))
+            confusion[way] = log_confusion(remaining)
     sums = np.where(np.abs(rotations_deg) >= LEAST_ARC_DEG, confusion + seconds, np.inf)
     chosen = int((sums if np.isfinite(sums).any() else confusion + seconds).argmin())
-    if pairs.any():
-        most = int(pairs.argmax())
-        objects = belief.index.object_index
-        pair = int(objects[place[first[most]]]), int(objects[place[second[most]]])
     rotation_deg = float(rotations_deg[chosen])
+    pair = None if is_one else pairs.named(int(pairs.probability.argmax()))
     return NextBestView(rotation_deg, wrap360(here_deg + rotation_deg), pair, rotations_deg, confusion, seconds, None)

@@ -6,7 +6,6 @@ The paper's voting (`hbr.retrieve`) follows the few views on its lists. This fil
 Decision: docs/decisions/0025.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Final
@@ -15,7 +14,8 @@ import numpy as np
 
 from hbr.core.angles import wrap180, wrap360
 from hbr.core.arrays import FloatArray, IndexArray, LevelArray
-from hbr.dense.index import BIN_DEG, BINS, DenseIndex, Floats
+from hbr.dense.index import BIN_DEG, BINS, POWER, DenseIndex, Floats
+from hbr.descriptors import descriptor
 
 #: As for `Belief.posterior`: fits the similarities of the bench's own descriptor.
 BETA: Final = 30.0
@@ -71,7 +71,7 @@ class Belief:
     def scores(self) -> FloatArray:
         """Score of every object considered: the power mean of the similarities at the best azimuth, 0..1."""
         mean = self.support.max(axis=1).astype(np.float64) / self.amount
-        scores: FloatArray = np.maximum(mean, 0) ** (1 / self.index.power)
+        scores: FloatArray = np.maximum(mean, 0) ** (1 / POWER)
         return scores
 
     def ranking(self) -> "DenseRanking":
@@ -119,6 +119,17 @@ class Belief:
             probability.flags.writeable = False
             self._posteriors[beta] = probability
         return self._posteriors[beta]
+
+    def probability(self, beta: float = BETA) -> FloatArray:
+        """Return the probability of every object considered, (k,): the sum over its azimuths."""
+        probability: FloatArray = self.posterior(beta).sum(axis=1)
+        return probability
+
+    def likeliest(self, beta: float = BETA) -> tuple[int, float]:
+        """Return the place in the index of the likeliest object, and its probability."""
+        probability = self.probability(beta)
+        place = int(probability.argmax())
+        return place, float(probability[place])
 
     @cached_property
     def _posteriors(self) -> dict[float, FloatArray]:
@@ -175,7 +186,7 @@ def update_belief(
     """
     index = so_far.index if isinstance(so_far, Belief) else so_far
     query = np.asarray(query)
-    length = index.length
+    length = descriptor(index.views.descriptor).length
     if query.dtype != np.uint8 or query.ndim not in (1, 2) or query.shape[-1] != length or not query.size:
         raise ValueError(
             f"the query is {query.dtype} of shape {query.shape}; {index.views.descriptor} has uint8 of ({length},)"
@@ -203,32 +214,24 @@ def update_belief(
     return Belief(index, index.support(similar, 0.0), np.array([orientation_deg], np.float64), levels=(query,))
 
 
-def completed(belief: Belief, index: DenseIndex, queries: Sequence[LevelArray]) -> Belief:
+def completed(belief: Belief, index: DenseIndex) -> Belief:
     """Return a belief with all objects that can be first or second, as if they had been considered from the start.
 
     The support of an object is at most the sum of the largest similarities of its views. Objects that were left out
-    after the first query, and whose sum reaches the support of the second object considered, are added.
-
-    Parameters
-    ----------
-    belief : Belief
-        Of some objects of the index.
-    index : DenseIndex
-        With all objects.
-    queries : sequence of uint8 arrays (length,) or (h, length)
-        The queries of the belief.
+    after the first query, and whose sum reaches the support of the second object considered, are added. The index has
+    all objects.
     """
     kept = np.searchsorted(index.object_index, belief.index.object_index)
     best = belief.support.max(axis=1)
     second = float(np.partition(best, -2)[-2]) if len(best) > 1 else -np.inf
-    bounds = np.sum([index.bounds(query) for query in queries], axis=0)
+    bounds = np.sum([index.bounds(query) for query in belief.levels], axis=0)
     bounds[kept] = np.inf
-    places = np.flatnonzero(bounds >= second - _ROUNDING * len(queries))
+    places = np.flatnonzero(bounds >= second - _ROUNDING * belief.queries)
     if len(places) == len(kept):
         return belief
     more: DenseIndex | Belief = index.only(places)
-    weights = [None] * len(queries) if belief.weights is None else belief.weights.tolist()
-    for query, orientation_deg, weight in zip(queries, belief.orientation_deg.tolist(), weights, strict=True):
+    weights = [None] * belief.queries if belief.weights is None else belief.weights.tolist()
+    for query, orientation_deg, weight in zip(belief.levels, belief.orientation_deg.tolist(), weights, strict=True):
         more = update_belief(query, orientation_deg, more, kept=len(places), weight=weight)
     assert isinstance(more, Belief)
     return more

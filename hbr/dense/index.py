@@ -21,13 +21,15 @@ from hbr.core.angles import size_deg
 from hbr.core.arrays import FloatArray, IndexArray, LevelArray
 from hbr.core.segments import lengths, ranges
 from hbr.dense.whitening import Whitening
-from hbr.descriptors import Packed, descriptor
+from hbr.descriptors import Packed
 from hbr.kernels import calls
 from hbr.model.views import Views
 
 #: Number of azimuths at the first query.
 BINS: Final = 72
 BIN_DEG: Final = 360 / BINS
+#: p, of the similarities.
+POWER: Final = 4.0
 #: An angle in degrees that is larger than every azimuth.
 _FAR_DEG: Final = 2000.0
 
@@ -43,23 +45,17 @@ class DenseIndex:
         Of any descriptor. Objects without views are left out.
     omega : float
         Weight ω of the orientation, per revolution.
-    power : float
-        p, of the similarities; 1 for the plain sum.
     """
 
-    def __init__(self, views: Views, *, omega: float = 2.0, power: float = 4.0) -> None:
+    def __init__(self, views: Views, *, omega: float = 2.0) -> None:
         if not (np.isfinite(omega) and omega >= 0):
             raise ValueError(f"omega is {omega}; a finite weight of at least 0 is needed, 2 by default")
-        if not (np.isfinite(power) and power >= 1):
-            raise ValueError(f"power is {power}; a finite one of at least 1 is needed, 4 by default")
         if not len(views):
             raise ValueError("there are no views; enroll at least one object first")
         self.views = views
         self.omega = omega
-        self.power = power
         self.object_index: IndexArray = np.flatnonzero(np.bincount(views.object_index))
-        self.compared = views.prepared()
-        self.whitening = Whitening(views)
+        self._prepare()
         order, begin = views.of_each(self.object_index)
         count = lengths(begin, len(order))
         rising = np.diff(views.azimuth_deg[order], prepend=0) >= 0
@@ -78,15 +74,15 @@ class DenseIndex:
 
     def __getstate__(self) -> dict[str, object]:
         """Return what another process needs; it prepares the views for comparison itself."""
-        own = {name: self.__dict__[name] for name in ("views", "omega", "power", "object_index")}
-        return own | {"segments": (self._segments.order, self._segments.begin, self._segments.lengths)}
+        return {name: self.__dict__[name] for name in ("views", "omega", "object_index", "_segments")}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        segments = state.pop("segments")
         self.__dict__.update(state)
+        self._prepare()
+
+    def _prepare(self) -> None:
         self.compared = self.views.prepared()
         self.whitening = Whitening(self.views)
-        self._set_segments(*segments)
 
     def without(self, views: IndexArray) -> "DenseIndex":
         """Return an index that leaves out some views; each object must keep at least one."""
@@ -147,11 +143,6 @@ class DenseIndex:
             spacing_deg[self._segments.lengths == count] = np.median(steps_deg, axis=1)
         return spacing_deg
 
-    @cached_property
-    def length(self) -> int:
-        """Number of levels of a view."""
-        return descriptor(self.views.descriptor).length
-
     def similarity(self, query: LevelArray) -> FloatArray:
         """Return the similarity of every view to a query, (n,): of several segmentations, (h, length), the largest."""
         similar = self.compared.similarity(np.atleast_2d(query))
@@ -171,7 +162,7 @@ class DenseIndex:
             most = np.max([compared.bounds(row, self._segments) for row in np.atleast_2d(query)], axis=0)
         else:
             most = self.best(query)
-        return self._raised(most).astype(np.float64)
+        return _raised(most).astype(np.float64)
 
     def nearest(self, query: LevelArray, kept: int) -> IndexArray:
         """Return the objects with the most similar views, ascending places (kept,); of equal ones, the first."""
@@ -188,6 +179,11 @@ class DenseIndex:
     def view_counts(self) -> IndexArray:
         """Number of views of each object."""
         return self._segments.lengths
+
+    def rows_of(self, place: int) -> IndexArray:
+        """Return the rows of the views of the object at a place, by rising azimuth."""
+        begin = self._segments.begin[place]
+        return self._segments.order[begin : begin + self._segments.lengths[place]]
 
     def nearest_views(self, places: IndexArray, at_deg: FloatArray, count: int) -> IndexArray:
         """Return the rows of the views that are nearest to azimuths, (m, n, count), for objects (m,) and (m, n).
@@ -254,7 +250,7 @@ class DenseIndex:
             For azimuths 0, 5, 10, ... at the first query.
         """
         whole, part_deg = divmod(rotated_deg % 360.0, BIN_DEG)
-        levels = self._raised(similar)
+        levels = _raised(similar)
         slope = self.omega / 360
         azimuth_deg = self.views.azimuth_deg
         compiled = calls.support(self._segments, azimuth_deg, levels, slope, part_deg, int(whole))
@@ -279,12 +275,8 @@ class DenseIndex:
         np.maximum(best, behind[place, count - 1] - revolution + slope_at, out=best)
         return np.roll(best, -int(whole), axis=1)
 
-    def _raised(self, similar: FloatArray) -> Floats:
-        """Return the similarities to the power p; for 4 by products, which are the same on every computer."""
-        raised = np.maximum(similar, 0)
-        if self.power == 4:
-            np.square(raised, out=raised)
-            np.square(raised, out=raised)
-        else:
-            raised **= self.power
-        return raised.astype(np.float32)
+
+def _raised(similar: FloatArray) -> Floats:
+    """Return the similarities to the power p = 4, by products, which are the same on every computer."""
+    raised = np.square(np.maximum(similar, 0))
+    return np.square(raised, out=raised).astype(np.float32)

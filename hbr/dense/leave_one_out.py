@@ -1,9 +1,14 @@
-"""Searches for every enrolled object with its own views: the sample from which a stopping rule is fitted."""
+"""Searches for every enrolled object with its own views: the sample from which a stopping rule is fitted.
+
+`leave_one_out` searches with the enrolled views, as if the camera had been beside them. `shifted_searches` searches
+with views that are changed as another bench would change their description (`hbr.descriptors.shift`), often by several
+segmentations. Both evaluate each search twice: among all objects, and as if its object were not enrolled.
+"""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Final, NamedTuple, TypeVar
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,88 +16,34 @@ from numpy.typing import NDArray
 from hbr.core.arrays import FloatArray, IndexArray, LevelArray
 from hbr.dense.filter import BETA, Belief
 from hbr.dense.index import BINS, DenseIndex
+from hbr.dense.open_set import NUMBERS, Leaders, evidence, leader
+from hbr.dense.whitening import unit_rows
+from hbr.descriptors import descriptor
+from hbr.descriptors.shift import Shift
 
-#: Weight of the margin in the open-set score, and of the leader's usual score.
-_MARGIN_WEIGHT: Final = 0.5
-_USUAL_WEIGHT: Final = 1.0
 #: Distances of queries from their enrolled views, as shares of a step: the multiples of this number, modulo 1.
 _GOLDEN: Final = 0.618034
 #: Distance between the views of a search.
 _STEP_DEG: Final = 90.0
-
-
-Scores = TypeVar("Scores", float, FloatArray)
-
-
-@dataclass(frozen=True, eq=False)
-class Leaders:
-    """The leading candidate after each view of each search, arrays (searches, views).
-
-    Attributes
-    ----------
-    object_index : integer array
-        The leading candidate.
-    score, margin : float64 array
-        Its score per view, and that score minus the second one.
-    """
-
-    object_index: IndexArray
-    score: FloatArray
-    margin: FloatArray
-
-    @classmethod
-    def of(cls, found: list[tuple[int, float, float]], shape: tuple[int, int]) -> "Leaders":
-        """Return the leading candidates that `leader` found after each view of each search."""
-        object_index, score, margin = zip(*found, strict=True)
-        return cls(np.reshape(object_index, shape), np.reshape(score, shape), np.reshape(margin, shape))
-
-    def open_set_score(self, usual_scores: FloatArray) -> FloatArray:
-        """Return the open-set score after each view of each search, (searches, views).
-
-        Parameters
-        ----------
-        usual_scores : float64 array (objects, views)
-            As `usual_scores` returns it.
-        """
-        views = np.arange(self.score.shape[1])
-        usual = usual_scores[self.object_index, views]
-        return open_set_score(self.score, self.margin, usual, np.median(usual_scores, axis=0))
-
-
-def open_set_score(score: Scores, margin: Scores, usual: Scores, typical: Scores) -> Scores:
-    """Return the open-set score of a leading candidate.
-
-    It is the score plus half of the margin, minus the amount by which the leader usually scores more than other
-    objects. An unknown object resembles several enrolled objects a little; an enrolled object resembles one of them
-    closely. An object that looks the same from all sides usually scores more, so it must match better.
-
-    Parameters
-    ----------
-    score, margin
-        As in `Leaders`.
-    usual
-        The usual score of the leader, see `usual_scores`.
-    typical
-        The median of the usual scores of all objects.
-    """
-    return score + _MARGIN_WEIGHT * margin - _USUAL_WEIGHT * (usual - typical)
-
+#: Numbers of each view of a leave-one-out search: what `leader` returns among all objects and among the others, the
+#: probability of the likeliest object, and whether that is the searched one.
+NUMBERS_OF_VIEW: Final = 8
+#: Strengths of the changes of the bench, in turn; 1 is a hard change.
+STRENGTHS: Final = (0.0, 0.25, 0.5, 1.0, 1.3)
+#: Probabilities of one, two and three segmentations of a view, as searches without an empty-table image have them.
+_SEVERAL: Final = (0.45, 0.35, 0.2)
+#: Strength of the change in further segmentations, which are worse: relative to the first one, and the smallest.
+_WORSE: Final = 1.6
+_LEAST_WORSE: Final = 0.7
+#: With more views, the whitened descriptions of all of them would take too much memory.
+_MOST_VIEWS: Final = 20_000
+_SEED: Final = 20
 
 Task = tuple[int, float]
 """The place of a searched object in the index, and the distance of the queries in the search before it."""
-
-
-class Found(NamedTuple):
-    """The searches for one object; each list has the views of the first search, then those of the second, ..."""
-
-    known: list[tuple[int, float, float]]
-    unknown: list[tuple[int, float, float]]
-    confidence: list[float]
-    correct: list[bool]
-
-
-Tasks = Callable[[Callable[[Task], Found], Sequence[Task]], Iterable[tuple[Task, Found]]]
-"""Applies a function to each task, for example in other processes; yields each task with its result, in any order."""
+Tasks = Callable[[Callable[[Task], FloatArray], Sequence[Task]], Iterable[tuple[Task, FloatArray]]]
+"""Applies a function to each task, for example in other processes; yields each task with its result, in any order. The
+results are float64 arrays (searches, views, 8)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,12 +82,10 @@ def leave_one_out(
     *,
     beta: float = BETA,
     views: int = 4,
-    seen: LevelArray | None = None,
     searches: int = 4,
     most_objects: int | None = None,
     step_deg: float = _STEP_DEG,
     weight: float | None = None,
-    progress: Callable[[int, int], object] | None = None,
     tasks: Tasks | None = None,
 ) -> LeaveOneOut:
     """Search for every object with its own enrolled views, as if the camera had been beside their azimuths.
@@ -153,9 +102,6 @@ def leave_one_out(
         As for `Belief.posterior`.
     views : int
         Views of a search.
-    seen : uint8 array (n, length), optional
-        Each enrolled view as a search would see it: from a second session, or described again under the bench's noise
-        and blur. The enrolled views themselves by default.
     searches : int
         Searches for each object; their first views are spread around it.
     most_objects : int, optional
@@ -165,8 +111,6 @@ def leave_one_out(
     weight : float, optional
         Weight of each view after the first, if the views are nearly the same evidence. All views of a search then have
         the same distance from their enrolled views, because two sessions differ in all views in the same way.
-    progress : callable, optional
-        Called before each object with the number of objects done, and of all.
     tasks : Tasks, optional
         Applies the search for an object to each task.
 
@@ -177,72 +121,49 @@ def leave_one_out(
     """
     if len(index) < 2:
         raise ValueError(f"{len(index)} object; leave-one-out searches need at least two")
-    shape = len(index.views), index.length
-    if seen is not None and seen.shape != shape:
-        raise ValueError(f"seen has shape {seen.shape}; the catalog's views have {shape}")
     # List the objects to search for; each continues the sequence of distances, so that tasks are independent.
-    counts = np.bincount(index.views.object_index)[index.object_index]
-    places = np.flatnonzero(counts >= (max(views, 2) if weight is None else 2))
+    places = np.flatnonzero(index.view_counts >= (max(views, 2) if weight is None else 2))
+    if not len(places):
+        raise ValueError(f"no object has {max(views, 2)} views; enroll more of each, or search with fewer views")
     if most_objects is not None and len(places) > most_objects:
         places = places[np.linspace(0, len(places) - 1, most_objects).astype(int)]
     todo, aside = [], 0.0
-    for place, count in zip(places.tolist(), counts[places].tolist(), strict=True):
+    for place, count in zip(places.tolist(), index.view_counts[places].tolist(), strict=True):
         todo.append((place, aside))
         drawn = views if weight is None else 1  # shares of a step that each search draws
-        for _ in range(drawn * len(np.unique(np.arange(searches) * count // searches))):
+        for _ in range(drawn * len(_starts(searches, count))):
             aside = (aside + _GOLDEN) % 1
     # Search, then join the results in the order of the objects.
-    work = partial(_searches_for, index, beta, views, seen, searches, step_deg, weight)
-    by_place: dict[int, Found] = {}
-    for (place, _), found in ((one, work(one)) for one in todo) if tasks is None else tasks(work, todo):
-        if progress is not None:
-            progress(len(by_place), len(todo))
-        by_place[place] = found
-    searched, known, unknown, confidence, correct = [], [], [], [], []
-    for place, _ in todo:
-        one = by_place[place]
-        searched += [int(index.object_index[place])] * (len(one.known) // views)
-        known += one.known
-        unknown += one.unknown
-        confidence += one.confidence
-        correct += one.correct
-    if not known:
-        raise ValueError(f"no object has {max(views, 2)} views; enroll more of each, or search with fewer views")
-    each = -1, views
+    work = partial(_searches_for, index, beta, views, searches, step_deg, weight)
+    done = ((one, work(one)) for one in todo) if tasks is None else tasks(work, todo)
+    by_place = {place: found for (place, _), found in done}
+    numbers = np.concatenate([by_place[place] for place, _ in todo])
     return LeaveOneOut(
         len(index.views.object_names),
-        np.array(searched),
-        Leaders.of(known, each),
-        Leaders.of(unknown, each),
-        np.reshape(confidence, each),
-        np.reshape(correct, each),
+        np.repeat(index.object_index[places], [len(by_place[place]) for place, _ in todo]),
+        Leaders.of(numbers[..., :3]),
+        Leaders.of(numbers[..., 3:6]),
+        numbers[..., 6],
+        numbers[..., 7] > 0,
         beta,
     )
 
 
 def _searches_for(
-    index: DenseIndex,
-    beta: float,
-    views: int,
-    seen: LevelArray | None,
-    searches: int,
-    step_deg: float,
-    weight: float | None,
-    task: Task,
-) -> Found:
-    """Search for the object at one place of the index."""
+    index: DenseIndex, beta: float, views: int, searches: int, step_deg: float, weight: float | None, task: Task
+) -> FloatArray:
+    """Search for the object at one place of the index; return the numbers of each view, (searches, views, 8)."""
     place, aside = task
-    rows = index.views.of(int(index.object_index[place]))
-    rows = rows[np.argsort(index.views.azimuth_deg[rows], kind="stable")]
+    rows = index.rows_of(place)
     azimuth_deg = index.views.azimuth_deg[rows]
-    starts = np.unique(np.arange(searches) * len(rows) // searches).tolist()
-    spreads = [spread(azimuth_deg, start, views, step_deg, again=weight is not None) for start in starts]
+    spreads = [
+        _spread(azimuth_deg, start, views, step_deg, again=weight is not None) for start in _starts(searches, len(rows))
+    ]
     used = np.unique(spreads)
-    levels = index.views.levels(rows[used]) if seen is None else seen[rows[used]]
-    similar = dict(zip(used.tolist(), index.compared.similarity(levels), strict=True))
+    similar = dict(zip(used.tolist(), index.compared.similarity(index.views.levels(rows[used])), strict=True))
     others = np.delete(index.object_index, place)
-    found = Found([], [], [], [])
-    for start, chosen in zip(starts, spreads, strict=True):
+    numbers = np.empty((len(spreads), views, NUMBERS_OF_VIEW))
+    for search, chosen in enumerate(spreads):
         support = np.zeros((len(index), BINS), np.float32)
         aside = aside if weight is None else (aside + _GOLDEN) % 1
         for n, i in enumerate(chosen):
@@ -251,37 +172,23 @@ def _searches_for(
             neighbour = rows[(i + (1 if n % 2 else -1)) % len(rows)]
             moved = similar[i].copy()
             moved[rows[i]] -= aside * (moved[rows[i]] - moved[neighbour])
-            added = index.support(moved, float(azimuth_deg[i] - azimuth_deg[start]))
+            added = index.support(moved, float(azimuth_deg[i] - azimuth_deg[chosen[0]]))
             support += added if weight is None or n == 0 else added * np.float32(weight)
             weights = None if weight is None else np.concatenate([[1.0], np.full(n, weight)])
             belief = Belief(index, support, azimuth_deg[chosen[: n + 1]], weights)
-            scores, probability = belief.scores(), belief.posterior(beta).sum(axis=1)
-            found.known.append(leader(index.object_index, scores))
-            found.unknown.append(leader(others, np.delete(scores, place)))
-            found.confidence.append(float(probability.max()))
-            found.correct.append(bool(probability.argmax() == place))
-    return found
+            scores, (likeliest, confidence) = belief.scores(), belief.likeliest(beta)
+            known, unknown = leader(index.object_index, scores), leader(others, np.delete(scores, place))
+            numbers[search, n] = (*known, *unknown, confidence, likeliest == place)
+    return numbers
 
 
-def leader(object_index: IndexArray, scores: FloatArray) -> tuple[int, float, float]:
-    """Return the leading candidate, its score and its margin: the whole score without a second candidate."""
-    best = int(scores.argmax())
-    margin = scores[best] - np.partition(scores, -2)[-2] if len(scores) > 1 else scores[best]
-    return int(object_index[best]), float(scores[best]), float(margin)
+def _starts(searches: int, views: int) -> list[int]:
+    """Return the first views of the searches for an object, spread around it."""
+    starts: list[int] = np.unique(np.arange(searches) * views // searches).tolist()
+    return starts
 
 
-def usual_scores(leaders: Leaders, correct: NDArray[np.bool_], objects: int) -> FloatArray:
-    """Return each object's median score in the searches that found it, (objects, views); else the median of all."""
-    usual = np.full((objects, leaders.score.shape[1]), np.nan)
-    for n in range(usual.shape[1]):
-        for j in np.unique(leaders.object_index[correct[:, n], n]).tolist():
-            usual[j, n] = np.median(leaders.score[correct[:, n] & (leaders.object_index[:, n] == j), n])
-        found = usual[~np.isnan(usual[:, n]), n]
-        usual[np.isnan(usual[:, n]), n] = np.median(found) if len(found) else 0.0
-    return usual
-
-
-def spread(
+def _spread(
     azimuth_deg: FloatArray, start: int, count: int, step_deg: float = _STEP_DEG, *, again: bool = False
 ) -> list[int]:
     """Return the indices of ``count`` views, a step apart, from ``start`` on; all different unless ``again`` is set."""
@@ -292,3 +199,101 @@ def spread(
             away[chosen] = np.inf
         chosen.append(int(away.argmin()))
     return chosen
+
+
+@dataclass(frozen=True, eq=False)
+class ShiftedSearches:
+    """Searches under changes of the bench, one after the other.
+
+    Attributes
+    ----------
+    strength : float64 array (searches,)
+        Of the change, as an element of `STRENGTHS`.
+    known, unknown : float64 arrays (searches, views, 7)
+        The numbers of `hbr.dense.open_set.NUMBERS`, with the object enrolled, and without it.
+    correct : bool array (searches, views)
+        Whether the object is the leading candidate, if it is enrolled.
+    """
+
+    strength: FloatArray
+    known: FloatArray
+    unknown: FloatArray
+    correct: NDArray[np.bool_]
+
+
+def can_shift(index: DenseIndex) -> bool:
+    """Return whether the descriptor can compute its levels on another bench."""
+    kind = descriptor(index.views.descriptor)
+    row = index.views.levels(np.array([0]))[0]
+    hard = Shift.drawn(np.random.default_rng(_SEED), 2.0)
+    return not np.array_equal(kind.shifted(row, hard), row)
+
+
+def shifted_searches(index: DenseIndex, *, views: int, searches: int) -> ShiftedSearches:
+    """Search for the objects of an index in turn, each time with the same number of views.
+
+    Objects with fewer views are left out. Every object is searched for under each strength before one is repeated.
+
+    Raises
+    ------
+    ValueError
+        No object has enough views.
+    """
+    rng = np.random.default_rng(_SEED)
+    places = np.flatnonzero(index.view_counts >= max(2, views)).tolist()
+    if not places:
+        raise ValueError(f"no object has {max(2, views)} views; enroll more of each, or search with fewer views")
+    every = np.arange(len(index.views))
+    white = index.whitening.white(index.views.levels(every)) if len(every) <= _MOST_VIEWS else None
+    strength = np.empty(searches)
+    known, unknown = np.empty((2, searches, views, len(NUMBERS)))
+    correct = np.empty((searches, views), np.bool_)
+    for n in range(searches):
+        rows = index.rows_of(place := places[n % len(places)])
+        azimuth_deg = index.views.azimuth_deg[rows]
+        chosen = _spread(azimuth_deg, int(rng.integers(len(rows))), views)
+        # a different strength in each round, and for neighbouring objects
+        strength[n] = STRENGTHS[(n // len(places) + n) % len(STRENGTHS)]
+        pairs = [index.views.levels(rows[[i, (i + 1) % len(rows)]]) for i in chosen]
+        queries = [_segmentations(index, pair, strength[n], rng) for pair in pairs]
+        known[n], unknown[n], correct[n] = _numbers(index, place, queries, azimuth_deg[chosen], white)
+    return ShiftedSearches(strength, known, unknown, correct)
+
+
+def _segmentations(index: DenseIndex, pair: LevelArray, strength: float, rng: np.random.Generator) -> LevelArray:
+    """Return a view between two enrolled ones, on a changed bench, by one to three segmentations, a row for each."""
+    shifted = descriptor(index.views.descriptor).shifted
+    more = int(rng.choice(len(_SEVERAL), p=_SEVERAL))
+    rows = []
+    for one in [strength, *[max(_LEAST_WORSE, _WORSE * strength)] * more]:
+        share = rng.uniform(0, 0.5)  # of the entries that come from the second view
+        between = np.where(rng.random(pair.shape[1]) < share, pair[1], pair[0]).astype(np.uint8)
+        rows.append(shifted(between, Shift.drawn(rng, one)))
+    return np.stack(rows)
+
+
+def _numbers(
+    index: DenseIndex, place: int, queries: list[LevelArray], azimuth_deg: FloatArray, white: FloatArray | None
+) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
+    """Return the numbers of a search after each view, with its object and without it, and where the object leads.
+
+    Without the object, the whitening leaves out its views, too: they would make it less similar to the others than an
+    unknown object is.
+    """
+
+    def whitened(some: IndexArray) -> FloatArray:
+        return index.whitening.white(index.views.levels(some)) if white is None else white[some]
+
+    left_out = index.whitening.without(index.rows_of(place))
+    in_white = [index.whitening.white(query) for query in queries]
+    units, others = [unit_rows(one) for one in in_white], [left_out(one) for one in in_white]
+    support = np.zeros((len(index), BINS), np.float32)
+    known, unknown = np.zeros((2, len(queries), len(NUMBERS)))
+    correct = np.zeros(len(queries), np.bool_)
+    for n, query in enumerate(queries):
+        support += index.support(index.similarity(query), float(azimuth_deg[n] - azimuth_deg[0]))
+        belief = Belief(index, support, azimuth_deg[: n + 1])
+        best, known[n] = evidence(belief, units[: n + 1], lambda some: unit_rows(whitened(some)))
+        _, unknown[n] = evidence(belief, others[: n + 1], lambda some: left_out(whitened(some)), place)
+        correct[n] = best == place
+    return known, unknown, correct

@@ -17,17 +17,14 @@ Decision: docs/decisions/0057.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hbr.core.angles import wrap180, wrap360
+from hbr.core.angles import wrap180
 from hbr.core.arrays import ImageArray
-from hbr.dense.filter import Belief
-from hbr.dense.index import BIN_DEG
-from hbr.dense.pose import likely_azimuths
 
 #: Side of the compared images.
 SIDE_PX: Final = 128
@@ -51,12 +48,7 @@ _REACH_PX: Final = 3
 _FLOOR: Final = 10.0
 #: A view with less weight than this does not show a difference.
 _LEAST_WEIGHT: Final = 300.0
-_ITERATIONS: Final = 25
-#: Poses of an object that are tried: those of at least this probability, relative to the likeliest one.
-_MOST_POSES: Final = 3
-_LEAST_POSE: Final = 0.02
-_POSES_APART_DEG: Final = 25.0
-
+_CRITERIA: Final = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 25, 1e-4)
 Mask = NDArray[np.uint8]
 Map = NDArray[np.float32]
 
@@ -79,6 +71,12 @@ class LocalView:
     mask: Mask
     azimuth_deg: float
 
+    def resized(self, side_px: int) -> tuple[ImageArray, Mask]:
+        """Return crop and mask, uint8 (side, side, 3) and (side, side)."""
+        size = (side_px, side_px)
+        crop, mask = (cv2.resize(one, size, interpolation=cv2.INTER_AREA) for one in (self.crop, self.mask))
+        return crop.astype(np.uint8, copy=False), mask.astype(np.uint8, copy=False)
+
 
 @dataclass(frozen=True, eq=False)
 class ViewDifference:
@@ -92,6 +90,10 @@ class ViewDifference:
         1 for the first object, −1 for the second one.
     weight : float
         How much the objects differ from this side: grey levels, summed over pixels.
+    unexplained : (float, float)
+        Differences of the view from each object that neighbouring enrolled views do not have, in the same unit.
+    pixels : int
+        Pixels of the object in the view.
     difference : float32 array (128, 128)
         Difference of the enrolled views of both objects, minus that of neighbouring views of one object, in grey
         levels.
@@ -102,6 +104,8 @@ class ViewDifference:
     view: int
     score: float
     weight: float
+    unexplained: tuple[float, float]
+    pixels: int
     difference: Map
     query: ImageArray
     first: ImageArray
@@ -156,36 +160,12 @@ class LocalDecision:
 
 
 class _Fit(NamedTuple):
-    """An enrolled view that was registered to another one, and its difference from that one."""
+    """An enrolled view that was registered to another one, its difference from that one, and the mean of that."""
 
-    view: LocalView
     image: ImageArray
     mask: Mask
     apart: Map
-
-
-class _Shown(NamedTuple):
-    """The result for a view: score, weight, unexplained difference of each object, the map, the enrolled views."""
-
-    score: float
-    weight: float
-    unexplained: tuple[float, float]
-    pixels: int
-    difference: Map
-    images: tuple[ImageArray, ImageArray, ImageArray]
-
-
-def poses_of(belief: Belief, object_index: int) -> tuple[float, ...]:
-    """Return the likely azimuths of an object at the last view, the likeliest first; symmetric objects have several."""
-    best_deg, likely = likely_azimuths(belief, object_index)
-    found = [best_deg]
-    for place in np.argsort(-likely, kind="stable").tolist():
-        azimuth_deg = float(wrap360(place * BIN_DEG + belief.rotated_deg))
-        if likely[place] < _LEAST_POSE or len(found) == _MOST_POSES:
-            break
-        if min(abs(wrap180(azimuth_deg - one)) for one in found) >= _POSES_APART_DEG:
-            found.append(azimuth_deg)
-    return tuple(found)
+    mean: float
 
 
 def chosen_views(orientations_deg: Sequence[float]) -> list[int]:
@@ -228,34 +208,29 @@ def compare_objects(
         raise ValueError("the comparison needs a view of the search and two enrolled views of each object")
     fits = [_best_pose(queries, views, rotations) for views, rotations in zip(objects, rotations_deg, strict=True)]
     (first_deg, first), (second_deg, second) = fits
-    shown = [_shown(query, a, b) for query, a, b in zip(queries, first, second, strict=True)]
-    telling = [n for n, one in enumerate(shown) if one.weight >= _LEAST_WEIGHT]
-    weights = np.array([shown[n].weight for n in telling])
+    shown = [_shown(n, query, a, b) for n, (query, a, b) in enumerate(zip(queries, first, second, strict=True))]
+    telling = [one for one in shown if one.weight >= _LEAST_WEIGHT]
+    weights = np.array([one.weight for one in telling])
     weight = float(weights.sum())
-    views = tuple(
-        ViewDifference(n, shown[n].score, shown[n].weight, shown[n].difference, *shown[n].images)
-        for n in sorted(telling, key=lambda n: -shown[n].weight)
-    )
-    score = float(weights @ [shown[n].score for n in telling]) / weight if weight else 0.0
+    score = float(weights @ [one.score for one in telling]) / weight if weight else 0.0
     best = int(score < 0)
     pixels = max(1, sum(one.pixels for one in shown))
     left = sum(one.unexplained[best] for one in shown)
     misfit, apart = left / pixels, weight / pixels
     unexplained = left / weight if weight else None
-    if unexplained is None or weight < MIN_WEIGHT or misfit > MAX_MISFIT:
-        return LocalDecision(None, score, None, 1.0, unexplained, weight, misfit, apart, views)
-    scores, own = _left_out([queries[n] for n in telling], objects, (first_deg, second_deg))
-    expected = float(scores[0] @ own[0] / own[0].sum()), float(scores[1] @ own[1] / own[1].sum())
-    away = np.concatenate([1 - scores[0], 1 + scores[1]])
-    scatter = float(away**2 @ np.concatenate(own) / np.concatenate(own).sum()) / (weight**2 / float(weights @ weights))
-    bound = scatter / (scatter + (1 + abs(score)) ** 2)
-    decided = (
-        abs(score) >= MIN_SCORE
-        and unexplained <= MAX_UNEXPLAINED
-        and min(expected[0], -expected[1]) >= MIN_SCORE
-        and bound <= max_error
-    )
-    return LocalDecision(best if decided else None, score, expected, bound, unexplained, weight, misfit, apart, views)
+    winner, expected, bound = None, None, 1.0
+    if unexplained is not None and weight >= MIN_WEIGHT and misfit <= MAX_MISFIT:
+        scores, own = _left_out([queries[one.view] for one in telling], objects, (first_deg, second_deg))
+        expected = float(scores[0] @ own[0] / own[0].sum()), float(scores[1] @ own[1] / own[1].sum())
+        away = np.concatenate([1 - scores[0], 1 + scores[1]])
+        every = np.concatenate(own)
+        scatter = float(away**2 @ every / every.sum()) / (weight**2 / float(weights @ weights))
+        bound = scatter / (scatter + (1 + abs(score)) ** 2)
+        is_clear = min(abs(score), expected[0], -expected[1]) >= MIN_SCORE
+        if is_clear and unexplained <= MAX_UNEXPLAINED and bound <= max_error:
+            winner = best
+    views = tuple(sorted(telling, key=lambda one: -one.weight))
+    return LocalDecision(winner, score, expected, bound, unexplained, weight, misfit, apart, views)
 
 
 def _left_out(
@@ -273,7 +248,7 @@ def _left_out(
             azimuths_deg = [view.azimuth_deg - added_deg[own] + by for by in added_deg]
             sides = [rest if side == own else objects[side] for side in (0, 1)]
             a, b = (_fits(view, views, deg) for views, deg in zip(sides, azimuths_deg, strict=True))
-            found.append(_shown(view, a, b))
+            found.append(_shown(0, view, a, b))
         scores.append(np.array([one.score for one in found]))
         weights.append(np.array([max(one.weight, 1.0) for one in found]))
     return scores, weights
@@ -283,14 +258,8 @@ def _best_pose(
     queries: Sequence[LocalView], views: Sequence[LocalView], rotations_deg: Sequence[float]
 ) -> tuple[float, list[list[_Fit]]]:
     """Return the rotation at which an object fits the views best, with the enrolled views there, the best one first."""
-    found: list[tuple[float, float, list[list[_Fit]]]] = []
-    for rotation_deg in rotations_deg:
-        fits = [_fits(query, views, query.azimuth_deg + rotation_deg) for query in queries]
-        found.append(
-            (sum(_mean(query, fit[0].apart) for query, fit in zip(queries, fits, strict=True)), rotation_deg, fits)
-        )
-    _, rotation_deg, fits = min(found, key=lambda one: one[0])
-    return rotation_deg, fits
+    poses = [(deg, [_fits(query, views, query.azimuth_deg + deg) for query in queries]) for deg in rotations_deg]
+    return min(poses, key=lambda pose: sum(best.mean for best, *_ in pose[1]))
 
 
 def _nearest(views: Sequence[LocalView], azimuth_deg: float, count: int) -> list[LocalView]:
@@ -299,21 +268,19 @@ def _nearest(views: Sequence[LocalView], azimuth_deg: float, count: int) -> list
 
 def _fits(query: LocalView, views: Sequence[LocalView], azimuth_deg: float) -> list[_Fit]:
     """Return the enrolled views nearest to an azimuth, registered to a view, the one that fits best first."""
-    image, _ = _small(query)
+    image, mask = query.resized(SIDE_PX)
+    own = (mask > 127).astype(np.uint8)
     found = []
     for view in _nearest(views, azimuth_deg, NEAREST):
-        moved, mask = _registered(view, query)
-        found.append(_Fit(view, moved, mask, pixel_difference(image, moved)))
-    return sorted(found, key=lambda fit: _mean(query, fit.apart))
+        moved, moved_mask = _registered(view, query)
+        apart = pixel_difference(image, moved)
+        found.append(_Fit(moved, moved_mask, apart, float(cv2.mean(apart, mask=own)[0])))
+    return sorted(found, key=lambda fit: fit.mean)
 
 
-def _mean(query: LocalView, apart: Map) -> float:
-    return float(cv2.mean(apart, mask=(_small(query)[1] > 127).astype(np.uint8))[0])
-
-
-def _shown(query: LocalView, first: Sequence[_Fit], second: Sequence[_Fit]) -> _Shown:
+def _shown(number: int, query: LocalView, first: Sequence[_Fit], second: Sequence[_Fit]) -> ViewDifference:
     """Compare a view with the enrolled views of both objects, where these differ."""
-    image, mask = _small(query)
+    image, mask = query.resized(SIDE_PX)
     a, b = first[0], second[0]
     both = pixel_difference(a.image, b.image)
     noise = np.full_like(both, _FLOOR)
@@ -325,30 +292,19 @@ def _shown(query: LocalView, first: Sequence[_Fit], second: Sequence[_Fit]) -> _
     total = float((weights * both).sum())
     score = float((weights * (b.apart - a.apart)).sum()) / total if total > 0 else 0.0
     own = mask > 127
-    rest = [float(np.maximum(one.apart - noise, 0)[own].sum()) for one in (a, b)]
-    images = image, a.image, b.image
-    return _Shown(score, float(weights.sum()), (rest[0], rest[1]), int(own.sum()), weights, images)
-
-
-def _small(view: LocalView) -> tuple[ImageArray, Mask]:
-    size = (SIDE_PX, SIDE_PX)
-    crop = cv2.resize(view.crop, size, interpolation=cv2.INTER_AREA).astype(np.uint8, copy=False)
-    return crop, cv2.resize(view.mask, size, interpolation=cv2.INTER_AREA).astype(np.uint8, copy=False)
+    of_first, of_second = (float(np.maximum(one.apart - noise, 0)[own].sum()) for one in (a, b))
+    weight, pixels = float(weights.sum()), int(own.sum())
+    return ViewDifference(number, score, weight, (of_first, of_second), pixels, weights, image, a.image, b.image)
 
 
 def _registered(view: LocalView, to: LocalView) -> tuple[ImageArray, Mask]:
     """Return a view and its mask, moved, scaled and sheared to fit another view, with the light of that view."""
-    image, mask = _small(view)
-    target, target_mask = _small(to)
+    image, mask = view.resized(SIDE_PX)
+    target, target_mask = to.resized(SIDE_PX)
     grey, target_grey = (cv2.cvtColor(one, cv2.COLOR_BGR2GRAY) for one in (image, target))
     move = np.eye(2, 3, dtype=np.float32)
-    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, _ITERATIONS, 1e-4)
-    try:
-        inside = cv2.dilate(target_mask, _square(5))
-        _, found = cv2.findTransformECC(target_grey, grey, move.copy(), cv2.MOTION_AFFINE, criteria, inside, 5)
-        move = np.asarray(found, np.float32)
-    except cv2.error:  # an even surface shows nothing to register: it stays where the silhouettes have placed it
-        pass
+    found = affine_map(target_grey, grey, move, cv2.dilate(target_mask, _square(5)), _CRITERIA, 5)
+    move = move if found is None else found  # an even surface stays where the silhouettes have placed it
     size, flags = (SIDE_PX, SIDE_PX), cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     moved = cv2.warpAffine(image, move, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
     moved_mask = cv2.warpAffine(mask, move, size, flags=flags)
@@ -357,6 +313,25 @@ def _registered(view: LocalView, to: LocalView) -> tuple[ImageArray, Mask]:
         levels = [np.median(one[both], axis=0).astype(np.float64) + 8.0 for one in (target, moved)]
         moved = np.clip(moved * np.clip(levels[0] / levels[1], 0.5, 2.0), 0, 255)
     return moved.astype(np.uint8, copy=False), moved_mask.astype(np.uint8, copy=False)
+
+
+def affine_map(
+    to: NDArray[Any],
+    image: NDArray[Any],
+    begin: Map,
+    inside: NDArray[Any],
+    criteria: tuple[int, int, float],
+    blur_px: int,
+) -> Map | None:
+    """Return the affine map, float32 (2, 3), from pixels of ``to`` to those of an image, both of one channel.
+
+    It begins with ``begin`` and looks at the pixels ``inside``; None if an even surface has nothing to register.
+    """
+    try:
+        _, found = cv2.findTransformECC(to, image, begin.copy(), cv2.MOTION_AFFINE, criteria, inside, blur_px)
+    except cv2.error:
+        return None
+    return np.asarray(found, np.float32)
 
 
 def pixel_difference(a: ImageArray, b: ImageArray) -> Map:

@@ -5,7 +5,7 @@ Decision: docs/decisions/0032.
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,7 +17,7 @@ from hbr.dense.index import BINS
 from hbr.descriptors import Packed
 from hbr.kernels import calls
 
-#: How reliably a view separates two objects that look different.
+#: λ: how reliably a view separates two objects that look different.
 SHARPNESS: Final = 100.0
 #: Largest number of compared hypotheses, and the share of the belief that is not compared.
 _STRONGEST: Final = 16
@@ -62,7 +62,6 @@ def next_best_view(
     belief: Belief,
     *,
     beta: float = BETA,
-    sharpness: float = SHARPNESS,
     rotations_deg: ArrayLike | None = None,
     seconds: ArrayLike | None = None,
 ) -> NextBestView:
@@ -80,8 +79,6 @@ def next_best_view(
         After at least one query.
     beta : float
         As for `Belief.posterior`.
-    sharpness : float
-        λ: how reliably a view separates two objects that look different.
     rotations_deg : array (a,), optional
         Possible rotations, e.g. within the cable budget; by default every 5 degrees, the shorter way round.
     seconds : array (a,), optional
@@ -112,28 +109,68 @@ def next_best_view(
     landing_deg = here_deg + angles_deg
     apart_deg = size_deg(landing_deg[:, None] - belief.orientation_deg).min(axis=1)
     novelty = 1 - np.exp(-0.5 * (apart_deg / _NEAR_DEG) ** 2)
-    probability, place, bin_of = strongest(belief.posterior(beta))
-    first, second = pairs_of(place)
-    if len(first):
-        similar, known = expected_similarity(belief, place, bin_of, angles_deg, first, second)
-        tells = novelty[:, None] * np.sqrt(known[:, first] * known[:, second])
-        pairs = probability[first] * probability[second]
-        remaining = pairs * np.exp(-sharpness * tells * (1 - similar))
+    pairs = pairs_after(belief, beta, angles_deg)
+    is_one = not len(pairs.probability)  # one object alone: a new side helps to find its azimuth
+    if is_one:
+        confusion = -SHARPNESS * novelty
+    else:
+        remaining = pairs.probability * np.exp(-SHARPNESS * (novelty[:, None] * pairs.known) * (1 - pairs.similar))
         confusion = log_confusion(remaining)
-    else:  # one object alone: a new side helps to find its azimuth
-        confusion = -sharpness * novelty
     # Choose the best one, and name the pair that it separates most.
     chosen = int((confusion + cost).argmin())
     pair: tuple[int, int] | None = None
     similarity: FloatArray | None = None
-    if len(first):
-        most = int((pairs - remaining[chosen]).argmax())
-        objects = belief.index.object_index
-        ordered = sorted((first[most], second[most]), key=lambda i: -probability[i])
-        pair = int(objects[place[ordered[0]]]), int(objects[place[ordered[1]]])
-        similarity = similar[:, most]
+    if not is_one:
+        most = int((pairs.probability - remaining[chosen]).argmax())
+        pair, similarity = pairs.named(most), pairs.similar[:, most]
     rotation_deg = float(angles_deg[chosen])
     return NextBestView(rotation_deg, wrap360(here_deg + rotation_deg), pair, angles_deg, confusion, cost, similarity)
+
+
+class Pairs(NamedTuple):
+    """The pairs of strong hypotheses of different objects, and what their views show after some rotations.
+
+    Attributes
+    ----------
+    objects : integer array (2, p)
+        Index of both objects of each pair in the views' names, the likelier hypothesis first.
+    probability : float64 array (p,)
+        Product of their probabilities.
+    similar : float64 array (a, p)
+        Similarity of their views after each rotation.
+    known : float64 array (a, p)
+        √(κ κ'), 0..1: to which share their views are known (`next_best_view`).
+    """
+
+    objects: IndexArray
+    probability: FloatArray
+    similar: FloatArray
+    known: FloatArray
+
+    def named(self, place: int) -> tuple[int, int]:
+        """Return the two objects of the pair at this place."""
+        return int(self.objects[0, place]), int(self.objects[1, place])
+
+
+def pairs_after(belief: Belief, beta: float, rotations_deg: FloatArray) -> Pairs:
+    """Return the pairs of strong hypotheses, after each of some rotations, float64 (a,)."""
+    probability, place, bin_of = strongest(belief.posterior(beta))
+    first, second = _all_pairs(len(place))
+    different = place[first] != place[second]
+    first, second = first[different], second[different]
+    compared = belief.index.compared
+    rows, away_deg = expected_views(belief, place, bin_of, rotations_deg)
+    known = np.exp(-0.5 * (away_deg / _NEAR_DEG) ** 2)
+    if isinstance(compared, Packed):
+        similar = compared.pairs(rows, first, second)
+    else:
+        similar = compared.among(rows)[:, first, second]
+    return Pairs(
+        belief.index.object_index[place[np.stack([first, second])]],
+        probability[first] * probability[second],
+        similar,
+        np.sqrt(known[:, first] * known[:, second]),
+    )
 
 
 def log_confusion(remaining: FloatArray) -> FloatArray:
@@ -142,15 +179,9 @@ def log_confusion(remaining: FloatArray) -> FloatArray:
     return confusion
 
 
-def pairs_of(place: IndexArray) -> tuple[IndexArray, IndexArray]:
-    """Return the pairs of hypotheses of different objects; pairs with the same first one follow each other."""
-    first, second = _all_pairs(len(place))
-    different = place[first] != place[second]
-    return first[different], second[different]
-
-
 @lru_cache(maxsize=_STRONGEST)
 def _all_pairs(count: int) -> tuple[IndexArray, IndexArray]:
+    """Return two of ``count`` each; pairs with the same first one follow each other, as the comparison needs them."""
     return np.triu_indices(count, 1)
 
 
@@ -179,38 +210,6 @@ def _peak_weights(posterior: FloatArray) -> FloatArray:
     mass, total = posterior.sum(axis=1), peaks.sum(axis=1)
     share: FloatArray = np.divide(mass, total, out=np.zeros_like(mass), where=total > 0)
     return peaks * share[:, None]
-
-
-def expected_similarity(
-    belief: Belief,
-    place: IndexArray,
-    bin_of: IndexArray,
-    angles_deg: FloatArray,
-    first: IndexArray,
-    second: IndexArray,
-) -> tuple[FloatArray, FloatArray]:
-    """Return how similar pairs of hypotheses would look after each rotation.
-
-    Parameters
-    ----------
-    place, bin_of
-        As `strongest` returns them, (m,).
-    first, second
-        The two of each pair, (p,): pairs with the same first one follow each other.
-
-    Returns
-    -------
-    similar : float64 array (a, p)
-        Similarity of the two.
-    known : float64 array (a, m)
-        Share, 0..1, to which the view of each hypothesis is known.
-    """
-    compared = belief.index.compared
-    rows, away_deg = expected_views(belief, place, bin_of, angles_deg)
-    known = np.exp(-0.5 * (away_deg / _NEAR_DEG) ** 2)
-    if isinstance(compared, Packed):
-        return compared.pairs(rows, first, second), known
-    return compared.among(rows)[:, first, second], known
 
 
 def expected_views(

@@ -1,12 +1,12 @@
-"""The open-set score of the dense search: a log-odds that compares the leading candidate with all others.
+"""The open-set scores of the dense search: high for enrolled objects, low for unknown ones.
 
-An absolute similarity means little after a change of the bench: it falls for an enrolled object, too. Therefore the
-score weighs several numbers (`Evidence`), each of which compares the leading candidate with the other candidates under
-the same conditions. Half of them come from whitened descriptions: properties that all enrolled views share count little
-there, and properties that distinguish them count much. The weights for the rig's own descriptor come from searches on
-drawn benches (`hbr.evaluation.changed_bench`); for other descriptors they are fitted on leave-one-out searches of the
-catalog, under changes of the bench of several strengths (`hbr.descriptors.shift`). The thresholds always come from the
-catalog.
+`open_set_score` is for a bench that has not changed. An absolute similarity means little after a change of the bench:
+it falls for an enrolled object, too. Therefore `OpenSetModel.score`, a log-odds, weighs several numbers (`evidence`),
+each of which compares the leading candidate with the other candidates under the same conditions. Half of them come from
+whitened descriptions: properties that all enrolled views share count little there, and properties that distinguish them
+count much. The weights for the rig's own descriptor come from searches on drawn benches
+(`hbr.evaluation.changed_bench`); for other descriptors they are fitted on leave-one-out searches of the catalog, under
+changes of the bench of several strengths (`hbr.descriptors.shift`). The thresholds always come from the catalog.
 
 Sources: B. Hariharan, J. Malik and D. Ramanan, "Discriminative decorrelation for clustering and classification", ECCV
 2012 (whitening); R. Auckenthaler, M. Carey and H. Lloyd-Thomas, "Score normalization for text-independent speaker
@@ -17,19 +17,22 @@ Decisions: docs/decisions/0049, docs/decisions/0059.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hbr.core.arrays import FloatArray, IndexArray, LevelArray
-from hbr.dense.index import DenseIndex
+from hbr.core.arrays import FloatArray, IndexArray
+from hbr.dense.filter import Belief
+from hbr.dense.index import BIN_DEG
 
+#: Weight of the margin in the open-set score without fitted weights, and of the leader's usual score.
+_MARGIN_WEIGHT: Final = 0.5
+_USUAL_WEIGHT: Final = 1.0
 #: Candidates that the leader is compared with.
 COHORT: Final = 10
 #: Enrolled views next to the estimated pose that are compared.
 _NEXT: Final = 3
-_BIN_DEG: Final = 5.0
 #: Strength of the regularisation, which draws weights to 0.
 _RIDGE: Final = 1e-3
 _STEPS: Final = 60
@@ -38,71 +41,102 @@ _STEPS: Final = 60
 #: descriptions, and the cohort's mean.
 NUMBERS: Final = ("score", "margin", "lead", "whitened", "whitened_margin", "whitened_lead", "whitened_cohort")
 
+Scores = TypeVar("Scores", float, FloatArray)
+
+
+@dataclass(frozen=True, eq=False)
+class Leaders:
+    """The leading candidate after each view of each search, arrays (searches, views).
+
+    Attributes
+    ----------
+    object_index : integer array
+        The leading candidate.
+    score, margin : float64 array
+        Its score per view, and that score minus the second one.
+    """
+
+    object_index: IndexArray
+    score: FloatArray
+    margin: FloatArray
+
+    @classmethod
+    def of(cls, found: FloatArray) -> "Leaders":
+        """Return the leading candidates from what `leader` returned after each view, float64 (searches, views, 3)."""
+        return cls(found[..., 0].astype(np.intp), found[..., 1], found[..., 2])
+
+    def open_set_score(self, usual_scores: FloatArray) -> FloatArray:
+        """Return the open-set score after each view of each search, (searches, views), from all `usual_scores`."""
+        usual = usual_scores[self.object_index, np.arange(self.score.shape[1])]
+        return open_set_score(self.score, self.margin, usual, np.median(usual_scores, axis=0))
+
+
+def leader(object_index: IndexArray, scores: FloatArray) -> tuple[int, float, float]:
+    """Return the leading candidate, its score and its margin: the whole score without a second candidate."""
+    best = int(scores.argmax())
+    margin = scores[best] - np.partition(scores, -2)[-2] if len(scores) > 1 else scores[best]
+    return int(object_index[best]), float(scores[best]), float(margin)
+
+
+def usual_scores(leaders: Leaders, correct: NDArray[np.bool_], objects: int) -> FloatArray:
+    """Return each object's median score in the searches that found it, (objects, views); else the median of all."""
+    usual = np.full((objects, leaders.score.shape[1]), np.nan)
+    for n in range(usual.shape[1]):
+        for j in np.unique(leaders.object_index[correct[:, n], n]).tolist():
+            usual[j, n] = np.median(leaders.score[correct[:, n] & (leaders.object_index[:, n] == j), n])
+        found = usual[~np.isnan(usual[:, n]), n]
+        usual[np.isnan(usual[:, n]), n] = np.median(found) if len(found) else 0.0
+    return usual
+
+
+def open_set_score(score: Scores, margin: Scores, usual: Scores, typical: Scores) -> Scores:
+    """Return the open-set score of a leading candidate without weights.
+
+    It is the score plus half of the margin, minus the amount by which the leader usually scores more than other
+    objects. An unknown object resembles several enrolled objects a little; an enrolled object resembles one of them
+    closely. An object that looks the same from all sides usually scores more, so it must match better. ``usual`` is
+    the usual score of the leader (`usual_scores`), and ``typical`` the median of those of all objects.
+    """
+    return score + _MARGIN_WEIGHT * margin - _USUAL_WEIGHT * (usual - typical)
+
 
 def evidence(
-    index: DenseIndex,
-    support: NDArray[np.float32],
-    orientation_deg: FloatArray,
-    queries: Sequence[LevelArray],
-    *,
-    units: Sequence[FloatArray] | None = None,
-    enrolled: Callable[[IndexArray], FloatArray] | None = None,
+    belief: Belief,
+    units: Sequence[FloatArray],
+    enrolled: Callable[[IndexArray], FloatArray],
     without: int | None = None,
 ) -> tuple[int, FloatArray]:
     """Return the place of the leading candidate, and the numbers of `NUMBERS`.
 
     Parameters
     ----------
-    index : DenseIndex
-        The enrolled views.
-    support : float32 array (k, 72)
-        As `Belief.support`.
-    orientation_deg : float64 array (n,)
-        Orientations of the camera at the queries.
-    queries : sequence of uint8 arrays (length,) or (h, length)
-        The queries.
-    units : sequence of float64 arrays, optional
-        Their whitened descriptions, if they are known.
-    enrolled : callable, optional
-        Returns whitened descriptions of enrolled views, (n, d), from their rows, if they are known.
+    belief : Belief
+        After n queries without weights.
+    units : sequence of n float64 arrays (h, d)
+        The whitened descriptions of each query, of unit length, a row for each segmentation.
+    enrolled : callable
+        Returns those of enrolled views, (m, d), from their rows.
     without : int, optional
         Place of an object that does not count, as if it were not enrolled.
     """
-    count = len(queries)
-    scores = np.maximum(support.max(axis=1).astype(np.float64) / count, 0) ** (1 / index.power)
+    scores = belief.scores()
     if without is not None:
         scores[without] = -1.0
     order = np.argsort(-scores, kind="stable")[: COHORT + 1]
     order = order[scores[order] >= 0]
     best = int(order[0])
-    alone = np.zeros(len(NUMBERS))
-    alone[[0, 1, 2]] = scores[best]
-    if not queries:
-        return best, alone
-    if units is None:
-        units = [index.whitening.unit(np.atleast_2d(query)) for query in queries]
-    pose_deg = support[order].argmax(axis=1) * _BIN_DEG
-    rotated_deg = orientation_deg - orientation_deg[0]
-    rows = index.nearest_views(order, pose_deg[:, None] + rotated_deg, _NEXT)
-    near = index.whitening.unit(index.views.levels(rows.ravel())) if enrolled is None else enrolled(rows.ravel())
-    near = near.reshape(*rows.shape, -1)
+    pose_deg = belief.support[order].argmax(axis=1) * BIN_DEG
+    rotated_deg = belief.orientation_deg - belief.orientation_deg[0]
+    rows = belief.index.nearest_views(order, pose_deg[:, None] + rotated_deg, _NEXT)
+    near = enrolled(rows.ravel()).reshape(*rows.shape, -1)
     white = np.zeros(len(order))
     for n, unit in enumerate(units):
-        white += (near[:, n] @ unit.T).max(axis=(1, 2)) / count
-    if len(order) == 1:
-        alone[3:6] = white[0]
-        return best, alone
-    others, white_others = scores[order[1:]], white[1:]
-    found = [
-        scores[best],
-        scores[best] - others[0],
-        scores[best] - others.mean(),
-        white[0],
-        white[0] - white_others.max(),
-        white[0] - white_others.mean(),
-        white_others.mean(),
-    ]
-    return best, np.array(found)
+        white += (near[:, n] @ unit.T).max(axis=(1, 2)) / belief.queries
+    numbers: list[float] = []
+    for one in (scores[order], white):
+        first, others = one[0], one[1:]
+        numbers += [first, first - others.max(), first - others.mean()] if len(others) else [first] * 3
+    return best, np.array([*numbers, white[1:].mean() if len(order) > 1 else 0.0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,17 +180,14 @@ class OpenSetModel:
         correct : bool array (searches, views)
             Whether the leading candidate of `known` is right.
         """
-        views = known.shape[1]
-        middle, spread, weights, offset = [], [], [], []
-        for n in range(views):
+        fits = []
+        for n in range(known.shape[1]):
             numbers = np.concatenate([known[:, n], unknown[:, n]])
             wanted = np.concatenate([np.where(correct[:, n], 1.0, -1.0), -np.ones(len(unknown))])
-            middle.append(numbers.mean(axis=0))
-            spread.append(np.maximum(numbers.std(axis=0), 1e-6))
-            found = _logistic((numbers - middle[-1]) / spread[-1], wanted)
-            weights.append(found[:-1])
-            offset.append(found[-1])
-        return cls(np.array(middle), np.array(spread), np.array(weights), np.array(offset))
+            middle, spread = numbers.mean(axis=0), np.maximum(numbers.std(axis=0), 1e-6)
+            found = _logistic((numbers - middle) / spread, wanted)
+            fits.append((middle, spread, found[:-1], found[-1]))
+        return cls(*map(np.array, zip(*fits, strict=True)))
 
 
 #: Weights of the numbers after 1, 2, 3 and 4 views, and offsets, by descriptor. They were fitted to searches for

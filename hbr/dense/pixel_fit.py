@@ -11,17 +11,14 @@ from typing import Final
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from hbr.core.arrays import ImageArray
-from hbr.dense.local_difference import LocalView
+from hbr.dense.local_difference import LocalView, Map, Mask, affine_map
 
 #: Side of the compared images, and their largest movement in the first step.
 SIDE_PX: Final = 64
 _REACH_PX: Final = 10
-#: Scales of the first step, and largest ratio of the scales of width and height.
-_SCALES: Final = (0.88, 1.0, 1.13)
-_MOST_APART: Final = 1.2
+#: Scales of width and height in the first step.
+_SCALES: Final = ((0.88, 0.88), (0.88, 1.0), (1.0, 0.88), (1.0, 1.0), (1.0, 1.13), (1.13, 1.0), (1.13, 1.13))
 #: Smallest gain of correlation that justifies a change of a scale, and a movement by a pixel of the reduced image.
 _SCALE_COST: Final = 0.02
 _PIXEL_COST: Final = 0.002
@@ -34,8 +31,6 @@ _UNITS: Final = 40.0
 _DARK: Final = (9.0, 12.0)
 #: Smallest number of common pixels for a comparison.
 _FEWEST: Final = 60
-
-Map = NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,15 +48,13 @@ class Pixels:
     """
 
     colours: Map
-    mask: NDArray[np.uint8]
+    mask: Mask
     alone: Map
 
     @classmethod
     def of(cls, view: LocalView) -> "Pixels":
         """Prepare a view."""
-        size = (SIDE_PX, SIDE_PX)
-        crop: ImageArray = cv2.resize(view.crop, size, interpolation=cv2.INTER_AREA).astype(np.uint8, copy=False)
-        mask = cv2.resize(view.mask, size, interpolation=cv2.INTER_AREA).astype(np.uint8, copy=False)
+        crop, mask = view.resized(SIDE_PX)
         levels = crop.astype(np.float32)
         brightness = np.log(levels.mean(axis=2) + _DARK[0])
         blue, green, red = cv2.split(np.log(levels + _DARK[1]))
@@ -99,11 +92,9 @@ def _registered(view: Pixels, enrolled: Pixels, begin: Map) -> Map | None:
     """Return the affine map, (2, 3), from pixels of a view to those of an enrolled view; None if none is found."""
     inside = cv2.erode((enrolled.mask > 127).astype(np.uint8), np.ones((3, 3), np.uint8))
     here, there = (np.ascontiguousarray(one.colours[:, :, 0]) for one in (view, enrolled))
-    try:
-        _, found = cv2.findTransformECC(here, there, begin.copy(), cv2.MOTION_AFFINE, _CRITERIA, inside, 3)
-    except cv2.error:  # an even surface has nothing to register
+    move = affine_map(here, there, begin, inside, _CRITERIA, 3)
+    if move is None:
         return None
-    move = np.asarray(found, np.float32)
     area = float(np.linalg.det(move[:, :2]))
     plausible = _AREAS[0] < area < _AREAS[1] and float(np.abs(move[:, :2] - np.eye(2)).max()) < _MOST_SHEAR
     return move if plausible else None
@@ -115,17 +106,14 @@ def _begin(view: Pixels, enrolled: Pixels) -> Map:
     half = cv2.resize(wide, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
     side = enrolled.alone.shape[0]
     found: list[tuple[float, tuple[float, float, float, float]]] = []
-    for across in _SCALES:
-        for down in _SCALES:
-            if not 1 / _MOST_APART < across / down < _MOST_APART:
-                continue
-            middle = (side - 1) / 2
-            scaled = np.array([[across, 0, (1 - across) * middle], [0, down, (1 - down) * middle]])
-            part = cv2.warpAffine(enrolled.alone, scaled, (side, side), borderMode=cv2.BORDER_REPLICATE)
-            _, similar, _, (x, y) = cv2.minMaxLoc(cv2.matchTemplate(half, part, cv2.TM_CCOEFF_NORMED))
-            away = x - _REACH_PX / 2, y - _REACH_PX / 2
-            similar -= _SCALE_COST * ((across != 1) + (down != 1)) + _PIXEL_COST * (abs(away[0]) + abs(away[1]))
-            found.append((similar, (across, down, 2 * away[0], 2 * away[1])))
+    middle = (side - 1) / 2
+    for across, down in _SCALES:
+        scaled = np.array([[across, 0, (1 - across) * middle], [0, down, (1 - down) * middle]])
+        part = cv2.warpAffine(enrolled.alone, scaled, (side, side), borderMode=cv2.BORDER_REPLICATE)
+        _, similar, _, (x, y) = cv2.minMaxLoc(cv2.matchTemplate(half, part, cv2.TM_CCOEFF_NORMED))
+        away = x - _REACH_PX / 2, y - _REACH_PX / 2
+        similar -= _SCALE_COST * ((across != 1) + (down != 1)) + _PIXEL_COST * (abs(away[0]) + abs(away[1]))
+        found.append((similar, (across, down, 2 * away[0], 2 * away[1])))
     across, down, x_px, y_px = max(found)[1]
     middle = (SIDE_PX - 1) / 2
     forward = np.array([[across, 0, (1 - across) * middle + x_px], [0, down, (1 - down) * middle + y_px], [0, 0, 1]])

@@ -13,10 +13,10 @@ from typing import Final
 
 import numpy as np
 
-from hbr.core.angles import wrap360
+from hbr.core.angles import wrap180, wrap360
 from hbr.core.arrays import FloatArray
 from hbr.dense.filter import Belief
-from hbr.dense.index import BINS
+from hbr.dense.index import BIN_DEG, BINS
 
 #: κ, and the uncertainty as a share of the posterior's half-width, because azimuths are estimated finer than its bins.
 SHARPNESS: Final = 120.0
@@ -29,6 +29,10 @@ _LARGEST_SHARE: Final = 1 / 9
 _LEAST_PART: Final = 0.25
 #: An object looks the same from all sides if the likeliest azimuths, 95 % together, are at least this share of all.
 _FREE_SHARE: Final = 0.5
+#: Poses of an object that a comparison tries: those of at least this probability, relative to the likeliest one.
+_MOST_POSES: Final = 3
+_LEAST_POSE: Final = 0.02
+_POSES_APART_DEG: Final = 25.0
 _ORDERS: Final = range(2, 13)
 _ONE_SIGMA, _TWO_SIGMA = 0.683, 0.954
 
@@ -55,11 +59,24 @@ class Pose:
 
 def pose(belief: Belief, object_index: int) -> Pose:
     """Return the pose of an object that the filter considers."""
-    azimuth_deg, p = likely_azimuths(belief, object_index)
+    azimuth_deg, p = _likely_azimuths(belief, object_index)
     return pose_of(p / p.sum(), azimuth_deg, azimuth_deg - belief.rotated_deg)
 
 
-def likely_azimuths(belief: Belief, object_index: int) -> tuple[float, FloatArray]:
+def poses_of(belief: Belief, object_index: int) -> tuple[float, ...]:
+    """Return the likely azimuths of an object at the last view, the likeliest first; symmetric objects have several."""
+    best_deg, likely = _likely_azimuths(belief, object_index)
+    found = [best_deg]
+    for place in np.argsort(-likely, kind="stable").tolist():
+        azimuth_deg = float(wrap360(place * BIN_DEG + belief.rotated_deg))
+        if likely[place] < _LEAST_POSE or len(found) == _MOST_POSES:
+            break
+        if min(abs(wrap180(azimuth_deg - one)) for one in found) >= _POSES_APART_DEG:
+            found.append(azimuth_deg)
+    return tuple(found)
+
+
+def _likely_azimuths(belief: Belief, object_index: int) -> tuple[float, FloatArray]:
     """Return an object's estimated azimuth at the last query, and how likely those at the first one are, (72,)."""
     ranking = belief.ranking()
     (support,) = belief.support[belief.index.object_index == object_index].astype(np.float64)
@@ -68,18 +85,11 @@ def likely_azimuths(belief: Belief, object_index: int) -> tuple[float, FloatArra
 
 
 def pose_of(posterior: FloatArray, azimuth_deg: float, estimate_deg: float) -> Pose:
-    """Return the pose by the posterior of one object's azimuths.
+    """Return the pose by the posterior of one object's azimuths, float64 (72,), at the first query.
 
-    Parameters
-    ----------
-    posterior : float64 array (72,)
-        Probability of the azimuths 0, 5, ... at the first query.
-    azimuth_deg
-        The estimated azimuth at the last query.
-    estimate_deg
-        The same at the first query.
+    The estimated azimuth is ``azimuth_deg`` at the last query, and ``estimate_deg`` at the first one.
     """
-    away_deg: FloatArray = np.arange(BINS, dtype=np.float64) * (360 / BINS) - estimate_deg
+    away_deg: FloatArray = np.arange(BINS, dtype=np.float64) * BIN_DEG - estimate_deg
     sigma_deg = _sigma_deg(posterior, away_deg, 360.0)
     if sigma_deg <= LARGEST_SIGMA_DEG:
         return Pose((azimuth_deg,), sigma_deg, 360.0)

@@ -13,13 +13,21 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from hbr.core.arrays import LevelArray
-from hbr.dense.enrolled_views import Asking, Queries
 from hbr.dense.filter import KEPT, Belief, completed, update_belief
 from hbr.dense.index import DenseIndex
-from hbr.dense.leaders import LeaderComparison, compare_leaders
+from hbr.dense.last_steps import (
+    FOUND_FROM,
+    FOUND_FROM_SAME_BENCH,
+    Asking,
+    LeaderComparison,
+    Queries,
+    Verification,
+    compare_leaders,
+    is_doubtful,
+    verify,
+)
 from hbr.dense.next_view import NextBestView, next_best_view
 from hbr.dense.stopping import Outcome, StopDecision, StoppingRule
-from hbr.dense.verification import Verification, found_from, is_doubtful, verify
 from hbr.descriptors.together import like_enrollment
 
 _WORTH_REDUCING: Final = 2
@@ -67,7 +75,6 @@ class DenseSession:
         self._kept = KEPT if len(index) > _WORTH_REDUCING * KEPT else len(index)
         self._index = index
         self._so_far: DenseIndex | Belief = index
-        self._queries: list[LevelArray] = []
         self._reliable = True
         self._same_bench: bool | None = None
         self._like_enrollment: bool | None = None
@@ -108,7 +115,7 @@ class DenseSession:
             self._replace(earlier)
         self._begin_view(orientation_deg)
         self._extend(levels, orientation_deg)
-        self.present = self._decide(self.belief)
+        self.present = self._decide()
         if self.is_new_decision:
             self.decision = self.present
             if self.decision.outcome is not Outcome.CONTINUE:
@@ -124,17 +131,16 @@ class DenseSession:
         self._so_far = self.belief = update_belief(
             levels, orientation_deg, self._so_far, kept=self._kept, weight=self._weight(orientation_deg)
         )
-        self._queries.append(levels)
 
     def _replace(self, queries: Sequence[LevelArray]) -> None:
         """Compute the belief again from other descriptions of the same views."""
-        if len(queries) != len(self._queries):
-            raise ValueError(f"{len(queries)} earlier views; the search has {len(self._queries)}")
-        same = all(np.array_equal(a, b) for a, b in zip(queries, self._queries, strict=True))
-        if same or not queries:
+        before = self._so_far.levels if isinstance(self._so_far, Belief) else ()
+        if len(queries) != len(before):
+            raise ValueError(f"{len(queries)} earlier views; the search has {len(before)}")
+        if all(np.array_equal(a, b) for a, b in zip(queries, before, strict=True)):
             return
         orientations_deg = self.belief.orientation_deg.tolist()
-        self._so_far, self._queries = self._index, []
+        self._so_far = self._index
         for query, orientation_deg in zip(queries, orientations_deg, strict=True):
             self._extend(query, orientation_deg)
 
@@ -150,30 +156,25 @@ class DenseSession:
         decision = self.decision
         if decision.outcome is Outcome.CONTINUE:
             self._complete()
-            decision = self._decide(self.belief, last=True)
+            decision = self._decide(last=True)
         if self.verification is not None:
             decision = self.verification.decided(decision, self.found_from)
         return decision if self.comparison is None else self.comparison.decided(decision)
 
     @property
     def found_from(self) -> float:
-        """Log-odds from which a verified leader is found (`hbr.dense.verification.found_from`)."""
-        return found_from(self._same_bench)
+        """Log-odds from which a verified leader is found."""
+        return FOUND_FROM_SAME_BENCH if self._same_bench else FOUND_FROM
 
     @property
     def is_doubtful(self) -> bool:
-        """Whether the search must verify its leader before it ends (`hbr.dense.verification.is_doubtful`)."""
+        """Whether the search must verify its leader before it ends (`hbr.dense.last_steps.is_doubtful`)."""
         return is_doubtful(self.rule, self.end(), self.belief.queries, self.belief.index.views.descriptor)
 
     def verify(self, queries: Queries, measured: Verification | None = None) -> Asking[Verification | None]:
         """Verify a doubtful leader, pixel by pixel; None without doubt.
 
-        Parameters
-        ----------
-        queries
-            The views of the search.
-        measured : Verification, optional
-            The fit that was measured before; it is used instead of enrolled views.
+        A fit that was ``measured`` before is used instead of enrolled views.
         """
         self.verification = None
         if measured is None and self.is_doubtful:
@@ -182,13 +183,7 @@ class DenseSession:
         return measured
 
     def compare(self, queries: Queries) -> Asking[LeaderComparison | None]:
-        """Compare the two leaders, pixel by pixel, if the search does not end with one object; else None.
-
-        Parameters
-        ----------
-        queries
-            The views of the search.
-        """
+        """Compare the two leaders, pixel by pixel, if the search does not end with one object; else None."""
         self.comparison = None
         outcome, rule = self.end().outcome, self.rule
         self.comparison = yield from compare_leaders(
@@ -200,15 +195,17 @@ class DenseSession:
         """Return the weight of the next view; None: 1."""
         return None
 
-    def _decide(self, belief: Belief, *, last: bool = False) -> StopDecision:
-        most = belief.queries if last else self.max_views
-        return self.rule.decide(belief, max_views=most, reliable=self._reliable, same_bench=self._like_enrollment)
+    def _decide(self, *, last: bool = False) -> StopDecision:
+        return self._by_rule(self.belief, self.belief.queries if last else self.max_views)
+
+    def _by_rule(self, belief: Belief, max_views: int) -> StopDecision:
+        return self.rule.decide(belief, max_views=max_views, reliable=self._reliable, same_bench=self._like_enrollment)
 
     def _complete(self) -> None:
         """Decide again before an end if an object that was left out after the first view can be first or second."""
         if len(self.belief.index) == len(self._index):
             return
-        found = completed(self.belief, self._index, self._queries)
+        found = completed(self.belief, self._index)
         if found is not self.belief:
             self._so_far = self.belief = found
-            self.decision = self._decide(found)
+            self.decision = self._decide()

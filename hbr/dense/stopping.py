@@ -1,6 +1,6 @@
 """The stopping rule of the dense search: it ends searches and rejects unknown objects at measured error rates.
 
-`hbr.dense.calibration` sets the thresholds, and `StoppingRule.decide` applies them after each view of a search.
+`hbr.dense.fitting` sets the thresholds, and `StoppingRule.decide` applies them after each view of a search.
 
 Decisions: docs/decisions/0026, docs/decisions/0060.
 """
@@ -14,8 +14,7 @@ import numpy as np
 
 from hbr.core.arrays import FloatArray
 from hbr.dense.filter import Belief
-from hbr.dense.leave_one_out import leader, open_set_score
-from hbr.dense.open_set import OpenSetModel, evidence
+from hbr.dense.open_set import OpenSetModel, evidence, leader, open_set_score
 
 
 class Outcome(StrEnum):
@@ -125,6 +124,15 @@ class ShiftRates:
     false_accepts: int
 
 
+def by_confidence(is_enough: bool, *, last: bool, reliable: bool) -> tuple[Outcome, StopReason]:
+    """Return what a search does whose open-set score is high enough, from whether its confidence is enough, too."""
+    if is_enough and (reliable or last):
+        return Outcome.FOUND, StopReason.CONFIDENT
+    if last:
+        return Outcome.AMBIGUOUS, StopReason.MAX_VIEWS
+    return Outcome.CONTINUE, StopReason.BADLY_SEGMENTED if is_enough else StopReason.NOT_CONFIDENT
+
+
 @dataclass(frozen=True, eq=False)
 class StoppingRule:
     """A rule that ends a search and decides which objects are unknown.
@@ -149,7 +157,7 @@ class StoppingRule:
     limitations : tuple of Limitation
         What the rule does not guarantee; empty if it guarantees both rates.
     open_set : OpenSetModel, optional
-        The weights of the open-set score. Without them the score is that of `hbr.dense.leave_one_out.open_set_score`.
+        The weights of the open-set score. Without them the score is that of `hbr.dense.open_set.open_set_score`.
     unknown_thresholds : tuple of float
         With weights: open-set scores after 1, 2, ... views below which an object is unknown. Between them and
         ``open_set_thresholds`` it is ambiguous. Without weights both thresholds are one.
@@ -157,7 +165,7 @@ class StoppingRule:
         With weights: ``open_set_thresholds`` for a bench that is known to have changed since the enrollment, and for
         one that is known to be the same.
     leave_one_out_thresholds : tuple of float
-        With weights: scores of `hbr.dense.leave_one_out.open_set_score` after 1, 2, ... views. On an unchanged bench,
+        With weights: scores of `hbr.dense.open_set.open_set_score` after 1, 2, ... views. On an unchanged bench,
         few enrolled objects score less, and an object that reaches the highest of them is found.
     rates : tuple of ShiftRates
         Measured rates under changes of the bench.
@@ -184,43 +192,38 @@ class StoppingRule:
     ) -> StopDecision:
         """Decide whether a search ends after these views.
 
-        An object is found if its confidence and its open-set score reach their thresholds. Before the last calibrated
-        view the highest of all open-set thresholds counts: an unknown object that passes the first threshold gets
-        another view, which costs an enrolled object little. From the last calibrated view on, an object below the
+        An object is found if its confidence and its open-set score reach their thresholds. Before the last fitted view
+        the highest of all open-set thresholds counts: an unknown object that passes the first threshold gets
+        another view, which costs an enrolled object little. From the last fitted view on, an object below the
         threshold is unknown, even if views are left: no false-reject rate was measured for those. After ``max_views``
         an object with too little confidence is ambiguous. If the views were not segmented reliably, the search
         continues until ``max_views``: another view costs little, and the background is then known. ``same_bench`` is
         whether the bench is that of the enrollment; None: not known. On the same bench, an object with enough
         confidence is also found if it reaches all leave-one-out thresholds, which are for an unchanged bench.
         """
-        probabilities = belief.posterior(self.beta).sum(axis=1)
-        best = int(probabilities.argmax())
+        best, probability = belief.likeliest(self.beta)
         known = {True: self.same_bench_thresholds, False: self.changed_bench_thresholds, None: ()}[same_bench]
         thresholds = known or self.open_set_thresholds
-        calibrated = len(thresholds)
+        fitted = len(thresholds)
         views = belief.queries
-        n = min(views, calibrated) - 1
+        n = min(views, fitted) - 1
         score = self._open_set_score(belief, n)
-        early = views < min(calibrated, max_views)
+        early, last = views < min(fitted, max_views), views >= max_views
         threshold = max(thresholds) if early else thresholds[n]
-        probability = float(probabilities[best])
         unknown_below = min(threshold, self.unknown_thresholds[n]) if self.unknown_thresholds else threshold
-        if score < threshold:
-            outcome = Outcome.CONTINUE if early else Outcome.UNKNOWN
-            reason = StopReason.BELOW_OPEN_SET_THRESHOLD
-            if not early and score >= unknown_below:
-                outcome = Outcome.CONTINUE if views < max_views else Outcome.AMBIGUOUS
-        elif probability >= self.min_confidence:
-            outcome, reason = Outcome.FOUND, StopReason.CONFIDENT
-        elif views < max_views:
-            outcome, reason = Outcome.CONTINUE, StopReason.NOT_CONFIDENT
+        if score >= threshold:
+            outcome, reason = by_confidence(probability >= self.min_confidence, last=last, reliable=reliable)
         else:
-            outcome, reason = Outcome.AMBIGUOUS, StopReason.MAX_VIEWS
-        if not reliable and outcome is not Outcome.CONTINUE and views < max_views:
-            outcome, reason = Outcome.CONTINUE, StopReason.BADLY_SEGMENTED
+            outcome, reason = Outcome.UNKNOWN, StopReason.BELOW_OPEN_SET_THRESHOLD
+            if not early and score >= unknown_below:
+                outcome = Outcome.AMBIGUOUS
+            if early or (outcome is Outcome.AMBIGUOUS and not last):
+                outcome = Outcome.CONTINUE
+            elif not (reliable or last):
+                outcome, reason = Outcome.CONTINUE, StopReason.BADLY_SEGMENTED
         object_index = int(belief.index.object_index[best])
         decision = StopDecision(outcome, reason, object_index, probability, self.min_confidence, score, threshold)
-        if same_bench and reliable and score < threshold and views <= calibrated:
+        if same_bench and reliable and score < threshold and views <= fitted:
             return self._found_on_same_bench(belief, n, decision)
         return decision
 
@@ -242,7 +245,9 @@ class StoppingRule:
 
     def _open_set_score(self, belief: Belief, n: int) -> float:
         if self.open_set is not None:
-            _, numbers = evidence(belief.index, belief.support, belief.orientation_deg, belief.levels)
+            levels, unit = belief.index.views.levels, belief.index.whitening.unit
+            units = [unit(np.atleast_2d(query)) for query in belief.levels]
+            _, numbers = evidence(belief, units, lambda rows: unit(levels(rows)))
             return self.open_set.score(numbers, belief.queries)
         return self._leave_one_out_score(belief, n)[1]
 

@@ -4,6 +4,7 @@ Source: B. Hariharan, J. Malik and D. Ramanan, "Discriminative decorrelation for
 2012.
 """
 
+from collections.abc import Callable
 from functools import cached_property
 from typing import Final
 
@@ -73,35 +74,23 @@ class Whitening:
             known.update(zip(missing, unit_rows(self.white(levels[list(missing.values())])), strict=True))
         return np.array([known[key] for key in keys])
 
-    def without(self, rows: IndexArray) -> "WhiteningWithout":
-        """Return the whitening as if these views were not enrolled."""
+    def without(self, rows: IndexArray) -> Callable[[FloatArray], FloatArray]:
+        """Return the whitening as if k views were not enrolled, without computing it again.
+
+        If C is the covariance with these views and U has their distances from the mean as columns, the covariance
+        without them is C - U Uᵀ (the mean stays). By the Woodbury identity its inverse is
+        C⁻¹ + C⁻¹ U (I - Uᵀ C⁻¹ U)⁻¹ Uᵀ C⁻¹. The second part adds entries to each whitened description, one for each
+        view that is left out.
+
+        Returns
+        -------
+        callable
+            Returns descriptions of unit length, (n, d + k), of those that `white` returns, (n, d).
+        """
         used = rows[np.isin(rows, self._rows)]
-        return WhiteningWithout(self.white(self._views.levels(used)), len(self._rows))
-
-
-class WhiteningWithout:
-    """Whitening as if some views were not enrolled, without computing it again.
-
-    If C is the covariance with these views and U has their distances from the mean as columns, the covariance without
-    them is C - U Uᵀ (the mean stays). By the Woodbury identity its inverse is C⁻¹ + C⁻¹ U (I - Uᵀ C⁻¹ U)⁻¹ Uᵀ C⁻¹. The
-    second part adds entries to each whitened description, one for each view that is left out.
-
-    Parameters
-    ----------
-    own : float64 array (k, d)
-        Whitened descriptions of the views that are left out, as `Whitening.white` returns them.
-    views : int
-        Number of views from which the whitening was computed.
-    """
-
-    def __init__(self, own: FloatArray, views: int) -> None:
-        scaled = own / np.sqrt(max(1, views - 1))
-        inner = np.eye(len(own)) - scaled @ scaled.T
-        self._more: FloatArray = scaled.T @ np.linalg.cholesky(np.linalg.inv(inner))
-
-    def unit(self, white: FloatArray) -> FloatArray:
-        """Return the descriptions of unit length, (n, d + k), of whitened ones, (n, d)."""
-        return unit_rows(np.hstack([white, white @ self._more]))
+        own = self.white(self._views.levels(used)) / np.sqrt(max(1, len(self._rows) - 1))
+        more = own.T @ np.linalg.cholesky(np.linalg.inv(np.eye(len(own)) - own @ own.T))
+        return lambda white: unit_rows(np.hstack([white, white @ more]))
 
 
 def unit_rows(white: FloatArray) -> FloatArray:

@@ -14,7 +14,7 @@ from hbr.core.arrays import FloatArray, ImageArray, LevelArray
 from hbr.descriptors.base import CompiledDescriptor
 from hbr.descriptors.cosine import WholeCosine
 from hbr.descriptors.shift import Shift
-from hbr.kernels import parts
+from hbr.kernels import images
 from hbr.kernels.calls import Measure
 from hbr.segmentation import CROP_PX, Segmentation, segment
 
@@ -111,7 +111,7 @@ def _histogram(image: ImageArray) -> NDArray[np.float32]:
 
 def _strongest(x: cv2.typing.MatLike, y: cv2.typing.MatLike) -> tuple[Floats, Floats]:
     """Return at every pixel the gradient of the channel with the strongest edge."""
-    found = parts.strongest(x, y)
+    found = images.strongest(x, y)
     if found is not None:
         return found
     strength = x * x + y * y
@@ -123,7 +123,7 @@ def _strongest(x: cv2.typing.MatLike, y: cv2.typing.MatLike) -> tuple[Floats, Fl
 def _votes(magnitude: cv2.typing.MatLike, angle: cv2.typing.MatLike) -> Floats:
     """Return the votes of the pixels for the eight directions, float32 (8, h, w)."""
     scale = np.float32(_DIRECTIONS / np.pi)
-    found = parts.votes(magnitude, angle, scale)
+    found = images.votes(magnitude, angle, scale)
     if found is not None:
         return found
     place = angle * scale

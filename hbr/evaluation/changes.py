@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from hbr.core.angles import wrap180
 from hbr.core.arrays import ImageArray, LevelArray
-from hbr.dense.enrolled_views import answered, near
 from hbr.dense.index import DenseIndex
+from hbr.dense.last_steps import answered, near
 from hbr.dense.local_difference import LocalView
 from hbr.dense.session import DenseSession
 from hbr.dense.stopping import Outcome, StoppingRule
@@ -82,11 +82,11 @@ class SearchResult:
     views : int
         Views until the end.
     compared : bool
-        Whether its two leaders were compared pixel by pixel (`hbr.dense.leaders`).
+        Whether its two leaders were compared pixel by pixel (`hbr.dense.last_steps`).
     by_comparison : bool
         Whether that comparison changed the outcome.
     verified : bool
-        Whether the leader was doubtful, and compared with the views pixel by pixel (`hbr.dense.verification`).
+        Whether the leader was doubtful, and compared with the views pixel by pixel (`hbr.dense.last_steps`).
     left_out : Outcome, optional
         Outcome of the same search if the object is not enrolled; None if it never was.
     """

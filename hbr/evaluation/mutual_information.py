@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from hbr.dense.filter import BETA, Belief
+from hbr.dense.index import POWER
 from hbr.dense.next_view import ALL_ROTATIONS_DEG, expected_views, strongest
 
 
@@ -22,9 +23,7 @@ def most_informative_rotation(belief: Belief, *, beta: float = BETA, rotations_d
     probability, place, bin_of = strongest(belief.posterior(beta))
     rows, _ = expected_views(belief, place, bin_of, angles_deg)
     similar = belief.index.compared.among(rows)
-    weights = probability * np.exp(
-        beta / np.sqrt(belief.queries + 1) * (np.maximum(similar, 0) ** belief.index.power - 1)
-    )
+    weights = probability * np.exp(beta / np.sqrt(belief.queries + 1) * (np.maximum(similar, 0) ** POWER - 1))
     weights /= weights.sum(axis=2, keepdims=True)
     objects = (place[:, None] == np.unique(place)).astype(np.float64)
     shares = weights @ objects

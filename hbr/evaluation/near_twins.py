@@ -1,9 +1,9 @@
-"""The images of a data set as views for the comparison of two leaders (`hbr.dense.leaders`)."""
+"""The images of a data set as views for the comparison of two leaders (`hbr.dense.last_steps`)."""
 
 from collections.abc import Sequence
 
 from hbr.core.arrays import IndexArray
-from hbr.dense.enrolled_views import near
+from hbr.dense.last_steps import near
 from hbr.dense.local_difference import LocalView
 from hbr.descriptors import descriptor
 from hbr.evaluation.condition import Condition, EvaluationImage

@@ -46,7 +46,7 @@ class Stopping:
     """Results of searches with an end: by a decision, or after all views.
 
     The paper's methods end when the margin per view reaches ``margin``; the dense filter ends by the stopping rule that
-    was calibrated on the enrolled views. A hit is a search that found the right object. ``unknown_rate``,
+    was fitted to the enrolled views. A hit is a search that found the right object. ``unknown_rate``,
     ``ambiguous_rate`` and ``wrong_rate`` are the shares of searches with these outcomes. ``compared_rate`` is the share
     whose two leaders were compared pixel by pixel, ``compared_right_rate`` the share in which the comparison named the
     right object, and ``ended_early`` the share that ended before the last view.

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from hbr.core.angles import wrap180
 from hbr.core.arrays import FloatArray, IndexArray, LevelArray
-from hbr.dense.calibration import calibrate_stopping_rule
-from hbr.dense.enrolled_views import answered
 from hbr.dense.filter import Belief, update_belief
+from hbr.dense.fitting import fit_stopping_rule
 from hbr.dense.index import DenseIndex
+from hbr.dense.last_steps import answered
 from hbr.dense.local_difference import LocalView
 from hbr.dense.session import DenseSession
 from hbr.dense.stopping import Outcome, StoppingRule
@@ -379,8 +379,8 @@ class _Trials:
 
 
 def rule_of_trial(views: Views, protocol: Protocol) -> StoppingRule:
-    """Return the stopping rule, calibrated on the views that are enrolled in all trials, as on a bench."""
-    return calibrate_stopping_rule(DenseIndex(views.select(views_of_trial(views, protocol)))).rule
+    """Return the stopping rule, fitted to the views that are enrolled in all trials, as on a bench."""
+    return fit_stopping_rule(DenseIndex(views.select(views_of_trial(views, protocol)))).rule
 
 
 def _similar_views(similar: FloatArray, ring: IndexArray) -> NDArray[np.bool_]:

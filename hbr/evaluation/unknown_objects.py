@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hbr.core.arrays import BoolArray
-from hbr.dense.calibration import conformal_threshold
-from hbr.dense.leave_one_out import Leaders, usual_scores
+from hbr.dense.fitting import conformal_threshold
+from hbr.dense.open_set import Leaders, usual_scores
 from hbr.dense.stopping import StoppingRule
 from hbr.evaluation.draws import generator
 from hbr.evaluation.protocol import Protocol, Runs
@@ -17,12 +17,12 @@ from hbr.evaluation.protocol import Protocol, Runs
 class UnknownObjects:
     """Results after ``views`` views, over all draws of objects that were left out.
 
-    If ``calibrated``, the thresholds are those of the stopping rule that a bench calibrates on the enrolled views.
+    If ``fitted``, the thresholds are those of the stopping rule that a bench fits to the enrolled views.
     Otherwise the first third of the enrolled objects' trials gives the usual scores, the second third the thresholds,
     and the last third the false rejects.
     """
 
-    calibrated: bool
+    fitted: bool
     views: int
     nominal: float
     known_trials: int

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from hbr.core.arrays import FloatArray, ImageArray, IndexArray, LevelArray
 from hbr.core.cores import THREADS
-from hbr.kernels.library import address, library
+from hbr.kernels.library import address, library, run
 
 _ROWS_OF_A_THREAD: Final = 100_000
 """Smallest number of rows for a thread: fewer take less time than its start."""
@@ -44,16 +44,15 @@ WORKSPACE = _Workspace()
 
 def cedd(image: ImageArray, grid: tuple[int, int, int, int], tables: Addresses) -> LevelArray | None:
     """Return the CEDD levels of an image, (144,); ``grid`` and ``tables`` as in `hbr.descriptors.cedd`."""
-    found = library()
     rows, columns, height, width = grid
-    if found is None or height > 257 or height * width > 8000:
+    if height > 257 or height * width > 8000:
         return None
     if image.strides[1:] != (3, 1):
         image = np.ascontiguousarray(image)
     work = WORKSPACE.grown(18 + 16 * columns + 2 * columns * width)
-    found.hbr_cedd(
-        address(image), image.strides[0], rows, columns, height, width, tables.address, work.address + 144, work.address
-    )
+    address, size = work.address, (rows, columns, height, width)
+    if not run("hbr_cedd", image, image.strides[0], *size, tables.address, address + 144, address):
+        return None
     return work.array[:18].view(np.uint8).copy()
 
 
@@ -294,44 +293,30 @@ def support(
     whole: int,
 ) -> NDArray[np.float32] | None:
     """Return the support that one query adds to every azimuth of each object, (objects, 72); see `hbr.dense.index`."""
-    found = library()
-    if found is None:
-        return None
     room = 2 * int(segments.lengths.max())
     scratch = np.empty(4 * room)
     added = np.empty((len(segments.lengths), 72), np.float32)
-    found.hbr_support(
-        *map(address, segments[:3]), len(segments.lengths), address(azimuth_deg), address(levels),
-        slope, part_deg, whole, address(scratch), room, address(added),
-    )  # fmt: skip
-    return added
+    of_bins = slope, part_deg, whole, scratch, room, added
+    is_done = run("hbr_support", *segments[:3], len(segments.lengths), azimuth_deg, levels, *of_bins)
+    return added if is_done else None
 
 
 def peak_weights(posterior: FloatArray) -> FloatArray | None:
     """Return the weight of each hypothesis of a posterior, (k, 72); see `hbr.dense.next_view.strongest`."""
-    found = library()
-    if found is None:
-        return None
     posterior = np.ascontiguousarray(posterior)
     weights = np.empty(posterior.shape)
-    found.hbr_peak_weights(address(posterior), len(posterior), address(weights))
-    return weights
+    return weights if run("hbr_peak_weights", posterior, len(posterior), weights) else None
 
 
 def nearest_view(
     segments: Segments, azimuth_deg: FloatArray, places: IndexArray, at_deg: FloatArray
 ) -> tuple[IndexArray, FloatArray] | None:
     """Return the view of each object, (m,), that is nearest to azimuths, (a, m), and its distance in degrees."""
-    found = library()
-    if found is None:
-        return None
     places, at_deg = _whole(places), np.ascontiguousarray(at_deg)
     rows, away_deg = np.empty(at_deg.shape, np.int64), np.empty(at_deg.shape)
-    found.hbr_nearest_view(
-        *map(address, segments[:3]), address(azimuth_deg), address(places), len(places),
-        address(at_deg), len(at_deg), address(rows), address(away_deg),
-    )  # fmt: skip
-    return rows, away_deg
+    asked = places, len(places), at_deg, len(at_deg)
+    is_done = run("hbr_nearest_view", *segments[:3], azimuth_deg, *asked, rows, away_deg)
+    return (rows, away_deg) if is_done else None
 
 
 def rotated(
@@ -342,15 +327,10 @@ def rotated(
     azimuth_deg: FloatArray,
 ) -> IndexArray | None:
     """Return for each view the view of its object that is nearest to its azimuth plus ``rotation_deg``."""
-    found = library()
-    if found is None:
-        return None
-    given = _whole(anchors), np.ascontiguousarray(rotation_deg), _whole(object_index), *map(_whole, by_object)
-    azimuths = np.ascontiguousarray(azimuth_deg)
+    given = _whole(anchors), np.ascontiguousarray(rotation_deg), len(anchors)
+    enrolled = *map(_whole, (object_index, *by_object)), np.ascontiguousarray(azimuth_deg)
     views = np.empty(len(anchors), np.int64)
-    asked, rotation, *others = map(address, given)
-    found.hbr_rotated(asked, rotation, len(anchors), *others, address(azimuths), address(views))
-    return views
+    return views if run("hbr_rotated", *given, *enrolled, views) else None
 
 
 def paths(
@@ -363,8 +343,7 @@ def paths(
     omega: float,
 ) -> tuple[FloatArray, IndexArray] | None:
     """Return score (C,) and path (C, N) of every object, by rising object; see `hbr.paper.hough`."""
-    found = library()
-    if found is None or queries.shape[1] > ByteRows.LONGEST:
+    if queries.shape[1] > ByteRows.LONGEST:
         return None
     queries, orientation_deg = np.ascontiguousarray(queries), np.ascontiguousarray(orientation_deg)
     object_index, azimuth_deg = _whole(object_index), np.ascontiguousarray(azimuth_deg)
@@ -376,12 +355,11 @@ def paths(
     most = len(columns[-1])
     value, predecessor = np.empty(len(rows)), np.empty(len(rows), np.int64)
     scores, taken, count = np.empty(most), np.empty((most, len(columns)), np.int64), np.empty(1, np.int64)
-    found.hbr_paths(
-        address(queries), queries.strides[0], *queries.shape, address(descriptors), descriptors.strides[0],
-        address(object_index), address(azimuth_deg), address(orientation_deg), omega,
-        *map(address, (begin, rows, value, predecessor, scores, taken, count)),
+    is_done = run(
+        "hbr_paths", queries, queries.strides[0], *queries.shape, descriptors, descriptors.strides[0],
+        object_index, azimuth_deg, orientation_deg, omega, begin, rows, value, predecessor, scores, taken, count,
     )  # fmt: skip
-    return scores[: count[0]], taken[: count[0]]
+    return (scores[: count[0]], taken[: count[0]]) if is_done else None
 
 
 def _whole(array: IndexArray) -> NDArray[np.int64]:

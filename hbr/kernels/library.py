@@ -85,6 +85,18 @@ def load(path: Path) -> ctypes.CDLL | None:
     return found
 
 
+def run(name: str, *arguments: Any) -> bool:
+    """Run a kernel, and return True; False without the compiled library.
+
+    Contiguous arrays are passed by their addresses.
+    """
+    found = library()
+    if found is None:
+        return False
+    getattr(found, name)(*[address(one) if isinstance(one, np.ndarray) else one for one in arguments])
+    return True
+
+
 @contextmanager
 def without_library() -> Iterator[None]:
     """Let NumPy do the work in a ``with`` block: for tests and benchmarks."""

@@ -57,12 +57,11 @@ EXPORT void hbr_nearest_view(const int64_t *order, const int64_t *begin, const i
                              int64_t angles, int64_t *rows, double *away_deg) {
     for (int64_t m = 0; m < size; m++) {
         const int64_t *own = order + begin[places[m]], n = count[places[m]];
-        const double shift = 1000.0 * (double)m; /* as the reference searches all objects at once */
-        int64_t next = 0;                        /* the first view at or after the azimuth: often near the last one */
+        int64_t next = 0; /* the first view at or after the azimuth: often near the last one */
         for (int64_t a = 0; a < angles; a++) {
-            const double at = at_deg[a * size + m], key = wrap360(at) + shift;
-            while (next < n && azimuth_deg[own[next]] + shift < key) next++;
-            while (next && azimuth_deg[own[next - 1]] + shift >= key) next--;
+            const double at = at_deg[a * size + m], key = wrap360(at);
+            while (next < n && azimuth_deg[own[next]] < key) next++;
+            while (next && azimuth_deg[own[next - 1]] >= key) next--;
             const int64_t behind = next == n ? 0 : next;
             int64_t before = next ? next - 1 : n - 1;
             while (before && azimuth_deg[own[before - 1]] == azimuth_deg[own[before]]) before--;

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from hbr.core.arrays import FloatArray, ImageArray
 from hbr.core.validation import check_frame
-from hbr.kernels import fit, view
+from hbr.kernels import images
 from hbr.segmentation.evidence import IssueCode
 
 Mask = NDArray[np.bool_]
@@ -186,7 +186,7 @@ class Background:
     def _planes(self, small: ImageArray, illumination: Illumination) -> tuple[Floats, Floats, Mask, Mask, Mask]:
         """Return the planes of a `Difference`, without the grain, and where the frame agrees with this image."""
         sides = illumination.sides(*small.shape[:2])
-        found = view.compare(small, self._grey_levels, _LOG, self._log, sides, _NOISE, _AGREES)
+        found = images.compare(small, self._grey_levels, _LOG, self._log, sides, _NOISE, _AGREES)
         if found is not None:
             evenly, coloured, certain, possible, agrees = found
             return evenly, coloured, certain.view(np.bool_), possible.view(np.bool_), agrees.view(np.bool_)
@@ -248,7 +248,7 @@ def shrunk(image_bgr: ImageArray) -> ImageArray:
     scale = SIDE_PX / max(image_bgr.shape[:2])
     if scale < 1:
         size = max(1, round(image_bgr.shape[1] * scale)), max(1, round(image_bgr.shape[0] * scale))
-        by_kernel = view.shrink(image_bgr, size)
+        by_kernel = images.shrink(image_bgr, size)
         if by_kernel is None:
             by_kernel = cv2.resize(image_bgr, size, interpolation=cv2.INTER_AREA).astype(np.uint8, copy=False)
         image_bgr = by_kernel
@@ -310,7 +310,7 @@ def _medians(rows: FloatArray) -> FloatArray:
 
 def _fit(small: ImageArray, useful: Mask, table_log: Floats) -> FloatArray:
     """Fit a plane to each channel of the difference of logarithms by least squares, repeated without the outliers."""
-    samples = fit.samples(small, useful, _LOG, table_log, _plane(*useful.shape))
+    samples = images.samples(small, useful, _LOG, table_log, _plane(*useful.shape))
     basis, values, middle = _samples(small, useful, table_log) if samples is None else samples
     if len(basis) < 12:
         return np.zeros((3, 3))
@@ -319,7 +319,7 @@ def _fit(small: ImageArray, useful: Mask, table_log: Floats) -> FloatArray:
     quarter = len(values) // 4
     for tolerance in (0.35, 0.2, 0.12, 0.12):
         fitted = basis @ slopes
-        inliers = fit.inliers(values, fitted, basis, tolerance, quarter)
+        inliers = images.inliers(values, fitted, basis, tolerance, quarter)
         own, own_values = _inliers(values, fitted, basis, tolerance, quarter) if inliers is None else inliers
         gram = own.T @ own + _RIDGE
         slopes = np.linalg.solve(gram, own.T @ own_values).astype(np.float64, copy=False)
@@ -327,7 +327,7 @@ def _fit(small: ImageArray, useful: Mask, table_log: Floats) -> FloatArray:
 
 
 def _samples(small: ImageArray, useful: Mask, table_log: Floats) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return what `hbr.kernels.fit.samples` returns."""
+    """Return what `hbr.kernels.images.samples` returns."""
     few = np.s_[2::_EVERY, 2::_EVERY]
     keep = useful[few] & _useful(small[few])
     basis = _plane(*useful.shape)[keep]
@@ -338,7 +338,7 @@ def _samples(small: ImageArray, useful: Mask, table_log: Floats) -> tuple[FloatA
 def _inliers(
     values: FloatArray, fitted: FloatArray, basis: FloatArray, tolerance: float, quarter: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Return what `hbr.kernels.fit.inliers` returns."""
+    """Return what `hbr.kernels.images.inliers` returns."""
     away = np.maximum.reduce(np.abs(values - fitted).T)
     inlier = np.flatnonzero(away <= max(tolerance, float(np.partition(away, quarter)[quarter])))
     return basis.take(inlier, axis=0), values.take(inlier, axis=0)

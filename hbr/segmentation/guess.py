@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hbr.core.arrays import ImageArray
-from hbr.kernels.components import likely_parts
-from hbr.kernels.grab_cut import grab_cut
+from hbr.kernels.images import grab_cut, likely_parts
 from hbr.segmentation.background import Mask
 
 #: Part of the frame that an object may be in: left, top, right, bottom.
@@ -85,7 +84,7 @@ def _main_part(cut: Binary, prior: NDArray[np.float32]) -> Binary | None:
 
 
 def _parts(opened: Binary, prior: NDArray[np.float32]) -> Binary:
-    """Return what `hbr.kernels.components.likely_parts` returns."""
+    """Return what `hbr.kernels.images.likely_parts` returns."""
     count, labels, stats, _ = cv2.connectedComponentsWithStats(opened)
     if count < 2:
         return np.empty(0, np.uint8)

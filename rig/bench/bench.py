@@ -36,26 +36,14 @@ DEVICES = ("imu", "camera")
 """The devices that can be opened later than the servo."""
 
 
-class Operator(Protocol):
-    """An operator: puts objects on the table."""
+class Placer(Protocol):
+    """Puts objects on the table, so that no person has to: a robot, or the simulated operator."""
 
     def place(self, name: str | None) -> None:
         """Wait until the object ``name`` (None: the one to identify) is on the table, and the hands are away."""
 
-
-@runtime_checkable
-class TableClearer(Protocol):
-    """An operator that can empty the table without a prompt."""
-
     def clear(self) -> bool:
         """Return True when the table is empty; False if that is not possible."""
-
-
-class ObjectAlreadyPlaced:
-    """The operator of a bench on which the object is placed before the command starts."""
-
-    def place(self, name: str | None) -> None:
-        """Do nothing: the object is already on the table."""
 
 
 @dataclass(slots=True)
@@ -64,6 +52,8 @@ class Bench(AbstractContextManager["Bench"]):
 
     Attributes
     ----------
+    placer
+        Puts objects on the table; None if a person does that, before a plan begins.
     conditions
         The noise model or the calibrations in force; stored with every enrollment.
     findings
@@ -86,7 +76,7 @@ class Bench(AbstractContextManager["Bench"]):
     servo: Servo
     imu: Imu
     camera: Camera
-    operator: Operator = field(default_factory=ObjectAlreadyPlaced)
+    placer: Placer | None = None
     conditions: Mapping[str, Any] = field(default_factory=dict)
     findings: tuple[str, ...] = ()
     calibration_findings: tuple[str, ...] = field(default=(), init=False)
@@ -143,6 +133,11 @@ class Bench(AbstractContextManager["Bench"]):
     def _unpowered(self) -> bool:
         """Return whether the rig head's relay cuts the servo's supply: then it has no torque either."""
         return self.head is not None and self.config.head.power and not self.head.status.relay_closed
+
+    def place(self, name: str | None) -> None:
+        """Let the placer put an object on the table, as `Placer.place`; without a placer, it is there already."""
+        if self.placer is not None:
+            self.placer.place(name)
 
     def open_devices(self, parts: Collection[str]) -> None:
         """Open ``imu`` and ``camera`` now, not at their first use.

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from sqlalchemy import select
 
-from hbr.dense.enrolled_views import near
+from hbr.dense.last_steps import near
 from hbr.dense.local_difference import LocalView
 from rig.catalog.catalog import Catalog
 from rig.catalog.describing import stored_describer
@@ -17,7 +17,7 @@ from rig.views.description import BENCH_DESCRIPTOR
 def local_views(catalog: Catalog, name: str, azimuths_deg: Sequence[float]) -> list[LocalView]:
     """Return the enrolled views of an object that are nearest to each of these azimuths, by azimuth.
 
-    Which these are, `hbr.dense.enrolled_views.near` decides for the bench and for the evaluation.
+    Which these are, `hbr.dense.last_steps.near` decides for the bench and for the evaluation.
 
     Raises
     ------

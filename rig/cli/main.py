@@ -13,10 +13,10 @@ from typing import Annotated, Any, Unpack
 import typer
 from typer.core import TyperGroup
 
-from rig.cli.bench import config, doctor, find, head, jog, safety, serve, servo, setup, snapshot, table
-from rig.cli.catalog import calibrate as rules
-from rig.cli.catalog import catalog, deliver, exchange, results, upkeep
-from rig.cli.objects import empty_table, enroll, evaluate, identify, runs
+from rig.cli.bench import config, doctor, find, head, jog, serve, servo, setup, snapshot, table
+from rig.cli.catalog import catalog, exchange, results, upkeep
+from rig.cli.catalog import fit as rules
+from rig.cli.objects import enroll, evaluate, identify, runs
 from rig.cli.ui.command import show_error, without_color
 from rig.cli.ui.exit_codes import EXIT_CODES
 from rig.cli.ui.options import CommonOptions, show_parameters, spread
@@ -117,13 +117,13 @@ app.command("enroll", rich_help_panel=OBJECTS)(enroll.enroll)
 app.command("identify", rich_help_panel=OBJECTS)(identify.identify)
 app.command("replay", rich_help_panel=OBJECTS)(runs.replay)
 app.command("report", rich_help_panel=OBJECTS)(runs.report)
-app.command("empty-table", rich_help_panel=BENCH)(empty_table.empty_table)
+app.command("empty-table", rich_help_panel=BENCH)(snapshot.empty_table)
 app.command("goto", rich_help_panel=BENCH, context_settings={"ignore_unknown_options": True})(table.goto)
 app.command("home", rich_help_panel=BENCH)(table.home)
 app.command("jog", rich_help_panel=BENCH)(jog.jog)
 app.command("status", rich_help_panel=BENCH)(table.status)
-app.command("stop", rich_help_panel=BENCH)(safety.stop)
-app.command("acknowledge", rich_help_panel=BENCH)(safety.acknowledge)
+app.command("stop", rich_help_panel=BENCH)(table.stop)
+app.command("acknowledge", rich_help_panel=BENCH)(table.acknowledge)
 app.command("snapshot", rich_help_panel=BENCH)(snapshot.snapshot)
 app.command("doctor", rich_help_panel=BENCH)(doctor.doctor)
 app.command("serve", rich_help_panel=BENCH)(serve.serve)
@@ -132,8 +132,8 @@ app.command("setup", rich_help_panel=BENCH)(setup.setup)
 app.command("import", rich_help_panel=OBJECTS)(exchange.import_)
 app.command("export", rich_help_panel=OBJECTS)(exchange.export)
 app.command("log", rich_help_panel=OBJECTS)(upkeep.log)
-catalog.app.command("deliver")(deliver.deliver)
-catalog.app.command("calibrate")(rules.calibrate)
+catalog.app.command("fit")(rules.fit)
+catalog.app.command("calibrate", hidden=True)(rules.fit)  # the word that technicians try first
 app.add_typer(results.app, name="results", rich_help_panel=OBJECTS)
 app.add_typer(catalog.app, name="catalog", rich_help_panel=OBJECTS)
 app.add_typer(config.app, name="config", rich_help_panel=BENCH)

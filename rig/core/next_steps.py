@@ -94,7 +94,7 @@ class Do(StrEnum):
     VERIFY_CATALOG = "verify-catalog", "check the catalog", "rig catalog verify"
     REPAIR_CATALOG = "repair-catalog", "repair the catalog", "rig catalog verify --repair"
     REDESCRIBE = "redescribe", "describe the stored images again", "rig catalog redescribe"
-    FIT_STOPPING_RULE = "fit-stopping-rule", "fit the stopping rule again", "rig catalog calibrate"
+    FIT_STOPPING_RULE = "fit-stopping-rule", "fit the stopping rule again", "rig catalog fit"
     MERGE = "merge", "add the objects to a catalog", "rig catalog merge {source}"
     DELIVER_RENAMED = (
         "deliver-renamed",

@@ -61,8 +61,11 @@ def open_context(
     seed: int | None = None,
     options: tuple[str, ...] = (),
     file_options: tuple[str, ...] = (),
+    is_held: bool = False,
 ) -> Iterator[DoctorContext]:
     """Yield a bench to check; its computer is this one unless the bench provides another.
+
+    ``is_held`` says that this program holds the bench, and has closed its devices.
 
     Raises
     ------
@@ -72,7 +75,7 @@ def open_context(
     kind = bench_kind(bench)
     chosen = validate(kind.options, config.bench.get(bench, {}), where="the configuration", prefix=f"bench.{bench}")
     try:
-        who = holder(config.state_path(bench))
+        who = None if is_held else holder(config.state_path(bench))
     except OSError:  # the folder is not readable: the check of the bench's state reports it
         who = None
     if isinstance(kind, ComputerProvider):

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hbr.core.arrays import LevelArray
-from hbr.dense.calibration import calibrate_stopping_rule
+from hbr.dense.fitting import fit_stopping_rule
 from hbr.dense.index import DenseIndex
 from hbr.dense.stopping import StoppingRule
 from hbr.evaluation.changes import (
@@ -59,7 +59,7 @@ def run_changes(
         advance(names[j])
     parts = [Views.of_object(item.name, *enrolled[j], DESCRIPTOR) for j, item in enumerate(items)]
     index = DenseIndex(Views.concatenate(parts))
-    rule = calibrate_stopping_rule(index).rule
+    rule = fit_stopping_rule(index).rule
     searched: dict[str, list[SearchResult]] = {}
     work = partial(_search, dataset, changes, index.views, rule)
     for j, results in map_in_processes(work, range(len(dataset.objects)), jobs):
@@ -75,7 +75,7 @@ def run_changes(
         "settings": {"version": version("hbr-rig"), "dataset": dataset.name, "objects": len(names), **asdict(changes)},
         "changed_bench": shares(searched),
         **({} if reported is None else {"reported": shares(reported)}),
-        "calibrated": [asdict(one) for one in rule.rates],
+        "fitted": [asdict(one) for one in rule.rates],
         "searches": {item.name: [asdict(one) for one in searched[item.name]] for item in dataset.objects},
     }
 

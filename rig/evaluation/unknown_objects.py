@@ -7,7 +7,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from hbr.dense.calibration import calibration_searches, fit_stopping_rule
+from hbr.dense.fitting import fitting_searches, rule_from_searches
 from hbr.dense.index import DenseIndex
 from hbr.dense.leave_one_out import LeaveOneOut
 from hbr.dense.stopping import StoppingRule
@@ -67,22 +67,24 @@ def unknown_object_rows(results: dict[str, Any]) -> Rows:
     for row in results["unknown_objects"]:
         rejected = 100 * row["false_rejects"] / row["known_trials"]
         accepted = 100 * row["false_accepts"] / row["unknown_trials"]
-        by_nominal.setdefault((row["calibrated"], row["nominal"]), []).append(f"{rejected:.2f} / {accepted:.2f}")
+        by_nominal.setdefault((row["fitted"], row["nominal"]), []).append(f"{rejected:.2f} / {accepted:.2f}")
     views = max(row["views"] for row in results["unknown_objects"])
     heads = ["false rejects / accepts, %, at N =", *(str(n) for n in range(1, views + 1))]
-    names = {key: f"nominal {100 * key[1]:g}{', calibrated' if key[0] else ''}" for key in sorted(by_nominal)}
+    names = {key: f"nominal {100 * key[1]:g}{', fitted' if key[0] else ''}" for key in sorted(by_nominal)}
     return Rows(heads, [[name, *by_nominal[key]] for key, name in names.items()])
 
 
 def _searches(views: Views, protocol: Protocol) -> LeaveOneOut:
-    searches = calibration_searches(DenseIndex(views.select(views_of_trial(views, protocol))))
+    searches = fitting_searches(DenseIndex(views.select(views_of_trial(views, protocol))))
     if searches is None:
-        raise ValueError("objects with a single enrolled view cannot be calibrated; enroll more views of each")
+        raise ValueError(
+            "objects with a single enrolled view are too few for a stopping rule; enroll more views of each"
+        )
     return searches
 
 
 def _rules(searches: list[LeaveOneOut], false_reject: float) -> list[StoppingRule]:
-    return [fit_stopping_rule(one, false_reject=false_reject) for one in searches]
+    return [rule_from_searches(one, false_reject=false_reject) for one in searches]
 
 
 def _search(plan: Plan, views: Views, draws: tuple[tuple[Protocol, StoppingRule], ...], j: int) -> list[Runs]:

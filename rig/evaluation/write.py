@@ -97,7 +97,7 @@ def _page(results: dict[str, Any], drawn: Mapping[str, Chart]) -> str:
             (
                 "Decisions and poses",
                 f"A search of the paper ends when the best object leads by {stopping['margin']:g} per view, one "
-                "with the dense filter by the stopping rule calibrated on enrolled views; both end after all views. "
+                "with the dense filter by the stopping rule fitted to enrolled views; both end after all views. "
                 "Columns: number of views (mean, 95th percentile), hit rate, share of unknown, mean sum of rotations; "
                 "pose error after all views in the trials that found the object (median and RMSE, then symmetry-aware, "
                 "then the median of objects without symmetry); median time of the last step.",

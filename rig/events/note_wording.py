@@ -132,7 +132,7 @@ def limitation_words(limitation: Limitation) -> str:
             )
         case LimitationCode.SINGLE_VIEWS:
             return (
-                "objects with a single view cannot be calibrated: no object is called unknown, and no rate is "
+                "no rule can be fitted to objects with a single view: no object is called unknown, and no rate is "
                 "guaranteed; enroll more"
             )
 

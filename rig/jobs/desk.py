@@ -6,7 +6,7 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-from rig.bench import Bench, ObjectAlreadyPlaced
+from rig.bench import Bench
 from rig.bench.bench import DEVICES
 from rig.catalog import Action, Catalog
 from rig.catalog.jobs import JobProgress
@@ -16,6 +16,7 @@ from rig.config.catalog_place import CatalogPlace
 from rig.core.clock import Clock, SystemClock
 from rig.core.errors import CatalogBusy, CatalogError, RigError
 from rig.core.next_steps import SomeSteps
+from rig.doctor.finding import Finding
 from rig.events.events import Event
 from rig.plans.operator import Operator, Unattended
 
@@ -51,7 +52,7 @@ class Progress:
 
 
 T = TypeVar("T")
-Step = Event | Remark | Result | Progress
+Step = Event | Remark | Result | Progress | Finding
 Steps = Generator[Step, None, T]
 
 
@@ -81,7 +82,7 @@ class Desk(ABC):
 
     def who_places(self, bench: Bench) -> Operator:
         """Return who answers questions about the objects of a tray: no person if the bench places them by itself."""
-        return self.operator if isinstance(bench.operator, ObjectAlreadyPlaced) else Unattended()
+        return self.operator if bench.placer is None else Unattended()
 
     @abstractmethod
     def open_to_read(self) -> Catalog:

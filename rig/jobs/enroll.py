@@ -43,7 +43,7 @@ def enroll(
     with desk.open_bench() as bench, desk.open_to_enroll(bench.clock) as catalog:
         catalog.check_enrollable(name, label=label, note=note, resume=resume, replace=replace)
         yield from warn_of_other_regions(bench, catalog)
-        yield from refresh_table_image(desk, bench, bench.operator, ask=ask, then=name)
+        yield from refresh_table_image(desk, bench, bench.placer, ask=ask, then=name)
         events = enroll_views(
             bench, catalog, name, views=views, label=label, note=note, resume=resume, replace=replace, fly=fly
         )
@@ -57,7 +57,7 @@ def enroll_list(
     with desk.open_bench() as bench, desk.open_to_enroll(bench.clock) as catalog:
         yield from warn_of_other_regions(bench, catalog)
         if left_to_enroll(catalog, items):
-            yield from refresh_table_image(desk, bench, bench.operator, ask=ask)
+            yield from refresh_table_image(desk, bench, bench.placer, ask=ask)
         events = enroll_tray(bench, catalog, items, views=views, operator=desk.who_places(bench), fly=fly)
         yield from _delivered(desk, catalog, events)
 

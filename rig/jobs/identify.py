@@ -4,7 +4,6 @@ from collections.abc import Callable, Generator
 from contextlib import closing
 from pathlib import Path
 
-from rig.bench import ObjectAlreadyPlaced, TableClearer
 from rig.catalog.results import clean_text
 from rig.core.clock import SystemClock
 from rig.core.errors import UsageError
@@ -83,16 +82,16 @@ def identify(
             settings = bench.config if max_views is None else bench.config.with_max_views(max_views)
             yield from warn_of_other_regions(bench, catalog)
             # The camera sees when the operator has put the next object on the table.
-            by_hand = isinstance(bench.operator, ObjectAlreadyPlaced)
-            watcher = TableWatcher(bench) if watch and by_hand else None
-            placer = watcher or bench.operator
+            watcher = TableWatcher(bench) if watch and bench.placer is None else None
+            placer = watcher or bench.placer
             uses_image = known.descriptor != PAPER_DESCRIPTOR and known.with_empty_table is not False
-            if uses_image and isinstance(placer, TableClearer):
+            if uses_image and placer is not None:
                 yield from refresh_table_image(desk, bench, placer, ask=False)
 
             def one() -> Generator[Event, None, Identified]:
+                enrolled = model() if watch else known  # objects enrolled meanwhile are found
                 return identify_one(
-                    bench, model(), config=settings, watcher=watcher, strategy=chosen, seed=seed, top=top, live=live
+                    bench, enrolled, config=settings, placer=placer, strategy=chosen, seed=seed, top=top, live=live
                 )
 
             events: Generator[Event, None, object] = watch_table(bench, one) if watch else one()

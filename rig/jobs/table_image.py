@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from typing import Final
 
-from rig.bench import Bench, ObjectAlreadyPlaced, TableClearer
+from rig.bench import Bench, Placer
 from rig.catalog import Action
 from rig.core.errors import TableNotEmpty, ViewRejected
 from rig.core.next_steps import Do, SomeSteps
@@ -25,17 +25,19 @@ def take_table_image(desk: Desk, *, anyway: bool = False) -> Steps[None]:
         yield from desk.log(Action.TABLE_PHOTOGRAPHED, anyway=anyway)
 
 
-def refresh_table_image(desk: Desk, bench: Bench, placer: object, *, ask: bool, then: str | None = None) -> Steps[None]:
+def refresh_table_image(
+    desk: Desk, bench: Bench, placer: Placer | None, *, ask: bool, then: str | None = None
+) -> Steps[None]:
     """Ensure that the bench has an empty-table image of today before objects are put on the table.
 
-    A ``placer`` of objects that can clear the table by itself does so. Otherwise the operator is asked, if ``ask`` is
+    The ``placer`` of the objects clears the table, if there is one. Otherwise the operator is asked, if ``ask`` is
     set and the operator is there; ``then`` names the object to put on the table afterwards. Without an operator, a
     remark says that the work continues with the old image or without one.
     """
     status = empty_table_status(bench)
     if (status.table is not None and not status.problems) or bench.config.table.carries == "camera":
         return
-    if isinstance(placer, TableClearer):
+    if placer is not None:
         if placer.clear():
             try:
                 yield from _photographed(bench)
@@ -43,7 +45,7 @@ def refresh_table_image(desk: Desk, bench: Bench, placer: object, *, ask: bool, 
                 yield Remark(error.what, steps=error.steps)
         return
     consequence = WITHOUT_IMAGE if status.table is None else OLD_IMAGE
-    if not (isinstance(placer, ObjectAlreadyPlaced) and ask and desk.operator.is_there):
+    if not (ask and desk.operator.is_there):
         yield Remark(f"{status.text}; {consequence}.", steps=Do.EMPTY_TABLE())
         return
     # Ask until the image is taken, or the operator continues without it.

@@ -1,7 +1,7 @@
 """Takes frames while the table rotates, and checks them as `rig.views.capture` does for frames at rest."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 import numpy as np
@@ -18,6 +18,7 @@ READINGS: Final = 8
 """Readings of the encoder from which the angle of a frame is estimated during a flight."""
 
 
+@dataclass(eq=False)
 class FlightFrames:
     """The frames of one flight, or of several flights with one trajectory.
 
@@ -36,15 +37,15 @@ class FlightFrames:
         The frames of the camera.
     """
 
-    def __init__(self, bench: Bench, table: Turntable, *, newest: bool = False) -> None:
-        self.recorder = table.recorder()
-        self._config = bench.config
-        self._bench = bench
-        self._table = table
-        self.stream = FrameStream(bench.camera, bench.clock)
-        self._newest = newest
-        self._stamps_ns: list[int] = []
-        self._begun_ns = bench.clock.now_ns()
+    bench: Bench
+    table: Turntable
+    newest: bool = False
+    _stamps_ns: list[int] = field(default_factory=list, init=False)
+
+    def __post_init__(self) -> None:
+        self.recorder = self.table.recorder()
+        self.stream = FrameStream(self.bench.camera, self.bench.clock)
+        self._begun_ns = self.bench.clock.now_ns()
 
     def flight(
         self,
@@ -55,11 +56,11 @@ class FlightFrames:
         quiet: bool = True,
     ) -> Flight:
         """Begin a flight for `Turntable.fly`, which calls ``take`` with each frame; it may return a new goal."""
-        self._begun_ns = self._bench.clock.now_ns()
+        self._begun_ns = self.bench.clock.now_ns()
         self._stamps_ns.clear()
 
         def each() -> float | None:
-            frame = self.stream.next(self._table.collect_gyro, newest=self._newest)
+            frame = self.stream.next(self.table.collect_gyro, newest=self.newest)
             if frame is None:
                 return None
             self._stamps_ns.append(frame.stamp_ns)
@@ -69,10 +70,10 @@ class FlightFrames:
 
     def about_deg(self, frame: StreamFrame) -> float:
         """Return the approximate angle of a frame during a flight, from the last readings of the encoder."""
-        time_ns = middle_ns(frame.stamp_ns, self._config.camera_time)
+        time_ns = middle_ns(frame.stamp_ns, self.bench.config.camera_time)
         readings = self.recorder.readings[-READINGS:]
         if len(readings) < 2:
-            return readings[-1][1] if readings else self._table.rest_deg
+            return readings[-1][1] if readings else self.table.rest_deg
         times = np.array([(t - time_ns) * 1e-9 for t, _ in readings])
         angles = np.array([angle for _, angle in readings])
         if times[-1] >= 0:
@@ -83,7 +84,7 @@ class FlightFrames:
     def irregular_ns(self, last: int = 0) -> set[int]:
         """Return which time stamps of this flight, or of its ``last`` frames, cannot be trusted."""
         stamps_ns = np.array(self._stamps_ns[-last:], np.int64)
-        off = irregular_stamps(stamps_ns.tolist(), self.stream.period_s, self._config.camera_time.jitter_ms)
+        off = irregular_stamps(stamps_ns.tolist(), self.stream.period_s, self.bench.config.camera_time.jitter_ms)
         return set(stamps_ns[off].tolist())
 
     def attempt(
@@ -104,7 +105,7 @@ class FlightFrames:
         stamps
             The number of the last time stamps that the frame's is compared with; 0 for all of this flight.
         """
-        config = self._config
+        config = self.bench.config
         quality = ImageQuality.of(frame.image_bgr, config.view)
         middle = middle_ns(frame.stamp_ns, config.camera_time)
         motion = trajectory.at([middle])
@@ -159,7 +160,7 @@ class FlightFrames:
         motion, box = attempt.evidence.motion, (segmentation or {}).get("box_px")
         if motion is None or box is None:
             return attempt
-        middle_ns = motion.middle_ns + after_middle_row_ns(self._config, box)
+        middle_ns = motion.middle_ns + after_middle_row_ns(self.bench.config, box)
         angle_deg = float(trajectory.at([middle_ns]).angle_deg[0])
         motion = replace(motion, middle_ns=middle_ns, angle_deg=angle_deg)
         return replace(attempt, evidence=replace(attempt.evidence, motion=motion))

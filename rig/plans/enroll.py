@@ -112,7 +112,7 @@ def enroll(
     retakes = 0
     if missing:
         try:
-            bench.operator.place(enrollment.object_name)
+            bench.place(enrollment.object_name)
             empty_table = None if status.table is None else status.table.image_bgr
             if empty_table is not None:
                 enrollment.store_empty_table(empty_table)

@@ -43,7 +43,7 @@ HELD_DEG: Final = 15.0
 """Largest distance of a frame from its planned angle, as far as it is known during the revolution."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Seen:
     """An image at rest, with the index of its view and its table angle."""
 
@@ -52,7 +52,7 @@ class _Seen:
     image_bgr: NDArray[np.uint8]
 
 
-@dataclass
+@dataclass(eq=False)
 class EnrollmentViews:
     """Takes and stores the views of one session of an enrollment.
 

@@ -1,7 +1,7 @@
 """The plan of an enrollment before anything moves: table angles, duration, and whether it is possible."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 from itertools import pairwise
 from math import ceil, floor
@@ -155,16 +155,14 @@ def dry_run(
         name = clean_name(given)
         summary = known.get(name)
         action, obstacle = planned_action(summary, resume=resume, replace=replace, tray=len(names) > 1)
-        azimuths: Sequence[float] = ()
+        planned: Sequence[float] = ()
         if action in ("enroll", "replace"):
-            azimuths = even_azimuths(own_views or views or bench.config.enroll.views, limits_deg, sign)
-            angles = table_angles(azimuths, limits_deg, sign)
-        elif action == "resume" and catalog is not None and (kept := catalog.resumable(name)) is not None:
-            every = table_angles(kept.planned_azimuth_deg, limits_deg, sign)
-            azimuths = [kept.planned_azimuth_deg[index] for index in kept.missing]
-            angles = tuple(every[index] for index in kept.missing)
-        else:
-            angles = ()
+            planned = even_azimuths(own_views or views or bench.config.enroll.views, limits_deg, sign)
+        missing: Sequence[int] = range(len(planned))
+        if action == "resume" and catalog is not None and (kept := catalog.resumable(name)) is not None:
+            planned, missing = kept.planned_azimuth_deg, kept.missing
+        every = table_angles(planned, limits_deg, sign)
+        angles = tuple(every[index] for index in missing)
         in_motion = takes_in_motion(bench.config, fly, tray=len(names) > 1)
         scan = (angles[0], angles[0] + 360.0) if in_motion and angles else angles
         stops = [table_deg, *scan, 0.0] if angles else [table_deg]
@@ -175,7 +173,7 @@ def dry_run(
                 obstacle=obstacle,
                 enrolled_views=summary.views if summary else 0,
                 views=len(angles),
-                azimuths_deg=tuple(azimuths),
+                azimuths_deg=tuple(planned[index] for index in missing),
                 angles_deg=angles,
                 table_deg=table_deg,
                 limits_deg=limits_deg,
@@ -203,6 +201,7 @@ def planned_action(
     return "enroll", None
 
 
+@dataclass(eq=False)
 class TimeLeft:
     """Remaining time of an enrollment: the motion model, scaled by the time that the views so far really took.
 
@@ -216,28 +215,25 @@ class TimeLeft:
         Whether they are taken in one revolution; they are reported after it.
     """
 
-    def __init__(self, model: MotionModel, angles_deg: Sequence[float], *, in_motion: bool = False) -> None:
-        self._model = model
-        self._angles_deg = angles_deg
-        self._in_motion = in_motion
-        self._done = 0
-        self._exposed_ns: list[int] = []
+    model: MotionModel
+    angles_deg: Sequence[float]
+    in_motion: bool = False
+    _exposed_ns: list[int] = field(default_factory=list, init=False)
 
     def add(self, event: Event) -> None:
         """Take the next event of the plan."""
         if isinstance(event, Accepted):
-            self._done += 1
             self._exposed_ns.append(event.evidence.exposed_ns)
 
     @property
     def seconds(self) -> float:
         """Remaining time in the bench's clock, until the table is back at 0."""
-        model, done, angles = self._model, self._done, self._angles_deg
+        model, done, angles = self.model, len(self._exposed_ns), self.angles_deg
         if not angles:
             return 0.0
         if not done:
-            return model.enrollment_s(angles[0], angles, in_motion=self._in_motion)
-        if self._in_motion:
+            return model.enrollment_s(angles[0], angles, in_motion=self.in_motion)
+        if self.in_motion:
             return model.park_s(angles[0] + 360.0)
         left, expected = model.views_s(angles[done - 1 :]), model.views_s(angles[:done])
         if expected > 0:

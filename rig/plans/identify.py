@@ -11,9 +11,9 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from hbr.dense.enrolled_views import answered
+from hbr.dense.last_steps import answered
 from hbr.dense.local_difference import LocalView
-from rig.bench import Bench
+from rig.bench import Bench, Placer
 from rig.config import RigConfig
 from rig.core.errors import CatalogError, MotionStopped, NoObject, RigError, ViewRejected
 from rig.events.events import (
@@ -38,7 +38,6 @@ from rig.search.strategies import AnyStrategy, Rotate
 from rig.views.capture import Viewer
 from rig.views.description import SearchDescriber
 from rig.views.empty_table import empty_table_status
-from rig.views.object_presence import TableWatcher
 
 
 def identify(
@@ -46,7 +45,7 @@ def identify(
     model: Model,
     *,
     config: RigConfig | None = None,
-    watcher: TableWatcher | None = None,
+    placer: Placer | None = None,
     strategy: AnyStrategy | str | None = None,
     seed: int = 0,
     top: int = SHOWN,
@@ -56,7 +55,7 @@ def identify(
     """Identify the object on the table; yields events and returns the answer.
 
     After each view the strategy chooses the next view or ends the search (`rig.search.strategies`). ``dense`` is the
-    bench's own: it takes the next best view until the stopping rule, which was calibrated on the catalog, finds an
+    bench's own: it takes the next best view until the stopping rule, which was fitted to the catalog, finds an
     object or calls it unknown. ``ahbr`` is the paper's: the first rotation is fixed, and each further one leads to the
     side on which the candidates look less similar (Eq. 5-7). The search ends when an enrolled object leads all others
     by ``identify.margin`` per view, or after ``identify.max_views``. The object is unknown if its score per view is
@@ -71,8 +70,8 @@ def identify(
         The enrolled views, from `rig.search.model.load_model` or `rig.search.model.model_of`.
     config
         The settings of the search, if they are not those of the bench.
-    watcher
-        Waits until the object is on the table; by default the bench's own operator.
+    placer
+        Puts the object on the table, or waits for it; the default is that of the bench.
     strategy
         Its name, or a `Strategy` object. The default is the one that the model is for.
     seed
@@ -121,7 +120,7 @@ def identify(
         bench_image=None if bench.config.table.carries == "camera" else model.bench_image,
     )
     check = partial(check_object, bench, empty_table=empty_table if own is None else own.image_bgr)
-    (watcher or bench.operator).place(None)
+    (placer or bench).place(None)
     yield Started(
         "identify",
         None,
@@ -210,8 +209,8 @@ def watch(
     bench
         An open bench.
     identify_next
-        Begins `identify` for the next object, with a model of what is enrolled then. Its operator brings the objects,
-        or its watcher waits for them.
+        Begins `identify` for the next object, with a model of what is enrolled then. Its placer brings the objects,
+        or waits for them.
 
     Raises
     ------

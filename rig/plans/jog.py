@@ -57,7 +57,10 @@ def jog(bench: Bench, keys: Iterable[JogKey | None], *, step_deg: float = 5.0) -
                 case JogKey.END:
                     return
                 case JogKey.LARGER_STEP | JogKey.SMALLER_STEP:
-                    step_deg = _next_step(step_deg, larger=key is JogKey.LARGER_STEP)
+                    if key is JogKey.LARGER_STEP:
+                        step_deg = min((step for step in STEPS_DEG if step > step_deg), default=step_deg)
+                    else:
+                        step_deg = max((step for step in STEPS_DEG if step < step_deg), default=step_deg)
                     yield step_deg
                     continue
                 case JogKey.HOME:
@@ -67,10 +70,3 @@ def jog(bench: Bench, keys: Iterable[JogKey | None], *, step_deg: float = 5.0) -
             target_deg = min(max(target_deg, low_deg), high_deg)
             yield moved(number, (yield from announced(number, table, target_deg, asked_deg=target_deg)))
             number += 1
-
-
-def _next_step(step_deg: float, *, larger: bool) -> float:
-    """Return the next larger or smaller step; the step itself if there is none."""
-    if larger:
-        return next((step for step in STEPS_DEG if step > step_deg), step_deg)
-    return next((step for step in reversed(STEPS_DEG) if step < step_deg), step_deg)

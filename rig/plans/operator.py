@@ -1,6 +1,6 @@
 """The operator of a job: its questions, and who answers them.
 
-The terminal (`rig.cli.ui.operator`), the browser (`rig.web.work`) and `Unattended` implement `Operator`.
+The terminal (`rig.cli.ui.prompts`), the browser (`rig.web.work`) and `Unattended` implement `Operator`.
 """
 
 from collections.abc import Mapping

@@ -5,7 +5,7 @@ from typing import Final
 
 import hbr
 from hbr.segmentation import MIN_AGREEMENT
-from rig.bench import Bench, TableClearer
+from rig.bench import Bench
 from rig.core.clock import seconds_between
 from rig.core.errors import TableNotEmpty, UsageError
 from rig.core.json_form import plain
@@ -57,7 +57,7 @@ def photograph_table(bench: Bench, *, anyway: bool = False) -> Generator[Event, 
             "The camera moves around the object, so every view has another background.",
             next_step="Use a plain background. This bench needs no empty-table image.",
         )
-    if isinstance(bench.operator, TableClearer) and not bench.operator.clear():
+    if bench.placer is not None and not bench.placer.clear():
         raise UsageError(
             "The object on this bench cannot be taken away.", next_step="Continue without an empty-table image."
         )

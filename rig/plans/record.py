@@ -1,6 +1,7 @@
 """Record the answers of identifications in a catalog."""
 
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from rig.core.next_steps import steps_as_json
 from rig.events.events import Accepted, Event, Failed, Identified, Note, NoteCode, Recorded, Started, Warned, event_dict
 
 
+@dataclass(eq=False)
 class ResultRecorder:
     """Records each answer of `identify` or `watch`, with the image of its first view.
 
@@ -44,25 +46,15 @@ class ResultRecorder:
         The sample on the table, None if it has no name. It is for one object: give it before each answer.
     """
 
-    def __init__(
-        self,
-        place: CatalogPlace | Path,
-        bench: Bench,
-        *,
-        clock: Clock,
-        catalog_version: Callable[[], str],
-        operator: str | None = None,
-        with_image: bool = True,
-    ) -> None:
-        self.sample: str | None = None
-        self._place = place
-        self._bench = bench
-        self._clock = clock
-        self._catalog_version = catalog_version
-        self._operator = operator
-        self._with_image = with_image
-        self._image: NDArray[np.uint8] | None = None
-        self._azimuths_deg: list[float] = []
+    place: CatalogPlace | Path
+    bench: Bench
+    clock: Clock
+    catalog_version: Callable[[], str]
+    operator: str | None = None
+    with_image: bool = True
+    sample: str | None = field(default=None, init=False)
+    _image: NDArray[np.uint8] | None = field(default=None, init=False)
+    _azimuths_deg: list[float] = field(default_factory=list, init=False)
 
     def add(self, event: Event) -> Recorded | Warned | None:
         """Take the next event; record an answer, and return the event about it."""
@@ -70,7 +62,7 @@ class ResultRecorder:
             case Started():
                 self._image, self._azimuths_deg = None, []
             case Accepted():
-                if self._with_image and self._image is None:
+                if self.with_image and self._image is None:
                     self._image = event.image_bgr
                 self._azimuths_deg.append(event.azimuth_deg)
             case Identified():
@@ -89,15 +81,15 @@ class ResultRecorder:
                 Answer(Outcome(answer.outcome.value), next(iter(answer.possible), None), self.sample),
                 event_dict(answer),
                 tuple(self._azimuths_deg),
-                Provenance(self._bench.name, self._bench.devices(), self._bench.conditions),
-                self._catalog_version(),
-                self._operator,
+                Provenance(self.bench.name, self.bench.devices(), self.bench.conditions),
+                self.catalog_version(),
+                self.operator,
             )
             try:
-                with Catalog.open(self._place, clock=self._clock, create=False) as catalog:
+                with Catalog.open(self.place, clock=self.clock, create=False) as catalog:
                     return Recorded(record(catalog, new, self._image), self.sample)
             except CatalogUnavailable:
-                with Journal.of(CatalogPlace.of(self._place), self._clock) as journal:
+                with Journal.of(CatalogPlace.of(self.place), self.clock) as journal:
                     return Recorded(record(journal, new, self._image), self.sample)
         except RigError as error:
             return Warned(

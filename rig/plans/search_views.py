@@ -42,7 +42,7 @@ MOST_REJECTED: Final = 15
 NEW_GOAL_DEG: Final = 10.0
 
 
-@dataclass
+@dataclass(eq=False)
 class ViewsAtRest:
     """The views of a search, each at rest.
 
@@ -128,7 +128,7 @@ class ViewsAtRest:
         return moved(self.number, move)
 
 
-@dataclass
+@dataclass(eq=False)
 class ViewsInMotion(ViewsAtRest):
     """The views of a search in motion: those at rest, and the frames of the arcs between them.
 

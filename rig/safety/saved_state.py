@@ -116,6 +116,8 @@ class SessionEnd(StrEnum):
         match error:
             case None:
                 return cls.FINISHED
+            case GeneratorExit() if error.__context__ is not None:  # a job was closed because showing it failed
+                return cls.of(error.__context__)
             case MotionStopped():
                 return cls.STOPPED
             case Exception():

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hbr.dense.leaders import LeaderComparison
+from hbr.dense.last_steps import LeaderComparison
 from hbr.dense.local_difference import LocalView, ViewDifference
 from rig.events.compared import Compared, ComparedView
 

@@ -1,7 +1,7 @@
 """The model of a catalog, loaded again when the catalog has changed."""
 
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from typing import Self
 
 from rig.catalog import Catalog
@@ -12,6 +12,7 @@ from rig.search.model import Model, load_model
 from rig.search.stopping_rules import FILE
 
 
+@dataclass(eq=False)
 class CurrentModel:
     """Loads the enrolled views, and again after a change of the catalog or of its stopping rule.
 
@@ -25,15 +26,16 @@ class CurrentModel:
         `Catalog.version` of the loaded views; empty before the first call.
     """
 
-    def __init__(self, catalog: Catalog, descriptor: str | None = None) -> None:
-        self._catalog = catalog
-        self._descriptor = descriptor
-        self._loaded_state: object = None
-        self._model: Model | None = None
-        self._seen = ""
-        self._server: Catalog | None = None
-        self._attempts = Attempts(catalog.clock)
-        self.version = ""
+    catalog: Catalog
+    descriptor: str | None = None
+    version: str = field(default="", init=False)
+    _loaded_state: object = field(default=None, init=False)
+    _model: Model | None = field(default=None, init=False)
+    _seen: str = field(default="", init=False)
+    _server: Catalog | None = field(default=None, init=False)
+
+    def __post_init__(self) -> None:
+        self._attempts = Attempts(self.catalog.clock)
 
     def __enter__(self) -> Self:
         return self
@@ -46,16 +48,16 @@ class CurrentModel:
         """Return the model; errors as `load_model`, and `CatalogUnavailable` if none was loaded before."""
         try:
             self._leave_copy()
-            rules = self._catalog.path / FILE
-            changed = self._catalog.database.may_have_changed()
-            version = self._catalog.version() if changed or not self.version else self.version
+            rules = self.catalog.path / FILE
+            changed = self.catalog.database.may_have_changed()
+            version = self.catalog.version() if changed or not self.version else self.version
             state = version, rules.stat().st_mtime_ns if rules.exists() else None
             if state != self._loaded_state:
-                self._model, self._loaded_state = load_model(self._catalog, descriptor=self._descriptor), state
+                self._model, self._loaded_state = load_model(self.catalog, descriptor=self.descriptor), state
                 self.version = version
-                if self._catalog.place.url is not None:
+                if self.catalog.place.url is not None:
                     with suppress(RigError):  # the copy is for later; the search has its model already
-                        update_copy(self._catalog)
+                        update_copy(self.catalog)
         except CatalogUnavailable:
             if self._model is None:
                 raise
@@ -64,15 +66,15 @@ class CurrentModel:
             note = Note(NoteCode.LOCAL_COPY, {"copied_utc": self._seen})
             return replace(self._model, notes=(note, *self._model.notes))
         assert self._model is not None
-        if self._catalog.copied_utc is None:
-            self._seen = f"{self._catalog.clock.utc():%Y-%m-%d %H:%M:%S} UTC"
+        if self.catalog.copied_utc is None:
+            self._seen = f"{self.catalog.clock.utc():%Y-%m-%d %H:%M:%S} UTC"
         return self._model
 
     def _leave_copy(self) -> None:
         """Replace a local copy by the catalog itself when its server answers again."""
-        place = self._catalog.copy_of
+        place = self.catalog.copy_of
         if place is None:
             return
         with suppress(RigError):
             self._server = self._attempts.open(place)
-            self._catalog, self._loaded_state, self.version = self._server, None, ""
+            self.catalog, self._loaded_state, self.version = self._server, None, ""

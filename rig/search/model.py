@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import hbr
-from hbr.dense.arc import ArcRule, ArcSession, calibrate_arc_rule
+from hbr.dense.arc import ArcSession, fit_arc_confidence
 from rig.bench import Bench
 from rig.catalog import Catalog
 from rig.catalog.descriptions import (
@@ -110,14 +110,14 @@ class PaperModel(Model):
 
 @dataclass(frozen=True, eq=False)
 class DenseModel(Model):
-    """A model for the dense search; `hbr.calibrate_stopping_rule` makes the rule of an index."""
+    """A model for the dense search; `hbr.fit_stopping_rule` makes the rule of an index."""
 
     index: hbr.DenseIndex
     rule: hbr.StoppingRule
 
     def search(self, config: RigConfig, strategy: AnyStrategy, *, seed: int, top: int) -> Search:
         if is_in_motion(strategy):
-            moving = ArcSession(self.index, _arc_rule(self.index, self.rule))
+            moving = ArcSession(self.index, self.rule, _arc_confidence(self.index, self.rule))
             return ArcSearch(moving, self.views, config, strategy, seed=seed, top=top)
         session = hbr.DenseSession(self.index, self.rule, max_views=config.identify.max_views)
         return DenseSearch(session, self.views, config, strategy, seed=seed, top=top)
@@ -127,9 +127,9 @@ class DenseModel(Model):
 
 
 @lru_cache(maxsize=4)
-def _arc_rule(index: hbr.DenseIndex, rule: hbr.StoppingRule) -> ArcRule:
-    """Return the rule of searches in motion; it is fitted once for each model."""
-    return calibrate_arc_rule(index, rule)
+def _arc_confidence(index: hbr.DenseIndex, rule: hbr.StoppingRule) -> float:
+    """Return the confidence that ends searches in motion; it is fitted once for each model."""
+    return fit_arc_confidence(index, rule)
 
 
 def model_of(views: hbr.Views, *, rule: hbr.StoppingRule | None = None) -> Model:
@@ -182,8 +182,8 @@ def load_model(
 ) -> Model:
     """Load the enrolled views: by the bench's own descriptor if every object has it, else by the paper's.
 
-    The stopping rule of the dense search is the one that `rig catalog calibrate` stored, if it is of this catalog.
-    Otherwise a quick calibration makes one (`rig.search.stopping_rules.stopping_rule_of`).
+    The stopping rule of the dense search is the one that `rig catalog fit` stored, if it is of this catalog.
+    Otherwise a quick fit makes one (`rig.search.stopping_rules.stopping_rule_of`).
 
     Parameters
     ----------

@@ -5,8 +5,7 @@ from dataclasses import dataclass, field, replace
 from math import isclose
 from typing import Any, Final
 
-from hbr.dense.enrolled_views import answered
-from hbr.dense.verification import Verification
+from hbr.dense.last_steps import Verification, answered
 from rig.core.json_form import plain
 from rig.events.compared import Compared, Verified
 from rig.events.events import (
@@ -82,8 +81,10 @@ def check(run: SavedRun, *, by: AnyStrategy | None = None) -> Check:
     """
     started = run.started
     found = Check(is_complete=run.error is not None and not run.is_cut)
-    search: Search | None = None
-    describe: SearchDescriber | None = None
+    strategy = by or started.strategy
+    search = begin_search(run.model, run.config, strategy, seed=started.seed or 0, top=len(run.views.object_names))
+    revise = not search.in_motion
+    describe = SearchDescriber(run.config.view, run.views.descriptor, run.empty_table, revise=revise)
     table_deg = 0.0
     for event in run.events():
         computed: Event | dict[str, Any] | None = None
@@ -91,13 +92,6 @@ def check(run: SavedRun, *, by: AnyStrategy | None = None) -> Check:
             case Moved():
                 table_deg = event.encoder_deg
             case Accepted():
-                if search is None:
-                    top = len(run.views.object_names)
-                    strategy = by or started.strategy
-                    search = begin_search(run.model, run.config, strategy, seed=started.seed or 0, top=top)
-                    revise = not search.in_motion
-                    describe = SearchDescriber(run.config.view, run.views.descriptor, run.empty_table, revise=revise)
-                assert describe is not None
                 view = describe(event.image_bgr)
                 if event.evidence.motion is not None:
                     table_deg = event.evidence.motion.angle_deg
@@ -107,22 +101,22 @@ def check(run: SavedRun, *, by: AnyStrategy | None = None) -> Check:
                 if event.segmentation is not None:
                     saved, again = event.segmentation, plain(view.segmentation)
                     found.differences += _compare(found.views, "segmentation", saved, again)
-            case Ranked() if search is not None:
+            case Ranked():
                 # The number of candidates is a setting of the run.
                 computed = replace(search.ranked, candidates=search.ranked.candidates[: len(event.candidates)])
-            case FrameUsed() if search is not None and search.in_motion:
+            case FrameUsed() if search.in_motion:
                 computed = search.frame_used(event.index, event.azimuth_deg, event.seconds, event.rejected)
             case Decided():
                 found.decisions += 1
                 computed = _decided(search, event)
-            case Verified() if search is not None:
+            case Verified():
                 # the enrolled images are not in the run, so their measured fit is used
                 measured = Verification(search.names.index(event.name), event.fit, event.others)
                 computed = answered(search.verify((), measured))
-            case Compared() if search is not None and describe is not None:
+            case Compared():
                 views = saved_enrolled_views(event, search.names)
                 computed = answered(search.compare(describe.hypotheses), views) or {}
-            case Identified() if search is not None:
+            case Identified():
                 found.decisions += 1
                 answer = search.answer(travelled_deg=event.travelled_deg, seconds=event.seconds)
                 computed = replace(answer, candidates=answer.candidates[: len(event.candidates)])
@@ -136,11 +130,10 @@ def check(run: SavedRun, *, by: AnyStrategy | None = None) -> Check:
     return found
 
 
-def _decided(search: Search | None, saved: Decided) -> Decided | dict[str, Any]:
+def _decided(search: Search, saved: Decided) -> Decided | dict[str, Any]:
     """Return the event of the computed step; the target angle is the turntable's, not the search's."""
-    step = None if search is None else search.step
-    if search is None or not isinstance(step, Rotate):
-        return {"reason": None if step is None else plain(step.reason)}
+    if not isinstance(search.step, Rotate):
+        return {"reason": plain(search.step.reason)}
     computed = search.decided(saved.index, saved.target_deg)
     return replace(computed, candidates=computed.candidates[: len(saved.candidates)])
 

@@ -129,19 +129,10 @@ class RunWriter:
             The disk is full or fails.
         """
         with _writing(self._folder):
-            if isinstance(event, Accepted):
-                write(frame_path(self._folder, event.index), images.encode(event.image_bgr))
-            elif isinstance(event, Compared):
-                self._add_compared(event)
+            for name, image in _images_of(event):
+                (self._folder / name).parent.mkdir(exist_ok=True)
+                write(self._folder / name, images.encode(image))
             self._line(event_dict(event))
-
-    def _add_compared(self, event: Compared) -> None:
-        (self._folder / LEADERS).mkdir(exist_ok=True)
-        if event.picture_bgr is not None:
-            write(self._folder / DIFFERS_HERE, images.encode(event.picture_bgr))
-        for side, own in enumerate(event.leaders):
-            for number, image in enumerate(own):
-                write(leader_path(self._folder, side, number), images.encode(image))
 
     def _line(self, value: dict[str, Any]) -> None:
         self._events.write(json.dumps(value, ensure_ascii=False, allow_nan=False, default=str) + "\n")
@@ -256,15 +247,15 @@ class SavedRun:
             return replace(event, image_bgr=self._frame(event.index))
         if not isinstance(event, Compared):
             return event
-        picture = _image(self.folder, self.folder / DIFFERS_HERE) if event.views else None
+        picture = _image(self.folder, DIFFERS_HERE) if event.views else None
         leaders = tuple(
-            tuple(_image(self.folder, leader_path(self.folder, side, number)) for number in range(len(azimuths_deg)))
+            tuple(_image(self.folder, _leader_file(side, number)) for number in range(len(azimuths_deg)))
             for side, azimuths_deg in enumerate(event.azimuths_deg)
         )
         return replace(event, picture_bgr=picture, leaders=leaders)
 
     def _frame(self, index: int) -> NDArray[np.uint8]:
-        frame = _image(self.folder, frame_path(self.folder, index))
+        frame = _image(self.folder, _frame_file(index))
         x, y, width, height = self.config.view.roi or (0, 0, 0, 0)
         if x + width > frame.shape[1] or y + height > frame.shape[0]:
             raise ValueError(f"frame {index} has {frame.shape[1]} x {frame.shape[0]} pixels, less than the region")
@@ -299,7 +290,7 @@ def load_run(folder: Path) -> SavedRun:
         views = _views((_object(line) for line in _lines(_bytes(folder, "model.jsonl"))), kind.name)
         stored = read_stopping_rule(folder)
         model = model_of(views, rule=None if stored is None else stored.adapted(views))
-        empty_table = _image(folder, folder / EMPTY_TABLE) if (folder / EMPTY_TABLE).exists() else None
+        empty_table = _image(folder, EMPTY_TABLE) if (folder / EMPTY_TABLE).exists() else None
         content = _bytes(folder, "events.jsonl")
         is_cut = bool(content) and not content.endswith(b"\n")
         lines = [_object(line) for line in _lines(content)[: -1 if is_cut else None]]
@@ -313,14 +304,26 @@ def load_run(folder: Path) -> SavedRun:
     return SavedRun(folder, about, config, model, empty_table, failed, is_cut, tuple(lines))
 
 
-def frame_path(folder: Path, index: int) -> Path:
+def _frame_file(index: int) -> str:
     """Return the file of the frame of an accepted view."""
-    return folder / "frames" / f"{index:03d}.png"
+    return f"frames/{index:03d}.png"
 
 
-def leader_path(folder: Path, side: int, number: int) -> Path:
+def _leader_file(side: int, number: int) -> str:
     """Return the file of an enrolled view of the first (0) or second (1) leader that were compared."""
-    return folder / LEADERS / f"{side}-{number:03d}.png"
+    return f"{LEADERS}/{side}-{number:03d}.png"
+
+
+def _images_of(event: Event) -> Iterator[tuple[str, NDArray[np.uint8]]]:
+    """Yield the images of an event, with their files."""
+    if isinstance(event, Accepted):
+        yield _frame_file(event.index), event.image_bgr
+    elif isinstance(event, Compared):
+        if event.picture_bgr is not None:
+            yield DIFFERS_HERE, event.picture_bgr
+        for side, own in enumerate(event.leaders):
+            for number, image in enumerate(own):
+                yield _leader_file(side, number), image
 
 
 def _model_lines(views: hbr.Views) -> Iterator[str]:
@@ -362,10 +365,10 @@ def _descriptor(folder: Path, used: dict[str, Any]) -> Descriptor:
     return kind
 
 
-def _image(folder: Path, path: Path) -> NDArray[np.uint8]:
-    image = images.decode(_bytes(folder, str(path.relative_to(folder))), max_pixels=MAX_FRAME_PIXELS)
+def _image(folder: Path, name: str) -> NDArray[np.uint8]:
+    image = images.decode(_bytes(folder, name), max_pixels=MAX_FRAME_PIXELS)
     if min(image.shape[:2]) < MIN_SIDE_PX:
-        raise ValueError(f"{path.name} has {image.shape[1]} x {image.shape[0]} pixels")
+        raise ValueError(f"{name} has {image.shape[1]} x {image.shape[0]} pixels")
     return image
 
 

@@ -19,10 +19,9 @@ from numpy.typing import NDArray
 import hbr
 from hbr.core.angles import wrap360
 from hbr.core.arrays import IndexArray
-from hbr.dense.enrolled_views import Asking, Queries
+from hbr.dense.last_steps import UNKNOWN_BELOW, Asking, Queries, Verification
 from hbr.dense.local_difference import LocalView
 from hbr.dense.pose import pose
-from hbr.dense.verification import UNKNOWN_BELOW, Verification
 from hbr.model.symmetry import symmetry
 from rig.config import RigConfig
 from rig.events.compared import Compared, Verified
@@ -276,7 +275,7 @@ class DenseSearch(Search):
     def _ordered(self) -> tuple[NDArray[np.float64], NDArray[np.float64], IndexArray]:
         """Return probability and score of each object considered, and their order, the likeliest first."""
         belief = self._session.belief
-        probability, scores = belief.posterior(self._session.rule.beta).sum(axis=1), belief.scores()
+        probability, scores = belief.probability(self._session.rule.beta), belief.scores()
         return probability, scores, np.lexsort((-scores, -probability))
 
     def frame_used(self, number: int, azimuth_deg: float, seconds: float, rejected: int) -> FrameUsed:

@@ -1,4 +1,4 @@
-"""The stopping rule of a catalog: stored beside it, and calibrated again when the catalog changes.
+"""The stopping rule of a catalog: stored beside it, and fitted again when the catalog changes.
 
 See docs/decisions/0031-store-the-stopping-rule-beside-the-catalog.md.
 """
@@ -15,6 +15,7 @@ import numpy as np
 
 import hbr
 from hbr.dense.filter import BETA
+from hbr.dense.index import POWER
 from hbr.dense.open_set import NUMBERS, OpenSetModel
 from hbr.dense.stopping import Limitation, LimitationCode, ShiftRates
 from hbr.descriptors import descriptor
@@ -46,7 +47,7 @@ _KNOWN_SHARE: Final = 0.5
 _QUICK_S: Final = 0.4
 _LEAST_QUICK_S: Final = 0.08
 _LOADED_S: Final = 5e-6
-"""Time for a calibration while the operator waits, its minimum, and its reduction by each loaded view."""
+"""Time for a fit while the operator waits, its minimum, and its reduction by each loaded view."""
 _SEARCH_S, _VIEW_S = 1.4e-3, 1.3e-6
 """Time of a leave-one-out search, and its increase with each enrolled view."""
 _QUICK_SHIFTED: Final = 80
@@ -56,15 +57,15 @@ _QUICK_SHIFTED: Final = 80
 def quick_stopping_rule(
     index: hbr.DenseIndex, *, error_rate: float = ERROR_RATE, false_reject: float = FALSE_REJECT
 ) -> hbr.StoppingRule:
-    """Return a stopping rule that is calibrated on as many objects as about 0.4 s allow."""
+    """Return a stopping rule that is fitted to as many objects as about 0.4 s allow."""
     budget_s = max(_QUICK_S - _LOADED_S * len(index.views), _LEAST_QUICK_S)
     searches = _affordable(len(index.views), budget_s)
     sample = None
     if searches < len(index):
-        # The calibration searches for each object of a sample once, among the others of the sample.
+        # The fit searches for each object of a sample once, among the others of the sample.
         each = len(index.views) // len(index)
         sample = next(n for n in range(len(index), 0, -1) if n <= max(1, _affordable(n * each, budget_s)))
-    return hbr.calibrate_stopping_rule(
+    return hbr.fit_stopping_rule(
         index,
         error_rate=error_rate,
         false_reject=false_reject,
@@ -81,7 +82,7 @@ def _affordable(views: int, budget_s: float) -> int:
 
 @dataclass(frozen=True, eq=False)
 class StoredRule:
-    """A stopping rule with the model that it was calibrated on.
+    """A stopping rule with the model that it was fitted to.
 
     Attributes
     ----------
@@ -92,7 +93,7 @@ class StoredRule:
     sha256
         Digest of the model (`digest`).
     made_utc
-        Time of the calibration, in the format of ISO 8601.
+        Time of the fit, in the format of ISO 8601.
     """
 
     rule: hbr.StoppingRule
@@ -115,7 +116,7 @@ def digest(index: hbr.DenseIndex) -> str:
     """Return a digest of a model: its objects, their views, the descriptor's version, and the program that searches."""
     views = index.views
     kind = descriptor(views.descriptor)
-    searched = [version("hbr-rig"), kind.name, kind.version, index.omega, index.power, BETA]
+    searched = [version("hbr-rig"), kind.name, kind.version, index.omega, POWER, BETA]
     found = sha256(json.dumps([searched, views.object_names], ensure_ascii=False).encode())
     for column in (views.object_index.astype("<i8"), views.azimuth_deg.astype("<f8")):
         found.update(np.ascontiguousarray(column).data)
@@ -128,9 +129,9 @@ def digest(index: hbr.DenseIndex) -> str:
 def stopping_rule_of(folder: Path, index: hbr.DenseIndex) -> tuple[hbr.StoppingRule, tuple[Note, ...]]:
     """Return the stopping rule for a model, and notes for the operator about it.
 
-    A stored rule of this model is used as it is. If the catalog has changed since, it is calibrated again if that is
+    A stored rule of this model is used as it is. If the catalog has changed since, it is fitted again if that is
     quick for all objects; otherwise the stored rule is used, and new objects count as typical. If there is no rule, or
-    one of another catalog, which knows less than half of the objects, a quick calibration makes one.
+    one of another catalog, which knows less than half of the objects, a quick fit makes one.
     """
     notes: list[Note] = []
     try:

@@ -299,7 +299,7 @@ class DenseStrategy:
         if best.pair is not None:
             reason = RotationReason.SEPARATES_CANDIDATES
         else:  # the strongest hypotheses are poses of one object, but the others together may be as likely
-            leading = state.session.belief.posterior(state.session.rule.beta).sum(axis=1).max()
+            _, leading = state.session.belief.likeliest(state.session.rule.beta)
             reason = RotationReason.NEW_SIDE if leading >= ALONE else RotationReason.SEVERAL_POSES
         return Rotate(
             best.rotation_deg,

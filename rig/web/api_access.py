@@ -9,20 +9,20 @@ from rig.web.server import COOKIE, HandOverBody, LeaseBody, LoginBody, Routes, S
 
 
 def add_access(routes: Routes, server: Server) -> None:
-    @routes.anybody.get("/health", tags=["server"])
+    @routes.public.get("/health", tags=["server"])
     def health() -> dict[str, Any]:
         """Return whether the server works; needs no login."""
         status = server.remote.status
         return {"status": "ok", "version": version("hbr-rig"), "bench_open": bool(status.get("open"))}
 
-    @routes.anybody.post("/login", tags=["access"])
+    @routes.public.post("/login", tags=["access"])
     def login(body: LoginBody, response: Response) -> dict[str, Any]:
         """Log in with a token; the answer sets a cookie."""
         secret, person = server.sessions.login(body.token)
         response.set_cookie(COOKIE, secret, httponly=True, samesite="strict", secure=server.secure_cookies, path="/")
         return {"name": person.name, "role": person.role}
 
-    @routes.anybody.post("/logout", tags=["access"])
+    @routes.public.post("/logout", tags=["access"])
     def logout(request: Request, response: Response) -> dict[str, Any]:
         """Log out. The open streams of this login end."""
         server.sessions.logout(request.cookies.get(COOKIE, ""))

@@ -14,7 +14,7 @@ from rig.web.hub import MAX_LISTENERS
 from rig.web.problems import problem
 from rig.web.remote_bench import BOUNDARY
 from rig.web.requests import Job, JobRequest
-from rig.web.server import AnswerBody, Operator, Page, Routes, Server
+from rig.web.server import AnswerBody, OperatorPerson, Page, Routes, Server
 
 MAX_VIEWERS = 50
 
@@ -45,7 +45,7 @@ def add_bench(routes: Routes, server: Server) -> None:
         headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
         return EventStream(server.hub.stream(last_event_id, lambda: server.still_allowed(request)), headers=headers)
 
-    @routes.anybody.websocket("/socket")
+    @routes.public.websocket("/socket")
     async def socket(socket: WebSocket) -> None:
         """Send the events to a page, and take its STOP: the connection is open already, and no other can occupy it."""
         if not server.still_allowed(socket) or server.hub.listeners >= MAX_LISTENERS:
@@ -118,7 +118,7 @@ def add_jobs(routes: Routes, server: Server) -> None:
         return page.of(server.remote.ask("jobs"), "id")
 
     @routes.operate.post("/jobs", tags=["jobs"], status_code=201, response_model=Job)
-    def submit(body: JobRequest, person: Operator) -> Any:
+    def submit(body: JobRequest, person: OperatorPerson) -> Any:
         """Add a job to the queue."""
         return server.remote.ask("submit", request=body, operator=person.name)
 

@@ -18,7 +18,7 @@ from rig.events.events import event_dict
 from rig.search.replay import Check, check
 from rig.search.saved_run import SavedRun, load_run
 from rig.web.event_schema import SavedRunBody
-from rig.web.server import CorrectionBody, Operator, Page, Routes, Server, long_work, time_text
+from rig.web.server import CorrectionBody, OperatorPerson, Page, Routes, Server, long_work, time_text
 from rig.web.work import calibrations
 
 RUN_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
@@ -81,7 +81,7 @@ def add_records(routes: Routes, server: Server) -> None:
 
     @routes.operate.post("/results/{result_id}/correct", tags=["results"])
     def correct_result(
-        body: CorrectionBody, person: Operator, result_id: Annotated[int, Field(ge=1, lt=2**62)]
+        body: CorrectionBody, person: OperatorPerson, result_id: Annotated[int, Field(ge=1, lt=2**62)]
     ) -> dict[str, Any]:
         """Correct the object or the sample of an answer, with the reason. The answer itself stays."""
         with server.catalog.open_to_change() as catalog:

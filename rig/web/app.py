@@ -56,7 +56,7 @@ def create_app(server: Server) -> FastAPI:
     routes = Routes()
     for add in (add_access, add_bench, add_jobs, add_catalog, add_records):
         add(routes, server)
-    for router in (routes.anybody, routes.watch, routes.operate):
+    for router in (routes.public, routes.watch, routes.operate):
         app.include_router(router, prefix=API, responses=_ERRORS)
     app.include_router(pages(server))
     app.mount("/static", StaticFiles(packages=[("rig.web", "static")]), name="static")

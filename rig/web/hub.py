@@ -48,7 +48,8 @@ class Hub:
 
     def __init__(self, epoch: str, capacity: int = CAPACITY) -> None:
         self._epoch = epoch
-        self._messages: deque[Message] = deque(maxlen=capacity)
+        self._capacity = capacity
+        self._messages: deque[Message] = deque()
         self._last = 0
         self._size = 0
         self._lock = threading.Lock()
@@ -62,11 +63,9 @@ class Hub:
         text = json.dumps(data, ensure_ascii=False, allow_nan=False, default=str)
         with self._lock:
             self._last += 1
-            if len(self._messages) == self._messages.maxlen:
-                self._size -= len(self._messages.popleft().data)
             self._messages.append(Message(self._last, kind, text))
             self._size += len(text)
-            while self._size > MAX_SIZE and len(self._messages) > 1:
+            while len(self._messages) > self._capacity or (self._size > MAX_SIZE and len(self._messages) > 1):
                 self._size -= len(self._messages.popleft().data)
         self.wake()
 
@@ -108,13 +107,13 @@ class Hub:
         self.listeners += 1
         silent_s = 0.0
         try:
-            yield self._hello(number, lost)
+            yield _hello(number, lost)
             while not self._closed and still_allowed():
                 changed = self._changed
                 messages, lost = self.since(number)
                 if lost:
                     number = messages[0].number - 1
-                    yield self._hello(number, lost)
+                    yield _hello(number, lost)
                 for message in messages:
                     number, silent_s = message.number, 0.0
                     yield message
@@ -152,10 +151,11 @@ class Hub:
             except RuntimeError:  # the loop is closed: the server ends
                 self._loop = None
 
-    def _hello(self, number: int, lost: bool) -> Message:
-        return Message(number, "hello", json.dumps({"lost": lost}))
-
     def _wake(self) -> None:
         if self._changed is not None:
             self._changed.set()
             self._changed = asyncio.Event()
+
+
+def _hello(number: int, lost: bool) -> Message:
+    return Message(number, "hello", json.dumps({"lost": lost}))

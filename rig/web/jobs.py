@@ -15,7 +15,7 @@ from rig.core.clock import Clock
 from rig.core.errors import JobNotFound, JobRejected, RigError, StateNotStored, os_errors_as
 from rig.core.files import read, write
 from rig.core.masking import masked
-from rig.core.next_steps import Do
+from rig.core.next_steps import Do, NextStep
 from rig.plans.operator import Choice
 from rig.web.requests import EnrollRequest, IdentifyRequest, Job, JobRequest, JobState, Question, TrayRequest
 
@@ -217,7 +217,7 @@ class JobQueue:
         with self._lock:
             job.error = None if error is None else to_jsonable_python(error.as_dict(), fallback=str)
             if state is not JobState.DONE:
-                self._offer_to_continue(job)
+                self._offer_to_continue(job, error)
             self._end(state, job)
 
     # -- inside -------------------------------------------------------------------------------------------------------
@@ -240,11 +240,12 @@ class JobQueue:
         if jobs:
             self._store(*jobs)
 
-    def _offer_to_continue(self, job: Job) -> None:
-        """Set the request and the command that continue the work of a job that ended early."""
+    def _offer_to_continue(self, job: Job, error: RigError | None = None) -> None:
+        """Set the request and the command that continue the work of a job that ended early, with this error."""
         request = job.request
         if isinstance(request, EnrollRequest):
-            started = job.views > 0 or request.resume
+            actions = [step.action for step in (error.steps if error else ()) if isinstance(step, NextStep)]
+            started = job.views > 0 or request.resume or Do.CONTINUE_ENROLLMENT in actions
             job.resume = request.model_copy(update={"resume": True, "replace": False}) if started else request
             words = ["rig", "enroll", request.name, *(["--resume"] if started else [])]
             if not started and request.replace:

@@ -138,7 +138,7 @@ class Link:
                 self._send({**answer, "number": number}, content)
             return
         future = self._waiting.get(number)
-        if future is None or future.done():  # nobody waits for it any more
+        if future is None or future.done():  # the call has ended already
             return
         if "error" in message:
             kind, what, steps, evidence = message["error"]

@@ -196,14 +196,14 @@ async def long_work(work: Callable[[], Result]) -> Result:
 
 
 Watcher = Annotated[Person, Depends(watcher)]
-Operator = Annotated[Person, Depends(operator)]
+OperatorPerson = Annotated[Person, Depends(operator)]
 
 
 class Routes:
     """The routes of the API by the right that they need: none, to watch, or to operate the bench."""
 
     def __init__(self) -> None:
-        self.anybody = APIRouter()
+        self.public = APIRouter()
         self.watch = APIRouter(dependencies=[Depends(watcher)])
         self.operate = APIRouter(dependencies=[Depends(operator)])
 

@@ -15,6 +15,8 @@ from rig.core.errors import UsageError
 from rig.core.json_form import plain
 from rig.core.next_steps import NextSteps, as_steps, steps_as_json
 from rig.core.phrases import counted, duration_words
+from rig.doctor.context import open_context
+from rig.doctor.finding import Finding, finding_words
 from rig.events.events import Accepted, Decided, Enrolled, Event, Identified, Started, event_dict
 from rig.events.lines import next_steps, page_line
 from rig.jobs.desk import Desk, Progress, Remark, Result, Step, Steps
@@ -136,6 +138,8 @@ class ServedDesk(Desk):
                 self._note(text, as_steps(steps)) if event is None else self.show(event)
             case Progress(words=text):
                 self._note(text)
+            case Finding(topic=topic):
+                self._note(f"{topic}: {finding_words(step)}")
             case Result():
                 self.job.result, self.job.result_text = step.values, step.text
             case _:
@@ -227,7 +231,8 @@ def _identify(desk: ServedDesk, **parameters: Any) -> Steps[Identified | None]:
 def _examine(desk: ServedDesk) -> Steps[None]:
     desk.close_bench()  # the checks open the devices themselves
     setup = desk.setup
-    return examine(setup.bench, setup.config, seed=setup.seed, options=setup.arguments)
+    opened = open_context(setup.bench, setup.config, seed=setup.seed, options=setup.arguments, is_held=True)
+    return examine(setup.bench, opened)
 
 
 def _calibrate(desk: ServedDesk, name: str, object: str | None) -> Steps[None]:

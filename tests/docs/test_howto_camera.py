@@ -51,7 +51,7 @@ def test_new_camera_takes_the_views_of_an_enrollment(monkeypatch, tmp_path):
             page["VENDOR"].open(config, options, None) as bench,
             Catalog.open(tmp_path / "catalog", clock=world.clock) as catalog,
         ):
-            bench.operator = ShelfOperator(world, shelf())
+            bench.placer = ShelfOperator(world, shelf())
             if bench.safety.state is TableState.UNREFERENCED:
                 bench.safety.set_revolutions(0)
             events = list(enroll(bench, catalog, "lamp", views=8))

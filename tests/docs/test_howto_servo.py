@@ -111,7 +111,7 @@ def test_servo_of_another_make_rotates_the_table_for_an_enrollment(stepper, tmp_
             state=MemoryStore(),
         )
         with bench, Catalog.open(tmp_path / "catalog", clock=bench.clock) as catalog:
-            bench.operator = ShelfOperator(world, shelf())
+            bench.placer = ShelfOperator(world, shelf())
             assert bench.safety.state is TableState.UNREFERENCED  # as the page says
             bench.safety.set_revolutions(0)
             events = list(enroll(bench, catalog, "lamp", views=8))

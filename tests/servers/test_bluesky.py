@@ -77,7 +77,7 @@ def test_devices_have_the_protocols_and_scan(devices: BenchDevices) -> None:
     assert isinstance(devices.imu, protocols.Triggerable)
     documents: Documents = []
     with devices:
-        devices.bench.operator.place("toy-house")
+        devices.bench.placer.place("toy-house")
         engine = RunEngine({}, context_managers=[])
         engine.subscribe(lambda name, document: documents.append((name, document)))
         engine(plans.scan([devices.camera, devices.imu], devices.table, 0, 90, 3, md=devices.provenance()))

@@ -14,7 +14,7 @@ import pytest
 from typer.testing import Result
 
 import hbr
-from hbr import DenseIndex, calibrate_stopping_rule
+from hbr import DenseIndex, fit_stopping_rule
 from rig.catalog import Catalog
 from rig.catalog.redescribe import redescribe
 from rig.catalog.verify import verify
@@ -104,7 +104,7 @@ def test_catalog_jobs_on_a_cluster_give_the_same_results(cluster: Cluster, tmp_p
         assert finished(verify(catalog, jobs=cluster)) == finished(verify(catalog, jobs=1))
 
 
-def test_calibration_gives_the_same_bits(cluster: Cluster) -> None:
+def test_fit_of_the_rule_gives_the_same_bits(cluster: Cluster) -> None:
     rng = np.random.default_rng(0)
     views = hbr.Views.concatenate(
         [
@@ -113,8 +113,8 @@ def test_calibration_gives_the_same_bits(cluster: Cluster) -> None:
         ]
     )
     index = DenseIndex(views)
-    alone = calibrate_stopping_rule(index)
-    spread = calibrate_stopping_rule(index, tasks=lambda work, tasks: map_in_processes(work, tasks, cluster))
+    alone = fit_stopping_rule(index)
+    spread = fit_stopping_rule(index, tasks=lambda work, tasks: map_in_processes(work, tasks, cluster))
     assert repr(spread) == repr(alone)
     assert spread.rule.min_confidence == alone.rule.min_confidence
 

@@ -14,12 +14,11 @@ from rig.config.values import default_path
 from rig.core.errors import RigError
 from rig.core.json_form import plain
 from rig.core.masking import masked
-from rig.doctor.finding import Finding
 from rig.safety.saved_state import FileStore
 from rig.views.image_files import encode
 
 
-def write_bundle(settings: Settings, file: Path, findings: list[Finding], *, picture: bool) -> None:
+def write_bundle(settings: Settings, file: Path, findings: list[dict[str, Any]], *, picture: bool) -> None:
     """Write findings, log, configuration and versions into a ZIP file, and with ``picture`` one image of the camera.
 
     Passwords and tokens are masked. What cannot be read is left out; the list ``missing`` in ``versions.json`` has the
@@ -30,7 +29,7 @@ def write_bundle(settings: Settings, file: Path, findings: list[Finding], *, pic
     UsageError
         The file exists or cannot be written.
     """
-    contents: dict[str, bytes] = {"findings.json": _json([finding.as_dict() for finding in findings])}
+    contents: dict[str, bytes] = {"findings.json": _json(findings)}
     missing: list[str] = []
 
     def log() -> bytes:

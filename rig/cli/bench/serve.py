@@ -3,7 +3,7 @@
 import ipaddress
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -12,9 +12,6 @@ from rig.cli.ui.settings import Settings
 from rig.core.clock import SystemClock
 from rig.core.errors import UsageError
 from rig.core.next_steps import Do
-
-if TYPE_CHECKING:
-    from rig.web.access import Tokens
 
 DEFAULT_PORT = 8420
 
@@ -86,8 +83,11 @@ def serve(
     if (certfile is None) != (keyfile is None):
         raise UsageError("TLS needs a certificate and its key.", next_step="Give --certfile and --keyfile.")
     needs_login = login or not is_loopback(host)
-    if needs_login:
-        _require_tokens(tokens, host)
+    if needs_login and not tokens.stored():
+        raise UsageError(
+            f"Everybody at {host} needs a token, and there is none.",
+            next_step=Do.NEW_TOKEN(role="operate"),
+        )
     listening = Listening(
         host=host,
         port=port,
@@ -118,11 +118,3 @@ def is_loopback(host: str) -> bool:
         return ipaddress.ip_address(host.strip("[]")).is_loopback
     except ValueError:
         return False
-
-
-def _require_tokens(tokens: "Tokens", host: str) -> None:
-    if not tokens.stored():
-        raise UsageError(
-            f"Everybody at {host} needs a token, and there is none.",
-            next_step=Do.NEW_TOKEN(role="operate"),
-        )

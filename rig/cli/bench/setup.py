@@ -49,21 +49,23 @@ def setup(
     path = settings.config or default_path() or Path(FILE_NAME)
     there = path.exists()
     # A new file has no settings of the file in force: that may belong to another bench.
-    new_file = {"config": load_config(None, settings.overrides, search=False)}
-    now = settings if there else replace(settings, config=None, _loaded=new_file)
+    now = settings if there else replace(settings, config=None, search=False)
     stored = load_config(path) if there else RigConfig()
     out = sys.stderr if settings.json else sys.stdout
     with doctor_context(now) as context:
         context.require_free()
-        print(_heading(context, settings), file=out)
+        simulated = context.computer.simulated
+        real = "" if settings.bench else " For the real bench: rig setup --bench hardware"
+        print(f"Bench {context.bench}{f', with simulated devices.{real}' if simulated else ':'}", file=out)
         dialogue = Dialogue(context, ask_nothing=yes or settings.json, out=out)
         wanted = dialogue.run()
-        if context.computer.simulated:  # the devices in the file are real ones
-            wanted = {key: value for key, value in wanted.items() if not _is_set(stored, key)}
+        if simulated:  # the devices in the file are real ones
+            missing = [key for key in wanted if key[-1] not in _at(stored, key[:-1]).model_fields_set]
+            wanted = {key: wanted[key] for key in missing}
         if stored.default_bench != context.bench:
             wanted[("default_bench",)] = context.bench
         old = read_text(path) if there else blank_file(RigConfig)
-        changes = {key: value for key, value in wanted.items() if not there or _in_force(stored, key) != value}
+        changes = {key: value for key, value in wanted.items() if not there or _at(stored, key) != value}
         new = with_values(old, changes)
         write = not there or new != old
         lines = [f"{'.'.join(key)} = {stated(key, value)}" for key, value in changes.items()]
@@ -73,12 +75,15 @@ def setup(
     if write:
         save(path, new)
     done = f"Wrote {path}." if write else f"{path} is unchanged."
-    after = replace(settings, _loaded={}) if path.exists() else now
+    after = replace(settings) if path.exists() else now  # a copy reads the file again
     written = {".".join(key): value for key, value in changes.items()}
     settings.say(f"{done}\n", {"path": path, "written": write, "settings": written})
-    code = print_findings(after)
+    code = print_findings(after)["exit_code"]
     if not settings.json:
-        print(_next(context, code))
+        rotate, enroll, check = (context.step(one).command for one in (Do.GOTO(angle=90), Do.ENROLL(), Do.DOCTOR()))
+        move = f"rotate the table with {rotate}, then enroll with {enroll}."
+        fix = f"fix the findings marked ✗, then run {check}."
+        print(f"\nNext: {fix if code else move}")
     if code:
         raise typer.Exit(code)
 
@@ -95,11 +100,8 @@ class Dialogue:
     def run(self) -> "dict[Key, Any]":
         """Return the settings that were found or entered, by key."""
         scan = self._scan()
-        while (
-            not scan.servos
-            and not scan.duplicate_ids
-            and self._search_again("No servo that the rig can drive was found.")
-        ):
+        again = "No servo that the rig can drive was found. Check cables and supply. Search again?"
+        while not (scan.servos or scan.duplicate_ids or self.ask_nothing) and prompts.ask_yes_no(again):
             scan = self._scan()
         config, found = self.context.config, scan.candidates
         if (servo := self._pick("servo", found["servo"])) is not None:
@@ -126,11 +128,6 @@ class Dialogue:
         scan = DeviceScan()
         show_findings(console(stderr=self.out is sys.stderr), self.context, scan.checks)
         return scan
-
-    def _search_again(self, what: str) -> bool:
-        if self.ask_nothing:
-            return False
-        return prompts.ask_yes_no(f"{what} Check cables and supply. Search again?", default=False)
 
     def _pick(self, what: str, found: "Sequence[Candidate]") -> "Candidate | None":
         """Return the only device, or the one that the operator chooses; None without a choice."""
@@ -227,27 +224,8 @@ def _degrees(text: str) -> float:
     return value
 
 
-def _heading(context: "DoctorContext", settings: Settings) -> str:
-    """Return which bench is set up, and how to set up a real one instead of a simulated one."""
-    if not context.computer.simulated:
-        return f"Bench {context.bench}:"
-    real = "" if settings.bench else " For the real bench: rig setup --bench hardware"
-    return f"Bench {context.bench}, with simulated devices.{real}"
-
-
-def _is_set(config: Any, key: "Key") -> bool:
-    *above, name = key
-    return name in _in_force(config, tuple(above)).model_fields_set
-
-
-def _in_force(config: Any, key: "Key") -> Any:
+def _at(config: Any, key: "Key") -> Any:
+    """Return a value of a configuration, or a section of it."""
     for part in key:
         config = getattr(config, part)
     return list(config) if isinstance(config, tuple) else config
-
-
-def _next(context: "DoctorContext", code: int) -> str:
-    if code:
-        return f"\nNext: fix the findings marked ✗, then run {context.step(Do.DOCTOR()).command}."
-    rotate, enroll = (context.step(step).command for step in (Do.GOTO(angle=90), Do.ENROLL()))
-    return f"\nNext: rotate the table with {rotate}, then enroll with {enroll}."

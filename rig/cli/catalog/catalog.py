@@ -7,8 +7,9 @@ import typer
 
 from rig.cli.ui.command import command
 from rig.cli.ui.complete import object_names
-from rig.cli.ui.jobs import confirm, size_words
+from rig.cli.ui.jobs import size_words
 from rig.cli.ui.options import YesOption
+from rig.cli.ui.prompts import confirm
 from rig.cli.ui.settings import Settings
 from rig.core.errors import UsageError
 from rig.core.phrases import counted, number

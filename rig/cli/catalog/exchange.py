@@ -131,8 +131,9 @@ def run_import(
     begin_ns = clock.now_ns()
     nothing = "Interrupted; nothing was imported."
     if dry_run:
-        with settings.existing_catalog() or nullcontext() as existing:
-            plan = plan_import(existing, batch, conflict)
+        existing = settings.open_catalog(read_only=True) if settings.place.may_exist() else nullcontext()
+        with existing as catalog:
+            plan = plan_import(catalog, batch, conflict)
         done = run_job("checking", preview_import(plan, strict=strict, jobs=jobs), interrupted=nothing)
     else:
         with settings.open_catalog(create=True) as catalog:

@@ -86,6 +86,7 @@ def show(settings: Settings, result: ResultArgument) -> None:
     """
     from rig.catalog.results import find_result
     from rig.core.json_form import plain
+    from rig.events.wording import result_words
 
     with settings.open_catalog(read_only=True) as catalog:
         found = find_result(catalog, result)
@@ -98,12 +99,13 @@ def show(settings: Settings, result: ResultArgument) -> None:
         settings.print_json(shown)
         return
     corrected = f"corrected to {_words(found.current)}; the answer was: " if found.corrections else ""
-    print(f"Result {found.id}: {corrected}{_answer_words(found)}")
+    answer = _event(found)
+    print(f"Result {found.id}: {corrected}{_words(found.answered) if answer is None else result_words(answer)}")
     lines = {
         "sample": found.answered.sample or "–",
         "time": f"{found.time_utc:%Y-%m-%d %H:%M:%S} UTC",
         "operator": f"{found.operator} (account {found.user} on {found.host})",
-        "candidates": _candidates(found),
+        "candidates": ", ".join(f"{one.name} {one.score:.3f}" for one in answer.candidates) if answer else "–",
         "views": f"{len(found.azimuths_deg)}",
         "bench": f"{found.provenance.bench}, {found.provenance.software}",
         "catalog": f"version {found.catalog_version[:12]}",
@@ -205,19 +207,6 @@ def _words(answer: "Answer") -> str:
             return f"ambiguous ({answer.object_name}?)"
         case Outcome.UNKNOWN:
             return "unknown"
-
-
-def _answer_words(result: "Result") -> str:
-    """Return the answer in the words that were printed after the search."""
-    from rig.events.wording import result_words
-
-    answer = _event(result)
-    return _words(result.answered) if answer is None else result_words(answer)
-
-
-def _candidates(result: "Result") -> str:
-    answer = _event(result)
-    return "–" if answer is None else ", ".join(f"{one.name} {one.score:.3f}" for one in answer.candidates)
 
 
 def _event(result: "Result") -> "Identified | None":

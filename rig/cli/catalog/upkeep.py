@@ -1,4 +1,4 @@
-"""`rig catalog verify`, `redescribe`, `gc` and `merge`, and `rig log`."""
+"""`rig catalog verify`, `redescribe`, `gc`, `copy`, `merge` and `deliver`, and `rig log`."""
 
 import sys
 from datetime import UTC, datetime, timedelta
@@ -11,8 +11,9 @@ from rig.cli.catalog.catalog import app
 from rig.cli.ui.command import command
 from rig.cli.ui.complete import object_names
 from rig.cli.ui.exit_codes import EXIT_CATALOG
-from rig.cli.ui.jobs import confirm, run_job, size_words
+from rig.cli.ui.jobs import run_job, size_words
 from rig.cli.ui.options import ClusterOption, DryImportOption, JobsOption, YesOption, descriptor_name, jobs_of
+from rig.cli.ui.prompts import confirm
 from rig.cli.ui.settings import Settings
 from rig.core.clock import SystemClock
 from rig.core.errors import UsageError
@@ -271,12 +272,8 @@ def _detail(key: str, value: Any) -> str:
         return name if value else ""
     if key.endswith("_deg") and isinstance(value, int | float):
         return f"{name} {angle_words(value)}"
-    return f"{name} {_short(value)}"
-
-
-def _short(value: Any) -> str:
     text = ", ".join(map(str, value)) if isinstance(value, list) else str(value)
-    return text if len(text) <= 60 else f"{text[:59]}…"
+    return f"{name} {text if len(text) <= 60 else f'{text[:59]}…'}"
 
 
 def _region(settings: Settings, text: str) -> Any:
@@ -334,3 +331,57 @@ def merge(
     with Catalog.open(other, clock=SystemClock(), create=False, read_only=True) as source:
         batch = read_catalog(source)
     run_import(settings, batch, on_conflict=on_conflict, label=None, strict=True, dry_run=dry_run, jobs=jobs)
+
+
+@app.command("deliver")
+@command
+def deliver(
+    settings: Settings,
+    rename: Annotated[
+        tuple[str, str] | None,
+        typer.Option("--rename", metavar="NAME NEW", help="Deliver an object of the journal under another name."),
+    ] = None,
+    replace: Annotated[
+        list[str] | None,
+        typer.Option("--replace", metavar="NAME", help="Replace the object of the server by that of the journal."),
+    ] = None,
+    discard: Annotated[
+        str | None, typer.Option("--discard", metavar="NAME", help="Remove an object from the journal.")
+    ] = None,
+) -> None:
+    """Deliver what this computer enrolled and answered while the server of the catalog did not answer.
+
+    rig enroll and rig identify do this, too. The options resolve a name that both the journal and the server have.
+
+    Example: rig catalog deliver --rename mug-white mug-white-2
+    """
+    from rig.catalog import edit
+    from rig.catalog.journal import Journal
+    from rig.catalog.journal import discard as remove
+    from rig.catalog.shared import deliver_journal, delivery_words
+
+    place = settings.place
+    if place.url is None:
+        raise UsageError(
+            "The catalog is in a folder of this computer.",
+            next_step="Enroll and identify as usual: there is nothing to deliver.",
+        )
+    if rename is not None or discard is not None or replace:
+        with Journal.of(place, SystemClock()) as journal:
+            for name in replace or ():
+                journal.summary(name)  # there must be one
+            if rename is not None:
+                edit.rename(journal, *rename)
+            if discard is not None:
+                remove(journal, discard)
+    done = deliver_journal(place, SystemClock(), replacing=replace or ())
+    for one in done:
+        print(f"{'' if one.conflict is None else 'Note: '}{delivery_words(one, place)}", file=sys.stderr)
+    conflicts = [one for one in done if one.conflict is not None]
+    if settings.json:
+        rows = [{"name": one.name, "views": one.views, "conflict": one.conflict and one.conflict.what} for one in done]
+        settings.print_json({"delivered": len(done) - len(conflicts), "objects": rows})
+    elif not done:
+        print("No object was delivered.")
+    if conflicts:
+        raise typer.Exit(EXIT_CATALOG)

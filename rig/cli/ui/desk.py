@@ -12,13 +12,13 @@ from rig.catalog.jobs import JobProgress
 from rig.catalog.journal import waiting
 from rig.catalog.local_copy import open_or_copy
 from rig.catalog.shared import BackgroundDelivery
-from rig.cli.ui import jobs
-from rig.cli.ui.operator import TerminalOperator
+from rig.cli.ui import prompts
 from rig.cli.ui.present import Progress as ProgressBar
 from rig.cli.ui.settings import Settings
 from rig.core.clock import Clock, SystemClock
 from rig.core.errors import RigError
 from rig.core.next_steps import in_words
+from rig.doctor.finding import Finding, finding_words
 from rig.events.events import Event, event_dict
 from rig.events.lines import line
 from rig.jobs.desk import Desk, Progress, Remark, Result, Steps
@@ -56,8 +56,8 @@ class CommandDesk(Desk):
     ) -> None:
         self.config = settings.load()
         self.place = settings.place
-        is_there = (with_json or not settings.json) and jobs.is_interactive()
-        self.operator: Operator = Unattended() if yes else TerminalOperator(is_there=is_there, before=before)
+        is_there = (with_json or not settings.json) and prompts.is_interactive()
+        self.operator: Operator = Unattended() if yes else prompts.TerminalOperator(is_there=is_there, before=before)
         self._settings = settings
         self._before = before
 
@@ -117,6 +117,8 @@ class CommandDesk(Desk):
                     case Progress() as progress:
                         values = {"event": "progress", "share": progress.share, "words": progress.words}
                         self._settings.say(progress.words, values)
+                    case Finding() as finding:
+                        self._settings.say(finding_words(finding), finding.as_dict())
                     case event if show is not None:
                         show(event)
                     case event:

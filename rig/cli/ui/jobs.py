@@ -1,4 +1,4 @@
-"""Long jobs of the catalog, and questions before deletions."""
+"""Long jobs of the catalog on the terminal, and sizes in words."""
 
 import sys
 from collections.abc import Callable, Generator, Iterator
@@ -7,9 +7,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 import typer
 
-from rig.cli.ui.exit_codes import EXIT_DECLINED, EXIT_INTERRUPTED
-from rig.cli.ui.settings import Settings
-from rig.core.errors import UsageError
+from rig.cli.ui.exit_codes import EXIT_INTERRUPTED
 
 if TYPE_CHECKING:
     from rig.catalog.jobs import JobProgress
@@ -34,28 +32,6 @@ def interruptible(words: str | Callable[[], str]) -> Iterator[None]:
     except KeyboardInterrupt:
         print(words if isinstance(words, str) else words(), file=sys.stderr)
         raise typer.Exit(EXIT_INTERRUPTED) from None
-
-
-def is_interactive() -> bool:
-    """Return whether an operator can answer questions: standard input is a terminal."""
-    return sys.stdin.isatty()
-
-
-def confirm(question: str, *, yes: bool, settings: Settings) -> None:
-    """Ask before a deletion.
-
-    Raises
-    ------
-    UsageError
-        There is no terminal to ask on, and ``yes`` is not set.
-    """
-    if yes:
-        return
-    if settings.json or not is_interactive():
-        raise UsageError(f"{question} This needs a confirmation.", next_step="Add --yes to confirm.")
-    if not typer.confirm(question, err=True):
-        print("Nothing was changed.", file=sys.stderr)
-        raise typer.Exit(EXIT_DECLINED)
 
 
 def size_words(size: float) -> str:

@@ -2,12 +2,63 @@
 
 import sys
 from collections.abc import Callable, Sequence
-from typing import TypeVar
+from typing import Final, TypeVar
 
+import typer
+
+from rig.cli.ui.exit_codes import EXIT_DECLINED
+from rig.cli.ui.settings import Settings
+from rig.cli.ui.terminal import unguarded
 from rig.core.errors import UsageError
+from rig.core.next_steps import in_words
 from rig.core.phrases import whole
+from rig.plans.operator import Choice, Question
 
+BELL: Final = "\a"
+_KEYS: Final = {
+    Choice.CONTINUE: "y",
+    Choice.RESTART: "n",
+    Choice.KEEP: "k",
+    Choice.SKIP: "s",
+    Choice.STOP: "q",
+}
 T = TypeVar("T")
+
+
+class TerminalOperator:
+    """Asks the questions of a job at the terminal, with a beep.
+
+    Parameters
+    ----------
+    is_there
+        Whether a person reads the questions.
+    before
+        Called before each question: removes the live display.
+    """
+
+    def __init__(self, *, is_there: bool = True, before: Callable[[], None] = lambda: None) -> None:
+        self.is_there = is_there
+        self._before = before
+
+    def choose(self, question: Question) -> Choice:
+        self._before()
+        keys = {"" if choice is question.default else _KEYS[choice]: choice for choice in question.choices}
+        hints = ", ".join(f"{key or 'Enter'}: {question.choices[choice]}" for key, choice in keys.items())
+        words = "\n".join(filter(None, (question.text, in_words(question.steps))))
+        text = f"{words}{question.picture}\n  {hints}"
+        # At the end of the input, a question is answered with its last choice, unless Enter would stop the job.
+        ask = ask_line if question.default is Choice.STOP else read_answer
+        while True:
+            if sys.stderr.isatty():
+                unguarded(sys.stderr).write(BELL)
+            answer = ask(text)
+            if answer is None:
+                return list(question.choices)[-1]
+            if (choice := keys.get(answer.lower())) is not None:
+                return choice
+
+    def ask_sample(self) -> str | None:
+        return ask_sample()
 
 
 def ask_sample() -> str | None:
@@ -25,24 +76,36 @@ def ask_sample() -> str | None:
             print(f"{error.what} {error.next_step}", file=sys.stderr)
 
 
-def ask_line(question: str, *, otherwise: str = "add --yes") -> str:
-    """Print a question on stderr and return the line that answers it; Ctrl+C is passed on.
+def read_answer(question: str) -> str | None:
+    """Print a question on stderr and return the line that answers it; None if standard input has ended.
 
     Raises
     ------
     UsageError
-        Standard input has ended.
+        Standard input cannot be read.
     """
     print(question, end=" ", file=sys.stderr, flush=True)
-    answer = sys.stdin.readline()
+    try:
+        answer = sys.stdin.readline()
+    except (OSError, UnicodeDecodeError) as error:
+        raise UsageError(
+            "The program cannot ask: standard input is not readable.",
+            next_step="Run the command in a terminal.",
+        ) from error
     if not sys.stdin.isatty():
         print(answer.strip(), file=sys.stderr)  # a log then shows the answers, too
-    if not answer:
+    return answer.strip() if answer else None
+
+
+def ask_line(question: str, *, otherwise: str = "add --yes") -> str:
+    """Return the answer to a question; Ctrl+C is passed on. Raises `UsageError` if standard input has ended."""
+    answer = read_answer(question)
+    if answer is None:
         raise UsageError(
             "The question was not answered: standard input has ended.",
             next_step=f"Run the command in a terminal, or {otherwise}.",
         )
-    return answer.strip()
+    return answer
 
 
 def ask_yes_no(question: str, *, default: bool = False) -> bool:
@@ -52,6 +115,28 @@ def ask_yes_no(question: str, *, default: bool = False) -> bool:
         if answer in ("", "y", "yes", "n", "no"):
             return answer[0] == "y" if answer else default
         print("Answer y or n.", file=sys.stderr)
+
+
+def is_interactive() -> bool:
+    """Return whether an operator can answer questions: standard input is a terminal."""
+    return sys.stdin.isatty()
+
+
+def confirm(question: str, *, yes: bool, settings: Settings) -> None:
+    """Ask before a deletion.
+
+    Raises
+    ------
+    UsageError
+        There is no terminal to ask on, and ``yes`` is not set.
+    """
+    if yes:
+        return
+    if settings.json or not is_interactive():
+        raise UsageError(f"{question} This needs a confirmation.", next_step="Add --yes to confirm.")
+    if not ask_yes_no(question):
+        print("Nothing was changed.", file=sys.stderr)
+        raise typer.Exit(EXIT_DECLINED)
 
 
 def ask_choice(question: str, options: Sequence[str], *, other: str = "") -> int | None:

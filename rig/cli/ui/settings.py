@@ -6,6 +6,7 @@ This module imports none of numpy, cv2, scipy and sqlalchemy: `rig --help` must 
 import json
 import sys
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,7 +33,8 @@ class Settings:
     overrides: tuple[str, ...] = ()
     seed: int | None = None
     json: bool = False
-    _loaded: dict[str, "RigConfig"] = field(default_factory=dict, repr=False, compare=False)
+    search: bool = True
+    """Whether the configuration file in force is used if none is given."""
     opened: list[str] = field(default_factory=list, repr=False, compare=False)
     """Benches that the command has opened."""
 
@@ -53,16 +55,17 @@ class Settings:
             overrides=(*self.overrides, *(overrides or ())),
             seed=self.seed if seed is None else seed,
             json=json or self.json,
-            _loaded={},
         )
 
     def load(self) -> "RigConfig":
-        """Return the configuration in force."""
-        if "config" not in self._loaded:
-            from rig.config import load_config
+        """Return the configuration in force; it is read once."""
+        return self._loaded
 
-            self._loaded["config"] = load_config(self.config, self.overrides)
-        return self._loaded["config"]
+    @cached_property
+    def _loaded(self) -> "RigConfig":
+        from rig.config import load_config
+
+        return load_config(self.config, self.overrides, search=self.search)
 
     def arguments(self) -> list[str]:
         """Return the arguments that pass these settings to another command, to be shown: without passwords."""
@@ -116,10 +119,6 @@ class Settings:
             next_step=(f"Add --bench {others[0]} to use the catalog of that bench, or", enroll) if others else enroll,
             evidence={"folder": str(path), "benches with a catalog": others},
         )
-
-    def existing_catalog(self) -> "Catalog | None":
-        """Return the bench's catalog, opened for reading; None if there is none yet."""
-        return self.open_catalog(read_only=True) if self.place.may_exist() else None
 
     def say(self, text: str, data: Any) -> None:
         """Print ``text``, or with ``--json`` ``data`` as one line of JSON."""

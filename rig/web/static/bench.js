@@ -1,4 +1,4 @@
-import { $, API, act, duration, h, jobTitle, nextSteps, number, on, request, showJob, start, submit } from "./rig.js";
+import { $, API, duration, h, listJobs, nextSteps, number, on, start, submit } from "./rig.js";
 
 /** Return a point of the dial: 0° is at the top, angles grow counter-clockwise, as the table's do seen from above. */
 const polar = (degrees, radius) => {
@@ -71,18 +71,9 @@ function outline(found) {
   );
 }
 
-const jobs = new Map();
-let open = null;
-function showJobs() {
-  const newest = [...jobs.values()].sort((a, b) => (a.created_utc < b.created_utc ? 1 : -1));
-  const active = newest.find((job) => ["running", "paused", "waiting"].includes(job.state));
-  const chosen = (open && jobs.get(open)) || active || newest[0];
-  showJob($("job"), chosen);
-  if (chosen && chosen.request.kind === "doctor" && chosen.result) findings(chosen.result.findings);
-  $("jobs").replaceChildren(
-    ...newest.slice(0, 12).map((job) => h("li", {}, h("button", { class: "quiet", onclick: () => { open = job.id; showJobs(); } }, jobTitle(job)), ` ${job.state}, ${job.operator}, ${job.created_utc}`)),
-  );
-}
+listJobs((job) => {
+  if (job.request.kind === "doctor" && job.result) findings(job.result.findings);
+});
 
 function findings(list) {
   const marks = { fine: "✓", warning: "!", bad: "✗" };
@@ -92,28 +83,7 @@ function findings(list) {
   );
 }
 
-on("job", (job) => {
-  if (!jobs.has(job.id)) open = null;
-  jobs.set(job.id, job);
-  showJobs();
-});
-on("hello", () => act(async () => {
-  for (const job of (await request("GET", "/jobs")).items) jobs.set(job.id, job);
-  showJobs();
-}));
-
-$("goto").addEventListener("submit", (event) => {
-  event.preventDefault();
-  submit({ kind: "goto", angle_deg: Number($("angle").value) });
-});
-$("set-angle").addEventListener("submit", (event) => {
-  event.preventDefault();
-  submit({ kind: "reference", revolutions: Number($("revolutions").value) });
-});
 $("here").addEventListener("click", () => submit({ kind: "reference", here: true }));
-for (const [id, kind] of [["home", "home"], ["empty", "empty-table"], ["doctor", "doctor"]]) {
-  $(id).addEventListener("click", () => submit({ kind }));
-}
 
 // The live image: one short request after the other. An endless one would occupy one of the browser's few connections.
 

@@ -1,26 +1,20 @@
-import { $, API, act, canOperate, counted, h, on, request, start } from "./rig.js";
+import { $, API, act, canOperate, counted, h, on, pager, request, start } from "./rig.js";
 
-let next = null;
-let shown = 0;
 let opened = null;
 const path = (name) => encodeURIComponent(name);
-
-async function load(more) {
-  const query = new URLSearchParams({ limit: "60", search: $("search").value, deleted: $("deleted").checked });
-  if (more && next) query.set("after", next);
-  const page = await request("GET", `/objects?${query}`);
-  if (!more) { $("objects").replaceChildren(); shown = 0; }
-  shown += page.items.length;
-  next = page.next;
-  $("more").hidden = next === null;
-  $("count").textContent = counted(page.total, "object");
-  $("objects").append(...page.items.map(card));
-}
+const load = pager(
+  () => `/objects?${new URLSearchParams({ limit: "60", search: $("search").value, deleted: $("deleted").checked })}`,
+  (page, isFirst) => {
+    if (isFirst) $("objects").replaceChildren();
+    $("count").textContent = counted(page.total, "object");
+    $("objects").append(...page.items.map(card));
+  },
+);
 
 function card(one) {
   const views = one.unfinished_views !== null ? `interrupted, ${counted(one.unfinished_views, "view")}` : counted(one.views, "view");
   const image = one.picture === null ? null : h("img", { src: `${API}/views/${one.picture}/image`, alt: "", loading: "lazy" });
-  const action = $("deleted").checked ? () => act(async () => { await request("POST", "/undelete", { name: one.name }); await load(false); }) : () => act(() => open(one.name));
+  const action = $("deleted").checked ? () => act(async () => { await request("POST", "/undelete", { name: one.name }); await load(); }) : () => act(() => open(one.name));
   return h("li", {}, h("button", { onclick: action }, image, h("strong", {}, one.name), h("br"), h("span", { class: "soft" }, $("deleted").checked ? "Restore" : `${one.label ? `${one.label}, ` : ""}${views}`)));
 }
 
@@ -63,27 +57,26 @@ function ring(views) {
 async function upload(file) {
   const done = await request("POST", "/import", file);
   $("count").textContent = `Imported ${counted(done.objects, "object")} with ${counted(done.views, "view")}.`;
-  await load(false);
+  await load();
 }
 
 $("find").addEventListener("submit", (event) => event.preventDefault());
 let timer = null;
-$("search").addEventListener("input", () => { clearTimeout(timer); timer = setTimeout(() => act(() => load(false)), 200); });
-$("deleted").addEventListener("change", () => act(() => load(false)));
-$("more").addEventListener("click", () => act(() => load(true)));
+$("search").addEventListener("input", () => { clearTimeout(timer); timer = setTimeout(() => act(load), 200); });
+$("deleted").addEventListener("change", () => act(load));
 $("close").addEventListener("click", () => $("object").close());
 $("edit").addEventListener("submit", (event) => {
   event.preventDefault();
   act(async () => {
     await request("PATCH", `/objects/${path(opened)}`, { name: $("new-name").value, label: $("new-label").value, note: $("new-note").value });
     $("object").close();
-    await load(false);
+    await load();
   });
 });
 $("delete").addEventListener("click", () => act(async () => {
   await request("DELETE", `/objects/${path(opened)}`);
   $("object").close();
-  await load(false);
+  await load();
 }));
 $("bundle").addEventListener("change", () => act(() => upload($("bundle").files[0])));
 document.addEventListener("dragover", (event) => { event.preventDefault(); $("main").classList.add("drop"); });
@@ -93,6 +86,6 @@ document.addEventListener("drop", (event) => {
   $("main").classList.remove("drop");
   if (event.dataTransfer.files.length) act(() => upload(event.dataTransfer.files[0]));
 });
-on("hello", () => act(() => load(false)));
-on("plan", (event) => { if (event.event === "enrolled") act(() => load(false)); });
+on("hello", () => act(load));
+on("plan", (event) => { if (event.event === "enrolled") act(load); });
 start();

@@ -1,16 +1,8 @@
-import { $, act, followJobs, h, on, request, start, submit, table, thumb } from "./rig.js";
+import { $, act, followJobs, h, on, request, start, submit, table } from "./rig.js";
 
-let current = null;
-const number = (id) => ($(id).value === "" ? null : Number($(id).value));
-const text = (id) => ($(id).value === "" ? null : $(id).value);
-
-$("one").addEventListener("submit", (event) => {
-  event.preventDefault();
-  submit({ kind: "enroll", name: $("name").value, views: number("views"), label: text("label"), note: text("note"), replace: $("replace").checked });
-});
 $("dry").addEventListener("click", () => {
   if (!$("one").reportValidity()) return;
-  submit({ kind: "dry-run", objects: [{ name: $("name").value, views: number("views") }], replace: $("replace").checked });
+  submit({ kind: "dry-run", objects: [{ name: $("name").value, views: $("views").value ? Number($("views").value) : null }], replace: $("replace").checked });
 });
 
 // -- the tray ------------------------------------------------------------------------------------------------------------
@@ -67,18 +59,9 @@ function checks(event) {
   return `view ${event.index + 1}, ${event.azimuth_deg.toFixed(0)}°: sharpness ${e.sharpness.toFixed(0)}, mean level ${e.mean_level.toFixed(0)}`;
 }
 
-on("plan", (event) => {
-  if (event.job !== current) return;
-  if (event.event === "started") $("thumbs").replaceChildren();
-  if (event.event === "accepted") $("thumbs").append(thumb(event.job, event.picture, checks(event)));
+on("shown-plan", (event) => {
   if (event.event === "rejected") $("thumbs").append(h("li", { class: "error" }, event.text));
   if (event.event === "similar_objects") $("similar").replaceChildren(...event.text.split("\n").map((words) => h("li", {}, words)));
 });
-followJobs($("job"), ["enroll", "tray", "dry-run"], (job) => {
-  if (job.id === current) return;
-  current = job.id;
-  $("similar").replaceChildren();
-  // A page that was opened in the middle of a job shows the views so far.
-  $("thumbs").replaceChildren(...Array.from({ length: job.views }, (_, k) => thumb(job.id, k, `view ${k + 1}`)));
-});
+followJobs(["enroll", "tray", "dry-run"], (job, isOther) => { if (isOther) $("similar").replaceChildren(); }, checks);
 start();

@@ -1,11 +1,4 @@
-import { $, followJobs, h, nextSteps, number, on, percent, start, submit, thumb } from "./rig.js";
-
-let current = null;
-
-$("start").addEventListener("submit", (event) => {
-  event.preventDefault();
-  submit({ kind: "identify", watch: $("watch").checked, sample: $("sample").disabled ? null : $("sample").value || null, max_views: $("max-views").value ? Number($("max-views").value) : null });
-});
+import { $, followJobs, h, nextSteps, number, on, percent, start } from "./rig.js";
 
 function oneSample() {
   $("sample").disabled = $("watch").checked;
@@ -26,7 +19,7 @@ export function noAnswer(error) {
 }
 
 function clear() {
-  for (const id of ["thumbs", "steps", "candidates", "shares"]) $(id).replaceChildren();
+  for (const id of ["steps", "candidates", "shares"]) $(id).replaceChildren();
   answer("Searching …", "", "");
 }
 
@@ -51,27 +44,23 @@ export function result(event) {
   bars(event.candidates, event.outcome === "unknown");
 }
 
-on("plan", (event) => {
-  if (event.job !== current) return;
+on("shown-plan", (event) => {
   if (event.event === "frame_used") return answer("Searching …", "", event.text.trim());
   if (event.event === "started") clear();
   if (event.event === "waiting") answer(event.reason === "first-object" ? "Put an object on the table" : "Put the next object on the table", "", "");
-  if (event.event === "accepted") $("thumbs").append(thumb(event.job, event.picture, `view ${event.index + 1}, ${event.azimuth_deg.toFixed(0)}°`));
   if (event.event === "ranked") bars(event.candidates);
   if (event.event === "identified") result(event);
   if (event.event === "failed") noAnswer(event);
   if (event.text) for (const words of event.text.split("\n")) $("steps").append(h("li", {}, words.trim()));
   if (event.steps?.length) $("steps").append(h("li", {}, "Next step: ", ...nextSteps(event.steps)));
 });
-followJobs($("job"), ["identify"], (job) => {
-  if (job.id !== current) {
-    current = job.id;
+followJobs(["identify"], (job, isOther) => {
+  if (isOther) {
     clear();
-    $("thumbs").replaceChildren(...Array.from({ length: job.views }, (_, k) => thumb(job.id, k, `view ${k + 1}`)));
     if (job.state === "queued") answer("Waiting for the bench …", "", "");
   }
   if (job.result && job.result.event === "identified" && !job.request.watch) result({ ...job.result, text: job.result_text });
   if (job.state === "failed") noAnswer(job.error);
   if (["cancelled", "interrupted"].includes(job.state)) answer("Stopped", "", "");
-});
+}, (event) => `view ${event.index + 1}, ${event.azimuth_deg.toFixed(0)}°`);
 start();

@@ -1,13 +1,5 @@
 // Calibrations, runs, log and settings: each part runs on the page that has its element.
-import { $, API, act, counted, followJobs, h, on, percent, request, start, submit, table, whoami } from "./rig.js";
-
-let next = null;
-async function more(path, add) {
-  const page = await request("GET", `${path}${next ? `?after=${encodeURIComponent(next)}` : ""}`);
-  next = page.next;
-  $("more").hidden = next === null;
-  add(page.items);
-}
+import { $, API, act, counted, followJobs, h, on, pager, percent, request, start, submit, table, whoami } from "./rig.js";
 
 if ($("calibrations")) {
   const load = async () => {
@@ -17,7 +9,7 @@ if ($("calibrations")) {
     table($("calibrations"), ["Calibration", "Date", "Outcome", "Values"], found.history.map((one) => [one.name, one.when_utc, one.passed ? "passed" : "not passed", Object.entries(one.values).map(([key, value]) => `${key} ${value}`).join("; ")]));
   };
   on("hello", () => act(load));
-  followJobs($("job"), ["calibrate"], (job) => { if (job.state === "done") act(load); });
+  followJobs(["calibrate"], (job) => { if (job.state === "done") act(load); });
 }
 
 if ($("runs")) {
@@ -38,22 +30,21 @@ if ($("runs")) {
     table($("answers"), ["Time (UTC)", "Sample", "Answer", "Confidence", "Views", "Operator"], page.items.map((one) => [one.time_utc.slice(0, 19).replace("T", " "), one.sample, one.outcome === "unknown" ? "unknown object" : `${one.outcome === "ambiguous" ? "ambiguous: " : ""}${one.object}${one.corrections ? " (corrected)" : ""}`, one.confidence === null ? "" : percent(one.confidence), one.views, one.operator]));
   };
   on("hello", () => act(answers));
-  const add = (items) => {
+  const runs = pager(() => "/runs?limit=50", ({ items }, isFirst) => {
+    if (isFirst) $("runs").replaceChildren();
     $("runs").append(...items.map((run) => h("li", {}, h("button", { class: "quiet", onclick: () => act(() => open(run.name)) }, run.name))));
     if (!$("runs").children.length) $("runs").append(h("li", {}, "There are no runs yet. Identify an object."));
-  };
-  $("more").addEventListener("click", () => act(() => more("/runs", add)));
-  on("hello", () => act(() => { next = null; $("runs").replaceChildren(); return more("/runs", add); }));
+  });
+  on("hello", () => act(runs));
 }
 
 if ($("log")) {
-  const rows = [];
-  const add = (items) => {
-    rows.push(...items);
+  let rows = [];
+  const log = pager(() => "/log?limit=100", ({ items }, isFirst) => {
+    rows = isFirst ? items : [...rows, ...items];
     table($("log"), ["Time (UTC)", "Action", "Object", "User", "Details"], rows.map((one) => [one.time_utc, one.action, one.object_name, `${one.user} on ${one.host}`, JSON.stringify(one.details)]));
-  };
-  $("more").addEventListener("click", () => act(() => more("/log", add)));
-  on("hello", () => act(() => { next = null; rows.length = 0; return more("/log", add); }));
+  });
+  on("hello", () => act(log));
 }
 
 if ($("configuration")) {

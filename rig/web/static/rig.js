@@ -113,6 +113,27 @@ export async function act(action) {
 
 export const submit = (values) => act(() => request("POST", "/jobs", values));
 
+/** Return the values of a form by the names of its fields. An empty field is null. */
+function valuesOf(form) {
+  const value = (field) => {
+    if (field.type === "checkbox") return field.checked;
+    if (field.value === "") return null;
+    return field.type === "number" ? Number(field.value) : field.value;
+  };
+  return Object.fromEntries([...form.elements].filter((field) => field.name && !field.disabled).map((field) => [field.name, value(field)]));
+}
+
+// A form or a button with data-job submits this kind of job. The names of the fields are the parameters of the job.
+addEventListener("submit", (event) => {
+  const { job } = event.target.dataset;
+  if (!job) return;
+  event.preventDefault();
+  submit({ kind: job, ...valuesOf(event.target) });
+});
+addEventListener("click", ({ target }) => {
+  if (target.matches?.("button[data-job]")) submit({ kind: target.dataset.job });
+});
+
 // -- events -----------------------------------------------------------------------------------------------------------
 
 const listeners = {};
@@ -296,9 +317,11 @@ on("stop", ({ ended, torque_off: torqueOff }) => {
 // -- a job ---------------------------------------------------------------------------------------------------------------
 
 const NAMES = { enroll: "Enroll", tray: "Enroll a tray", identify: "Identify", "empty-table": "Empty-table image", goto: "Rotate", home: "Rotate home", acknowledge: "Acknowledge", reference: "Set the angle", doctor: "Check the bench", calibrate: "Calibrate", "dry-run": "Plan" };
+const ENDED = ["done", "failed", "cancelled", "interrupted"];
+const ACTIVE = ["running", "paused", "waiting"];
 const CHOICES = { continue: "Continue", restart: "Start again", skip: "Skip", stop: "Stop" };
 
-export function jobTitle(job) {
+function jobTitle(job) {
   const request_ = job.request;
   const what = request_.name || (request_.angle_deg !== undefined ? `to ${number(request_.angle_deg)}°` : "");
   return `${NAMES[request_.kind] || request_.kind} ${what}`.trim();
@@ -313,11 +336,11 @@ export function duration(seconds) {
 }
 
 /** Show a job in a box: progress, question, buttons, outcome. */
-export function showJob(box, job) {
+function showJob(box, job) {
   if (!job) return box.replaceChildren();
   const post = (what, body) => () => act(() => request("POST", `/jobs/${job.id}/${what}`, body));
   const parts = [h("p", {}, h("strong", {}, jobTitle(job)), ` – ${job.state}`)];
-  const ended = ["done", "failed", "cancelled", "interrupted"].includes(job.state);
+  const ended = ENDED.includes(job.state);
   if (job.progress && job.progress.total && !ended) {
     const left = job.progress.seconds_left;
     const words = `${job.progress.done} of ${job.progress.total}${left ? `, about ${duration(left)} left` : ""}`;
@@ -344,29 +367,75 @@ export function showJob(box, job) {
   return undefined;
 }
 
-/** Show the newest job of these kinds in a box; call `changed` with it. */
-export function followJobs(box, kinds, changed = () => {}) {
+const loadJobs = async () => (await request("GET", "/jobs?limit=50")).items;
+const newestOf = (jobs) => jobs.find((job) => ACTIVE.includes(job.state)) || jobs[0];
+
+/** Show the newest job of these kinds: its state, and its views. Call `changed` with it, and whether it is another one. */
+export function followJobs(kinds, changed = () => {}, viewWords = null) {
   let shown = null;
+  const add = (number, words) => $("thumbs").append(h("li", {}, h("img", { src: `${API}/jobs/${shown.id}/views/${number}`, alt: "", loading: "lazy" }), words));
   const take = (job) => {
+    const isOther = !shown || shown.id !== job.id;
     if (!kinds.includes(job.request.kind)) return;
-    if (shown && shown.id !== job.id && job.created_utc < shown.created_utc) return;
-    if (shown && shown.id !== job.id && job.state === "queued" && !["done", "failed", "cancelled", "interrupted"].includes(shown.state)) return;
+    if (shown && isOther && (job.created_utc < shown.created_utc || (job.state === "queued" && !ENDED.includes(shown.state)))) return;
     shown = job;
-    showJob(box, job);
-    changed(job);
+    showJob($("job"), job);
+    if (isOther && viewWords) { // a page that was opened in the middle of a job shows the views so far
+      $("thumbs").replaceChildren();
+      for (let k = 0; k < job.views; k += 1) add(k, `view ${k + 1}`);
+    }
+    changed(job, isOther);
   };
   on("job", take);
-  const load = async () => {
-    const { items } = await request("GET", "/jobs");
-    const mine = items.filter((job) => kinds.includes(job.request.kind));
-    const active = mine.find((job) => ["running", "paused", "waiting"].includes(job.state)) || mine[0];
-    if (active) take(active);
-  };
-  on("hello", () => act(load));
+  on("hello", () => act(async () => {
+    const newest = newestOf((await loadJobs()).filter((job) => kinds.includes(job.request.kind)));
+    if (newest) take(newest);
+  }));
+  on("plan", (event) => {
+    if (event.job !== shown?.id) return;
+    if (viewWords && event.event === "started") $("thumbs").replaceChildren();
+    if (viewWords && event.event === "accepted") add(event.picture, viewWords(event));
+    dispatch("shown-plan", event);
+  });
 }
 
-export const thumb = (job, number, words) =>
-  h("li", {}, h("img", { src: `${API}/jobs/${job}/views/${number}`, alt: "", loading: "lazy" }), words);
+/** Show all jobs: the one that was chosen, or else the newest, and a list. Call `changed` with the shown one. */
+export function listJobs(changed) {
+  const jobs = new Map();
+  let open = null;
+  const showAll = () => {
+    const newest = [...jobs.values()].sort((a, b) => (a.created_utc < b.created_utc ? 1 : -1));
+    const chosen = jobs.get(open) || newestOf(newest);
+    showJob($("job"), chosen);
+    if (chosen) changed(chosen);
+    $("jobs").replaceChildren(
+      ...newest.slice(0, 12).map((job) => h("li", {}, h("button", { class: "quiet", onclick: () => { open = job.id; showAll(); } }, jobTitle(job)), ` ${job.state}, ${job.operator}, ${job.created_utc}`)),
+    );
+  };
+  on("job", (job) => {
+    if (!jobs.has(job.id)) open = null;
+    jobs.set(job.id, job);
+    showAll();
+  });
+  on("hello", () => act(async () => {
+    for (const job of await loadJobs()) jobs.set(job.id, job);
+    showAll();
+  }));
+}
+
+/** Return a function that loads a list from its beginning. `add` gets its pages; the button #more loads the next one. */
+export function pager(path, add) {
+  let next = null;
+  const load = async (more) => {
+    const page = await request("GET", path() + (more ? `&after=${encodeURIComponent(next)}` : ""));
+    next = page.next;
+    $("more").hidden = next === null;
+    add(page, !more);
+  };
+  $("more").addEventListener("click", () => act(() => load(true)));
+  return () => load(false);
+}
+
 
 export function table(element, head, rows) {
   element.replaceChildren(

@@ -12,14 +12,13 @@ from hbr.dense.arc import (
     SIDE_DEG,
     STEP_DEG,
     STEP_WEIGHT,
-    ArcRule,
     ArcSession,
-    calibrate_arc_rule,
-    fit_arc_rule,
+    arc_confidence,
+    fit_arc_confidence,
     frame_weight,
 )
-from hbr.dense.calibration import UNCALIBRATED_MIN_CONFIDENCE, calibrate_stopping_rule
-from hbr.dense.stopping import LimitationCode, StoppingRule, StopReason
+from hbr.dense.fitting import UNFITTED_MIN_CONFIDENCE, fit_stopping_rule
+from hbr.dense.stopping import StoppingRule, StopReason
 from tests.hbr.dense.test_stopping import catalog
 
 
@@ -30,7 +29,7 @@ def index() -> DenseIndex:
 
 @pytest.fixture(scope="module")
 def rest(index: DenseIndex) -> StoppingRule:
-    return calibrate_stopping_rule(index, most_searches=60).rule
+    return fit_stopping_rule(index, most_searches=60).rule
 
 
 def pass_by(session: ArcSession, of: Views, row: int, degrees: float) -> list[Outcome]:
@@ -50,16 +49,16 @@ def test_evidence_of_an_arc_does_not_depend_on_the_number_of_its_frames() -> Non
 
 
 def test_first_view_is_decided_as_at_rest(index: DenseIndex, rest: StoppingRule) -> None:
-    rule = calibrate_arc_rule(index, rest, most_searches=24)
+    confidence = fit_arc_confidence(index, rest, most_searches=24)
     for row in range(0, len(index.views), 9):
         levels = index.views.levels(np.array([row]))[0]
-        at_rest, moving = DenseSession(index, rest), ArcSession(index, rule)
+        at_rest, moving = DenseSession(index, rest), ArcSession(index, rest, confidence)
         assert moving.add(levels, 0.0) == at_rest.add(levels, 0.0)
 
 
 def test_later_decisions_come_every_step_and_need_two_sides(index: DenseIndex, rest: StoppingRule) -> None:
-    certain = ArcRule(replace(rest, min_confidence=2.0), 0.0)  # the first view ends no search, any later frame does
-    session = ArcSession(index, certain)
+    later = replace(rest, min_confidence=2.0)  # the first view ends no search, any later frame does
+    session = ArcSession(index, later, 0.0)
     levels = index.views.levels(np.array([0]))[0]
     decided = []
     for angle in np.arange(0.0, 31.0, 3.0).tolist():
@@ -70,14 +69,14 @@ def test_later_decisions_come_every_step_and_need_two_sides(index: DenseIndex, r
     session.add(levels, 20.0)  # seen before
     assert not session.is_new_decision
     assert session.belief.amount < session.belief.queries
-    outcomes = pass_by(ArcSession(index, certain), index.views, 0, 90.0)
+    outcomes = pass_by(ArcSession(index, later, 0.0), index.views, 0, 90.0)
     assert outcomes.index(Outcome.FOUND) == SIDE_DEG // 4
 
 
 def test_rule_is_asked_after_every_frame_but_ends_no_search_on_a_guess(index: DenseIndex, rest: StoppingRule) -> None:
-    certain = ArcRule(replace(rest, min_confidence=2.0), 0.0)
+    later = replace(rest, min_confidence=2.0)
     for reliable in (True, False):
-        session, present = ArcSession(index, certain), []
+        session, present = ArcSession(index, later, 0.0), []
         levels = index.views.levels(np.array([0]))[0]
         for angle in np.arange(0.0, 71.0, 2.0).tolist():
             session.add(levels, angle, reliable=reliable)
@@ -92,42 +91,36 @@ def test_rule_is_asked_after_every_frame_but_ends_no_search_on_a_guess(index: De
 
 
 def test_search_ends_after_the_arc_as_ambiguous_or_unknown(index: DenseIndex, rest: StoppingRule) -> None:
-    never = ArcRule(replace(rest, min_confidence=2.0), 2.0)
-    session = ArcSession(index, never)
+    later = replace(rest, min_confidence=2.0)
+    session = ArcSession(index, later, 2.0)
     outcomes = pass_by(session, index.views, 0, 240.0)
     assert outcomes[-1] is Outcome.AMBIGUOUS
     assert session.decisions >= DECISIONS
-    short = ArcSession(index, never)
+    short = ArcSession(index, later, 2.0)
     pass_by(short, index.views, 0, 45.0)
     assert short.end().outcome is Outcome.AMBIGUOUS
     strict = replace(rest, min_confidence=2.0, open_set_thresholds=(5.0,) * len(rest.open_set_thresholds))
-    outcomes = pass_by(missed := ArcSession(index, ArcRule(strict, 0.0)), index.views, 0, 240.0)
+    outcomes = pass_by(missed := ArcSession(index, strict, 0.0), index.views, 0, 240.0)
     just_above = missed.decision.open_set_score + MOTION_LOSS / 2
     doubtful = replace(strict, open_set_thresholds=(just_above,) * len(rest.open_set_thresholds))
-    assert pass_by(ArcSession(index, ArcRule(doubtful, 0.0)), index.views, 0, 240.0)[-1] is Outcome.AMBIGUOUS
+    assert pass_by(ArcSession(index, doubtful, 0.0), index.views, 0, 240.0)[-1] is Outcome.AMBIGUOUS
     assert outcomes.index(Outcome.UNKNOWN) == (len(rest.open_set_thresholds) - 1) * SIDE_DEG // 4
 
 
 def test_error_rate_counts_only_decisions_that_can_end_a_search(index: DenseIndex, rest: StoppingRule) -> None:
     searches = leave_one_out(index, views=DECISIONS, searches=4, step_deg=STEP_DEG, weight=STEP_WEIGHT)
-    rest = replace(rest, error_rate=0.05)
+    rest = replace(rest, error_rate=0.05, min_confidence=0.9)
     correct = searches.correct.copy()
     correct[:, 1 : round(SIDE_DEG / STEP_DEG)] = False  # wrong where no decision is made
-    usual = fit_arc_rule(replace(searches, correct=correct), rest)
-    assert usual.limitations == ()
-    assert usual.min_confidence >= rest.min_confidence
+    assert rest.min_confidence <= arc_confidence(replace(searches, correct=correct), rest) < UNFITTED_MIN_CONFIDENCE
     correct[:, 0] = False  # and where the first view ends the search
-    wrong = fit_arc_rule(replace(searches, correct=correct), replace(rest, min_confidence=0.0))
-    assert [one.code for one in wrong.limitations] == [LimitationCode.SIMILAR_OBJECTS]
-    assert wrong.limitations[0].values["wrong"] == len(correct)
+    wrong = arc_confidence(replace(searches, correct=correct), replace(rest, min_confidence=0.0))
+    assert wrong == UNFITTED_MIN_CONFIDENCE
 
 
-def test_rule_of_a_large_catalog_is_fitted_to_a_part_with_a_limitation(index: DenseIndex, rest: StoppingRule) -> None:
-    rule = calibrate_arc_rule(index, rest, most_searches=4)
-    assert rule.min_confidence == max(UNCALIBRATED_MIN_CONFIDENCE, rest.min_confidence)
+def test_confidence_of_a_large_catalog_is_fitted_to_a_part(index: DenseIndex, rest: StoppingRule) -> None:
+    assert fit_arc_confidence(index, rest, most_searches=4) == max(UNFITTED_MIN_CONFIDENCE, rest.min_confidence)
     strict = replace(rest, min_confidence=0.9999)
-    assert calibrate_arc_rule(index, strict, most_searches=4).min_confidence == 0.9999
-    assert [one.code for one in rule.limitations] == [LimitationCode.SAMPLED, LimitationCode.ERROR_RATE]
-    assert rule.limitations[0].values == {"searched": 4, "objects": len(index)}
+    assert fit_arc_confidence(index, strict, most_searches=4) == 0.9999
     single = DenseIndex(catalog(objects=1))
-    assert calibrate_arc_rule(single, rest).min_confidence == rest.min_confidence
+    assert fit_arc_confidence(single, rest) == rest.min_confidence

@@ -28,7 +28,7 @@ def catalog(seed: int, objects: int = 4, *, ragged: bool = True) -> Views:
     return Views.concatenate(parts)
 
 
-def written_out(queries: np.ndarray, angles: list[float], views: Views, omega: float, power: float = 4.0) -> np.ndarray:
+def written_out(queries: np.ndarray, angles: list[float], views: Views, omega: float) -> np.ndarray:
     """Return A_n(j, φ), computed object by object, bin by bin, view by view."""
     total = np.zeros((len(views.object_names), BINS))
     for j in range(len(views.object_names)):
@@ -42,7 +42,7 @@ def written_out(queries: np.ndarray, angles: list[float], views: Views, omega: f
                     rotated = (b * 5 + angle - angles[0] - views.azimuth_deg[k]) % 360
                     away = max(0.0, min(rotated - left, 360 - rotated - right))
                     similar = float(tanimoto(query, views.descriptors[k])[0, 0])
-                    best = max(best, similar**power - omega * away / 360)
+                    best = max(best, similar**4 - omega * away / 360)
                 total[j, b] += best
     return total
 
@@ -51,22 +51,21 @@ def written_out(queries: np.ndarray, angles: list[float], views: Views, omega: f
 @given(
     st.integers(0, 10**6),
     st.floats(0, 8),
-    st.sampled_from([1.0, 2.5, 4.0]),
     st.lists(st.floats(-720, 720), min_size=1, max_size=3),
 )
-@example(seed=149003, omega=0.5, power=1.0, angles=[0.0])  # views at 135°, 145° and 146°, whose arc ends at 321°
+@example(seed=432, omega=0.05, angles=[0.0])  # a gap, beside which the best view is up to 270° away
 def test_support_follows_the_formula_at_every_azimuth_of_every_object(
-    seed: int, omega: float, power: float, angles: list[float]
+    seed: int, omega: float, angles: list[float]
 ) -> None:
     views = catalog(seed, objects=3)
     queries = catalog(seed + 1, ragged=False).descriptors[: len(angles)]
-    belief = belief_after(queries, angles, DenseIndex(views, omega=omega, power=power))
-    wanted = written_out(queries, angles, views, omega, power)
+    belief = belief_after(queries, angles, DenseIndex(views, omega=omega))
+    wanted = written_out(queries, angles, views, omega)
     np.testing.assert_allclose(belief.support, wanted, atol=2e-5)
     ranking = belief.ranking()
     assert ranking.object_index[0] in np.flatnonzero(wanted.max(axis=1) >= wanted.max() - 1e-4)
     mean = np.maximum(wanted.max(axis=1), 0) / len(angles)
-    np.testing.assert_allclose(np.sort(ranking.scores) ** power, np.sort(mean), atol=2e-5)
+    np.testing.assert_allclose(np.sort(ranking.scores) ** 4, np.sort(mean), atol=2e-5)
     assert belief.posterior(30.0).sum() == pytest.approx(1)
 
 
@@ -83,7 +82,7 @@ def test_no_object_that_can_lead_or_be_second_is_lost(seed: int, queries: int) -
         few = update_belief(query, angle, few, kept=1)
     assert isinstance(few, Belief)
     assert len(few.index) == 1
-    found, whole = completed(few, index, seen).ranking(), every.ranking()
+    found, whole = completed(few, index).ranking(), every.ranking()
     np.testing.assert_array_equal(found.object_index[:2], whole.object_index[:2])
     np.testing.assert_array_equal(found.scores[:2], whole.scores[:2])
     np.testing.assert_array_equal(found.pose_deg[:2], whole.pose_deg[:2])
@@ -149,8 +148,6 @@ def test_invalid_query_is_rejected() -> None:
         update_belief(query, 0.0, index, kept=0)
     with pytest.raises(ValueError, match="enroll at least one object"):
         DenseIndex(Views.empty())
-    with pytest.raises(ValueError, match=r"power is 0\.5"):
-        DenseIndex(catalog(1), power=0.5)
 
 
 def test_index_of_another_process_whitens_in_the_same_way() -> None:

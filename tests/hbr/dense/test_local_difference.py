@@ -13,8 +13,8 @@ from hbr.dense.local_difference import (
     chosen_views,
     compare_objects,
     pixel_difference,
-    poses_of,
 )
+from hbr.dense.pose import poses_of
 
 STEP_DEG = 10.0
 

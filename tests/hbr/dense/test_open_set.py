@@ -6,16 +6,15 @@ import numpy as np
 import pytest
 
 from hbr import DenseIndex, Outcome, Views
-from hbr.dense.calibration import (
+from hbr.dense.fitting import (
     FALSE_ACCEPT,
-    calibrate_stopping_rule,
     fit_open_set,
     fit_stopping_rule,
+    rule_from_searches,
     with_false_accepts,
 )
-from hbr.dense.leave_one_out import leave_one_out
+from hbr.dense.leave_one_out import STRENGTHS, ShiftedSearches, leave_one_out
 from hbr.dense.open_set import NUMBERS, OpenSetModel
-from hbr.dense.shifted_searches import STRENGTHS, ShiftedSearches
 from hbr.dense.stopping import LimitationCode, StoppingRule, StopReason
 from tests.hbr.dense.searches import belief_after
 from tests.hbr.dense.test_stopping import catalog
@@ -30,7 +29,7 @@ def index() -> DenseIndex:
 
 @pytest.fixture(scope="module")
 def plain(index: DenseIndex) -> StoppingRule:
-    return calibrate_stopping_rule(index).rule
+    return fit_stopping_rule(index).rule
 
 
 def drawn(searches: int = 500, seed: int = 0) -> ShiftedSearches:
@@ -132,7 +131,7 @@ def test_rule_states_that_twins_are_accepted_more_often_than_promised(plain: Sto
     apart, twins = catalog(4), Views.concatenate([catalog(4), renamed(catalog(4, noise=0.2))])
     for views, codes in ((apart, []), (twins, [LimitationCode.FALSE_ACCEPT_RATE])):
         searches = leave_one_out(DenseIndex(views))
-        rule = replace(fit_stopping_rule(searches), limitations=())
+        rule = replace(rule_from_searches(searches), limitations=())
         found = with_false_accepts(rule, searches)
         assert [one.code for one in found.limitations] == codes
         for one in found.limitations:

@@ -8,10 +8,9 @@ import pytest
 
 import hbr
 from hbr import Outcome, StopReason
-from hbr.dense.arc import ArcRule, ArcSession
-from hbr.dense.enrolled_views import NeedEnrolledViews, answered
+from hbr.dense.arc import ArcSession
+from hbr.dense.last_steps import NeedEnrolledViews, Verification, answered
 from hbr.dense.local_difference import LocalView
-from hbr.dense.verification import Verification
 from tests.hbr.dense.test_local_difference import shown
 from tests.hbr.dense.test_stopping import catalog
 
@@ -31,7 +30,7 @@ def session() -> hbr.DenseSession:
     own = others.of(0)
     twin = hbr.Views.of_object("twin", others.levels(own), others.azimuth_deg[own])
     index = hbr.DenseIndex(hbr.Views.concatenate([others, twin]))
-    rule = hbr.calibrate_stopping_rule(hbr.DenseIndex(others)).rule
+    rule = hbr.fit_stopping_rule(hbr.DenseIndex(others)).rule
     usual = np.vstack([rule.usual_scores, rule.usual_scores[:1]])
     session = hbr.DenseSession(index, replace(rule, usual_scores=usual), max_views=1)
     session.add(others.levels(own[:1])[0], 0.0)
@@ -80,7 +79,7 @@ def test_a_doubtful_search_in_motion_is_not_verified(session, monkeypatch) -> No
     monkeypatch.setattr("hbr.dense.session.is_doubtful", lambda *_: True)
     need = next(session.verify(lambda _: pytest.fail("first it asks")))
     assert need.object_index == session.end().object_index
-    moving = ArcSession(session.belief.index, ArcRule(session.rule, 2.0))
+    moving = ArcSession(session.belief.index, session.rule, 2.0)
     moving.add(session.belief.levels[0], 0.0)
     assert answered(moving.verify(lambda _: pytest.fail("no view is needed"))) is None
     assert moving.verification is None

@@ -8,14 +8,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hbr import Belief, DenseIndex, DenseSession, Outcome, StopReason, Views, leave_one_out, tanimoto, update_belief
-from hbr.dense.calibration import (
-    UNCALIBRATED_MIN_CONFIDENCE,
-    calibrate_stopping_rule,
+from hbr.dense.fitting import (
+    UNFITTED_MIN_CONFIDENCE,
     conformal_threshold,
     fit_stopping_rule,
     min_confidence_for,
+    rule_from_searches,
 )
-from hbr.dense.leave_one_out import Leaders, usual_scores
+from hbr.dense.open_set import Leaders, usual_scores
 from hbr.dense.stopping import LimitationCode, StoppingRule
 from tests.fuzzing import examples
 
@@ -88,10 +88,6 @@ def test_leave_one_out_searches_for_each_object_between_its_own_views() -> None:
     assert found.known.margin[0, 0] == pytest.approx(ordered[-1] - ordered[-2])
     assert found.unknown.score[0, 0] == pytest.approx(others[-1])
     assert found.unknown.margin[0, 0] == pytest.approx(others[-1] - others[-2])
-    # Views of a second session that are less similar to the enrolled ones score less.
-    other = np.maximum(views.descriptors, 1) - (views.descriptors > 0)
-    again = leave_one_out(index, beta=BETA, views=3, searches=2, seen=other.astype(np.uint8))
-    assert again.known.score.mean() < found.known.score.mean()
 
 
 def test_open_set_score_is_relative_to_the_usual_score_of_the_leader() -> None:
@@ -107,7 +103,7 @@ def test_open_set_score_is_relative_to_the_usual_score_of_the_leader() -> None:
 def test_fitted_rule_finds_enrolled_objects_and_calls_others_unknown() -> None:
     everything = catalog(40, seed=3)
     index = DenseIndex(everything.select(everything.object_index < 30))
-    rule = fit_stopping_rule(leave_one_out(index, beta=BETA), error_rate=0.05, false_reject=0.05)
+    rule = rule_from_searches(leave_one_out(index, beta=BETA), error_rate=0.05, false_reject=0.05)
     assert rule.limitations == ()
     assert rule.false_accept < 0.1
     ends = []
@@ -125,8 +121,8 @@ def test_fitted_rule_finds_enrolled_objects_and_calls_others_unknown() -> None:
 
 def test_small_catalog_guarantees_no_rate_and_reports_the_data_it_needs() -> None:
     index = DenseIndex(catalog(2))
-    rule = fit_stopping_rule(leave_one_out(index, beta=BETA), error_rate=0.01, false_reject=0.02)
-    assert rule.min_confidence == UNCALIBRATED_MIN_CONFIDENCE
+    rule = rule_from_searches(leave_one_out(index, beta=BETA), error_rate=0.01, false_reject=0.02)
+    assert rule.min_confidence == UNFITTED_MIN_CONFIDENCE
     assert np.isfinite(rule.open_set_thresholds).all()
     limits = {one.code: one.values for one in rule.limitations}
     assert limits[LimitationCode.FALSE_REJECT_RATE] == {"rate": 0.02, "searches": 8, "needed": 49, "reached": 1 / 9}
@@ -139,7 +135,7 @@ def test_small_catalog_guarantees_no_rate_and_reports_the_data_it_needs() -> Non
     ("thresholds", "min_confidence", "views", "max_views", "outcome", "reason"),
     [
         ((0.0, 0.0, 0.0), 0.5, 1, 8, Outcome.FOUND, StopReason.CONFIDENT),
-        # Before the last calibrated view, the highest threshold counts.
+        # Before the last fitted view, the highest threshold counts.
         ((0.0, 9.0, 9.0), 0.5, 1, 8, Outcome.CONTINUE, StopReason.BELOW_OPEN_SET_THRESHOLD),
         ((0.0, 9.0, 9.0), 0.5, 1, 1, Outcome.FOUND, StopReason.CONFIDENT),
         ((0.0, 9.0, 9.0), 0.5, 2, 8, Outcome.CONTINUE, StopReason.BELOW_OPEN_SET_THRESHOLD),
@@ -168,7 +164,7 @@ def test_decision_follows_the_confidence_and_the_open_set_score(
 def test_one_object_is_compared_with_its_own_views() -> None:
     views = catalog(1)
     index = DenseIndex(views)
-    rule = calibrate_stopping_rule(index).rule
+    rule = fit_stopping_rule(index).rule
     assert [one.code for one in rule.limitations] == [LimitationCode.ONE_OBJECT]
     scores = [
         update_belief(views.descriptors[i], views.azimuth_deg[i], index.without(np.array([i]))).scores()[0]
@@ -194,5 +190,3 @@ def test_leave_one_out_rejects_catalogs_without_enough_views() -> None:
         leave_one_out(DenseIndex(catalog(1)), beta=BETA)
     with pytest.raises(ValueError, match="no object has 19 views"):
         leave_one_out(DenseIndex(catalog(2)), beta=BETA, views=19)
-    with pytest.raises(ValueError, match="seen has shape"):
-        leave_one_out(DenseIndex(catalog(2)), beta=BETA, seen=np.zeros((3, 144), np.uint8))

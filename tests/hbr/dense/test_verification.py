@@ -7,22 +7,21 @@ import cv2
 import numpy as np
 import pytest
 
-from hbr import Belief, DenseIndex, Outcome, StopDecision, StopReason, Views, update_belief
-from hbr.dense.calibration import calibrate_stopping_rule
-from hbr.dense.enrolled_views import answered
-from hbr.dense.local_difference import LocalView
-from hbr.dense.open_set import fitted_before
-from hbr.dense.pixel_fit import Pixels, fit
-from hbr.dense.stopping import StoppingRule
-from hbr.dense.verification import (
+from hbr import Belief, DenseIndex, DenseSession, Outcome, StopDecision, StopReason, Views, update_belief
+from hbr.dense.fitting import fit_stopping_rule
+from hbr.dense.last_steps import (
     FOUND_FROM,
     FOUND_FROM_SAME_BENCH,
     UNKNOWN_BELOW,
     Verification,
-    found_from,
+    answered,
     is_doubtful,
     verify,
 )
+from hbr.dense.local_difference import LocalView
+from hbr.dense.open_set import fitted_before
+from hbr.dense.pixel_fit import Pixels, fit
+from hbr.dense.stopping import StoppingRule
 from tests.hbr.dense.test_stopping import catalog
 
 KIND = "edges+colours"
@@ -86,9 +85,12 @@ def test_outcome_follows_from_fit_and_open_set_score(fitted: float, confidence: 
 
 
 @pytest.mark.parametrize("fitted", [0.5, 0.8])
-def test_object_on_an_unchanged_bench_needs_a_better_fit(fitted: float) -> None:
-    assert found_from(True) == FOUND_FROM_SAME_BENCH > FOUND_FROM
-    assert found_from(None) == found_from(False) == FOUND_FROM
+def test_object_on_an_unchanged_bench_needs_a_better_fit(index: DenseIndex, rule: StoppingRule, fitted: float) -> None:
+    for same_bench, least in ((True, FOUND_FROM_SAME_BENCH), (None, FOUND_FROM), (False, FOUND_FROM)):
+        session = DenseSession(index, rule)
+        session.add(index.views.descriptors[0], 0.0, same_bench=same_bench)
+        assert session.found_from == least
+    assert FOUND_FROM_SAME_BENCH > FOUND_FROM
     found = Verification(0, fitted, fitted - 0.2)
     assert found.decided(decision(0.0)).outcome is Outcome.FOUND
     strict = found.decided(decision(0.0), FOUND_FROM_SAME_BENCH).outcome
@@ -102,7 +104,7 @@ def index() -> DenseIndex:
 
 @pytest.fixture(scope="module")
 def rule(index: DenseIndex) -> StoppingRule:
-    plain = calibrate_stopping_rule(index).rule
+    plain = fit_stopping_rule(index).rule
     return replace(plain, open_set=fitted_before(KIND, 4), open_set_thresholds=(3.0, 3.0, 3.0, -1.0))
 
 

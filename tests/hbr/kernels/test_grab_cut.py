@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from hbr.evaluation.changed_bench import HARD, Bench, Visit
 from hbr.kernels import library, without_library
-from hbr.kernels.grab_cut import grab_cut
+from hbr.kernels.images import grab_cut
 from hbr.segmentation.background import shrunk
 from hbr.segmentation.guess import guess_object
 from tests.fuzzing import examples

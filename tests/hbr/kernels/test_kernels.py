@@ -142,13 +142,12 @@ def test_paper_search_is_the_same_with_and_without_kernels(count: int, more: int
     alike=st.booleans(),
     step_deg=st.sampled_from([0.0, 2.5, 5.0, 90.0]),
     omega=st.sampled_from([0.0, 0.5, 2.0, 10.0]),
-    power=st.sampled_from([1.0, 2.5, 4.0]),
     rotation_deg=st.one_of(st.floats(-720, 720), st.sampled_from([0.0, -90.0, 2.5, 2.5 + 1e-12])),
     seed=seeds,
 )
-@example(counts=[72] * 6, alike=True, step_deg=5.0, omega=2.0, power=4.0, rotation_deg=2.5 + 1e-12, seed=0)
+@example(counts=[72] * 6, alike=True, step_deg=5.0, omega=2.0, rotation_deg=2.5 + 1e-12, seed=0)
 def test_support_has_the_bits_of_the_reference(
-    counts: list[int], alike: bool, step_deg: float, omega: float, power: float, rotation_deg: float, seed: int
+    counts: list[int], alike: bool, step_deg: float, omega: float, rotation_deg: float, seed: int
 ) -> None:
     rng = np.random.default_rng(seed)
     counts = counts[:1] * len(counts) if alike else counts
@@ -163,7 +162,7 @@ def test_support_has_the_bits_of_the_reference(
         objects = rng.permutation(objects)
     levels = np.zeros((total, 512), np.uint8)
     index = DenseIndex(
-        hbr.Views(levels, azimuth_deg, objects, tuple(map(str, range(len(counts)))), "edges"), omega=omega, power=power
+        hbr.Views(levels, azimuth_deg, objects, tuple(map(str, range(len(counts)))), "edges"), omega=omega
     )
     similar = rng.uniform(-0.1, 1, total)
     with without_library():

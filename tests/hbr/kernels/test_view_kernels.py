@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hbr import Background, descriptor, segment
-from hbr.kernels import components, library, view, without_library
+from hbr.kernels import images, library, without_library
 from hbr.segmentation.background import shrunk
 from hbr.segmentation.cut_out import CROP_PX
 from hbr.segmentation.silhouette import _cleaned as cleaned
@@ -55,7 +55,7 @@ def test_frames_are_shrunk_as_by_opencv(seed: int, factor: int, height: int, eve
 def test_squares_are_averaged_as_by_opencv(seed: int, size: int, left: int) -> None:
     part = picture(np.random.default_rng(seed), size, size + 40)[:, left : left + size]
     expected = cv2.resize(part, (CROP_PX, CROP_PX), interpolation=cv2.INTER_AREA)
-    np.testing.assert_array_equal(view.average(part, CROP_PX), expected)
+    np.testing.assert_array_equal(images.average(part, CROP_PX), expected)
 
 
 @compiled
@@ -108,9 +108,9 @@ def test_parts_of_a_mask_are_those_of_opencv(seed: int, height: int, width: int,
     for least, of_border, part in ((1, 0.6, 0.08), (4, 1.5, 0.5)):
         labels = cv2.connectedComponents(mask)[1]
         for framed in (False, True):
-            found = components.largest_parts(mask, framed, 5, least, of_border, part)
+            found = images.largest_parts(mask, framed, 5, least, of_border, part)
             np.testing.assert_array_equal(found, largest(labels, framed, 5, least, of_border, part))
-        found = components.likely_parts(mask, prior, 3, part, 0.35)
+        found = images.likely_parts(mask, prior, 3, part, 0.35)
         np.testing.assert_array_equal(found, likely(labels, prior, 3, part, 0.35))
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import hbr
-from hbr.dense.shifted_searches import can_shift
+from hbr.dense.leave_one_out import can_shift
 from hbr.dense.whitening import Whitening
 from hbr.descriptors.shift import Shift
 from hbr.descriptors.together import like_enrollment
@@ -122,7 +122,7 @@ def test_no_answer_on_a_guessed_view_while_another_one_is_possible() -> None:
     views = hbr.ViewsTogether("edges+colours")
     views.add(images[0])
     index = hbr.DenseIndex(hbr.Views(views.levels[0][:1], np.zeros(1), np.zeros(1, np.intp), ("a",), "edges+colours"))
-    rule = hbr.calibrate_stopping_rule(index).rule
+    rule = hbr.fit_stopping_rule(index).rule
     session = hbr.DenseSession(index, rule)
     decision = session.add(views.levels[0], 0.0, reliable=views.reliable)
     assert (decision.outcome, decision.reason) == (hbr.Outcome.CONTINUE, hbr.StopReason.BADLY_SEGMENTED)
@@ -144,11 +144,11 @@ def test_whitening_without_an_object_is_that_of_the_other_views() -> None:
     levels = rng.integers(0, 4, (60, 512), dtype=np.uint8)
     index = hbr.DenseIndex(hbr.Views(levels, np.arange(60) * 60.0 % 360, np.repeat(np.arange(10), 6), NAMES, "edges"))
     left_out = index.whitening.without(np.arange(6))
-    found = left_out.unit(index.whitening.white(levels[6:]))
+    found = left_out(index.whitening.white(levels[6:]))
     expected = Whitening(index.views.select(np.arange(6, 60))).unit(levels[6:])
     np.testing.assert_allclose(found @ found.T, expected @ expected.T, atol=0.03)
     with_it = index.whitening.unit(levels[:6])
-    own = left_out.unit(index.whitening.white(levels[:6]))
+    own = left_out(index.whitening.white(levels[:6]))
     gain = own @ found.T - with_it @ index.whitening.unit(levels[6:]).T
     assert np.abs(gain).max() > 0.003  # an unknown object is compared differently
 

@@ -28,7 +28,7 @@ os.setuid({uid})
 RIG = "from rig.cli.main import main\nmain()\n"
 IMPORTED = (
     *("rig.bench.hardware", "rig.catalog", "rig.catalog.results", "rig.cli.main", "rig.cli.ui.live"),
-    *("rig.cli.ui.operator_prompts", "rig.cli.ui.present", "rig.doctor.checks", "rig.doctor.device_scan"),
+    *("rig.cli.ui.prompts", "rig.cli.ui.present", "rig.doctor.checks", "rig.doctor.device_scan"),
     *("rig.doctor.single_servo", "rig.motion.stop_request", "rig.plans.enroll", "rig.plans.identify"),
     *("rig.plans.photograph_table", "rig.plans.record", "rig.plans.similar_objects", "rig.plans.tray"),
     *("rig.plans.watch", "rig.report.contact_sheet", "rig.search.current_model", "dynamixel_easy_sdk"),

@@ -24,7 +24,8 @@ def commands(group: object, words: tuple[str, ...] = ()) -> Iterator[tuple[str, 
         yield words
         return
     for name, command in inner.items():
-        yield from commands(command, (*words, name))
+        if not command.hidden:  # a second name of another command
+            yield from commands(command, (*words, name))
 
 
 COMMANDS = sorted(commands(typer.main.get_command(app)))

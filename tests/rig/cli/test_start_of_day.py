@@ -9,7 +9,7 @@ from typing import Any
 import cv2
 import pytest
 
-from rig.bench import ObjectAlreadyPlaced, open_bench
+from rig.bench import open_bench
 from rig.catalog import Catalog
 from rig.cli.ui.desk import CommandDesk
 from rig.cli.ui.settings import Settings
@@ -110,13 +110,13 @@ def asked(
     ) -> tuple[Any, str]:
         s = simulated()
         s.operator.place("toy-car")
-        s.bench.operator = ObjectAlreadyPlaced()
+        s.bench.placer = None
         if isinstance(answers, Answers) and not stays:
             times = iter(range(99))
             answers._asked = lambda: s.world.put(None) if next(times) == 1 else None  # forgotten the first time
         monkeypatch.setattr("sys.stdin", answers)
         desk = CommandDesk(Settings(json=as_json))
-        desk.run(refresh_table_image(desk, s.bench, s.bench.operator, ask=ask, then="toy-car"))
+        desk.run(refresh_table_image(desk, s.bench, s.bench.placer, ask=ask, then="toy-car"))
         return empty_table_status(s.bench).table, capsys.readouterr().err
 
     return run

@@ -57,7 +57,7 @@ def flying(
 
 def true_errors(events: list[Event], bench: Bench, world: World) -> np.ndarray[Any, Any]:
     """Return the errors of the angles of views in motion that the world still remembers."""
-    times, found = bench.operator.devices.camera.times, []  # type: ignore[attr-defined]
+    times, found = bench.placer.devices.camera.times, []  # type: ignore[attr-defined]
     for event in events:
         if isinstance(event, Accepted) and (motion := event.evidence.motion) is not None:
             middle_ns = event.evidence.exposed_ns - times.offset_ns + times.readout_ns // 2 + 5_000_000
@@ -133,7 +133,7 @@ def outcome(tmp_path: Path, *faults: str) -> tuple[RigError | None, list[Event],
                 worst = max([worst, *np.abs(true_errors([event], bench, world))])
         except RigError as failure:
             error = failure
-        happened = {one.fault.kind.name for one in bench.operator.faults.history}  # type: ignore[attr-defined]
+        happened = {one.fault.kind.name for one in bench.placer.faults.history}  # type: ignore[attr-defined]
         assert happened == {Fault.parse(one).kind.name for one in faults}
         if "unplug" not in happened:
             assert not bench.servo.read_condition().torque

@@ -3,7 +3,6 @@
 import pytest
 
 import hbr
-from rig.bench import ObjectAlreadyPlaced
 from rig.catalog import Catalog
 from rig.core.errors import NoObject
 from rig.events.events import Accepted, Failed, Identified, Ranked, ScanStarted, Started, Waiting
@@ -49,7 +48,7 @@ def bench(world):
     """A bench with a calibrated camera time and an empty-table image. Its operator puts no object on the table."""
     with open_sim_bench(camera_time(world, *SMALL), ShelfOperator(world, shelf())) as bench:
         list(photograph_table(bench))
-        bench.operator = ObjectAlreadyPlaced()
+        bench.placer = None
         yield bench
 
 
@@ -85,7 +84,7 @@ def test_empty_table_is_noticed_by_the_image_of_the_enrollment(bench, model, wor
 
 def test_without_an_empty_table_image_an_empty_table_is_unknown(simulated, models):
     s = simulated()
-    s.bench.operator = ObjectAlreadyPlaced()
+    s.bench.placer = None
     *_, answer = identify(s.bench, models[1])
     assert answer.outcome is hbr.Outcome.UNKNOWN
 
@@ -142,6 +141,6 @@ def test_object_is_on_the_table_when_the_search_starts(bench, model, world):
         def place(self, name):
             world.put(shelf()["toy-car"])
 
-    bench.operator = Comes()
+    bench.placer = Comes()
     assert isinstance(next(identify(bench, model)), Started)
     assert world.scene.object is shelf()["toy-car"]

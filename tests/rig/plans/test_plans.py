@@ -66,7 +66,7 @@ def test_enrollment_stores_every_view_at_the_angle_it_was_taken(simulated, catal
 
 def test_unlocked_exposure_of_the_camera_is_a_note(simulated, catalog):
     s = simulated("camera.exposure_us=none")
-    s.bench.operator.place("dice")
+    s.bench.placer.place("dice")
     with pytest.raises(ViewRejected) as rejected:
         for _ in enroll(s.bench, catalog, "dice", views=4):
             s.world.change(light=(0.4, 0.4, 0.4))

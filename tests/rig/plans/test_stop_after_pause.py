@@ -64,7 +64,7 @@ def test_stop_after_a_pause(
     limits = f"table.limits_deg=[{BUDGET_DEG[0]}, {BUDGET_DEG[1]}]"
     store = FileStore(tmp_path / "state")
     with flying(tmp_path, *FAST, limits, state=store, camera_readout_ms=0.0) as (bench, catalog, world):
-        operator = bench.operator
+        operator = bench.placer
         assert isinstance(operator, ShelfOperator)
         assert operator.devices is not None
         memory, clock = operator.devices.servo.memory, world.clock

@@ -5,18 +5,19 @@ import os
 import signal
 import subprocess
 import sys
-from contextlib import suppress
+from contextlib import closing, suppress
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rig.bench import open_bench
 from rig.config import load_config
 from rig.core.clock import SystemClock
 from rig.core.errors import BenchBusy, Stalled, StateNotStored
 from rig.core.next_steps import Do
 from rig.safety.bench_lock import BenchLock, holder
-from rig.safety.saved_state import LATCH_BYTES, BenchState, FileStore, Holder, LatchedFault, SavedTable
+from rig.safety.saved_state import LATCH_BYTES, SESSION, BenchState, FileStore, Holder, LatchedFault, SavedTable
 from sim import disk
 from tests.fuzzing import fuzz_settings
 
@@ -272,3 +273,17 @@ def test_each_bench_has_its_own_folder(tmp_path, monkeypatch):
     (tmp_path / "rig.toml").write_text('state_dir = "here"\n')
     assert load_config().state_path("sim") == tmp_path / "here" / "sim"
     assert json.loads(load_config().model_dump_json())["state_dir"] == str(tmp_path / "here")
+
+
+@pytest.mark.parametrize(("error", "ended"), [(ValueError, "failed"), (KeyboardInterrupt, "interrupted")])
+def test_error_of_the_one_who_shows_a_job_is_how_its_session_ended(tmp_path, error, ended):
+    config = load_config(None, [f"state_dir={tmp_path}"])
+
+    def job():
+        with open_bench("sim", config):
+            yield "a step"
+
+    with pytest.raises(error), closing(job()) as steps:
+        for step in steps:
+            raise error(step)
+    assert json.loads((config.state_path("sim") / SESSION).read_text())["ended"] == ended

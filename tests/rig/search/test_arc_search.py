@@ -111,7 +111,7 @@ def test_stop_in_an_arc_after_a_pause_switches_the_torque_off_before_anything_el
     frames: list[FrameUsed] = []
     late_events: list[bool] = []
     with moving(world, "table.limits_deg=[-30, 30]", "table.mode=pan") as bench:
-        operator = bench.operator
+        operator = bench.placer
         assert isinstance(operator, ShelfOperator)
         assert operator.devices is not None
         servo, store = operator.devices.servo, operator.state
@@ -162,7 +162,7 @@ def test_guessed_view_does_not_end_the_search(model: Model, monkeypatch: pytest.
     for reliable in (True, False):
         monkeypatch.setattr(hbr.ViewsTogether, "reliable", property(lambda _, now=reliable: now))
         with moving(World(seed=2)) as bench:
-            bench.operator.next_object = "can-peach"  # type: ignore[attr-defined]
+            bench.placer.next_object = "can-peach"  # type: ignore[attr-defined]
             events = identify(bench, model)
             first = next(event for event in events if isinstance(event, Ranked))
             events.close()
@@ -174,7 +174,7 @@ def test_guessed_view_does_not_end_the_search(model: Model, monkeypatch: pytest.
 @pytest.mark.nightly
 def test_unknown_object_is_recognised_within_the_arc(model: Model) -> None:
     with moving(World(seed=3)) as bench:
-        bench.operator.next_object = "jar-honey"  # type: ignore[attr-defined]
+        bench.placer.next_object = "jar-honey"  # type: ignore[attr-defined]
         *_, answer = identify(bench, model)
     assert isinstance(answer, Identified)
     assert answer.outcome is hbr.Outcome.UNKNOWN
@@ -196,7 +196,7 @@ def test_table_continues_to_rotate_while_the_camera_delivers_nothing(model: Mode
     """Frames of the same arc end the search, or a view at rest where the arc has ended."""
     with moving(World(seed=2), faults=(fault,)) as bench:
         *events, answer = identify(bench, model)
-        assert bench.operator.faults.history  # type: ignore[attr-defined]
+        assert bench.placer.faults.history  # type: ignore[attr-defined]
         assert not bench.servo.read_condition().torque
     assert isinstance(answer, Identified)
     assert answer.name == "bottle-harvest"
@@ -216,13 +216,13 @@ FAULTS = (
 def test_faulty_frames_are_no_evidence(model: Model, faults: tuple[str, ...]) -> None:
     world = World(seed=2)
     with moving(world, faults=faults) as bench:
-        times = bench.operator.devices.camera.times  # type: ignore[attr-defined]
+        times = bench.placer.devices.camera.times  # type: ignore[attr-defined]
         with suppress(RigError):
             for event in identify(bench, model):
                 if isinstance(event, Accepted) and (motion := event.evidence.motion) is not None:
                     middle_ns = event.evidence.exposed_ns - times.offset_ns + times.readout_ns // 2 + 5_000_000
                     assert abs(motion.angle_deg - world.table_deg(middle_ns) - 0.125) < 0.6
         assert not bench.servo.read_condition().torque
-        assert {one.fault.kind.name for one in bench.operator.faults.history} == {  # type: ignore[attr-defined]
+        assert {one.fault.kind.name for one in bench.placer.faults.history} == {  # type: ignore[attr-defined]
             Fault.parse(one).kind.name for one in faults
         }

@@ -1,4 +1,4 @@
-"""The stopping rule of a catalog: calibrated, stored beside it, and renewed when the catalog changes."""
+"""The stopping rule of a catalog: fitted, stored beside it, and renewed when the catalog changes."""
 
 import json
 from dataclasses import replace
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import hbr
-from hbr.dense.calibration import UNCALIBRATED_MIN_CONFIDENCE
+from hbr.dense.fitting import UNFITTED_MIN_CONFIDENCE
 from hbr.dense.leave_one_out import leave_one_out
 from hbr.dense.stopping import LimitationCode
 from rig.catalog import Catalog
@@ -72,7 +72,7 @@ def codes(rule: hbr.StoppingRule) -> list[LimitationCode]:
 
 
 def test_enough_searches_guarantee_the_rates():
-    found = hbr.calibrate_stopping_rule(shelf(*[18] * 12))
+    found = hbr.fit_stopping_rule(shelf(*[18] * 12))
     assert found.rule.limitations == ()
     assert found.rule.searches >= 100
     assert (found.wrong + 1) / (found.ended + 1) <= 0.01
@@ -94,9 +94,9 @@ def test_enough_searches_guarantee_the_rates():
 )
 def test_little_data_guarantees_nothing_and_still_finds_objects(counts, code):
     index = shelf(*counts)
-    rule = hbr.calibrate_stopping_rule(index).rule
+    rule = hbr.fit_stopping_rule(index).rule
     assert code in codes(rule)
-    assert rule.min_confidence == UNCALIBRATED_MIN_CONFIDENCE
+    assert rule.min_confidence == UNFITTED_MIN_CONFIDENCE
     for j, count in enumerate(counts):
         assert search_for(index, rule, views_of(f"object {j}", count, seed=j))[0] == f"object {j}"
     name, taken = search_for(index, rule, views_of("unknown", 24, seed=99))
@@ -105,7 +105,7 @@ def test_little_data_guarantees_nothing_and_still_finds_objects(counts, code):
     assert taken <= 8
 
 
-def test_quick_calibration_of_a_large_catalog_searches_for_a_sample():
+def test_quick_fit_of_a_large_catalog_searches_for_a_sample():
     rule = quick_stopping_rule(shelf(*[3] * 400))
     assert rule.searches < 400
     assert rule.limitations[0].code is LimitationCode.SAMPLED
@@ -126,21 +126,21 @@ def test_similar_objects_prevent_an_error_rate():
             KIND.name,
         )
     )
-    rule = hbr.calibrate_stopping_rule(index).rule
-    assert rule.min_confidence == UNCALIBRATED_MIN_CONFIDENCE
+    rule = hbr.fit_stopping_rule(index).rule
+    assert rule.min_confidence == UNFITTED_MIN_CONFIDENCE
     assert LimitationCode.SIMILAR_OBJECTS in codes(rule)
 
 
 def test_confused_objects_are_named():
     twins = [views_of("one", 18, seed=1), views_of("two", 18, seed=1, changing=0.45), views_of("three", 18, seed=2)]
-    found = hbr.calibrate_stopping_rule(hbr.DenseIndex(hbr.Views.concatenate([*twins, views_of("four", 18, seed=3)])))
+    found = hbr.fit_stopping_rule(hbr.DenseIndex(hbr.Views.concatenate([*twins, views_of("four", 18, seed=3)])))
     assert set(found.confused) <= {("one", "two"), ("two", "one")}
     # also if another object scores more than the searched one, which is the likeliest by its probability
     searches = leave_one_out(hbr.DenseIndex(hbr.Views.concatenate(twins)))
     leading = replace(searches.known, object_index=searches.unknown.object_index)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("hbr.dense.calibration.leave_one_out", lambda *_, **__: replace(searches, known=leading))
-        again = hbr.calibrate_stopping_rule(hbr.DenseIndex(hbr.Views.concatenate(twins)), false_reject=0.4)
+        patch.setattr("hbr.dense.fitting.leave_one_out", lambda *_, **__: replace(searches, known=leading))
+        again = hbr.fit_stopping_rule(hbr.DenseIndex(hbr.Views.concatenate(twins)), false_reject=0.4)
     assert again.confused
     assert all(one != other for one, other in again.confused)
     assert bool(found.confused) == bool(found.accepted)
@@ -156,7 +156,7 @@ def same(one: hbr.StoppingRule, other: hbr.StoppingRule) -> bool:
 def test_stored_rules_are_read_as_they_were_written(tmp_path):
     for number, counts in enumerate(([8], [8, 8], [18] * 6)):
         index = shelf(*counts)
-        rule = hbr.calibrate_stopping_rule(index).rule
+        rule = hbr.fit_stopping_rule(index).rule
         folder = tmp_path / str(number)
         folder.mkdir()
         assert read_stopping_rule(folder) is None
@@ -167,9 +167,9 @@ def test_stored_rules_are_read_as_they_were_written(tmp_path):
         assert same(stored.adapted(index.views), rule)
 
 
-def test_rule_of_another_version_or_without_a_value_is_calibrated_again(tmp_path):
+def test_rule_of_another_version_or_without_a_value_is_fitted_again(tmp_path):
     index = shelf(8, 8, 8)
-    write_stopping_rule(tmp_path / FILE, hbr.calibrate_stopping_rule(index).rule, index, made_utc=NOW)
+    write_stopping_rule(tmp_path / FILE, hbr.fit_stopping_rule(index).rule, index, made_utc=NOW)
     values = json.loads((tmp_path / FILE).read_text())
     assert read_stopping_rule(tmp_path) is not None
     for changed, reason in (
@@ -197,13 +197,13 @@ def test_damaged_rule_is_reported_and_not_used(tmp_path, content):
     assert notes[0].code is NoteCode.STOPPING_RULE_UNREADABLE
 
 
-def test_rule_of_a_changed_catalog_is_calibrated_again_or_used_with_a_note(tmp_path, monkeypatch):
+def test_rule_of_a_changed_catalog_is_fitted_again_or_used_with_a_note(tmp_path, monkeypatch):
     before, after = shelf(*[18] * 8), shelf(*[18] * 9)
-    stored = hbr.calibrate_stopping_rule(before, error_rate=0.05, false_reject=0.1).rule
+    stored = hbr.fit_stopping_rule(before, error_rate=0.05, false_reject=0.1).rule
     write_stopping_rule(tmp_path / FILE, stored, before, made_utc=NOW)
     rule, notes = stopping_rule_of(tmp_path, before)
     assert (rule.open_set_thresholds, notes) == (stored.open_set_thresholds, ())
-    # A small catalog is calibrated again, for the rates that were asked for.
+    # A small catalog gets a new rule, for the rates that were asked for.
     renewed, _ = stopping_rule_of(tmp_path, after)
     assert (renewed.error_rate, renewed.false_reject) == (0.05, 0.1)
     assert renewed.usual_scores.shape[0] == 9
@@ -228,7 +228,7 @@ def test_digest_changes_with_everything_that_the_rule_depends_on():
     views = index.views
     moved = hbr.Views(views.descriptors, views.azimuth_deg + 1, views.object_index, views.object_names, KIND.name)
     renamed = hbr.Views(views.descriptors, views.azimuth_deg, views.object_index, ("a", "b"), KIND.name)
-    others = [hbr.DenseIndex(moved), hbr.DenseIndex(renamed), hbr.DenseIndex(views, power=1.0), shelf(8, 9)]
+    others = [hbr.DenseIndex(moved), hbr.DenseIndex(renamed), hbr.DenseIndex(views, omega=1.0), shelf(8, 9)]
     assert len({digest(one) for one in (index, *others)}) == 5
     assert digest(shelf(8, 8)) == digest(index)
 
@@ -261,7 +261,7 @@ class Around:
 
 def test_custom_strategy_decides_on_the_dense_search():
     index = shelf(12, 12, 12)
-    model = DenseModel(index, hbr.calibrate_stopping_rule(index).rule)
+    model = DenseModel(index, hbr.fit_stopping_rule(index).rule)
     search = begin_search(model, RigConfig(), Around())
     assert search.strategy.name == "around"
     for number in range(3):
@@ -274,7 +274,7 @@ def test_custom_strategy_decides_on_the_dense_search():
 def test_strategy_that_does_not_fit_the_model_is_rejected():
     index = shelf(8, 8)
     dense, papers = (
-        DenseModel(index, hbr.calibrate_stopping_rule(index).rule),
+        DenseModel(index, hbr.fit_stopping_rule(index).rule),
         model_of(hbr.Views.of_object("a", *_cedd())),
     )
     for model, name in ((dense, "ahbr"), (papers, "dense"), (papers, Around())):
@@ -294,15 +294,15 @@ def _cedd() -> tuple[np.ndarray, np.ndarray]:
 def test_search_ends_if_the_cable_allows_no_rotation():
     index = shelf(8, 8, 8)
     config = RigConfig.model_validate({"table": {"mode": "pan", "limits_deg": [-1, 1]}})
-    search = begin_search(DenseModel(index, hbr.calibrate_stopping_rule(index).rule), config)
+    search = begin_search(DenseModel(index, hbr.fit_stopping_rule(index).rule), config)
     unknown = views_of("unknown", 8, seed=5)
     _, step = search.add(seen(unknown.descriptors[0]), 0.0, table_deg=0.0)
     assert step == Finish(hbr.StopReason.NO_ROTATION_LEFT)
 
 
-def test_unknown_objects_end_after_the_calibrated_views():
+def test_unknown_objects_end_after_the_fitted_views():
     index = shelf(*[18] * 8)
-    rule = hbr.calibrate_stopping_rule(index).rule
+    rule = hbr.fit_stopping_rule(index).rule
     assert len(rule.open_set_thresholds) == 4
     assert search_for(index, rule, views_of("unknown", 18, seed=77), max_views=8) == (None, 4)
     assert search_for(index, rule, views_of("unknown", 18, seed=77), max_views=2) == (None, 2)
@@ -345,7 +345,7 @@ def sim_catalog_of_both(tmp_path, simulated):
 
 def test_stored_rules_are_readable_json(tmp_path):
     index = shelf(8, 8, 8)
-    write_stopping_rule(tmp_path / FILE, hbr.calibrate_stopping_rule(index).rule, index, made_utc=NOW)
+    write_stopping_rule(tmp_path / FILE, hbr.fit_stopping_rule(index).rule, index, made_utc=NOW)
     values = json.loads((tmp_path / FILE).read_text(encoding="utf-8"))
     assert values["model"]["objects"] == 3
     assert list(values["usual_scores"]) == ["object 0", "object 1", "object 2"]

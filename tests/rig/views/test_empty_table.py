@@ -185,10 +185,10 @@ def test_date_in_the_future_is_reported(simulated: Open) -> None:
 
 def test_watching_bench_takes_the_image_before_the_first_object(simulated: Open) -> None:
     s = simulated()
-    s.bench.operator = TableWatcher(s.bench)
+    s.bench.placer = TableWatcher(s.bench)
     assert photographed(s.bench).turning_share == 0
     s.world.clock.call_at(s.world.clock.now_ns() + 2_000_000_000, lambda: s.world.put(shelf()["toy-car"]))
-    s.bench.operator.place(None)
+    s.bench.placer.place(None)
     with pytest.raises(UsageError, match="cannot be taken away"):
         photographed(s.bench)
 

@@ -131,7 +131,7 @@ def test_watch_identifies_objects_and_continues_after_a_failure(simulated, tmp_p
             list(enroll(s.bench, catalog, name, views=6))
         index = model_of(catalog.views().views)
     s.world.put(None)
-    s.bench.operator = TableWatcher(s.bench)
+    s.bench.placer = TableWatcher(s.bench)
     upcoming = [("toy-car", 30.0), ("radio", 0.0), ("book-night", 200.0)]
     answers = []
     for event in watch(s.bench, lambda: identify(s.bench, index)):

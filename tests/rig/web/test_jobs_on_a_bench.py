@@ -123,6 +123,26 @@ def stops_of(served: Served, number: int) -> list[dict[str, Any]]:
         SystemClock().sleep(0.005)
 
 
+def test_job_that_meets_an_interrupted_enrollment_offers_to_continue_it(serve):
+    served = serve()
+    worker = served.side.worker
+    publish = worker.publish
+
+    def published(kind: str, data: Any) -> None:
+        publish(kind, data)
+        if kind == "plan" and data.get("picture") == 1:
+            assert served.client.post(f"/api/v1/jobs/{data['job']}/cancel").status_code == 200
+
+    worker.publish = published
+    assert served.run(kind="enroll", name="lamp", views=4)["state"] == "cancelled"
+    worker.publish = publish
+    job = served.run(kind="enroll", name="lamp", views=4)
+    assert (job["state"], job["views"], job["error"]["code"]) == ("failed", 0, 700)
+    assert job["command"] == "rig enroll lamp --resume --bench sim"
+    done = served.run(**job["resume"])
+    assert (done["state"], done["views"]) == ("done", 2)
+
+
 def test_fault_is_latched_shown_and_acknowledged(serve):
     served = serve("bench.sim.faults=['jam@move0+9s']")
     job = served.run(kind="goto", angle_deg=180)

@@ -93,7 +93,7 @@ def test_catalog_is_edited_and_every_change_is_logged(two: Rig) -> None:
 
 @pytest.mark.parametrize(("answer", "left"), [("n\n", ["mug", "tin"]), ("y\n", ["tin"])])
 def test_delete_asks_for_confirmation(two: Rig, monkeypatch: pytest.MonkeyPatch, answer: str, left: list[str]) -> None:
-    monkeypatch.setattr("rig.cli.ui.jobs.is_interactive", lambda: True)
+    monkeypatch.setattr("rig.cli.ui.prompts.is_interactive", lambda: True)
     done = CliRunner().invoke(app, ["catalog", "delete", "mug"], input=answer)
     assert "Delete mug with 4 views?" in done.output
     assert done.exit_code == (0 if answer == "y\n" else 1)

@@ -59,30 +59,30 @@ def test_interrupted_redescription_continues(two: Rig, monkeypatch: pytest.Monke
     assert not list(Path("catalog").glob("*.unfinished*"))
 
 
-def test_interrupted_calibration_continues_to_the_same_rule(two: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_interrupted_fit_continues_to_the_same_rule(two: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     assert two("catalog", "redescribe", "--descriptor", "edges+colours").exit_code == 0
     rule = Path("catalog/search_rules.json")
-    assert two("catalog", "calibrate").exit_code == 0
+    assert two("catalog", "fit").exit_code == 0
     expected = json.loads(rule.read_text())
     rule.unlink()
     with monkeypatch.context() as patch:
         interrupt(patch, "rig.core.processes", 1)
-        stopped = two("catalog", "calibrate")
+        stopped = two("catalog", "fit")
     assert stopped.exit_code == 130
     assert "Interrupted; the searches so far are stored. The same command continues." in stopped.stderr
     assert not rule.exists()
-    unfinished = Path("catalog/calibrate.unfinished")
+    unfinished = Path("catalog/fit.unfinished")
     kept = unfinished.read_text()
     seen = interrupt(monkeypatch, "rig.core.processes", 99)
-    assert two("catalog", "calibrate").exit_code == 0
+    assert two("catalog", "fit").exit_code == 0
     assert len(seen) == 1, "the search for the other object"
     for changed in (
-        kept.replace("0x1", "x"),
+        kept.replace("1.0", '"x"'),
         kept.replace("[[[", "[["),
         kept.partition("\n")[0] + '\n["(0, 0.0)", 5]\n',
     ):
         unfinished.write_text(changed)
-        assert two("catalog", "calibrate").exit_code == 0
+        assert two("catalog", "fit").exit_code == 0
     assert len(seen) == 7, "both searches again"
     assert {**json.loads(rule.read_text()), "made_utc": None} == {**expected, "made_utc": None}
     assert not list(Path("catalog").glob("*.unfinished*"))

@@ -6,7 +6,6 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from rig.bench import ObjectAlreadyPlaced
 from rig.cli.main import app
 from sim.bench import SimBenchKind
 
@@ -71,8 +70,8 @@ def with_operator(monkeypatch):
 
     def open_without(self, config, options, seed):
         bench = really(self, config, options, seed)
-        opened.append(bench.operator.world)
-        bench.operator = ObjectAlreadyPlaced()
+        opened.append(bench.placer.world)
+        bench.placer = None
         return bench
 
     monkeypatch.setattr(SimBenchKind, "open", open_without)

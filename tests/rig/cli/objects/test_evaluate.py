@@ -277,10 +277,10 @@ def test_left_out_objects_are_searched_for(photographs: Path, tmp_path: Path) ->
     found = json.loads((out / "unknown_objects.json").read_text())
     rows = found["unknown_objects"]
     assert {row["unknown_trials"] for row in rows} == {30}
-    # Calibrated rules are measured with all trials, others with the third that they do not come from.
-    assert {(row["calibrated"], row["known_trials"]) for row in rows} == {(False, 10), (True, 30)}
+    # Fitted rules are measured with all trials, others with the third that they do not come from.
+    assert {(row["fitted"], row["known_trials"]) for row in rows} == {(False, 10), (True, 30)}
     # With two trials for thresholds, no object is called unknown.
-    by_trials = [row for row in rows if not row["calibrated"]]
+    by_trials = [row for row in rows if not row["fitted"]]
     assert all(row["false_rejects"] == 0 and row["false_accepts"] == 30 for row in by_trials)
     assert run(photographs, *options[:4], "--leave-out", "3", "--jobs", "1", "--out", out).exit_code == 2
 

@@ -135,21 +135,21 @@ def test_dense_is_the_default_strategy(rig, enrolled):
     assert next(e for e in events if e["event"] == "started")["strategy"] == "ahbr"
 
 
-def test_stopping_rule_is_calibrated_stored_and_used(rig, enrolled):
-    reported = rig("catalog", "calibrate", "--false-reject", "0.1")
+def test_stopping_rule_is_fitted_stored_and_used(rig, enrolled):
+    reported = rig("catalog", "fit", "--false-reject", "0.1")
     assert reported.exit_code == 0, reported.output
     assert re.search(r"^\d+ leave-one-out searches of 4 views for 2 objects", reported.stdout)
     assert "Not guaranteed: An error rate of 1.0 % needs 100 leave-one-out searches" in reported.stdout
     kept = enrolled[0] / "catalog" / "search_rules.json"
     assert reported.stdout.rstrip().endswith(str(kept))
-    values = json.loads(rig("catalog", "calibrate", "--json").stdout)
+    values = json.loads(rig("catalog", "fit", "--json").stdout)
     assert values["false_reject"] == 0.02
-    assert values["calibration"]["views"] == 4
+    assert values["fit"]["views"] == 4
     assert json.loads(kept.read_text(encoding="utf-8"))["searches"] == values["searches"]
     kept.write_text("{", encoding="utf-8")
     done = rig("identify", "--set", "bench.sim.object=lamp")
     assert done.exit_code == 0
-    assert "Fit the stopping rule again: `rig catalog calibrate`" in done.stdout
+    assert "Fit the stopping rule again: `rig catalog fit`" in done.stdout
     kept.unlink()
 
 
@@ -170,7 +170,7 @@ def test_catalog_without_dense_descriptors_is_searched_by_ahbr_with_a_note(enrol
     assert done.exit_code == 0, done.output
     assert "rig catalog redescribe --descriptor edges+colours" in done.stdout
     assert "S_left" in done.stdout or "fixed" in done.stdout
-    for words in (["identify", "--strategy", "dense"], ["catalog", "calibrate"]):
+    for words in (["identify", "--strategy", "dense"], ["catalog", "fit"]):
         rejected = run(app, words)
         assert rejected.exit_code == 7
         assert "rig catalog redescribe --descriptor edges+colours" in rejected.stderr
@@ -231,7 +231,7 @@ def test_watch_finds_objects_that_were_enrolled_meanwhile(rig, enrolled):
 
 
 def test_ambiguous_object_ends_with_exit_code_10(rig):
-    assert rig("catalog", "calibrate").exit_code == 0
+    assert rig("catalog", "fit").exit_code == 0
     path = Path("catalog/search_rules.json")
     before = path.read_text(encoding="utf-8")
     try:

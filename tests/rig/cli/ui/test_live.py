@@ -18,7 +18,7 @@ from hbr import Outcome
 from rig.catalog import ObjectSummary
 from rig.cli.ui.keys import Pause
 from rig.cli.ui.live import EnrollView, IdentifyView, LiveView
-from rig.cli.ui.operator import TerminalOperator
+from rig.cli.ui.prompts import TerminalOperator
 from rig.config import load_config
 from rig.core.clock import SystemClock
 from rig.core.errors import UsageError, ViewRejected
@@ -36,7 +36,7 @@ from rig.events.events import (
     Waiting,
     WaitReason,
 )
-from rig.plans.operator import Choice
+from rig.plans.operator import Choice, Question
 from rig.plans.tray import TrayItem, after_error, next_object
 from rig.views.capture import MotionEvidence
 from tests.programs import Program
@@ -340,13 +340,26 @@ def test_sigtstp_pauses_between_two_views_and_sigcont_resumes(folder):
     assert "5 views enrolled" in rest
 
 
-def asked(answers: str, kept: ObjectSummary | None = None) -> tuple[Choice, str]:
-    questions = io.StringIO()
-    person = TerminalOperator(questions=questions, answers=io.StringIO(answers))
-    return person.choose(next_object(TrayItem(2, "mug", "kitchen"), 3, 25, kept)), questions.getvalue()
+@pytest.fixture
+def choose(monkeypatch, capsys):
+    """Return a function that asks a question; it returns the choice by the answers, and what was asked."""
+
+    def run(answers: str, question: Question) -> tuple[Choice, str]:
+        monkeypatch.setattr("sys.stdin", io.StringIO(answers))
+        return TerminalOperator().choose(question), capsys.readouterr().err
+
+    return run
 
 
-def test_operator_is_asked_for_the_next_object():
+@pytest.fixture
+def asked(choose):
+    def run(answers: str, kept: ObjectSummary | None = None) -> tuple[Choice, str]:
+        return choose(answers, next_object(TrayItem(2, "mug", "kitchen"), 3, 25, kept))
+
+    return run
+
+
+def test_operator_is_asked_for_the_next_object(asked):
     answer, question = asked("\n")
     assert answer is Choice.CONTINUE
     assert question.startswith("3 of 25: put mug (kitchen) on the table")
@@ -356,7 +369,7 @@ def test_operator_is_asked_for_the_next_object():
     assert asked("")[0] is Choice.STOP
 
 
-def test_operator_is_asked_whether_an_interrupted_object_was_moved():
+def test_operator_is_asked_whether_an_interrupted_object_was_moved(asked):
     clock = SystemClock()
     kept = ObjectSummary("mug", "", "", clock.utc(), None, 0, 31)
     answer, question = asked("n\n", kept)
@@ -365,23 +378,23 @@ def test_operator_is_asked_whether_an_interrupted_object_was_moved():
     assert asked("\n", kept)[0] is Choice.CONTINUE
 
 
-def test_operator_decides_about_an_object_that_failed():
+def test_operator_decides_about_an_object_that_failed(choose):
     error = ViewRejected("View 3 was rejected: too dark.", next_step="Check the light.")
     for said, expected in (("\n", Choice.CONTINUE), ("s\n", Choice.SKIP), ("q\n", Choice.STOP)):
-        questions = io.StringIO()
-        person = TerminalOperator(questions=questions, answers=io.StringIO(said))
-        assert person.choose(after_error(error, TrayItem(2, "mug"))) is expected
-        assert "too dark" in questions.getvalue()
-        assert "Check the light" in questions.getvalue()
+        choice, question = choose(said, after_error(error, TrayItem(2, "mug")))
+        assert choice is expected
+        assert "too dark" in question
+        assert "Check the light" in question
 
 
-def test_unreadable_input_is_a_usage_error():
+def test_unreadable_input_is_a_usage_error(monkeypatch):
     class Closed(io.StringIO):
         def readline(self, *_: object) -> str:
             raise OSError("no input")
 
+    monkeypatch.setattr("sys.stdin", Closed())
     with pytest.raises(UsageError):
-        TerminalOperator(questions=io.StringIO(), answers=Closed()).choose(next_object(TrayItem(2, "mug"), 1, 1, None))
+        TerminalOperator().choose(next_object(TrayItem(2, "mug"), 1, 1, None))
 
 
 def test_skipped_objects_are_reported():

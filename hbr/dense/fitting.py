@@ -1,12 +1,11 @@
 """The thresholds of the stopping rule, from searches for the objects of a catalog among each other.
 
-`leave_one_out` searches for every object, `fit_stopping_rule` sets the thresholds from these searches, and
-`fit_open_set` fits the open-set score to changes of the bench (`hbr.dense.shifted_searches`).
+`leave_one_out` searches for every object, `rule_from_searches` sets the thresholds from these searches, and
+`fit_open_set` fits the open-set score to changes of the bench (`shifted_searches`).
 
 Decisions: docs/decisions/0026, docs/decisions/0049, docs/decisions/0059, docs/decisions/0060.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from math import ceil, floor, inf, nan
 from typing import Final
@@ -17,15 +16,22 @@ from numpy.typing import ArrayLike, NDArray
 from hbr.core.arrays import FloatArray
 from hbr.dense.filter import BETA, update_belief
 from hbr.dense.index import DenseIndex
-from hbr.dense.leave_one_out import Leaders, LeaveOneOut, Tasks, leader, leave_one_out, usual_scores
-from hbr.dense.open_set import OpenSetModel, fitted_before
-from hbr.dense.shifted_searches import STRENGTHS, ShiftedSearches, can_shift, shifted_searches
+from hbr.dense.leave_one_out import (
+    STRENGTHS,
+    LeaveOneOut,
+    ShiftedSearches,
+    Tasks,
+    can_shift,
+    leave_one_out,
+    shifted_searches,
+)
+from hbr.dense.open_set import OpenSetModel, fitted_before, open_set_score, usual_scores
 from hbr.dense.stopping import Limitation, LimitationCode, ShiftRates, StoppingRule
 
 #: No search ends at a smaller confidence, even if all leave-one-out searches were right: real views may be less clear.
 SMALLEST_MIN_CONFIDENCE: Final = 0.9
 #: Confidence that ends a search if the catalog has too little data for the error rate that was asked for.
-UNCALIBRATED_MIN_CONFIDENCE: Final = 0.98
+UNFITTED_MIN_CONFIDENCE: Final = 0.98
 #: With fewer objects, no second candidate remains when one object is left out.
 FEWEST_OBJECTS: Final = 3
 #: With fewer objects, the open-set score is not fitted to changes of the bench: a share of 2 % needs this many objects.
@@ -38,10 +44,10 @@ _EARLY_ACCEPT: Final = 0.0025
 _MILD: Final = 0.5
 #: The strengths up to this one are those of a bench that has not changed.
 _SAME: Final = 0.25
-#: Views of a leave-one-out search, if most objects have enough; searches in a calibration.
-CALIBRATED_VIEWS: Final = 4
+#: Views of a leave-one-out search, if most objects have enough; searches of a fit.
+FITTED_VIEWS: Final = 4
 MOST_SEARCHES: Final = 400
-#: Largest number of objects that a calibration searches for: it then measures a rate of 1 % to a third of its value.
+#: Largest number of objects that a fit searches for: it then measures a rate of 1 % to a third of its value.
 MOST_OBJECTS: Final = 1000
 
 
@@ -81,18 +87,16 @@ def min_confidence_for(confidence: FloatArray, correct: NDArray[np.bool_], error
     return inf
 
 
-def fit_stopping_rule(
+def rule_from_searches(
     searches: LeaveOneOut, *, error_rate: float = 0.01, false_reject: float = 0.02, objects: int | None = None
 ) -> StoppingRule:
     """Fit the rule that keeps the error rates in leave-one-out searches.
 
     If there is too little data for a rate, the rule does what the data allows and states a limitation: a search ends at
-    `UNCALIBRATED_MIN_CONFIDENCE`, and objects that score less than every search did are unknown.
+    `UNFITTED_MIN_CONFIDENCE`, and objects that score less than every search did are unknown.
 
     Parameters
     ----------
-    searches : LeaveOneOut
-        As `leave_one_out` returns it.
     error_rate, false_reject : float
         Share of wrong objects among those named, and of enrolled objects called unknown.
     objects : int, optional
@@ -138,10 +142,10 @@ def fit_min_confidence(searches: LeaveOneOut, error_rate: float) -> tuple[float,
     if found <= 1:
         return found, None
     count, needed = len(searches.confidence), ceil(1 / error_rate)
-    ended, wrong = _ended(searches.confidence, searches.correct, UNCALIBRATED_MIN_CONFIDENCE)
-    values = {"rate": error_rate, "searches": count, "needed": needed, "min_confidence": UNCALIBRATED_MIN_CONFIDENCE}
+    ended, wrong = _ended(searches.confidence, searches.correct, UNFITTED_MIN_CONFIDENCE)
+    values = {"rate": error_rate, "searches": count, "needed": needed, "min_confidence": UNFITTED_MIN_CONFIDENCE}
     code = LimitationCode.ERROR_RATE if count < needed else LimitationCode.SIMILAR_OBJECTS
-    return UNCALIBRATED_MIN_CONFIDENCE, Limitation(code, {**values, "wrong": wrong, "ended": len(ended)})
+    return UNFITTED_MIN_CONFIDENCE, Limitation(code, {**values, "wrong": wrong, "ended": len(ended)})
 
 
 def fit_open_set(rule: StoppingRule, searches: ShiftedSearches, model: OpenSetModel | None = None) -> StoppingRule:
@@ -221,7 +225,7 @@ def _accepted_from(unknown: FloatArray) -> FloatArray:
 
 
 @dataclass(frozen=True, eq=False)
-class CalibratedRule:
+class FittedRule:
     """A stopping rule with its results in the leave-one-out searches that it was fitted to.
 
     Attributes
@@ -255,7 +259,7 @@ class CalibratedRule:
     searched: int = 0
 
 
-def calibrate_stopping_rule(
+def fit_stopping_rule(
     index: DenseIndex,
     *,
     error_rate: float = 0.01,
@@ -263,9 +267,8 @@ def calibrate_stopping_rule(
     most_searches: int = MOST_SEARCHES,
     most_shifted_searches: int = MOST_SEARCHES,
     sample: int | None = None,
-    progress: Callable[[int, int], object] | None = None,
     tasks: Tasks | None = None,
-) -> CalibratedRule:
+) -> FittedRule:
     """Search for the enrolled objects among each other, and return the rule that is fitted to these searches.
 
     Parameters
@@ -273,7 +276,7 @@ def calibrate_stopping_rule(
     index : DenseIndex
         Of at least one object.
     error_rate, false_reject
-        As for `fit_stopping_rule`.
+        As for `rule_from_searches`.
     most_searches
         Total number of searches, from different first views. Each object is searched for at least once; if there are
         more than `MOST_OBJECTS`, this many of them, evenly spread.
@@ -281,81 +284,77 @@ def calibrate_stopping_rule(
         Searches under changes of the bench, from which the open-set score is fitted (`fit_open_set`).
     sample
         Number of objects to search for, among each other; by default all.
-    progress, tasks
+    tasks
         As for `leave_one_out`.
     """
-    searches = calibration_searches(index, most_searches=most_searches, sample=sample, progress=progress, tasks=tasks)
+    searches = fitting_searches(index, most_searches=most_searches, sample=sample, tasks=tasks)
     if searches is None:
-        return CalibratedRule(_rule_without_candidates(index, error_rate, false_reject))
+        return FittedRule(_rule_without_candidates(index, error_rate, false_reject))
     objects = len(index) if sample is None else min(len(index), max(2, sample))
-    rule = fit_stopping_rule(searches, error_rate=error_rate, false_reject=false_reject, objects=objects)
+    rule = rule_from_searches(searches, error_rate=error_rate, false_reject=false_reject, objects=objects)
+    ended, wrong = _ended(searches.confidence, searches.correct, rule.min_confidence)
+    found = FittedRule(
+        rule,
+        views=searches.confidence.shape[1],
+        ended=len(ended),
+        wrong=wrong,
+        mean_views=float(ended.mean() + 1) if len(ended) else nan,
+        searched=len(np.unique(searches.searched)),
+    )
     if sample is None and len(index) >= FEWEST_OBJECTS_SHIFTED and can_shift(index):
-        views = searches.confidence.shape[1]
-        shifted = shifted_searches(index, views=views, searches=most_shifted_searches)
+        shifted = shifted_searches(index, views=found.views, searches=most_shifted_searches)
         rule = with_false_accepts(rule, searches)
-        rule = fit_open_set(rule, shifted, fitted_before(index.views.descriptor, views))
+        rule = fit_open_set(rule, shifted, fitted_before(index.views.descriptor, found.views))
         rejected = sum(one.rejected for one in rule.rates)  # in searches under changes of the bench
-        return _calibrated(rule, searches, rejected=rejected, accepted=sum(one.false_accepts for one in rule.rates))
+        return replace(found, rule=rule, rejected=rejected, accepted=sum(one.false_accepts for one in rule.rates))
     known, unknown = (part.open_set_score(rule.usual_scores)[:, -1] for part in (searches.known, searches.unknown))
     accepted = unknown >= rule.open_set_thresholds[-1]
     pairs = np.stack([searches.searched, searches.unknown.object_index[:, -1]], axis=1)[accepted]
     confused, first, times = np.unique(pairs, axis=0, return_index=True, return_counts=True)
     names = index.views.object_names
-    return _calibrated(
-        rule,
-        searches,
+    return replace(
+        found,
         rejected=int((known < rule.open_set_thresholds[-1]).sum()),
         accepted=int(accepted.sum()) if objects >= FEWEST_OBJECTS else None,
         confused=tuple((names[a], names[b]) for a, b in confused[np.lexsort((first, -times))].tolist()),
     )
 
 
-def _calibrated(
-    rule: StoppingRule,
-    searches: LeaveOneOut,
-    *,
-    rejected: int,
-    accepted: int | None,
-    confused: tuple[tuple[str, str], ...] = (),
-) -> CalibratedRule:
-    """Return the rule with the results of its leave-one-out searches."""
-    ended, wrong = _ended(searches.confidence, searches.correct, rule.min_confidence)
-    return CalibratedRule(
-        rule,
-        views=searches.confidence.shape[1],
-        ended=len(ended),
-        wrong=wrong,
-        mean_views=float(ended.mean() + 1) if len(ended) else nan,
-        rejected=rejected,
-        accepted=accepted,
-        confused=confused,
-        searched=len(np.unique(searches.searched)),
-    )
-
-
-def calibration_searches(
+def fitting_searches(
     index: DenseIndex,
     *,
     most_searches: int = MOST_SEARCHES,
     sample: int | None = None,
-    progress: Callable[[int, int], object] | None = None,
     tasks: Tasks | None = None,
 ) -> LeaveOneOut | None:
-    """Return the leave-one-out searches of a calibration; None if objects cannot be compared with each other."""
-    usual_views = int(np.median((~index.left_out).sum(axis=1)))
-    if len(index) < 2 or usual_views < 2:
+    """Return the leave-one-out searches of a fit; None if objects cannot be compared with each other."""
+    chosen = searched_objects(index, most_searches, sample)
+    if chosen is None:
         return None
-    places = np.arange(len(index))
-    if sample is not None:
-        places = np.unique(np.linspace(0, len(index) - 1, max(2, sample)).astype(int))
+    some, each, views = chosen
     return leave_one_out(
-        index.only(places),
-        views=min(CALIBRATED_VIEWS, usual_views),
-        searches=max(1, min(most_searches // len(index), int(index.rows.shape[1]))),
+        some,
+        views=min(FITTED_VIEWS, views),
+        searches=each,
         most_objects=MOST_OBJECTS,
-        progress=progress,
         tasks=tasks,
     )
+
+
+def searched_objects(
+    index: DenseIndex, most_searches: int, sample: int | None = None
+) -> tuple[DenseIndex, int, int] | None:
+    """Return an index of the objects to search for among each other, the searches for each, and their usual views.
+
+    None if objects cannot be compared with each other. A ``sample`` is spread evenly; by default all are searched for.
+    """
+    usual_views = int(np.median(index.view_counts))
+    if len(index) < 2 or usual_views < 2:
+        return None
+    each = max(1, min(most_searches // len(index), int(index.view_counts.max())))
+    if sample is not None:
+        index = index.only(np.unique(np.linspace(0, len(index) - 1, max(2, sample)).astype(int)))
+    return index, each, usual_views
 
 
 def _rule_without_candidates(index: DenseIndex, error_rate: float, false_reject: float) -> StoppingRule:
@@ -370,14 +369,13 @@ def _rule_without_candidates(index: DenseIndex, error_rate: float, false_reject:
         code, searches = LimitationCode.ONE_OBJECT, len(index.views)
         levels, azimuth_deg = index.views.descriptors, index.views.azimuth_deg
         left_out = [
-            update_belief(levels[row], azimuth_deg[row], index.without(np.array([row]))).scores()
+            float(update_belief(levels[row], azimuth_deg[row], index.without(np.array([row]))).scores()[0])
             for row in range(searches)
         ]
-        leaders = Leaders.of([leader(index.object_index, scores) for scores in left_out], (searches, 1))
-        threshold = float(leaders.open_set_score(usual).min())
+        threshold = min(open_set_score(score, score, 0.0, 0.0) for score in left_out)  # all of it is the margin
     return StoppingRule(
         beta=BETA,
-        min_confidence=UNCALIBRATED_MIN_CONFIDENCE,
+        min_confidence=UNFITTED_MIN_CONFIDENCE,
         usual_scores=usual,
         open_set_thresholds=(threshold,),
         error_rate=error_rate,

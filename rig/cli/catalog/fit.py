@@ -1,4 +1,4 @@
-"""`rig catalog calibrate`: fit the stopping rule of the dense search to the catalog."""
+"""`rig catalog fit`: fit the stopping rule of the dense search to the catalog."""
 
 import os
 import sys
@@ -19,8 +19,9 @@ from rig.core.phrases import counted, percent, percent_words, sentence
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
 
-    from hbr import CalibratedRule
-    from hbr.dense.leave_one_out import Found, Task
+    from hbr import FittedRule
+    from hbr.core.arrays import FloatArray
+    from hbr.dense.leave_one_out import Task
     from rig.catalog.unfinished import UnfinishedJob
 
 _SEVERAL_PROCESSES: Final = 20_000
@@ -28,7 +29,7 @@ _SEVERAL_PROCESSES: Final = 20_000
 
 
 @command
-def calibrate(
+def fit(
     settings: Settings,
     error_rate: Annotated[
         float, typer.Option(min=0.0001, max=0.5, help="Largest share of wrong objects among those named.")
@@ -38,16 +39,16 @@ def calibrate(
     ] = 0.02,
     cluster: ClusterOption = None,
 ) -> None:
-    """Calibrate the stopping rule, which decides when rig identify ends a search.
+    """Fit the stopping rule, which decides when rig identify ends a search, to the catalog.
 
     The command searches for each enrolled object with its own views, as if the camera had been a little to the side.
     Then it leaves the object out and searches again, as for an unknown object. In a catalog of more than 1000 objects,
     it searches for 1000 of them among all. It reports what the rule cannot guarantee, and how much more data is needed.
     Repeat the command when rig identify reports that the catalog has changed.
 
-    Example: rig catalog calibrate --bench sim --error-rate 0.005
+    Example: rig catalog fit --bench sim --error-rate 0.005
     """
-    from hbr import DenseIndex, calibrate_stopping_rule
+    from hbr import DenseIndex, fit_stopping_rule
     from rig.catalog.jobs import JobProgress
     from rig.catalog.prepared import prepared_views
     from rig.catalog.unfinished import UnfinishedJob
@@ -67,7 +68,7 @@ def calibrate(
     begun_ns = clock.now_ns()
     print(f"Searching for {len(views.object_names)} objects among each other ...", file=sys.stderr)
     index = DenseIndex(views)
-    unfinished = UnfinishedJob(path.with_name("calibrate.unfinished"), digest(index))
+    unfinished = UnfinishedJob(path.with_name("fit.unfinished"), digest(index))
     unfinished.load()
 
     def interrupted() -> str:
@@ -78,22 +79,23 @@ def calibrate(
         where = jobs_of(None, cluster)
         if where is None and len(views) >= _SEVERAL_PROCESSES:
             where = os.cpu_count() or 1
-        found = calibrate_stopping_rule(
-            index,
-            error_rate=error_rate,
-            false_reject=false_reject,
-            progress=lambda done, total: progress(JobProgress(done, total)),
-            tasks=lambda work, tasks: _continued(
-                unfinished, tasks, lambda left: map_in_processes(work, left, where or 1)
-            ),
-        )
+
+        def searched(
+            work: "Callable[[Task], FloatArray]", tasks: "Sequence[Task]"
+        ) -> "Iterator[tuple[Task, FloatArray]]":
+            found = _continued(unfinished, tasks, lambda left: map_in_processes(work, left, where or 1))
+            for done, one in enumerate(found):
+                progress(JobProgress(done, len(tasks)))
+                yield one
+
+        found = fit_stopping_rule(index, error_rate=error_rate, false_reject=false_reject, tasks=searched)
     unfinished.remove()
     made_utc = f"{clock.utc():%Y-%m-%dT%H:%M:%SZ}"
     write_stopping_rule(path, found.rule, index, made_utc=made_utc)
     if settings.json:
         outcome = {key: value for key, value in plain(found).items() if key != "rule"}
         values = stopping_rule_values(found.rule, index, made_utc=made_utc)
-        settings.print_json({"file": str(path), "calibration": outcome, **values})
+        settings.print_json({"file": str(path), "fit": outcome, **values})
         return
     for words in _lines(found, len(views.object_names), seconds_between(begun_ns, clock.now_ns())):
         print(words)
@@ -103,29 +105,29 @@ def calibrate(
 def _continued(
     unfinished: "UnfinishedJob",
     tasks: "Sequence[Task]",
-    search: "Callable[[Sequence[Task]], Iterable[tuple[Task, Found]]]",
-) -> "Iterator[tuple[Task, Found]]":
+    search: "Callable[[Sequence[Task]], Iterable[tuple[Task, FloatArray]]]",
+) -> "Iterator[tuple[Task, FloatArray]]":
     """Yield the searches for all objects: first those that are stored, then the others, which are stored, too."""
-    from hbr.dense.leave_one_out import Found
+    import numpy as np
+
+    from hbr.dense.leave_one_out import NUMBERS_OF_VIEW
 
     left = []
     for task in tasks:
         try:
-            *leaders, confidence, correct = unfinished.found[repr(task)]
-            known, unknown = ([(int(n), float.fromhex(a), float.fromhex(b)) for n, a, b in part] for part in leaders)
-            done = Found(known, unknown, [float.fromhex(one) for one in confidence], [bool(one) for one in correct])
+            found = np.array(unfinished.found[repr(task)], np.float64)
         except (KeyError, TypeError, ValueError):  # not stored, or changed by hand
-            left.append(task)
+            found = np.empty(0)
+        if found.ndim == 3 and found.shape[2] == NUMBERS_OF_VIEW:
+            yield task, found
         else:
-            yield task, done
+            left.append(task)
     for task, found in search(left):
-        leaders = [[(int(n), float(a).hex(), float(b).hex()) for n, a, b in part] for part in found[:2]]
-        confidence, correct = [float(one).hex() for one in found.confidence], [bool(one) for one in found.correct]
-        unfinished.store({repr(task): [*leaders, confidence, correct]})
+        unfinished.store({repr(task): found.tolist()})
         yield task, found
 
 
-def _lines(found: "CalibratedRule", objects: int, seconds: float) -> list[str]:
+def _lines(found: "FittedRule", objects: int, seconds: float) -> list[str]:
     from rig.events.note_wording import limitation_words
 
     rule = found.rule
