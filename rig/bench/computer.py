@@ -8,19 +8,15 @@ Decision: docs/decisions/0013.
 
 import grp
 import os
+import pwd
 import re
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
-from rig.bench.device_files import DeviceFile as DeviceFile
-from rig.bench.device_files import Disk as Disk
-from rig.bench.device_files import Process as Process
-from rig.bench.device_files import SerialPort as SerialPort
-from rig.bench.device_files import User as User
 from rig.config import RigConfig
 from rig.core.camera_node import camera_node
 from rig.core.clock import Clock, SystemClock
@@ -42,6 +38,69 @@ _RAW_RECEIVERS = re.compile(r"unicam|rp1-cfe", re.IGNORECASE)
 _SENSORS = re.compile(r"((?:imx|ov|gc|s5k|hm|arducam)[\w-]*) \d+-[0-9a-f]{4}")
 """Names of the sensors' own nodes (v4l-subdev), with their I2C bus and address."""
 _NETWORK_FILE_SYSTEMS = frozenset({"nfs", "nfs4", "cifs", "smb3", "smbfs", "sshfs", "fuse.sshfs", "9p", "afs"})
+
+
+@dataclass(frozen=True, slots=True)
+class Process:
+    """A program that has a device open."""
+
+    pid: int
+    command: str
+
+    def __str__(self) -> str:
+        return f"process {self.pid} ({self.command})"
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceFile:
+    """A device file, and its properties that are known without opening it.
+
+    ``stable`` is its name that stays the same after replugging, ``group`` its user group. ``usable`` says whether this
+    user may open it. ``holders`` are the programs that have it open, as far as this user may see them.
+    """
+
+    path: str
+    name: str
+    stable: str | None
+    group: str
+    usable: bool
+    holders: tuple[Process, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class SerialPort(DeviceFile):
+    """A serial port; ``latency_ms`` is the adapter's latency timer (in `latency_file`), None if it has none."""
+
+    latency_ms: int | None
+    latency_file: str
+    usb: Mapping[str, str]
+
+
+@dataclass(frozen=True, slots=True)
+class User:
+    """The user of this program; ``gids`` are the groups of this login."""
+
+    name: str
+    uid: int
+    gids: frozenset[int]
+
+    @classmethod
+    def current(cls) -> "User":
+        uid = os.geteuid()
+        try:
+            name = pwd.getpwuid(uid).pw_name
+        except KeyError:
+            name = str(uid)
+        return cls(name, uid, frozenset({os.getegid(), *os.getgroups()}))
+
+
+@dataclass(frozen=True, slots=True)
+class Disk:
+    """The disk of a folder: whether it is on the network, and whether this user may write."""
+
+    free_bytes: int
+    network: bool
+    writable: bool = True
 
 
 @dataclass

@@ -265,6 +265,10 @@ class Lease:
                 self._holder = None
             return self._holder
 
+    def is_held_by(self, person: Person) -> bool:
+        holder = self.holder
+        return holder is not None and holder.key == person.key
+
     def take(self, person: Person, *, force: bool = False) -> None:
         """Take or renew the lease; with ``force`` also from another operator, who is warned.
 
@@ -274,18 +278,18 @@ class Lease:
             Another operator has it.
         """
         with self._lock:
-            before = self.holder
-            if before is not None and before.key != person.key and not force:
+            before, renewed = self.holder, self.is_held_by(person)
+            if before is not None and not renewed and not force:
                 raise LeaseHeld(
                     f"{before.name} uses the bench now.",
                     next_step="Wait, ask for it, or take it over. The other operator is then warned.",
                     evidence={"holder": before.name},
                 )
-            if before is None or before.key != person.key:
+            if not renewed:
                 self._asked.clear()
             self._holder = person
             self._until_ns = self.clock.now_ns() + round(LEASE_S * 1e9)
-        if before is None or before.key != person.key:
+        if not renewed:
             self.changed(self.as_json(taken_from=before))
 
     def ask(self, person: Person) -> None:
@@ -307,8 +311,7 @@ class Lease:
             No operator of that name asked for it.
         """
         with self._lock:
-            holder = self.holder
-            if holder is None or holder.key != person.key:
+            if not self.is_held_by(person):
                 raise LeaseHeld("You do not have the lease.", next_step="Take it first.")
             to = self._asked.get((name, client))
             if to is None:

@@ -33,8 +33,7 @@ def add_access(routes: Routes, server: Server) -> None:
     @routes.watch.get("/me", tags=["access"])
     def me(person: Watcher) -> dict[str, Any]:
         """Return who is logged in, and who has the lease."""
-        holder = server.lease.holder
-        mine = holder is not None and holder.key == person.key
+        mine = server.lease.is_held_by(person)
         return {"name": person.name, "role": person.role, "has_lease": mine, "lease": server.lease.as_json()}
 
     @routes.watch.get("/lease", tags=["access"])

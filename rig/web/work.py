@@ -146,6 +146,8 @@ class ServedDesk(Desk):
                 self.show(step)
 
     def _note(self, text: str, steps: NextSteps = ()) -> None:
+        if self.job.result is not None:  # of an object that was enrolled: whether it was delivered
+            self.job.result_text += f"\n{text}"
         self._publish(text, steps, {"event": "note"})
         self._worker.check(self.job)
 

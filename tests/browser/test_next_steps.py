@@ -15,7 +15,7 @@ def rotate(page, server, angle_deg):
 @pytest.mark.parametrize("stored", [True, False], ids=["stored", "only in the program"])
 def test_fault_is_acknowledged_on_any_page(page, serve_process, stored, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
-    settings = ['bench.sim.faults=["jam@move1"]']
+    settings = ['bench.sim.faults=["jam@move0"]']
     server = serve_process(*settings, *([] if stored else ["state_dir=none"]))
     rotate(page, server, 90)
     page.wait_for_selector("#next-steps:has-text('Remove what blocks the table')", timeout=WAIT_MS)
