@@ -126,9 +126,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--number", type=int, default=100, help="mutants")
+    parser.add_argument("--skip", type=int, default=0, help="mutants that an interrupted run has tried already")
     parser.add_argument("--jobs", type=int, default=2, help="mutants at a time")
     options = parser.parse_args()
-    drawn = random.Random(options.seed).sample([one for room in ROOMS for one in places(room)], options.number)
+    sample = random.Random(options.seed).sample([one for room in ROOMS for one in places(room)], options.number)
+    drawn = sample[options.skip :]
     with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(options.jobs) as pool:
         free = []
         for job in range(options.jobs):
@@ -148,7 +150,7 @@ def main() -> None:
         for found, where in pool.map(tried, drawn):
             noticed += found
             print(f"{'noticed' if found else 'NOT NOTICED'}  {where}", flush=True)
-    print(f"{noticed} of {options.number} mutants were noticed.")
+    print(f"{noticed} of {len(drawn)} mutants were noticed.")
 
 
 if __name__ == "__main__":

@@ -2,6 +2,8 @@
 
 A next step is a list of sentences, for what only hands can do, and of actions of the rig with their parameters. This
 module words it for a terminal. The page `rig.web.next_steps` words it as buttons and links.
+
+Decision: docs/decisions/0066.
 """
 
 import re
