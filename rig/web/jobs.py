@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from pydantic_core import to_jsonable_python
 
 from rig.core.clock import Clock
-from rig.core.errors import JobNotFound, JobRejected, RigError, StateNotStored, os_errors_as
+from rig.core.errors import JobNotFound, JobRejected, ObjectExists, RigError, StateNotStored, os_errors_as
 from rig.core.files import read, write
 from rig.core.masking import masked
 from rig.core.next_steps import Do, NextStep
@@ -246,6 +246,8 @@ class JobQueue:
         if isinstance(request, EnrollRequest):
             actions = [step.action for step in (error.steps if error else ()) if isinstance(step, NextStep)]
             started = job.views > 0 or request.resume or Do.CONTINUE_ENROLLMENT in actions
+            if isinstance(error, ObjectExists) and not started:
+                return  # the same request would be rejected again
             job.resume = request.model_copy(update={"resume": True, "replace": False}) if started else request
             words = ["rig", "enroll", request.name, *(["--resume"] if started else [])]
             if not started and request.replace:
