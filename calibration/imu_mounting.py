@@ -95,7 +95,8 @@ class ImuMounting(Procedure):
         column, sign = "xyz".index(config.imu.axis), config.imu.sign
         moves: list[RecordedMove] = []
         levels: list[GravityReading] = []
-        with recording(bench) as kept, Turntable(bench) as table, returning(table) as goto:
+        recorded_bench, kept = recording(bench)
+        with Turntable(recorded_bench) as table, returning(table) as goto:
             for index in range(STEPS + 1):
                 if index == 0:
                     yield moved(0, goto(first_deg))

@@ -1,7 +1,6 @@
 """Record the readings of servo and IMU while a procedure moves the table."""
 
-from collections.abc import Generator
-from contextlib import contextmanager
+from copy import copy
 from dataclasses import dataclass, field
 from typing import Any, cast
 
@@ -54,14 +53,9 @@ class _Tapped:
         return read
 
 
-@contextmanager
-def recording(bench: Bench) -> Generator[Recording, None, None]:
-    """Record servo and IMU for the length of a ``with`` block; enter it before a `Turntable` is created."""
-    kept = Recording()
-    servo, imu = bench.servo, bench.imu
-    bench.servo = cast(Servo, _Tapped(servo, "read_state", kept.states))
-    bench.imu = cast(Imu, _Tapped(imu, "read_samples", kept.samples))
-    try:
-        yield kept
-    finally:
-        bench.servo, bench.imu = servo, imu
+def recording(bench: Bench) -> tuple[Bench, Recording]:
+    """Return a bench on the same devices, for a `Turntable`, and what it reads from servo and IMU."""
+    kept, recorded = Recording(), copy(bench)
+    recorded.servo = cast(Servo, _Tapped(bench.servo, "read_state", kept.states))
+    recorded.imu = cast(Imu, _Tapped(bench.imu, "read_samples", kept.samples))
+    return recorded, kept

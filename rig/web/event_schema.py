@@ -21,13 +21,13 @@ class SavedRunBody(BaseModel):
 
 
 @dataclass(frozen=True, slots=True)
-class Remark:
-    """A remark of a job, with its words in ``text`` and ``steps``."""
+class NoteMessage:
+    """A remark or a progress of a job, with its words in ``text`` and ``steps``."""
 
     event: Literal["note"] = field(default="note", init=False)
 
 
-class JobMessage(RootModel[Annotated[Event | Remark, Discriminator("event")]]):
+class JobMessage(RootModel[Annotated[Event | NoteMessage, Discriminator("event")]]):
     """An event of the running job: the data of the messages ``plan`` of the stream, as JSON text.
 
     It also has ``job`` (the id) and ``text`` (the event in words), and if the operator should do something, ``steps``

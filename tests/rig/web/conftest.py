@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import pytest
 
@@ -36,6 +36,14 @@ class Served:
     server: Server
     client: TestClient
     folder: Path
+
+    def opened(self) -> Self:
+        """Return the server when its bench is open: before, a stop has no torque to confirm."""
+        for _ in range(6000):
+            if self.side.worker.status.get("open"):
+                return self
+            threading.Event().wait(0.01)
+        pytest.fail(f"the bench is not open: {self.side.worker.status}")
 
     def run(self, **request: Any) -> dict[str, Any]:
         """Submit a job, and return it when it has ended."""

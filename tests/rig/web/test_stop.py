@@ -154,7 +154,7 @@ def test_stop_does_not_wait_for_exports(moving, motion):
 
 
 def test_stop_works_after_wrong_tokens_and_with_a_damaged_file_of_tokens(serve):
-    served = serve(needs_login=True)
+    served = serve(needs_login=True).opened()
     tokens = served.server.sessions.tokens
     right = {"Authorization": f"Bearer {tokens.new('tablet', Role.WATCH)}"}
     assert served.client.get("/api/v1/status", headers=right).status_code == 200
