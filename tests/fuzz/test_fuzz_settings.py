@@ -62,6 +62,7 @@ def test_any_edit_changes_one_key_or_is_a_config_error(text, key, value):
 
 @cases(6)
 @given(FILES, st.lists(SETTINGS, max_size=2), st.sampled_from([["config", "check"], ["config", "show"], ["status"]]))
+@example("", ["imu.rate_hz=6"], ["status"])
 def test_any_configuration_ends_with_a_documented_exit_code(commands, text, overrides, command):
     (commands.fresh() / "fuzzed.toml").write_text(text, encoding="utf-8", errors="surrogateescape", newline="")
     options = [word for one in overrides if "\0" not in one for word in ("--set", one)]

@@ -109,7 +109,8 @@ def report_lines(report: Mapping[str, Any]) -> Iterator[str]:
     if is_open or page:
         yield f"state    {_state_words(report)}"
     if problem := report.get("error"):
-        yield f"error    {problem['code']}: {problem['what']} {problem['next_step']}"
+        yield f"error    {problem['code']}: {problem['what']}"
+        yield f"         Next step: {problem['next_step']}"
     if limits_deg := report.get("limits_deg"):
         angle_deg = report.get("table_deg")
         angle = "angle in doubt" if angle_deg is None else angle_words(angle_deg, 2)
@@ -120,7 +121,8 @@ def report_lines(report: Mapping[str, Any]) -> Iterator[str]:
     for device, lines in _LINES.items():
         if values := report.get(device):
             error = values.get("error")
-            shown = [f"error {error['code']}: {error['what']} {error['next_step']}"] if error else lines(values)
+            failed = error and [f"error {error['code']}: {error['what']}", f"Next step: {error['next_step']}"]
+            shown = failed or lines(values)
             yield from (f"{'' if n else device:8s} {line}" for n, line in enumerate(shown))
     yield from (f"note     {finding}" for finding in report.get("findings", ()))
     if not report.get("fault") and not report.get("doubt") and (steps := report.get("steps")):
