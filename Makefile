@@ -19,7 +19,7 @@ help:
 	@echo "make test-web   test the pages in a real browser, and attack the server"
 	@echo "make kernel-test  run the program with Linux's real drivers in a virtual machine"
 	@echo "make test-servers  test PostgreSQL, S3, Dask and bluesky with real servers"
-	@echo "make fuzz   attack every kind of input for up to 45 minutes (a part of test-nightly)"
+	@echo "make fuzz   attack every kind of input, 5 to 45 minutes (a part of test-nightly)"
 	@echo "make lint   check formatting, lint, types and import contracts"
 	@echo "make docs   build the documentation as a site in site/"
 	@echo "make wheel  build wheel and sdist in dist/, and try the wheel in an empty environment"
