@@ -204,9 +204,13 @@ def steps_as_json(steps: Iterable[str | NextStep]) -> list[Any]:
     return [step if isinstance(step, str) else step.as_dict() for step in steps]
 
 
-def steps_from_json(values: Iterable[Any]) -> NextSteps:
-    """Return the next step of values from `steps_as_json`."""
-    return tuple(
-        value if isinstance(value, str) else NextStep(_ACTIONS[value["action"]], value["parameters"])
-        for value in values
-    )
+def steps_from_json(values: Any) -> NextSteps:
+    """Return the next step of values from `steps_as_json`; what is not one is left out: a saved run may be damaged."""
+    steps: list[str | NextStep] = []
+    for value in values if isinstance(values, list | tuple) else ():
+        match value:
+            case str():
+                steps.append(value)
+            case {"action": str(action), "parameters": dict(parameters)} if action in _ACTIONS:
+                steps.append(NextStep(_ACTIONS[action], parameters))
+    return tuple(steps)

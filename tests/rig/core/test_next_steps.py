@@ -9,9 +9,12 @@ from typing import Any
 
 import pytest
 import typer.main
+from hypothesis import example, given
+from hypothesis import strategies as st
 
 from rig.cli.main import app
 from rig.core.next_steps import Do, as_steps, in_words, steps_as_json, steps_from_json
+from tests.fuzzing import examples
 
 ROOT = Path(__file__).parents[3]
 FOR_TERMINALS = ("rig/cli", "sim/demo", "sim/realtime")
@@ -41,6 +44,20 @@ FOR_TERMINALS = ("rig/cli", "sim/demo", "sim/realtime")
 def test_terminal_words_a_step_as_a_command(steps, words):
     assert in_words(steps) == words
     assert steps_from_json(steps_as_json(as_steps(steps))) == as_steps(steps)
+
+
+@examples(20)
+@given(
+    st.recursive(
+        st.none() | st.integers() | st.text(max_size=5) | st.sampled_from(list(Do)),
+        lambda inner: st.lists(inner) | st.dictionaries(st.sampled_from(["action", "parameters", "x y"]), inner),
+    )
+)
+@example([{"action": "enroll", "parameters": 3}, {"action": "no such action", "parameters": {}}, {}, 3, "Wait."])
+def test_damaged_steps_are_left_out(values):
+    steps = steps_from_json(values)
+    in_words(steps)
+    assert steps_from_json(steps_as_json(steps)) == steps
 
 
 def test_passwords_are_masked_in_sentences_and_parameters():
