@@ -1,34 +1,24 @@
-"""The catalog of enrolled objects: an SQLite file, and the images as files beside it."""
+"""The catalog of enrolled objects: facts in a database, and the images as files beside it."""
 
-from rig.catalog.audit import Action, AuditEntry
 from rig.catalog.catalog import Catalog
-from rig.catalog.enrollment import Enrollment
-from rig.catalog.queries import ModelSet
-from rig.catalog.records import (
-    EnrollmentStatus,
-    EnrollmentSummary,
-    ObjectDetails,
-    ObjectSummary,
-    Provenance,
-    Session,
-    StoredView,
-    ViewRecord,
-    clean_name,
-)
+from rig.catalog.enrolling import OpenEnrollment
+from rig.catalog.facts import Action, Enrollment, Entry, Session, View
+from rig.catalog.records import EnrollmentStatus, Outcome, Provenance, clean_name
+from rig.catalog.state import EnrollmentState, ObjectDetails, ObjectSummary
 
 __all__ = [
     "Action",
-    "AuditEntry",
     "Catalog",
     "Enrollment",
+    "EnrollmentState",
     "EnrollmentStatus",
-    "EnrollmentSummary",
-    "ModelSet",
+    "Entry",
     "ObjectDetails",
     "ObjectSummary",
+    "OpenEnrollment",
+    "Outcome",
     "Provenance",
     "Session",
-    "StoredView",
-    "ViewRecord",
+    "View",
     "clean_name",
 ]

@@ -1,5 +1,6 @@
 """The catalog: objects with their enrollments and views."""
 
+import secrets
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from datetime import datetime
@@ -9,55 +10,27 @@ from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import Connection, func, select, update
+from sqlalchemy import func, select
+from sqlalchemy.orm import Session as Transaction
 
-from rig.catalog import audit
-from rig.catalog.audit import AuditEntry
-from rig.catalog.database import Database, insert_row
-from rig.catalog.describing import known_descriptor
-from rig.catalog.enrollment import Enrollment
-from rig.catalog.opening import open_database
-from rig.catalog.queries import (
-    ModelSet,
-    check_not_enrolled,
-    enrollment_summaries,
-    find,
-    in_use,
-    model_set,
-    object_summaries,
-    of_views,
-    retrieved,
-    searched_version,
-    stored_views,
-    unfinished,
-)
-from rig.catalog.records import (
-    EnrollmentStatus,
-    EnrollmentSummary,
-    ObjectDetails,
-    ObjectSummary,
-    Provenance,
-    Session,
-    StoredView,
-    check_azimuth,
-    checked_texts,
-    clean_name,
-)
-from rig.catalog.rows import abandon_unfinished, insert_session, of_status, unfinished_and_complete
-from rig.catalog.schema import enrollments, objects, views
-from rig.catalog.seal import changing_enrollments, changing_object, damage_of, seal_enrollments, seal_objects
+from rig.catalog import log, state
+from rig.catalog.database import Database
+from rig.catalog.enrolling import OpenEnrollment
+from rig.catalog.facts import Action, Enrollment, Entry, Session, View, digest_of
+from rig.catalog.records import EnrollmentStatus, Provenance, check_azimuth, checked_texts, clean_name
+from rig.catalog.state import EnrollmentState, ObjectDetails, ObjectSummary
 from rig.config.catalog_place import CatalogPlace
 from rig.core.clock import Clock
 from rig.core.errors import CatalogDamaged, CatalogError, UsageError
-from rig.views.description import PAPER_DESCRIPTOR
+from rig.views import image_files as images
 
 
 class Catalog(AbstractContextManager["Catalog"]):
     """Objects with their enrollments and views.
 
     They are in one folder (``catalog.sqlite`` and ``images/``), or on a server for several benches (`CatalogPlace`).
-    Open it with `Catalog.open`. Several processes may read and write at once. To edit, check, clean up, import and
-    export it, use the functions of `rig.catalog.edit`, `.verify`, `.redescribe`, `.upkeep` and `.exchange`.
+    Open it with `Catalog.open`. Several processes may read and write at once. For answers, checks, imports and exports
+    use the functions of `rig.catalog.results`, `.derived`, `.verify`, `.upkeep`, `.transfer` and `.exchange`.
 
     Attributes
     ----------
@@ -112,7 +85,7 @@ class Catalog(AbstractContextManager["Catalog"]):
             The server of the catalog does not answer.
         """
         place = CatalogPlace.of(path)
-        return cls(open_database(place, create=create, read_only=read_only, busy_timeout_s=busy_timeout_s), clock)
+        return cls(Database.open(place, create=create, read_only=read_only, busy_timeout_s=busy_timeout_s), clock)
 
     def __exit__(self, *_: object) -> None:
         self.close()
@@ -130,6 +103,100 @@ class Catalog(AbstractContextManager["Catalog"]):
         """Where the catalog is."""
         return self.database.place
 
+    # What is enrolled
+
+    def objects(self, *, deleted: bool = False) -> list[ObjectSummary]:
+        """Return the objects in use in the order in which they were added, or the deleted ones that can be restored."""
+        with self.database.read() as transaction:
+            return state.summaries(transaction, deleted=deleted)
+
+    def summary(self, name: str) -> ObjectSummary:
+        """Return an object without its enrollments and views; errors as for `object`."""
+        with self.database.read() as transaction:
+            return state.summaries(transaction, object_id=state.find(transaction, name).object_id)[0]
+
+    def object(self, name: str) -> ObjectDetails:
+        """Return an object with its enrollments and views.
+
+        Raises
+        ------
+        ObjectNotFound
+            There is no object of that name.
+        CatalogDamaged
+            It is not as it was stored.
+        """
+        with self.database.read() as transaction:
+            found = state.find(transaction, name)
+            (summary,) = state.summaries(transaction, object_id=found.object_id)
+            own = Enrollment.object_id == found.object_id
+            return ObjectDetails(summary, tuple(state.enrollments(transaction, own)))
+
+    def first_views(self) -> dict[str, int]:
+        """Return the id of one view of each object in use, to show the object by."""
+        with self.database.read() as transaction:
+            names = {one.enrollment_id: one.name for one in state.used(transaction)}
+            rows = transaction.execute(select(View.enrollment_id, func.min(View.id)).group_by(View.enrollment_id))
+            return {names[enrollment_id]: view_id for enrollment_id, view_id in rows if enrollment_id in names}
+
+    def version(self) -> str:
+        """Return a digest of what searches compare with, SHA-256: another one after every change of the objects."""
+        with self.database.read() as transaction:
+            return state.version(transaction)
+
+    def damage(self, name: str | None = None) -> CatalogDamaged | None:
+        """Return the error that an object, or any object, is not as it was stored; None if it is.
+
+        Compares digests of rows, not of images. `rig.catalog.verify` compares everything.
+        """
+        try:
+            with self.database.read() as transaction:
+                conditions = []
+                if name is not None:
+                    conditions = [Enrollment.object_id == state.find(transaction, name).object_id]
+                state.check(transaction, *conditions)
+        except CatalogDamaged as error:
+            return error
+        return None
+
+    def view(self, view_id: int) -> View:
+        """Return one view.
+
+        Raises
+        ------
+        CatalogError
+            There is no view with that id, or it is not as it was stored.
+        """
+        with self.database.read() as transaction:
+            view = transaction.get(View, int(view_id))
+            if view is None:
+                raise CatalogError(
+                    f"There is no view {view_id} in the catalog {self.place}.", next_step="Load the views again."
+                )
+            key = transaction.scalar(select(Enrollment.key).where(Enrollment.id == view.enrollment_id))
+            if view.digest != digest_of(view, str(key)):
+                raise state.changed([f"view {view_id}"])
+            return view
+
+    def image_path(self, image: str) -> Path:
+        """Return a file with an image; an image of an object store is fetched.
+
+        A `CatalogDamaged` if a link leads out of the catalog.
+        """
+        return self.database.images.file(image)
+
+    def read_image(self, image: str) -> NDArray[np.uint8]:
+        """Return the pixels that were stored, uint8 (H, W, 3) BGR, such as those of `View.image`.
+
+        Raises
+        ------
+        CatalogError
+            The file is missing, is not the stored one, or the system denies access.
+        """
+        with self.database.catalog_errors():
+            return self.database.images.pixels(image)
+
+    # Enroll
+
     def check_enrollable(
         self,
         name: str,
@@ -140,21 +207,17 @@ class Catalog(AbstractContextManager["Catalog"]):
         replace: bool = False,
     ) -> None:
         """Raise what `begin`, or with ``resume`` `resume`, would raise for this object now; change nothing."""
-        self._check_here(name, label, note, resume=resume, replace=replace)
-        if not resume:
-            self._check_elsewhere(clean_name(name), replace=replace)
-
-    def _check_here(self, name: str, label: str | None, note: str | None, *, resume: bool, replace: bool) -> None:
         name = clean_name(name)
         checked_texts(label, note)
-        with self.database.read() as connection:
+        with self.database.read() as transaction:
             if resume:
-                unfinished(connection, *find(connection, name))
-            elif not replace and (object_id := connection.scalar(select(objects.c.id).where(in_use(name)))) is not None:
-                check_not_enrolled(connection, object_id, name)
+                state.unfinished(transaction, state.find(transaction, name))
+            elif not replace and (known := state.state_of(transaction, name)) is not None:
+                state.check_not_enrolled(transaction, known)
 
-    def _check_elsewhere(self, name: str, *, replace: bool) -> None:
-        """Check nothing: only the names of a journal are also those of another catalog."""
+    def known_objects(self) -> list[ObjectSummary]:
+        """Return the objects that need not be enrolled: those in use. `rig.catalog.shared` adds those of a server."""
+        return self.objects()
 
     def begin(
         self,
@@ -165,7 +228,8 @@ class Catalog(AbstractContextManager["Catalog"]):
         label: str | None = None,
         note: str | None = None,
         replace: bool = False,
-    ) -> Enrollment:
+        empty_table: NDArray[np.uint8] | None = None,
+    ) -> OpenEnrollment:
         """Start to enroll an object.
 
         Parameters
@@ -181,6 +245,8 @@ class Catalog(AbstractContextManager["Catalog"]):
         replace
             Enroll a known object again. Its complete enrollment stays in use until the new one is complete. An
             unfinished one is abandoned.
+        empty_table : uint8 array (H, W, 3), optional
+            The empty-table image of the bench.
 
         Raises
         ------
@@ -200,36 +266,37 @@ class Catalog(AbstractContextManager["Catalog"]):
         for azimuth_deg in plan:
             check_azimuth(azimuth_deg)
         texts = checked_texts(label, note)
+        image = None if empty_table is None else self._put(empty_table)
         now = self.clock.utc()
-        with self.database.write() as connection:
-            object_id = connection.scalar(select(objects.c.id).where(in_use(name)))
-            if object_id is None:
-                object_id = insert_row(
-                    connection, objects, name=name, created_utc=now, **({"label": "", "note": ""} | texts)
-                )
-                seal_objects(connection, [object_id])
-            else:
+        with self.database.write() as transaction:
+            known = state.state_of(transaction, name)
+            if known is not None:
                 if not replace:
-                    check_not_enrolled(connection, object_id, name)
-                with changing_enrollments(connection, unfinished_and_complete(connection, object_id)):
-                    abandon_unfinished(connection, object_id, now)
-                if texts:
-                    with changing_object(connection, object_id):
-                        connection.execute(update(objects).where(objects.c.id == object_id).values(texts))
-            enrollment_id = insert_row(
-                connection,
-                enrollments,
-                object_id=object_id,
-                status=EnrollmentStatus.IN_PROGRESS,
-                started_utc=now,
-                planned_azimuth_deg=plan,
+                    state.check_not_enrolled(transaction, known)
+                self._end_unfinished(transaction, known)
+            object_id = log.head(transaction)[0] + 1 if known is None else known.object_id
+            assert object_id is not None
+            enrollment = Enrollment(
+                key=secrets.token_hex(32), object_id=object_id, started_utc=now, planned_azimuth_deg=plan
             )
-            seal_enrollments(connection, [enrollment_id])
-            details = {"enrollment_id": enrollment_id, "views": len(plan), "replace": replace}
-            audit.append(connection, self.clock, audit.Action.ENROLLMENT_STARTED, name, **details)
-            return self._start_session(connection, enrollment_id, object_id, name, plan, provenance)
+            enrollment.digest = digest_of(enrollment, enrollment.key)
+            transaction.add(enrollment)
+            transaction.flush()
+            changed_texts = known is None or bool(texts)
+            log.append(
+                transaction,
+                self.clock,
+                Action.ENROLLMENT_STARTED,
+                name,
+                **(state.columns(known, now, **texts) if changed_texts else {}),
+                object_id=object_id,
+                enrollment_id=enrollment.id,
+                status=EnrollmentStatus.IN_PROGRESS,
+                details={"enrollment_id": enrollment.id, "views": len(plan), "replace": replace},
+            )
+            return self._start_session(transaction, enrollment, name, provenance, image)
 
-    def resumable(self, name: str) -> EnrollmentSummary | None:
+    def resumable(self, name: str) -> EnrollmentState | None:
         """Return the unfinished enrollment of an object, or None.
 
         Raises
@@ -237,12 +304,12 @@ class Catalog(AbstractContextManager["Catalog"]):
         ObjectNotFound
             There is no object of that name.
         """
-        with self.database.read() as connection:
-            object_id, _ = find(connection, name)
-            in_progress = of_status(object_id, EnrollmentStatus.IN_PROGRESS)
-            return next(iter(enrollment_summaries(connection, in_progress)), None)
+        with self.database.read() as transaction:
+            return state.of_status(transaction, state.find(transaction, name), EnrollmentStatus.IN_PROGRESS)
 
-    def resume(self, name: str, *, provenance: Provenance) -> Enrollment:
+    def resume(
+        self, name: str, *, provenance: Provenance, empty_table: NDArray[np.uint8] | None = None
+    ) -> OpenEnrollment:
         """Continue the unfinished enrollment of an object, on the same bench or on another one.
 
         Raises
@@ -254,143 +321,142 @@ class Catalog(AbstractContextManager["Catalog"]):
         CatalogBusy
             Another process is writing for longer than the timeout.
         """
-        with self.database.write() as connection:
-            object_id, name = find(connection, name)
-            found = unfinished(connection, object_id, name)
-            plan = tuple(found.planned_azimuth_deg)
-            audit.append(connection, self.clock, audit.Action.ENROLLMENT_RESUMED, name, enrollment_id=found.id)
-            return self._start_session(connection, found.id, object_id, name, plan, provenance)
-
-    def objects(self) -> list[ObjectSummary]:
-        """Return the objects in use, in the order in which they were added."""
-        with self.database.read() as connection:
-            return object_summaries(connection, objects.c.deleted_utc.is_(None))
-
-    def known_objects(self) -> list[ObjectSummary]:
-        """Return the objects that need not be enrolled: those in use. A journal adds those of its server."""
-        return self.objects()
-
-    def first_views(self) -> dict[str, int]:
-        """Return the id of one view of each object in use, to show the object by."""
-        with self.database.read() as connection:
-            rows = connection.execute(
-                of_views(objects.c.name, func.min(views.c.id).label("id")).where(retrieved()).group_by(objects.c.name)
+        image = None if empty_table is None else self._put(empty_table)
+        with self.database.write() as transaction:
+            found = state.find(transaction, name)
+            enrollment = state.unfinished(transaction, found).enrollment
+            name = str(found.object_name)
+            log.append(
+                transaction,
+                self.clock,
+                Action.ENROLLMENT_RESUMED,
+                name,
+                details={"enrollment_id": enrollment.id},
             )
-            return {row.name: row.id for row in rows}
+            return self._start_session(transaction, enrollment, name, provenance, image)
 
-    def summary(self, name: str) -> ObjectSummary:
-        """Return an object without its enrollments and views, in any state; errors as for `object`."""
-        with self.database.read() as connection:
-            object_id, _ = find(connection, name)
-            (summary,) = object_summaries(connection, objects.c.id == object_id)
-            return summary
+    # Change objects
 
-    def version(self) -> str:
-        """Return a digest of what searches compare with, SHA-256: another one after every change of the objects."""
-        with self.database.read() as connection:
-            return searched_version(connection)
-
-    def object(self, name: str) -> ObjectDetails:
-        """Return an object with its enrollments and views.
-
-        Raises
-        ------
-        ObjectNotFound
-            There is no object of that name.
-        """
-        with self.database.read() as connection:
-            object_id, _ = find(connection, name)
-            (summary,) = object_summaries(connection, objects.c.id == object_id)
-            return ObjectDetails(
-                summary=summary,
-                enrollments=tuple(enrollment_summaries(connection, enrollments.c.object_id == object_id)),
-                views=tuple(stored_views(connection, of_status(object_id, EnrollmentStatus.COMPLETE))),
-            )
-
-    def damage(self, name: str | None = None) -> CatalogDamaged | None:
-        """Return the error that rows of an object, or of any object, are not as they were stored; None if they are.
-
-        Compares digests of rows, not of images: 0.2 s for 7,000 views. `rig.catalog.verify` compares everything.
-        """
-        with self.database.read() as connection:
-            if name is None:
-                return damage_of(connection, None, None)
-            object_id, _ = find(connection, name)
-            own = connection.scalars(select(enrollments.c.id).where(enrollments.c.object_id == object_id)).all()
-            return damage_of(connection, [object_id], own)
-
-    def views(self, descriptor: str = PAPER_DESCRIPTOR) -> ModelSet:
-        """Return the views of every complete enrollment as a descriptor describes them, by object and index.
+    def rename(self, name: str, new_name: str) -> None:
+        """Give an object another name.
 
         Raises
         ------
         UsageError
-            There is no such descriptor.
-        DescriptorOutdated
-            Some views are not described by this version of it and cannot be compared.
-        CatalogDamaged
-            An object or a view is not as it was stored.
+            The new name is not valid.
+        ObjectNotFound
+            There is no object of that name.
+        ObjectExists
+            Another object has the new name.
         """
-        kind = known_descriptor(descriptor)
-        with self.database.read() as connection:
-            return model_set(connection, kind)
+        new_name = clean_name(new_name)
+        with self.database.write() as transaction:
+            known = state.find(transaction, name)
+            if new_name == known.object_name:
+                return
+            state.check_free(transaction, new_name)
+            columns = state.columns(known, known.time_utc)
+            before = {"before": known.object_name}
+            log.append(transaction, self.clock, Action.RENAMED, new_name, **columns, details=before)
 
-    def note(self, action: audit.Action, object_name: str | None = None, **details: Any) -> None:
-        """Add an action to the audit log; details are JSON values."""
-        with self.database.write() as connection:
-            audit.append(connection, self.clock, action, object_name, **details)
-
-    def log(self, *, since: datetime | None = None, object_name: str | None = None) -> list[AuditEntry]:
-        """Return the audit log: who did what and when, oldest first."""
-        with self.database.read() as connection:
-            return audit.entries(connection, since, object_name)
-
-    def view(self, view_id: int) -> StoredView:
-        """Return one view.
+    def set_texts(self, name: str, *, label: str | None = None, note: str | None = None) -> None:
+        """Change the label and the note of an object. None leaves them unchanged.
 
         Raises
         ------
-        CatalogError
-            There is no view with that id.
+        UsageError
+            They are not valid text.
+        ObjectNotFound
+            There is no object of that name.
         """
-        with self.database.read() as connection:
-            found = stored_views(connection, views.c.id == int(view_id))
-        if not found:
-            raise CatalogError(
-                f"There is no view {view_id} in the catalog {self.place}.", next_step="Load the views again."
+        texts = checked_texts(label, note)
+        with self.database.write() as transaction:
+            known = state.find(transaction, name)
+            if texts:
+                columns = state.columns(known, known.time_utc, **texts)
+                log.append(transaction, self.clock, Action.LABELLED, known.object_name, **columns, details=texts)
+
+    def delete(self, *names: str) -> None:
+        """Delete objects, all or none. `undelete` restores them until `collect_garbage` removes them.
+
+        Raises
+        ------
+        ObjectNotFound
+            There is no object of one of these names.
+        """
+        with self.database.write() as transaction:
+            for known in [state.find(transaction, name) for name in dict.fromkeys(names)]:
+                columns = state.columns(known, known.time_utc, deleted=True)
+                log.append(transaction, self.clock, Action.DELETED, known.object_name, **columns)
+
+    def undelete(self, name: str) -> None:
+        """Restore the object that was deleted last under this name.
+
+        Raises
+        ------
+        ObjectNotFound
+            There is no deleted object of that name.
+        ObjectExists
+            An object in use has this name.
+        """
+        with self.database.write() as transaction:
+            known = state.find(transaction, name, deleted=True)
+            state.check_free(transaction, str(known.object_name))
+            columns = state.columns(known, known.time_utc)
+            log.append(transaction, self.clock, Action.UNDELETED, known.object_name, **columns)
+
+    # The log
+
+    def note(self, action: Action, object_name: str | None = None, **details: Any) -> None:
+        """Add an action to the log; details are JSON values."""
+        with self.database.write() as transaction:
+            log.append(transaction, self.clock, action, object_name, details=details)
+
+    def log(self, *, since: datetime | None = None, object_name: str | None = None) -> list[Entry]:
+        """Return the log: who did what and when, oldest first."""
+        with self.database.read() as transaction:
+            return log.entries(transaction, since, object_name)
+
+    def _end_unfinished(self, transaction: Transaction, known: Entry) -> None:
+        """Abandon the unfinished enrollment of an object, if there is one."""
+        begun = state.of_status(transaction, known, EnrollmentStatus.IN_PROGRESS)
+        if begun is not None:
+            log.append(
+                transaction,
+                self.clock,
+                Action.ENROLLMENT_ABANDONED,
+                known.object_name,
+                object_id=known.object_id,
+                enrollment_id=begun.enrollment.id,
+                status=EnrollmentStatus.ABANDONED,
+                finished_utc=self.clock.utc(),
+                details={"enrollment_id": begun.enrollment.id},
             )
-        return found[0]
 
-    def image_path(self, view: StoredView) -> Path:
-        """Return a file with the image of a view; a `CatalogDamaged` if its path leads out of the catalog.
-
-        An image of an object store is fetched.
-        """
-        return self.database.images.file(view.image)
-
-    def read_image(self, view: StoredView) -> NDArray[np.uint8]:
-        """Return the pixels that were stored, uint8 (H, W, 3) BGR.
-
-        Raises
-        ------
-        CatalogError
-            The file is missing, is not the stored one, or the system denies access.
-        """
+    def _put(self, image_bgr: NDArray[np.uint8]) -> tuple[str, int]:
+        """Store an image, and return its name and its size in bytes."""
+        png = images.encode(image_bgr)
         with self.database.catalog_errors():
-            return self.database.images.pixels(view.image, view.image_sha256)
+            return self.database.images.put(png), len(png)
 
     def _start_session(
         self,
-        connection: Connection,
-        enrollment_id: int,
-        object_id: int,
-        object_name: str,
-        plan: tuple[float, ...],
+        transaction: Transaction,
+        enrollment: Enrollment,
+        name: str,
         provenance: Provenance,
-    ) -> Enrollment:
-        now = self.clock.utc()
-        with changing_enrollments(connection, [enrollment_id]):
-            session = Session(insert_session(connection, enrollment_id, now, provenance), now, provenance)
-        enrollment = Enrollment(self.database, self.clock, enrollment_id, object_id, object_name, session, plan)
-        self.database.images.make_folder(enrollment.folder.as_posix())
-        return enrollment
+        empty_table: tuple[str, int] | None,
+    ) -> OpenEnrollment:
+        image, size = empty_table or (None, None)
+        session = Session(
+            number=len(enrollment.sessions),
+            started_utc=self.clock.utc(),
+            provenance=provenance,
+            empty_table=image,
+            empty_table_bytes=size,
+        )
+        session.enrollment_id = enrollment.id
+        session.digest = digest_of(session, enrollment.key)
+        transaction.add(session)
+        transaction.flush()
+        return OpenEnrollment(self, enrollment, name, session)

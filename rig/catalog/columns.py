@@ -3,20 +3,29 @@
 Every reader gets its values through these types. A damaged or hostile database ends in a `CatalogDamaged`.
 """
 
-import json
 import math
-from collections.abc import Callable, Mapping
+import re
+from collections.abc import Callable
 from datetime import UTC, datetime
-from pathlib import PurePosixPath
-from typing import Any
+from typing import Any, Final
 
-from sqlalchemy import JSON, BigInteger, DateTime, Dialect, Float, Integer, LargeBinary, String, Text, TypeDecorator
+from sqlalchemy import (
+    JSON,
+    BigInteger,
+    Boolean,
+    DateTime,
+    Dialect,
+    Float,
+    Integer,
+    LargeBinary,
+    String,
+    Text,
+    TypeDecorator,
+)
 from sqlalchemy.types import TypeEngine
 
-from rig.catalog.records import EnrollmentStatus, Outcome
+from rig.catalog.records import EnrollmentStatus, is_region
 from rig.core.errors import CatalogDamaged
-from rig.views.image_files import IMAGE_FOLDER
-from rig.views.segmentation_evidence import check_evidence
 
 FIX = "Use a backup of the catalog; if you received it, ask the sender for an exported bundle instead."
 
@@ -29,15 +38,7 @@ def damaged(what: str, found: object) -> CatalogDamaged:
     )
 
 
-def image_path(name: str) -> str:
-    """Return the path of an image as it is recorded. ValueError if it does not stay within ``images/``."""
-    pure = PurePosixPath(name)
-    parts = name.split("/")
-    if pure.is_absolute() or parts[0] != IMAGE_FOLDER or len(parts) < 2 or {"", ".", ".."} & set(parts):
-        raise ValueError("an image path that leads out of the catalog")
-    if "\0" in name or "\\" in name:
-        raise ValueError("an image path with characters that this program does not use")
-    return name
+_IMAGE_NAME: Final = re.compile(r"[0-9a-f]{64}\.(png|jpg)")
 
 
 class _Checked(TypeDecorator[Any]):
@@ -110,30 +111,19 @@ class Status(_Checked):
 
     impl = Text
 
-    def check(self, value: Any) -> None:
-        EnrollmentStatus(value)
+    def process_result_value(self, value: str | None, dialect: Dialect) -> EnrollmentStatus | None:  # noqa: ARG002
+        return None if value is None else EnrollmentStatus(value)
 
 
-class ResultOutcome(_Checked):
-    """An `Outcome`."""
+class ImageName(_Checked):
+    """Name of an image: the SHA-256 of its bytes, and the suffix of its format."""
 
-    impl = Text
-
-    def check(self, value: Any) -> None:
-        Outcome(value)
-
-
-class ImagePath(_Checked):
-    """Path of an image, relative to the catalog, within ``images/``.
-
-    `rig.catalog.places` makes it a file, and checks that no link leads out.
-    """
-
-    impl = Text
+    impl = String(68)
 
     def check(self, value: Any) -> None:
         _check_type(value, str)
-        image_path(value)
+        if not _IMAGE_NAME.fullmatch(value):
+            raise ValueError("a name that is not one of an image")
 
 
 class Number(_Checked):
@@ -163,6 +153,15 @@ class Nanoseconds(Count):
     impl = BigInteger
 
 
+class Truth(_Checked):
+    """True or false."""
+
+    impl = Boolean
+
+    def check(self, value: Any) -> None:
+        _check_type(value, bool)
+
+
 class Bytes(_Checked):
     """Bytes."""
 
@@ -188,36 +187,27 @@ class JsonMapping(JsonText):
         _check_type(value, dict)
 
 
-class SegmentationEvidence(JsonText):
-    """The evidence of a segmentation as JSON."""
-
-    def check(self, value: Any) -> None:
-        check_evidence(value)
-
-
 class Azimuths(JsonText):
-    """A list of azimuths as JSON."""
+    """A tuple of azimuths as JSON."""
+
+    def process_result_value(self, value: Any, dialect: Dialect) -> tuple[float, ...]:  # noqa: ARG002
+        _check_type(value, list)
+        return tuple(value)
 
     def check(self, value: Any) -> None:
-        _check_type(value, list)
         for azimuth_deg in value:
             _check_number(azimuth_deg)
 
 
-def parse_mapping(text: str) -> Mapping[str, Any]:
-    """Return a JSON object from the text of a column.
+class RegionOfImage(JsonText):
+    """A `Region` as JSON."""
 
-    Raises
-    ------
-    CatalogDamaged
-        It is not one.
-    """
-    try:
-        found = json.loads(text)
-        _check_type(found, dict)
-    except (ValueError, TypeError, RecursionError) as error:
-        raise damaged("a text that should be a JSON object", text) from error
-    return dict(found)
+    def process_result_value(self, value: Any, dialect: Dialect) -> Any:  # noqa: ARG002
+        return None if value is None else tuple(value)
+
+    def check(self, value: Any) -> None:
+        if value is not None and not is_region(value):
+            raise ValueError("a region that is not one")
 
 
 def _check_type(value: object, kind: type) -> None:

@@ -1,20 +1,24 @@
-"""The interface of a catalog's database, with two engines: `rig.catalog.sqlite_database` and `rig.catalog.postgres`.
+"""The database of a catalog: SQLite in a file, or PostgreSQL for several benches.
 
 Decision: docs/decisions/0050.
 """
 
+import uuid
 from abc import ABC, abstractmethod
-from contextlib import AbstractContextManager
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
-from typing import Any
 
-from sqlalchemy import Connection, Table, insert, text
+from sqlalchemy import Connection, select
+from sqlalchemy.orm import Session as Transaction
 
 from rig.catalog.columns import damaged
-from rig.catalog.image_store import ImageStore
-from rig.catalog.schema import SCHEMA_VERSION
+from rig.catalog.facts import SCHEMA_VERSION, Property, Row
+from rig.catalog.images import Images
 from rig.config.catalog_place import CatalogPlace
 from rig.core.errors import CatalogError
+
+APPLICATION = "hbr-rig catalog"
 
 
 class Database(ABC):
@@ -29,99 +33,105 @@ class Database(ABC):
     """
 
     place: CatalogPlace
-    images: ImageStore
+    images: Images
+    read_only: bool
+
+    @classmethod
+    def open(cls, place: CatalogPlace, *, create: bool, read_only: bool, busy_timeout_s: float) -> "Database":
+        """Open the database at a place; parameters and errors as for `rig.catalog.Catalog.open`."""
+        if place.url is None:
+            from rig.catalog.sqlite_database import SqliteDatabase
+
+            return SqliteDatabase(place, create=create, read_only=read_only, busy_timeout_s=busy_timeout_s)
+        from rig.catalog.postgres import PostgresDatabase
+
+        return PostgresDatabase(place, create=create, read_only=read_only, busy_timeout_s=busy_timeout_s)
 
     @property
     def root(self) -> Path:
         """Folder of the catalog on this computer."""
         return self.place.path
 
+    @contextmanager
+    def read(self) -> Iterator[Transaction]:
+        """Yield a transaction that sees the catalog as it is at its first query."""
+        with self.catalog_errors(), self._reading() as connection, _transaction(connection) as transaction:
+            yield transaction
+
+    @contextmanager
+    def write(self) -> Iterator[Transaction]:
+        """Yield a transaction that adds to the catalog. An exception rolls it back. No other one runs meanwhile."""
+        if self.read_only:
+            raise CatalogError(f"The catalog {self.place} is open for reading only.", next_step="Open it for writing.")
+        with self.catalog_errors(), self._writing() as connection, _transaction(connection) as transaction:
+            yield transaction
+            transaction.flush()
+
     @abstractmethod
     def close(self) -> None:
         """Close all connections."""
 
     @abstractmethod
-    def read(self) -> AbstractContextManager[Connection]:
-        """Yield a transaction that sees the catalog as it is at its first query."""
+    def _reading(self) -> AbstractContextManager[Connection]: ...
 
     @abstractmethod
-    def write(self, enrollment_id: int | None = None) -> AbstractContextManager[Connection]:
-        """Yield a transaction that changes the catalog. An exception rolls it back.
-
-        Parameters
-        ----------
-        enrollment_id
-            The only enrollment that it changes; None for any change. Changes of different enrollments may run at once,
-            any other change runs alone.
-        """
+    def _writing(self) -> AbstractContextManager[Connection]: ...
 
     @abstractmethod
     def catalog_errors(self) -> AbstractContextManager[None]:
         """Raise errors of the database and of the store of images as errors of the catalog."""
 
-    @abstractmethod
-    def damage(self, connection: Connection) -> list[str]:
+    def damage(self, transaction: Transaction) -> list[str]:  # noqa: ARG002 - a server checks its own pages
         """Return what the database's own check of its structure finds."""
+        return []
 
     @abstractmethod
-    def orphans(self, connection: Connection) -> list[tuple[str, int | None, str]]:
-        """Return table, row and missing table of each row that refers to a missing row."""
-
-    @abstractmethod
-    def last_ids(self, connection: Connection) -> dict[str, int]:
-        """Return the last id that each table has given."""
-
-    @abstractmethod
-    def settings(self, connection: Connection) -> list[tuple[str, Any, Any]]:
-        """Return name, value and right value of each wrong setting of the database."""
-
-    @abstractmethod
-    def size_bytes(self, connection: Connection) -> int:
+    def size_bytes(self, transaction: Transaction) -> int:
         """Return the size of the database."""
 
     def may_have_changed(self) -> bool:
         """Return whether another query can find something new since the last call."""
         return True
 
-    def read_only_error(self) -> CatalogError:
-        """Return the error for a change of a catalog that is open for reading."""
-        return CatalogError(f"The catalog {self.place} is open for reading only.", next_step="Open it for writing.")
+
+def _transaction(connection: Connection) -> Transaction:
+    return Transaction(connection, expire_on_commit=False, autoflush=True)
 
 
-def check_version(place: CatalogPlace, version: int) -> None:
-    """Check the version of a catalog's tables.
+def create_tables(connection: Connection) -> None:
+    """Create the tables of a new catalog."""
+    Row.metadata.create_all(connection)
+    first = {"application": APPLICATION, "version": str(SCHEMA_VERSION), "id": uuid.uuid4().hex, "head": "0 "}
+    connection.execute(Property.__table__.insert(), [{"key": key, "value": value} for key, value in first.items()])
+
+
+def properties(connection: Connection | Transaction) -> dict[str, str]:
+    """Return the properties of a catalog."""
+    return dict(connection.execute(select(Property.key, Property.value)).tuples().all())
+
+
+def check_properties(found: dict[str, str], place: CatalogPlace) -> None:
+    """Check that a database is a catalog, of this version.
 
     Raises
     ------
     CatalogError
-        Another version of the program wrote the catalog.
+        It belongs to another program, or to another version of this one.
     CatalogDamaged
         No program has written such a version.
     """
+    if found.get("application") != APPLICATION:
+        raise CatalogError(f"{place} is the database of another program.", next_step="Give the place of a catalog.")
+    try:
+        version = int(found["version"])
+    except (KeyError, ValueError) as error:
+        raise damaged("the version of its tables", found.get("version")) from error
     if version < 1:
-        raise damaged("the version of its schema", version)
+        raise damaged("the version of its tables", version)
     if version != SCHEMA_VERSION:
         raise CatalogError(
-            f"The catalog {place} was written by another version of the program: its schema has version {version}, "
+            f"The catalog {place} was written by another version of the program: its tables have version {version}, "
             f"this program knows {SCHEMA_VERSION}.",
             next_step="Use the version of hbr-rig that wrote it, or another catalog.",
             evidence={"found": version, "known": SCHEMA_VERSION},
         )
-
-
-def insert_row(connection: Connection, table: Table, **values: object) -> int:
-    """Insert a row and return its id."""
-    row_id: int = connection.execute(insert(table).values(values).returning(table.c.id)).scalar_one()
-    return row_id
-
-
-def given_id(connection: Connection, table: Table) -> dict[str, int]:
-    """Return the id of the next row of an append-only table as its column; empty if the database gives it.
-
-    The sequences of PostgreSQL leave gaps after a rollback, and a gap in these tables means that rows are missing.
-    """
-    if connection.dialect.name != "postgresql":
-        return {}
-    more = "CAST(CAST(value AS bigint) + 1 AS text)"
-    statement = text(f"UPDATE catalog_properties SET value = {more} WHERE key = :name RETURNING value")
-    return {"id": int(connection.execute(statement, {"name": table.name}).scalar_one())}

@@ -11,22 +11,13 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
-from rig.catalog.columns import FIX, image_path
+from rig.catalog.columns import FIX
 from rig.config.catalog_place import DATABASE_NAME
 from rig.core.errors import CatalogDamaged
 from rig.core.files import make_folder, open_regular
 from rig.views.image_files import IMAGE_FOLDER
 
-LOST: Final = "lost+found"
-"""Folder for files that `verify` moves away."""
-
-INCOMING: Final = "incoming"
-"""Folder of running imports."""
-
-PREPARED: Final = "prepared"
-"""Folder of the prepared views (`rig.catalog.prepared`)."""
-
-_OWN: Final = (DATABASE_NAME, IMAGE_FOLDER, LOST, INCOMING, PREPARED)
+_OWN: Final = (DATABASE_NAME, IMAGE_FOLDER)
 _BESIDE: Final = tuple(f"{DATABASE_NAME}-{suffix}" for suffix in ("wal", "shm", "journal"))
 """Files that SQLite itself writes beside the database."""
 
@@ -86,23 +77,22 @@ def _check_rollback_journal(root: Path) -> None:
         )
 
 
-def image_file(root: Path, name: str) -> Path:
-    """Return the file of an image, from its path relative to the catalog in the folder ``root``.
+def image_file(root: Path, path: str) -> Path:
+    """Return the file of an image at a path within ``images/`` of the catalog in the folder ``root``.
 
     Raises
     ------
     CatalogDamaged
-        The path or a link in it leads out of the images of the catalog.
+        A link leads out of the images of the catalog, or the file is a pipe or a device.
     """
-    try:
-        return _inside(root, IMAGE_FOLDER, image_path(name))
-    except ValueError as error:
-        raise _leads_out(root / name) from error
-
-
-def lost_file(root: Path, name: str) -> Path:
-    """Return the file in lost+found for a file of the catalog; errors as for `image_file`."""
-    return _inside(root, LOST, f"{LOST}/{name}")
+    file = root / path
+    real = os.path.realpath(root)
+    if not os.path.realpath(file).startswith(f"{real}{os.sep}{IMAGE_FOLDER}{os.sep}"):
+        raise _leads_out(file)
+    with suppress(FileNotFoundError):
+        if stat.S_IFMT(file.stat().st_mode) not in (stat.S_IFREG, stat.S_IFDIR):
+            raise _leads_out(file)
+    return file
 
 
 def files_within(folder: Path) -> Iterator[Path]:
@@ -123,24 +113,9 @@ def file_mode(root: Path) -> int:
 
 
 def make_folder_within(root: Path, folder: Path) -> None:
-    """Create ``folder`` of the catalog in ``root`` with the permissions of its files."""
-    make_folder(folder, within=root, mode=folder_mode(file_mode(root)))
-
-
-def folder_mode(mode: int) -> int:
-    """Return the permissions of a folder for files with these permissions."""
-    return mode | (mode & 0o444) >> 2
-
-
-def _inside(root: Path, top: str, name: str) -> Path:
-    path = root / name
-    real = os.path.realpath(root)
-    if not os.path.realpath(path).startswith(f"{real}{os.sep}{top}{os.sep}"):
-        raise _leads_out(path)
-    with suppress(FileNotFoundError):
-        if stat.S_IFMT(path.stat().st_mode) not in (stat.S_IFREG, stat.S_IFDIR):
-            raise _leads_out(path)  # a pipe or a device
-    return path
+    """Create ``folder`` of the catalog in ``root``; who may read its files may also enter it."""
+    mode = file_mode(root)
+    make_folder(folder, within=root, mode=mode | (mode & 0o444) >> 2)
 
 
 def _leads_out(path: Path) -> CatalogDamaged:

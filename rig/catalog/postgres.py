@@ -1,25 +1,21 @@
 """A catalog in a PostgreSQL database, for several benches at once.
 
-The tables are those of SQLite. A table ``catalog_properties`` holds what SQLite keeps outside of tables: the kind and
-the version of the database, its id, and the last ids of the append-only tables.
-
 Decision: docs/decisions/0050.
 """
 
-import uuid
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from typing import Any, Final
 
-from sqlalchemy import Column, Connection, MetaData, QueuePool, Table, Text, create_engine, func, select, text
+from sqlalchemy import DDL, Connection, QueuePool, create_engine, event, func, select, text
 from sqlalchemy.engine import make_url
 from sqlalchemy.exc import ArgumentError
+from sqlalchemy.orm import Session as Transaction
 
-from rig.catalog.columns import damaged
-from rig.catalog.database import Database, check_version
+from rig.catalog.database import Database, check_properties, create_tables, properties
+from rig.catalog.facts import FACTS, Enrollment, Entry, Property, Row
 from rig.catalog.failures import server_errors
-from rig.catalog.image_store import open_store
-from rig.catalog.schema import APPEND_ONLY, METADATA, SCHEMA_VERSION
+from rig.catalog.images import open_images
 from rig.config.catalog_place import CatalogPlace
 from rig.core.errors import CatalogError, CatalogUnavailable, ConfigError, ExtraMissing
 from rig.core.files import make_folder
@@ -28,11 +24,25 @@ from rig.core.next_steps import Do
 CHANNEL: Final = "hbr_rig_catalog"
 """Channel of the notifications about changes; the payload is the id of the catalog."""
 
-APPLICATION: Final = "hbr-rig catalog"
+_CREATION: Final = 0x48425200
+"""Lock of the creation of the tables."""
 
-_PROPERTIES: Final = Table(
-    "catalog_properties", MetaData(), Column("key", Text, primary_key=True), Column("value", Text, nullable=False)
-)
+_CATALOG: Final = f"CAST(CAST('{Property.__tablename__}' AS regclass) AS bigint)"
+"""Lock of a catalog."""
+
+for _fact in FACTS:  # a program that changes a fact in place fails
+    _table = _fact.__tablename__
+    _changes = ("UPDATE", "DELETE", "TRUNCATE") if _fact is Entry else ("UPDATE",)
+    for _statement in (
+        f"CREATE FUNCTION {_table}_no_change() RETURNS trigger LANGUAGE plpgsql AS "
+        "$$ BEGIN RAISE EXCEPTION 'a fact is written once'; END $$",
+        *(
+            f"CREATE TRIGGER {_table}_no_{_change.lower()} BEFORE {_change} ON {_table} "
+            f"{'' if _change == 'TRUNCATE' else 'FOR EACH ROW '}EXECUTE FUNCTION {_table}_no_change()"
+            for _change in _changes
+        ),
+    ):
+        event.listen(_fact.__table__, "after_create", DDL(_statement).execute_if(dialect="postgresql"))  # type: ignore[no-untyped-call]
 
 LOST_BENCH_S: Final = 30
 """After this time the server ends a transaction that has locks, of a bench that lost its network or its power."""
@@ -49,27 +59,24 @@ _SETTINGS: Final = {
     "synchronous_commit": "on",
 }
 
-_ENROLLMENT_LOCKS: Final = 0x48425200
-
 
 class PostgresDatabase(Database):
     """The database of a catalog on a PostgreSQL server.
 
-    A commit is durable. Transactions that change one enrollment share a lock of the whole catalog and have a lock of
-    the enrollment; all others have the lock of the catalog alone. Readers have a snapshot and do not wait.
+    A commit is durable. A transaction that writes has the lock of the catalog. Readers have a snapshot and do not wait.
 
     Parameters and errors are those of `rig.catalog.Catalog.open`.
     """
 
     def __init__(self, place: CatalogPlace, *, create: bool, read_only: bool, busy_timeout_s: float) -> None:
         self.place = place
-        self.images = open_store(place)
+        self.images = open_images(place)
         make_folder(place.path, within=next(one for one in place.path.parents if one.exists()), mode=0o700)
-        self._read_only = read_only
+        self.read_only = read_only
         self._busy_timeout_s = busy_timeout_s
         engine = _engine(place, busy_timeout_s)
-        self._reading = engine.execution_options(isolation_level="REPEATABLE READ", postgresql_readonly=True)
-        self._writing = engine.execution_options(isolation_level="READ COMMITTED")
+        self._snapshots = engine.execution_options(isolation_level="REPEATABLE READ", postgresql_readonly=True)
+        self._changes = engine.execution_options(isolation_level="READ COMMITTED")
         self._dispose = engine.dispose
         self._listener: Any = None
         try:
@@ -85,19 +92,18 @@ class PostgresDatabase(Database):
             self._listener.close()
 
     @contextmanager
-    def read(self) -> Iterator[Connection]:
-        with self.catalog_errors(), self._reading.begin() as connection:
-            _check_version(properties(connection), self.place)
+    def _reading(self) -> Iterator[Connection]:
+        with self._snapshots.begin() as connection:
+            check_properties(properties(connection), self.place)
             yield connection
 
     @contextmanager
-    def write(self, enrollment_id: int | None = None) -> Iterator[Connection]:
-        if self._read_only:
-            raise self.read_only_error()
-        with self.catalog_errors(), self._writing.begin() as connection:
+    def _writing(self) -> Iterator[Connection]:
+        with self._changes.begin() as connection:
             # The transaction sees what was committed before it got the lock: each query has a snapshot of its own.
-            lock_catalog(connection, enrollment_id)
-            _check_version(properties(connection), self.place)
+            limit_idle(connection, LOST_BENCH_S)
+            connection.execute(text(f"SELECT pg_advisory_xact_lock({_CATALOG})"))
+            check_properties(properties(connection), self.place)
             yield connection
             connection.execute(select(func.pg_notify(CHANNEL, self.id)))
 
@@ -105,18 +111,16 @@ class PostgresDatabase(Database):
         return server_errors(self.place, self._busy_timeout_s)
 
     def _open(self, *, create: bool) -> None:
-        with self._writing.begin() as connection:
+        with self._changes.begin() as connection:
             exists = _has_tables(connection)
         if not exists:
             if not create:
                 raise _absent(self.place)
             self._create()
-        with self._writing.begin() as connection:
+        with self._changes.begin() as connection:
             found = properties(connection)
-        if found.get("application") != APPLICATION:
-            raise CatalogError(f"{self.place} is the database of another program.", next_step="Check catalog.url.")
+        check_properties(found, self.place)
         self.id = found["id"]
-        _check_version(found, self.place)
         self._check_mark()
 
     def _check_mark(self) -> None:
@@ -124,12 +128,12 @@ class PostgresDatabase(Database):
         mark = self.images.mark()
         if mark == self.id:
             return
-        where = self.images.where("images")
+        where = self.images.where("")
         fix = "Set catalog.images to the folder or the store that all benches of the catalog use."
         if mark is not None:
             raise CatalogError(f"{where} has the images of another catalog than {self.place}.", next_step=fix)
         with self.read() as connection:
-            used = connection.scalar(select(func.count()).select_from(METADATA.tables["enrollments"])) or 0
+            used = connection.scalar(select(func.count()).select_from(Enrollment)) or 0
         if used and self.images.is_empty():
             raise CatalogUnavailable(
                 f"The images of the catalog {self.place} are not in {where}, which is empty.",
@@ -137,20 +141,15 @@ class PostgresDatabase(Database):
             )
         if used:
             raise CatalogError(f"The images of the catalog {self.place} are not in {where}.", next_step=fix)
-        if not self._read_only:
+        if not self.read_only:
             self.images.set_mark(self.id)
 
     def _create(self) -> None:
-        with self._writing.begin() as connection:
-            connection.execute(select(func.pg_advisory_xact_lock(_ENROLLMENT_LOCKS)))
+        with self._changes.begin() as connection:
+            connection.execute(select(func.pg_advisory_xact_lock(_CREATION)))
             if _has_tables(connection):
                 return  # another process was faster
-            _PROPERTIES.metadata.create_all(connection)
-            METADATA.create_all(connection)
-            first = {"application": APPLICATION, "version": str(SCHEMA_VERSION), "id": uuid.uuid4().hex}
-            first |= {table.name: "0" for table in APPEND_ONLY}
-            rows = [{"key": key, "value": value} for key, value in first.items()]
-            connection.execute(_PROPERTIES.insert(), rows)
+            create_tables(connection)
 
     def may_have_changed(self) -> bool:
         """Return whether the server has sent a notification; True without a connection: the next query reports it."""
@@ -171,28 +170,8 @@ class PostgresDatabase(Database):
             self._listener = None
             return True
 
-    def damage(self, connection: Connection) -> list[str]:  # noqa: ARG002 - the server checks its own pages
-        return []
-
-    def orphans(self, connection: Connection) -> list[tuple[str, int | None, str]]:  # noqa: ARG002 - always enforced
-        return []
-
-    def last_ids(self, connection: Connection) -> dict[str, int]:
-        found = properties(connection)
-        given = {table.name: int(found.get(table.name, "0")) for table in APPEND_ONLY}
-        for name in ("objects", "enrollments", "sessions", "views"):
-            last = connection.execute(text(f"SELECT last_value, is_called FROM {name}_id_seq")).one()
-            given[name] = last.last_value if last.is_called else 0
-        return given
-
-    def settings(self, connection: Connection) -> list[tuple[str, Any, Any]]:  # noqa: ARG002 - those of the server
-        return []
-
-    def size_bytes(self, connection: Connection) -> int:
-        sizes = [
-            connection.scalar(select(func.pg_total_relation_size(name))) or 0
-            for name in (*METADATA.tables, _PROPERTIES.name)
-        ]
+    def size_bytes(self, transaction: Transaction) -> int:
+        sizes = (transaction.scalar(select(func.pg_total_relation_size(name))) or 0 for name in Row.metadata.tables)
         return sum(sizes)
 
 
@@ -209,41 +188,11 @@ def limit_idle(connection: Connection, seconds: int) -> None:
     connection.execute(text(statement), {"ms": str(1000 * seconds)})
 
 
-def lock_catalog(connection: Connection, enrollment_id: int | None = None) -> None:
-    """Wait for the lock of the catalog until the end of the transaction; or, shared, for that of one enrollment."""
-    limit_idle(connection, LOST_BENCH_S)
-    catalog = "CAST(CAST('catalog_properties' AS regclass) AS oid)"
-    if enrollment_id is None:
-        connection.execute(text(f"SELECT pg_advisory_xact_lock(CAST({catalog} AS bigint))"))
-        return
-    connection.execute(text(f"SELECT pg_advisory_xact_lock_shared(CAST({catalog} AS bigint))"))
-    one = f"SELECT pg_advisory_xact_lock(CAST({catalog} AS integer), CAST(:id AS integer))"
-    connection.execute(text(one), {"id": enrollment_id})
-
-
-def properties(connection: Connection) -> dict[str, str]:
-    """Return the properties of a catalog."""
-    return {row.key: row.value for row in connection.execute(select(_PROPERTIES))}
-
-
-def set_property(connection: Connection, key: str, value: str) -> None:
-    """Change a property of a catalog."""
-    connection.execute(_PROPERTIES.update().where(_PROPERTIES.c.key == key).values(value=value))
-
-
 def _has_tables(connection: Connection) -> bool:
     # to_regclass may answer from a cache of the session
     here = "relnamespace = CAST(current_schema() AS regnamespace)"
     found = f"SELECT count(*) FROM pg_class WHERE relname = :name AND {here}"
-    return bool(connection.execute(text(found), {"name": _PROPERTIES.name}).scalar())
-
-
-def _check_version(found: dict[str, str], place: CatalogPlace) -> None:
-    try:
-        version = int(found["version"])
-    except (KeyError, ValueError) as error:
-        raise damaged("the version of its schema", found.get("version")) from error
-    check_version(place, version)
+    return bool(connection.execute(text(found), {"name": Property.__tablename__}).scalar())
 
 
 def _engine(place: CatalogPlace, busy_timeout_s: float) -> Any:

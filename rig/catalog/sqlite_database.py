@@ -4,33 +4,40 @@ Decision: docs/decisions/0014.
 """
 
 import os
+import re
 import sqlite3
 import sys
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, closing, contextmanager
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Final
 
-from sqlalchemy import Connection, NullPool, QueuePool, create_engine, event
+from sqlalchemy import DDL, Connection, NullPool, QueuePool, StaticPool, create_engine, event
+from sqlalchemy.orm import Session as Transaction
 
 from rig.catalog.columns import FIX
-from rig.catalog.database import Database, check_version
+from rig.catalog.database import APPLICATION, Database, check_properties, create_tables, properties
+from rig.catalog.facts import FACTS, SCHEMA_VERSION, Entry, Row
 from rig.catalog.failures import absent, catalog_errors
-from rig.catalog.image_store import open_store
+from rig.catalog.images import open_images
 from rig.catalog.places import check_folder
-from rig.catalog.schema import (
-    APPLICATION_ID,
-    KNOWN_NAMES,
-    METADATA,
-    SCHEMA_VERSION,
-    expected_schema,
-    schema_digest,
-)
 from rig.config.catalog_place import DATABASE_NAME, CatalogPlace
 from rig.core.errors import CatalogDamaged, CatalogError
 from rig.core.files import make_folder, sync_folder
+
+APPLICATION_ID: Final = 0x48425247
+"""``HBRG``: marks the SQLite file as a catalog (`PRAGMA application_id`)."""
+
+for _fact in FACTS:  # a program that changes a fact in place fails
+    _changes = ("UPDATE", "DELETE") if _fact is Entry else ("UPDATE",)
+    for _change in _changes:
+        _statement = (
+            f"CREATE TRIGGER {_fact.__tablename__}_no_{_change.lower()} BEFORE {_change} ON {_fact.__tablename__} "
+            "BEGIN SELECT RAISE(ABORT, 'a fact is written once'); END"
+        )
+        event.listen(_fact.__table__, "after_create", DDL(_statement).execute_if(dialect="sqlite"))  # type: ignore[no-untyped-call]
 
 
 class SqliteDatabase(Database):
@@ -44,13 +51,13 @@ class SqliteDatabase(Database):
 
     def __init__(self, place: CatalogPlace, *, create: bool, read_only: bool, busy_timeout_s: float) -> None:
         self.place = place
-        self.images = open_store(place)
+        self.images = open_images(place)
         self._file = place.database_file
-        self._read_only = read_only
+        self.read_only = read_only
         self._busy_timeout_s = busy_timeout_s
         self._engine = create_engine("sqlite://", creator=self._connect, poolclass=QueuePool)
         event.listen(self._engine, "begin", _begin)
-        self._writing = self._engine.execution_options(begin="BEGIN IMMEDIATE")
+        self._immediate = self._engine.execution_options(begin="BEGIN IMMEDIATE")
         try:
             with self.catalog_errors():
                 self._open(create=create and not read_only)
@@ -62,15 +69,13 @@ class SqliteDatabase(Database):
         self._engine.dispose()
 
     @contextmanager
-    def read(self) -> Iterator[Connection]:
-        with self.catalog_errors(), self._engine.begin() as connection:
+    def _reading(self) -> Iterator[Connection]:
+        with self._engine.begin() as connection:
             yield connection
 
     @contextmanager
-    def write(self, enrollment_id: int | None = None) -> Iterator[Connection]:  # noqa: ARG002 - one writer at a time
-        if self._read_only:
-            raise self.read_only_error()
-        with self.catalog_errors(), self._writing.begin() as connection:
+    def _writing(self) -> Iterator[Connection]:
+        with self._immediate.begin() as connection:
             yield connection
 
     def catalog_errors(self) -> AbstractContextManager[None]:
@@ -84,39 +89,33 @@ class SqliteDatabase(Database):
             parent = next(parent for parent in self.root.parents if parent.exists())
             make_folder(self.root, within=parent, mode=0o700)
             self._create()
-        with self.read() as connection:
+        with self._reading() as connection:
             _check_kind(connection, self.root)
             _check_schema(connection, self.root)
+            check_properties(properties(connection), self.place)
             journal = connection.exec_driver_sql("PRAGMA journal_mode").scalar()
-        if journal != "wal" and not self._read_only:
+        if journal != "wal" and not self.read_only:
             # Another program has changed the mode, for example for a backup. A kill would leave a rollback journal, and
             # `check_folder` rejects any.
             with closing(self._connect()) as changing:
                 changing.execute("PRAGMA journal_mode = WAL")
 
-    def damage(self, connection: Connection) -> list[str]:
+    def damage(self, transaction: Transaction) -> list[str]:
+        connection = transaction.connection()
         messages = connection.exec_driver_sql("PRAGMA integrity_check(20)").scalars().all()
-        return [] if messages == ["ok"] else [str(message) for message in messages]
+        found = [] if messages == ["ok"] else [str(one) for one in messages]
+        orphans = connection.exec_driver_sql("PRAGMA foreign_key_check").all()
+        found += [
+            f"row {row_id} of {table} refers to a missing row of {parent}" for table, row_id, parent, _ in orphans
+        ]
+        return found
 
-    def orphans(self, connection: Connection) -> list[tuple[str, int | None, str]]:
-        found = connection.exec_driver_sql("PRAGMA foreign_key_check").all()
-        return [(table, row_id, parent) for table, row_id, parent, _ in found]
-
-    def last_ids(self, connection: Connection) -> dict[str, int]:
-        given = connection.exec_driver_sql("SELECT name, CAST(seq AS INTEGER) FROM sqlite_sequence")
-        return {row[0]: row[1] for row in given}
-
-    def settings(self, connection: Connection) -> list[tuple[str, Any, Any]]:
-        journal = connection.exec_driver_sql("PRAGMA journal_mode").scalar()
-        wrong = journal not in ("wal", "off")  # off: opened without permission to write
-        return [("journal", journal, "wal")] if wrong else []
-
-    def size_bytes(self, connection: Connection) -> int:  # noqa: ARG002
+    def size_bytes(self, transaction: Transaction) -> int:  # noqa: ARG002
         return sum(file.stat().st_size for file in self.root.glob(f"{DATABASE_NAME}*"))
 
     def _connect(self) -> sqlite3.Connection:
         mode = "rw"
-        if self._read_only:
+        if self.read_only:
             mode = "ro" if self._is_shareable() else "ro&immutable=1"
         connection = connect(self.root, mode, self._busy_timeout_s)
         try:
@@ -142,7 +141,7 @@ class SqliteDatabase(Database):
             engine = create_engine("sqlite://", creator=partial(sqlite3.connect, made), poolclass=NullPool)
             with engine.connect() as connection:
                 connection.exec_driver_sql("PRAGMA journal_mode = WAL")
-                METADATA.create_all(connection)
+                create_tables(connection)
                 connection.exec_driver_sql(f"PRAGMA application_id = {APPLICATION_ID}")
                 connection.exec_driver_sql(f"PRAGMA user_version = {SCHEMA_VERSION}")
                 connection.commit()
@@ -204,27 +203,40 @@ def database_exists(root: Path) -> bool:
 
 
 def _check_kind(connection: Connection, root: Path) -> None:
-    """Check that the database is a catalog, and of this version."""
-    application_id = connection.exec_driver_sql("PRAGMA application_id").scalar_one()
-    if application_id != APPLICATION_ID:
+    """Check that the database is a catalog."""
+    if connection.exec_driver_sql("PRAGMA application_id").scalar_one() != APPLICATION_ID:
         raise CatalogError(
             f"{root / DATABASE_NAME} is the database of another program.", next_step="Give the folder of a catalog."
         )
-    check_version(CatalogPlace(root), connection.exec_driver_sql("PRAGMA user_version").scalar_one())
+    version = connection.exec_driver_sql("PRAGMA user_version").scalar_one()
+    check_properties({"application": APPLICATION, "version": str(version)}, CatalogPlace(root))
 
 
 def _check_schema(connection: Connection, root: Path) -> None:
     """Raise `CatalogDamaged` if a database has other tables, indexes, triggers or views than a new one."""
     database = connection.connection.driver_connection
     assert isinstance(database, sqlite3.Connection)
-    if schema_digest(database) != expected_schema():
-        names = sorted({str(name) for (name,) in database.execute("SELECT name FROM sqlite_master")} - KNOWN_NAMES)
+    found, expected = _schema(database), _expected_schema()
+    if found != expected:
         raise CatalogDamaged(
             f"The database of the catalog {root} has other tables, triggers or views than this program made; "
             "nothing was changed.",
             next_step=FIX,
-            evidence={"version": SCHEMA_VERSION, "unknown": names[:20]},
+            evidence={"version": SCHEMA_VERSION, "unknown": sorted(found.keys() - expected.keys())[:20]},
         )
+
+
+def _schema(database: sqlite3.Connection) -> dict[str, str]:
+    """Return the definitions of all tables, indexes, triggers and views by their names, without their white space."""
+    rows = database.execute("SELECT name, type, tbl_name, sql FROM sqlite_master")
+    return {str(row[0]): ascii((*row[1:3], re.sub(r'[\s"]+', "", str(row[3])))) for row in rows}
+
+
+@cache
+def _expected_schema() -> dict[str, str]:
+    with closing(sqlite3.connect(":memory:", isolation_level=None)) as connection:
+        Row.metadata.create_all(create_engine("sqlite://", creator=lambda: connection, poolclass=StaticPool))
+        return _schema(connection)
 
 
 def _begin(connection: Connection) -> None:

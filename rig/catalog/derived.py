@@ -1,0 +1,619 @@
+"""What is computed from the facts: the silhouettes and descriptors of the enrolled views.
+
+The views of an enrollment are segmented and described together, once, when it ends, as a search segments its views. The
+result is kept in the catalog's table ``derived``. It names the enrollment by its seal, and the versions that made it. A
+missing, old or damaged result is computed again, so the table can be emptied at any time.
+
+Decisions: docs/decisions/0042, docs/decisions/0053.
+"""
+
+import hashlib
+import json
+from collections.abc import Callable, Collection, Generator, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import partial
+from itertools import groupby
+from typing import Any, Final, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from sqlalchemy import delete, insert, select
+from sqlalchemy.orm import Session as Transaction
+
+import hbr
+from hbr.core.cores import THREADS
+from hbr.dense.last_steps import near
+from hbr.dense.local_difference import LocalView
+from hbr.descriptors import Descriptor, descriptor, names
+from rig.calibrations.store import CALIBRATIONS
+from rig.catalog import log, state
+from rig.catalog.catalog import Catalog
+from rig.catalog.database import Database
+from rig.catalog.facts import Action, Derived, Enrollment, Entry, Session, View, seal_of
+from rig.catalog.images import Images
+from rig.catalog.jobs import JobProgress, finished, processes
+from rig.catalog.records import EnrollmentStatus, JsonObject, Region
+from rig.config import ViewConfig
+from rig.core.errors import CatalogDamaged, CatalogError, RigError, UsageError
+from rig.core.next_steps import Do
+from rig.core.processes import Jobs, map_in_processes
+from rig.views.description import (
+    BENCH_DESCRIPTOR,
+    DESCRIPTORS,
+    PAPER_DESCRIPTOR,
+    EnrollmentDescriber,
+    ViewDescriber,
+    within,
+)
+from rig.views.segmentation_evidence import check_evidence
+
+SEGMENTATION: Final = "segmentation"
+"""The kind of the stored silhouettes: a list of the evidence of each view (`hbr.segmentation.stored`)."""
+SEGMENTATION_VERSION: Final = 1
+"""Increases when the same images give other silhouettes."""
+FEWEST_VIEWS: Final = 4
+"""A session with fewer views, after an interruption, learns its background from all views of the enrollment."""
+
+Levels = NDArray[np.uint8]
+
+
+class _Image(NamedTuple):
+    """The image of a view, its session, and the part of it that is described."""
+
+    image: str
+    session: int
+    region: Region | None
+    azimuth_deg: float
+
+
+class _Task(NamedTuple):
+    """An enrollment to be described: by these descriptors, with the empty-table image of each session."""
+
+    seal: str
+    name: str
+    names: tuple[str, ...]
+    region: tuple[Region | None] | None
+    views: tuple[_Image, ...]
+    empty_tables: tuple[str | None, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Described:
+    """The levels of the views of an enrollment by each descriptor, uint8 (n, length), and their segmentation."""
+
+    levels: Mapping[str, Levels]
+    segmentation: tuple[dict[str, Any], ...]
+
+
+class _Pixels(Protocol):
+    def __call__(self, image: str, /) -> NDArray[np.uint8]: ...
+
+
+def known_descriptor(name: str) -> Descriptor:
+    """Return the descriptor of this name. A `UsageError` lists the known ones."""
+    try:
+        return descriptor(name)
+    except ValueError as error:
+        raise UsageError(
+            f"There is no descriptor {name!r}.", next_step=f"Choose one of {', '.join(names())}."
+        ) from error
+
+
+def describe_new(catalog: Catalog, enrollment: Enrollment, held: Mapping[str, NDArray[np.uint8]], name: str) -> str:
+    """Describe an enrollment that is about to be complete, store the result, and return its seal.
+
+    ``held`` are pixels of images that need not be read again.
+
+    Raises
+    ------
+    CatalogError
+        An image cannot be read, or a view cannot be segmented.
+    """
+    store = catalog.database.images
+    seal = seal_of(enrollment)
+    task = _task(enrollment, seal, name, DESCRIPTORS, None)
+
+    def pixels(image: str) -> NDArray[np.uint8]:
+        return held[image] if image in held else store.pixels(image)
+
+    with catalog.database.catalog_errors():
+        found = _describe(pixels, task, threads=THREADS)
+    _store(catalog, [(task, found)])
+    return seal
+
+
+def described(catalog: Catalog, enrollment: Enrollment, name: str, *wanted: str) -> Described:
+    """Return the stored description of an enrollment, or compute it; by `DESCRIPTORS` or those that are ``wanted``.
+
+    Raises
+    ------
+    CatalogError
+        An image cannot be read, or a view cannot be segmented.
+    """
+    kinds = wanted or DESCRIPTORS
+    seal = seal_of(enrollment)
+    with catalog.database.read() as transaction:
+        region = _regions(transaction).of(transaction, enrollment.id)
+        stored = _stored(transaction, [seal], (SEGMENTATION, *kinds), region)
+    levels = {name: _records(descriptor(name), stored[name][seal])["packed"] for name in kinds if seal in stored[name]}
+    if len(levels) == len(kinds) and seal in stored[SEGMENTATION]:
+        unpacked = {name: descriptor(name).unpack_rows(packed.tobytes()) for name, packed in levels.items()}
+        return Described(unpacked, _evidence(stored[SEGMENTATION][seal]))
+    task = _task(enrollment, seal, name, kinds, region)
+    with catalog.database.catalog_errors():
+        found = _describe(catalog.database.images.pixels, task, threads=THREADS)
+    _store(catalog, [(task, found)])
+    return found
+
+
+def load_views(catalog: Catalog, descriptor: str) -> Generator[JobProgress, None, hbr.Views]:
+    """Return the views of every complete enrollment of the objects in use, by object and index.
+
+    It yields its progress in enrollments while it describes those that are not described yet.
+
+    Raises
+    ------
+    UsageError
+        There is no such descriptor.
+    CatalogDamaged
+        An object or a view is not as it was stored.
+    CatalogError
+        A view that is not described yet cannot be described.
+    """
+    kind = known_descriptor(descriptor)
+    found: dict[str, bytes] = {}
+    wanted, tasks = _missing(catalog, kind.name, found)
+    for task, result in (yield from _described_now(catalog, tasks, None)):
+        if isinstance(result, str):
+            raise CatalogError(f"{task.name!r} cannot be described: {result}.", next_step=Do.VERIFY_CATALOG())
+        found[task.seal] = _content(task, result)[kind.name]
+    if not wanted:
+        return hbr.Views.empty(kind.name)
+    parts = [_records(kind, found[one.seal]) for one in wanted]
+    records = np.concatenate(parts)
+    return hbr.PackedViews(
+        records["packed"],
+        np.ascontiguousarray(records["azimuth_deg"]),
+        np.repeat(np.arange(len(wanted)), [len(part) for part in parts]),
+        tuple(one.name for one in wanted),
+        kind.name,
+    )
+
+
+def views(
+    catalog: Catalog, descriptor: str = PAPER_DESCRIPTOR, progress: Callable[[JobProgress], None] | None = None
+) -> hbr.Views:
+    """Return the views of `load_views`; ``progress`` is called while it describes some."""
+
+    def show(at: JobProgress) -> None:
+        if progress is not None and at.total:
+            progress(at)
+
+    return finished(load_views(catalog, descriptor), show)
+
+
+@dataclass(frozen=True, slots=True)
+class Redescribed:
+    """Numbers of views that were described now and before, and the objects that failed, with the reasons."""
+
+    descriptor: str
+    version: int
+    described: int
+    unchanged: int
+    failed: tuple[tuple[str, str], ...]
+
+
+def redescribe(
+    catalog: Catalog, descriptor: str = PAPER_DESCRIPTOR, *, again: bool = False, jobs: Jobs | None = None
+) -> Generator[JobProgress, None, Redescribed]:
+    """Describe the objects in use that are not described by the present version of a descriptor, or all ``again``.
+
+    Each result is stored at once: after an interruption the next call continues there.
+
+    Raises
+    ------
+    UsageError
+        There is no such descriptor.
+    CatalogError, CatalogBusy
+        The catalog cannot be written.
+    """
+    kind = known_descriptor(descriptor)
+    if again:
+        with catalog.database.write() as transaction:
+            transaction.execute(delete(Derived).where(Derived.what.in_((kind.name, SEGMENTATION))))
+    found: dict[str, bytes] = {}
+    _, tasks = _missing(catalog, kind.name, found)
+    results = yield from _described_now(catalog, tasks, jobs)
+    failed = [(task.name, result) for task, result in results if isinstance(result, str)]
+    described = sum(len(task.views) for task, result in results if not isinstance(result, str))
+    unchanged = sum(len(_records(kind, content)) for content in found.values())
+    return Redescribed(kind.name, kind.version, described, unchanged, tuple(failed))
+
+
+def choose_region(catalog: Catalog, region: Region | None) -> None:
+    """Let the views of benches in use be described within another part of their images; None for the whole image.
+
+    Imported photographs keep theirs.
+    """
+    with catalog.database.write() as transaction:
+        log.append(transaction, catalog.clock, Action.REGION_CHOSEN, details={"region": region})
+
+
+def local_views(catalog: Catalog, name: str, azimuths_deg: Sequence[float]) -> list[LocalView]:
+    """Return the enrolled views of an object that are nearest to each of these azimuths, by azimuth.
+
+    They are cut out as at the enrollment (`hbr.dense.local_difference`). Which these are, `hbr.dense.last_steps.near`
+    decides for the bench and for the evaluation.
+
+    Raises
+    ------
+    ObjectNotFound, CatalogError
+        There is no such object, or an image is missing or is not the stored one.
+    """
+    found = catalog.object(name)
+    enrollment = found.complete
+    if enrollment is None:
+        return []
+    evidence = described(catalog, enrollment, name, BENCH_DESCRIPTOR).segmentation
+    near_ones = near([view.azimuth_deg for view in enrollment.views], azimuths_deg)
+    return [
+        LocalView(cut.crop, cut.mask, view.azimuth_deg) for view, cut in _cut(catalog, enrollment, evidence, near_ones)
+    ]
+
+
+def _cut(
+    catalog: Catalog, enrollment: Enrollment, evidence: Sequence[Mapping[str, Any]], places: Iterable[int]
+) -> list[tuple[View, hbr.Segmentation]]:
+    """Return views of an enrollment with their stored segmentation."""
+    with catalog.database.read() as transaction:
+        region = _regions(transaction).of(transaction, enrollment.id)
+    found = []
+    for place in places:
+        view = enrollment.views[place]
+        table = enrollment.sessions[view.session].empty_table
+        part = view.region if region is None else region[0]
+        empty = None if table is None else catalog.read_image(table)
+        describer = ViewDescriber(ViewConfig(roi=part), (BENCH_DESCRIPTOR,), empty)
+        try:
+            found.append((view, describer.segment(catalog.read_image(view.image), evidence[place])))
+        except ValueError as error:
+            raise CatalogDamaged(
+                f"The view {view.id} cannot be segmented: {error}.", next_step=Do.VERIFY_CATALOG()
+            ) from error
+    return found
+
+
+# What the enrolled views have in common
+
+
+class EmptyTables(NamedTuple):
+    """Names of the objects that were enrolled with an empty-table image and without, and the newest of these images."""
+
+    with_image: tuple[str, ...]
+    without_image: tuple[str, ...]
+    newest: str | None
+
+
+def empty_tables(catalog: Catalog) -> EmptyTables:
+    """Return which of the objects in use were enrolled with an empty-table image."""
+    newest = None
+    with_image: dict[str, bool] = {}
+    with catalog.database.read() as transaction:
+        owner = {one.enrollment_id: one.name for one in state.used(transaction)}
+        rows = transaction.execute(select(Session.enrollment_id, Session.empty_table).order_by(Session.started_utc))
+        for enrollment_id, image in rows:
+            if (name := owner.get(enrollment_id)) is not None:
+                with_image[name] = with_image.get(name, False) or image is not None
+                newest = newest if image is None else image
+    with_one = tuple(name for name in owner.values() if with_image.get(name))
+    return EmptyTables(with_one, tuple(name for name in owner.values() if not with_image.get(name)), newest)
+
+
+def camera_settings(catalog: Catalog) -> list[dict[str, Any]]:
+    """Return the camera's settings (`rig.devices.camera.CameraLocks`) of the objects in use, each combination once."""
+    with catalog.database.read() as transaction:
+        ids = {one.enrollment_id for one in state.used(transaction)}
+        rows = transaction.execute(select(View.enrollment_id, View.evidence).where(View.index == 0).order_by(View.id))
+        return _settings(evidence for enrollment_id, evidence in rows if enrollment_id in ids)
+
+
+def unfinished_camera_settings(catalog: Catalog, name: str) -> list[dict[str, Any]]:
+    """Return the camera's settings of the views of an unfinished enrollment, each combination once."""
+    begun = catalog.resumable(name)
+    return [] if begun is None else _settings(view.evidence for view in begun.enrollment.views)
+
+
+def _settings(evidence: Iterable[JsonObject]) -> list[dict[str, Any]]:
+    settings: list[dict[str, Any]] = []
+    for one in evidence:
+        locks = one.get("locks")
+        if isinstance(locks, dict) and locks not in settings:
+            settings.append(locks)
+    return settings
+
+
+def newest_view(catalog: Catalog) -> str | None:
+    """Return the image of the first view of the newest enrollment in use; None if there is none."""
+    with catalog.database.read() as transaction:
+        ids = [one.enrollment_id for one in state.used(transaction)]
+        return transaction.scalar(
+            select(View.image).where(View.index == 0, View.enrollment_id == max(ids, default=0)).limit(1)
+        )
+
+
+def described_regions(catalog: Catalog, bench: str) -> set[tuple[Region | None, tuple[str, ...]]]:
+    """Return the regions that the views of a bench are described within; None is the whole image.
+
+    Each region comes with the ids of the calibration results in force when its views were taken.
+    """
+    sessions, found = Session.__table__.c, set()
+    with catalog.database.read() as transaction:
+        regions = _regions(transaction)
+        ids = {one.enrollment_id for one in state.used(transaction)}
+        rows = transaction.execute(
+            select(sessions.enrollment_id, sessions.conditions, View.region)
+            .join(View, (View.enrollment_id == sessions.enrollment_id) & (View.session == sessions.number))
+            .where(sessions.bench == bench, View.index == 0)
+        ).all()
+        for enrollment_id, conditions, region in rows:
+            if enrollment_id in ids:
+                chosen = regions.of(transaction, enrollment_id)
+                calibrations = tuple(map(str, conditions.get(CALIBRATIONS) or ()))
+                found.add((region if chosen is None else chosen[0], calibrations))
+    return found
+
+
+@dataclass(frozen=True, slots=True)
+class _Regions:
+    """The lines of the log that choose a region for what was enrolled before them, the last one first."""
+
+    lines: tuple[tuple[int, Region | None], ...]
+
+    def of(self, transaction: Transaction, enrollment_id: int) -> tuple[Region | None] | None:
+        """Return the chosen region of an enrollment; None if its views keep their own."""
+        if not self.lines:
+            return None
+        line = transaction.scalar(
+            select(Entry.id).where(Entry.enrollment_id == enrollment_id, Entry.status == EnrollmentStatus.COMPLETE)
+        )
+        bench = transaction.scalar(select(Session.__table__.c.bench).where(Session.enrollment_id == enrollment_id))
+        if line is None or not bench:
+            return None
+        return next(((region,) for number, region in self.lines if number > line), None)
+
+
+def _regions(transaction: Transaction) -> _Regions:
+    rows = transaction.execute(
+        select(Entry.id, Entry.details).where(Entry.action == Action.REGION_CHOSEN).order_by(Entry.id.desc())
+    )
+    return _Regions(tuple((line, tuple(d["region"]) if d.get("region") else None) for line, d in rows))  # type: ignore[misc]
+
+
+# Describe
+
+
+def _missing(catalog: Catalog, name: str, found: dict[str, bytes]) -> tuple[list[state.Used], list[_Task]]:
+    """Return the enrollments in use, and those to be described; put the stored levels of the others into ``found``."""
+    kinds = (name,) if descriptor(name).whole_image else (name, SEGMENTATION)
+    with catalog.database.read() as transaction:
+        wanted = state.used(transaction)
+        regions = _regions(transaction)
+        chosen = {one.seal: regions.of(transaction, one.enrollment_id) for one in wanted}
+        for region in set(chosen.values()):
+            seals = [seal for seal, one in chosen.items() if one == region]
+            stored = _stored(transaction, seals, (name,), region)
+            found.update(stored[name])
+        missing = [one for one in wanted if one.seal not in found]
+        tasks = []
+        for one in missing:
+            (known,) = state.enrollments(transaction, Enrollment.id == one.enrollment_id)
+            compute = DESCRIPTORS if name in DESCRIPTORS and SEGMENTATION in kinds else (name,)
+            tasks.append(_task(known.enrollment, one.seal, one.name, compute, chosen[one.seal]))
+    return wanted, tasks
+
+
+def _task(
+    enrollment: Enrollment, seal: str, name: str, names: tuple[str, ...], region: tuple[Region | None] | None
+) -> _Task:
+    views = tuple(
+        _Image(view.image, view.session, view.region if region is None else region[0], view.azimuth_deg)
+        for view in enrollment.views
+    )
+    return _Task(seal, name, names, region, views, tuple(session.empty_table for session in enrollment.sessions))
+
+
+def _described_now(
+    catalog: Catalog, tasks: Sequence[_Task], jobs: Jobs | None
+) -> Generator[JobProgress, None, list[tuple[_Task, Described | str]]]:
+    """Describe enrollments in processes and store the results; a text is the reason why one cannot be described."""
+    done: list[tuple[_Task, Described | str]] = []
+    if tasks:
+        yield JobProgress(0, len(tasks))
+    work = partial(_describe_task, catalog.database.images)
+    count = sum(len(task.views) for task in tasks)
+    for task, result in map_in_processes(work, tasks, processes(jobs, count)):
+        if not isinstance(result, str):
+            _store(catalog, [(task, result)])
+        done.append((task, result))
+        yield JobProgress(len(done), len(tasks))
+    return done
+
+
+def _describe_task(images: Images, task: _Task) -> Described | str:
+    """Describe an enrollment in a worker process; a text says why it cannot be described."""
+    try:
+        return _describe(images.pixels, task)
+    except (CatalogError, UsageError) as error:
+        return error.what.rstrip(".")
+
+
+def _describe(pixels: _Pixels, task: _Task, *, threads: int = 1) -> Described:
+    """Segment the views of an enrollment together and describe them.
+
+    Raises
+    ------
+    CatalogError
+        An image cannot be read, or a view cannot be segmented.
+    """
+    count = len(task.views)
+    levels: dict[str, list[Levels]] = {name: [np.empty(0, np.uint8)] * count for name in task.names}
+    evidence: list[dict[str, Any]] = [{}] * count
+    alone = [name for name in task.names if not descriptor(name).whole_image]
+
+    def whole(place: int) -> None:
+        view = task.views[place]
+        part = within(pixels(view.image), view.region)
+        for name in task.names:
+            if name not in alone:
+                levels[name][place] = descriptor(name).describe(part)
+
+    def together(place: int, describer: EnrollmentDescriber, number: int) -> None:
+        view = task.views[place]
+        found = describer.describe(number, pixels(view.image))
+        for name in alone:
+            levels[name][place] = found.levels[name]
+        evidence[place] = found.segmentation or {}
+
+    steps: list[tuple[int, Callable[[], None]]] = []
+    if len(alone) < len(task.names):
+        steps += [(place, partial(whole, place)) for place in range(count)]
+    for session, places in (
+        groupby(sorted(range(count), key=partial(_group, task)), partial(_group, task)) if alone else ()
+    ):
+        own = list(places)
+        region = task.views[own[0]].region
+        same_region = [place for place in range(count) if task.views[place].region == region]
+        learned_from = own if len(own) >= FEWEST_VIEWS else same_region
+        table = task.empty_tables[session[0]]
+        describer = EnrollmentDescriber(
+            ViewConfig(roi=region), tuple(sorted(alone)), None if table is None else pixels(table)
+        )
+        numbers = {}
+        for place in learned_from:
+            with _reasons(task, place):
+                numbers[place] = describer.learn(pixels(task.views[place].image))
+        steps += [(place, partial(together, place, describer, numbers[place])) for place in own]
+
+    def run(step: tuple[int, Callable[[], None]]) -> None:
+        with _reasons(task, step[0]):
+            step[1]()
+
+    if threads == 1:
+        for step in steps:
+            run(step)
+    else:
+        with ThreadPoolExecutor(threads, "describer") as pool:
+            list(pool.map(run, steps))
+    return Described({name: np.stack(rows) for name, rows in levels.items()}, tuple(evidence))
+
+
+def _group(task: _Task, place: int) -> tuple[int, str]:
+    return task.views[place].session, repr(task.views[place].region)
+
+
+class _reasons:  # noqa: N801 - used as a function
+    """Raise errors about a view as a `CatalogError` that names it."""
+
+    def __init__(self, task: _Task, place: int) -> None:
+        self._task, self._place = task, place
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
+        if isinstance(error, UsageError | ValueError):
+            reason = error.what.rstrip(".") if isinstance(error, UsageError) else str(error)
+            raise CatalogError(
+                f"View {self._place} of {self._task.name!r} cannot be described: {reason}.",
+                next_step=("Check the disk.", Do.VERIFY_CATALOG()),
+            ) from error
+
+
+# Store
+
+
+def _made_by(what: str, region: tuple[Region | None] | None) -> str:
+    version = SEGMENTATION_VERSION if what == SEGMENTATION else descriptor(what).version
+    segmentation = (
+        "" if what != SEGMENTATION and descriptor(what).whole_image else f", segmentation {SEGMENTATION_VERSION}"
+    )
+    return f"{what} {version}{segmentation}{'' if region is None else f', region {region[0]}'}"
+
+
+def _record(kind: Descriptor) -> np.dtype[np.void]:
+    return np.dtype([("packed", "u1", (kind.size_bytes,)), ("azimuth_deg", "<f8")])
+
+
+def _records(kind: Descriptor, content: bytes) -> NDArray[np.void]:
+    return np.frombuffer(content, _record(kind))
+
+
+def _content(task: _Task, found: Described) -> dict[str, bytes]:
+    """Return the contents of a description by their kind."""
+    contents = {}
+    for name, levels in found.levels.items():
+        kind = descriptor(name)
+        records = np.empty(len(task.views), _record(kind))
+        records["packed"] = np.frombuffer(b"".join(map(kind.pack, levels)), np.uint8).reshape(len(levels), -1)
+        records["azimuth_deg"] = [view.azimuth_deg for view in task.views]
+        contents[name] = records.tobytes()
+    if any(found.segmentation):
+        contents[SEGMENTATION] = json.dumps(found.segmentation).encode()
+    return contents
+
+
+def _store(catalog: Catalog, done: Sequence[tuple[_Task, Described]]) -> None:
+    """Store descriptions. A catalog that cannot be written keeps none: they are computed again."""
+    rows = [
+        {"seal": task.seal, "what": what, "made_by": _made_by(what, task.region), "content": content}
+        for task, found in done
+        for what, content in _content(task, found).items()
+    ]
+    for row in rows:
+        row["sha256"] = hashlib.sha256(row["content"]).hexdigest()
+    if not catalog.database.read_only:
+        _write(catalog.database, rows)
+        return
+    with suppress(RigError):  # derived data may also be added to a catalog that is open for reading
+        database = Database.open(catalog.place, create=False, read_only=False, busy_timeout_s=1.0)
+        try:
+            _write(database, rows)
+        finally:
+            database.close()
+
+
+def _write(database: Database, rows: Collection[dict[str, Any]]) -> None:
+    with database.write() as transaction:
+        for row in rows:
+            transaction.execute(delete(Derived).where(Derived.seal == row["seal"], Derived.what == row["what"]))
+        transaction.execute(insert(Derived), list(rows))
+
+
+def _stored(
+    transaction: Transaction, seals: Collection[str], kinds: Iterable[str], region: tuple[Region | None] | None
+) -> dict[str, dict[str, bytes]]:
+    """Return the stored contents of each kind by seal; those that are damaged or old are left out."""
+    wanted = set(seals)
+    found: dict[str, dict[str, bytes]] = {}
+    for what in kinds:
+        query = select(Derived.seal, Derived.content, Derived.sha256).where(
+            Derived.what == what, Derived.made_by == _made_by(what, region)
+        )
+        if len(wanted) < 100:
+            query = query.where(Derived.seal.in_(wanted))
+        size = 1 if what == SEGMENTATION else _record(descriptor(what)).itemsize
+        found[what] = {
+            seal: content
+            for seal, content, sha256 in transaction.execute(query)
+            if seal in wanted and hashlib.sha256(content).hexdigest() == sha256 and content and not len(content) % size
+        }
+    return found
+
+
+def _evidence(content: bytes) -> tuple[dict[str, Any], ...]:
+    found = tuple(json.loads(content))
+    for one in found:
+        check_evidence(one)
+    return found

@@ -1,0 +1,307 @@
+"""The facts of a catalog: what was observed and done. A row is written once and never changed.
+
+What is true now follows from the rows (`rig.catalog.state`). Each row has a digest of its values, and each line of the
+log also covers the digest of the line before it, so a change that this program did not make is found.
+
+Decision: docs/decisions/0067.
+"""
+
+import hashlib
+import json
+from collections.abc import Sequence
+from datetime import datetime
+from enum import StrEnum
+from typing import Any, Final
+
+from sqlalchemy import CheckConstraint, ForeignKey, ForeignKeyConstraint, Index, MetaData, UniqueConstraint
+from sqlalchemy.orm import DeclarativeBase, Mapped, MappedAsDataclass, composite, mapped_column, relationship
+
+from rig.catalog.columns import (
+    Azimuths,
+    Bytes,
+    Count,
+    ImageName,
+    JsonMapping,
+    Name,
+    Nanoseconds,
+    Number,
+    RegionOfImage,
+    Status,
+    Truth,
+    Utc,
+    Words,
+)
+from rig.catalog.records import MAX_NAME_LENGTH, EnrollmentStatus, JsonObject, Provenance, Region
+
+SCHEMA_VERSION: Final = 1
+"""Version of the tables below."""
+
+
+class Action(StrEnum):
+    """What a line of the log tells. The values are stored."""
+
+    ENROLLMENT_STARTED = "enrollment started"
+    ENROLLMENT_RESUMED = "enrollment resumed"
+    ENROLLMENT_ABANDONED = "enrollment abandoned"
+    ENROLLMENT_DISCARDED = "enrollment discarded"
+    ENROLLMENT_SUPERSEDED = "enrollment superseded"
+    ENROLLED = "enrolled"
+    IDENTIFIED = "identified"
+    RESULT_CORRECTED = "result corrected"
+    RENAMED = "renamed"
+    LABELLED = "labelled"
+    DELETED = "deleted"
+    UNDELETED = "undeleted"
+    IMPORTED = "imported"
+    GARBAGE_COLLECTED = "collected garbage"
+    REGION_CHOSEN = "region chosen"
+    COPIED = "copied"
+    MOVED = "moved"
+    TABLE_PHOTOGRAPHED = "photographed the empty table"
+
+
+class Row(MappedAsDataclass, DeclarativeBase, kw_only=True, eq=False):
+    """A row of a catalog."""
+
+    metadata = MetaData(
+        naming_convention={
+            "ix": "ix_%(table_name)s_%(column_0_N_name)s",
+            "uq": "uq_%(table_name)s_%(column_0_N_name)s",
+            "ck": "ck_%(table_name)s_%(constraint_name)s",
+            "fk": "fk_%(table_name)s_%(column_0_N_name)s",
+            "pk": "pk_%(table_name)s",
+        }
+    )
+
+
+class Property(Row):
+    """A property of the whole catalog: its kind, its version, its id, and the last line of its log."""
+
+    __tablename__ = "properties"
+    key: Mapped[str] = mapped_column(Words, primary_key=True)
+    value: Mapped[str] = mapped_column(Words)
+
+
+class Entry(Row):
+    """A line of the log: who did what and when.
+
+    A line that changes an object has its state after the change: ``object_name``, ``label``, ``note``, ``deleted`` and
+    ``created_utc``. A line that changes an enrollment has its new ``status``; if that is complete, also its ``seal``.
+
+    Attributes
+    ----------
+    id
+        Numbers the lines from 1, without a gap.
+    finished_utc
+        When the enrollment ended. It is earlier than the line if another catalog had it first.
+    seal
+        `seal_of` the enrollment: its sessions and its views.
+    result
+        The number of the answer that the line tells or corrects (`rig.catalog.results`).
+    details
+        For readers of the log.
+    record
+        The whole fact, if it is longer than the details.
+    """
+
+    __tablename__ = "log"
+    id: Mapped[int] = mapped_column(primary_key=True, autoincrement=False)
+    time_utc: Mapped[datetime] = mapped_column(Utc)
+    user: Mapped[str] = mapped_column(Words)
+    host: Mapped[str] = mapped_column(Words)
+    software: Mapped[str] = mapped_column(Words)
+    action: Mapped[str] = mapped_column(Words)
+    object_name: Mapped[str | None] = mapped_column(Name(MAX_NAME_LENGTH), default=None)
+    object_id: Mapped[int | None] = mapped_column(Count, default=None)
+    label: Mapped[str | None] = mapped_column(Words, default=None)
+    note: Mapped[str | None] = mapped_column(Words, default=None)
+    deleted: Mapped[bool | None] = mapped_column(Truth, default=None)
+    created_utc: Mapped[datetime | None] = mapped_column(Utc, default=None)
+    enrollment_id: Mapped[int | None] = mapped_column(Count, default=None)
+    status: Mapped[EnrollmentStatus | None] = mapped_column(Status, default=None)
+    finished_utc: Mapped[datetime | None] = mapped_column(Utc, default=None)
+    seal: Mapped[str | None] = mapped_column(Name(64), default=None)
+    result: Mapped[int | None] = mapped_column(Count, default=None, index=True)
+    details: Mapped[JsonObject] = mapped_column(JsonMapping, default_factory=dict)
+    record: Mapped[JsonObject | None] = mapped_column(JsonMapping(none_as_null=True), default=None)
+    digest: Mapped[str] = mapped_column(Name(64), init=False, default="")
+
+
+class Enrollment(Row):
+    """An enrollment: the planned azimuth of view 0, 1, .... With its last view it is complete and never changes.
+
+    ``key`` is the same in every catalog that has the enrollment.
+    """
+
+    __tablename__ = "enrollments"
+    id: Mapped[int] = mapped_column(primary_key=True, init=False)
+    key: Mapped[str] = mapped_column(Name(64), unique=True)
+    object_id: Mapped[int] = mapped_column(Count, index=True)
+    started_utc: Mapped[datetime] = mapped_column(Utc)
+    planned_azimuth_deg: Mapped[tuple[float, ...]] = mapped_column(Azimuths)
+    digest: Mapped[str] = mapped_column(Name(64), init=False, default="")
+    sessions: Mapped[list["Session"]] = relationship(order_by="Session.number", init=False, repr=False)
+    views: Mapped[list["View"]] = relationship(order_by="View.index", init=False, repr=False)
+    __table_args__ = ({"sqlite_autoincrement": True},)  # no id is given twice, even after a removal
+
+    @property
+    def present(self) -> tuple[int, ...]:
+        """Indices of the stored views, ascending."""
+        return tuple(view.index for view in self.views)
+
+    @property
+    def missing(self) -> tuple[int, ...]:
+        """Indices of the planned views that are not stored yet, ascending."""
+        return tuple(sorted(set(range(len(self.planned_azimuth_deg))) - set(self.present)))
+
+
+class Session(Row):
+    """An uninterrupted part of an enrollment, numbered from 0. Its views share one origin of the bench clock.
+
+    A resumed enrollment may use another bench, program or calibration. ``empty_table`` is the bench's empty-table image
+    of this session, if there is one.
+    """
+
+    __tablename__ = "sessions"
+    enrollment_id: Mapped[int] = mapped_column(ForeignKey(Enrollment.id), primary_key=True, init=False, repr=False)
+    number: Mapped[int] = mapped_column(Count, primary_key=True)
+    started_utc: Mapped[datetime] = mapped_column(Utc)
+    provenance: Mapped[Provenance] = composite(
+        mapped_column("bench", Words),
+        mapped_column("devices", JsonMapping),
+        mapped_column("conditions", JsonMapping),
+        mapped_column("software", Words),
+    )
+    empty_table: Mapped[str | None] = mapped_column(ImageName, default=None)
+    empty_table_bytes: Mapped[int | None] = mapped_column(Count, default=None, repr=False)
+    digest: Mapped[str] = mapped_column(Name(64), init=False, default="", repr=False)
+
+
+class View(Row):
+    """A view of an object, and the evidence on which it was accepted.
+
+    Attributes
+    ----------
+    index
+        Position in the plan of the enrollment, from 0.
+    azimuth_deg
+        Orientation of the camera around the object, in [0, 360).
+    commanded_deg, encoder_deg
+        Commanded and measured table angle, unwrapped; None for a view that was not taken by a bench.
+    imu_deg, imu_sigma_deg
+        Table angle measured by the IMU, unwrapped, and its standard uncertainty; both None without an IMU.
+    captured_ns, captured_utc
+        Start of the exposure on the bench's clock, and in civil time; None for a view that was not taken by a bench.
+    evidence
+        The numbers for which the view was accepted (sharpness, exposure, settling, locks) as JSON values. The keys
+        contain the units.
+    region
+        The part of the image that shows the object: x, y, width, height in pixels; None for the whole image.
+    image
+        Name of the image (`rig.catalog.images`): its SHA-256, and the suffix of its format.
+    """
+
+    __tablename__ = "views"
+    id: Mapped[int] = mapped_column(primary_key=True, init=False)
+    enrollment_id: Mapped[int] = mapped_column(init=False, default=None)
+    index: Mapped[int] = mapped_column("view_index", Count, CheckConstraint("view_index >= 0", name="view_index"))
+    session: Mapped[int] = mapped_column(Count, init=False, default=0)
+    azimuth_deg: Mapped[float] = mapped_column(
+        Number, CheckConstraint("azimuth_deg >= 0 AND azimuth_deg < 360", name="azimuth_deg")
+    )
+    commanded_deg: Mapped[float | None] = mapped_column(Number, default=None)
+    encoder_deg: Mapped[float | None] = mapped_column(Number, default=None)
+    imu_deg: Mapped[float | None] = mapped_column(Number, default=None)
+    imu_sigma_deg: Mapped[float | None] = mapped_column(Number, default=None)
+    captured_ns: Mapped[int | None] = mapped_column(Nanoseconds, default=None)
+    captured_utc: Mapped[datetime | None] = mapped_column(Utc, default=None)
+    evidence: Mapped[JsonObject] = mapped_column(JsonMapping, default_factory=dict)
+    region: Mapped[Region | None] = mapped_column(RegionOfImage(none_as_null=True), default=None)
+    image: Mapped[str] = mapped_column(ImageName, default="")
+    image_bytes: Mapped[int] = mapped_column(Count, default=0)
+    digest: Mapped[str] = mapped_column(Name(64), init=False, default="", repr=False)
+    __table_args__ = (
+        UniqueConstraint("enrollment_id", "view_index"),
+        ForeignKeyConstraint(["enrollment_id"], [Enrollment.id]),
+        ForeignKeyConstraint(["enrollment_id", "session"], [Session.enrollment_id, Session.number]),
+        {"sqlite_autoincrement": True},
+    )
+
+
+class Derived(Row):
+    """Something that was computed from the facts of an enrollment (`rig.catalog.derived`). It can be deleted.
+
+    Attributes
+    ----------
+    seal
+        `Entry.seal` of the enrollment.
+    what
+        Its kind, such as the name of a descriptor.
+    made_by
+        The versions and settings of the computation.
+    sha256
+        Of the content.
+    """
+
+    __tablename__ = "derived"
+    seal: Mapped[str] = mapped_column(Name(64), primary_key=True)
+    what: Mapped[str] = mapped_column(Name(100), primary_key=True)
+    made_by: Mapped[str] = mapped_column(Words)
+    content: Mapped[bytes] = mapped_column(Bytes)
+    sha256: Mapped[str] = mapped_column(Name(64))
+
+
+FACTS: Final[tuple[type[Row], ...]] = (Entry, Enrollment, Session, View)
+"""Rows that are never changed. Lines of the log are never removed, either."""
+
+_STATES, _ENDS = Entry.deleted.is_not(None), Entry.status.is_not(None)
+Index("ix_log_states", Entry.object_id, Entry.id, sqlite_where=_STATES, postgresql_where=_STATES)
+Index("ix_log_names", Entry.object_name, sqlite_where=_STATES, postgresql_where=_STATES)
+Index("ix_log_statuses", Entry.enrollment_id, Entry.id, sqlite_where=_ENDS, postgresql_where=_ENDS)
+Index("ix_log_actions", Entry.action, Entry.id)
+
+_LOCAL: Final = {"id", "enrollment_id", "object_id", "digest"}
+"""Columns of an enrollment and its parts that differ from catalog to catalog, and the digest itself."""
+
+
+def digest_of(row: Row, key: str) -> str:
+    """Return the digest of a row of the enrollment ``key``, or of a line of the log after the line with this digest."""
+    left_out = {"digest"} if isinstance(row, Entry) else _LOCAL
+    columns = [column for column in row.__table__.columns if column.name not in left_out]
+    return _sha256([key, *(_value(row, column.name) for column in columns)])
+
+
+def seal_of(enrollment: Enrollment) -> str:
+    """Return the digest of an enrollment with its sessions and views, by their own digests."""
+    parts: Sequence[Session | View] = (*enrollment.sessions, *enrollment.views)
+    return _sha256([enrollment.digest, *(part.digest for part in parts)])
+
+
+def damaged_parts(enrollment: Enrollment, seal: str | None) -> list[Enrollment | Session | View]:
+    """Return the parts of an enrollment that are not as they were written.
+
+    The enrollment itself is among them if ``seal`` is given and is not its own: a part is missing or was exchanged.
+    """
+    parts: list[Enrollment | Session | View] = [enrollment, *enrollment.sessions, *enrollment.views]
+    wrong = [part for part in parts if part.digest != digest_of(part, enrollment.key)]
+    if seal is not None and seal != seal_of(enrollment) and enrollment not in wrong:
+        wrong.insert(0, enrollment)
+    return wrong
+
+
+def _value(row: Row, column: str) -> Any:
+    if isinstance(row, Session) and column in Provenance.__slots__:
+        return getattr(row.provenance, column)
+    name = "index" if column == "view_index" else column
+    return getattr(row, name)
+
+
+def _sha256(values: Sequence[Any]) -> str:
+    text = json.dumps(values, sort_keys=True, separators=(",", ":"), default=_words)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _words(value: Any) -> Any:
+    if isinstance(value, datetime):
+        return value.isoformat()
+    raise TypeError(f"a value of type {type(value).__name__} has no digest")

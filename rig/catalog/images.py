@@ -1,0 +1,343 @@
+"""Stores of the images of a catalog: a folder, or a store that fsspec supports, such as S3.
+
+An image has the SHA-256 of its bytes as its name. So a changed byte is found by the name, an image is stored only once,
+and it can be copied again without harm. An image is complete under its name or is not there.
+"""
+
+import os
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from datetime import datetime
+from math import inf
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.catalog.places import file_mode, files_within, image_file, make_folder_within
+from rig.config.catalog_place import CatalogPlace
+from rig.core.errors import CatalogError, CatalogUnavailable, ConfigError, ExtraMissing
+from rig.core.files import MAX_SINGLE_SYNCS, open_new, sync_file, sync_folder
+from rig.core.files import read as read_local
+from rig.core.files import write as write_local
+from rig.core.next_steps import Do
+from rig.views import image_files as files
+
+FOLDER: Final = files.IMAGE_FOLDER
+MARK: Final = "catalog-id"
+"""Beside ``images/`` of a catalog on a server: the id of the catalog that the images belong to."""
+
+CACHE: Final = "image-cache"
+"""Folder of images that were fetched from a store for programs that read files."""
+
+
+def name_of(content: bytes) -> str:
+    """Return the name of an image: the SHA-256 of its bytes, and the suffix of its format."""
+    return f"{files.digest(content)}{files.suffix(content)}"
+
+
+def path_of(name: str) -> str:
+    """Return the path of an image in a store or an export, such as ``images/3f/3f79….png``."""
+    return f"{FOLDER}/{name[:2]}/{name}"
+
+
+class Images(ABC):
+    """The images of a catalog. It can be sent to other processes.
+
+    Every method raises an `OSError` with the reason if it fails, and `CatalogUnavailable` if a store does not answer.
+    """
+
+    @abstractmethod
+    def where(self, name: str) -> str:
+        """Return the place of an image for messages; of all images for an empty name."""
+
+    @abstractmethod
+    def read(self, name: str) -> bytes:
+        """Return the bytes under a name, unchecked."""
+
+    def content(self, name: str) -> bytes:
+        """Return the bytes of an image.
+
+        Raises
+        ------
+        CatalogError
+            It is missing, cannot be read, or is not the one that was stored.
+        """
+        fix = (Do.VERIFY_CATALOG(), "Then restore it from a backup, or", Do.ENROLL_AGAIN())
+        try:
+            content = self.read(name)
+        except FileNotFoundError as error:
+            raise CatalogError(f"The image {self.where(name)} is missing.", next_step=fix) from error
+        except OSError as error:
+            raise CatalogError(
+                f"The image {self.where(name)} cannot be read: {error.strerror}.", next_step=fix
+            ) from error
+        if not name.startswith(files.digest(content)):
+            raise CatalogError(f"The image {self.where(name)} is not the one that was stored.", next_step=fix)
+        return content
+
+    def pixels(self, name: str) -> NDArray[np.uint8]:
+        """Return the pixels of an image, uint8 (H, W, 3) BGR; errors as `content`, or it is no valid image."""
+        try:
+            return files.decode(self.content(name))
+        except files.BadImage as error:
+            raise CatalogError(
+                f"The image {self.where(name)} is not readable: {error}.", next_step=Do.VERIFY_CATALOG()
+            ) from error
+
+    @abstractmethod
+    def file(self, name: str) -> Path:
+        """Return a file on this computer with the bytes of an image."""
+
+    @abstractmethod
+    def put(self, content: bytes, *, settled: bool = True) -> str:
+        """Store an image completely or not at all, and return its name; nothing happens if it is there already.
+
+        On return it is durable if it is ``settled``; otherwise `settle` makes it durable.
+        """
+
+    def settle(self, names: Iterable[str]) -> None:
+        """Wait until these images are durable; a store stores them so at once."""
+        del names
+
+    @abstractmethod
+    def names(self, *, before_s: float = inf) -> set[str]:
+        """Return the names of the files that were written before this time, in seconds since 1970."""
+
+    @abstractmethod
+    def size(self, name: str) -> int:
+        """Return the size of an image in bytes; 0 if there is none."""
+
+    @abstractmethod
+    def remove(self, names: Iterable[str]) -> None:
+        """Remove images. A missing one is no error."""
+
+    @abstractmethod
+    def free_bytes(self) -> int | None:
+        """Return the free space; None if the store reports no limit."""
+
+    @abstractmethod
+    def mark(self) -> str | None:
+        """Return the id of the catalog that the images belong to."""
+
+    @abstractmethod
+    def set_mark(self, catalog_id: str) -> None:
+        """Store the id of the catalog that the images belong to."""
+
+    def is_empty(self) -> bool:
+        """Return whether there is nothing at all, as in a network share that is not mounted."""
+        return False
+
+
+class FolderImages(Images):
+    """The images in a folder of this computer, or in a shared folder."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+
+    def where(self, name: str) -> str:
+        return str(self.root / (path_of(name) if name else FOLDER))
+
+    def read(self, name: str) -> bytes:
+        return files.read_file(self.file(name))
+
+    def file(self, name: str) -> Path:
+        return image_file(self.root, path_of(name))
+
+    def put(self, content: bytes, *, settled: bool = True) -> str:
+        name = name_of(content)
+        path = self.file(name)
+        with suppress(OSError):
+            if files.read_file(path) == content:
+                return name
+        if not path.parent.is_dir():
+            make_folder_within(self.root, path.parent)
+        if settled:
+            write_local(path, content, mode=file_mode(self.root))
+            return name
+        part = path.with_name(f"{name}.{os.getpid()}.part")
+        with open_new(part, mode=file_mode(self.root)) as file:
+            file.write(content)
+        part.replace(path)
+        return name
+
+    def settle(self, names: Iterable[str]) -> None:
+        paths = [self.file(name) for name in names]
+        if len(paths) > MAX_SINGLE_SYNCS:
+            os.sync()  # one by one, thousands of small files take minutes on some disks
+            return
+        for path in paths:
+            sync_file(path)
+        for folder in {path.parent for path in paths}:
+            sync_folder(folder)
+
+    def names(self, *, before_s: float = inf) -> set[str]:
+        return {path.name for path in files_within(self.root / FOLDER) if path.lstat().st_mtime < before_s}
+
+    def size(self, name: str) -> int:
+        with suppress(FileNotFoundError):
+            return (self.root / path_of(name)).lstat().st_size
+        return 0
+
+    def remove(self, names: Iterable[str]) -> None:
+        for name in names:
+            path = self.root / path_of(name)
+            path.unlink(missing_ok=True)
+            with suppress(OSError):  # its folder is not empty
+                path.parent.rmdir()
+
+    def free_bytes(self) -> int | None:
+        disk = os.statvfs(self.root)
+        return disk.f_bavail * disk.f_frsize
+
+    def mark(self) -> str | None:
+        with suppress(FileNotFoundError):
+            return read_local(self.root / MARK, max_bytes=100).decode()
+        return None
+
+    def set_mark(self, catalog_id: str) -> None:
+        self.root.mkdir(parents=True, exist_ok=True)
+        write_local(self.root / MARK, catalog_id.encode(), mode=file_mode(self.root))
+
+    def is_empty(self) -> bool:
+        return not self.root.is_dir() or not any(self.root.iterdir())
+
+
+class FsspecImages(Images):
+    """The images in a store that fsspec supports. A store writes an image as a whole."""
+
+    def __init__(self, url: str, cache: Path) -> None:
+        self.url = url.rstrip("/")
+        self._cache = cache
+        self._opened: tuple[Any, str] | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_opened": None}  # a connection belongs to its process
+
+    def where(self, name: str) -> str:
+        return f"{self.url}/{path_of(name) if name else FOLDER}"
+
+    def read(self, name: str) -> bytes:
+        if self._size(name) > files.MAX_FILE_BYTES:
+            raise OSError(None, f"it is larger than {files.MAX_FILE_BYTES} bytes", name)
+        with self._store() as (store, root):
+            return bytes(store.cat_file(f"{root}/{path_of(name)}"))
+
+    def file(self, name: str) -> Path:
+        path = image_file(self._cache, path_of(name))
+        if not path.exists():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_local(path, self.content(name), mode=0o600)
+        return path
+
+    def put(self, content: bytes, *, settled: bool = True) -> str:  # noqa: ARG002
+        name = name_of(content)
+        if self.size(name) != len(content):
+            self._write(path_of(name), content)
+        return name
+
+    def _write(self, path: str, content: bytes) -> None:
+        try:
+            with self._store() as (store, root):
+                store.pipe_file(f"{root}/{path}", content)
+        except FileNotFoundError as error:
+            raise CatalogError(
+                f"The store {self.url} does not exist.",
+                next_step="Create its bucket, or correct catalog.images.",
+                evidence={"error": str(error)},
+            ) from error
+
+    def names(self, *, before_s: float = inf) -> set[str]:
+        with self._store() as (store, root):
+            found = store.find(f"{root}/{FOLDER}", detail=True)
+        return {path.rpartition("/")[2] for path, info in found.items() if _written_s(info) < before_s}
+
+    def size(self, name: str) -> int:
+        with suppress(FileNotFoundError):
+            return self._size(name)
+        return 0
+
+    def _size(self, name: str) -> int:
+        with self._store() as (store, root):
+            return int(store.info(f"{root}/{path_of(name)}")["size"])
+
+    def remove(self, names: Iterable[str]) -> None:
+        with self._store() as (store, root):
+            for name in names:
+                with suppress(FileNotFoundError):
+                    store.rm_file(f"{root}/{path_of(name)}")
+                (self._cache / path_of(name)).unlink(missing_ok=True)
+
+    def free_bytes(self) -> int | None:
+        return None
+
+    def mark(self) -> str | None:
+        with suppress(FileNotFoundError), self._store() as (store, root):
+            return bytes(store.cat_file(f"{root}/{MARK}")).decode()
+        return None
+
+    def set_mark(self, catalog_id: str) -> None:
+        self._write(MARK, catalog_id.encode())
+
+    @contextmanager
+    def _store(self) -> Iterator[tuple[Any, str]]:
+        """Yield the file system and the path of the store; its errors become `OSError` or `CatalogUnavailable`."""
+        if self._opened is None:
+            self._opened = _connect(self.url)
+        store, root = self._opened
+        try:
+            store.invalidate_cache()
+            yield store, root
+        except FileNotFoundError:
+            raise
+        except Exception as error:  # each store has its own errors for a connection that fails
+            raise CatalogUnavailable(
+                f"The images of the catalog in {self.url} cannot be reached.",
+                next_step="Check the network and the access to the store, then try again.",
+                evidence={"error": f"{type(error).__name__}: {error}"},
+            ) from error
+
+
+def open_images(place: CatalogPlace) -> Images:
+    """Return the store of the images of a catalog; nothing is read yet.
+
+    Raises
+    ------
+    ExtraMissing
+        The packages for this kind of store are not installed.
+    """
+    if place.images is None:
+        return FolderImages(place.path)
+    if "://" not in place.images or place.images.startswith("file://"):
+        return FolderImages(Path(place.images.removeprefix("file://")).expanduser().absolute())
+    try:
+        import fsspec
+
+        fsspec.get_filesystem_class(place.images.partition("://")[0])
+    except (ImportError, ValueError) as error:
+        if isinstance(error, ValueError):
+            raise ConfigError(
+                f"catalog.images = {place.images!r}: no such kind of store.",
+                next_step="Give a folder, or a URL such as s3://bucket/folder.",
+            ) from error
+        raise ExtraMissing.of("store", "images in an object store", error) from error
+    return FsspecImages(place.images, place.path / CACHE)
+
+
+def _connect(url: str) -> tuple[Any, str]:
+    import fsspec
+
+    options: dict[str, Any] = {}
+    if url.startswith("s3://"):  # the address and the keys are in the environment, as for every program that uses S3
+        limits = {"connect_timeout": 5, "read_timeout": 20, "retries": {"max_attempts": 2}}
+        options = {"config_kwargs": limits, "use_listings_cache": False}
+    store, root = fsspec.core.url_to_fs(url, **options)
+    return store, str(root).rstrip("/")
+
+
+def _written_s(info: Mapping[str, Any]) -> float:
+    """Return when a file of a store was written, in seconds since 1970; 0 if the store does not say."""
+    when = info.get("LastModified") or info.get("mtime") or 0.0
+    return float(when.timestamp() if isinstance(when, datetime) else when)

@@ -1,0 +1,95 @@
+"""The log: who did what and when. Lines are only added, in the transaction of the change itself, as a chain of digests.
+
+Decision: docs/decisions/0016.
+"""
+
+import os
+import pwd
+import socket
+from collections.abc import Iterator
+from datetime import datetime
+from typing import Any, Final
+
+from sqlalchemy import insert, select, update
+from sqlalchemy.orm import Session as Transaction
+
+from rig.catalog.columns import damaged
+from rig.catalog.facts import Action, Entry, Property, digest_of
+from rig.catalog.records import as_json, this_software
+from rig.core.clock import Clock
+from rig.core.masking import masked
+
+_COLUMNS: Final = tuple(column.name for column in Entry.__table__.columns)
+
+
+def append(
+    transaction: Transaction, clock: Clock, action: Action, object_name: str | None = None, **columns: Any
+) -> Entry:
+    """Add a line to the log, with these other columns of `Entry`, and return it."""
+    details = as_json(columns.pop("details", {}), "The details of the log entry")
+    entry = Entry(
+        id=0, time_utc=clock.utc(), **author(), action=action, object_name=object_name, details=details, **columns
+    )
+    add(transaction, entry)
+    return entry
+
+
+def add(transaction: Transaction, *entries: Entry) -> None:
+    """Add lines to the log after its last one; each gets its number and its digest."""
+    last, before = head(transaction)
+    rows = []
+    for entry in entries:
+        last += 1
+        entry.id = last
+        entry.digest = before = digest_of(entry, before)
+        rows.append({name: getattr(entry, name) for name in _COLUMNS})
+    if rows:
+        transaction.execute(insert(Entry), rows)
+        value = f"{last} {before}"
+        transaction.execute(update(Property).where(Property.key == "head").values(value=value))
+
+
+def head(transaction: Transaction) -> tuple[int, str]:
+    """Return the number and the digest of the last line."""
+    found = transaction.scalar(select(Property.value).where(Property.key == "head"))
+    number, _, digest = str(found).partition(" ")
+    if not number.isdigit():
+        raise damaged("the end of its log", found)
+    return int(number), digest
+
+
+def wrong_lines(transaction: Transaction, first: int = 1, last: int | None = None) -> Iterator[int]:
+    """Yield the numbers of lines that are not as they were written, or that follow missing ones, from ``first`` on."""
+    end, digest = head(transaction)
+    before = transaction.scalar(select(Entry.digest).where(Entry.id == first - 1)) or ""
+    expected = first
+    wanted = select(Entry).where(Entry.id >= first, Entry.id <= (end if last is None else last)).order_by(Entry.id)
+    for entry in transaction.scalars(wanted.execution_options(yield_per=1000)):
+        if entry.id != expected or entry.digest != digest_of(entry, before):
+            yield entry.id
+        expected, before = entry.id + 1, entry.digest
+    if last is None and (expected != end + 1 or before != digest):
+        yield end
+
+
+def entries(transaction: Transaction, since: datetime | None = None, object_name: str | None = None) -> list[Entry]:
+    """Return the log, oldest first, with masked secrets."""
+    wanted = select(Entry).order_by(Entry.id)
+    if since is not None:
+        wanted = wanted.where(Entry.time_utc >= since)
+    if object_name is not None:
+        wanted = wanted.where(Entry.object_name == object_name)
+    found = list(transaction.scalars(wanted))
+    transaction.expunge_all()
+    for entry in found:
+        entry.details = masked(entry.details)
+    return found
+
+
+def author() -> dict[str, str]:
+    """Return the columns that say who changes the catalog: account, computer and program."""
+    try:
+        user = pwd.getpwuid(os.getuid()).pw_name  # the account, not LOGNAME, which any user can change
+    except KeyError:
+        user = str(os.getuid())
+    return {"user": user, "host": socket.gethostname(), "software": this_software()}

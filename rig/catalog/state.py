@@ -1,0 +1,320 @@
+"""The state of a catalog, which follows from its log: the objects in use, their names, and their enrollments.
+
+The last line that gives an object a state counts, and the last line that gives an enrollment a status. No other module
+says which these are.
+"""
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from difflib import get_close_matches
+from hashlib import sha256
+from typing import Any
+
+from sqlalchemy import ColumnElement, Select, and_, exists, func, select
+from sqlalchemy.orm import Session as Transaction
+from sqlalchemy.orm import aliased, selectinload
+
+from rig.catalog.facts import Enrollment, Entry, View, damaged_parts, digest_of
+from rig.catalog.records import EnrollmentStatus, clean_name
+from rig.core.errors import CatalogDamaged, CatalogError, ObjectExists, ObjectNotFound
+from rig.core.next_steps import Do
+
+Named = aliased(Entry, name="named")
+"""The line that gives an object its present state."""
+Ended = aliased(Entry, name="ended")
+"""The line that gives an enrollment its present status."""
+_Later = aliased(Entry, name="later")
+
+
+def _is_last(entry: type[Entry], key: str, sets: str) -> ColumnElement[bool]:
+    """Return the condition that no later line of the same object or enrollment sets the column ``sets``, too."""
+    later = exists(1).where(
+        getattr(_Later, key) == getattr(entry, key), getattr(_Later, sets).is_not(None), _Later.id > entry.id
+    )
+    return and_(getattr(entry, sets).is_not(None), ~later)
+
+
+IS_STATE = _is_last(Named, "object_id", "deleted")
+IS_STATUS = _is_last(Ended, "enrollment_id", "status")
+IN_USE = and_(IS_STATE, Named.deleted.is_(False))
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectSummary:
+    """An object: the number of views of its complete enrollment, and of an unfinished one (None if there is none)."""
+
+    name: str
+    label: str
+    note: str
+    created_utc: datetime
+    enrolled_utc: datetime | None
+    views: int
+    unfinished_views: int | None
+    deleted_utc: datetime | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EnrollmentState:
+    """An enrollment with its present status; ``seal`` is that of a complete one, and of an earlier one."""
+
+    enrollment: Enrollment
+    status: EnrollmentStatus
+    finished_utc: datetime | None
+    seal: str | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ObjectDetails:
+    """An object with its enrollments, newest first."""
+
+    summary: ObjectSummary
+    enrollments: tuple[EnrollmentState, ...]
+
+    @property
+    def complete(self) -> Enrollment | None:
+        """The enrollment that searches use."""
+        return next((one.enrollment for one in self.enrollments if one.status is EnrollmentStatus.COMPLETE), None)
+
+    @property
+    def views(self) -> Sequence[View]:
+        """The views of that enrollment, by index."""
+        return () if self.complete is None else self.complete.views
+
+
+@dataclass(frozen=True, slots=True)
+class Used:
+    """A complete enrollment of an object in use: what searches compare with."""
+
+    object_id: int
+    name: str
+    enrollment_id: int
+    key: str
+    seal: str
+    line: int
+    """The line of the log with the seal."""
+
+
+def used(transaction: Transaction, object_ids: Collection[int] | None = None) -> list[Used]:
+    """Return the enrollments that searches use, in the order in which their objects were added.
+
+    Raises
+    ------
+    CatalogDamaged
+        The name or the seal of an object is not as it was written.
+    """
+    wanted = (
+        select(Named.object_id, Named.object_name, Ended.enrollment_id, Enrollment.key, Ended.seal, Ended.id, Named.id)
+        .join(Ended, Ended.object_id == Named.object_id)
+        .join(Enrollment, Enrollment.id == Ended.enrollment_id)
+        .where(IN_USE, IS_STATUS, Ended.status == EnrollmentStatus.COMPLETE)
+        .order_by(Named.object_id)
+    )
+    if object_ids is not None:
+        wanted = wanted.where(Named.object_id.in_(object_ids))
+    rows = transaction.execute(wanted).all()
+    check_lines(transaction, {line for row in rows for line in row[5:]})
+    return [Used(*row[:6]) for row in rows]
+
+
+def version(transaction: Transaction) -> str:
+    """Return a digest of what searches compare with: the names of the objects and the seals of their enrollments."""
+    return sha256(ascii([(one.name, one.seal) for one in used(transaction)]).encode()).hexdigest()
+
+
+def check_lines(transaction: Transaction, ids: Collection[int]) -> None:
+    """Raise `CatalogDamaged` if one of these lines of the log is not as it was written."""
+    wrong = []
+    for part in _portions(sorted(ids)):
+        before = _Later
+        rows = transaction.execute(
+            select(Entry, before.digest).outerjoin(before, before.id == Entry.id - 1).where(Entry.id.in_(part))
+        )
+        wrong += [entry for entry, digest in rows if entry.digest != digest_of(entry, digest or "")]
+    transaction.expunge_all()
+    if wrong:
+        raise changed([str(one.object_name) for one in wrong])
+
+
+def changed(names: Sequence[str]) -> CatalogDamaged:
+    """Return the error that objects are not as they were stored."""
+    shown = list(dict.fromkeys(names))
+    return CatalogDamaged(
+        f"{', '.join(map(repr, shown[:3]))}{' and others' if len(shown) > 3 else ''} in the catalog changed after they "
+        "were stored.",
+        next_step=(Do.VERIFY_CATALOG(), "Then use a backup, or delete these objects and enroll them again."),
+        evidence={"objects": shown[:20]},
+    )
+
+
+def find(transaction: Transaction, name: str, *, deleted: bool = False) -> Entry:
+    """Return the state of an object in use, or of the last ``deleted`` one that is still stored.
+
+    Raises
+    ------
+    ObjectNotFound
+        There is no such object. The next step lists similar names.
+    """
+    name = clean_name(name)
+    among = _among(deleted)
+    found = transaction.scalar(
+        select(Named).where(Named.object_name == name, *among).order_by(Named.id.desc()).limit(1)
+    )
+    if found is not None:
+        return found
+    by_folded = {str(known).casefold(): known for known in transaction.scalars(select(Named.object_name).where(*among))}
+    near = [by_folded[folded] for folded in get_close_matches(name.casefold(), by_folded)]
+    state = "deleted object" if deleted else "object"
+    raise ObjectNotFound(
+        f"There is no {state} {name!r} in the catalog.",
+        next_step=f"Did you mean {' or '.join(map(repr, near))}?" if near else Do.LIST_OBJECTS(deleted=deleted),
+        evidence={"near": near},
+    )
+
+
+def _among(deleted: bool) -> list[ColumnElement[bool]]:
+    """Return the conditions for the objects in use; or for the deleted ones that `collect_garbage` has not removed."""
+    if not deleted:
+        return [IN_USE]
+    return [IS_STATE, Named.deleted.is_(True), exists(1).where(Enrollment.object_id == Named.object_id)]
+
+
+def state_of(transaction: Transaction, name: str) -> Entry | None:
+    """Return the state of the object in use with this name, which is clean; None if there is none."""
+    return transaction.scalar(select(Named).where(Named.object_name == name, IN_USE))
+
+
+def by_id(transaction: Transaction, object_id: int) -> Entry:
+    """Return the state of an object, in use or deleted."""
+    return transaction.scalars(select(Named).where(IS_STATE, Named.object_id == object_id)).one()
+
+
+def columns(known: Entry | None, now: datetime, *, deleted: bool = False, **texts: str) -> dict[str, Any]:
+    """Return the columns of a line of the log that gives an object this state; what is not given stays as it is."""
+    label, note = ("", "") if known is None else (known.label or "", known.note or "")
+    created_utc = now if known is None else known.created_utc
+    found: dict[str, Any] = {"label": label, "note": note, "deleted": deleted, "created_utc": created_utc, **texts}
+    return found if known is None else {**found, "object_id": known.object_id}
+
+
+def check_free(transaction: Transaction, name: str) -> None:
+    """Raise `ObjectExists` if an object in use has this name."""
+    if state_of(transaction, name) is not None:
+        raise ObjectExists(
+            f"There is another object {name!r} in the catalog.",
+            next_step=("Choose another name, or", Do.RENAME(name=name)),
+        )
+
+
+def summaries(transaction: Transaction, *, deleted: bool = False, object_id: int | None = None) -> list[ObjectSummary]:
+    """Return the objects in use or the deleted ones, or one object, in the order in which they were added.
+
+    Raises
+    ------
+    CatalogDamaged
+        The state of an object is not as it was written.
+    """
+    conditions = _among(deleted) if object_id is None else [IS_STATE, Named.object_id == object_id]
+    count = select(func.count()).where(View.enrollment_id == Ended.enrollment_id).correlate(Ended).scalar_subquery()
+    states = transaction.scalars(select(Named).where(*conditions).order_by(Named.object_id)).all()
+    wanted = (
+        select(Ended.object_id, Ended.status, Ended.finished_utc, count)
+        .join(Enrollment, Enrollment.id == Ended.enrollment_id)
+        .where(IS_STATUS, Ended.status.in_([EnrollmentStatus.COMPLETE, EnrollmentStatus.IN_PROGRESS]))
+    )
+    if object_id is not None:
+        wanted = wanted.where(Ended.object_id == object_id)
+    current = {(owner, status): (when, number) for owner, status, when, number in transaction.execute(wanted)}
+    check_lines(transaction, [one.id for one in states])
+    found = []
+    for one in states:
+        enrolled_utc, views = current.get((one.object_id, EnrollmentStatus.COMPLETE), (None, 0))
+        _, unfinished = current.get((one.object_id, EnrollmentStatus.IN_PROGRESS), (None, None))
+        found.append(
+            ObjectSummary(
+                name=str(one.object_name),
+                label=one.label or "",
+                note=one.note or "",
+                created_utc=one.created_utc or one.time_utc,
+                enrolled_utc=enrolled_utc,
+                views=views,
+                unfinished_views=unfinished,
+                deleted_utc=one.time_utc if one.deleted else None,
+            )
+        )
+    return found
+
+
+def enrollments(transaction: Transaction, *conditions: ColumnElement[bool]) -> list[EnrollmentState]:
+    """Return enrollments with their sessions and views, newest first, all as they were written.
+
+    Raises
+    ------
+    CatalogDamaged
+        They are not.
+    """
+    wanted: Select[Any] = (
+        select(Enrollment, Ended)
+        .join(Ended, Ended.enrollment_id == Enrollment.id)
+        .where(IS_STATUS, *conditions)
+        .options(selectinload(Enrollment.sessions), selectinload(Enrollment.views))
+        .order_by(Enrollment.id.desc())
+        .execution_options(populate_existing=True)
+    )
+    rows = transaction.execute(wanted).all()
+    check_lines(transaction, [ended.id for _, ended in rows])
+    for enrollment, ended in rows:
+        if damaged_parts(enrollment, ended.seal):
+            raise changed([str(by_id(transaction, enrollment.object_id).object_name)])
+    transaction.expunge_all()
+    return [EnrollmentState(one, ended.status, ended.finished_utc, ended.seal) for one, ended in rows]
+
+
+def unfinished(transaction: Transaction, state: Entry) -> EnrollmentState:
+    """Return the unfinished enrollment of an object; a `CatalogError` if there is none."""
+    found = of_status(transaction, state, EnrollmentStatus.IN_PROGRESS)
+    if found is None:
+        raise CatalogError(
+            f"{state.object_name!r} has no unfinished enrollment.", next_step=Do.ENROLL(name=str(state.object_name))
+        )
+    return found
+
+
+def of_status(transaction: Transaction, state: Entry, status: EnrollmentStatus) -> EnrollmentState | None:
+    """Return the enrollment of an object that is complete or in progress; None if there is none."""
+    return next(iter(enrollments(transaction, Enrollment.object_id == state.object_id, Ended.status == status)), None)
+
+
+def check_not_enrolled(transaction: Transaction, state: Entry) -> None:
+    """Raise an error if an object is enrolled, or its enrollment has begun."""
+    name = str(state.object_name)
+    if (begun := of_status(transaction, state, EnrollmentStatus.IN_PROGRESS)) is not None:
+        raise CatalogError(
+            f"The enrollment of {name!r} is unfinished, with {len(begun.enrollment.views)} of "
+            f"{len(begun.enrollment.planned_azimuth_deg)} views.",
+            next_step=(Do.CONTINUE_ENROLLMENT(name=name), "Or", Do.ENROLL_AGAIN(name=name)),
+        )
+    if (done := of_status(transaction, state, EnrollmentStatus.COMPLETE)) is not None:
+        raise ObjectExists(
+            f"{name!r} is enrolled already, with {len(done.enrollment.views)} views.",
+            next_step=(
+                "Choose another name, or",
+                Do.ENROLL_AGAIN(name=name),
+                "The old views stay in use until the new ones are complete.",
+            ),
+        )
+
+
+def _portions(ids: Sequence[int], size: int = 500) -> list[Sequence[int]]:
+    return [ids[start : start + size] for start in range(0, len(ids), size)]
+
+
+def check(transaction: Transaction, *conditions: ColumnElement[bool]) -> None:
+    """Raise `CatalogDamaged` if objects or enrollments, all or some, are not as they were written."""
+    ids = transaction.scalars(
+        select(Enrollment.id).join(Ended, Ended.enrollment_id == Enrollment.id).where(IS_STATUS, *conditions)
+    ).all()
+    for part in _portions(ids, 20):
+        enrollments(transaction, Enrollment.id.in_(part))
+    if not conditions:
+        check_lines(transaction, list(transaction.scalars(select(Named.id).where(IS_STATE))))
