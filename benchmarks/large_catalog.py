@@ -2,35 +2,31 @@
 
 python -m benchmarks.large_catalog FOLDER [OBJECTS] [--images]
 
-All objects but the first are copies of its records, with descriptors of their own and without images. With
-``--images`` each view has an image, for `rig catalog verify` and `redescribe`: a frame of 320x240 of one of four
-objects of the simulator. Views that show the same are hard links to one file.
+All objects have the same records, with descriptors of their own, and all views the same black image. With ``--images``
+each view shows one of four objects of the simulator in 320x240, for `rig catalog verify` and `redescribe`.
 """
 
 import argparse
+import hashlib
 import json
-import os
-import shutil
-import sqlite3
-from collections.abc import Sequence
-from contextlib import closing
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from sqlalchemy import insert
+from sqlalchemy.orm import Session as Transaction
 
 from benchmarks.bench_search import VIEWS_OF_AN_OBJECT, model
 from hbr import Views, descriptor
 from hbr.core.arrays import LevelArray
-from rig.catalog import Catalog, Provenance, ViewRecord
-from rig.catalog.describing import pack
-from rig.catalog.seal import seal_enrollments, seal_objects
-from rig.config import ViewConfig
+from rig.catalog import Action, Catalog, Enrollment, EnrollmentStatus, Provenance, Session, View, derived, log
+from rig.catalog.facts import Derived, Entry, digest_of, seal_of
 from rig.core.clock import SystemClock
 from rig.views import image_files
-from rig.views.description import BENCH_DESCRIPTOR, ViewDescriber
+from rig.views.description import BENCH_DESCRIPTOR, PAPER_DESCRIPTOR
 from sim.camera import SimCapture
 from sim.objects.shelf import shelf
 from sim.world import World
@@ -67,24 +63,99 @@ _PROVENANCE = Provenance(
 )
 
 
-_SMALL_REGION = (40, 0, 240, 240)
 _SHOWN = ("mug-star", "teapot", "toy-car", "radio")
 
 
 def build(folder: Path, objects: int = OBJECTS, *, images: bool = False) -> Views:
     """Make the catalog in a new folder, and return the views in it."""
     views = model(objects)
-    frames = _frames() if images else [[np.zeros((480, 560, 3), np.uint8)] * VIEWS_OF_AN_OBJECT]
     with Catalog.open(folder, clock=SystemClock()) as catalog:
-        _enroll(catalog, views, frames[0])
-    with closing(sqlite3.connect(folder / "catalog.sqlite", isolation_level=None)) as connection:
-        _copy(connection, views)
+        shown = _put(catalog, _frames() if images else [[np.zeros((480, 560, 3), np.uint8)]])
+        with catalog.database.write() as transaction:
+            log.add(transaction, *_entries(transaction, catalog, views, shown))
         if images:
-            _link_images(connection, folder, frames)
-    with Catalog.open(folder, clock=SystemClock()) as catalog, catalog.database.write() as writing:
-        seal_objects(writing, None)
-        seal_enrollments(writing, None)
+            for kind in (PAPER_DESCRIPTOR, BENCH_DESCRIPTOR):
+                derived.views(catalog, kind)
+        else:
+            _describe(catalog, views)
     return views
+
+
+def _put(catalog: Catalog, frames: Sequence[Sequence[NDArray[np.uint8]]]) -> list[list[tuple[str, int]]]:
+    """Store the frames, and return the name and size of each."""
+    found = []
+    for of_object in frames:
+        encoded = [image_files.encode(frame) for frame in of_object]
+        found.append([(catalog.database.images.put(png, settled=False), len(png)) for png in encoded])
+    return found
+
+
+def _entries(
+    transaction: Transaction, catalog: Catalog, views: Views, shown: Sequence[Sequence[tuple[str, int]]]
+) -> Iterator[Entry]:
+    """Insert the rows of all objects, and yield the lines of the log about them."""
+    now = catalog.clock.utc()
+    region = (40, 0, 240, 240) if len(shown) > 1 else (80, 0, 480, 480)
+    for j, name in enumerate(views.object_names):
+        own = views.of(j)
+        azimuths_deg = tuple(views.azimuth_deg[own].tolist())
+        images = shown[j % len(shown)]
+        key = hashlib.sha256(name.encode()).hexdigest()
+        enrollment = Enrollment(key=key, object_id=j + 1, started_utc=now, planned_azimuth_deg=azimuths_deg)
+        session = Session(number=0, started_utc=now, provenance=_PROVENANCE)
+        taken = [
+            View(
+                index=i,
+                commanded_deg=-5.0 * i,
+                encoder_deg=-5.0 * i + 0.03,
+                imu_deg=-5.0 * i + 0.1,
+                imu_sigma_deg=0.5,
+                azimuth_deg=azimuth_deg,
+                captured_ns=i,
+                evidence=_EVIDENCE,
+                region=region,
+                image=images[i % len(images)][0],
+                image_bytes=images[i % len(images)][1],
+            )
+            for i, azimuth_deg in enumerate(azimuths_deg)
+        ]
+        enrollment.sessions, enrollment.views = [session], taken
+        for row in (enrollment, session, *taken):
+            row.digest = digest_of(row, key)
+        transaction.add(enrollment)
+        transaction.flush()
+        yield Entry(
+            id=0,
+            time_utc=now,
+            **log.author(),
+            action=Action.ENROLLED,
+            object_name=name,
+            object_id=j + 1,
+            label=f"shelf {j % 20}",
+            note="",
+            deleted=False,
+            created_utc=now,
+            enrollment_id=enrollment.id,
+            status=EnrollmentStatus.COMPLETE,
+            finished_utc=now,
+            seal=seal_of(enrollment),
+        )
+        transaction.expunge_all()
+
+
+def _describe(catalog: Catalog, views: Views) -> None:
+    """Store descriptors that differ from object to object, as if the images did."""
+    with catalog.database.write() as transaction:
+        for j, one in enumerate(derived.state.used(transaction)):
+            own = views.of(j)
+            for kind in (descriptor(PAPER_DESCRIPTOR), descriptor(BENCH_DESCRIPTOR)):
+                packed = _rotating(kind.size_bytes, VIEWS_OF_AN_OBJECT, j)
+                if kind.name == PAPER_DESCRIPTOR:
+                    packed = kind.pack_rows(views.descriptors[own])
+                content = derived.content_of(kind, packed, views.azimuth_deg[own])
+                transaction.execute(insert(Derived).values(derived.row_of(one.seal, kind.name, None, content)))
+            evidence = json.dumps([{}] * VIEWS_OF_AN_OBJECT).encode()
+            transaction.execute(insert(Derived).values(derived.row_of(one.seal, derived.SEGMENTATION, None, evidence)))
 
 
 def _frames() -> list[list[NDArray[np.uint8]]]:
@@ -104,100 +175,6 @@ def _frames() -> list[list[NDArray[np.uint8]]]:
             assert taken
             found[-1].append(np.asarray(frame, np.uint8))
     return found
-
-
-def _link_images(connection: sqlite3.Connection, folder: Path, frames: Sequence[Sequence[NDArray[np.uint8]]]) -> None:
-    """Give each view an image with its own name, and the descriptors of that image."""
-    describe = ViewDescriber(ViewConfig(roi=_SMALL_REGION))
-    kept = folder / "frames"
-    kept.mkdir()
-    shown = {}
-    for j, of_object in enumerate(frames):
-        for i, frame in enumerate(of_object):
-            png, described = image_files.encode(frame), describe(frame)
-            path = kept / f"{j}-{i:03d}.png"
-            path.write_bytes(png)
-            packed = {one.name: one.packed for one in pack(described.levels, _SMALL_REGION)}
-            shown[j, i] = path, image_files.digest(png), len(png), json.dumps(described.segmentation), packed
-    rows = connection.execute("SELECT id, enrollment_id, view_index, image FROM views").fetchall()
-    connection.execute("BEGIN IMMEDIATE")
-    for view, enrollment, i, image in rows:
-        path, digest, size, segmentation, packed = shown[(enrollment - 1) % len(frames), i]
-        if enrollment > 1:
-            image = Path(image_files.IMAGE_FOLDER, f"{enrollment:06d}-large", f"{enrollment:06d}", f"{i:03d}.png")
-            (folder / image).parent.mkdir(parents=True, exist_ok=True)
-            os.link(path, folder / image)
-        connection.execute(
-            "UPDATE views SET image = ?, image_sha256 = ?, image_bytes = ?, segmentation = ? WHERE id = ?",
-            (str(image), digest, size, segmentation, view),
-        )
-        connection.executemany(
-            "UPDATE descriptors SET packed = ? WHERE view_id = ? AND name = ?",
-            [(levels, view, name) for name, levels in packed.items()],
-        )
-    connection.execute("COMMIT")
-    shutil.rmtree(kept)
-
-
-def _enroll(catalog: Catalog, views: Views, frames: Sequence[NDArray[np.uint8]]) -> None:
-    """Enroll the first object."""
-    region = _SMALL_REGION if frames[0].shape[0] == 240 else (80, 0, 480, 480)
-    own = descriptor(BENCH_DESCRIPTOR)
-    levels = own.unpack_rows(_rotating(own.size_bytes, VIEWS_OF_AN_OBJECT, 0).tobytes())
-    azimuths_deg = views.azimuth_deg[:VIEWS_OF_AN_OBJECT].tolist()
-    enrollment = catalog.begin(
-        views.object_names[0], planned_azimuth_deg=azimuths_deg, provenance=_PROVENANCE, label="shelf 0"
-    )
-    for i, azimuth_deg in enumerate(azimuths_deg):
-        view = ViewRecord(
-            index=i,
-            commanded_deg=-5.0 * i,
-            encoder_deg=-5.0 * i + 0.03,
-            imu_deg=-5.0 * i + 0.1,
-            imu_sigma_deg=0.5,
-            azimuth_deg=azimuth_deg,
-            captured_ns=i,
-            evidence=_EVIDENCE,
-            descriptors={"cedd": views.descriptors[i], own.name: levels[i]},
-            region=region,
-        )
-        enrollment.add(view, frames[i])
-    enrollment.finish()
-
-
-def _copy(connection: sqlite3.Connection, views: Views) -> None:
-    """Insert the other objects as copies of the first one's rows."""
-    kinds = descriptor("cedd"), descriptor(BENCH_DESCRIPTOR)
-    tables = ("objects", "enrollments", "sessions", "views")
-    columns = {table: [row[1] for row in connection.execute(f"PRAGMA table_info({table})")] for table in tables}
-    settings = connection.execute("SELECT settings FROM descriptors LIMIT 1").fetchone()[0]
-
-    def copied(table: str, **changes: object) -> int | None:
-        named = [name for name in columns[table] if name not in ("id", "digest")]
-        values = ", ".join("?" if name in changes else name for name in named)
-        where = "enrollment_id" if table == "views" else "id"
-        statement = f"INSERT INTO {table} ({', '.join(named)}) SELECT {values} FROM {table} WHERE {where} = 1"
-        return connection.execute(statement, [changes[name] for name in named if name in changes]).lastrowid
-
-    connection.execute("BEGIN IMMEDIATE")
-    for j, name in list(enumerate(views.object_names))[1:]:
-        number = copied("objects", name=name, label=f"shelf {j % 20}")
-        enrollment = copied("enrollments", object_id=number)
-        copied("views", enrollment_id=enrollment, session_id=copied("sessions", enrollment_id=enrollment))
-        ids = connection.execute("SELECT id FROM views WHERE enrollment_id = ? ORDER BY view_index", (enrollment,))
-        packed = (
-            kinds[0].pack_rows(views.descriptors[views.of(j)]),
-            _rotating(kinds[1].size_bytes, VIEWS_OF_AN_OBJECT, j),
-        )
-        connection.executemany(
-            "INSERT INTO descriptors (view_id, name, version, settings, packed) VALUES (?, ?, ?, ?, ?)",
-            [
-                (view_id, kind.name, kind.version, settings, row.tobytes())
-                for view_id, *rows in zip((row[0] for row in ids.fetchall()), *packed, strict=True)
-                for kind, row in zip(kinds, rows, strict=True)
-            ],
-        )
-    connection.execute("COMMIT")
 
 
 def _rotating(size: int, views: int, seed: int) -> LevelArray:

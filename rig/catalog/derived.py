@@ -18,7 +18,7 @@ from itertools import groupby
 from typing import Any, Final, NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from sqlalchemy import delete, insert, select
 from sqlalchemy.orm import Session as Transaction
 
@@ -550,15 +550,26 @@ def _records(kind: Descriptor, content: bytes) -> NDArray[np.void]:
     return np.frombuffer(content, _record(kind))
 
 
+def content_of(kind: Descriptor, packed: NDArray[np.uint8], azimuth_deg: ArrayLike) -> bytes:
+    """Return the content of a row of descriptors: their packed levels, uint8 (n, size), with the azimuths (n,)."""
+    records = np.empty(len(packed), _record(kind))
+    records["packed"], records["azimuth_deg"] = packed, azimuth_deg
+    return records.tobytes()
+
+
+def row_of(seal: str, what: str, region: tuple[Region | None] | None, content: bytes) -> dict[str, Any]:
+    """Return the columns of a row of `Derived` by this program; ``region`` is the one that was chosen later."""
+    sha256 = hashlib.sha256(content).hexdigest()
+    return {"seal": seal, "what": what, "made_by": _made_by(what, region), "content": content, "sha256": sha256}
+
+
 def _content(task: _Task, found: Described) -> dict[str, bytes]:
     """Return the contents of a description by their kind."""
     contents = {}
     for name, levels in found.levels.items():
         kind = descriptor(name)
-        records = np.empty(len(task.views), _record(kind))
-        records["packed"] = np.frombuffer(b"".join(map(kind.pack, levels)), np.uint8).reshape(len(levels), -1)
-        records["azimuth_deg"] = [view.azimuth_deg for view in task.views]
-        contents[name] = records.tobytes()
+        packed = np.frombuffer(b"".join(map(kind.pack, levels)), np.uint8).reshape(len(levels), -1)
+        contents[name] = content_of(kind, packed, [view.azimuth_deg for view in task.views])
     if any(found.segmentation):
         contents[SEGMENTATION] = json.dumps(found.segmentation).encode()
     return contents
@@ -567,12 +578,10 @@ def _content(task: _Task, found: Described) -> dict[str, bytes]:
 def _store(catalog: Catalog, done: Sequence[tuple[_Task, Described]]) -> None:
     """Store descriptions. A catalog that cannot be written keeps none: they are computed again."""
     rows = [
-        {"seal": task.seal, "what": what, "made_by": _made_by(what, task.region), "content": content}
+        row_of(task.seal, what, task.region, content)
         for task, found in done
         for what, content in _content(task, found).items()
     ]
-    for row in rows:
-        row["sha256"] = hashlib.sha256(row["content"]).hexdigest()
     if not catalog.database.read_only:
         _write(catalog.database, rows)
         return
