@@ -11,7 +11,7 @@ from difflib import get_close_matches
 from hashlib import sha256
 from typing import Any
 
-from sqlalchemy import ColumnElement, Select, and_, exists, func, select
+from sqlalchemy import ColumnElement, Select, and_, exists, false, func, select, true
 from sqlalchemy.orm import Session as Transaction
 from sqlalchemy.orm import aliased, selectinload
 
@@ -37,7 +37,7 @@ def _is_last(entry: type[Entry], key: str, sets: str) -> ColumnElement[bool]:
 
 IS_STATE = _is_last(Named, "object_id", "deleted")
 IS_STATUS = _is_last(Ended, "enrollment_id", "status")
-IN_USE = and_(IS_STATE, Named.deleted.is_(False))
+IN_USE = and_(IS_STATE, Named.deleted == false())
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,7 +176,7 @@ def _among(deleted: bool) -> list[ColumnElement[bool]]:
     """Return the conditions for the objects in use; or for the deleted ones that `collect_garbage` has not removed."""
     if not deleted:
         return [IN_USE]
-    return [IS_STATE, Named.deleted.is_(True), exists(1).where(Enrollment.object_id == Named.object_id)]
+    return [IS_STATE, Named.deleted == true(), exists(1).where(Enrollment.object_id == Named.object_id)]
 
 
 def state_of(transaction: Transaction, name: str) -> Entry | None:
