@@ -293,7 +293,8 @@ def _value(row: Row, column: str) -> Any:
     if isinstance(row, Session) and column in Provenance.__slots__:
         return getattr(row.provenance, column)
     name = "index" if column == "view_index" else column
-    return getattr(row, name)
+    value = getattr(row, name)
+    return value + 0.0 if isinstance(value, float) else value  # a database stores −0.0 as 0.0
 
 
 def _sha256(values: Sequence[Any]) -> str:
