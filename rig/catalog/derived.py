@@ -263,19 +263,24 @@ def local_views(catalog: Catalog, name: str, azimuths_deg: Sequence[float]) -> l
     ]
 
 
+def regions_of(catalog: Catalog, enrollment: Enrollment) -> tuple[Region | None, ...]:
+    """Return the part of the image of each view that is described; None for the whole image."""
+    with catalog.database.read() as transaction:
+        chosen = _regions(transaction).of(transaction, enrollment.id)
+    return tuple(view.region if chosen is None else chosen[0] for view in enrollment.views)
+
+
 def _cut(
     catalog: Catalog, enrollment: Enrollment, evidence: Sequence[Mapping[str, Any]], places: Iterable[int]
 ) -> list[tuple[View, hbr.Segmentation]]:
     """Return views of an enrollment with their stored segmentation."""
-    with catalog.database.read() as transaction:
-        region = _regions(transaction).of(transaction, enrollment.id)
+    regions = regions_of(catalog, enrollment)
     found = []
     for place in places:
         view = enrollment.views[place]
         table = enrollment.sessions[view.session].empty_table
-        part = view.region if region is None else region[0]
         empty = None if table is None else catalog.read_image(table)
-        describer = ViewDescriber(ViewConfig(roi=part), (BENCH_DESCRIPTOR,), empty)
+        describer = ViewDescriber(ViewConfig(roi=regions[place]), (BENCH_DESCRIPTOR,), empty)
         try:
             found.append((view, describer.segment(catalog.read_image(view.image), evidence[place])))
         except ValueError as error:
