@@ -86,7 +86,7 @@ def load_catalog(catalog: Catalog, region: tuple[int, int, int, int] | None) -> 
     for summary in catalog.objects():
         photographs = sorted(
             (
-                Photograph(catalog.image_path(view), view.record.azimuth_deg)
+                Photograph(catalog.image_path(view.image), view.azimuth_deg)
                 for view in catalog.object(summary.name).views
             ),
             key=lambda photograph: photograph.azimuth_deg,

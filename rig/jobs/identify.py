@@ -75,7 +75,8 @@ def identify(
         desk.open_to_read() as catalog,
         CurrentModel(catalog, None if chosen is None else descriptor_for(chosen)) as model,
     ):
-        known = model()  # report a catalog that cannot be searched before the bench is opened
+        with desk.preparing() as progress:
+            known = model(progress)  # report a catalog that cannot be searched before the bench is opened
         if scan and not watch:
             sample = desk.operator.ask_sample()
         with desk.open_bench() as bench:

@@ -7,7 +7,7 @@ from rig.bench import Bench
 from rig.calibrations import CalibrationStore
 from rig.calibrations.store import CALIBRATIONS
 from rig.catalog import Catalog
-from rig.catalog.descriptions import described_regions
+from rig.catalog.derived import described_regions
 from rig.core.next_steps import Do
 from rig.jobs.desk import Remark
 

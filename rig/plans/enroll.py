@@ -10,7 +10,7 @@ from contextlib import suppress
 
 from rig.bench import Bench
 from rig.catalog import Catalog, Provenance
-from rig.catalog.descriptions import unfinished_camera_settings
+from rig.catalog.derived import unfinished_camera_settings
 from rig.core.clock import seconds_between
 from rig.core.errors import RigError
 from rig.events.events import Enrolled, Event, Started
@@ -20,7 +20,7 @@ from rig.plans.capture import check_camera
 from rig.plans.enroll_views import EnrollmentViews
 from rig.plans.estimate import even_azimuths, table_angles
 from rig.views.capture import Viewer
-from rig.views.description import DESCRIPTORS, ViewDescriber
+from rig.views.description import ViewDescriber
 from rig.views.empty_table import empty_table_status
 
 
@@ -47,9 +47,9 @@ def enroll(
     With ``fly`` the views are taken in one revolution without a stop (`rig.plans.enroll_views`). Views that fail or are
     missing are then taken at rest. The default is ``enroll.mode``; "auto" means at rest.
 
-    Every view is described by `rig.views.description.DESCRIPTORS`. Segmentation uses the bench's empty-table image, if
-    there is one (`rig.plans.photograph_table`); the enrollment stores it. At the end all views are segmented again,
-    together (`Enrollment.revise`).
+    Every view is segmented for its checks and its event, with the bench's empty-table image if there is one
+    (`rig.plans.photograph_table`); the enrollment stores it. At the end all views are segmented and described together
+    (`OpenEnrollment.finish`).
 
     Raises
     ------
@@ -83,9 +83,10 @@ def enroll(
         },
     )
     # Begin or resume the enrollment in the catalog.
+    empty_table = None if status.table is None else status.table.image_bgr
     if resume:
         check_camera(bench, unfinished_camera_settings(catalog, name))
-        enrollment = catalog.resume(name, provenance=provenance)
+        enrollment = catalog.resume(name, provenance=provenance, empty_table=empty_table)
     else:
         enrollment = catalog.begin(
             name,
@@ -94,6 +95,7 @@ def enroll(
             label=label,
             note=note,
             replace=replace,
+            empty_table=empty_table,
         )
     views = len(enrollment.planned_azimuth_deg)
     angles_deg = table_angles(enrollment.planned_azimuth_deg, limits_deg, sign)
@@ -113,13 +115,10 @@ def enroll(
     if missing:
         try:
             bench.place(enrollment.object_name)
-            empty_table = None if status.table is None else status.table.image_bgr
-            if empty_table is not None:
-                enrollment.store_empty_table(empty_table)
-            describe = ViewDescriber(bench.config.view, DESCRIPTORS, empty_table)
+            segment = ViewDescriber(bench.config.view, empty_table=empty_table)
             viewer = Viewer(bench.camera, bench.config, encodes=not in_motion)
             with Turntable(bench) as table:
-                taking = EnrollmentViews(bench, enrollment, describe, table, viewer)
+                taking = EnrollmentViews(bench, enrollment, segment, table, viewer)
                 yield from taking.take(to_go, in_motion=in_motion)
             retakes = taking.retakes
         except BaseException:
@@ -127,8 +126,6 @@ def enroll(
                 with suppress(RigError):  # it has views to resume
                     enrollment.discard()  # a mistyped name, or a table that did not start, is not left in the catalog
             raise
-    # Segment all views together, then let searches use them.
-    enrollment.revise()
     enrollment.finish()
     done = Enrolled(enrollment.object_name, views, retakes, seconds_between(started_ns, bench.clock.now_ns()))
     yield done

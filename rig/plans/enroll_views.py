@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from hbr.core.angles import wrap360
 from rig.bench import Bench
-from rig.catalog import Enrollment, ViewRecord
+from rig.catalog import OpenEnrollment, View
 from rig.core.errors import LimitExceeded, ObjectMoved, RotationDisagreement
 from rig.core.json_form import plain
 from rig.core.next_steps import Do
@@ -63,8 +63,8 @@ class EnrollmentViews:
     """
 
     bench: Bench
-    enrollment: Enrollment
-    describe: ViewDescriber
+    enrollment: OpenEnrollment
+    segment: ViewDescriber
     table: Turntable
     viewer: Viewer
     retakes: int = 0
@@ -123,12 +123,12 @@ class EnrollmentViews:
             attempt = yield from capture(index, self.viewer, self.table, move.settled_ns)
             self.retakes += attempt.number - 1
             if self._first is None:
-                check_object(self.bench, attempt.image_bgr, self.describe.empty_table)
-            described = self.describe(attempt.image_bgr)
+                check_object(self.bench, attempt.image_bgr, self.segment.empty_table)
+            segmented = self.segment(attempt.image_bgr)
             yield from self._store(
                 index,
                 attempt,
-                described,
+                segmented,
                 commanded_deg=move.commanded_deg,
                 encoder_deg=move.encoder_deg,
                 table_deg=imu_deg if move.by_gyro else move.encoder_deg,
@@ -159,7 +159,7 @@ class EnrollmentViews:
         if abs(table.rest_deg - start_deg) > config.table.tolerance_deg:
             yield moved(0, (yield from announced(0, table, start_deg)))
         before = yield from capture(0, self.viewer, table, self.bench.clock.now_ns())
-        check_object(self.bench, before.image_bgr, self.describe.empty_table)
+        check_object(self.bench, before.image_bgr, self.segment.empty_table)
         self._first = _Seen(0, start_deg, before.image_bgr)
         yield ScanStarted(speed.dps, speed.limit, speed.value, start_deg, end_deg)
         frames = FlightFrames(self.bench, table)
@@ -197,12 +197,12 @@ class EnrollmentViews:
                 yield Rejected(index, attempt.number, attempt.reasons, attempt.evidence)
                 continue
             attempt = replace(attempt, encoded=encoder.begin(attempt.image_bgr))
-            described = self.describe(attempt.image_bgr)
-            attempt = frames.at_the_object(attempt, described.segmentation, trajectory)
+            segmented = self.segment(attempt.image_bgr)
+            attempt = frames.at_the_object(attempt, segmented.segmentation, trajectory)
             assert attempt.evidence.motion is not None
             measured_deg = attempt.evidence.motion.angle_deg
             yield from self._store(
-                index, attempt, described, commanded_deg=angle_deg, encoder_deg=measured_deg, table_deg=measured_deg
+                index, attempt, segmented, commanded_deg=angle_deg, encoder_deg=measured_deg, table_deg=measured_deg
             )
             stored.add(index)
         self._require_not_moved(self._first, after)
@@ -212,7 +212,7 @@ class EnrollmentViews:
         self,
         index: int,
         attempt: Attempt,
-        described: DescribedView,
+        segmented: DescribedView,
         *,
         commanded_deg: float,
         encoder_deg: float,
@@ -221,22 +221,20 @@ class EnrollmentViews:
         imu_sigma_deg: float | None = None,
     ) -> Generator[Event, None, None]:
         """Store an accepted view; ``table_deg`` is the best measurement of its table angle."""
-        record = ViewRecord(
+        view = View(
             index=index,
             commanded_deg=commanded_deg,
             encoder_deg=encoder_deg,
             azimuth_deg=float(wrap360(self.bench.config.table.orientation_sign * table_deg)),
-            descriptors=described.levels,
             captured_ns=attempt.evidence.exposed_ns,
             imu_deg=imu_deg,
             imu_sigma_deg=imu_sigma_deg,
             evidence=plain(attempt.evidence),
             region=self.bench.config.view.roi,
-            segmentation=described.segmentation,
         )
-        self.enrollment.add(record, attempt.image_bgr, attempt.encoded, described.segmented)
-        yield accepted(index, record.azimuth_deg, attempt, described)
-        yield from warn_of_table(self.bench, index, described)
+        self.enrollment.add(view, attempt.image_bgr, attempt.encoded)
+        yield accepted(index, view.azimuth_deg, attempt, segmented)
+        yield from warn_of_table(self.bench, index, segmented)
 
     def _require_not_moved(self, first: _Seen, again: Attempt) -> None:
         """Compare two frames of one angle; abandon the enrollment and raise `ObjectMoved` if the object moved."""

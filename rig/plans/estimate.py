@@ -160,7 +160,7 @@ def dry_run(
             planned = even_azimuths(own_views or views or bench.config.enroll.views, limits_deg, sign)
         missing: Sequence[int] = range(len(planned))
         if action == "resume" and catalog is not None and (kept := catalog.resumable(name)) is not None:
-            planned, missing = kept.planned_azimuth_deg, kept.missing
+            planned, missing = kept.enrollment.planned_azimuth_deg, kept.enrollment.missing
         every = table_angles(planned, limits_deg, sign)
         angles = tuple(every[index] for index in missing)
         in_motion = takes_in_motion(bench.config, fly, tray=len(names) > 1)

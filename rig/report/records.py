@@ -11,7 +11,7 @@ from typing import Any, Final
 
 from hbr import Outcome
 from hbr.core.angles import wrap180
-from rig.catalog import ViewRecord
+from rig.catalog import View
 from rig.charts.polar_path import PathStep
 from rig.events.compared import Compared, Verified
 from rig.events.events import (
@@ -116,13 +116,13 @@ class EnrollmentRecord:
         elif isinstance(event, SimilarObjects):
             self.similar = event
 
-    def complete(self, stored: Iterable[tuple[ViewRecord, Image]]) -> None:
-        """Add the stored views of earlier sessions, which this report did not see."""
+    def complete(self, stored: Iterable[tuple[View, Mapping[str, Any], Image]]) -> None:
+        """Add the stored views of earlier sessions, which this report did not see, with their segmentations."""
         seen = {view.index for view in self.views}
-        for record, image_bgr in stored:
-            if record.index not in seen:
-                taken = {name: getattr(record, name) for name in ("index", "azimuth_deg", "evidence", "segmentation")}
-                event = event_of({"event": "accepted", **taken})
+        for view, segmentation, image_bgr in stored:
+            if view.index not in seen:
+                taken = {name: getattr(view, name) for name in ("index", "azimuth_deg", "evidence")}
+                event = event_of({"event": "accepted", **taken, "segmentation": segmentation or None})
                 assert isinstance(event, Accepted)
                 self._collector.views.append(self._collector.view(replace(event, image_bgr=image_bgr)))
         self._collector.views.sort(key=lambda view: view.index)

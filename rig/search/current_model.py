@@ -1,11 +1,13 @@
 """The model of a catalog, loaded again when the catalog has changed."""
 
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Self
 
 from rig.catalog import Catalog
-from rig.catalog.local_copy import Attempts, update_copy
+from rig.catalog.jobs import JobProgress
+from rig.catalog.shared import Attempts, update_copy
 from rig.core.errors import CatalogUnavailable, RigError
 from rig.events.events import Note, NoteCode
 from rig.search.model import Model, load_model
@@ -44,8 +46,11 @@ class CurrentModel:
         if self._server is not None:
             self._server.close()
 
-    def __call__(self) -> Model:
-        """Return the model; errors as `load_model`, and `CatalogUnavailable` if none was loaded before."""
+    def __call__(self, progress: Callable[[JobProgress], None] | None = None) -> Model:
+        """Return the model; errors as `load_model`, and `CatalogUnavailable` if none was loaded before.
+
+        ``progress`` is called while views are described.
+        """
         try:
             self._leave_copy()
             rules = self.catalog.path / FILE
@@ -53,8 +58,8 @@ class CurrentModel:
             version = self.catalog.version() if changed or not self.version else self.version
             state = version, rules.stat().st_mtime_ns if rules.exists() else None
             if state != self._loaded_state:
-                self._model, self._loaded_state = load_model(self.catalog, descriptor=self.descriptor), state
-                self.version = version
+                self._model = load_model(self.catalog, descriptor=self.descriptor, progress=progress)
+                self._loaded_state, self.version = state, version
                 if self.catalog.place.url is not None:
                     with suppress(RigError):  # the copy is for later; the search has its model already
                         update_copy(self.catalog)

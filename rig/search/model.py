@@ -17,20 +17,10 @@ from numpy.typing import NDArray
 import hbr
 from hbr.dense.arc import ArcSession, fit_arc_confidence
 from rig.bench import Bench
-from rig.catalog import Catalog
-from rig.catalog.descriptions import (
-    camera_settings,
-    empty_tables,
-    guessed_objects,
-    has_descriptor,
-    newest_view,
-    read_image,
-)
+from rig.catalog import Catalog, derived
 from rig.catalog.jobs import JobProgress
-from rig.catalog.local_views import local_views
-from rig.catalog.prepared import prepared_views
 from rig.config import RigConfig
-from rig.core.errors import CatalogError, DescriptorOutdated, UsageError
+from rig.core.errors import CatalogError, UsageError
 from rig.core.next_steps import Do
 from rig.events.events import Note, NoteCode
 from rig.search.comparison import EnrolledViews
@@ -38,7 +28,7 @@ from rig.search.session import SHOWN, ArcSearch, DenseSearch, HoughSearch, Searc
 from rig.search.stopping_rules import stopping_rule_of, write_stopping_rule
 from rig.search.strategies import AnyStrategy, descriptor_for, is_in_motion, strategy_for
 from rig.search.strategies import strategy as strategy_named
-from rig.views.description import BENCH_DESCRIPTOR, PAPER_DESCRIPTOR
+from rig.views.description import BENCH_DESCRIPTOR
 from rig.views.empty_table import empty_table_status
 
 
@@ -63,7 +53,7 @@ class Model(ABC):
     bench_image : uint8 array (H, W, 3), optional
         An image that shows the bench of the newest enrollment: its empty-table image, or one of its views.
     leader_views
-        Returns the enrolled views of an object near some azimuths (`rig.catalog.local_views`); None if the model does
+        Returns the enrolled views of an object near some azimuths (`rig.catalog.derived.local_views`); None if the model does
         not come from a catalog.
     """
 
@@ -180,7 +170,7 @@ def begin_search(
 def load_model(
     catalog: Catalog, *, descriptor: str | None = None, progress: Callable[[JobProgress], None] | None = None
 ) -> Model:
-    """Load the enrolled views: by the bench's own descriptor if every object has it, else by the paper's.
+    """Load the enrolled views, by the bench's own descriptor.
 
     The stopping rule of the dense search is the one that `rig catalog fit` stored, if it is of this catalog.
     Otherwise a quick fit makes one (`rig.search.stopping_rules.stopping_rule_of`).
@@ -190,62 +180,44 @@ def load_model(
     catalog
         An open one.
     descriptor
-        Load views by this descriptor only.
+        Another descriptor, for a strategy of the paper.
     progress
-        Called while the program reads views of a large catalog for the first time.
+        Called while the program describes views that have no description by it.
 
     Raises
     ------
-    DescriptorOutdated
-        Objects lack the descriptor that was asked for, or both.
+    UsageError
+        There is no such descriptor.
     CatalogError, CatalogBusy
-        The catalog cannot be read.
+        The catalog cannot be read, or a view cannot be described.
     """
-    model = _load(catalog, descriptor, progress)
+    views = derived.views(catalog, descriptor or BENCH_DESCRIPTOR, progress)
+    model = _loaded(catalog, views)
     if catalog.copied_utc is None:
         return model
     note = Note(NoteCode.LOCAL_COPY, {"copied_utc": f"{catalog.copied_utc:%Y-%m-%d %H:%M:%S} UTC"})
     return replace(model, notes=(note, *model.notes))
 
 
-def _load(catalog: Catalog, descriptor: str | None, progress: Callable[[JobProgress], None] | None) -> Model:
-    notes: tuple[Note, ...] = ()
-    if descriptor == BENCH_DESCRIPTOR:
-        return _dense(catalog, progress)
-    if descriptor is None:
-        objects = 0
-        if has_descriptor(catalog, BENCH_DESCRIPTOR):
-            try:
-                return _dense(catalog, progress)
-            except DescriptorOutdated as error:
-                objects = int(error.evidence["objects"])
-        values = {"used": PAPER_DESCRIPTOR, "missing": BENCH_DESCRIPTOR, "objects": objects}
-        notes = (Note(NoteCode.PAPER_SEARCH, values),)
-    views = prepared_views(catalog, PAPER_DESCRIPTOR, progress)
-    return PaperModel(hbr.ViewIndex(views), notes=notes if len(views) else (), camera=tuple(camera_settings(catalog)))
-
-
-def _dense(catalog: Catalog, progress: Callable[[JobProgress], None] | None) -> Model:
-    views = prepared_views(catalog, BENCH_DESCRIPTOR, progress)
-    if not len(views):
-        return PaperModel(hbr.ViewIndex(hbr.Views.empty()))  # the search reports that the catalog is empty
+def _loaded(catalog: Catalog, views: hbr.Views) -> Model:
+    camera = tuple(derived.camera_settings(catalog))
+    if not len(views) or views.descriptor != BENCH_DESCRIPTOR:
+        return PaperModel(hbr.ViewIndex(views), camera=camera)
     index = hbr.DenseIndex(views)
     rule, notes = stopping_rule_of(catalog.path, index)
-    before = empty_tables(catalog)
+    before = derived.empty_tables(catalog)
     with_image = len(before.with_image) >= len(before.without_image)
     others = before.without_image if with_image else before.with_image
     if others:
         notes += (Note(NoteCode.MIXED_EMPTY_TABLE, {"objects": list(others), "with_image": not with_image}),)
-    if guessed := guessed_objects(catalog):
-        notes += (Note(NoteCode.ENROLLED_BY_GUESS, {"objects": list(guessed)}),)
     table = bench_image = None
     with suppress(CatalogError):  # rig catalog verify reports it; the bench has its own image
         if with_image and before.newest is not None:
-            table = bench_image = read_image(catalog, before.newest)
-        elif (view := newest_view(catalog)) is not None:
-            bench_image = read_image(catalog, view)
-    camera = tuple(camera_settings(catalog))
-    return DenseModel(index, rule, notes, with_image, camera, table, bench_image, partial(local_views, catalog))
+            table = bench_image = catalog.read_image(before.newest)
+        elif (view := derived.newest_view(catalog)) is not None:
+            bench_image = catalog.read_image(view)
+    nearest = partial(derived.local_views, catalog)
+    return DenseModel(index, rule, notes, with_image, camera, table, bench_image, nearest)
 
 
 def empty_table_for(bench: Bench, model: Model) -> tuple[NDArray[np.uint8] | None, tuple[Note, ...]]:

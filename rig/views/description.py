@@ -5,16 +5,16 @@ Decision: docs/decisions/0029.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 import hbr
-from hbr.segmentation import MIN_AGREEMENT, Issue, IssueCode, Method
+from hbr.segmentation import MIN_AGREEMENT, Issue, IssueCode
 from hbr.segmentation.frame import Frame
 from hbr.segmentation.learned import LearnedBackground
-from hbr.segmentation.stored import TOGETHER, evidence_together, stored_segmentation
+from hbr.segmentation.stored import evidence_together, stored_segmentation
 from rig.config import ViewConfig
 from rig.core.errors import UsageError
 from rig.views.table_problems import TableProblem, TableProblemCode
@@ -29,23 +29,14 @@ IN_A_ROW: Final = 3
 """Number of successive frames that must differ from the empty-table image: one or two can show the operator's arm."""
 
 
-class Segmented(NamedTuple):
-    """The first description of a view that the empty-table image segments; its last one starts from it."""
-
-    frame: Frame
-    empty_table: hbr.Background
-    found: hbr.Segmentation
-    levels: Mapping[str, NDArray[np.uint8]]
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class DescribedView:
-    """The description of a view, as it is stored and compared.
+    """The description of a view.
 
     Attributes
     ----------
     levels : mapping of name to uint8 array (length,)
-        Levels of each descriptor.
+        Levels of each descriptor; in a search a row for each segmentation.
     segmentation
         `hbr.Segmentation.evidence` as JSON values; None if no segmentation was made.
     table_problem
@@ -56,8 +47,6 @@ class DescribedView:
         In a search: whether the view was segmented by a known background (`hbr.ViewsTogether.reliable`).
     same_bench
         In a search: whether the bench is that of the enrollment; None: not known.
-    segmented
-        Set if the view was segmented with the empty-table image: the input of `describe_alone`.
     """
 
     levels: Mapping[str, NDArray[np.uint8]]
@@ -66,24 +55,6 @@ class DescribedView:
     earlier: tuple[NDArray[np.uint8], ...] | None = None
     reliable: bool = True
     same_bench: bool | None = None
-    segmented: Segmented | None = None
-
-
-class DescribedAlone(NamedTuple):
-    """The levels of a view by each descriptor, and the evidence of its segmentation, as `DescribedView` has them."""
-
-    levels: dict[str, NDArray[np.uint8]]
-    evidence: dict[str, Any]
-
-
-def describe_alone(segmented: Segmented, names: tuple[str, ...]) -> DescribedAlone:
-    """Return the last description of a view, whose segmentation no other view changes, by descriptors of the object."""
-    (found,) = hbr.hypotheses(segmented.frame, empty_table=segmented.empty_table, first=segmented.found, most=1)
-    if found is segmented.found:
-        levels = {name: segmented.levels[name] for name in names}
-    else:
-        levels = {name: hbr.descriptor(name).describe(found) for name in names}
-    return DescribedAlone(levels, evidence_together(found, 1))
 
 
 def within(image_bgr: NDArray[np.uint8], region: tuple[int, int, int, int] | None) -> NDArray[np.uint8]:
@@ -106,7 +77,7 @@ def within(image_bgr: NDArray[np.uint8], region: tuple[int, int, int, int] | Non
 
 
 class ViewDescriber:
-    """Describes views of one bench by several descriptors. Segmentation runs once for each view.
+    """Segments views of one bench, and describes them by several descriptors.
 
     The paper's descriptors describe the whole region of interest. All others describe only the object.
 
@@ -115,7 +86,7 @@ class ViewDescriber:
     config
         Configuration with the region of interest to describe.
     names
-        The descriptors.
+        The descriptors. Without any, each view is only segmented; with the paper's alone, it is not.
     empty_table : uint8 array (H, W, 3), optional
         The bench's empty-table image: a whole frame of the same size as the views.
 
@@ -126,40 +97,45 @@ class ViewDescriber:
     """
 
     def __init__(
-        self, config: ViewConfig, names: tuple[str, ...] = DESCRIPTORS, empty_table: NDArray[np.uint8] | None = None
+        self, config: ViewConfig, names: tuple[str, ...] = (), empty_table: NDArray[np.uint8] | None = None
     ) -> None:
         self.region = config.roi
         self._descriptors = [hbr.descriptor(name) for name in names]
-        self._segments = any(not one.whole_image for one in self._descriptors)
+        self._segments = not names or any(not one.whole_image for one in self._descriptors)
         self.empty_table = empty_table if self._segments else None
         self._background: hbr.Background | None = None
         self._low: list[float] = []
         self._reported = False
 
-    def __call__(self, image_bgr: NDArray[np.uint8], stored: Mapping[str, Any] | None = None) -> DescribedView:
+    def __call__(self, image_bgr: NDArray[np.uint8]) -> DescribedView:
         """Describe a frame, uint8 (H, W, 3).
-
-        ``stored`` is the evidence of an enrolled view: a view that was segmented together with others keeps its
-        silhouette (`hbr.segmentation.stored`).
 
         Raises
         ------
         UsageError
             The region does not lie within the frame.
         ValueError
-            The region is too small for a segmentation, or the stored evidence is damaged.
+            The region is too small for a segmentation.
         """
-        part = within(image_bgr, self.region)
         if not self._segments:
-            return DescribedView(self._levels(part, None), None)
-        frame = Frame(part)
-        found = self._segment(frame, image_bgr, stored)
-        levels = self._levels(part, found)
-        problem = self._table_problem(found.agreement)
-        segmented = None
-        if stored is None and self._background is not None and found.method is Method.EMPTY_TABLE:
-            segmented = Segmented(frame, self._background, found, levels)
-        return DescribedView(levels, found.evidence(), problem, segmented=segmented)
+            return DescribedView(self._levels(within(image_bgr, self.region), None), None)
+        found = self.segment(image_bgr)
+        levels = self._levels(within(image_bgr, self.region), found)
+        return DescribedView(levels, found.evidence(), self._table_problem(found.agreement))
+
+    def segment(self, image_bgr: NDArray[np.uint8], stored: Mapping[str, Any] | None = None) -> hbr.Segmentation:
+        """Return the segmentation of the region of interest in a frame, uint8 (H, W, 3).
+
+        ``stored`` is the evidence of an enrolled view, which keeps its silhouette (`hbr.segmentation.stored`).
+
+        Raises
+        ------
+        UsageError, ValueError
+            As for a call, or the stored evidence is damaged.
+        """
+        background, issues = self._prepared_table(image_bgr)
+        found = stored_segmentation(within(image_bgr, self.region), stored, empty_table=background)
+        return replace(found, issues=(*issues, *(one for one in found.issues if one not in issues)))
 
     def _levels(self, part: NDArray[np.uint8], found: hbr.Segmentation | None) -> dict[str, NDArray[np.uint8]]:
         return {
@@ -176,17 +152,6 @@ class ViewDescriber:
         self._reported = True
         parameters = {"frames": IN_A_ROW, "agreement": round(max(self._low), 3)}
         return TableProblem(TableProblemCode.SURROUNDINGS, parameters)
-
-    def segment(self, image_bgr: NDArray[np.uint8], stored: Mapping[str, Any] | None = None) -> hbr.Segmentation:
-        """Return the segmentation of the region of interest in a frame, uint8 (H, W, 3); as for a call."""
-        return self._segment(Frame(within(image_bgr, self.region)), image_bgr, stored)
-
-    def _segment(
-        self, frame: Frame, image_bgr: NDArray[np.uint8], stored: Mapping[str, Any] | None
-    ) -> hbr.Segmentation:
-        background, issues = self._prepared_table(image_bgr)
-        found = stored_segmentation(frame, stored, empty_table=background)
-        return replace(found, issues=(*issues, *(one for one in found.issues if one not in issues)))
 
     def _prepared_table(self, image_bgr: NDArray[np.uint8]) -> tuple[hbr.Background | None, tuple[Issue, ...]]:
         """Return the empty-table image of the region, and the issue if it has another size than the frame."""
@@ -208,40 +173,31 @@ class EnrollmentDescriber(ViewDescriber):
     """
 
     def __init__(
-        self, config: ViewConfig, names: tuple[str, ...] = DESCRIPTORS, empty_table: NDArray[np.uint8] | None = None
+        self, config: ViewConfig, names: tuple[str, ...], empty_table: NDArray[np.uint8] | None = None
     ) -> None:
         super().__init__(config, names, empty_table)
         self._learned = LearnedBackground()
 
-    def learn(self, image_bgr: NDArray[np.uint8], small: NDArray[np.uint8] | None = None) -> int:
+    def learn(self, image_bgr: NDArray[np.uint8]) -> int:
         """Learn the background from the next view, uint8 (H, W, 3); return the number of the view.
-
-        ``small`` is the small image (`hbr.segmentation.background.shrunk`) of the region, if it is known.
 
         Raises
         ------
         UsageError, ValueError
             As for `ViewDescriber`, or the view has another size than the others.
         """
-        self._learned.add(within(image_bgr, self.region), small)
+        self._learned.add(within(image_bgr, self.region))
         return len(self._learned) - 1
 
-    def describe(self, view: int, image_bgr: NDArray[np.uint8], alone: DescribedAlone | None = None) -> DescribedView:
-        """Describe the image that `learn` got as the view of this number.
-
-        ``alone`` is what `describe_alone` returned for it, if its segmentation needs no other views.
-        """
-        levels, evidence = alone or self._described(image_bgr, self._learned.of(view))
-        return DescribedView(levels, {**evidence, TOGETHER: len(self._learned)})
-
-    def _described(self, image_bgr: NDArray[np.uint8], learned: hbr.Background | None) -> DescribedAlone:
+    def describe(self, view: int, image_bgr: NDArray[np.uint8]) -> DescribedView:
+        """Describe the image that `learn` got as the view of this number."""
         frame = Frame(within(image_bgr, self.region))
         background, issues = self._prepared_table(image_bgr)
-        (found,) = hbr.hypotheses(frame, empty_table=background, learned=learned, most=1)
+        (found,) = hbr.hypotheses(frame, empty_table=background, learned=self._learned.of(view), most=1)
         if found.box is None:
             found = hbr.segment(frame, empty_table=background)
         found = replace(found, issues=(*issues, *found.issues))
-        return DescribedAlone(self._levels(frame.image, found), evidence_together(found, len(self._learned)))
+        return DescribedView(self._levels(frame.image, found), evidence_together(found, len(self._learned)))
 
 
 class SearchDescriber(ViewDescriber):
@@ -293,7 +249,7 @@ class SearchDescriber(ViewDescriber):
         """All segmentations of each view so far, in the order of its levels; empty if the descriptor needs none."""
         return [] if self._views is None else self._views.segmentations
 
-    def __call__(self, image_bgr: NDArray[np.uint8], stored: Mapping[str, Any] | None = None) -> DescribedView:  # noqa: ARG002
+    def __call__(self, image_bgr: NDArray[np.uint8]) -> DescribedView:
         """Describe the next frame of the search; errors as for `ViewDescriber`."""
         if not self._segments:
             return super().__call__(image_bgr)

@@ -207,10 +207,15 @@ class _Shown:
 
     def _complete(self) -> None:
         """Add the views of earlier sessions to the record of a resumed enrollment."""
+        from rig.catalog.derived import described
+
         record, catalog = self._records[-1], self.desk.catalog
-        stored = catalog.object(record.name).views
-        if len(stored) > len(record.views):
-            record.complete((view.record, catalog.read_image(view)) for view in stored)
+        stored = catalog.object(record.name).complete
+        if stored is not None and len(stored.views) > len(record.views):
+            segmented = described(catalog, stored, record.name).segmentation
+            record.complete(
+                (view, one, catalog.read_image(view.image)) for view, one in zip(stored.views, segmented, strict=True)
+            )
 
     def _write(self, path: Path) -> None:
         from rig.report import Meta, render_report, write_report
