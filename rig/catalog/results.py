@@ -1,32 +1,35 @@
 """Results: the recorded answers about samples, and their later corrections by operators.
 
+An answer and a correction are lines of the log. Results are numbered from 1.
+
 Decision: docs/decisions/0036.
 """
 
+import secrets
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime
-from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import ColumnElement, Connection, func, insert, or_, select
+from sqlalchemy import ColumnElement, and_, func, or_, select
+from sqlalchemy.orm import Session as Transaction
+from sqlalchemy.orm import aliased
 
-from rig.catalog import audit
+from rig.catalog import log, state
 from rig.catalog.catalog import Catalog
-from rig.catalog.database import given_id, insert_row
-from rig.catalog.queries import check_complete, find
+from rig.catalog.columns import ImageName, damaged
+from rig.catalog.facts import Action, Entry, digest_of
+from rig.catalog.images import path_of
 from rig.catalog.records import JsonObject, Outcome, Provenance, as_json
-from rig.catalog.schema import corrections, results
-from rig.catalog.seal import seal_appended
-from rig.core.errors import CatalogError, UsageError
+from rig.core.errors import CatalogDamaged, CatalogError, UsageError
 from rig.core.next_steps import Do
 from rig.views import image_files as images
 
 MAX_TEXT_LENGTH: Final = 1000
-_FOLDER_SIZE: Final = 1000
 
 
 class Answer(NamedTuple):
@@ -79,7 +82,7 @@ class Correction:
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """A recorded answer with its corrections, oldest first. ``image`` is a path relative to the catalog's folder."""
+    """A recorded answer with its corrections, oldest first. ``image`` is the name of the image of its first view."""
 
     id: int
     time_utc: datetime
@@ -92,8 +95,16 @@ class Result:
     provenance: Provenance
     catalog_version: str
     image: str | None
-    image_sha256: str | None
     corrections: tuple[Correction, ...]
+
+    @property
+    def image_path(self) -> str | None:
+        """Path of the image in the catalog's folder."""
+        return None if self.image is None else path_of(self.image)
+
+    @property
+    def image_sha256(self) -> str | None:
+        return None if self.image is None else self.image.partition(".")[0]
 
     @property
     def current(self) -> Answer:
@@ -124,7 +135,7 @@ class Result:
             "bench": self.provenance.bench,
             "software": self.provenance.software,
             "catalog_version": self.catalog_version,
-            "image": self.image,
+            "image": self.image_path,
             "image_sha256": self.image_sha256,
             "answered_sample": self.answered.sample,
             "answered_outcome": self.answered.outcome.value,
@@ -154,7 +165,8 @@ class ResultFilter:
     def accepts(self, result: Result) -> bool:
         now = result.current
         return (
-            self.sample in (None, now.sample)
+            self.bench in (None, result.provenance.bench)
+            and self.sample in (None, now.sample)
             and self.object_name in (None, now.object_name)
             and self.outcome in (None, now.outcome)
             and (not self.corrected or bool(result.corrections))
@@ -185,8 +197,8 @@ def clean_text(text: str, what: str) -> str:
 def record(catalog: Catalog, new: NewResult, image_bgr: NDArray[np.uint8] | None) -> int:
     """Store an answer with the image of its first view, uint8 (H, W, 3) BGR, and return its number.
 
-    Both are durable when this returns. The image is complete under its name before the row is committed. A crash in
-    between leaves an image without a row, which the next result replaces.
+    Both are durable when this returns. The image is complete under its name before the line is committed. A crash in
+    between leaves an image that no line names, which is harmless.
 
     Raises
     ------
@@ -195,54 +207,44 @@ def record(catalog: Catalog, new: NewResult, image_bgr: NDArray[np.uint8] | None
     CatalogError, CatalogBusy
         The catalog cannot be written.
     """
-    png = None if image_bgr is None else images.encode(image_bgr)
-    author = audit.author()
-    operator = author["user"] if new.operator is None else clean_text(new.operator, "operator")
     sample = None if new.answered.sample is None else clean_text(new.answered.sample, "sample")
-    with catalog.database.write() as connection:
-        given = given_id(connection, results)
-        result_id = given["id"] if given else 1 + (connection.scalar(select(func.max(results.c.id))) or 0)
-        image = None if png is None else _write_image(catalog, result_id, png)
-        connection.execute(
-            insert(results).values(
-                **author,
-                id=result_id,
-                time_utc=catalog.clock.utc(),
-                operator=operator,
-                **new.answered._replace(sample=sample)._asdict(),
-                answer=as_json(new.details, "The answer"),
-                azimuths_deg=new.azimuths_deg,
-                bench=new.provenance.bench,
-                devices=new.provenance.devices,
-                conditions=new.provenance.conditions,
-                catalog_version=new.catalog_version,
-                image=image,
-                image_sha256=None if png is None else images.digest(png),
-                image_bytes=None if png is None else len(png),
-            )
-        )
-        seal_appended(connection, results)
-        _note(catalog, connection, audit.Action.IDENTIFIED, new.answered._replace(sample=sample), result_id, operator)
-    return result_id
+    fact: dict[str, Any] = {
+        "answer": new.details,
+        "azimuths_deg": new.azimuths_deg,
+        "bench": new.provenance.bench,
+        "devices": new.provenance.devices,
+        "conditions": new.provenance.conditions,
+        "catalog_version": new.catalog_version,
+        "image": None,
+        "image_bytes": None,
+    }
+    operator = _operator(new.operator)
+    if image_bgr is not None:
+        png = images.encode(image_bgr)
+        with catalog.database.catalog_errors():
+            fact |= {"image": catalog.database.images.put(png), "image_bytes": len(png)}
+    with catalog.database.write() as transaction:
+        number = 1 + (transaction.scalar(select(func.max(Entry.result))) or 0)
+        _append(catalog, transaction, Action.IDENTIFIED, number, new.answered._replace(sample=sample), operator, fact)
+    return number
 
 
 def find_results(catalog: Catalog, wanted: ResultFilter = ResultFilter()) -> list[Result]:
-    """Return results with their corrections, oldest first."""
-    conditions = [results.c.bench == wanted.bench] if wanted.bench is not None else []
-    conditions += [results.c.time_utc >= wanted.since] if wanted.since is not None else []
-    conditions += [results.c.time_utc < wanted.before] if wanted.before is not None else []
-    corrected = results.c.id.in_(select(corrections.c.result_id))  # their values can have changed
-    conditions += [
-        or_(column == value, corrected)
-        for column, value in (
-            (results.c.sample, wanted.sample),
-            (results.c.object_name, wanted.object_name),
-            (results.c.outcome, wanted.outcome),
-        )
-        if value is not None
-    ]
-    with catalog.database.read() as connection:
-        return [result for result in _load(connection, *conditions) if wanted.accepts(result)]
+    """Return results with their corrections, oldest first.
+
+    Raises
+    ------
+    CatalogDamaged
+        A result or a correction is not as it was recorded.
+    """
+    is_wanted = Entry.action == Action.IDENTIFIED
+    if wanted.since is not None:
+        is_wanted = and_(is_wanted, Entry.time_utc >= wanted.since)
+    if wanted.before is not None:
+        is_wanted = and_(is_wanted, Entry.time_utc < wanted.before)
+    with catalog.database.read() as transaction:
+        found = _load(transaction, or_(is_wanted, Entry.action == Action.RESULT_CORRECTED))
+    return [result for result in found if wanted.accepts(result)]
 
 
 def find_result(catalog: Catalog, result_id: int) -> Result:
@@ -252,9 +254,11 @@ def find_result(catalog: Catalog, result_id: int) -> Result:
     ------
     CatalogError
         There is no result of this number.
+    CatalogDamaged
+        It is not as it was recorded.
     """
-    with catalog.database.read() as connection:
-        return _find(connection, result_id)
+    with catalog.database.read() as transaction:
+        return _find(transaction, result_id)
 
 
 def correct(
@@ -292,14 +296,14 @@ def correct(
         There is no such result, or the catalog cannot be written.
     """
     reason = clean_text(reason, "reason")
-    author = audit.author()
-    operator = author["user"] if operator is None else clean_text(operator, "operator")
+    operator = _operator(operator)
     if unknown and object_name is not None:
         raise UsageError("--object and --unknown are both given.", next_step="Give one of them.")
-    with catalog.database.write() as connection:
-        now = before = _find(connection, result_id).current
+    with catalog.database.write() as transaction:
+        now = before = _find(transaction, result_id).current
         if object_name is not None:
-            now = now._replace(outcome=Outcome.FOUND, object_name=find(connection, object_name)[1])
+            right = state.find(transaction, object_name).object_name
+            now = now._replace(outcome=Outcome.FOUND, object_name=right)
         if unknown:
             now = now._replace(outcome=Outcome.UNKNOWN, object_name=None)
         if sample is not None:
@@ -309,76 +313,109 @@ def correct(
                 f"Result {result_id} has these values already.",
                 next_step="Give the right object, unknown, or the right sample.",
             )
-        insert_row(
-            connection,
-            corrections,
-            **given_id(connection, corrections),
-            result_id=result_id,
-            time_utc=catalog.clock.utc(),
-            operator=operator,
-            **author,
-            **now._asdict(),
-            reason=reason,
-        )
-        seal_appended(connection, corrections)
-        _note(
-            *(catalog, connection, audit.Action.RESULT_CORRECTED, now, result_id, operator),
+        _append(
+            *(catalog, transaction, Action.RESULT_CORRECTED, result_id, now, operator, {"reason": reason}),
             before=[part for part in before if part is not None],
             reason=reason,
         )
     return now
 
 
-def _note(
+def _operator(operator: str | None) -> str:
+    return log.author()["user"] if operator is None else clean_text(operator, "operator")
+
+
+def _append(
     catalog: Catalog,
-    connection: Connection,
-    action: audit.Action,
-    now: Answer,
-    result_id: int,
+    transaction: Transaction,
+    action: Action,
+    number: int,
+    answer: Answer,
     operator: str,
+    fact: Mapping[str, Any],
     **details: Any,
 ) -> None:
-    details = {"result": result_id, "outcome": now.outcome, "sample": now.sample, "operator": operator, **details}
-    given = {key: value for key, value in details.items() if value is not None}
-    audit.append(connection, catalog.clock, action, now.object_name, **given)
+    """Add the line of an answer or a correction to the log; its ``key`` is the same in every catalog that has it."""
+    own = {"outcome": answer.outcome, "sample": answer.sample, "operator": operator}
+    shown = {"result": number, **own, **details}
+    log.append(
+        transaction,
+        catalog.clock,
+        action,
+        answer.object_name,
+        result=number,
+        details={key: value for key, value in shown.items() if value is not None},
+        record=as_json({**fact, **own, "object": answer.object_name, "key": secrets.token_hex(32)}, "The answer"),
+    )
 
 
-def _write_image(catalog: Catalog, result_id: int, png: bytes) -> str:
-    path = Path(images.IMAGE_FOLDER, "results", f"{result_id // _FOLDER_SIZE:04d}", f"{result_id:06d}.png").as_posix()
-    catalog.database.images.write(path, png)
-    return path
-
-
-def _find(connection: Connection, result_id: int) -> Result:
-    found = _load(connection, results.c.id == result_id)
+def _find(transaction: Transaction, result_id: int) -> Result:
+    found = _load(transaction, Entry.result == result_id)
     if not found:
         raise CatalogError(f"There is no result {result_id} in the catalog.", next_step=Do.LIST_RESULTS())
     return found[0]
 
 
-def _load(connection: Connection, *conditions: ColumnElement[bool]) -> list[Result]:
-    corrected = defaultdict(list)
-    for row in connection.execute(select(corrections).order_by(corrections.c.id)):
-        check_complete(row, corrections)
-        answer = Answer(Outcome(row.outcome), row.object_name, row.sample)
-        corrected[row.result_id].append(Correction(row.time_utc, row.operator, row.user, row.host, answer, row.reason))
-    found = []
-    for row in connection.execute(select(results).where(*conditions).order_by(results.c.id)):
-        check_complete(row, results)
-        found.append(
-            Result(
-                *(row.id, row.time_utc, row.operator, row.user, row.host),
-                answered=Answer(Outcome(row.outcome), row.object_name, row.sample),
-                details=row.answer,
-                azimuths_deg=tuple(row.azimuths_deg),
-                provenance=Provenance(row.bench, row.devices, row.conditions, row.software),
-                catalog_version=row.catalog_version,
-                image=row.image,
-                image_sha256=row.image_sha256,
-                corrections=tuple(corrected[row.id]),
+def _load(transaction: Transaction, wanted: ColumnElement[bool]) -> list[Result]:
+    """Return the answers among these lines of the log, with the corrections among them."""
+    before = aliased(Entry)
+    rows = transaction.execute(
+        select(Entry, before.digest).outerjoin(before, before.id == Entry.id - 1).where(wanted).order_by(Entry.id)
+    )
+    answers: list[Entry] = []
+    corrections: dict[int | None, list[Correction]] = defaultdict(list)
+    for entry, digest in rows:
+        if entry.digest != digest_of(entry, digest or ""):
+            raise CatalogDamaged(
+                f"Result {entry.result} in the catalog changed after it was recorded.",
+                next_step=(Do.VERIFY_CATALOG(), "Then use a backup."),
+                evidence={"result": entry.result, "log_entry": entry.id},
             )
+        if entry.action == Action.RESULT_CORRECTED:
+            corrections[entry.result].append(_correction(entry))
+        else:
+            answers.append(entry)
+    return [_result(entry, corrections[entry.result]) for entry in answers]
+
+
+def _correction(entry: Entry) -> Correction:
+    with _record_of(entry) as found:
+        operator, reason = str(found["operator"]), str(found["reason"])
+        return Correction(entry.time_utc, operator, entry.user, entry.host, _answer(found), reason)
+
+
+def _result(entry: Entry, corrections: Sequence[Correction]) -> Result:
+    with _record_of(entry) as found:
+        if found["image"] is not None:
+            ImageName().check(found["image"])
+        return Result(
+            id=int(found["result"]),
+            time_utc=entry.time_utc,
+            operator=str(found["operator"]),
+            user=entry.user,
+            host=entry.host,
+            answered=_answer(found),
+            details=dict(found["answer"]),
+            azimuths_deg=tuple(map(float, found["azimuths_deg"])),
+            provenance=Provenance(str(found["bench"]), found["devices"], found["conditions"], entry.software),
+            catalog_version=str(found["catalog_version"]),
+            image=found["image"],
+            corrections=tuple(corrections),
         )
-    return found
+
+
+def _answer(found: Mapping[str, Any]) -> Answer:
+    name, sample = (None if found[key] is None else str(found[key]) for key in ("object", "sample"))
+    return Answer(Outcome(found["outcome"]), name, sample)
+
+
+@contextmanager
+def _record_of(entry: Entry) -> Iterator[dict[str, Any]]:
+    """Yield the record of a line and its number of the result; a record that this program did not write is damage."""
+    try:
+        yield {**(entry.record or {}), "result": entry.result}
+    except (KeyError, TypeError, ValueError, UsageError) as error:
+        raise damaged(f"the record of result {entry.result}", entry.record) from error
 
 
 def _number(details: Mapping[str, Any], name: str) -> float | None:
