@@ -403,7 +403,7 @@ def _missing(catalog: Catalog, name: str, found: dict[str, bytes]) -> tuple[list
     """Return the enrollments in use, and those to be described; put the stored levels of the others into ``found``."""
     kinds = (name,) if descriptor(name).whole_image else (name, SEGMENTATION)
     with catalog.database.read() as transaction:
-        wanted = state.used(transaction)
+        wanted = state.used(transaction, checked=True)
         regions = _regions(transaction)
         chosen = {one.seal: regions.of(transaction, one.enrollment_id) for one in wanted}
         for region in set(chosen.values()):

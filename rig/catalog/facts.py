@@ -9,11 +9,11 @@ Decision: docs/decisions/0034.
 import hashlib
 import json
 from collections.abc import Sequence
-from datetime import datetime
+from datetime import UTC, datetime
 from enum import StrEnum
 from typing import Any, Final
 
-from sqlalchemy import CheckConstraint, ForeignKey, ForeignKeyConstraint, Index, MetaData, UniqueConstraint
+from sqlalchemy import CheckConstraint, Column, ForeignKey, ForeignKeyConstraint, Index, MetaData, UniqueConstraint
 from sqlalchemy.orm import DeclarativeBase, Mapped, MappedAsDataclass, composite, mapped_column, relationship
 
 from rig.catalog.columns import (
@@ -22,6 +22,7 @@ from rig.catalog.columns import (
     Count,
     ImageName,
     JsonMapping,
+    JsonText,
     Name,
     Nanoseconds,
     Number,
@@ -264,17 +265,34 @@ _LOCAL: Final = {"id", "enrollment_id", "object_id", "digest"}
 """Columns of an enrollment and its parts that differ from catalog to catalog, and the digest itself."""
 
 
+def json_text(value: Any) -> str:
+    """Return JSON as a catalog stores it: equal values have equal texts, and so equal digests."""
+    return json.dumps(value, sort_keys=True, separators=(",", ":"))
+
+
+def digested(table: type[Row]) -> list[tuple[str, Column[Any]]]:
+    """Return the columns that a digest covers, with the names of their attributes."""
+    left_out = {"digest"} if table is Entry else _LOCAL
+    return [
+        ("index" if column.name == "view_index" else column.name, column)
+        for column in table.__table__.columns
+        if column.name not in left_out
+    ]
+
+
 def digest_of(row: Row, key: str) -> str:
     """Return the digest of a row of the enrollment ``key``, or of a line of the log after the line with this digest."""
-    left_out = {"digest"} if isinstance(row, Entry) else _LOCAL
-    columns = [column for column in row.__table__.columns if column.name not in left_out]
-    return _sha256([key, *(_value(row, column.name) for column in columns)])
+    source = row.provenance if isinstance(row, Session) else row
+    values = (
+        _as_stored(column, getattr(row if hasattr(row, name) else source, name)) for name, column in digested(type(row))
+    )
+    return sha256_of((key, *values))
 
 
 def seal_of(enrollment: Enrollment) -> str:
     """Return the digest of an enrollment with its sessions and views, by their own digests."""
     parts: Sequence[Session | View] = (*enrollment.sessions, *enrollment.views)
-    return _sha256([enrollment.digest, *(part.digest for part in parts)])
+    return sha256_of((enrollment.digest, *(part.digest for part in parts)))
 
 
 def damaged_parts(enrollment: Enrollment, seal: str | None) -> list[Enrollment | Session | View]:
@@ -289,20 +307,21 @@ def damaged_parts(enrollment: Enrollment, seal: str | None) -> list[Enrollment |
     return wrong
 
 
-def _value(row: Row, column: str) -> Any:
-    if isinstance(row, Session) and column in Provenance.__slots__:
-        return getattr(row.provenance, column)
-    name = "index" if column == "view_index" else column
-    value = getattr(row, name)
-    return value + 0.0 if isinstance(value, float) else value  # a database stores −0.0 as 0.0
-
-
-def _sha256(values: Sequence[Any]) -> str:
-    text = json.dumps(values, sort_keys=True, separators=(",", ":"), default=_words)
-    return hashlib.sha256(text.encode()).hexdigest()
-
-
-def _words(value: Any) -> Any:
+def _as_stored(column: Column[Any], value: Any) -> Any:
+    """Return a value as both databases give it without its type (`rig.catalog.digests`)."""
+    if value is None:
+        return None
+    if isinstance(column.type, JsonText):
+        return json_text(value)
     if isinstance(value, datetime):
-        return value.isoformat()
-    raise TypeError(f"a value of type {type(value).__name__} has no digest")
+        return value.astimezone(UTC).strftime("%Y-%m-%d %H:%M:%S.%f")
+    if isinstance(value, bool):
+        return int(value)
+    if isinstance(value, float):
+        return value + 0.0  # a database stores −0.0 as 0.0
+    return str(value) if isinstance(value, StrEnum) else value
+
+
+def sha256_of(values: Sequence[Any]) -> str:
+    """Return the digest of some values."""
+    return hashlib.sha256(ascii(values).encode()).hexdigest()

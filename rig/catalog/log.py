@@ -10,9 +10,10 @@ from collections.abc import Iterator
 from datetime import datetime
 from typing import Any, Final
 
-from sqlalchemy import insert, select, update
+from sqlalchemy import func, insert, select, update
 from sqlalchemy.orm import Session as Transaction
 
+from rig.catalog import digests
 from rig.catalog.columns import damaged
 from rig.catalog.facts import Action, Entry, Property, digest_of
 from rig.catalog.records import as_json, this_software
@@ -61,15 +62,16 @@ def head(transaction: Transaction) -> tuple[int, str]:
 def wrong_lines(transaction: Transaction, first: int = 1, last: int | None = None) -> Iterator[int]:
     """Yield the numbers of lines that are not as they were written, or that follow missing ones, from ``first`` on."""
     end, digest = head(transaction)
-    before = transaction.scalar(select(Entry.digest).where(Entry.id == first - 1)) or ""
-    expected = first
-    wanted = select(Entry).where(Entry.id >= first, Entry.id <= (end if last is None else last)).order_by(Entry.id)
-    for entry in transaction.scalars(wanted.execution_options(yield_per=1000)):
-        if entry.id != expected or entry.digest != digest_of(entry, before):
-            yield entry.id
-        expected, before = entry.id + 1, entry.digest
-    if last is None and (expected != end + 1 or before != digest):
-        yield end
+    stop = end if last is None else last
+    for start in range(first, stop + 1, 1000):
+        numbers = range(start, min(start + 1000, stop + 1))
+        present = set(transaction.scalars(select(Entry.id).where(Entry.id >= numbers[0], Entry.id <= numbers[-1])))
+        wrong = set(digests.wrong_lines(transaction, present))
+        yield from (number for number in numbers if number in wrong or number not in present)
+    newest = transaction.scalar(select(Entry.digest).where(Entry.id == end)) or ""
+    beyond = transaction.scalar(select(func.max(Entry.id))) or 0
+    if last is None and (newest != digest or beyond > end):
+        yield max(end, beyond)
 
 
 def entries(transaction: Transaction, since: datetime | None = None, object_name: str | None = None) -> list[Entry]:

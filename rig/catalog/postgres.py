@@ -13,7 +13,7 @@ from sqlalchemy.exc import ArgumentError
 from sqlalchemy.orm import Session as Transaction
 
 from rig.catalog.database import Database, check_properties, create_tables, properties
-from rig.catalog.facts import FACTS, Enrollment, Entry, Property, Row
+from rig.catalog.facts import FACTS, Enrollment, Entry, Property, Row, json_text
 from rig.catalog.failures import server_errors
 from rig.catalog.images import open_images
 from rig.config.catalog_place import CatalogPlace
@@ -209,6 +209,7 @@ def _engine(place: CatalogPlace, busy_timeout_s: float) -> Any:
         return create_engine(
             url.difference_update_query(["options"]),
             poolclass=QueuePool,
+            json_serializer=json_text,
             pool_pre_ping=True,
             pool_use_lifo=True,
             connect_args={

@@ -19,7 +19,7 @@ from sqlalchemy.orm import Session as Transaction
 
 from rig.catalog.columns import FIX
 from rig.catalog.database import APPLICATION, Database, check_properties, create_tables, properties
-from rig.catalog.facts import FACTS, SCHEMA_VERSION, Entry, Row
+from rig.catalog.facts import FACTS, SCHEMA_VERSION, Entry, Row, json_text
 from rig.catalog.failures import absent, catalog_errors
 from rig.catalog.images import open_images
 from rig.catalog.places import check_folder
@@ -55,7 +55,7 @@ class SqliteDatabase(Database):
         self._file = place.database_file
         self.read_only = read_only
         self._busy_timeout_s = busy_timeout_s
-        self._engine = create_engine("sqlite://", creator=self._connect, poolclass=QueuePool)
+        self._engine = create_engine("sqlite://", creator=self._connect, poolclass=QueuePool, json_serializer=json_text)
         event.listen(self._engine, "begin", _begin)
         self._immediate = self._engine.execution_options(begin="BEGIN IMMEDIATE")
         try:

@@ -15,7 +15,8 @@ from sqlalchemy import ColumnElement, Select, and_, exists, false, func, select,
 from sqlalchemy.orm import Session as Transaction
 from sqlalchemy.orm import aliased, selectinload
 
-from rig.catalog.facts import Enrollment, Entry, View, damaged_parts, digest_of
+from rig.catalog import digests
+from rig.catalog.facts import Enrollment, Entry, View, damaged_parts
 from rig.catalog.records import EnrollmentStatus, clean_name
 from rig.core.errors import CatalogDamaged, CatalogError, ObjectExists, ObjectNotFound
 from rig.core.next_steps import Do
@@ -95,13 +96,13 @@ class Used:
     """The line of the log with the seal."""
 
 
-def used(transaction: Transaction, object_ids: Collection[int] | None = None) -> list[Used]:
+def used(transaction: Transaction, *, checked: bool = False) -> list[Used]:
     """Return the enrollments that searches use, in the order in which their objects were added.
 
     Raises
     ------
     CatalogDamaged
-        The name or the seal of an object is not as it was written.
+        They are ``checked``, and the name or the seal of an object is not as it was written.
     """
     wanted = (
         select(Named.object_id, Named.object_name, Ended.enrollment_id, Enrollment.key, Ended.seal, Ended.id, Named.id)
@@ -110,10 +111,9 @@ def used(transaction: Transaction, object_ids: Collection[int] | None = None) ->
         .where(IN_USE, IS_STATUS, Ended.status == EnrollmentStatus.COMPLETE)
         .order_by(Named.object_id)
     )
-    if object_ids is not None:
-        wanted = wanted.where(Named.object_id.in_(object_ids))
     rows = transaction.execute(wanted).all()
-    check_lines(transaction, {line for row in rows for line in row[5:]})
+    if checked:
+        check_lines(transaction, {line for row in rows for line in row[5:]})
     return [Used(*row[:6]) for row in rows]
 
 
@@ -124,16 +124,8 @@ def version(transaction: Transaction) -> str:
 
 def check_lines(transaction: Transaction, ids: Collection[int]) -> None:
     """Raise `CatalogDamaged` if one of these lines of the log is not as it was written."""
-    wrong = []
-    for part in _portions(sorted(ids)):
-        before = _Later
-        rows = transaction.execute(
-            select(Entry, before.digest).outerjoin(before, before.id == Entry.id - 1).where(Entry.id.in_(part))
-        )
-        wrong += [entry for entry, digest in rows if entry.digest != digest_of(entry, digest or "")]
-    transaction.expunge_all()
-    if wrong:
-        raise changed([str(one.object_name) for one in wrong])
+    if wrong := digests.wrong_lines(transaction, ids):
+        raise changed(list(map(str, transaction.scalars(select(Entry.object_name).where(Entry.id.in_(wrong[:20]))))))
 
 
 def changed(names: Sequence[str]) -> CatalogDamaged:
@@ -305,16 +297,17 @@ def check_not_enrolled(transaction: Transaction, state: Entry) -> None:
         )
 
 
-def _portions(ids: Sequence[int], size: int = 500) -> list[Sequence[int]]:
-    return [ids[start : start + size] for start in range(0, len(ids), size)]
-
-
 def check(transaction: Transaction, *conditions: ColumnElement[bool]) -> None:
     """Raise `CatalogDamaged` if objects or enrollments, all or some, are not as they were written."""
-    ids = transaction.scalars(
-        select(Enrollment.id).join(Ended, Ended.enrollment_id == Enrollment.id).where(IS_STATUS, *conditions)
+    rows = transaction.execute(
+        select(Enrollment.id, Ended.seal, Enrollment.object_id, Ended.id)
+        .join(Ended, Ended.enrollment_id == Enrollment.id)
+        .where(IS_STATUS, *conditions)
     ).all()
-    for part in _portions(ids, 20):
-        enrollments(transaction, Enrollment.id.in_(part))
+    check_lines(transaction, [row[3] for row in rows])
+    owner = {row[0]: row[2] for row in rows}
+    wrong = [owner[one] for one in digests.damaged_enrollments(transaction, {row[0]: row[1] for row in rows})]
+    if wrong:
+        raise changed([str(by_id(transaction, one).object_name) for one in dict.fromkeys(wrong)])
     if not conditions:
         check_lines(transaction, list(transaction.scalars(select(Named.id).where(IS_STATE))))

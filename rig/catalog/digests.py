@@ -1,0 +1,82 @@
+"""Comparison of the digests of many rows, as the database stores them: without making objects of them."""
+
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from itertools import groupby
+from operator import itemgetter
+from typing import Any, Final
+
+from sqlalchemy import Column, ColumnElement, Integer, Text, cast, func, select, type_coerce
+from sqlalchemy.orm import Session as Transaction
+from sqlalchemy.orm import aliased
+from sqlalchemy.types import NullType
+
+from rig.catalog.columns import JsonText, Number, Truth, Utc
+from rig.catalog.facts import Enrollment, Entry, Row, Session, View, digested, sha256_of
+
+AT_ONCE: Final = 100
+"""Enrollments whose rows are in memory at once."""
+
+
+def wrong_lines(transaction: Transaction, ids: Collection[int]) -> list[int]:
+    """Return which of these lines of the log are not as they were written after the line before each."""
+    before, wrong = aliased(Entry, name="before"), []
+    for part in portions(sorted(ids), 500):
+        rows = transaction.execute(
+            select(Entry.id, Entry.digest, before.digest, *_raw(transaction, Entry))
+            .outerjoin(before, before.id == Entry.id - 1)
+            .where(Entry.id.in_(part))
+        )
+        wrong += [row[0] for row in rows if row[1] != sha256_of((row[2] or "", *row[3:]))]
+    return wrong
+
+
+def damaged_enrollments(transaction: Transaction, seals: Mapping[int, str | None]) -> Iterator[int]:
+    """Yield which of these enrollments, by their ids and seals, are not as they were written."""
+    enrollments, views = Enrollment.__table__.c, View.__table__.c
+    for part in portions(sorted(seals), AT_ONCE):
+        own = {
+            row[0]: row[1:]
+            for row in transaction.execute(
+                select(Enrollment.id, Enrollment.digest, Enrollment.key, *_raw(transaction, Enrollment)).where(
+                    enrollments.id.in_(part)
+                )
+            )
+        }
+        keys = {number: str(row[1]) for number, row in own.items()}
+        digests = {number: [row[0]] for number, row in own.items()}
+        wrong = {number for number, row in own.items() if row[0] != sha256_of((keys[number], *row[2:]))}
+        for table, order in ((Session, Session.number), (View, views.view_index)):
+            rows = transaction.execute(
+                select(table.enrollment_id, table.digest, *_raw(transaction, table))
+                .where(table.enrollment_id.in_(part))
+                .order_by(table.enrollment_id, order)
+            )
+            for number, group in groupby(rows, itemgetter(0)):
+                for row in group:
+                    digests[number].append(row[1])
+                    if row[1] != sha256_of((keys[number], *row[2:])):
+                        wrong.add(number)
+        wrong |= {number for number in own if seals[number] not in (None, sha256_of(tuple(digests[number])))}
+        yield from sorted(wrong)
+
+
+def portions(ids: Sequence[int], size: int) -> Iterator[Sequence[int]]:
+    """Yield ids in portions."""
+    for start in range(0, len(ids), size):
+        yield ids[start : start + size]
+
+
+def _raw(transaction: Transaction, table: type[Row]) -> list[ColumnElement[Any]]:
+    """Return the digested columns, with equal values for equal rows on both databases."""
+    is_postgres = transaction.get_bind().dialect.name == "postgresql"
+    return [_as_stored(column, is_postgres).label(f"raw_{name}") for name, column in digested(table)]
+
+
+def _as_stored(column: Column[Any], is_postgres: bool) -> ColumnElement[Any]:
+    if is_postgres and isinstance(column.type, Utc):
+        return func.to_char(column, "YYYY-MM-DD HH24:MI:SS.US")
+    if is_postgres and isinstance(column.type, JsonText | Truth):
+        return cast(column, Text if isinstance(column.type, JsonText) else Integer)
+    if isinstance(column.type, Number):
+        return type_coerce(column, NullType()) + 0.0 if is_postgres else type_coerce(column, NullType())
+    return type_coerce(column, NullType())
