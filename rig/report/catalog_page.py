@@ -1,6 +1,8 @@
 """Contact sheets of a catalog, and an HTML page that shows them with the data of each object."""
 
-from collections.abc import Iterable, Iterator
+import re
+import unicodedata
+from collections.abc import Iterator
 from pathlib import Path
 from statistics import median
 from typing import Any, Final, NamedTuple
@@ -9,10 +11,11 @@ from urllib.parse import quote
 import cv2
 import numpy as np
 
-from rig.catalog.exchange.batch import Enrollment, ExportedObject, Object, Session, region_of_view
-from rig.catalog.exchange.bundle import new_file, read_stored
-from rig.catalog.exchange.new_folder import new_folder
-from rig.catalog.records import EnrollmentStatus
+from rig.catalog.derived import regions_of
+from rig.catalog.exchange.new_files import new_file, new_folder
+from rig.catalog.exchange.tables import enrolled
+from rig.catalog.facts import Enrollment, Session
+from rig.catalog.transfer import CatalogSource, Item
 from rig.core.errors import ExportFailed
 from rig.core.phrases import counted
 from rig.core.templates import environment
@@ -22,11 +25,12 @@ from rig.report.records import TILE
 from rig.views.image_files import decode
 
 SHEETS: Final = "sheets"
+MAX_SLUG_LENGTH: Final = 40
 _STAMP: Final = (56, 56)
 
 
 class _Shown(NamedTuple):
-    item: Object
+    item: Item
     sheet: str
     stamp: str
     views: int
@@ -34,19 +38,21 @@ class _Shown(NamedTuple):
     items_: list[tuple[str, str]]
 
 
-def write_sheets(folder: Path, objects: Iterable[ExportedObject]) -> int:
+def write_sheets(folder: Path, source: CatalogSource) -> int:
     """Write a contact sheet of every object, ``0001-mug-white.jpg``, and return their number.
 
     Raises
     ------
     ExportFailed
-        The folder is not empty or cannot be written, or an image is not the one that was stored.
+        The folder is not empty or cannot be written.
+    CatalogError
+        An image is not the one that was stored.
     """
     with new_folder(folder) as made:
-        return sum(1 for _ in _shown(made, None, objects))
+        return sum(1 for _ in _shown(made, None, source))
 
 
-def write_catalog_page(target: Path, objects: Iterable[ExportedObject]) -> int:
+def write_catalog_page(target: Path, source: CatalogSource) -> int:
     """Write an HTML page with the contact sheets, and return the number of objects.
 
     ``target`` is the file (suffix ``.html``; the sheets are in a folder beside it), or a folder for ``index.html``.
@@ -59,12 +65,12 @@ def write_catalog_page(target: Path, objects: Iterable[ExportedObject]) -> int:
     if target.suffix.lower() == ".html":
         sheets = target.with_name(f"{target.stem}-{SHEETS}")
         with new_file(target) as file, new_folder(sheets) as made:
-            shown = list(_shown(made, sheets.name, objects))
+            shown = list(_shown(made, sheets.name, source))
             file.write(_page(shown))
     else:
         with new_folder(target) as made:
             (made / SHEETS).mkdir()
-            shown = list(_shown(made / SHEETS, SHEETS, objects))
+            shown = list(_shown(made / SHEETS, SHEETS, source))
             (made / "index.html").write_bytes(_page(shown))
     return len(shown)
 
@@ -75,28 +81,29 @@ def _page(shown: list[_Shown]) -> bytes:
     return template.render(objects=shown, views=sum(one.views for one in shown), labels=labels).encode()
 
 
-def _shown(folder: Path, link: str | None, objects: Iterable[ExportedObject]) -> Iterator[_Shown]:
+def _shown(folder: Path, link: str | None, source: CatalogSource) -> Iterator[_Shown]:
     """Write the sheets into ``folder``; ``link`` is its path from the page, None without a page."""
-    for number, (item, files) in enumerate(objects, start=1):
-        complete = [e for e in item.enrollments if e.status == EnrollmentStatus.COMPLETE]
-        if not complete:
-            continue
-        (enrollment,) = complete
-        pictures = list(_pictures(enrollment, files))
-        slug = Path(enrollment.views[0].image).parts[1].split("-", 1)[-1]
-        sheet, stamp = f"{number:04d}-{slug}.jpg", f"{number:04d}-{slug}-small.jpg"
+    for number, (item, enrollment) in enumerate(enrolled(source), start=1):
+        regions = regions_of(source.catalog, enrollment)
+        pictures = [
+            thumbnail(decode(source.content(view.image)), TILE, region)
+            for view, region in zip(enrollment.views, regions, strict=True)
+        ]
+        stem = f"{number:04d}-{_slug(item.name)}".rstrip("-")
+        sheet, stamp = f"{stem}.jpg", f"{stem}-small.jpg"
         _write(folder / sheet, contact_sheet(pictures, [view.azimuth_deg for view in enrollment.views], tile=TILE))
         if link is not None:
             _write(folder / stamp, thumbnail(pictures[0], _STAMP))
-        enrolled = f"{enrollment.finished_utc:%Y-%m-%d %H:%M} UTC" if enrollment.finished_utc else "–"
+        finished_utc = next(one.finished_utc for one in item.enrollments if one.enrollment is enrollment)
+        when = f"{finished_utc:%Y-%m-%d %H:%M} UTC" if finished_utc else "–"
         items = list(_items(item, enrollment))
-        yield _Shown(item, quote(f"{link}/{sheet}"), quote(f"{link}/{stamp}"), len(enrollment.views), enrolled, items)
+        yield _Shown(item, quote(f"{link}/{sheet}"), quote(f"{link}/{stamp}"), len(enrollment.views), when, items)
 
 
-def _pictures(enrollment: Enrollment, files: dict[str, Path]) -> Iterator[Image]:
-    for view in enrollment.views:
-        image = decode(read_stored(files[view.image], view.image_sha256))
-        yield thumbnail(image, TILE, region_of_view(view))
+def _slug(name: str) -> str:
+    """Return a name for a file; it may be empty."""
+    plain = unicodedata.normalize("NFKD", name).encode("ascii", "ignore").decode().lower()
+    return re.sub(r"[^a-z0-9]+", "-", plain)[:MAX_SLUG_LENGTH].strip("-")
 
 
 def _write(path: Path, image: Image) -> None:
@@ -108,7 +115,7 @@ def _write(path: Path, image: Image) -> None:
     path.write_bytes(jpeg.tobytes())
 
 
-def _items(item: Object, enrollment: Enrollment) -> Iterator[tuple[str, str]]:
+def _items(item: Item, enrollment: Enrollment) -> Iterator[tuple[str, str]]:
     if item.note:
         yield "note", item.note
     yield "views", counted(len(enrollment.views), "view")
@@ -123,9 +130,10 @@ def _items(item: Object, enrollment: Enrollment) -> Iterator[tuple[str, str]]:
 
 
 def _taken(session: Session) -> str:
-    devices = ", ".join(f"{name} {_identity(identity)}" for name, identity in session.devices.items())
-    where = f"bench {session.bench}" if session.bench else ""
-    words = (f"{session.started_utc:%Y-%m-%d %H:%M} UTC", where, session.software, devices)
+    by = session.provenance
+    devices = ", ".join(f"{name} {_identity(identity)}" for name, identity in by.devices.items())
+    where = f"bench {by.bench}" if by.bench else ""
+    words = (f"{session.started_utc:%Y-%m-%d %H:%M} UTC", where, by.software, devices)
     return "; ".join(word for word in words if word)
 
 

@@ -8,7 +8,7 @@ from fastapi.responses import HTMLResponse, JSONResponse
 from pydantic import Field
 
 from rig.calibrations import CalibrationStore
-from rig.catalog.exchange.results_table import plain_row
+from rig.catalog.exchange.tables import plain_row
 from rig.catalog.records import Outcome
 from rig.catalog.results import ResultFilter, correct, find_result, find_results
 from rig.core.errors import JobNotFound

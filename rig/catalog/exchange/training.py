@@ -1,15 +1,16 @@
 """Exports for training detectors: images with boxes and masks, as COCO or YOLO, split into parts.
 
-The folder of an export is an unpacked bundle with the annotations beside it, so an import restores everything.
+The folder of an export is a catalog with the annotations beside it, so an import restores everything.
 
 Decision: docs/decisions/0038.
 """
 
 import json
-from collections.abc import Callable, Generator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import lru_cache, partial
+from itertools import groupby
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -18,17 +19,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hbr.segmentation import Method
-from rig.catalog.exchange.batch import Enrollment, ExportedObject, Object, Session, View, region_of_view
-from rig.catalog.exchange.bundle import MANIFEST, OBJECTS, images_of, index_of, read_stored
-from rig.catalog.exchange.new_folder import new_folder
+from rig.catalog.catalog import Catalog
+from rig.catalog.derived import described, regions_of
+from rig.catalog.exchange.new_files import new_folder
+from rig.catalog.exchange.tables import enrolled
+from rig.catalog.facts import Enrollment, Session, View
+from rig.catalog.images import FolderImages, path_of
 from rig.catalog.jobs import JobProgress, portions, processes
-from rig.catalog.records import EnrollmentStatus, Region, this_software
+from rig.catalog.records import EnrollmentStatus, JsonObject, Region, this_software
+from rig.catalog.transfer import CatalogSource, Item, transfer
 from rig.config import ViewConfig
+from rig.config.catalog_place import DATABASE_NAME
 from rig.core.errors import ExportFailed, UsageError
 from rig.core.next_steps import Do
 from rig.core.processes import Jobs, map_in_processes
-from rig.views import image_files as images
 from rig.views.description import BENCH_DESCRIPTOR, ViewDescriber, within
+from rig.views.image_files import IMAGE_FOLDER
 
 PARTS: Final = ("train", "val", "test")
 Intrinsics = Callable[[Session], Mapping[str, float] | None]
@@ -58,15 +64,13 @@ class TrainingExport:
     without_mask: int
 
 
-class _Item(NamedTuple):
-    """A view to be annotated: its image and its empty-table image as files, with their SHA-256."""
+class _Task(NamedTuple):
+    """A view to be annotated: the names of its image and its empty-table image, and its stored segmentation."""
 
     image: str
-    file: str
-    sha256: str
     region: Region | None
-    empty_table: tuple[str, str] | None
-    segmentation: str
+    empty_table: str | None
+    segmentation: JsonObject
 
 
 class _Mask(NamedTuple):
@@ -81,9 +85,34 @@ class _Mask(NamedTuple):
     polygon: list[list[float]]
 
 
+class _Picture(NamedTuple):
+    """A view of the object of this number, both numbered from 0, and what was found in it."""
+
+    id: int
+    number: int
+    view: View
+    session: Session
+    task: _Task
+    mask: _Mask = _Mask(0, 0, "", None, 0, [], [])
+
+    @property
+    def file(self) -> str:
+        return path_of(self.task.image)
+
+
+class _Enrolled(CatalogSource):
+    """The objects of a catalog with the enrollments that searches use, and no others."""
+
+    def items(self) -> Iterator[Item]:
+        for item in super().items():
+            used = tuple(one for one in item.enrollments if one.status is EnrollmentStatus.COMPLETE)
+            if used:
+                yield replace(item, enrollments=used)
+
+
 def write_training(
     folder: Path,
-    objects: Sequence[ExportedObject],
+    source: CatalogSource,
     form: Annotations,
     *,
     split: Split | None = None,
@@ -94,7 +123,7 @@ def write_training(
 ) -> Generator[JobProgress, None, TrainingExport]:
     """Write the views that searches use as a training set into a new folder, all or nothing.
 
-    Masks are those of the descriptors: the stored silhouettes, or computed from the stored images.
+    Masks are the silhouettes of the descriptors. An image that several views share is annotated once.
 
     Parameters
     ----------
@@ -110,40 +139,52 @@ def write_training(
     UsageError
         The fractions are not valid.
     ExportFailed
-        The folder is not empty or cannot be written, there are no views, or an image is not the stored one.
+        The folder is not empty or cannot be written, or there are no views.
+    CatalogError
+        An image is not the stored one.
     """
     _check_fractions(fractions)
-    complete = [(_complete(item), files) for item, files in objects]
-    complete = [(item, files) for item, files in complete if item.enrollments]
-    if not complete:
+    objects = list(enrolled(source))
+    if not objects:
         raise ExportFailed("There are no complete enrollments to export.", next_step=Do.ENROLL())
-    kept = [item for item, _ in complete]
-    items = [one for item, files in complete for one in _items(item, files)]
-    part_of = _divided(kept, split, fractions, seed)
     parts = list(PARTS[: len(fractions)] if split else PARTS[:1])
     with new_folder(folder) as made:
-        # Copy the images and find the objects, in processes.
-        found: dict[str, _Mask] = {}
-        yield JobProgress(0, len(items))
+        # Copy the objects. The images get the permissions of the database: who may enter the folder may read them.
+        with Catalog.open(made, clock=source.catalog.clock) as copy:
+            (made / DATABASE_NAME).chmod(0o644)
+            yield from transfer(_Enrolled(source.catalog, source.names), copy, jobs=jobs)
+        # Find the objects in the images, in processes.
+        pictures = _pictures(source, objects)
+        tasks = [picture.task for picture in pictures]
+        masks: dict[str, _Mask] = {}
+        yield JobProgress(0, len(tasks))
         work = partial(_annotate, made)
-        for portion, masks_of in map_in_processes(work, portions(items), processes(jobs, len(items))):
-            found.update(zip((item.image for item in portion), masks_of, strict=True))
-            yield JobProgress(len(found), len(items))
-        masks = {item.image: found[item.image] for item in items}  # in the order of the catalog
-        for item, files in complete:
-            for name, sha256 in images_of(item).items():
-                if name not in masks:
-                    (made / name).write_bytes(read_stored(files[name], sha256))
-        # Write the annotations, and the files for an import.
-        write = _write_coco if form is Annotations.COCO else _write_yolo
-        names_of = {part: [name for name in masks if part_of[name] == part] for part in parts}
-        write(made, kept, masks, names_of, intrinsics)
-        text, manifest = index_of(kept)
-        (made / OBJECTS).write_bytes(text)
-        (made / MANIFEST).write_bytes(manifest)
-    used = list(part_of.values())
+        for portion, found in map_in_processes(work, portions(tasks), processes(jobs, len(tasks))):
+            masks.update(zip((task.image for task in portion), found, strict=True))
+            yield JobProgress(len(masks), len(tasks))
+        # Write the annotations, in the order of the catalog.
+        annotated = [picture._replace(mask=masks[picture.task.image]) for picture in pictures]
+        by_part = _divided(annotated, parts, split, fractions, seed)
+        items = [item for item, _ in objects]
+        if form is Annotations.COCO:
+            _write_coco(made, items, by_part, intrinsics)
+        else:
+            _write_yolo(made, items, by_part)
     without = sum(mask.box is None for mask in masks.values())
-    return TrainingExport(len(kept), {part: used.count(part) for part in parts}, without)
+    return TrainingExport(len(objects), {part: len(own) for part, own in by_part.items()}, without)
+
+
+def _pictures(source: CatalogSource, objects: Iterable[tuple[Item, Enrollment]]) -> list[_Picture]:
+    """Return the views of objects. Of several views with the same image it is the first one."""
+    pictures: dict[str, _Picture] = {}
+    for number, (item, enrollment) in enumerate(objects):
+        regions = regions_of(source.catalog, enrollment)
+        evidence = described(source.catalog, enrollment, item.name).segmentation
+        for view, region, found in zip(enrollment.views, regions, evidence, strict=True):
+            session = enrollment.sessions[view.session]
+            task = _Task(view.image, region, session.empty_table, found)
+            pictures.setdefault(view.image, _Picture(len(pictures), number, view, session, task))
+    return list(pictures.values())
 
 
 def _check_fractions(fractions: Sequence[float]) -> None:
@@ -157,66 +198,44 @@ def _check_fractions(fractions: Sequence[float]) -> None:
     raise UsageError(f"The fractions {shown} {problem}.", next_step="Give the shares of train, val, test: 0.8,0.1,0.1.")
 
 
-def _complete(item: Object) -> Object:
-    used = tuple(one for one in item.enrollments if one.status == EnrollmentStatus.COMPLETE)
-    return item.model_copy(update={"enrollments": used})
-
-
-def _views(item: Object) -> list[tuple[Enrollment, View]]:
-    return [(enrollment, view) for enrollment in item.enrollments for view in enrollment.views]
-
-
-def _items(item: Object, files: Mapping[str, Path]) -> list[_Item]:
-    found = []
-    for enrollment, view in _views(item):
-        session = enrollment.sessions[view.session]
-        table, sha256 = session.empty_table_image, session.empty_table_image_sha256
-        empty_table = None if table is None or sha256 is None else (str(files[table]), sha256)
-        assert view.image_sha256 is not None  # read from a catalog
-        evidence = json.dumps(view.segmentation)
-        file = str(files[view.image])
-        found.append(_Item(view.image, file, view.image_sha256, region_of_view(view), empty_table, evidence))
-    return found
-
-
-def _divided(items: Sequence[Object], split: Split | None, fractions: Sequence[float], seed: int) -> dict[str, str]:
-    """Return the part of each image."""
-    by_object = [[view.image for _, view in _views(item)] for item in items]
+def _divided(
+    pictures: Sequence[_Picture], parts: Sequence[str], split: Split | None, fractions: Sequence[float], seed: int
+) -> dict[str, list[_Picture]]:
+    """Return the pictures of each part, in their order."""
+    divided: dict[str, list[_Picture]] = {part: [] for part in parts}
     if split is None:
-        return {name: PARTS[0] for names in by_object for name in names}
+        divided[parts[0]] = list(pictures)
+        return divided
     rng = np.random.default_rng(seed)
-    if split is Split.OBJECT:
-        parts = _drawn(len(by_object), fractions, rng)
-        return {name: part for names, part in zip(by_object, parts, strict=True) for name in names}
-    return {
-        name: part for names in by_object for name, part in zip(names, _drawn(len(names), fractions, rng), strict=True)
-    }
+    of_objects = [list(own) for _, own in groupby(pictures, lambda picture: picture.number)]
+    drawn = _drawn(len(of_objects), fractions, rng) if split is Split.OBJECT else None
+    for place, own in enumerate(of_objects):
+        part_of = [drawn[place]] * len(own) if drawn else _drawn(len(own), fractions, rng)
+        for picture, part in zip(own, part_of, strict=True):
+            divided[parts[part]].append(picture)
+    return divided
 
 
-def _drawn(count: int, fractions: Sequence[float], rng: np.random.Generator) -> list[str]:
-    """Return a part for each of several things, as close to the fractions as whole numbers can be."""
+def _drawn(count: int, fractions: Sequence[float], rng: np.random.Generator) -> list[int]:
+    """Return the number of a part for each of several things, as close to the fractions as whole numbers can be."""
     ends = np.rint(np.cumsum(fractions) * count).astype(int)
     parts = np.searchsorted(ends, np.arange(count), side="right").clip(max=len(fractions) - 1)
-    return [PARTS[part] for part in rng.permutation(parts).tolist()]
+    drawn: list[int] = rng.permutation(parts).tolist()
+    return drawn
 
 
-def _annotate(folder: Path, portion: tuple[_Item, ...]) -> list[_Mask]:
-    """Copy images into a folder, and return where the objects are in them. Runs in a worker process."""
-    found = []
-    for item in portion:
-        content = read_stored(Path(item.file), item.sha256)
-        (folder / item.image).parent.mkdir(parents=True, exist_ok=True)
-        (folder / item.image).write_bytes(content)
-        found.append(_mask(item, images.decode(content)))
-    return found
+def _annotate(folder: Path, portion: tuple[_Task, ...]) -> list[_Mask]:
+    """Return where the objects are in images of the catalog in a folder. Runs in a worker process."""
+    store = FolderImages(folder)
+    return [_mask(folder, task, store.pixels(task.image)) for task in portion]
 
 
-def _mask(item: _Item, image: NDArray[np.uint8]) -> _Mask:
-    found = _describer(item.region, item.empty_table).segment(image, json.loads(item.segmentation))
+def _mask(folder: Path, task: _Task, image: NDArray[np.uint8]) -> _Mask:
+    found = _describer(folder, task.region, task.empty_table).segment(image, task.segmentation)
     height, width = image.shape[:2]
-    x0, y0, w, h = item.region or (0, 0, width, height)
+    x0, y0, w, h = task.region or (0, 0, width, height)
     whole = np.zeros((height, width), np.bool_)
-    part = within(whole, item.region)  # type: ignore[arg-type] # a view of it
+    part = within(whole, task.region)  # type: ignore[arg-type] # a view of it
     part[:] = found.frame_mask(w, h)
     if found.box is None or not part.any():
         part[:] = True
@@ -228,8 +247,8 @@ def _mask(item: _Item, image: NDArray[np.uint8]) -> _Mask:
 
 
 @lru_cache(maxsize=4)
-def _describer(region: Region | None, empty_table: tuple[str, str] | None) -> ViewDescriber:
-    table = None if empty_table is None else images.decode(read_stored(Path(empty_table[0]), empty_table[1]))
+def _describer(folder: Path, region: Region | None, empty_table: str | None) -> ViewDescriber:
+    table = None if empty_table is None else FolderImages(folder).pixels(empty_table)
     return ViewDescriber(ViewConfig(roi=region), (BENCH_DESCRIPTOR,), table)
 
 
@@ -250,82 +269,70 @@ def _outline(mask: NDArray[np.bool_]) -> list[list[int]]:
 
 
 def _write_coco(
-    folder: Path,
-    items: Sequence[Object],
-    masks: Mapping[str, _Mask],
-    parts: Mapping[str, Sequence[str]],
-    intrinsics: Intrinsics,
+    folder: Path, items: Sequence[Item], parts: Mapping[str, Sequence[_Picture]], intrinsics: Intrinsics
 ) -> None:
-    categories = [
-        {"id": number, "name": item.name, "supercategory": item.label or "object"}
-        for number, item in enumerate(items, 1)
-    ]
-    pictures: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {}
-    for number, item in enumerate(items, 1):
-        for enrollment, view in _views(item):
-            session = enrollment.sessions[view.session]
-            mask, image_id = masks[view.image], len(pictures) + 1
-            time = view.captured_utc
-            picture = {
-                "id": image_id,
-                "file_name": view.image,
-                "width": mask.width,
-                "height": mask.height,
-                "date_captured": None if time is None else time.isoformat(),
-                "azimuth_deg": view.azimuth_deg,
-                "intrinsics": intrinsics(session),
-            }
-            x, y, w, h = mask.box or region_of_view(view) or (0, 0, mask.width, mask.height)
-            annotation = {
-                "id": image_id,
-                "image_id": image_id,
-                "category_id": number,
-                "bbox": [x, y, w, h],
-                "area": mask.area,
-                "segmentation": {"size": [mask.height, mask.width], "counts": mask.counts},
-                "iscrowd": int(mask.box is None),  # a region that trainers and evaluators ignore
-                "azimuth_deg": view.azimuth_deg,
-                "method": mask.method,
-            }
-            pictures[view.image] = picture, annotation
-    (folder / "annotations").mkdir()
-    info = {
-        "description": "Views of objects on a turntable. The masks were computed from the images. If no object was "
-        "found, the whole region is a crowd.",
-        "version": this_software(),
+    about = {
+        "info": {
+            "description": "Views of objects on a turntable. The masks were computed from the images. If no object was "
+            "found, the whole region is a crowd.",
+            "version": this_software(),
+        },
+        "licenses": [],
+        "categories": [
+            {"id": number, "name": item.name, "supercategory": item.label or "object"}
+            for number, item in enumerate(items, 1)
+        ],
     }
-    for part, names in parts.items():
+    (folder / "annotations").mkdir()
+    for part, own in parts.items():
         content = {
-            "info": info,
-            "licenses": [],
-            "images": [pictures[name][0] for name in names],
-            "annotations": [pictures[name][1] for name in names],
-            "categories": categories,
+            **about,
+            "images": [_coco_image(one, intrinsics(one.session)) for one in own],
+            "annotations": [_coco_annotation(one) for one in own],
         }
         text = json.dumps(content, ensure_ascii=False, allow_nan=False)
         (folder / "annotations" / f"instances_{part}.json").write_text(text, encoding="utf-8")
 
 
-def _write_yolo(
-    folder: Path,
-    items: Sequence[Object],
-    masks: Mapping[str, _Mask],
-    parts: Mapping[str, Sequence[str]],
-    intrinsics: Intrinsics,  # noqa: ARG001
-) -> None:
-    classes = {view.image: number for number, item in enumerate(items) for _, view in _views(item)}
-    for name, mask in masks.items():
-        if mask.box is None:
-            continue  # without a label the object would count as background
-        file = (folder / "labels" / Path(name).relative_to(images.IMAGE_FOLDER)).with_suffix(".txt")
-        file.parent.mkdir(parents=True, exist_ok=True)
-        corners = " ".join(f"{part:.6f}" for corner in mask.polygon for part in corner)
-        file.write_text(f"{classes[name]} {corners}\n", encoding="utf-8")
+def _coco_image(picture: _Picture, intrinsics: Mapping[str, float] | None) -> dict[str, Any]:
+    time = picture.view.captured_utc
+    return {
+        "id": picture.id + 1,
+        "file_name": picture.file,
+        "width": picture.mask.width,
+        "height": picture.mask.height,
+        "date_captured": None if time is None else time.isoformat(),
+        "azimuth_deg": picture.view.azimuth_deg,
+        "intrinsics": intrinsics,
+    }
+
+
+def _coco_annotation(picture: _Picture) -> dict[str, Any]:
+    mask = picture.mask
+    return {
+        "id": picture.id + 1,
+        "image_id": picture.id + 1,
+        "category_id": picture.number + 1,
+        "bbox": list(mask.box or picture.task.region or (0, 0, mask.width, mask.height)),
+        "area": mask.area,
+        "segmentation": {"size": [mask.height, mask.width], "counts": mask.counts},
+        "iscrowd": int(mask.box is None),  # a region that trainers and evaluators ignore
+        "azimuth_deg": picture.view.azimuth_deg,
+        "method": mask.method,
+    }
+
+
+def _write_yolo(folder: Path, items: Sequence[Item], parts: Mapping[str, Sequence[_Picture]]) -> None:
+    for part, own in parts.items():
+        labelled = [one for one in own if one.mask.box is not None]  # without a label it would count as background
+        for one in labelled:
+            file = (folder / "labels" / Path(one.file).relative_to(IMAGE_FOLDER)).with_suffix(".txt")
+            file.parent.mkdir(parents=True, exist_ok=True)
+            corners = " ".join(f"{number:.6f}" for corner in one.mask.polygon for number in corner)
+            file.write_text(f"{one.number} {corners}\n", encoding="utf-8")
+        (folder / f"{part}.txt").write_text("".join(f"./{one.file}\n" for one in labelled), encoding="utf-8")
     # YAML reads JSON strings; names can contain any character.
     lines = [f"{part}: {part}.txt" for part in parts]
     lines += ["val: train.txt"] if "val" not in parts else []  # trainers need one
     lines += ["names:", *(f"  {number}: {json.dumps(item.name)}" for number, item in enumerate(items))]
     (folder / "data.yaml").write_text("\n".join([*lines, ""]), encoding="utf-8")
-    for part, names in parts.items():
-        text = "".join(f"./{name}\n" for name in names if masks[name].box is not None)
-        (folder / f"{part}.txt").write_text(text, encoding="utf-8")

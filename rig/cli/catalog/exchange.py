@@ -23,9 +23,10 @@ from rig.core.phrases import counted
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from rig.catalog import Session
     from rig.catalog.exchange import ImportBatch, Imported
-    from rig.catalog.exchange.batch import ExportedObject, Session
     from rig.catalog.exchange.training import Intrinsics
+    from rig.catalog.transfer import CatalogSource
     from rig.core.processes import Jobs
 
 SHOWN = 20
@@ -236,7 +237,9 @@ def export(
 
     Example: rig export training --format coco --split view --bench sim
     """
-    from rig.catalog.exchange import read_objects, write_bundle, write_folder, write_parquet, write_table
+    from rig.catalog.exchange.bundle import write_bundle
+    from rig.catalog.exchange.tables import write_folder, write_parquet, write_table
+    from rig.catalog.transfer import CatalogSource
     from rig.report.catalog_page import write_catalog_page, write_sheets
 
     writers = {
@@ -255,11 +258,11 @@ def export(
             wanted = [name for name in labelled if not wanted or name in wanted]
         if label is not None and not wanted:
             raise ExportFailed(f"No object has the label {label!r}.", next_step=Do.LIST_OBJECTS())
-        objects = read_objects(catalog, wanted)
+        source = CatalogSource(catalog, wanted)
         if form in (Format.COCO, Format.YOLO):
-            _export_training(settings, target, list(objects), form, split, fractions, jobs)
+            _export_training(settings, target, source, form, split, fractions, jobs)
             return
-        count = writers[form](target, objects)
+        count = writers[form](target, source)
     settings.say(
         f"Exported {counted(count, 'object')} to {target} ({form}).",
         {"target": str(target), "format": form, "objects": count},
@@ -269,7 +272,7 @@ def export(
 def _export_training(
     settings: Settings,
     target: Path,
-    objects: "list[ExportedObject]",
+    source: "CatalogSource",
     form: Format,
     split: str | None,
     fractions: str,
@@ -287,7 +290,7 @@ def _export_training(
             next_step="Give object or view, and shares such as 0.8,0.1,0.1.",
         ) from error
     job = write_training(
-        *(target, objects, Annotations(form.value)),
+        *(target, source, Annotations(form.value)),
         split=divided,
         fractions=shares,
         seed=settings.seed or 0,
@@ -314,8 +317,9 @@ def _intrinsics(settings: Settings) -> "Intrinsics":
         return {one.id: {name: estimate.value for name, estimate in one.estimates.items()} for one in results}
 
     def of_session(session: "Session") -> dict[str, float] | None:
-        known = of_bench(session.bench) if session.bench == settings.bench_name else {}
-        used = session.conditions.get(CALIBRATIONS)
+        by = session.provenance
+        known = of_bench(by.bench) if by.bench == settings.bench_name else {}
+        used = by.conditions.get(CALIBRATIONS)
         return next((known[str(one)] for one in used if str(one) in known), None) if isinstance(used, list) else None
 
     return of_session

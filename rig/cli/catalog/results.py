@@ -51,7 +51,7 @@ def list_(settings: Settings, **filters: Unpack[Filters]) -> None:
 
     Example: rig results list --sample S-0042 --since 7d --bench sim
     """
-    from rig.catalog.exchange.results_table import plain_row
+    from rig.catalog.exchange.tables import plain_row
     from rig.cli.ui.present import print_table
 
     found = _find(settings, filters)
@@ -130,7 +130,7 @@ def export(
 
     Example: rig results export june.csv --since 2026-06-01 --before 2026-07-01 --bench sim
     """
-    from rig.catalog.exchange.results_table import TableFormat, write_results
+    from rig.catalog.exchange.tables import TableFormat, write_results
 
     try:
         form = TableFormat(target.suffix.lower().removeprefix("."))

@@ -16,7 +16,7 @@ import pytest
 from rig.catalog import Catalog
 from rig.catalog.edit import delete, rename
 from rig.catalog.exchange import read_objects, write_bundle
-from rig.catalog.exchange.results_table import COLUMNS, TableFormat, write_results
+from rig.catalog.exchange.tables import RESULTS, TableFormat, write_results
 from rig.catalog.records import Outcome
 from rig.catalog.results import ResultFilter, correct, find_result, find_results, record
 from rig.catalog.upkeep import collect_garbage
@@ -200,7 +200,7 @@ def test_process_killed_while_recording_leaves_nothing_half_written(tmp_path: Pa
 def test_table_has_a_row_for_each_result(catalog: Catalog, tmp_path: Path) -> None:
     correct(catalog, 1, sample="=1+1", reason='a "quoted" reason')
     results = find_results(catalog)
-    assert list(results[0].as_row()) == list(COLUMNS)
+    assert list(results[0].as_row()) == list(RESULTS)
     for form in TableFormat:
         write_results(tmp_path / f"a.{form}", results, form)
     with pytest.raises(ExportFailed, match="exists already"):
