@@ -57,6 +57,7 @@ class Action(StrEnum):
     GARBAGE_COLLECTED = "collected garbage"
     REGION_CHOSEN = "region chosen"
     COPIED = "copied"
+    DELIVERED = "delivered"
     MOVED = "moved"
     TABLE_PHOTOGRAPHED = "photographed the empty table"
 
