@@ -1,28 +1,53 @@
 """A catalog on a server, as a bench uses it: with the journal and the local copy of this computer.
 
-Commands and the web server open their catalogs here, so that each of them works without the server.
+Both are ordinary catalogs in folders. Enrollments go into the journal, and from there to the server. Searches read the
+local copy while the server does not answer. Commands and the web server open their catalogs here, so that each of them
+works without the server.
 
 Decision: docs/decisions/0051.
 """
 
+import fcntl
+import json
+import os
+import shutil
 import threading
-from collections.abc import Callable, Collection
-from contextlib import AbstractContextManager
-from dataclasses import dataclass
-from typing import Final
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, suppress
+from dataclasses import asdict, dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any, Final, Self
 
 import numpy as np
+from sqlalchemy import ColumnElement, delete, func, insert, select
+from sqlalchemy.orm import Session as Transaction
 
 import hbr
+from rig.catalog import derived, log, state
 from rig.catalog.catalog import Catalog
-from rig.catalog.delivery import Delivery, deliver
-from rig.catalog.jobs import JobProgress
-from rig.catalog.journal import Journal, waiting
-from rig.catalog.local_copy import open_or_copy
-from rig.catalog.prepared import searched_views
+from rig.catalog.digests import portions
+from rig.catalog.enrolling import OpenEnrollment
+from rig.catalog.facts import Action, Derived, Enrollment, Entry, Property, Row, Session, View
+from rig.catalog.jobs import JobProgress, finished
+from rig.catalog.records import EnrollmentStatus
+from rig.catalog.state import ObjectSummary
+from rig.catalog.transfer import CatalogSource, Conflict, transfer
+from rig.catalog.upkeep import collect_garbage
 from rig.config.catalog_place import CatalogPlace
 from rig.core.clock import Clock
-from rig.core.errors import RigError
+from rig.core.errors import (
+    CatalogBusy,
+    CatalogDamaged,
+    CatalogError,
+    CatalogUnavailable,
+    ObjectExists,
+    ObjectNotFound,
+    RigError,
+)
+from rig.core.files import json_values, no_follow
+from rig.core.next_steps import Do
+from rig.views.description import BENCH_DESCRIPTOR
 
 CHECK_S: Final = 2.0
 """Time between two checks of the journal."""
@@ -30,11 +55,212 @@ RETRY_S: Final = 15.0
 """Time until the next attempt, if the server did not answer or a person has to decide about a name."""
 END_S: Final = 5.0
 """How long the end of a program waits for a delivery; the next program continues it."""
+RULES: Final = "search_rules.json"
+"""The stopping rule beside a catalog (`rig.search.stopping_rules`)."""
+
+_PATIENCE: Final = 20
+_LOCK: Final = "delivering"
+_COPY: Final = "copy"
+"""Property of a local copy: of which catalog, up to which line of its log, and when."""
+_AT_ONCE: Final = 100
+"""Enrollments that are read from the server at once."""
+
+
+# Open
+
+
+class Attempts:
+    """Attempts to open catalogs, with pauses, so that the operator does not wait repeatedly for a server that is down.
+
+    An attempt that failed after a time t is repeated after 20 t: a host that rejects a connection takes milliseconds,
+    a network that drops packets takes seconds. Until then the same error is raised at once.
+    """
+
+    def __init__(self, clock: Clock) -> None:
+        self._clock = clock
+        self._not_before_ns = clock.now_ns()
+        self._error: CatalogUnavailable | None = None
+
+    def open(self, place: CatalogPlace, *, create: bool = False) -> Catalog:
+        """Open a catalog, for reading only unless it is created if there is none; errors as `Catalog.open`."""
+        begun_ns = self._clock.now_ns()
+        if self._error is not None and begun_ns < self._not_before_ns:
+            raise self._error.with_traceback(None)  # a traceback grows each time that an error is raised
+        try:
+            return Catalog.open(place, clock=self._clock, create=create, read_only=not create)
+        except CatalogUnavailable as error:
+            now_ns = self._clock.now_ns()
+            self._error, self._not_before_ns = error, now_ns + _PATIENCE * (now_ns - begun_ns)
+            raise
+
+
+def open_copy(place: CatalogPlace, clock: Clock) -> Catalog:
+    """Return the local copy, open for reading; `Catalog.copied_utc` says when it was made.
+
+    Raises
+    ------
+    CatalogUnavailable
+        There is no copy of this catalog.
+    """
+    with suppress(CatalogError):
+        copy = Catalog.open(place.copy_folder, clock=clock, create=False, read_only=True)
+        with copy.database.read() as transaction:
+            made = _Copied.of(transaction)
+        if made is not None and made.catalog == str(place):
+            copy.copied_utc, copy.copy_of = made.copied_utc, place
+            return copy
+        copy.close()
+    raise CatalogUnavailable(
+        f"This computer has no copy of the catalog {place}.",
+        next_step="Search once while the server answers: the search makes the copy.",
+    )
+
+
+def open_or_copy(
+    place: CatalogPlace, clock: Clock, *, create: bool = False, attempts: Attempts | None = None
+) -> Catalog:
+    """Return a catalog, open for reading; its local copy while its server or its store does not answer.
+
+    With ``create`` the catalog is created if there is none, and is open for writing. ``attempts`` are those of a
+    program that opens the catalog often.
+
+    Raises
+    ------
+    CatalogUnavailable
+        There is no copy either.
+    """
+    try:
+        return (attempts or Attempts(clock)).open(place, create=create)
+    except CatalogUnavailable as error:
+        try:
+            return open_copy(place, clock)
+        except CatalogUnavailable as missing:
+            raise CatalogUnavailable(
+                f"{error.what} {missing.what}",
+                next_step=(*error.steps, *missing.steps),
+                evidence=error.evidence,
+            ) from error
 
 
 def open_for_enrollment(place: CatalogPlace, clock: Clock) -> Catalog:
     """Open the catalog for new views: the journal of this computer if the catalog is on a server."""
     return Catalog.open(place, clock=clock) if place.url is None else Journal.of(place, clock)
+
+
+# The journal
+
+
+def journal_folder(place: CatalogPlace) -> Path:
+    """Return the folder of the journal for a catalog on a server."""
+    return place.path / "journal"
+
+
+class Journal(Catalog):
+    """The catalog of this computer that enrollments go into before the server of the catalog gets them.
+
+    So an enrollment needs no server while it takes its views. Names are compared with those of the server, or of its
+    local copy. If two benches enroll one name, the second one that delivers it has a conflict.
+
+    Attributes
+    ----------
+    server
+        Place of the catalog that gets the enrollments.
+    unreachable
+        The reason why a name could not be compared with those of the server; None if it was.
+    """
+
+    server: CatalogPlace
+    unreachable: CatalogUnavailable | None = None
+    _attempts: Attempts
+
+    @classmethod
+    def of(cls, server: CatalogPlace, clock: Clock) -> Self:
+        """Open the journal of this computer for a catalog on a server; it is created if there is none."""
+        journal = cls.open(journal_folder(server), clock=clock)
+        journal.server, journal._attempts = CatalogPlace.of(server), Attempts(clock)
+        return journal
+
+    def known_objects(self) -> list[ObjectSummary]:
+        """Return the objects of the journal, and those that the server has, by its local copy if it does not answer."""
+        own = self.objects()
+        names = {one.name for one in own}
+        with self._shared() as shared:
+            others = [] if shared is None else [one for one in shared.objects() if one.enrolled_utc is not None]
+        return [*own, *(one for one in others if one.name not in names)]
+
+    def check_enrollable(
+        self,
+        name: str,
+        *,
+        label: str | None = None,
+        note: str | None = None,
+        resume: bool = False,
+        replace: bool = False,
+    ) -> None:
+        """Raise what `begin` or `resume` would raise; for a new object also if the server has the name."""
+        super().check_enrollable(name, label=label, note=note, resume=resume, replace=replace)
+        if not resume:
+            with self._shared() as shared:
+                if shared is not None:
+                    shared.check_enrollable(name, replace=replace)
+
+    def begin(self, name: str, *, replace: bool = False, **others: Any) -> OpenEnrollment:
+        """Start to enroll an object that the server does not have, or with ``replace`` one that it has."""
+        self.check_enrollable(name, replace=replace)
+        return super().begin(name, replace=replace, **others)
+
+    @contextmanager
+    def _shared(self) -> Iterator[Catalog | None]:
+        """Yield the catalog of the server; its local copy while it does not answer; None if there is no copy."""
+        self.unreachable = None
+        try:
+            shared = self._attempts.open(self.server, create=True)
+        except CatalogUnavailable as error:
+            self.unreachable = error
+            try:
+                shared = open_copy(self.server, self.clock)
+            except CatalogUnavailable:
+                yield None
+                return
+        with shared:
+            yield shared
+
+
+def journal_words(catalog: Catalog) -> str:
+    """Return a sentence if the views of the enrollment must wait for the server; empty if the server has answered."""
+    if not isinstance(catalog, Journal) or catalog.unreachable is None:
+        return ""
+    error = catalog.unreachable
+    return f"{error.what} The views go into the journal of this computer. Next step: {error.next_step}"
+
+
+def waiting(place: CatalogPlace, clock: Clock) -> int:
+    """Return how many objects and answers of the journal wait for the server."""
+    if place.url is None or not CatalogPlace(journal_folder(place)).database_file.exists():
+        return 0
+    with (
+        Catalog.open(journal_folder(place), clock=clock, read_only=True) as journal,
+        journal.database.read() as transaction,
+    ):
+        return len(state.used(transaction)) + len(_waiting_answers(transaction))
+
+
+def discard(journal: Catalog, name: str) -> None:
+    """Remove an object from the journal without delivering it. Errors as for `Catalog.delete`."""
+    journal.delete(name)
+    collect_garbage(journal)
+
+
+# Delivery
+
+
+@dataclass(frozen=True, slots=True)
+class Delivery:
+    """The outcome for an object of the journal: ``conflict`` is None if the server has it now."""
+
+    name: str
+    views: int
+    conflict: RigError | None = None
 
 
 def deliver_journal(place: CatalogPlace, clock: Clock, *, replacing: Collection[str] = ()) -> list[Delivery]:
@@ -51,6 +277,161 @@ def deliver_journal(place: CatalogPlace, clock: Clock, *, replacing: Collection[
         return deliver(journal, server, replacing=replacing)
 
 
+def deliver(journal: Catalog, server: Catalog, *, replacing: Collection[str] = ()) -> list[Delivery]:
+    """Transfer the complete enrollments and the answers of the journal, each exactly once, and remove them there.
+
+    A call that is killed at any point is continued by the next one: the server knows an enrollment by its key, and an
+    answer, too.
+
+    Parameters
+    ----------
+    replacing
+        Names of objects that replace those of the server.
+
+    Raises
+    ------
+    CatalogUnavailable
+        The server stopped answering; what was not delivered stays in the journal.
+    CatalogBusy
+        Another program delivers this journal.
+    """
+    done = []
+    with _only_delivery(journal):
+        for one in journal.objects():
+            if one.enrolled_utc is not None:
+                conflict = _deliver(journal, server, one.name, replaces=one.name in replacing)
+                done.append(Delivery(one.name, one.views, conflict))
+        if any(one.conflict is None for one in done):
+            collect_garbage(journal)
+        _deliver_answers(journal, server)
+    return done
+
+
+@contextmanager
+def _only_delivery(journal: Catalog) -> Iterator[None]:
+    """Prevent a delivery of the journal by another program: each would remove objects that the other one reads."""
+    lock = no_follow(str(journal.path / _LOCK), os.O_RDWR | os.O_CREAT, mode=0o600)
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # the system releases it when the process ends
+    except BlockingIOError as error:
+        raise CatalogBusy("Another program delivers the journal now.", next_step="Try again later.") from error
+    else:
+        yield
+    finally:
+        os.close(lock)
+
+
+def _deliver(journal: Catalog, server: Catalog, name: str, *, replaces: bool) -> RigError | None:
+    """Transfer one object and remove it from the journal; return the reason why it stays there."""
+    try:
+        enrollment = journal.object(name).complete
+        assert enrollment is not None
+        _check_images(journal, enrollment)
+        conflict = Conflict.REPLACE if replaces or _replaces(journal, enrollment) else Conflict.REJECT
+        finished(transfer(CatalogSource(journal, [name]), server, conflict=conflict))
+    except ObjectExists:
+        return ObjectExists(
+            f"The journal has {name!r}, and the catalog has another object of that name. Nothing is lost.",
+            next_step=(
+                Do.DELIVER_RENAMED(name=name),
+                "Or",
+                Do.DELIVER_REPLACING(name=name),
+                "Or",
+                Do.DISCARD(name=name),
+            ),
+        )
+    except (CatalogDamaged, ObjectNotFound) as error:
+        return error
+    _forget(journal, name, enrollment.key)
+    return None
+
+
+def _replaces(journal: Catalog, enrollment: Enrollment) -> bool:
+    """Return whether an enrollment began with the wish to replace that of a known object."""
+    with journal.database.read() as transaction:
+        begun = transaction.scalars(
+            select(Entry.details).where(Entry.enrollment_id == enrollment.id, Entry.action == Action.ENROLLMENT_STARTED)
+        )
+        return any(details.get("replace") for details in begun)
+
+
+def _check_images(journal: Catalog, enrollment: Enrollment) -> None:
+    """Raise `CatalogDamaged` if an image is not the one that was stored."""
+    names = {part.image for part in enrollment.views} | {part.empty_table for part in enrollment.sessions}
+    for image in filter(None, names):
+        try:
+            with journal.database.catalog_errors():
+                journal.database.images.content(image)
+        except CatalogError as error:
+            raise CatalogDamaged(
+                f"The image {journal.database.images.where(image)} of the journal is not the one that was stored.",
+                next_step=("Restore it from a backup, or", Do.DISCARD(), "Then enroll the object again."),
+            ) from error
+
+
+def _forget(journal: Catalog, name: str, key: str) -> None:
+    """Remove a delivered object from the journal, unless it has been or is being enrolled again."""
+    with journal.database.write() as transaction:
+        known = state.find(transaction, name)
+        complete = state.of_status(transaction, known, EnrollmentStatus.COMPLETE)
+        again = state.of_status(transaction, known, EnrollmentStatus.IN_PROGRESS) is not None
+        if not again and complete is not None and complete.enrollment.key == key:
+            columns = state.columns(known, known.time_utc, deleted=True)
+            log.append(transaction, journal.clock, Action.DELETED, name, **columns)
+
+
+def _waiting_answers(transaction: Transaction) -> Sequence[int]:
+    """Return the lines of the journal with answers, and corrections of them, that wait for the server."""
+    last = transaction.scalar(
+        select(Entry.details).where(Entry.action == Action.DELIVERED).order_by(Entry.id.desc()).limit(1)
+    )
+    waiting = select(Entry.id).where(Entry.result.is_not(None), Entry.id > (last or {}).get("line", 0))
+    return transaction.scalars(waiting.order_by(Entry.id)).all()
+
+
+def _deliver_answers(journal: Catalog, server: Catalog) -> None:
+    """Transfer the answers that were recorded without the server; they keep their time and their operator."""
+    with journal.database.read() as reading:
+        ids = _waiting_answers(reading)
+        if not ids:
+            return
+        state.check_lines(reading, ids)
+        entries = reading.scalars(select(Entry).where(Entry.result.is_not(None)).order_by(Entry.id)).all()
+        reading.expunge_all()
+    for entry in entries:
+        image = (entry.record or {}).get("image")
+        if image is not None and entry.id >= ids[0]:
+            with suppress(CatalogError):  # it is lost; rig catalog verify says so at the server
+                content = journal.database.images.content(image)
+                with server.database.catalog_errors():
+                    server.database.images.put(content)
+    with server.database.write() as writing:
+        numbers: dict[int | None, int] = {}
+        for entry in entries:
+            known = _delivered_answer(writing, entry)
+            if known is None and entry.id >= ids[0]:
+                known = numbers.get(entry.result) or 1 + (writing.scalar(select(func.max(Entry.result))) or 0)
+                details = {**entry.details, "result": known}
+                log.add(writing, _same(entry, result=known, details=details))
+            if known is not None:
+                numbers[entry.result] = known
+    journal.note(Action.DELIVERED, line=ids[-1])
+
+
+def _delivered_answer(transaction: Transaction, entry: Entry) -> int | None:
+    """Return the number under which a catalog has an answer of another one; None if it does not have it."""
+    same_time = select(Entry).where(Entry.time_utc == entry.time_utc, Entry.action == entry.action)
+    key = (entry.record or {}).get("key")
+    return next((one.result for one in transaction.scalars(same_time) if (one.record or {}).get("key") == key), None)
+
+
+def _same(entry: Entry, **others: Any) -> Entry:
+    """Return a line of the log for another catalog; these columns are other ones."""
+    columns = {column.name: getattr(entry, column.name) for column in Entry.__table__.columns}
+    del columns["digest"]
+    return Entry(**{**columns, **others})
+
+
 def delivery_words(one: Delivery, place: CatalogPlace) -> str:
     """Return the outcome for an object of the journal, as a sentence."""
     if one.conflict is not None:
@@ -64,12 +445,125 @@ def failure_words(error: RigError) -> str:
     return f"{error.what} {kept}. Next step: {error.next_step}"
 
 
-def journal_words(catalog: Catalog) -> str:
-    """Return a sentence if the views of the enrollment must wait for the server; empty if the server has its name."""
-    if not isinstance(catalog, Journal) or catalog.unreachable is None:
-        return ""
-    error = catalog.unreachable
-    return f"{error.what} The views go into the journal of this computer. Next step: {error.next_step}"
+# The local copy
+
+
+@dataclass(frozen=True, slots=True)
+class _Copied:
+    """What a local copy has: the catalog's place and id, the last line of its log with its digest, and the time."""
+
+    catalog: str
+    id: str
+    line: int
+    digest: str
+    copied_utc: datetime
+
+    @classmethod
+    def of(cls, transaction: Transaction) -> "_Copied | None":
+        """Return the property of a copy; None if a catalog is none."""
+        stored = transaction.scalar(select(Property.value).where(Property.key == _COPY))
+        try:
+            values = json_values((stored or "").encode())
+            return cls(**{**values, "copied_utc": datetime.fromisoformat(values["copied_utc"])})
+        except (ValueError, KeyError, TypeError):
+            return None
+
+    def store(self, transaction: Transaction) -> None:
+        values = {**asdict(self), "copied_utc": self.copied_utc.isoformat()}
+        transaction.merge(Property(key=_COPY, value=json.dumps(values)))
+
+
+def update_copy(catalog: Catalog) -> bool:
+    """Bring the local copy up to date; return whether anything had changed. Only what is new is read.
+
+    A copy that is damaged, or of another catalog, is made again.
+    """
+    folder = catalog.place.copy_folder
+    try:
+        changed = _update(catalog, folder)
+    except CatalogDamaged:
+        shutil.rmtree(folder, ignore_errors=True)
+        changed = _update(catalog, folder)
+    with suppress(FileNotFoundError):
+        shutil.copyfile(catalog.path / RULES, folder / RULES)
+    return changed
+
+
+def _update(catalog: Catalog, folder: Path) -> bool:
+    with Catalog.open(folder, clock=catalog.clock) as copy:
+        with catalog.database.read() as reading, copy.database.write() as writing:
+            before = _Copied.of(writing)
+            now = _copy_log(catalog, before, reading, writing)
+            now.store(writing)
+            _copy_enrollments(reading, writing)
+            _copy_derived(reading, writing)
+        newest = derived.empty_tables(copy).newest
+        store = copy.database.images
+        with copy.database.catalog_errors():
+            if newest is not None and not store.size(newest):
+                with suppress(CatalogError):  # rig catalog verify reports it
+                    store.put(catalog.database.images.content(newest))
+            store.remove(store.names() - {newest})
+    return before is None or before.line != now.line
+
+
+def _copy_log(catalog: Catalog, before: _Copied | None, reading: Transaction, writing: Transaction) -> _Copied:
+    """Add the new lines of the catalog's log to the log of the copy, but for the answers.
+
+    So the copy has the same objects, names and states.
+    """
+    properties = dict(reading.execute(select(Property.key, Property.value)).tuples().all())
+    line, digest = log.head(reading)
+    now = _Copied(str(catalog.place), properties["id"], line, digest, catalog.clock.utc())
+    if before is not None:
+        known = reading.scalar(select(Entry.digest).where(Entry.id == before.line)) or ""
+        if (before.catalog, before.id, before.digest) != (now.catalog, now.id, known):
+            raise CatalogDamaged("The local copy is one of another catalog.", next_step=Do.RUN_AGAIN())
+    elif log.head(writing)[0]:
+        raise CatalogDamaged("The local copy was not made by this program.", next_step=Do.RUN_AGAIN())
+    after = 0 if before is None else before.line
+    new = select(Entry).where(Entry.id > after, Entry.result.is_(None)).order_by(Entry.id)
+    for part in reading.scalars(new.execution_options(yield_per=1000)).partitions():
+        log.add(writing, *map(_same, part))
+        reading.expunge_all()
+    return now
+
+
+def _copy_enrollments(reading: Transaction, writing: Transaction) -> None:
+    """Copy the rows of the enrollments that searches use, with their ids, and remove the others."""
+    used = {one.enrollment_id for one in state.used(reading)}
+    known = set(writing.scalars(select(Enrollment.id)))
+    owners: tuple[tuple[type[Row], Any], ...] = (
+        (Enrollment, Enrollment.id),
+        (Session, Session.enrollment_id),
+        (View, View.enrollment_id),
+    )
+    for part in portions(sorted(known - used), _AT_ONCE):
+        for table, owner in reversed(owners):
+            writing.execute(delete(table).where(owner.in_(part)))
+    for part in portions(sorted(used - known), _AT_ONCE):
+        for table, owner in owners:
+            _copy_rows(reading, writing, table, owner.in_(part))
+
+
+def _copy_derived(reading: Transaction, writing: Transaction) -> None:
+    """Copy what is computed from these enrollments, if it is new or another program has computed it again."""
+    used = {one.seal for one in state.used(writing)}
+    columns = select(Derived.seal, Derived.what, Derived.made_by, Derived.sha256)
+    there = {tuple(row) for row in reading.execute(columns) if row.seal in used}
+    here = {tuple(row) for row in writing.execute(columns)}
+    for part in portions(sorted({row[0] for row in there ^ here}), _AT_ONCE):
+        writing.execute(delete(Derived).where(Derived.seal.in_(part)))
+        _copy_rows(reading, writing, Derived, Derived.seal.in_(used.intersection(part)))
+
+
+def _copy_rows(reading: Transaction, writing: Transaction, table: type[Row], wanted: ColumnElement[bool]) -> None:
+    rows = [dict(row) for row in reading.execute(select(table.__table__).where(wanted)).mappings()]
+    if rows:
+        writing.execute(insert(table.__table__), rows)
+
+
+# During other work
 
 
 def comparable_views(
@@ -79,13 +573,14 @@ def comparable_views(
 
     For an object of a journal, the others are those of the server or of its local copy, if there is one.
     """
+    views = derived.views(catalog, BENCH_DESCRIPTOR, progress)
     if not isinstance(catalog, Journal):
-        return searched_views(catalog, progress=progress)[0]
+        return views
     try:
         with open_or_copy(catalog.server, catalog.clock) as shared:
-            views, others = searched_views(catalog, shared, progress=progress)
+            others = derived.views(shared, BENCH_DESCRIPTOR, progress)
     except RigError:  # no server, and no copy yet
-        return searched_views(catalog, progress=progress)[0]
+        return views
     own = views.select(views.object_index == views.object_names.index(name))
     own = hbr.Views.of_object(name, own.descriptors, own.azimuth_deg, own.descriptor)
     kept = others.select(np.array([one != name for one in others.object_names], bool)[others.object_index])

@@ -40,7 +40,7 @@ class CatalogPlace:
 
     @property
     def copy_folder(self) -> Path:
-        """Folder of the local copy of a catalog on a server (`rig.catalog.local_copy`)."""
+        """Folder of the local copy of a catalog on a server (`rig.catalog.shared`)."""
         return self.path / "local-copy"
 
     def may_exist(self) -> bool:

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from rig.bench import Bench
 from rig.catalog import Catalog, Provenance
-from rig.catalog.journal import Journal
 from rig.catalog.records import Outcome
 from rig.catalog.results import Answer, NewResult, record
+from rig.catalog.shared import open_for_enrollment
 from rig.config.catalog_place import CatalogPlace
 from rig.core.clock import Clock
 from rig.core.errors import CatalogUnavailable, RigError
@@ -89,7 +89,7 @@ class ResultRecorder:
                 with Catalog.open(self.place, clock=self.clock, create=False) as catalog:
                     return Recorded(record(catalog, new, self._image), self.sample)
             except CatalogUnavailable:
-                with Journal.of(CatalogPlace.of(self.place), self.clock) as journal:
+                with open_for_enrollment(CatalogPlace.of(self.place), self.clock) as journal:
                     return Recorded(record(journal, new, self._image), self.sample)
         except RigError as error:
             return Warned(

@@ -4,8 +4,7 @@ from collections.abc import Callable
 from typing import Any
 
 from rig.catalog import Catalog
-from rig.catalog.local_copy import Attempts, open_or_copy
-from rig.catalog.shared import BackgroundDelivery, JournalState
+from rig.catalog.shared import Attempts, BackgroundDelivery, JournalState, open_or_copy
 from rig.config.catalog_place import CatalogPlace
 from rig.core.clock import Clock
 

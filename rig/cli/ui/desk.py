@@ -9,9 +9,7 @@ from rig.bench.bench import DEVICES
 from rig.catalog import Catalog
 from rig.catalog.background import BackgroundCheck
 from rig.catalog.jobs import JobProgress
-from rig.catalog.journal import waiting
-from rig.catalog.local_copy import open_or_copy
-from rig.catalog.shared import BackgroundDelivery
+from rig.catalog.shared import BackgroundDelivery, open_or_copy, waiting
 from rig.cli.ui import prompts
 from rig.cli.ui.present import Progress as ProgressBar
 from rig.cli.ui.settings import Settings
