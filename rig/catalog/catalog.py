@@ -128,7 +128,7 @@ class Catalog(AbstractContextManager["Catalog"]):
         with self.database.read() as transaction:
             found = state.find(transaction, name)
             (summary,) = state.summaries(transaction, object_id=found.object_id)
-            own = Enrollment.object_id == found.object_id
+            own = state.Ended.object_id == found.object_id
             return ObjectDetails(summary, tuple(state.enrollments(transaction, own)))
 
     def first_views(self) -> dict[str, int]:
@@ -152,7 +152,7 @@ class Catalog(AbstractContextManager["Catalog"]):
             with self.database.read() as transaction:
                 conditions = []
                 if name is not None:
-                    conditions = [Enrollment.object_id == state.find(transaction, name).object_id]
+                    conditions = [state.Ended.object_id == state.find(transaction, name).object_id]
                 state.check(transaction, *conditions)
         except CatalogDamaged as error:
             return error

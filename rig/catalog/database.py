@@ -101,13 +101,13 @@ def _transaction(connection: Connection) -> Transaction:
 def create_tables(connection: Connection) -> None:
     """Create the tables of a new catalog."""
     Row.metadata.create_all(connection)
-    first = {"application": APPLICATION, "version": str(SCHEMA_VERSION), "id": uuid.uuid4().hex, "head": "0 "}
+    first = {"application": APPLICATION, "version": str(SCHEMA_VERSION), "id": uuid.uuid4().hex, "head": "0  0 0"}
     connection.execute(Property.__table__.insert(), [{"key": key, "value": value} for key, value in first.items()])
 
 
 def properties(connection: Connection | Transaction) -> dict[str, str]:
     """Return the properties of a catalog."""
-    return dict(connection.execute(select(Property.key, Property.value)).tuples().all())
+    return dict(connection.execute(select(Property.key, Property.value)).all())
 
 
 def check_properties(found: dict[str, str], place: CatalogPlace) -> None:

@@ -22,11 +22,11 @@ def wrong_lines(transaction: Transaction, ids: Collection[int]) -> list[int]:
     before, wrong = aliased(Entry, name="before"), []
     for part in portions(sorted(ids), 500):
         rows = transaction.execute(
-            select(Entry.id, Entry.digest, before.digest, *_raw(transaction, Entry))
+            select(Entry.id, Entry.digest, func.coalesce(before.digest, ""), *_raw(transaction, Entry))
             .outerjoin(before, before.id == Entry.id - 1)
             .where(Entry.id.in_(part))
         )
-        wrong += [row[0] for row in rows if row[1] != sha256_of((row[2] or "", *row[3:]))]
+        wrong += [row[0] for row in rows if row[1] != sha256_of(row[2:])]
     return wrong
 
 

@@ -11,9 +11,20 @@ import json
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from enum import StrEnum
+from functools import cache
 from typing import Any, Final
 
-from sqlalchemy import CheckConstraint, Column, ForeignKey, ForeignKeyConstraint, Index, MetaData, UniqueConstraint
+from sqlalchemy import (
+    CheckConstraint,
+    Column,
+    ForeignKey,
+    ForeignKeyConstraint,
+    Index,
+    MetaData,
+    UniqueConstraint,
+    event,
+    inspect,
+)
 from sqlalchemy.orm import DeclarativeBase, Mapped, MappedAsDataclass, composite, mapped_column, relationship
 
 from rig.catalog.columns import (
@@ -31,6 +42,7 @@ from rig.catalog.columns import (
     Truth,
     Utc,
     Words,
+    damaged,
 )
 from rig.catalog.records import MAX_NAME_LENGTH, EnrollmentStatus, JsonObject, Provenance, Region
 
@@ -260,7 +272,23 @@ _STATES, _ENDS = Entry.deleted.is_not(None), Entry.status.is_not(None)
 Index("ix_log_states", Entry.object_id, Entry.id, sqlite_where=_STATES, postgresql_where=_STATES)
 Index("ix_log_names", Entry.object_name, sqlite_where=_STATES, postgresql_where=_STATES)
 Index("ix_log_statuses", Entry.enrollment_id, Entry.id, sqlite_where=_ENDS, postgresql_where=_ENDS)
+Index("ix_log_ends", Entry.object_id, sqlite_where=_ENDS, postgresql_where=_ENDS)
 Index("ix_log_actions", Entry.action, Entry.id)
+
+
+@event.listens_for(Row, "load", propagate=True)
+def _check_required(row: Row, _context: object) -> None:
+    """Raise `CatalogDamaged` for a value that is missing: a sender can make a table that allows it."""
+    for name in _required(type(row)):
+        if getattr(row, name) is None:
+            raise damaged(f"{name} of a row", None)
+
+
+@cache
+def _required(table: type[Row]) -> tuple[str, ...]:
+    mapper = inspect(table)
+    return tuple(mapper.get_property_by_column(column).key for column in mapper.columns if not column.nullable)
+
 
 _LOCAL: Final = {"id", "enrollment_id", "object_id", "digest"}
 """Columns of an enrollment and its parts that differ from catalog to catalog, and the digest itself."""

@@ -11,6 +11,7 @@ from contextlib import contextmanager, suppress
 from datetime import datetime
 from math import inf
 from pathlib import Path
+from secrets import token_hex
 from typing import Any, Final
 
 import numpy as np
@@ -149,18 +150,32 @@ class FolderImages(Images):
     def put(self, content: bytes, *, settled: bool = True) -> str:
         name = name_of(content)
         path = self.file(name)
+        stored = b""
         with suppress(OSError):
-            if files.read_file(path) == content:
-                return name
-        if not path.parent.is_dir():
-            make_folder_within(self.root, path.parent)
+            stored = files.read_file(path)
+        if stored == content:
+            with suppress(OSError):
+                os.utime(path)  # `collect_garbage` spares new files: the row of this one is not stored yet
+            if settled:
+                sync_file(path)  # the process that wrote it may not have waited, or was killed before it did
+        else:
+            if not path.parent.is_dir():
+                make_folder_within(self.root, path.parent)
+            # a name of its own: another process may write the same image now
+            part = path.with_name(f"{name}.{token_hex(8)}.part")
+            try:
+                with open_new(part, mode=file_mode(self.root)) as file:
+                    file.write(content)
+                    file.flush()
+                    if settled:
+                        os.fsync(file.fileno())
+                part.replace(path)
+            except BaseException:
+                with suppress(OSError):
+                    part.unlink()
+                raise
         if settled:
-            write_local(path, content, mode=file_mode(self.root))
-            return name
-        part = path.with_name(f"{name}.{os.getpid()}.part")
-        with open_new(part, mode=file_mode(self.root)) as file:
-            file.write(content)
-        part.replace(path)
+            sync_folder(path.parent)
         return name
 
     def settle(self, names: Iterable[str]) -> None:

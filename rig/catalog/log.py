@@ -5,12 +5,13 @@ Decision: docs/decisions/0016.
 
 import os
 import pwd
+import re
 import socket
 from collections.abc import Iterator
 from datetime import datetime
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
-from sqlalchemy import func, insert, select, update
+from sqlalchemy import func, insert, select, true, update
 from sqlalchemy.orm import Session as Transaction
 
 from rig.catalog import digests
@@ -18,8 +19,11 @@ from rig.catalog.columns import damaged
 from rig.catalog.facts import Action, Entry, Property, digest_of
 from rig.catalog.records import as_json, this_software
 from rig.core.clock import Clock
+from rig.core.errors import CatalogDamaged
 from rig.core.masking import masked
+from rig.core.next_steps import Do
 
+_HEAD: Final = re.compile(r"([0-9]{1,15}) ([0-9a-f]{64}|) ([0-9]{1,15}) ([0-9]{1,15})")
 _COLUMNS: Final = tuple(column.name for column in Entry.__table__.columns)
 
 
@@ -37,26 +41,62 @@ def append(
 
 def add(transaction: Transaction, *entries: Entry) -> None:
     """Add lines to the log after its last one; each gets its number and its digest."""
-    last, before = head(transaction)
+    last, before, states, statuses = _end(transaction)
     rows = []
     for entry in entries:
         last += 1
+        states += entry.deleted is not None
+        statuses += entry.status is not None
         entry.id = last
         entry.digest = before = digest_of(entry, before)
         rows.append({name: getattr(entry, name) for name in _COLUMNS})
     if rows:
         transaction.execute(insert(Entry), rows)
-        value = f"{last} {before}"
+        value = f"{last} {before} {states} {statuses}"
         transaction.execute(update(Property).where(Property.key == "head").values(value=value))
+
+
+class _End(NamedTuple):
+    """The last line and its digest; how many lines give an object a state, and how many an enrollment a status."""
+
+    line: int
+    digest: str
+    states: int
+    statuses: int
+
+
+def _end(transaction: Transaction) -> _End:
+    found = transaction.scalar(select(Property.value).where(Property.key == "head"))
+    if (parts := _HEAD.fullmatch(str(found))) is None:
+        raise damaged("the end of its log", found)
+    return _End(int(parts[1]), parts[2], int(parts[3]), int(parts[4]))
 
 
 def head(transaction: Transaction) -> tuple[int, str]:
     """Return the number and the digest of the last line."""
-    found = transaction.scalar(select(Property.value).where(Property.key == "head"))
-    number, _, digest = str(found).partition(" ")
-    if not number.isdigit():
-        raise damaged("the end of its log", found)
-    return int(number), digest
+    return _end(transaction)[:2]
+
+
+def check_complete(transaction: Transaction) -> None:
+    """Raise `CatalogDamaged` if a line that gives a state or a status is missing, or was changed to give none.
+
+    Without it, the line before would count. A line that counts is compared with its digest where it is used.
+    """
+    end = _end(transaction)
+    found = tuple(
+        transaction.scalar(select(counted).where(condition)) or 0
+        for counted, condition in (
+            (func.max(Entry.id), true()),
+            (func.count(), Entry.deleted.is_not(None)),
+            (func.count(), Entry.status.is_not(None)),
+        )
+    )
+    if found != (end.line, end.states, end.statuses):
+        raise CatalogDamaged(
+            "Lines of the catalog's log are missing or were changed.",
+            next_step=(Do.VERIFY_CATALOG(), "Then use a backup."),
+            evidence={"last_line_states_statuses": found, "stored": (end.line, end.states, end.statuses)},
+        )
 
 
 def wrong_lines(transaction: Transaction, first: int = 1, last: int | None = None) -> Iterator[int]:

@@ -18,7 +18,7 @@ from rig.catalog.failures import server_errors
 from rig.catalog.images import open_images
 from rig.config.catalog_place import CatalogPlace
 from rig.core.errors import CatalogError, CatalogUnavailable, ConfigError, ExtraMissing
-from rig.core.files import make_folder
+from rig.core.files import json_values, make_folder
 from rig.core.next_steps import Do
 
 CHANNEL: Final = "hbr_rig_catalog"
@@ -210,6 +210,7 @@ def _engine(place: CatalogPlace, busy_timeout_s: float) -> Any:
             url.difference_update_query(["options"]),
             poolclass=QueuePool,
             json_serializer=json_text,
+            json_deserializer=json_values,
             pool_pre_ping=True,
             pool_use_lifo=True,
             connect_args={

@@ -25,7 +25,7 @@ from rig.catalog.images import open_images
 from rig.catalog.places import check_folder
 from rig.config.catalog_place import DATABASE_NAME, CatalogPlace
 from rig.core.errors import CatalogDamaged, CatalogError
-from rig.core.files import make_folder, sync_folder
+from rig.core.files import json_values, make_folder, sync_folder
 
 APPLICATION_ID: Final = 0x48425247
 """``HBRG``: marks the SQLite file as a catalog (`PRAGMA application_id`)."""
@@ -55,7 +55,13 @@ class SqliteDatabase(Database):
         self._file = place.database_file
         self.read_only = read_only
         self._busy_timeout_s = busy_timeout_s
-        self._engine = create_engine("sqlite://", creator=self._connect, poolclass=QueuePool, json_serializer=json_text)
+        self._engine = create_engine(
+            "sqlite://",
+            creator=self._connect,
+            poolclass=QueuePool,
+            json_serializer=json_text,
+            json_deserializer=json_values,
+        )
         event.listen(self._engine, "begin", _begin)
         self._immediate = self._engine.execution_options(begin="BEGIN IMMEDIATE")
         try:

@@ -15,7 +15,8 @@ from sqlalchemy import ColumnElement, Select, and_, exists, false, func, select,
 from sqlalchemy.orm import Session as Transaction
 from sqlalchemy.orm import aliased, selectinload
 
-from rig.catalog import digests
+from rig.catalog import digests, log
+from rig.catalog.columns import damaged
 from rig.catalog.facts import Enrollment, Entry, View, damaged_parts
 from rig.catalog.records import EnrollmentStatus, clean_name
 from rig.core.errors import CatalogDamaged, CatalogError, ObjectExists, ObjectNotFound
@@ -107,13 +108,16 @@ def used(transaction: Transaction, *, checked: bool = False) -> list[Used]:
     wanted = (
         select(Named.object_id, Named.object_name, Ended.enrollment_id, Enrollment.key, Ended.seal, Ended.id, Named.id)
         .join(Ended, Ended.object_id == Named.object_id)
-        .join(Enrollment, Enrollment.id == Ended.enrollment_id)
+        .outerjoin(Enrollment, Enrollment.id == Ended.enrollment_id)
         .where(IN_USE, IS_STATUS, Ended.status == EnrollmentStatus.COMPLETE)
         .order_by(Named.object_id)
     )
     rows = transaction.execute(wanted).all()
     if checked:
+        log.check_complete(transaction)
         check_lines(transaction, {line for row in rows for line in row[5:]})
+    if wrong := [str(row[1]) for row in rows if None in row]:  # the enrollment is missing, or no program wrote this
+        raise changed(wrong)
     return [Used(*row[:6]) for row in rows]
 
 
@@ -153,7 +157,9 @@ def find(transaction: Transaction, name: str, *, deleted: bool = False) -> Entry
         select(Named).where(Named.object_name == name, *among).order_by(Named.id.desc()).limit(1)
     )
     if found is not None:
+        check_lines(transaction, [found.id])
         return found
+    check_states(transaction)  # or its name was changed
     by_folded = {str(known).casefold(): known for known in transaction.scalars(select(Named.object_name).where(*among))}
     near = [by_folded[folded] for folded in get_close_matches(name.casefold(), by_folded)]
     state = "deleted object" if deleted else "object"
@@ -173,12 +179,19 @@ def _among(deleted: bool) -> list[ColumnElement[bool]]:
 
 def state_of(transaction: Transaction, name: str) -> Entry | None:
     """Return the state of the object in use with this name, which is clean; None if there is none."""
-    return transaction.scalar(select(Named).where(Named.object_name == name, IN_USE))
+    found = transaction.scalar(select(Named).where(Named.object_name == name, IN_USE))
+    if found is not None:
+        check_lines(transaction, [found.id])
+    return found
 
 
 def by_id(transaction: Transaction, object_id: int) -> Entry:
     """Return the state of an object, in use or deleted."""
-    return transaction.scalars(select(Named).where(IS_STATE, Named.object_id == object_id)).one()
+    found = transaction.scalar(select(Named).where(IS_STATE, Named.object_id == object_id))
+    if found is None:
+        raise damaged("the owner of an enrollment", object_id)
+    check_lines(transaction, [found.id])
+    return found
 
 
 def columns(known: Entry | None, now: datetime, *, deleted: bool = False, **texts: str) -> dict[str, Any]:
@@ -204,24 +217,28 @@ def summaries(transaction: Transaction, *, deleted: bool = False, object_id: int
     Raises
     ------
     CatalogDamaged
-        The state of an object is not as it was written.
+        The state of an object is not as it was written, or the views of its complete enrollment are not all there.
     """
+    log.check_complete(transaction)
     conditions = _among(deleted) if object_id is None else [IS_STATE, Named.object_id == object_id]
     count = select(func.count()).where(View.enrollment_id == Ended.enrollment_id).correlate(Ended).scalar_subquery()
     states = transaction.scalars(select(Named).where(*conditions).order_by(Named.object_id)).all()
+    planned = func.json_array_length(Enrollment.planned_azimuth_deg)
     wanted = (
-        select(Ended.object_id, Ended.status, Ended.finished_utc, count)
+        select(Ended.object_id, Ended.status, Ended.finished_utc, count, planned, Ended.id)
         .join(Enrollment, Enrollment.id == Ended.enrollment_id)
         .where(IS_STATUS, Ended.status.in_([EnrollmentStatus.COMPLETE, EnrollmentStatus.IN_PROGRESS]))
     )
     if object_id is not None:
         wanted = wanted.where(Ended.object_id == object_id)
-    current = {(owner, status): (when, number) for owner, status, when, number in transaction.execute(wanted)}
-    check_lines(transaction, [one.id for one in states])
+    current = {(row[0], row[1]): row[2:] for row in transaction.execute(wanted)}
+    check_lines(transaction, {one.id for one in states} | {row[3] for row in current.values()})
     found = []
     for one in states:
-        enrolled_utc, views = current.get((one.object_id, EnrollmentStatus.COMPLETE), (None, 0))
-        _, unfinished = current.get((one.object_id, EnrollmentStatus.IN_PROGRESS), (None, None))
+        enrolled_utc, views, planned_views, _ = current.get((one.object_id, EnrollmentStatus.COMPLETE), (None, 0, 0, 0))
+        _, unfinished, _, _ = current.get((one.object_id, EnrollmentStatus.IN_PROGRESS), (None, None, None, None))
+        if views != planned_views:
+            raise changed([str(one.object_name)])
         found.append(
             ObjectSummary(
                 name=str(one.object_name),
@@ -256,10 +273,33 @@ def enrollments(transaction: Transaction, *conditions: ColumnElement[bool]) -> l
     rows = transaction.execute(wanted).all()
     check_lines(transaction, [ended.id for _, ended in rows])
     for enrollment, ended in rows:
-        if damaged_parts(enrollment, ended.seal):
+        if damaged_parts(enrollment, ended.seal) or not is_possible(enrollment, ended):
             raise changed([str(by_id(transaction, enrollment.object_id).object_name)])
     transaction.expunge_all()
     return [EnrollmentState(one, ended.status, ended.finished_utc, ended.seal) for one, ended in rows]
+
+
+def is_possible(enrollment: Enrollment, ended: Entry) -> bool:
+    """Return whether an enrollment refers to its own rows only, and has values that this program stores.
+
+    A sender can give any values the right digests.
+    """
+    sessions, plan = range(len(enrollment.sessions)), enrollment.planned_azimuth_deg
+    return (
+        ended.object_id == enrollment.object_id
+        and [session.number for session in enrollment.sessions] == list(sessions)
+        and all((one.empty_table is None) == (one.empty_table_bytes is None) for one in enrollment.sessions)
+        and all(0 <= azimuth_deg < 360 for azimuth_deg in (*plan, *(view.azimuth_deg for view in enrollment.views)))
+        and all(
+            0 <= view.index < len(plan)
+            and view.session in sessions
+            and (view.imu_deg is None) == (view.imu_sigma_deg is None)
+            and (view.imu_sigma_deg or 0.0) >= 0
+            and view.image_bytes > 0
+            for view in enrollment.views
+        )
+        and (ended.status != EnrollmentStatus.COMPLETE or (ended.finished_utc is not None and not enrollment.missing))
+    )
 
 
 def unfinished(transaction: Transaction, state: Entry) -> EnrollmentState:
@@ -274,7 +314,7 @@ def unfinished(transaction: Transaction, state: Entry) -> EnrollmentState:
 
 def of_status(transaction: Transaction, state: Entry, status: EnrollmentStatus) -> EnrollmentState | None:
     """Return the enrollment of an object that is complete or in progress; None if there is none."""
-    return next(iter(enrollments(transaction, Enrollment.object_id == state.object_id, Ended.status == status)), None)
+    return next(iter(enrollments(transaction, Ended.object_id == state.object_id, Ended.status == status)), None)
 
 
 def check_not_enrolled(transaction: Transaction, state: Entry) -> None:
@@ -299,15 +339,24 @@ def check_not_enrolled(transaction: Transaction, state: Entry) -> None:
 
 def check(transaction: Transaction, *conditions: ColumnElement[bool]) -> None:
     """Raise `CatalogDamaged` if objects or enrollments, all or some, are not as they were written."""
+    log.check_complete(transaction)
     rows = transaction.execute(
-        select(Enrollment.id, Ended.seal, Enrollment.object_id, Ended.id)
+        select(Enrollment.id, Ended.seal, Ended.object_id, Ended.id, Enrollment.object_id)
         .join(Ended, Ended.enrollment_id == Enrollment.id)
         .where(IS_STATUS, *conditions)
     ).all()
     check_lines(transaction, [row[3] for row in rows])
     owner = {row[0]: row[2] for row in rows}
-    wrong = [owner[one] for one in digests.damaged_enrollments(transaction, {row[0]: row[1] for row in rows})]
+    wrong = [row[2] for row in rows if row[2] != row[4]]
+    wrong += [owner[one] for one in digests.damaged_enrollments(transaction, {row[0]: row[1] for row in rows})]
     if wrong:
         raise changed([str(by_id(transaction, one).object_name) for one in dict.fromkeys(wrong)])
     if not conditions:
-        check_lines(transaction, list(transaction.scalars(select(Named.id).where(IS_STATE))))
+        check_states(transaction)
+        used(transaction)
+
+
+def check_states(transaction: Transaction) -> None:
+    """Raise `CatalogDamaged` if the state of an object, in use or deleted, is not as it was written."""
+    log.check_complete(transaction)
+    check_lines(transaction, list(transaction.scalars(select(Named.id).where(IS_STATE))))
