@@ -11,7 +11,6 @@ from urllib.parse import quote
 import cv2
 import numpy as np
 
-from rig.catalog.derived import regions_of
 from rig.catalog.exchange.new_files import new_file, new_folder
 from rig.catalog.exchange.tables import enrolled
 from rig.catalog.facts import Enrollment, Session
@@ -83,8 +82,7 @@ def _page(shown: list[_Shown]) -> bytes:
 
 def _shown(folder: Path, link: str | None, source: CatalogSource) -> Iterator[_Shown]:
     """Write the sheets into ``folder``; ``link`` is its path from the page, None without a page."""
-    for number, (item, enrollment) in enumerate(enrolled(source), start=1):
-        regions = regions_of(source.catalog, enrollment)
+    for number, (item, enrollment, regions) in enumerate(enrolled(source), start=1):
         pictures = [
             thumbnail(decode(source.content(view.image)), TILE, region)
             for view, region in zip(enrollment.views, regions, strict=True)
@@ -139,5 +137,6 @@ def _taken(session: Session) -> str:
 
 def _identity(identity: Any) -> str:
     if isinstance(identity, dict):
-        return " ".join(str(value) for value in identity.values() if value not in (None, ""))
+        in_order = sorted(identity, key=lambda name: name != "model")  # the model first
+        return " ".join(str(identity[name]) for name in in_order if identity[name] not in (None, ""))
     return str(identity)

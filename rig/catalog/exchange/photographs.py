@@ -7,16 +7,17 @@ import csv
 import math
 import re
 import secrets
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from functools import cached_property
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 from hbr.core.angles import wrap360
 from rig.catalog.exchange.tables import ANGLES, NAMES, parse_region
 from rig.catalog.facts import Enrollment, Session, View
-from rig.catalog.records import EnrollmentStatus, Provenance, check_azimuth, clean_name, this_software
+from rig.catalog.records import EnrollmentStatus, Provenance, clean_name, this_software
 from rig.catalog.state import EnrollmentState
 from rig.catalog.transfer import Gap, ImportProblem, Item, Reason, RejectedFile
 from rig.core.errors import ImportRejected, UsageError
@@ -24,46 +25,74 @@ from rig.core.next_steps import Do
 from rig.views.image_files import read_file
 
 DEFAULT_PATTERN: Final = "{object}__{angle}"
+
 _SUFFIXES: Final = {".png", ".jpg", ".jpeg"}
 _PARTS: Final = {"{object}": r"(?P<object>[^/]+?)", "{angle}": r"(?P<angle>[-+]?[0-9]+(?:\.[0-9]+)?)", "*": r"[^/]*?"}
 _NEEDED: Final = ("object", "azimuth_deg", "image")
 _MAX_TABLE_BYTES: Final = 1_000_000_000
 
-
-class Photograph(NamedTuple):
-    """An image file of an object at an azimuth. ``values`` are other fields of `View`."""
-
-    path: Path
-    name: str
-    azimuth_deg: float
-    values: Mapping[str, Any] = {}
-    label: str = ""
-    note: str = ""
-    bench: str = ""
-    software: str = ""
+_Row = Mapping[str, str]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(eq=False)
 class Photographs:
     """Objects that are imported from image files: a `rig.catalog.transfer.Source`.
 
-    The name of an image is the path of its file. A file is not read before it is transferred.
+    The name of an image is the path of its file. A file is not read before it is transferred. Each object has one
+    complete enrollment, with views by ascending azimuth.
 
     Attributes
     ----------
     origin
         The folder or the table.
+    folder
+        The folder that contains all files.
+    now
+        Time of the enrollments.
     rejected
         What cannot be used, and why.
     """
 
     origin: str
-    objects: tuple[Item, ...]
-    rejected: tuple[RejectedFile, ...]
+    folder: Path
+    now: datetime
+    rejected: list[RejectedFile] = field(default_factory=list)
+    _found: dict[str, dict[float, tuple[Path, _Row, dict[str, Any]]]] = field(default_factory=dict)
+    _inside: dict[Path, bool] = field(default_factory=dict)
+
+    def add(self, path: Path, row: _Row, azimuth_deg: float, **values: Any) -> None:
+        """Add a file that shows the object of a row; ``values`` are other fields of `View`.
+
+        It is rejected if the name of the object is not possible, or if the object has a view from this azimuth.
+        """
+        try:
+            name = clean_name(row["object"])
+        except UsageError as error:
+            self.reject(str(path), ImportProblem.INVALID_VALUE, error=error.what.rstrip("."))
+            return
+        views = self._found.setdefault(name, {})
+        if azimuth_deg in views:
+            self.reject(str(path), ImportProblem.SAME_AZIMUTH, name=name, other=views[azimuth_deg][0].name)
+            return
+        views[azimuth_deg] = path, row, values
+
+    def reject(self, path: str, code: ImportProblem, **values: Any) -> None:
+        self.rejected.append(RejectedFile(path, Reason(code, values)))
+
+    def contains(self, path: Path) -> bool:
+        """Return whether a file is really within the folder, where links lead."""
+        if path.is_symlink():
+            return path.resolve().is_relative_to(self.folder)
+        if path.parent not in self._inside:
+            self._inside[path.parent] = path.parent.resolve().is_relative_to(self.folder)
+        return self._inside[path.parent]
+
+    def rejected_words(self) -> list[str]:
+        return [f"{file.path} {file.reason}" for file in self.rejected[:5]]
 
     def items(self) -> Iterator[Item]:
         """Yield the objects in the order of the folder or the table."""
-        yield from self.objects
+        yield from self._items
 
     def content(self, image: str) -> bytes:
         """Return the bytes of an image file; an `OSError` if it cannot be read."""
@@ -72,7 +101,32 @@ class Photographs:
     @property
     def gaps(self) -> tuple[Gap, ...]:
         """The missing views of objects that are seen from most sides at even steps; each object has its own step."""
-        return tuple(Gap(item.name, azimuth_deg) for item in self.objects for azimuth_deg in _gaps(item))
+        return tuple(Gap(name, azimuth_deg) for name, views in self._found.items() for azimuth_deg in _gaps(views))
+
+    @cached_property
+    def _items(self) -> list[Item]:
+        return [self._item(name, views) for name, views in self._found.items()]
+
+    def _item(self, name: str, found: dict[float, tuple[Path, _Row, dict[str, Any]]]) -> Item:
+        azimuths_deg = tuple(sorted(found))
+        enrollment = Enrollment(
+            key=secrets.token_hex(32), object_id=0, started_utc=self.now, planned_azimuth_deg=azimuths_deg
+        )
+        sessions: dict[tuple[str, str], Session] = {}
+        texts = {"label": "", "note": ""}
+        for index, azimuth_deg in enumerate(azimuths_deg):
+            path, row, values = found[azimuth_deg]
+            by = (row.get("bench", ""), row.get("software") or this_software())
+            if by not in sessions:
+                provenance = Provenance(by[0], {}, {"imported_from": self.origin}, by[1])
+                sessions[by] = Session(number=len(sessions), started_utc=self.now, provenance=provenance)
+            view = View(index=index, azimuth_deg=azimuth_deg, image=str(path), **values)
+            view.session = sessions[by].number
+            enrollment.views.append(view)
+            texts = {key: text or row.get(key, "") for key, text in texts.items()}
+        enrollment.sessions.extend(sessions.values())
+        state = EnrollmentState(enrollment, EnrollmentStatus.COMPLETE, self.now, None)
+        return Item(name=name, **texts, created_utc=self.now, enrollments=(state,))
 
 
 def read_folder(
@@ -101,34 +155,31 @@ def read_folder(
     named = _regex(pattern)
     if not folder.is_dir():
         raise ImportRejected(f"There is no folder {folder}.", next_step="Check the path.")
-    real = folder.resolve()
-    inside: dict[Path, bool] = {}
-    names = _names(folder / NAMES)
-    photographs: list[tuple[str, Photograph]] = []
-    rejected = []
+    photographs = Photographs(str(folder), folder.resolve(), now)
+    matches: list[tuple[str, float, Path]] = []
     for path in sorted(folder.glob("/".join("*" * (pattern.count("/") + 1)))):
         if path.suffix.lower() not in _SUFFIXES:
             continue
         shown = path.relative_to(folder)
         if not path.is_file():
-            rejected.append(RejectedFile(str(shown), Reason(ImportProblem.NOT_A_FILE)))
-        elif not _stays(path, real, inside):
-            rejected.append(RejectedFile(str(shown), Reason(ImportProblem.LINK_OUTSIDE)))
+            photographs.reject(str(shown), ImportProblem.NOT_A_FILE)
+        elif not photographs.contains(path):
+            photographs.reject(str(shown), ImportProblem.LINK_OUTSIDE)
         elif (found := named.fullmatch(shown.with_suffix("").as_posix())) is None:
-            rejected.append(RejectedFile(str(shown), Reason(ImportProblem.NAME_PATTERN, {"pattern": pattern})))
+            photographs.reject(str(shown), ImportProblem.NAME_PATTERN, pattern=pattern)
         else:
-            angle_deg = float(found["angle"])
-            azimuth_deg = float(wrap360(-angle_deg if table_angles else angle_deg))
-            about = names.get(found["object"], {"name": found["object"]})
-            photographs.append((found["object"], Photograph(path=path, azimuth_deg=azimuth_deg, **about)))
-    if not photographs:
+            matches.append((found["object"], float(found["angle"]), path))
+    if not matches:
         raise ImportRejected(
             f"No photograph in {folder} matches the pattern {pattern}.png.",
             next_step=("Give the pattern of their names.", Do.RUN_AGAIN(pattern="{object}/{angle}")),
-            evidence={"rejected": [f"{file.path} {file.reason}" for file in rejected[:5]]},
+            evidence={"rejected": photographs.rejected_words()},
         )
-    in_order = [photograph for _, photograph in sorted(photographs, key=lambda pair: _natural(pair[0]))]
-    return _assembled(str(folder), in_order, rejected, now)
+    about = _about(folder / NAMES)
+    for key, angle_deg, path in sorted(matches, key=lambda match: _natural(match[0])):
+        row, region = about.get(key, ({"object": key}, None))
+        photographs.add(path, row, wrap360(-angle_deg if table_angles else angle_deg), region=region)
+    return photographs
 
 
 def read_table(path: Path, *, now: datetime) -> Photographs:
@@ -141,74 +192,42 @@ def read_table(path: Path, *, now: datetime) -> Photographs:
     ImportRejected
         The file is not such a table.
     """
-    folder = path.parent.resolve()
-    photographs, rejected = [], []
+    photographs = Photographs(str(path), path.parent.resolve(), now)
+    used = 0
     for line, row in _rows(path, _NEEDED, "Save it as CSV in UTF-8."):
         try:
-            photographs.append(_photograph({key: text.strip() for key, text in row.items()}, folder))
-        except ValueError as error:
-            reason = Reason(ImportProblem.INVALID_VALUE, {"error": str(error)})
-            rejected.append(RejectedFile(f"{path.name}, line {line}", reason))
-    if not photographs:
+            _add_row(photographs, {key: text.strip() for key, text in row.items()})
+            used += 1
+        except (ValueError, OSError) as error:
+            photographs.reject(f"{path.name}, line {line}", ImportProblem.INVALID_VALUE, error=str(error))
+    if not used:
         raise ImportRejected(
             f"{path} has no row that can be used.",
-            next_step="Fix the listed rows." if rejected else "Add one row per view.",
-            evidence={"rejected": [f"{file.path}: {file.reason}" for file in rejected[:5]]},
+            next_step="Fix the listed rows." if photographs.rejected else "Add one row per view.",
+            evidence={"rejected": photographs.rejected_words()},
         )
-    return _assembled(str(path), photographs, rejected, now)
+    return photographs
 
 
-# Folders
-
-
-def _stays(path: Path, real: Path, inside: dict[Path, bool]) -> bool:
-    """Return whether a file is really within a folder; ``inside`` caches the answer for its folder."""
-    if path.is_symlink():
-        return path.resolve().is_relative_to(real)
-    if path.parent not in inside:
-        inside[path.parent] = path.parent.resolve().is_relative_to(real)
-    return inside[path.parent]
-
-
-def _regex(pattern: str) -> re.Pattern[str]:
-    if pattern.count("{object}") != 1 or pattern.count("{angle}") != 1:
-        raise UsageError(
-            f"The pattern {pattern!r} does not contain {{object}} and {{angle}} once each.",
-            next_step="Give a pattern such as '{object}/view-{angle}'.",
-        )
-    stem = re.sub(r"\.(png|jpe?g)$", "", pattern, flags=re.IGNORECASE)
-    return re.compile(
-        "".join(_PARTS.get(part) or re.escape(part) for part in re.split(r"(\{object\}|\{angle\}|\*)", stem))
-    )
-
-
-def _names(path: Path) -> dict[str, dict[str, Any]]:
-    """Fields of `Photograph` for obj1, obj2, ..., from the file of an export."""
+def _add_row(photographs: Photographs, row: _Row) -> None:
+    """Add the photograph of a row. ValueError says why a row cannot be used."""
+    if missing := [name for name in _NEEDED if not row.get(name)]:
+        raise ValueError(f"{' and '.join(missing)} missing")
+    path = photographs.folder / row["image"]
+    if not photographs.contains(path):
+        raise ValueError(f"the image {row['image']} is not in the folder of the table")
     if not path.is_file():
-        return {}
-    fix = "Fix or remove it; without it, objects get the names of their files."
-    try:
-        return {
-            row["object"]: {
-                **{key: row.get(key, "") for key in ("name", "label", "note")},
-                "values": {"region": parse_region(row.get("region", ""))},
-            }
-            for _, row in _rows(path, (), fix)
-            if row.get("object") and row.get("name")
-        }
-    except ValueError as error:
-        raise ImportRejected(f"{path} cannot be read: {error}.", next_step=fix) from error
+        raise ValueError(f"there is no image {row['image']}")
+    values: dict[str, Any] = {name: _number(row[name], name) for name in ANGLES if row.get(name)}
+    if (values.get("imu_deg") is None) != (values.get("imu_sigma_deg") is None):
+        raise ValueError("imu_deg and imu_sigma_deg: give both or none")
+    if row.get("captured_utc"):
+        values["captured_utc"] = _time(row["captured_utc"])
+    azimuth_deg = wrap360(_number(row["azimuth_deg"], "azimuth_deg"))
+    photographs.add(path, row, azimuth_deg, region=parse_region(row.get("region", "")), **values)
 
 
-def _natural(name: str) -> list[tuple[int, int, str]]:
-    """Sort key that puts obj2 before obj10."""
-    return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in re.split(r"([0-9]+)", name) if part]
-
-
-# Tables
-
-
-def _rows(path: Path, needed: Sequence[str], fix: str) -> Iterator[tuple[int, dict[str, str]]]:
+def _rows(path: Path, needed: Sequence[str], fix: str) -> Iterator[tuple[int, _Row]]:
     """Yield the rows of a CSV file with their line numbers; ``fix`` is what to do if it cannot be read."""
     try:
         if path.stat().st_size > _MAX_TABLE_BYTES:
@@ -227,28 +246,36 @@ def _rows(path: Path, needed: Sequence[str], fix: str) -> Iterator[tuple[int, di
         raise ImportRejected(f"{path} cannot be read: {error}.", next_step=fix) from error
 
 
-def _photograph(row: Mapping[str, str], folder: Path) -> Photograph:
-    """Return the photograph of a row. ValueError says why a row cannot be used."""
-    if missing := [name for name in _NEEDED if not row.get(name)]:
-        raise ValueError(f"{' and '.join(missing)} missing")
-    path = folder / row["image"]
-    if not path.resolve().is_relative_to(folder):
-        raise ValueError(f"the image {row['image']} is not in the folder of the table")
+def _about(path: Path) -> dict[str, tuple[_Row, Any]]:
+    """Return the row and the region for each of obj1, obj2, ..., from the file of an export."""
     if not path.is_file():
-        raise ValueError(f"there is no image {row['image']}")
-    values: dict[str, Any] = {name: _number(row[name], name) for name in ANGLES if row.get(name)}
-    if (values.get("imu_deg") is None) != (values.get("imu_sigma_deg") is None):
-        raise ValueError("imu_deg and imu_sigma_deg: give both or none")
-    if row.get("captured_utc"):
-        values["captured_utc"] = _time(row["captured_utc"])
-    azimuth_deg = _number(row["azimuth_deg"], "azimuth_deg")
-    return Photograph(
-        path,
-        row["object"],
-        float(wrap360(azimuth_deg)),
-        {**values, "region": parse_region(row.get("region", ""))},
-        **{key: row.get(key, "") for key in ("label", "note", "bench", "software")},
+        return {}
+    fix = "Fix or remove it; without it, objects get the names of their files."
+    try:
+        return {
+            row["object"]: ({**row, "object": row["name"]}, parse_region(row.get("region", "")))
+            for _, row in _rows(path, (), fix)
+            if "object" in row and "name" in row
+        }
+    except ValueError as error:
+        raise ImportRejected(f"{path} cannot be read: {error}.", next_step=fix) from error
+
+
+def _regex(pattern: str) -> re.Pattern[str]:
+    if pattern.count("{object}") != 1 or pattern.count("{angle}") != 1:
+        raise UsageError(
+            f"The pattern {pattern!r} does not contain {{object}} and {{angle}} once each.",
+            next_step="Give a pattern such as '{object}/view-{angle}'.",
+        )
+    stem = re.sub(r"\.(png|jpe?g)$", "", pattern, flags=re.IGNORECASE)
+    return re.compile(
+        "".join(_PARTS.get(part) or re.escape(part) for part in re.split(r"(\{object\}|\{angle\}|\*)", stem))
     )
+
+
+def _natural(name: str) -> list[tuple[int, int, str]]:
+    """Sort key that puts obj2 before obj10."""
+    return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in re.split(r"([0-9]+)", name) if part]
 
 
 def _number(text: str, name: str) -> float:
@@ -271,63 +298,8 @@ def _time(text: str) -> datetime:
         raise ValueError("a time beyond the calendar") from error
 
 
-# Both
-
-
-def _assembled(
-    origin: str, photographs: Iterable[Photograph], rejected: Sequence[RejectedFile], now: datetime
-) -> Photographs:
-    """Return the source of photographs. Each object becomes one complete enrollment with views by ascending azimuth.
-
-    If two photographs show an object from the same azimuth, the second one is rejected.
-    """
-    by_name: dict[str, dict[float, Photograph]] = {}
-    all_rejected = list(rejected)
-    for photograph in photographs:
-        try:
-            name = clean_name(photograph.name)
-            check_azimuth(photograph.azimuth_deg)
-        except UsageError as error:
-            reason = Reason(ImportProblem.INVALID_VALUE, {"error": error.what.rstrip(".")})
-            all_rejected.append(RejectedFile(str(photograph.path), reason))
-            continue
-        taken = by_name.setdefault(name, {})
-        if photograph.azimuth_deg in taken:
-            other = taken[photograph.azimuth_deg].path.name
-            reason = Reason(ImportProblem.SAME_AZIMUTH, {"name": name, "other": other})
-            all_rejected.append(RejectedFile(str(photograph.path), reason))
-            continue
-        taken[photograph.azimuth_deg] = photograph
-    objects = [
-        _item(name, [taken[azimuth_deg] for azimuth_deg in sorted(taken)], origin, now)
-        for name, taken in by_name.items()
-    ]
-    return Photographs(origin, tuple(objects), tuple(all_rejected))
-
-
-def _item(name: str, photographs: Sequence[Photograph], origin: str, now: datetime) -> Item:
-    taken_with = list(dict.fromkeys((photograph.bench, photograph.software) for photograph in photographs))
-    enrollment = Enrollment(
-        key=secrets.token_hex(32),
-        object_id=0,
-        started_utc=now,
-        planned_azimuth_deg=tuple(photograph.azimuth_deg for photograph in photographs),
-    )
-    conditions = {"imported_from": origin}
-    for number, (bench, by) in enumerate(taken_with):
-        provenance = Provenance(bench, {}, conditions, by or this_software())
-        enrollment.sessions.append(Session(number=number, started_utc=now, provenance=provenance))
-    for index, photograph in enumerate(photographs):
-        view = View(index=index, azimuth_deg=photograph.azimuth_deg, image=str(photograph.path), **photograph.values)
-        view.session = taken_with.index((photograph.bench, photograph.software))
-        enrollment.views.append(view)
-    label, note = (next((text for one in photographs if (text := getattr(one, key))), "") for key in ("label", "note"))
-    state = EnrollmentState(enrollment, EnrollmentStatus.COMPLETE, now, None)
-    return Item(name=name, label=label, note=note, created_utc=now, enrollments=(state,))
-
-
-def _gaps(item: Item) -> list[float]:
-    ring = sorted(item.enrollments[-1].enrollment.planned_azimuth_deg)
+def _gaps(azimuths_deg: Mapping[float, object]) -> list[float]:
+    ring = sorted(azimuths_deg)
     if len(ring) < 2:
         return []
     steps = sorted((after - before) % 360 for before, after in zip(ring, [*ring[1:], ring[0]], strict=True))

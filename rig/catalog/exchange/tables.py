@@ -12,7 +12,7 @@ from datetime import datetime
 from enum import StrEnum
 from io import TextIOWrapper
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any, Final
+from typing import IO, TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
@@ -75,12 +75,20 @@ class TableFormat(StrEnum):
     PARQUET = "parquet"
 
 
-def enrolled(source: "CatalogSource") -> Iterator[tuple["Item", Enrollment]]:
+class Enrolled(NamedTuple):
+    """An object and its complete enrollment, with the part of the image that is described of each view."""
+
+    item: "Item"
+    enrollment: Enrollment
+    regions: tuple[Region | None, ...]
+
+
+def enrolled(source: "CatalogSource") -> Iterator[Enrolled]:
     """Yield the objects that are completely enrolled, with the enrollment that searches use."""
     for item in source.items():
         for one in item.enrollments:
             if one.status is EnrollmentStatus.COMPLETE:
-                yield item, one.enrollment
+                yield Enrolled(item, one.enrollment, regions_of(source.catalog, one.enrollment))
 
 
 def write_folder(folder: Path, source: "CatalogSource") -> int:
@@ -105,9 +113,8 @@ def write_folder(folder: Path, source: "CatalogSource") -> int:
         (made / NAMES).open("wb") as file,
         _csv(file, ("object", "name", "label", "note", "region")) as rows,
     ):
-        for count, (item, enrollment) in enumerate(enrolled(source), 1):
-            region = region_text(regions_of(source.catalog, enrollment)[0])
-            about = {"name": item.name, "label": item.label, "note": item.note, "region": region}
+        for count, (item, enrollment, regions) in enumerate(enrolled(source), 1):
+            about = {"name": item.name, "label": item.label, "note": item.note, "region": region_text(regions[0])}
             rows.writerow({"object": f"obj{count}", **about})
             for view in enrollment.views:
                 angle = np.format_float_positional(view.azimuth_deg, trim="-")
@@ -197,8 +204,7 @@ def plain_row(result: Result) -> dict[str, Any]:
 def _rows(source: "CatalogSource") -> Iterator[list[tuple[dict[str, Any], View]]]:
     """Yield the rows of each object, with all columns of both formats, and their views."""
     kind = descriptor(PAPER_DESCRIPTOR)
-    for item, enrollment in enrolled(source):
-        regions = regions_of(source.catalog, enrollment)
+    for item, enrollment, regions in enrolled(source):
         levels_of = described(source.catalog, enrollment, item.name, kind.name).levels[kind.name]
         rows = []
         for view, region, levels in zip(enrollment.views, regions, levels_of, strict=True):

@@ -20,13 +20,13 @@ from numpy.typing import NDArray
 
 from hbr.segmentation import Method
 from rig.catalog.catalog import Catalog
-from rig.catalog.derived import described, regions_of
+from rig.catalog.derived import described
 from rig.catalog.exchange.new_files import new_folder
-from rig.catalog.exchange.tables import enrolled
-from rig.catalog.facts import Enrollment, Session, View
+from rig.catalog.exchange.tables import Enrolled, enrolled
+from rig.catalog.facts import Session, View
 from rig.catalog.images import FolderImages, path_of
 from rig.catalog.jobs import JobProgress, portions, processes
-from rig.catalog.records import EnrollmentStatus, JsonObject, Region, this_software
+from rig.catalog.records import EnrollmentStatus, Region, this_software
 from rig.catalog.transfer import CatalogSource, Item, transfer
 from rig.config import ViewConfig
 from rig.config.catalog_place import DATABASE_NAME
@@ -70,7 +70,8 @@ class _Task(NamedTuple):
     image: str
     region: Region | None
     empty_table: str | None
-    segmentation: JsonObject
+    segmentation: str
+    """As JSON."""
 
 
 class _Mask(NamedTuple):
@@ -165,7 +166,7 @@ def write_training(
         # Write the annotations, in the order of the catalog.
         annotated = [picture._replace(mask=masks[picture.task.image]) for picture in pictures]
         by_part = _divided(annotated, parts, split, fractions, seed)
-        items = [item for item, _ in objects]
+        items = [item for item, *_ in objects]
         if form is Annotations.COCO:
             _write_coco(made, items, by_part, intrinsics)
         else:
@@ -174,15 +175,14 @@ def write_training(
     return TrainingExport(len(objects), {part: len(own) for part, own in by_part.items()}, without)
 
 
-def _pictures(source: CatalogSource, objects: Iterable[tuple[Item, Enrollment]]) -> list[_Picture]:
+def _pictures(source: CatalogSource, objects: Iterable[Enrolled]) -> list[_Picture]:
     """Return the views of objects. Of several views with the same image it is the first one."""
     pictures: dict[str, _Picture] = {}
-    for number, (item, enrollment) in enumerate(objects):
-        regions = regions_of(source.catalog, enrollment)
+    for number, (item, enrollment, regions) in enumerate(objects):
         evidence = described(source.catalog, enrollment, item.name).segmentation
         for view, region, found in zip(enrollment.views, regions, evidence, strict=True):
             session = enrollment.sessions[view.session]
-            task = _Task(view.image, region, session.empty_table, found)
+            task = _Task(view.image, region, session.empty_table, json.dumps(found))
             pictures.setdefault(view.image, _Picture(len(pictures), number, view, session, task))
     return list(pictures.values())
 
@@ -231,7 +231,7 @@ def _annotate(folder: Path, portion: tuple[_Task, ...]) -> list[_Mask]:
 
 
 def _mask(folder: Path, task: _Task, image: NDArray[np.uint8]) -> _Mask:
-    found = _describer(folder, task.region, task.empty_table).segment(image, task.segmentation)
+    found = _describer(folder, task.region, task.empty_table).segment(image, json.loads(task.segmentation))
     height, width = image.shape[:2]
     x0, y0, w, h = task.region or (0, 0, width, height)
     whole = np.zeros((height, width), np.bool_)
