@@ -12,15 +12,15 @@ import json
 import os
 import shutil
 import threading
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import asdict, dataclass
-from datetime import datetime
+from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any, Final, Self
 
 import numpy as np
-from sqlalchemy import ColumnElement, delete, func, insert, select
+from sqlalchemy import ColumnElement, Table, and_, delete, func, insert, select
 from sqlalchemy.orm import Session as Transaction
 
 import hbr
@@ -30,7 +30,7 @@ from rig.catalog.digests import portions
 from rig.catalog.enrolling import OpenEnrollment
 from rig.catalog.facts import Action, Derived, Enrollment, Entry, Property, Row, Session, View
 from rig.catalog.jobs import JobProgress, finished
-from rig.catalog.records import EnrollmentStatus
+from rig.catalog.records import EnrollmentStatus, JsonObject
 from rig.catalog.state import ObjectSummary
 from rig.catalog.transfer import CatalogSource, Conflict, transfer
 from rig.catalog.upkeep import collect_garbage
@@ -62,6 +62,8 @@ _PATIENCE: Final = 20
 _LOCK: Final = "delivering"
 _COPY: Final = "copy"
 """Property of a local copy: of which catalog, up to which line of its log, and when."""
+_SAME_ANSWER: Final = timedelta(hours=1)
+"""An answer is recorded at most so long after a first attempt whose commit the server could not confirm."""
 _AT_ONCE: Final = 100
 """Enrollments that are read from the server at once."""
 
@@ -242,7 +244,9 @@ def waiting(place: CatalogPlace, clock: Clock) -> int:
         Catalog.open(journal_folder(place), clock=clock, read_only=True) as journal,
         journal.database.read() as transaction,
     ):
-        return len(state.used(transaction)) + len(_waiting_answers(transaction))
+        return len(state.used(transaction)) + (
+            transaction.scalar(select(func.count()).where(_is_waiting(transaction))) or 0
+        )
 
 
 def discard(journal: Catalog, name: str) -> None:
@@ -380,49 +384,49 @@ def _forget(journal: Catalog, name: str, key: str) -> None:
             log.append(transaction, journal.clock, Action.DELETED, name, **columns)
 
 
-def _waiting_answers(transaction: Transaction) -> Sequence[int]:
-    """Return the lines of the journal with answers, and corrections of them, that wait for the server."""
-    last = transaction.scalar(
-        select(Entry.details).where(Entry.action == Action.DELIVERED).order_by(Entry.id.desc()).limit(1)
-    )
-    waiting = select(Entry.id).where(Entry.result.is_not(None), Entry.id > (last or {}).get("line", 0))
-    return transaction.scalars(waiting.order_by(Entry.id)).all()
+def _is_waiting(transaction: Transaction) -> ColumnElement[bool]:
+    """Return the condition for the lines of the journal with answers that wait for the server."""
+    last = select(Entry.details).where(Entry.action == Action.DELIVERED).order_by(Entry.id.desc()).limit(1)
+    return and_(Entry.result.is_not(None), Entry.id > (transaction.scalar(last) or {}).get("line", 0))
 
 
 def _deliver_answers(journal: Catalog, server: Catalog) -> None:
     """Transfer the answers that were recorded without the server; they keep their time and their operator."""
     with journal.database.read() as reading:
-        ids = _waiting_answers(reading)
-        if not ids:
+        is_waiting = _is_waiting(reading)
+        waiting = set(reading.scalars(select(Entry.id).where(is_waiting)))
+        if not waiting:
             return
-        state.check_lines(reading, ids)
-        entries = reading.scalars(select(Entry).where(Entry.result.is_not(None)).order_by(Entry.id)).all()
+        with_corrections = Entry.result.in_(select(Entry.result).where(is_waiting))
+        entries = reading.scalars(select(Entry).where(with_corrections).order_by(Entry.id)).all()
+        state.check_lines(reading, [one.id for one in entries])
         reading.expunge_all()
-    for entry in entries:
-        image = (entry.record or {}).get("image")
-        if image is not None and entry.id >= ids[0]:
-            with suppress(CatalogError):  # it is lost; rig catalog verify says so at the server
-                content = journal.database.images.content(image)
-                with server.database.catalog_errors():
-                    server.database.images.put(content)
+    for image in {(one.record or {}).get("image") for one in entries if one.id in waiting} - {None}:
+        try:
+            content = journal.database.images.content(str(image))
+        except CatalogError:  # it is lost; rig catalog verify says so at the server
+            continue
+        with server.database.catalog_errors():
+            server.database.images.put(content)
+    times = [one.time_utc for one in entries]
     with server.database.write() as writing:
-        numbers: dict[int | None, int] = {}
+        same_time = Entry.time_utc.between(min(times) - _SAME_ANSWER, max(times) + _SAME_ANSWER)
+        lines = writing.execute(select(Entry.record, Entry.result).where(Entry.result.is_not(None), same_time))
+        known = {_key(record): number for record, number in lines}
+        last = writing.scalar(select(func.max(Entry.result))) or 0
+        numbers: dict[int | None, int] = {}  # of answers in the journal, and on the server
         for entry in entries:
-            known = _delivered_answer(writing, entry)
-            if known is None and entry.id >= ids[0]:
-                known = numbers.get(entry.result) or 1 + (writing.scalar(select(func.max(Entry.result))) or 0)
-                details = {**entry.details, "result": known}
-                log.add(writing, _same(entry, result=known, details=details))
-            if known is not None:
-                numbers[entry.result] = known
-    journal.note(Action.DELIVERED, line=ids[-1])
+            number = known.get(_key(entry.record)) or numbers.get(entry.result)
+            if number is None:
+                number = last = last + 1
+            numbers[entry.result] = number
+            if _key(entry.record) not in known:
+                log.add(writing, _same(entry, result=number, details={**entry.details, "result": number}))
+    journal.note(Action.DELIVERED, line=max(waiting))
 
 
-def _delivered_answer(transaction: Transaction, entry: Entry) -> int | None:
-    """Return the number under which a catalog has an answer of another one; None if it does not have it."""
-    same_time = select(Entry).where(Entry.time_utc == entry.time_utc, Entry.action == entry.action)
-    key = (entry.record or {}).get("key")
-    return next((one.result for one in transaction.scalars(same_time) if (one.record or {}).get("key") == key), None)
+def _key(record: JsonObject | None) -> object:
+    return (record or {}).get("key")
 
 
 def _same(entry: Entry, **others: Any) -> Entry:
@@ -552,15 +556,19 @@ def _copy_derived(reading: Transaction, writing: Transaction) -> None:
     columns = select(Derived.seal, Derived.what, Derived.made_by, Derived.sha256)
     there = {tuple(row) for row in reading.execute(columns) if row.seal in used}
     here = {tuple(row) for row in writing.execute(columns)}
-    for part in portions(sorted({row[0] for row in there ^ here}), _AT_ONCE):
+    seals = sorted({str(row[0]) for row in there ^ here})
+    for start in range(0, len(seals), _AT_ONCE):
+        part = seals[start : start + _AT_ONCE]
         writing.execute(delete(Derived).where(Derived.seal.in_(part)))
         _copy_rows(reading, writing, Derived, Derived.seal.in_(used.intersection(part)))
 
 
 def _copy_rows(reading: Transaction, writing: Transaction, table: type[Row], wanted: ColumnElement[bool]) -> None:
-    rows = [dict(row) for row in reading.execute(select(table.__table__).where(wanted)).mappings()]
+    columns = table.__table__
+    assert isinstance(columns, Table)
+    rows = [dict(row) for row in reading.execute(select(columns).where(wanted)).mappings()]
     if rows:
-        writing.execute(insert(table.__table__), rows)
+        writing.execute(insert(columns), rows)
 
 
 # During other work

@@ -27,9 +27,9 @@ def object_names(ctx: typer.Context, incomplete: str) -> list[str]:
             return []
         with closing(sqlite3.connect(f"{path.as_uri()}?mode=ro", uri=True, timeout=0.2)) as database:
             rows = database.execute(
-                "SELECT object_name FROM log AS named WHERE deleted = 0 AND substr(object_name, 1, ?) = ? AND NOT EXISTS "
-                "(SELECT 1 FROM log WHERE object_id = named.object_id AND deleted IS NOT NULL AND id > named.id) "
-                "ORDER BY object_name",
+                "SELECT object_name FROM log AS named WHERE deleted = 0 AND substr(object_name, 1, ?) = ? "
+                "AND NOT EXISTS (SELECT 1 FROM log AS later WHERE later.object_id = named.object_id "
+                "AND later.deleted IS NOT NULL AND later.id > named.id) ORDER BY object_name",
                 (len(incomplete), incomplete),
             )
             return [str(name) for (name,) in rows]
