@@ -7,24 +7,27 @@ log and the results are compared here. The images are compared by `rig catalog v
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
+from functools import partial
 from pathlib import Path
 from typing import Final
 
-from sqlalchemy import Connection, Table, select
+from sqlalchemy import select
+from sqlalchemy.orm import Session as Transaction
 
+from rig.catalog import log, state
 from rig.catalog.catalog import Catalog
-from rig.catalog.columns import FIX
-from rig.catalog.schema import APPEND_ONLY, enrollments, objects
-from rig.catalog.seal import appended_digests, damage_of
+from rig.catalog.facts import Enrollment, Entry
+from rig.catalog.verify import missing_enrollments
 from rig.config.catalog_place import CatalogPlace
 from rig.core.clock import Clock, seconds_between
 from rig.core.errors import CatalogDamaged, RigError
+from rig.core.next_steps import Do
 
 SHARE: Final = 0.05
 """Largest share of a processor core, after the first `BURST_S` of work: small catalogs are compared at once."""
 BURST_S: Final = 0.1
-_ROWS: Final = 100
-"""Rows of a portion, so that the other threads of the program wait for milliseconds at most."""
+_LINES: Final = 100
+"""Lines of the log in a portion, so that the other threads of the program wait for milliseconds at most."""
 
 
 class BackgroundCheck(AbstractContextManager["BackgroundCheck"]):
@@ -55,10 +58,9 @@ class BackgroundCheck(AbstractContextManager["BackgroundCheck"]):
         spent_s = 0.0
         try:
             with Catalog.open(self._place, clock=self._clock, create=False, read_only=True) as catalog:
-                for damage in _portions(catalog):
-                    if damage is not None:
-                        self._report(damage)
-                        return
+                for check in _portions(catalog):
+                    with catalog.database.read() as transaction:
+                        check(transaction)
                     now_ns = self._clock.now_ns()
                     spent_s += seconds_between(begun_ns, now_ns)
                     if self._ended.wait((spent_s - BURST_S) / SHARE - seconds_between(start_ns, now_ns)):
@@ -70,33 +72,36 @@ class BackgroundCheck(AbstractContextManager["BackgroundCheck"]):
             pass  # the catalog was moved or is locked: the work itself reports it
 
 
-def _portions(catalog: Catalog) -> Iterator[CatalogDamaged | None]:
-    """Compare the digests in portions; yield the damage of each."""
-    database = catalog.database
-    with database.read() as connection:
-        object_ids = connection.scalars(select(objects.c.id)).all()
-        enrollment_ids = connection.scalars(select(enrollments.c.id)).all()
-    for start in range(0, len(object_ids), _ROWS):
-        with database.read() as connection:
-            damage = damage_of(connection, object_ids[start : start + _ROWS], ())
-        yield damage
-    for enrollment_id in enrollment_ids:
-        with database.read() as connection:
-            damage = damage_of(connection, (), [enrollment_id])
-        yield damage
-    for table in APPEND_ONLY:
-        after: int | None = 0
-        while after is not None:
-            with database.read() as connection:
-                damage, after = _appended(connection, table, after)
-            yield damage
+def _portions(catalog: Catalog) -> Iterator[Callable[[Transaction], None]]:
+    """Yield the checks of portions of the rows, which raise `CatalogDamaged`."""
+    with catalog.database.read() as transaction:
+        last, _ = log.head(transaction)
+        ids = transaction.scalars(select(Enrollment.id).order_by(Enrollment.id)).all()
+    for first in range(1, last + 1, _LINES):
+        yield partial(_check_lines, first, min(first + _LINES - 1, last))
+    yield partial(_check_lines, last + 1, None)  # the lines since then, and the end of the log
+    yield _check_missing
+    yield from (partial(_check_enrollment, number) for number in ids)
 
 
-def _appended(connection: Connection, table: Table, after: int) -> tuple[CatalogDamaged | None, int | None]:
-    """Compare rows of an append-only table; return the damage and the last id, None at the end of the table."""
-    rows = appended_digests(connection, table, after=after, limit=_ROWS)
-    for expected_id, (row_id, sealed, found) in enumerate(rows, after + 1):
-        if sealed != found or row_id != expected_id:
-            what = f"row {row_id} of {table.name} in the catalog is not the one that was written, or rows are missing"
-            return CatalogDamaged(what, next_step=FIX, evidence={"table": table.name, "row": row_id}), None
-    return None, rows[-1][0] if rows else None
+def _check_lines(first: int, last: int | None, transaction: Transaction) -> None:
+    wrong = next(log.wrong_lines(transaction, first, last), None)
+    if wrong is None:
+        return
+    line = transaction.execute(select(Entry.object_name).where(Entry.id == wrong, Entry.deleted.is_not(None))).scalar()
+    if line is not None:
+        raise state.changed([line])
+    raise CatalogDamaged(
+        f"Entry {wrong} of the log of the catalog is not the one that was written, or entries are missing.",
+        next_step=(Do.VERIFY_CATALOG(), "Then use a backup."),
+        evidence={"log_entry": wrong},
+    )
+
+
+def _check_enrollment(number: int, transaction: Transaction) -> None:
+    state.check(transaction, Enrollment.id == number)
+
+
+def _check_missing(transaction: Transaction) -> None:
+    if missing := missing_enrollments(transaction):
+        raise state.changed([str(one.object_name) for one in missing])

@@ -9,6 +9,8 @@ Decisions: docs/decisions/0042, docs/decisions/0053.
 
 import hashlib
 import json
+import re
+from collections import Counter
 from collections.abc import Callable, Collection, Generator, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -19,7 +21,7 @@ from typing import Any, Final, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from sqlalchemy import delete, insert, select
+from sqlalchemy import delete, func, insert, select
 from sqlalchemy.orm import Session as Transaction
 
 import hbr
@@ -55,6 +57,8 @@ SEGMENTATION_VERSION: Final = 1
 """Increases when the same images give other silhouettes."""
 FEWEST_VIEWS: Final = 4
 """A session with fewer views, after an interruption, learns its background from all views of the enrollment."""
+ROUNDED: Final = 0.02
+"""Largest share of a view's levels that another computer may have rounded to the neighbouring level."""
 
 Levels = NDArray[np.uint8]
 
@@ -68,7 +72,7 @@ class _Image(NamedTuple):
     azimuth_deg: float
 
 
-class _Task(NamedTuple):
+class Task(NamedTuple):
     """An enrollment to be described: by these descriptors, with the empty-table image of each session."""
 
     seal: str
@@ -393,13 +397,13 @@ def _regions(transaction: Transaction) -> _Regions:
     rows = transaction.execute(
         select(Entry.id, Entry.details).where(Entry.action == Action.REGION_CHOSEN).order_by(Entry.id.desc())
     )
-    return _Regions(tuple((line, tuple(d["region"]) if d.get("region") else None) for line, d in rows))  # type: ignore[misc]
+    return _Regions(tuple((line, tuple(d["region"]) if d.get("region") else None) for line, d in rows))
 
 
 # Describe
 
 
-def _missing(catalog: Catalog, name: str, found: dict[str, bytes]) -> tuple[list[state.Used], list[_Task]]:
+def _missing(catalog: Catalog, name: str, found: dict[str, bytes]) -> tuple[list[state.Used], list[Task]]:
     """Return the enrollments in use, and those to be described; put the stored levels of the others into ``found``."""
     kinds = (name,) if descriptor(name).whole_image else (name, SEGMENTATION)
     with catalog.database.read() as transaction:
@@ -421,19 +425,19 @@ def _missing(catalog: Catalog, name: str, found: dict[str, bytes]) -> tuple[list
 
 def _task(
     enrollment: Enrollment, seal: str, name: str, names: tuple[str, ...], region: tuple[Region | None] | None
-) -> _Task:
+) -> Task:
     views = tuple(
         _Image(view.image, view.session, view.region if region is None else region[0], view.azimuth_deg)
         for view in enrollment.views
     )
-    return _Task(seal, name, names, region, views, tuple(session.empty_table for session in enrollment.sessions))
+    return Task(seal, name, names, region, views, tuple(session.empty_table for session in enrollment.sessions))
 
 
 def _described_now(
-    catalog: Catalog, tasks: Sequence[_Task], jobs: Jobs | None
-) -> Generator[JobProgress, None, list[tuple[_Task, Described | str]]]:
+    catalog: Catalog, tasks: Sequence[Task], jobs: Jobs | None
+) -> Generator[JobProgress, None, list[tuple[Task, Described | str]]]:
     """Describe enrollments in processes and store the results; a text is the reason why one cannot be described."""
-    done: list[tuple[_Task, Described | str]] = []
+    done: list[tuple[Task, Described | str]] = []
     if tasks:
         yield JobProgress(0, len(tasks))
     work = partial(_describe_task, catalog.database.images)
@@ -446,7 +450,7 @@ def _described_now(
     return done
 
 
-def _describe_task(images: Images, task: _Task) -> Described | str:
+def _describe_task(images: Images, task: Task) -> Described | str:
     """Describe an enrollment in a worker process; a text says why it cannot be described."""
     try:
         return _describe(images.pixels, task)
@@ -454,7 +458,7 @@ def _describe_task(images: Images, task: _Task) -> Described | str:
         return error.what.rstrip(".")
 
 
-def _describe(pixels: _Pixels, task: _Task, *, threads: int = 1) -> Described:
+def _describe(pixels: _Pixels, task: Task, *, threads: int = 1) -> Described:
     """Segment the views of an enrollment together and describe them.
 
     Raises
@@ -514,14 +518,14 @@ def _describe(pixels: _Pixels, task: _Task, *, threads: int = 1) -> Described:
     return Described({name: np.stack(rows) for name, rows in levels.items()}, tuple(evidence))
 
 
-def _group(task: _Task, place: int) -> tuple[int, str]:
+def _group(task: Task, place: int) -> tuple[int, str]:
     return task.views[place].session, repr(task.views[place].region)
 
 
 class _reasons:  # noqa: N801 - used as a function
     """Raise errors about a view as a `CatalogError` that names it."""
 
-    def __init__(self, task: _Task, place: int) -> None:
+    def __init__(self, task: Task, place: int) -> None:
         self._task, self._place = task, place
 
     def __enter__(self) -> None:
@@ -568,7 +572,7 @@ def row_of(seal: str, what: str, region: tuple[Region | None] | None, content: b
     return {"seal": seal, "what": what, "made_by": _made_by(what, region), "content": content, "sha256": sha256}
 
 
-def _content(task: _Task, found: Described) -> dict[str, bytes]:
+def _content(task: Task, found: Described) -> dict[str, bytes]:
     """Return the contents of a description by their kind."""
     contents = {}
     for name, levels in found.levels.items():
@@ -580,7 +584,7 @@ def _content(task: _Task, found: Described) -> dict[str, bytes]:
     return contents
 
 
-def _store(catalog: Catalog, done: Sequence[tuple[_Task, Described]]) -> None:
+def _store(catalog: Catalog, done: Sequence[tuple[Task, Described]]) -> None:
     """Store descriptions. A catalog that cannot be written keeps none: they are computed again."""
     rows = [
         row_of(task.seal, what, task.region, content)
@@ -631,3 +635,78 @@ def _evidence(content: bytes) -> tuple[dict[str, Any], ...]:
     for one in found:
         check_evidence(one)
     return found
+
+
+def counts(transaction: Transaction) -> list[tuple[str, int, int, bool]]:
+    """Return name, version and number of views of each stored descriptor, and whether this program uses the version."""
+    rows = transaction.execute(
+        select(Derived.what, Derived.made_by, func.sum(func.length(Derived.content)))
+        .where(Derived.what.in_(names()))
+        .group_by(Derived.what, Derived.made_by)
+    )
+    found: Counter[tuple[str, int]] = Counter()
+    for what, made_by, size in rows:
+        if version := re.match(r"\S+ (\d+)\b", made_by):
+            found[what, int(version[1])] += size // _record(descriptor(what)).itemsize
+    return [
+        (name, version, views, version == descriptor(name).version) for (name, version), views in sorted(found.items())
+    ]
+
+
+# Compare what is stored with the images
+
+
+def to_compare(
+    transaction: Transaction, enrollment: Enrollment, name: str
+) -> tuple[tuple[str, ...], tuple[str, ...], Task | None]:
+    """Return the digests of what is stored for an enrollment, the damaged kinds, and the task that computes the others.
+
+    The task is None if this program would use nothing of it.
+    """
+    seal = seal_of(enrollment)
+    region = _regions(transaction).of(transaction, enrollment.id)
+    stored, damaged, used = [], [], []
+    rows = select(Derived.what, Derived.made_by, Derived.content, Derived.sha256).where(Derived.seal == seal)
+    for what, made_by, content, sha256 in transaction.execute(rows.order_by(Derived.what)):
+        stored.append(f"{what} {made_by} {sha256}")
+        if hashlib.sha256(content).hexdigest() != sha256:
+            damaged.append(what)
+        elif what in (SEGMENTATION, *names()) and made_by == _made_by(what, region):
+            used.append(what)
+    kinds = tuple(what for what in used if what != SEGMENTATION)
+    if SEGMENTATION in used and all(descriptor(what).whole_image for what in kinds):
+        kinds = (*kinds, BENCH_DESCRIPTOR)
+    return tuple(stored), tuple(damaged), _task(enrollment, seal, name, kinds, region) if used else None
+
+
+def contents(pixels: _Pixels, task: Task) -> dict[str, bytes]:
+    """Compute what a task would store, by kind; errors as `described`."""
+    return _content(task, _describe(pixels, task))
+
+
+def differing(transaction: Transaction, task: Task, found: Mapping[str, bytes]) -> list[str]:
+    """Return the kinds of stored contents that are not those that were ``found`` for the same task."""
+    stored = _stored(transaction, [task.seal], found, task.region)
+    return [
+        what for what in found if task.seal in stored[what] and not _near(what, stored[what][task.seal], found[what])
+    ]
+
+
+def _near(what: str, stored: bytes, found: bytes) -> bool:
+    """Return whether two contents are equal, or differ as if another computer had rounded the other way."""
+    if stored == found:
+        return True
+    if what == SEGMENTATION:
+        try:
+            ours, theirs = ([(one.get("method"), one.get("box_px")) for one in json.loads(t)] for t in (found, stored))
+        except (ValueError, TypeError, AttributeError):  # this program has not written it
+            return False
+        return ours == theirs
+    kind = descriptor(what)
+    if kind.whole_image or len(stored) != len(found):
+        return False
+    one, other = (_records(kind, content) for content in (found, stored))
+    levels = [kind.unpack_rows(records["packed"].tobytes()).astype(np.int16) for records in (one, other)]
+    off = np.abs(levels[0] - levels[1])
+    same_places = bool((one["azimuth_deg"] == other["azimuth_deg"]).all())
+    return same_places and int(off.max()) <= 1 and float((off > 0).mean(axis=1).max()) <= ROUNDED

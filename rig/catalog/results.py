@@ -17,12 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 from sqlalchemy import ColumnElement, and_, func, or_, select
 from sqlalchemy.orm import Session as Transaction
-from sqlalchemy.orm import aliased
 
-from rig.catalog import log, state
+from rig.catalog import digests, log, state
 from rig.catalog.catalog import Catalog
 from rig.catalog.columns import ImageName, damaged
-from rig.catalog.facts import Action, Entry, digest_of
+from rig.catalog.facts import Action, Entry
 from rig.catalog.images import path_of
 from rig.catalog.records import JsonObject, Outcome, Provenance, as_json
 from rig.core.errors import CatalogDamaged, CatalogError, UsageError
@@ -358,24 +357,19 @@ def _find(transaction: Transaction, result_id: int) -> Result:
 
 def _load(transaction: Transaction, wanted: ColumnElement[bool]) -> list[Result]:
     """Return the answers among these lines of the log, with the corrections among them."""
-    before = aliased(Entry)
-    rows = transaction.execute(
-        select(Entry, before.digest).outerjoin(before, before.id == Entry.id - 1).where(wanted).order_by(Entry.id)
-    )
-    answers: list[Entry] = []
+    lines = transaction.scalars(select(Entry).where(wanted).order_by(Entry.id)).all()
+    if wrong := digests.wrong_lines(transaction, [line.id for line in lines]):
+        numbers = [line.result for line in lines if line.id in wrong]
+        raise CatalogDamaged(
+            f"Result {numbers[0]} in the catalog changed after it was recorded.",
+            next_step=(Do.VERIFY_CATALOG(), "Then use a backup."),
+            evidence={"results": numbers[:20]},
+        )
     corrections: dict[int | None, list[Correction]] = defaultdict(list)
-    for entry, digest in rows:
-        if entry.digest != digest_of(entry, digest or ""):
-            raise CatalogDamaged(
-                f"Result {entry.result} in the catalog changed after it was recorded.",
-                next_step=(Do.VERIFY_CATALOG(), "Then use a backup."),
-                evidence={"result": entry.result, "log_entry": entry.id},
-            )
-        if entry.action == Action.RESULT_CORRECTED:
-            corrections[entry.result].append(_correction(entry))
-        else:
-            answers.append(entry)
-    return [_result(entry, corrections[entry.result]) for entry in answers]
+    for line in lines:
+        if line.action == Action.RESULT_CORRECTED:
+            corrections[line.result].append(_correction(line))
+    return [_result(line, corrections[line.result]) for line in lines if line.action == Action.IDENTIFIED]
 
 
 def _correction(entry: Entry) -> Correction:

@@ -3,21 +3,26 @@
 Decision: docs/decisions/0016.
 """
 
-from collections.abc import Sequence
-from contextlib import suppress
+from collections import Counter
+from collections.abc import Collection
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
-from sqlalchemy import Connection, and_, case, delete, func, or_, select
+from sqlalchemy import Select, delete, func, null, or_, select, true, union_all
+from sqlalchemy.orm import Session as Transaction
 
-from hbr.descriptors import descriptor, names
-from rig.catalog import audit, staging
+from rig.catalog import derived, log, state
 from rig.catalog.catalog import Catalog
-from rig.catalog.places import files_within
+from rig.catalog.digests import portions
+from rig.catalog.facts import SCHEMA_VERSION, Action, Derived, Enrollment, Entry, Session, View
 from rig.catalog.records import EnrollmentStatus
-from rig.catalog.schema import SCHEMA_VERSION, descriptors, enrollments, objects, results, sessions, views
-from rig.catalog.seal import changing_enrollments
+from rig.catalog.state import Ended, Named
+
+COLLECTED: Final = "enrollments"
+"""Key of the record of a line `Action.GARBAGE_COLLECTED`: the ids of the removed enrollments."""
+
+YOUNG_S: Final = 86_400
+"""An image that no row names is kept for this time: another process may be about to name it."""
 
 _OLD: Final = (EnrollmentStatus.SUPERSEDED, EnrollmentStatus.ABANDONED)
 
@@ -70,82 +75,59 @@ class GarbageReport:
 
 def statistics(catalog: Catalog) -> Statistics:
     """Return the statistics of a catalog."""
-    known = {name: descriptor(name).version for name in names()}
-    with catalog.database.read() as connection:
-        # Count objects, enrollments and views.
-        total, in_use = connection.execute(
-            select(func.count(), func.count(case((objects.c.deleted_utc.is_(None), 1)))).select_from(objects)
-        ).one()
-        sizes = {
-            (status, deleted): (count, view_count, size or 0)
-            for status, deleted, count, view_count, size in connection.execute(
-                select(
-                    enrollments.c.status,
-                    objects.c.deleted_utc.is_not(None).label("deleted"),
-                    func.count(enrollments.c.id.distinct()),
-                    func.count(views.c.id),
-                    func.sum(views.c.image_bytes),
-                )
-                .join(objects)
-                .outerjoin(views, views.c.enrollment_id == enrollments.c.id)
-                .group_by(enrollments.c.status, "deleted")
-            )
-        }
-        # Group objects by label, and views by bench and by descriptor.
-        labels = connection.execute(
-            select(objects.c.label, func.count())
-            .where(objects.c.deleted_utc.is_(None))
-            .group_by(objects.c.label)
-            .order_by(objects.c.label)
+    bench, image = Session.__table__.c.bench, Entry.record["image_bytes"].as_integer()
+    with catalog.database.read() as transaction:
+        # Count enrollments and views by their status.
+        counted = (func.count(Enrollment.id.distinct()), func.count(View.id), func.sum(View.image_bytes))
+        sizes = transaction.execute(
+            _states(Ended.status, Named.deleted, *counted)
+            .outerjoin(View, View.enrollment_id == Enrollment.id)
+            .group_by(Ended.status, Named.deleted)
         ).all()
-        benches = connection.execute(
-            select(sessions.c.bench, func.count(views.c.id))
-            .join(views, views.c.session_id == sessions.c.id)
-            .group_by(sessions.c.bench)
-            .order_by(sessions.c.bench)
-        ).all()
-        described = connection.execute(
-            select(descriptors.c.name, descriptors.c.version, func.count())
-            .group_by(descriptors.c.name, descriptors.c.version)
-            .order_by(descriptors.c.name, descriptors.c.version)
-        ).all()
-        # Count log entries and results.
-        entries = len(audit.entries(connection))
-        database_bytes = catalog.database.size_bytes(connection)
-        stored = select(func.count(), func.sum(results.c.image_bytes)).select_from(results)
-        recorded, recorded_bytes = connection.execute(stored).one()
-    counts: dict[str, int] = {}
-    for (status, _), (count, _, _) in sizes.items():
-        counts[status] = counts.get(status, 0) + count
-    return Statistics(
-        schema_version=SCHEMA_VERSION,
-        objects=in_use,
-        deleted_objects=total - in_use,
-        enrollments=counts,
-        views=sum(view_count for _, view_count, _ in sizes.values()),
-        image_bytes=sum(size for _, _, size in sizes.values()),
-        database_bytes=database_bytes,
-        free_disk_bytes=catalog.database.images.free_bytes(),
-        labels=dict(labels),
-        benches=dict(benches),
-        descriptors=tuple(
-            DescriptorStatistics(name, version, count, known.get(name) == version) for name, version, count in described
-        ),
-        log_entries=entries,
-        results=recorded,
-        result_image_bytes=recorded_bytes or 0,
-        deleted_image_bytes=sum(size for (_, deleted), (_, _, size) in sizes.items() if deleted),
-        old_image_bytes=sum(
-            size for (status, deleted), (_, _, size) in sizes.items() if not deleted and status in _OLD
-        ),
-    )
+        deleted = _states(func.count(Enrollment.object_id.distinct())).where(Named.deleted == true())
+        # Group objects by label, and views by bench.
+        labels = transaction.execute(
+            select(Named.label, func.count()).where(state.IN_USE).group_by(Named.label).order_by(Named.label)
+        )
+        by_label = {label or "": count for label, count in labels}
+        benches = transaction.execute(
+            select(bench, func.count(View.id))
+            .join(View, (View.enrollment_id == Session.enrollment_id) & (View.session == Session.number))
+            .group_by(bench)
+            .order_by(bench)
+        )
+        answers = select(func.count(), func.sum(image)).where(Entry.action == Action.IDENTIFIED)
+        recorded, recorded_bytes = transaction.execute(answers).one()
+        enrollments = Counter[str]()
+        for status, _, count, _, _ in sizes:
+            enrollments[str(status)] += count
+        return Statistics(
+            schema_version=SCHEMA_VERSION,
+            objects=sum(by_label.values()),
+            deleted_objects=transaction.scalar(deleted) or 0,
+            enrollments=dict(enrollments),
+            views=sum(count for *_, count, _ in sizes),
+            image_bytes=sum(size or 0 for *_, size in sizes),
+            database_bytes=catalog.database.size_bytes(transaction),
+            free_disk_bytes=catalog.database.images.free_bytes(),
+            labels=by_label,
+            benches=dict(benches.tuples().all()),
+            descriptors=tuple(DescriptorStatistics(*one) for one in derived.counts(transaction)),
+            log_entries=log.head(transaction)[0],
+            results=recorded,
+            result_image_bytes=recorded_bytes or 0,
+            deleted_image_bytes=sum(size or 0 for _, is_deleted, *_, size in sizes if is_deleted),
+            old_image_bytes=sum(
+                size or 0 for status, is_deleted, *_, size in sizes if not is_deleted and status in _OLD
+            ),
+        )
 
 
 def collect_garbage(catalog: Catalog, *, old: bool = False, dry_run: bool = False) -> GarbageReport:
-    """Remove deleted objects, files that `verify` moved away, and files of interrupted imports.
+    """Remove deleted objects, and images that no row names any more.
 
-    The rows are removed first, in one transaction. A crash after that leaves files without rows, which `verify` finds.
-    Levels by earlier versions of a descriptor are removed if the view has the present version.
+    The rows are removed first, in one transaction. After a crash the next call removes the images. An image that never
+    had a row, for example after a crash or by an interrupted import, is kept for `YOUNG_S`.
 
     Parameters
     ----------
@@ -159,83 +141,66 @@ def collect_garbage(catalog: Catalog, *, old: bool = False, dry_run: bool = Fals
     CatalogError, CatalogBusy
         The catalog cannot be written.
     """
-    transaction = catalog.database.read if dry_run else catalog.database.write
-    with transaction() as connection:
-        unused = connection.execute(
-            select(enrollments.c.id, objects.c.name, objects.c.deleted_utc)
-            .join(objects)
-            .where(or_(objects.c.deleted_utc.is_not(None), enrollments.c.status.in_(_OLD if old else ())))
-        ).all()
-        ids = [row.id for row in unused]
-        files = _files_of(connection, ids)
-        for name in files:
-            catalog.database.images.check(name)
-        view_count = connection.scalar(select(func.count()).where(views.c.enrollment_id.in_(ids))) or 0
-        deleted = tuple(
-            connection.scalars(select(objects.c.name).where(objects.c.deleted_utc.is_not(None)).order_by(objects.c.id))
-        )
-        if not dry_run:
-            _delete_rows(connection, ids)
     store = catalog.database.images
-    with catalog.database.catalog_errors():
-        files += sorted(store.lost())
-        staged = [path for folder in staging.abandoned(catalog.path) for path in files_within(folder)]
-        size = sum(map(store.size, files)) + sum(path.lstat().st_size for path in staged)
-    count = len(files) + len(staged)
-    collected = GarbageReport(deleted, len(ids), view_count, count, size)
+    unused = or_(Named.deleted == true(), Ended.status.in_(_OLD if old else ()))
+    rows = _states(Enrollment.id, Enrollment.object_id, Named.object_name, Named.deleted).where(unused)
+    with catalog.database.read() if dry_run else catalog.database.write() as transaction:
+        # The files are listed before the rows: an image whose row is committed in the meantime is named.
+        lost = store.names(before_s=catalog.clock.utc().timestamp() - YOUNG_S)
+        found = transaction.execute(rows.order_by(Enrollment.object_id)).all()
+        ids = {row.id for row in found}
+        deleted = tuple({row.object_id: str(row.object_name) for row in found if row.deleted}.values())
+        images = transaction.execute(_NAMED_IMAGES).all()
+        named = {row.image for row in images if row.enrollment_id not in ids}
+        lost |= {row.image for row in images if row.enrollment_id in ids}
+        sizes = {name: size for name in sorted(lost - named) if (size := store.size(name))}
+        views = sum(row.view_id is not None for row in images if row.enrollment_id in ids)
+        collected = GarbageReport(deleted, len(ids), views, len(sizes), sum(sizes.values()))
+        if not dry_run:
+            _remove_rows(transaction, ids)
+            if ids or sizes:
+                log.append(
+                    transaction,
+                    catalog.clock,
+                    Action.GARBAGE_COLLECTED,
+                    details={
+                        "objects": list(deleted),
+                        "enrollments": len(ids),
+                        "views": views,
+                        "freed_bytes": collected.bytes,
+                    },
+                    record={COLLECTED: sorted(ids)},
+                )
     if not dry_run:
         with catalog.database.catalog_errors():
-            store.remove(files)
-            _remove(catalog.path, staged)
-        if ids or deleted or count:
-            catalog.note(
-                audit.Action.GARBAGE_COLLECTED,
-                objects=list(deleted),
-                enrollments=len(ids),
-                views=view_count,
-                freed_bytes=size,
-            )
+            store.remove(sizes)
     return collected
 
 
-def _files_of(connection: Connection, ids: Sequence[int]) -> list[str]:
-    return [
-        *connection.scalars(select(views.c.image).where(views.c.enrollment_id.in_(ids))),
-        *connection.scalars(
-            select(sessions.c.empty_table_image).where(
-                sessions.c.enrollment_id.in_(ids), sessions.c.empty_table_image.is_not(None)
-            )
-        ),
-    ]
+_NAMED_IMAGES: Final = union_all(
+    select(View.enrollment_id, View.id.label("view_id"), View.image),
+    select(Session.enrollment_id, null(), Session.empty_table).where(Session.empty_table.is_not(None)),
+    select(null(), null(), Entry.record["image"].as_string()).where(Entry.action == Action.IDENTIFIED),
+)
+"""Every image that a row names, with its enrollment and view."""
 
 
-def _delete_rows(connection: Connection, ids: Sequence[int]) -> None:
-    their_views = select(views.c.id).where(views.c.enrollment_id.in_(ids))
-    connection.execute(delete(descriptors).where(descriptors.c.view_id.in_(their_views)))
-    connection.execute(delete(views).where(views.c.enrollment_id.in_(ids)))
-    connection.execute(delete(sessions).where(sessions.c.enrollment_id.in_(ids)))
-    connection.execute(delete(enrollments).where(enrollments.c.id.in_(ids)))
-    connection.execute(delete(objects).where(objects.c.deleted_utc.is_not(None)))
-    later = descriptors.alias()
-    for name in names():
-        version = descriptor(name).version
-        replaced = and_(
-            descriptors.c.name == name,
-            descriptors.c.version < version,
-            select(later.c.view_id)
-            .where(and_(later.c.view_id == descriptors.c.view_id, later.c.name == name, later.c.version == version))
-            .exists(),
-        )
-        owners = connection.scalars(select(views.c.enrollment_id).join(descriptors).where(replaced).distinct())
-        with changing_enrollments(connection, owners):
-            connection.execute(delete(descriptors).where(replaced))
+def _remove_rows(transaction: Transaction, ids: Collection[int]) -> None:
+    """Remove enrollments, and what was computed from enrollments that are no longer there."""
+    for part in portions(sorted(ids), 500):
+        for table in (View, Session):
+            transaction.execute(delete(table).where(table.enrollment_id.in_(part)))
+        transaction.execute(delete(Enrollment).where(Enrollment.id.in_(part)))
+    present = select(Entry.seal).join(Enrollment, Enrollment.id == Entry.enrollment_id)
+    transaction.execute(delete(Derived).where(Derived.seal.not_in(present.where(Entry.seal.is_not(None)))))
 
 
-def _remove(root: Path, paths: Sequence[Path]) -> None:
-    folders: set[Path] = set()
-    for path in paths:
-        path.unlink(missing_ok=True)
-        folders.update(parent for parent in path.parents if parent != root and parent.is_relative_to(root))
-    for folder in sorted(folders, key=lambda path: len(path.parts), reverse=True):
-        with suppress(OSError):  # it is not empty
-            folder.rmdir()
+def _states(*columns: Any) -> Select[Any]:
+    """Return a query of enrollments with their status, and the state of their objects."""
+    return (
+        select(*columns)
+        .select_from(Enrollment)
+        .join(Ended, Ended.enrollment_id == Enrollment.id)
+        .join(Named, Named.object_id == Enrollment.object_id)
+        .where(state.IS_STATUS, state.IS_STATE)
+    )

@@ -1,36 +1,67 @@
-"""Check whether a catalog is as it was stored: rows, images and descriptors. Repair it on request."""
+"""Check whether a catalog is as it was stored: the log, the enrollments, the images, and what is computed from them."""
 
-import json
-from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from collections.abc import Generator, Iterator, Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
 from functools import partial
-from typing import Any
+from hashlib import sha256
+from typing import Any, Final, NamedTuple
 
-from sqlalchemy import Connection, Table, delete, func, select, update
+import numpy as np
+from numpy.typing import NDArray
+from sqlalchemy import and_, func, select
+from sqlalchemy.orm import Session as Transaction
 
-from rig.catalog import audit
+from rig.catalog import derived, digests, log, state
 from rig.catalog.catalog import Catalog
-from rig.catalog.jobs import JobProgress, portions, processes
-from rig.catalog.schema import audit as audit_log
-from rig.catalog.schema import corrections, descriptors, enrollments, objects, results, sessions, views
-from rig.catalog.seal import appended_digests, changing_enrollments, enrollment_digests, object_digests
+from rig.catalog.enrolling import MOST_HELD_BYTES
+from rig.catalog.facts import Action, Enrollment, Entry, Session, View
+from rig.catalog.images import Images, path_of
+from rig.catalog.jobs import PORTION, JobProgress, processes
 from rig.catalog.unfinished import UnfinishedJob
-from rig.catalog.verify_images import (
-    Checked,
-    Described,
-    Finding,
-    Item,
-    Problem,
-    Repair,
-    check_key,
-    check_portion,
-    stored_images,
-    with_descriptions,
-)
-from rig.core.errors import CatalogDamaged
+from rig.catalog.upkeep import COLLECTED
+from rig.core.errors import CatalogDamaged, CatalogError
 from rig.core.processes import Jobs, map_in_processes
-from rig.views import image_files as images
+from rig.views import image_files as files
+
+_AT_ONCE: Final = 20
+"""Enrollments whose rows are read at once."""
+
+
+class Problem(StrEnum):
+    """Kind of a problem, with the keys of `Finding.details`."""
+
+    DAMAGED_DATABASE = "database damaged"
+    """``message`` of the database, or of the program that cannot read a row."""
+    LOG_CHANGED = "log changed"
+    """Entry ``entry_id`` of the log is not the one that was written, or entries before it are missing."""
+    ENROLLMENT_CHANGED = "enrollment changed"
+    """A value or a view of ``enrollment_id`` is not the stored one, or the log does not know the enrollment."""
+    MISSING_ENROLLMENT = "enrollment missing"
+    """``enrollment_id`` is in the log, and was not removed by this program."""
+    MISSING_IMAGE = "image missing"
+    """``reason`` of the system."""
+    CHANGED_IMAGE = "image changed"
+    """``bytes`` found and ``stored_bytes``."""
+    UNREADABLE_IMAGE = "image unreadable"
+    """``reason`` of the decoder."""
+    SIZES_DIFFER = "sizes differ"
+    """``size_px`` of the image and of the first view of its enrollment, ``first_size_px``."""
+    DESCRIPTION_DAMAGED = "description damaged"
+    """The stored ``descriptor`` is not used, because its digest is wrong."""
+    DESCRIPTION_DIFFERS = "description differs"
+    """The stored ``descriptor`` is not that of the images."""
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """A problem of a catalog, the object and the file that it concerns, and its evidence."""
+
+    problem: Problem
+    object_name: str | None = None
+    view_id: int | None = None
+    path: str | None = None
+    details: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,290 +74,217 @@ class Verification:
     image_bytes: int
     findings: tuple[Finding, ...]
 
-    @property
-    def unrepaired(self) -> tuple[Finding, ...]:
-        return tuple(finding for finding in self.findings if finding.repair is None)
+
+class _Image(NamedTuple):
+    """An image that must exist; the empty-table image of a session and the image of a result belong to no view."""
+
+    name: str
+    stored_bytes: int
+    view_id: int | None = None
 
 
-@dataclass
-class _State:
-    catalog: Catalog
-    repair: bool
+class _Group(NamedTuple):
+    """What is checked at once: the images of an enrollment with its descriptions, or the images of some results.
+
+    ``stored`` are the digests of the stored descriptions; those that are ``damaged`` are not compared, and ``task``
+    computes the others again.
+    """
+
+    object_name: str | None
+    images: tuple[_Image, ...]
+    stored: tuple[str, ...] = ()
+    damaged: tuple[str, ...] = ()
+    task: derived.Task | None = None
+    number: int = 0
+
+    def finding(self, problem: Problem, image: _Image | None = None, **details: Any) -> Finding:
+        view_id, path = (None, None) if image is None else (image.view_id, path_of(image.name))
+        return Finding(problem, self.object_name, view_id, path, details)
+
+    def key(self, quick: bool) -> str:
+        """Return a digest of everything that the check of this group depends on."""
+        return sha256(ascii((quick, *self[:-1])).encode()).hexdigest()
+
+
+@dataclass(eq=False)
+class _Rows:
+    """What the check of the rows found, and what is to be checked further: the intact enrollments and answers."""
+
     findings: list[Finding] = field(default_factory=list)
-    copies: dict[str, str] = field(default_factory=dict)
-    """The name of a file for each SHA-256."""
+    objects: int = 0
+    views: int = 0
     results: int = 0
+    images: int = 0
+    owners: dict[int, str | None] = field(default_factory=dict)
+    """The name of the object of each intact enrollment, by id."""
+    answers: list[int] = field(default_factory=list)
+    """The intact lines of the log with answers."""
 
 
 def verify(
-    catalog: Catalog,
-    *,
-    repair: bool = False,
-    quick: bool = False,
-    jobs: Jobs | None = None,
-    unfinished: UnfinishedJob | None = None,
+    catalog: Catalog, *, quick: bool = False, jobs: Jobs | None = None, unfinished: UnfinishedJob | None = None
 ) -> Generator[JobProgress, None, Verification]:
-    """Check every row, image and descriptor.
+    """Check every row and every image, and describe the images again; change nothing.
 
     Parameters
     ----------
-    repair
-        Repair what can be repaired, without deleting anything: restore an image whose content is found under another
-        name, compute descriptors from intact images, record orphaned rows in the audit log, and move orphaned files to
-        ``lost+found``.
     quick
-        Compare the hashes of the files only; do not describe the images again.
+        Compare digests only: do not decode the images, and do not describe them.
     jobs
         Number of processes, or a cluster; None for one process per core.
     unfinished
-        Stores which images were right. Images that it has stored are not checked again, unless their records in the
-        catalog have changed.
+        Stores what was right. It is not checked again, unless its rows in the catalog have changed.
 
     Raises
     ------
     CatalogError, CatalogBusy
-        The catalog cannot be read, or cannot be written for a repair.
+        The catalog cannot be read.
     """
-    state = _State(catalog, repair)
-    # The files are listed before the rows: an image whose row is committed in the meantime is not an orphan.
-    with catalog.database.catalog_errors():
-        files = catalog.database.images.names()
-    items, object_count = stored_images(catalog)
-    for item in items:  # before anything is repaired
-        catalog.database.images.check(item.image)
-    if _check_rows(state):
-        items, object_count = stored_images(catalog)
+    rows, found = _Rows(), dict[int, list[Finding]]()
+    image_bytes = done = 0
 
-    yield JobProgress(0, len(items))
-    checked: dict[Item, Checked] = {}
-    work = partial(check_portion, catalog.database.images, quick)
-    remaining = with_descriptions(catalog, items)
-    if unfinished is not None and unfinished.found:
-        remaining = _without_known(remaining, unfinished, quick, checked)
-    for portion, found in map_in_processes(work, portions(remaining), processes(jobs, len(items))):
-        checked.update(zip((item for item, _ in portion), found, strict=True))
-        if unfinished is not None:
-            unfinished.store(_right(portion, found, quick))
-        yield JobProgress(len(checked), len(items))
-    checked = {item: checked[item] for item in items}  # in the order of the catalog, not of the processes
+    def unknown() -> Iterator[_Group]:
+        nonlocal image_bytes, done
+        for number, group in enumerate(_groups(catalog, rows, quick)):
+            image_bytes += sum(image.stored_bytes for image in group.images)
+            if unfinished is not None and group.key(quick) in unfinished.found:
+                done += len(group.images)
+            else:
+                yield group._replace(number=number)
 
-    with catalog.database.read() as connection:
-        orphans = sorted(files - _referenced(connection))
-    _find_copies(state, checked, orphans)
-    _report_images(state, checked)
-    _report_sizes(state, checked)
-    _report_descriptors(state, checked)
-    _report_orphans(state, orphans)
-    _report_digests(state)
-    if repair and state.findings:
-        repaired = [f"{one.problem}: {one.path}, {one.repair}" for one in state.findings if one.repair is not None]
-        catalog.note(audit.Action.REPAIRED, found=len(state.findings), repaired=repaired)
-    return Verification(
-        object_count,
-        sum(item.view_id is not None for item in items),
-        state.results,
-        sum(item.file_bytes for item in items),
-        tuple(state.findings),
-    )
+    try:
+        with catalog.database.read() as transaction:
+            _check_rows(catalog, transaction, rows)
+        yield JobProgress(0, rows.images)
+        work = partial(_check, catalog.database.images, quick)
+        for group, (problems, contents) in map_in_processes(work, unknown(), processes(jobs, rows.images)):
+            found[group.number] = [*problems, *_check_descriptions(catalog, group, contents)]
+            if unfinished is not None and not found[group.number]:
+                unfinished.store({group.key(quick): len(group.images)})
+            done += len(group.images)
+            yield JobProgress(done, rows.images)
+    except CatalogDamaged as damage:  # a row that cannot be read ends the check
+        rows.findings.append(Finding(Problem.DAMAGED_DATABASE, details={"message": damage.what}))
+    in_order = [finding for number in sorted(found) for finding in found[number]]
+    return Verification(rows.objects, rows.views, rows.results, image_bytes, (*rows.findings, *in_order))
 
 
-def _without_known(
-    items: Iterator[Described], unfinished: UnfinishedJob, quick: bool, checked: dict[Item, Checked]
-) -> Iterator[Described]:
-    """Yield the items that are not known to be right, and put the others into ``checked``."""
-    for item, stored in items:
-        match unfinished.found.get(check_key(item, stored, quick), ""):
-            case None if quick:
-                checked[item] = Checked(item.sha256, item.file_bytes)
-            case [int(width), int(height)]:
-                checked[item] = Checked(item.sha256, item.file_bytes, (width, height))
-            case _:
-                yield item, stored
+def missing_enrollments(transaction: Transaction) -> list[Finding]:
+    """Return the enrollments that are in the log and not in the catalog, although this program did not remove them."""
+    lines = transaction.execute(select(Entry.enrollment_id, Entry.object_name).where(Entry.status.is_not(None)))
+    names = {number: name for number, name in lines if number is not None}
+    removals = (Action.ENROLLMENT_DISCARDED, Action.GARBAGE_COLLECTED)
+    removed = set(transaction.scalars(select(Enrollment.id)))
+    for line in transaction.scalars(select(Entry).where(Entry.action.in_(removals))):
+        collected = (line.record or {}).get(COLLECTED)
+        removed |= {one for one in collected if isinstance(one, int)} if isinstance(collected, list) else set()
+        if line.enrollment_id is not None:
+            removed.add(line.enrollment_id)
+    return [
+        Finding(Problem.MISSING_ENROLLMENT, names[number], details={"enrollment_id": number})
+        for number in sorted(names.keys() - removed)
+    ]
 
 
-def _right(portion: Sequence[Described], found: Sequence[Checked], quick: bool) -> dict[str, Any]:
-    """Return the size of each image of a portion that is right, by its key."""
-    return {
-        check_key(item, stored, quick): one.size_px
-        for (item, stored), one in zip(portion, found, strict=True)
-        if one == Checked(item.sha256, item.file_bytes, one.size_px)
-    }
+def _check_rows(catalog: Catalog, transaction: Transaction, rows: _Rows) -> None:
+    """Check the structure of the database, the log, and the rows of the enrollments; write the result into ``rows``."""
+    # What there is. A damaged table may not be readable further down.
+    rows.findings += [
+        Finding(Problem.DAMAGED_DATABASE, details={"message": message})
+        for message in catalog.database.damage(transaction)
+    ]
+    rows.objects = transaction.scalar(select(func.count(Enrollment.object_id.distinct()))) or 0
+    rows.views = transaction.scalar(select(func.count(View.id))) or 0
+    rows.results = transaction.scalar(select(func.max(Entry.result))) or 0
+    # The log, from which everything else follows.
+    wrong = set(log.wrong_lines(transaction))
+    for number in sorted(wrong):
+        name = transaction.scalar(select(Entry.object_name).where(Entry.id == number))
+        rows.findings.append(Finding(Problem.LOG_CHANGED, name, details={"entry_id": number}))
+    answers = transaction.scalars(select(Entry.id).where(Entry.action == Action.IDENTIFIED).order_by(Entry.id))
+    rows.answers = [line for line in answers if line not in wrong]
+    # The enrollments.
+    rows.findings += missing_enrollments(transaction)
+    wanted = select(Enrollment.id, state.Named.object_name)
+    owners = wanted.outerjoin(state.Named, and_(state.Named.object_id == Enrollment.object_id, state.IS_STATE))
+    rows.owners = dict(transaction.execute(owners.order_by(Enrollment.id)).tuples().all())
+    ended = transaction.execute(select(state.Ended.enrollment_id, state.Ended.seal).where(state.IS_STATUS))
+    seals = {number: seal for number, seal in ended if number is not None}
+    changed = {*digests.damaged_enrollments(transaction, seals), *(rows.owners.keys() - seals.keys())}
+    for number in sorted(changed):
+        name = rows.owners.pop(number)
+        rows.findings.append(Finding(Problem.ENROLLMENT_CHANGED, name, details={"enrollment_id": number}))
+    tables = transaction.scalar(select(func.count(Session.empty_table))) or 0
+    rows.images = rows.views + tables + len(rows.answers)
 
 
-def _check_rows(state: _State) -> bool:
-    """Check the structure of the database, and return whether rows were removed."""
-    removed = False
-    with state.catalog.database.read() as connection:
-        messages = state.catalog.database.damage(connection)
-        orphans = bool(state.catalog.database.orphans(connection))
-    state.findings += [Finding(Problem.DAMAGED_DATABASE, details={"message": message}) for message in messages]
-    if not orphans:
-        return False
-    transaction = state.catalog.database.write if state.repair else state.catalog.database.read
-    with transaction() as connection:
-        connection.exec_driver_sql("PRAGMA defer_foreign_keys = ON")
-        # The deletion of an orphan may make other rows orphans.
-        while broken := state.catalog.database.orphans(connection):
-            for table, rowid, parent in broken:
-                row = _row(connection, table, rowid)
-                finding = Finding(Problem.ORPHANED_ROW, details={"table": table, "parent": parent, "row": row})
-                if state.repair:
-                    if row and "id" in row:
-                        connection.exec_driver_sql(f"DELETE FROM {table} WHERE rowid = ?", (rowid,))
-                    audit.append(connection, state.catalog.clock, audit.Action.ROW_REMOVED, table=table, row=row)
-                    finding = replace(finding, repair=Repair.REMOVED)
-                state.findings.append(finding)
-            if not state.repair:
-                return False
-            removed = True
-            if any(rowid is None for _, rowid, _ in broken):
-                connection.execute(delete(descriptors).where(descriptors.c.view_id.not_in(select(views.c.id))))
-    return removed
+def _groups(catalog: Catalog, rows: _Rows, quick: bool) -> Iterator[_Group]:
+    """Yield what is to be checked further. A large catalog is read in portions."""
+    for ids in digests.portions(list(rows.owners), _AT_ONCE):
+        with catalog.database.read() as transaction:
+            enrollments = [one.enrollment for one in state.enrollments(transaction, Enrollment.id.in_(ids))]
+            groups = [_group(transaction, one, rows.owners[one.id], quick) for one in enrollments[::-1]]
+        yield from groups
+    for lines in digests.portions(rows.answers, PORTION):
+        image = (Entry.record["image"].as_string(), Entry.record["image_bytes"].as_integer())
+        with catalog.database.read() as transaction:
+            found = transaction.execute(select(*image).where(Entry.id.in_(lines)).order_by(Entry.id)).all()
+        images = tuple(_Image(name, size) for name, size in found if name is not None)
+        yield _Group(None, images)
 
 
-def _row(connection: Connection, table: str, rowid: int | None) -> dict[str, Any]:
-    if rowid is None:
-        return {}
-    row = connection.exec_driver_sql(f"SELECT * FROM {table} WHERE rowid = ?", (rowid,)).first()
-    return json.loads(json.dumps(dict(row._mapping), default=str)) if row is not None else {}
+def _group(transaction: Transaction, enrollment: Enrollment, name: str | None, quick: bool) -> _Group:
+    images = [_Image(view.image, view.image_bytes, view.id) for view in enrollment.views]
+    images += [
+        _Image(session.empty_table, session.empty_table_bytes or 0)
+        for session in enrollment.sessions
+        if session.empty_table is not None
+    ]
+    stored, damaged, task = derived.to_compare(transaction, enrollment, name or "")
+    return _Group(name, tuple(images), stored, damaged, None if quick else task)
 
 
-def _referenced(connection: Connection) -> set[str]:
-    recorded = results.c.image.is_not(None)
-    return {
-        *connection.scalars(select(results.c.image).where(recorded)),
-        *connection.scalars(select(views.c.image)),
-        *connection.scalars(select(sessions.c.empty_table_image).where(sessions.c.empty_table_image.is_not(None))),
-    }
-
-
-def _find_copies(state: _State, checked: Mapping[Item, Checked], orphans: Iterable[str]) -> None:
-    """Look for the content of missing and changed images under other names."""
-    store = state.catalog.database.images
-    if all(found.sha256 == item.sha256 for item, found in checked.items()):
-        return
-    for item, found in checked.items():
-        if found.sha256 is not None:
-            state.copies.setdefault(found.sha256, item.image)
-    for name in [*orphans, *sorted(store.lost())]:
-        with suppress(OSError, CatalogDamaged):  # not a regular file, or a link
-            state.copies.setdefault(images.digest(store.read(name)), name)
-
-
-def _report_images(state: _State, checked: Mapping[Item, Checked]) -> None:
-    store = state.catalog.database.images
-    wrong = {item: found for item, found in checked.items() if found.sha256 != item.sha256}
-    copies = {item: state.copies[item.sha256] for item in wrong if item.sha256 in state.copies}
-    # Read all before writing any: two images may have been swapped.
-    contents = {item: store.read(name) for item, name in copies.items()} if state.repair else {}
-    for item, found in checked.items():
-        if item not in wrong:
-            if found.reason:
-                state.findings.append(item.finding(Problem.UNREADABLE_IMAGE, reason=found.reason))
+def _check(store: Images, quick: bool, group: _Group) -> tuple[list[Finding], dict[str, bytes]]:
+    """Check the images of a group; return also how its views are described now, if all images are right."""
+    findings, pixels = [], dict[str, NDArray[np.uint8]]()
+    first: tuple[int, int] | None = None
+    for image in group.images:
+        try:
+            content = store.read(image.name)
+        except (OSError, CatalogDamaged) as error:
+            reason = error.what if isinstance(error, CatalogDamaged) else error.strerror or str(error)
+            findings.append(group.finding(Problem.MISSING_IMAGE, image, reason=reason))
             continue
-        repair = None
-        if item in contents:
-            if found.sha256 is not None and found.sha256 not in {other.sha256 for other in wrong}:
-                store.set_aside(item.image)
-            store.write(item.image, contents[item])
-            repair = Repair.RESTORED
-        copy = copies.get(item)
-        if found.sha256 is None:
-            finding = item.finding(Problem.MISSING_IMAGE, repair, reason=found.reason, copy=copy)
-        else:
-            sizes = {"bytes": found.file_bytes, "stored_bytes": item.file_bytes}
-            finding = item.finding(Problem.CHANGED_IMAGE, repair, **sizes, copy=copy)
-        state.findings.append(finding)
-
-
-def _report_sizes(state: _State, checked: Mapping[Item, Checked]) -> None:
-    first: dict[int, tuple[int, int]] = {}
-    for item, found in checked.items():
-        if found.size_px is None:
+        if not image.name.startswith(files.digest(content)):
+            sizes = {"bytes": len(content), "stored_bytes": image.stored_bytes}
+            findings.append(group.finding(Problem.CHANGED_IMAGE, image, **sizes))
             continue
-        first_size = first.setdefault(item.enrollment_id, found.size_px)
-        if found.size_px != first_size:
-            finding = item.finding(Problem.SIZES_DIFFER, size_px=found.size_px, first_size_px=first_size)
-            state.findings.append(finding)
+        if quick:
+            continue
+        try:
+            decoded = files.decode(content)
+        except files.BadImage as error:
+            findings.append(group.finding(Problem.UNREADABLE_IMAGE, image, reason=str(error)))
+            continue
+        if group.task is not None and sum(one.nbytes for one in pixels.values()) <= MOST_HELD_BYTES:
+            pixels[image.name] = decoded
+        size = (decoded.shape[1], decoded.shape[0])
+        first = first or size
+        if size != first and group.object_name is not None:
+            findings.append(group.finding(Problem.SIZES_DIFFER, image, size_px=size, first_size_px=first))
+    if group.task is None or findings:
+        return findings, {}
+    try:
+        return [], derived.contents(lambda name: pixels[name] if name in pixels else store.pixels(name), group.task)
+    except CatalogError:  # these images cannot have been described so
+        return [group.finding(Problem.DESCRIPTION_DIFFERS, descriptor=name) for name in group.task.names], {}
 
 
-def _report_descriptors(state: _State, checked: Mapping[Item, Checked]) -> None:
-    for item, found in checked.items():
-        for name, version, packed in found.different:
-            repair = None
-            if state.repair and packed is not None:
-                transaction = state.catalog.database.write()
-                with transaction as connection, changing_enrollments(connection, [item.enrollment_id]):
-                    connection.execute(
-                        update(descriptors)
-                        .where(
-                            descriptors.c.view_id == item.view_id,
-                            descriptors.c.name == name,
-                            descriptors.c.version == version,
-                        )
-                        .values(packed=packed)
-                    )
-                repair = Repair.DESCRIBED
-            state.findings.append(item.finding(Problem.DESCRIPTOR_DIFFERS, repair, descriptor=name))
-        if item.view_id is not None and not found.is_described:
-            state.findings.append(item.finding(Problem.NOT_DESCRIBED))
-
-
-def _report_digests(state: _State) -> None:
-    """Compare the digests, after the repairs: a repaired row is again the one that was stored."""
-    report = state.findings.append
-    with state.catalog.database.read() as connection:
-        owners = dict(connection.execute(select(enrollments.c.id, objects.c.name).join(objects)).all())
-        names = dict(connection.execute(select(objects.c.id, objects.c.name)).all())
-        for object_id, sealed, found in object_digests(connection):
-            if sealed != found:
-                report(Finding(Problem.OBJECT_CHANGED, names.get(object_id)))
-        for enrollment_id, sealed, found in enrollment_digests(connection):
-            if sealed != found:
-                details = {"enrollment_id": enrollment_id}
-                report(Finding(Problem.ENROLLMENT_CHANGED, owners.get(enrollment_id), details=details))
-        given = state.catalog.database.last_ids(connection)
-        state.findings += [
-            Finding(Problem.LOG_CHANGED, details={"entry_id": entry_id})
-            for entry_id in _changed_rows(connection, audit_log, given)
-        ]
-        state.results = given.get(results.name, 0)
-        for table in (results, corrections):
-            state.findings += [
-                Finding(Problem.RESULT_CHANGED, details={"table": table.name, "entry_id": entry_id})
-                for entry_id in _changed_rows(connection, table, given)
-            ]
-        for table in (objects, enrollments, sessions, views):
-            last = connection.scalar(select(func.max(table.c.id))) or 0
-            if table.kwargs.get("sqlite_autoincrement") and last > given.get(table.name, 0):
-                report(_changed(f"last id of {table.name}", given.get(table.name), last))
-        for setting, found_value, stored in state.catalog.database.settings(connection):
-            report(_changed(setting, found_value, stored))
-
-
-def _changed_rows(connection: Connection, table: Table, given: Mapping[str, int]) -> list[int]:
-    """Return the ids of the rows of an append-only table that are not as they were written, or follow missing ones."""
-    changed, before = [], 0
-    for entry_id, sealed, found in appended_digests(connection, table):
-        if sealed != found or entry_id != before + 1:
-            changed.append(entry_id)
-        before = entry_id
-    last = given.get(table.name, 0)
-    return changed if last == before else [*changed, last]
-
-
-def _changed(setting: str, found: object, stored: object) -> Finding:
-    return Finding(Problem.SETTING_CHANGED, details={"setting": setting, "found": found, "stored": stored})
-
-
-def _report_orphans(state: _State, orphans: Iterable[str]) -> None:
-    store = state.catalog.database.images
-    for name in orphans:
-        repair = moved_to = None
-        if state.repair:
-            with state.catalog.database.write() as connection:
-                if name in _referenced(connection) or name not in store.names():
-                    continue
-                moved_to = store.set_aside(name)
-            repair = Repair.MOVED
-        state.findings.append(Finding(Problem.ORPHANED_FILE, path=name, details={"moved_to": moved_to}, repair=repair))
+def _check_descriptions(catalog: Catalog, group: _Group, contents: Mapping[str, bytes]) -> Iterator[Finding]:
+    for name in group.damaged:
+        yield group.finding(Problem.DESCRIPTION_DAMAGED, descriptor=name)
+    if group.task is not None and contents:
+        with catalog.database.read() as transaction:
+            different = derived.differing(transaction, group.task, contents)
+        for name in different:
+            yield group.finding(Problem.DESCRIPTION_DIFFERS, descriptor=name)
