@@ -9,7 +9,7 @@ import secrets
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Any, Final, NamedTuple
 
@@ -57,6 +57,8 @@ class NewResult:
         `Catalog.version` when the enrolled views were loaded.
     operator
         None for the user's account.
+    key
+        The same in every catalog that has the answer.
     """
 
     answered: Answer
@@ -65,6 +67,7 @@ class NewResult:
     provenance: Provenance
     catalog_version: str
     operator: str | None = None
+    key: str = field(default_factory=lambda: secrets.token_hex(32))
 
 
 @dataclass(frozen=True, slots=True)
@@ -208,6 +211,7 @@ def record(catalog: Catalog, new: NewResult, image_bgr: NDArray[np.uint8] | None
     """
     sample = None if new.answered.sample is None else clean_text(new.answered.sample, "sample")
     fact: dict[str, Any] = {
+        "key": new.key,
         "answer": new.details,
         "azimuths_deg": new.azimuths_deg,
         "bench": new.provenance.bench,
@@ -344,7 +348,7 @@ def _append(
         answer.object_name,
         result=number,
         details={key: value for key, value in shown.items() if value is not None},
-        record=as_json({**fact, **own, "object": answer.object_name, "key": secrets.token_hex(32)}, "The answer"),
+        record=as_json({"key": secrets.token_hex(32), **fact, **own, "object": answer.object_name}, "The answer"),
     )
 
 
