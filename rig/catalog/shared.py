@@ -14,7 +14,7 @@ import shutil
 import threading
 from collections.abc import Callable, Collection, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any, Final, Self
@@ -26,6 +26,7 @@ from sqlalchemy.orm import Session as Transaction
 import hbr
 from rig.catalog import derived, log, state
 from rig.catalog.catalog import Catalog
+from rig.catalog.database import properties
 from rig.catalog.digests import portions
 from rig.catalog.enrolling import OpenEnrollment
 from rig.catalog.facts import Action, Derived, Enrollment, Entry, Property, Row, Session, View
@@ -107,9 +108,9 @@ def open_copy(place: CatalogPlace, clock: Clock) -> Catalog:
     with suppress(CatalogError):
         copy = Catalog.open(place.copy_folder, clock=clock, create=False, read_only=True)
         with copy.database.read() as transaction:
-            made = _Copied.of(transaction)
-        if made is not None and made.catalog == str(place):
-            copy.copied_utc, copy.copy_of = made.copied_utc, place
+            made = _copied(transaction)
+        if made.get("catalog") == str(place):
+            copy.copied_utc, copy.copy_of = datetime.fromisoformat(made["copied_utc"]), place
             return copy
         copy.close()
     raise CatalogUnavailable(
@@ -452,29 +453,12 @@ def failure_words(error: RigError) -> str:
 # The local copy
 
 
-@dataclass(frozen=True, slots=True)
-class _Copied:
-    """What a local copy has: the catalog's place and id, the last line of its log with its digest, and the time."""
-
-    catalog: str
-    id: str
-    line: int
-    digest: str
-    copied_utc: datetime
-
-    @classmethod
-    def of(cls, transaction: Transaction) -> "_Copied | None":
-        """Return the property of a copy; None if a catalog is none."""
-        stored = transaction.scalar(select(Property.value).where(Property.key == _COPY))
-        try:
-            values = json_values((stored or "").encode())
-            return cls(**{**values, "copied_utc": datetime.fromisoformat(values["copied_utc"])})
-        except (ValueError, KeyError, TypeError):
-            return None
-
-    def store(self, transaction: Transaction) -> None:
-        values = {**asdict(self), "copied_utc": self.copied_utc.isoformat()}
-        transaction.merge(Property(key=_COPY, value=json.dumps(values)))
+def _copied(transaction: Transaction) -> dict[str, Any]:
+    """Return what a local copy has: place and id of the catalog, last line of its log with its digest, and the time."""
+    stored = transaction.scalar(select(Property.value).where(Property.key == _COPY))
+    with suppress(ValueError, TypeError):
+        return dict(json_values((stored or "").encode()))
+    return {}
 
 
 def update_copy(catalog: Catalog) -> bool:
@@ -496,11 +480,17 @@ def update_copy(catalog: Catalog) -> bool:
 def _update(catalog: Catalog, folder: Path) -> bool:
     with Catalog.open(folder, clock=catalog.clock) as copy:
         with catalog.database.read() as reading, copy.database.write() as writing:
-            before = _Copied.of(writing)
-            now = _copy_log(catalog, before, reading, writing)
-            now.store(writing)
+            before = _copied(writing)
+            line, digest = log.head(reading)
+            own = {"catalog": str(catalog.place), "id": properties(reading)["id"]}
+            now = {**own, "line": line, "digest": digest, "copied_utc": catalog.clock.utc().isoformat()}
+            known = reading.scalar(select(Entry.digest).where(Entry.id == before.get("line"))) or ""
+            if {**before, **own, "digest": known} != before and log.head(writing)[0]:
+                raise CatalogDamaged("The local copy is one of another catalog.", next_step=Do.RUN_AGAIN())
+            _copy_log(reading, writing, after=before.get("line", 0))
             _copy_enrollments(reading, writing)
             _copy_derived(reading, writing)
+            writing.merge(Property(key=_COPY, value=json.dumps(now)))
         newest = derived.empty_tables(copy).newest
         store = copy.database.images
         with copy.database.catalog_errors():
@@ -508,29 +498,15 @@ def _update(catalog: Catalog, folder: Path) -> bool:
                 with suppress(CatalogError):  # rig catalog verify reports it
                     store.put(catalog.database.images.content(newest))
             store.remove(store.names() - {newest})
-    return before is None or before.line != now.line
+    return bool(before.get("line") != line)
 
 
-def _copy_log(catalog: Catalog, before: _Copied | None, reading: Transaction, writing: Transaction) -> _Copied:
-    """Add the new lines of the catalog's log to the log of the copy, but for the answers.
-
-    So the copy has the same objects, names and states.
-    """
-    properties = dict(reading.execute(select(Property.key, Property.value)).tuples().all())
-    line, digest = log.head(reading)
-    now = _Copied(str(catalog.place), properties["id"], line, digest, catalog.clock.utc())
-    if before is not None:
-        known = reading.scalar(select(Entry.digest).where(Entry.id == before.line)) or ""
-        if (before.catalog, before.id, before.digest) != (now.catalog, now.id, known):
-            raise CatalogDamaged("The local copy is one of another catalog.", next_step=Do.RUN_AGAIN())
-    elif log.head(writing)[0]:
-        raise CatalogDamaged("The local copy was not made by this program.", next_step=Do.RUN_AGAIN())
-    after = 0 if before is None else before.line
+def _copy_log(reading: Transaction, writing: Transaction, *, after: int) -> None:
+    """Add the new lines of the catalog's log to that of the copy, without answers: so it has the same state."""
     new = select(Entry).where(Entry.id > after, Entry.result.is_(None)).order_by(Entry.id)
     for part in reading.scalars(new.execution_options(yield_per=1000)).partitions():
         log.add(writing, *map(_same, part))
         reading.expunge_all()
-    return now
 
 
 def _copy_enrollments(reading: Transaction, writing: Transaction) -> None:
