@@ -274,10 +274,6 @@ class ObjectNotFound(CatalogError, code=702, title="object not found"):
     """No object of that name is in the catalog."""
 
 
-class DescriptorOutdated(CatalogError, code=703, title="descriptor outdated"):
-    """Views lack the descriptor, or the version of it, that this program compares."""
-
-
 class ImportRejected(CatalogError, code=705, title="import rejected"):
     """The import cannot be used; the catalog did not change."""
 

@@ -28,10 +28,8 @@ SCHEMA = 1
 class NoteCode(StrEnum):
     """The subjects of notes; `rig.events.note_wording.note_words` has their sentences."""
 
-    PAPER_SEARCH = "paper-search"
     MIXED_EMPTY_TABLE = "mixed-empty-table"
     ENROLLED_WITHOUT_EMPTY_TABLE = "enrolled-without-empty-table"
-    ENROLLED_BY_GUESS = "enrolled-by-guess"
     EMPTY_TABLE_DOUBTED = "empty-table-doubted"
     EMPTY_TABLE_MISSING = "empty-table-missing"
     EMPTY_TABLE_OF_ENROLLMENT = "empty-table-of-enrollment"

@@ -6,7 +6,6 @@ from hbr.dense.stopping import Limitation, LimitationCode
 from rig.core.next_steps import Do, NextSteps, steps_from_json
 from rig.core.phrases import counted, joined, percent
 from rig.events.events import Note, NoteCode, WaitReason
-from rig.views.description import BENCH_DESCRIPTOR
 from rig.views.table_problems import problem_text
 
 
@@ -14,11 +13,6 @@ def note_words(note: Note) -> str:
     """Return a note as a sentence without its full stop."""
     v = note.values
     match note.code:
-        case NoteCode.PAPER_SEARCH:
-            missing = (
-                f"{counted(v['objects'], 'object')} without it" if v.get("objects") else "the catalog is without it"
-            )
-            return f"the search compares whole images by {v['used']} because {v['missing']} is missing ({missing})"
         case NoteCode.MIXED_EMPTY_TABLE:
             names, one = v["objects"], len(v["objects"]) == 1
             return (
@@ -27,8 +21,6 @@ def note_words(note: Note) -> str:
             )
         case NoteCode.ENROLLED_WITHOUT_EMPTY_TABLE:
             return "most objects were enrolled without an empty-table image, so the search does not use it"
-        case NoteCode.ENROLLED_BY_GUESS:
-            return f"the views of {_some(v['objects'])} were segmented one by one, by a guess, unlike those of a search"
         case NoteCode.EMPTY_TABLE_DOUBTED:
             return f"the empty-table image may be outdated ({_problems(v)})"
         case NoteCode.EMPTY_TABLE_MISSING:
@@ -69,10 +61,6 @@ def _problems(values: dict[str, Any]) -> str:
 def note_steps(note: Note) -> NextSteps:
     """Return what the operator should do about a note; empty if nothing."""
     match note.code:
-        case NoteCode.PAPER_SEARCH:
-            return (Do.REDESCRIBE(descriptor=note.values["missing"]),)
-        case NoteCode.ENROLLED_BY_GUESS:
-            return (Do.REDESCRIBE(descriptor=BENCH_DESCRIPTOR),)
         case NoteCode.MIXED_EMPTY_TABLE | NoteCode.ENROLLED_WITHOUT_EMPTY_TABLE:
             return (Do.ENROLL_AGAIN(),)
         case NoteCode.EMPTY_TABLE_DOUBTED | NoteCode.EMPTY_TABLE_MISSING | NoteCode.EMPTY_TABLE_OF_ENROLLMENT:

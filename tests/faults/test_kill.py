@@ -30,7 +30,7 @@ def check_run(folder: Path, reported: list[int]) -> None:
         with Catalog.open(folder, clock=rig.world.clock) as catalog:
             begun = bool(catalog.objects())
             unfinished = catalog.resumable(NAME) if begun else None
-            present = set(unfinished.present) if unfinished else set(range(VIEWS)) if begun else set()
+            present = set(unfinished.enrollment.present) if unfinished else set(range(VIEWS)) if begun else set()
         assert set(reported) <= present
         assert len(present) <= len(reported) + 1  # the last one may have been stored, but not yet reported
         check_stored(rig, present, tolerance_deg=0.5, planned=VIEWS)

@@ -305,7 +305,8 @@ def test_every_fault_works_on_every_simulated_device(servo, imu):
 def test_fixtures_of_the_pytest_plugin_take_faults(sim_bench, sim_catalog):
     with pytest.raises(DeviceSilent):
         list(enroll(sim_bench, sim_catalog, "dice", views=4))
-    assert sim_catalog.resumable("dice").present == (0,)  # the second frame came, but its locks could not be read
+    unfinished = sim_catalog.resumable("dice")
+    assert unfinished.enrollment.present == (0,)  # the second frame came, but its locks could not be read
     assert [occurrence.fault.kind.name for occurrence in sim_bench.placer.faults.history] == [
         "clock_jump",
         "camera.off",

@@ -12,9 +12,6 @@ from tests.rig.report.report_samples import NOTE
 @pytest.mark.parametrize(
     ("code", "values", "words"),
     [
-        (NoteCode.PAPER_SEARCH, {"used": "cedd", "missing": "edges", "objects": 1}, "(1 object without it)"),
-        (NoteCode.PAPER_SEARCH, {"used": "cedd", "missing": "edges", "objects": 0}, "the catalog is without it"),
-        (NoteCode.ENROLLED_BY_GUESS, {"objects": list("abcde")}, "the views of a, b, c and 2 more were segmented one"),
         (NoteCode.MIXED_EMPTY_TABLE, {"objects": ["a"], "with_image": False}, "a was enrolled without an empty-table"),
         (NoteCode.MIXED_EMPTY_TABLE, {"objects": list("abcde"), "with_image": True}, "a, b, c and 2 more were"),
         (NoteCode.ENROLLED_WITHOUT_EMPTY_TABLE, {}, "most objects were enrolled without"),
@@ -41,8 +38,6 @@ def test_warnings_have_a_next_step() -> None:
         assert note_steps(Note(code))[-1] == Do.EMPTY_TABLE()
     for steps in (("Wait.",), (Do.FREE_DISK(), Do.ENROLL(name="cup"))):
         assert note_steps(Note(NoteCode.NOT_RECORDED, {"steps": steps_as_json(steps)})) == steps
-    missing = Note(NoteCode.PAPER_SEARCH, {"used": "cedd", "missing": "edges", "objects": 1})
-    assert note_steps(missing) == (Do.REDESCRIBE(descriptor="edges"),)
     assert wait_words(WaitReason.NEXT_OBJECT) != wait_words(WaitReason.FIRST_OBJECT)
 
 

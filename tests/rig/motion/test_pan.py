@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rig.catalog import Catalog
+from rig.catalog import Catalog, derived
 from rig.events.events import Accepted, Enrolled, Identified
 from rig.motion.turntable import Turntable
 from rig.plans.enroll import enroll
@@ -53,7 +53,7 @@ def test_ax12_enrolls_and_identifies_within_its_reach(simulated, tmp_path: Path)
         assert len(enrolled(simulated, catalog, "toy-car", *AX, views=12)) == 11  # the 300° that it reaches
         s = simulated(*AX)
         s.operator.next_object, s.operator.yaw_deg = "toy-car", 30.0
-        *_, found = identify(s.bench, model_of(catalog.views().views))
+        *_, found = identify(s.bench, model_of(derived.views(catalog)))
     assert isinstance(found, Identified)
     assert found.name == "toy-car"
 

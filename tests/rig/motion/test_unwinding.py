@@ -4,7 +4,7 @@ from itertools import pairwise
 
 import pytest
 
-from rig.catalog import Catalog
+from rig.catalog import Catalog, derived
 from rig.core.errors import LimitExceeded, Stalled
 from rig.events.events import Accepted, Enrolled, Identified, Moved, Unwinding
 from rig.motion.turntable import Turntable
@@ -57,7 +57,7 @@ def test_search_unwinds_when_necessary_and_reports_it(simulated, catalog, start_
     with Turntable(s.bench) as table:
         table.goto(start_deg)
     s.operator.next_object = "toy-car"
-    events = list(identify(s.bench, model_of(catalog.views().views)))
+    events = list(identify(s.bench, model_of(derived.views(catalog))))
     assert isinstance(events[-1], Identified)
     assert [e.to_deg for e in events if isinstance(e, Unwinding)] == pytest.approx(rotates_to, abs=0.3)
     assert abs(s.world.table_deg()) <= 180
@@ -73,7 +73,7 @@ def test_answer_is_reported_although_the_cable_cannot_be_unwound(simulated, cata
     s.operator.next_object = "toy-car"
     events = []
     with pytest.raises(Stalled):
-        for event in identify(s.bench, model_of(catalog.views().views)):
+        for event in identify(s.bench, model_of(derived.views(catalog))):
             events.append(event)
             if isinstance(event, Unwinding):
                 s.operator.devices.servo.jam()

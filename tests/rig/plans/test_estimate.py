@@ -53,7 +53,7 @@ def test_enrollment_with_a_short_cable_takes_all_views_within_its_limits(simulat
     with Catalog.open(tmp_path, clock=s.bench.clock) as catalog:
         moves = [e for e in enroll(s.bench, catalog, "dice", views=6) if isinstance(e, Moved)]
         assert [m.commanded_deg for m in moves] == [-120.0, -60.0, 0.0, 60.0, 120.0, 180.0]
-        assert sorted(round(v.record.azimuth_deg) % 360 for v in catalog.object("dice").views) == [
+        assert sorted(round(v.azimuth_deg) % 360 for v in catalog.object("dice").views) == [
             0, 60, 120, 180, 240, 300,
         ]  # fmt: skip
 

@@ -84,9 +84,9 @@ def test_one_revolution_enrolls_all_views_at_their_true_angles(tmp_path: Path) -
         assert planned_scan.seconds == pytest.approx(done.seconds, rel=0.15)
         stored = catalog.object("block").views
         planned = -15.0 * np.arange(24) % 360
-        azimuths = np.array([view.record.azimuth_deg for view in stored])
+        azimuths = np.array([view.azimuth_deg for view in stored])
         assert np.abs((azimuths - planned + 180) % 360 - 180).max() < 4.0
-        moving = [view.record.evidence for view in stored if view.record.evidence["motion"]]
+        moving = [view.evidence for view in stored if view.evidence["motion"]]
         assert len(moving) >= 22
         for evidence in moving:
             assert set(evidence["motion"]) >= {"middle_ns", "angle_deg", "angle_sigma_deg", "speed_dps", "smear_px"}

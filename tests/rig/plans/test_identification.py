@@ -5,7 +5,7 @@ import pytest
 
 import hbr
 from hbr.core.angles import wrap180
-from rig.catalog import Catalog
+from rig.catalog import Catalog, derived
 from rig.config import load_config
 from rig.core.errors import (
     CatalogError,
@@ -32,7 +32,7 @@ def three_enrolled(tmp_path_factory):
     ):
         for name in ("mug-dots", "lamp", "toy-car"):
             list(enroll(bench, catalog, name, views=VIEWS))
-        return model_of(catalog.views().views)
+        return model_of(derived.views(catalog))
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ import pytest
 
 import hbr
 from hbr.core.angles import wrap180
-from rig.catalog import Catalog
+from rig.catalog import Catalog, derived
 from rig.core.errors import (
     CameraSettingsDiffer,
     CatalogError,
@@ -21,7 +21,9 @@ from rig.core.next_steps import Do
 from rig.events.events import Accepted, Enrolled, Moved, Rejected, Started, event_dict
 from rig.plans.enroll import enroll
 from rig.plans.identify import identify
+from rig.plans.photograph_table import photograph_table
 from rig.search.model import load_model, model_of
+from rig.views.description import BENCH_DESCRIPTOR, PAPER_DESCRIPTOR, EnrollmentDescriber
 
 VIEWS = 8
 
@@ -52,16 +54,43 @@ def test_enrollment_stores_every_view_at_the_angle_it_was_taken(simulated, catal
     assert details.summary.views == VIEWS
     assert details.summary.label == "kitchen"
     for view, true_deg in zip(details.views, truth, strict=True):
-        record = view.record
-        assert record.encoder_deg == pytest.approx(true_deg, abs=0.3)
-        assert record.imu_deg == pytest.approx(true_deg, abs=max(4 * record.imu_sigma_deg, 0.3))
-        assert wrap180(record.azimuth_deg + record.encoder_deg) == pytest.approx(0, abs=1e-6)
-        assert record.evidence["exposed_ns"] >= record.evidence["settled_ns"]
-        x, y, width, height = s.bench.config.view.roi
-        stored = catalog.read_image(view)[y : y + height, x : x + width]
-        assert (hbr.describe(stored) == record.descriptors["cedd"]).all()
-        assert record.segmentation["together"] == VIEWS
+        assert view.encoder_deg == pytest.approx(true_deg, abs=0.3)
+        assert view.imu_deg == pytest.approx(true_deg, abs=max(4 * view.imu_sigma_deg, 0.3))
+        assert wrap180(view.azimuth_deg + view.encoder_deg) == pytest.approx(0, abs=1e-6)
+        assert view.evidence["exposed_ns"] >= view.evidence["settled_ns"]
+        assert view.region == s.bench.config.view.roi
     assert torque(s) == 0
+
+
+@pytest.mark.parametrize("interrupted_after", [None, 1, 5])
+def test_enrolled_views_are_described_together(simulated, catalog, interrupted_after):
+    """The pixels come from memory or from the disk; few views of a session learn the background from all sessions."""
+    s = simulated(seed=4)
+    list(photograph_table(s.bench))
+    plan = enroll(s.bench, catalog, "teapot", views=VIEWS)
+    if interrupted_after is not None:
+        for event in plan:
+            if isinstance(event, Accepted) and event.index == interrupted_after:
+                break
+        plan.close()
+        plan = enroll(s.bench, catalog, "teapot", resume=True)
+    list(plan)
+    stored = catalog.object("teapot").complete
+    images = [catalog.read_image(view.image) for view in stored.views]
+    tables = [catalog.read_image(session.empty_table) for session in stored.sessions]
+    sessions = [view.session for view in stored.views]
+    found = derived.described(catalog, stored, "teapot")
+    for index, image in enumerate(images):
+        own = [n for n, session in enumerate(sessions) if session == sessions[index]]
+        learned = own if len(own) >= derived.FEWEST_VIEWS else range(VIEWS)
+        describer = EnrollmentDescriber(s.bench.config.view, (BENCH_DESCRIPTOR,), tables[sessions[index]])
+        numbers = {n: describer.learn(images[n]) for n in learned}
+        expected = describer.describe(numbers[index], image)
+        x, y, width, height = s.bench.config.view.roi
+        paper = hbr.describe(image[y : y + height, x : x + width])
+        assert (found.levels[BENCH_DESCRIPTOR][index] == expected.levels[BENCH_DESCRIPTOR]).all()
+        assert (found.levels[PAPER_DESCRIPTOR][index] == paper).all()
+        assert found.segmentation[index] == expected.segmentation
 
 
 def test_unlocked_exposure_of_the_camera_is_a_note(simulated, catalog):
@@ -105,10 +134,10 @@ def test_each_view_is_stored_before_the_next_rotation(simulated, catalog):
     stored = 0
     for event in enroll(s.bench, catalog, "dice", views=6):
         if isinstance(event, Moved):
-            assert len(catalog.resumable("dice").present) == stored
+            assert len(catalog.resumable("dice").enrollment.present) == stored
         if isinstance(event, Accepted):
             stored += 1
-            assert len(catalog.resumable("dice").present) == stored
+            assert len(catalog.resumable("dice").enrollment.present) == stored
 
 
 def test_interrupted_enrollment_keeps_its_views_and_resume_takes_the_missing_ones(simulated, catalog):
@@ -119,7 +148,7 @@ def test_interrupted_enrollment_keeps_its_views_and_resume_takes_the_missing_one
             break
     plan.close()
     assert torque(s) == 0
-    assert catalog.resumable("lamp").present == (0, 1, 2)
+    assert catalog.resumable("lamp").enrollment.present == (0, 1, 2)
     with pytest.raises(CatalogError, match="unfinished"):
         next(enroll(s.bench, catalog, "lamp", views=6))
     taken = [e.index for e in enroll(s.bench, catalog, "lamp", resume=True) if isinstance(e, Accepted)]
@@ -131,7 +160,7 @@ def test_conditions_of_a_view_are_stored_with_it(simulated, catalog):
     """The conditions are the calibration in force, the camera settings, and the findings of opening the bench."""
     s = simulated("imu.scale=1.007")
     list(enroll(s.bench, catalog, "dice", views=4))
-    provenance = catalog.object("dice").views[0].session.provenance
+    provenance = catalog.object("dice").complete.sessions[0].provenance
     assert provenance.conditions["imu"]["scale"] == 1.007
     assert provenance.conditions["table"]["zero_deg"] == s.bench.config.table.zero_deg
     assert provenance.conditions["camera"]["exposure_us"] == s.bench.config.camera.exposure_us
@@ -149,7 +178,7 @@ def test_darkness_causes_retakes_and_ends_the_enrollment_without_losing_views(si
                 s.world.change(light=(0.0, 0.0, 0.0))
     assert sum(isinstance(e, Rejected) for e in events) == 1 + s.bench.config.view.retakes
     assert caught.value.exit_code == 6
-    assert catalog.resumable("lamp").present == (0, 1)
+    assert catalog.resumable("lamp").enrollment.present == (0, 1)
     assert torque(s) == 0
 
 
@@ -160,7 +189,7 @@ def test_slipping_platter_ends_the_enrollment_before_a_wrong_angle_is_stored(sim
             if isinstance(event, Accepted) and event.index == 3:
                 s.world.clock.call_at(s.world.clock.now_ns() + 400_000_000, lambda: s.world.slip(-6.0, 0.1))
     assert caught.value.evidence["difference_deg"] == pytest.approx(6.0, abs=0.7)
-    assert catalog.resumable("lamp").present == (0, 1, 2, 3)
+    assert catalog.resumable("lamp").enrollment.present == (0, 1, 2, 3)
 
 
 def test_unplugged_servo_ends_the_plan_with_all_views_stored(simulated, catalog):
@@ -169,7 +198,7 @@ def test_unplugged_servo_ends_the_plan_with_all_views_stored(simulated, catalog)
         for event in enroll(s.bench, catalog, "lamp", views=8):
             if isinstance(event, Accepted) and event.index == 2:
                 s.bench.servo.bus.port.ser.unplug()
-    assert catalog.resumable("lamp").present == (0, 1, 2)
+    assert catalog.resumable("lamp").enrollment.present == (0, 1, 2)
     with pytest.raises(DeviceSilent):
         s.bench.close()  # reports that the torque is still on, and closes the other devices
 
@@ -216,7 +245,7 @@ def test_failing_gyro_ends_the_plan_with_the_table_stopped_and_torque_off(simula
                 s.world.clock.call_at(s.world.clock.now_ns() + 400_000_000, lambda: fail(s))
             if not moving and isinstance(event, Moved) and event.index == 3:
                 fail(s)
-    assert catalog.resumable("lamp").present == (0, 1, 2)
+    assert catalog.resumable("lamp").enrollment.present == (0, 1, 2)
     assert torque(s) == 0
     s.world.clock.sleep(1.0)
     assert s.world.shaft()[1] == 0
@@ -233,7 +262,7 @@ def test_supply_dip_of_the_servo_ends_the_plan_and_nothing_moves_afterwards(simu
                 servo_of(s).power_cycle()
                 s.world.clock.sleep(0.5)
     assert caught.value.exit_code in (4, 5, 6)
-    assert set(catalog.resumable("lamp").present) <= {0, 1, 2}
+    assert set(catalog.resumable("lamp").enrollment.present) <= {0, 1, 2}
     assert torque(s) == 0
     before = s.world.shaft()[0]
     s.world.clock.sleep(2.0)
@@ -269,7 +298,7 @@ def test_rotation_beyond_the_gyro_range_ends_the_enrollment_before_a_wrong_angle
         for event in enroll(s.bench, catalog, "dice", views=6):
             if isinstance(event, Accepted) and event.index == 2:
                 s.world.clock.call_at(s.world.clock.now_ns() + 400_000_000, lambda: s.world.slip(-10.0))
-    assert catalog.resumable("dice").present == (0, 1, 2)
+    assert catalog.resumable("dice").enrollment.present == (0, 1, 2)
 
 
 def test_events_are_valid_json_without_gyro_values(simulated, catalog):
@@ -289,7 +318,7 @@ def test_events_depend_on_nothing_but_the_seed(simulated, tmp_path):
         s = simulated(seed=seed)
         with Catalog.open(tmp_path / folder, clock=s.bench.clock) as catalog:
             events = [event_dict(e) for e in enroll(s.bench, catalog, "toy-car", views=3)]
-            return events + [event_dict(e) for e in identify(s.bench, model_of(catalog.views().views))]
+            return events + [event_dict(e) for e in identify(s.bench, model_of(derived.views(catalog)))]
 
     events = run(5, "a")
     assert events == run(5, "b")
@@ -325,23 +354,23 @@ def test_resume_finishes_an_enrollment_that_has_all_its_views(simulated, catalog
     events = list(enroll(s.bench, catalog, "dice", resume=True))
     assert [type(event) for event in events] == [Started, Enrolled]
     assert catalog.object("dice").summary.views == 4
-    assert {view.record.segmentation["together"] for view in catalog.object("dice").views} == {4}
+    found = derived.described(catalog, catalog.object("dice").complete, "dice")
+    assert {one["together"] for one in found.segmentation} == {4}
 
 
 def test_old_views_stay_in_use_until_the_new_ones_are_complete(simulated, catalog):
     s = simulated()
     list(enroll(s.bench, catalog, "dice", views=4))
-    old_ids = set(catalog.views().view_ids.tolist())
-    assert len(old_ids) == 4
+    old = catalog.version()
+    assert len(derived.views(catalog)) == 4
     again = enroll(s.bench, catalog, "dice", views=5, replace=True)
     for event in again:
         if isinstance(event, Enrolled):
             break
-        assert set(catalog.views().view_ids.tolist()) == old_ids
+        assert catalog.version() == old
         if isinstance(event, Accepted) and event.index == 3:
             again.close()  # an interruption does not change that
-    assert set(catalog.views().view_ids.tolist()) == old_ids
+    assert catalog.version() == old
     list(enroll(s.bench, catalog, "dice", resume=True))
-    new_ids = set(catalog.views().view_ids.tolist())
-    assert len(new_ids) == 5
-    assert not new_ids & old_ids
+    assert catalog.version() != old
+    assert len(derived.views(catalog)) == 5

@@ -163,7 +163,7 @@ def test_interrupted_object_that_was_moved_is_enrolled_again(simulated, catalog)
     events = list(enroll_tray(s.bench, catalog, items("lamp"), views=4, operator=Scripted([Choice.RESTART])))
     assert actions(events) == [("lamp", "replace")]
     assert sum(isinstance(e, Accepted) for e in events) == 4
-    assert len({view.session.id for view in catalog.object("lamp").views}) == 1
+    assert len({view.session for view in catalog.object("lamp").views}) == 1
 
 
 def test_operator_can_skip_objects_or_stop(simulated, catalog):

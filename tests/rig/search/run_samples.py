@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from rig.catalog import Catalog
+from rig.catalog import Catalog, derived
 from rig.config import load_config
 from rig.events.events import Event
 from rig.plans.enroll import enroll
@@ -31,7 +31,7 @@ def saved_runs(home: Path, strategies: Sequence[str] = ("ahbr", "hbr", "sweep", 
         list(photograph_table(bench))
         for name in ("mug-white", "mug-star", "lamp"):
             list(enroll(bench, catalog, name, views=6))
-        index = model_of(catalog.views().views)
+        index = model_of(derived.views(catalog))
         for number, strategy in enumerate(strategies):
             operator.next_object, operator.yaw_deg = "mug-star", 40.0 * number
             with RunWriter(home / strategy, bench, index) as writer:

@@ -74,8 +74,9 @@ def test_image_of_today_comes_before_the_image_of_the_enrollment(simulated, tmp_
         list(enroll(another.bench, catalog, "mug-dots", views=3))
         mixed = load_model(catalog)
         assert mixed.notes[-1] == Note(NoteCode.MIXED_EMPTY_TABLE, {"objects": ["mug-dots"], "with_image": False})
-        for picture in tmp_path.rglob("empty-*.png"):
-            picture.unlink()
+        tables = {one.empty_table for name in ("lamp", "teapot") for one in catalog.object(name).complete.sessions}
+        for table in tables:
+            catalog.image_path(table).unlink()
         assert load_model(catalog).empty_table is None
         assert NoteCode.EMPTY_TABLE_MISSING in codes(search(another, load_model(catalog), "lamp")[0][0])
 

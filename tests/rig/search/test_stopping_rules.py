@@ -6,16 +6,19 @@ from math import isfinite, nan
 
 import numpy as np
 import pytest
+from sqlalchemy import delete
 
 import hbr
 from hbr.dense.fitting import UNFITTED_MIN_CONFIDENCE
 from hbr.dense.leave_one_out import leave_one_out
 from hbr.dense.stopping import LimitationCode
 from rig.catalog import Catalog
+from rig.catalog.facts import Derived
 from rig.config import RigConfig
-from rig.core.errors import CatalogError, DescriptorOutdated, UsageError
-from rig.core.next_steps import Do, NextStep
+from rig.core.errors import CatalogError, UsageError
+from rig.core.next_steps import Do
 from rig.events.events import NoteCode
+from rig.plans.enroll import enroll
 from rig.search.model import DenseModel, begin_search, load_model, model_of
 from rig.search.stopping_rules import (
     FILE,
@@ -308,39 +311,22 @@ def test_unknown_objects_end_after_the_fitted_views():
     assert search_for(index, rule, views_of("unknown", 18, seed=77), max_views=2) == (None, 2)
 
 
-def test_objects_without_the_descriptor_are_searched_by_the_paper(sim_catalog_of_both):
-    catalog, lacking = sim_catalog_of_both
-    model = load_model(catalog)
-    assert isinstance(model.index, hbr.DenseIndex)
-    assert model.rule is not None
-    lacking()
-    model = load_model(catalog)
-    assert isinstance(model.index, hbr.ViewIndex)
-    assert (model.notes[0].code, model.notes[0].values["objects"]) == (NoteCode.PAPER_SEARCH, 1)
-    with pytest.raises(DescriptorOutdated) as caught:
-        load_model(catalog, descriptor="edges+colours")
-    assert any(isinstance(step, NextStep) and step.action is Do.REDESCRIBE for step in caught.value.steps)
-    assert load_model(catalog, descriptor="cedd").notes == ()
-
-
-@pytest.fixture
-def sim_catalog_of_both(tmp_path, simulated):
-    """Return a catalog of two objects with both descriptors, and a function that removes the bench's own from one
-    view."""
-    from rig.catalog.seal import seal_enrollments
-    from rig.plans.enroll import enroll
-
+def test_views_without_a_description_are_described_before_a_search(tmp_path, simulated):
     s = simulated()
     with Catalog.open(tmp_path / "catalog", clock=s.bench.clock) as catalog:
         for name in ("lamp", "dice"):
             list(enroll(s.bench, catalog, name, views=6))
-
-        def lacking() -> None:
-            with catalog.database.write() as connection:
-                connection.exec_driver_sql("DELETE FROM descriptors WHERE name != 'cedd' AND view_id = 1")
-                seal_enrollments(connection, None)
-
-        yield catalog, lacking
+        before = load_model(catalog)
+        assert isinstance(before.index, hbr.DenseIndex)
+        with catalog.database.write() as transaction:
+            transaction.execute(delete(Derived))
+        progress = []
+        model = load_model(catalog, progress=progress.append)
+        assert np.array_equal(model.views.descriptors, before.views.descriptors)
+        assert (model.notes, progress[-1].done) == (before.notes, 2)
+        paper = load_model(catalog, descriptor="cedd")
+        assert isinstance(paper.index, hbr.ViewIndex)
+        assert (paper.rule, paper.notes) == (None, ())
 
 
 def test_stored_rules_are_readable_json(tmp_path):

@@ -155,7 +155,7 @@ def test_region_of_interest_is_described(on_the_table):
     s, table, viewer = on_the_table
     (attempt,) = attempts_of(s, table, viewer)
     x, y, width, height = s.bench.config.view.roi
-    levels = ViewDescriber(s.bench.config.view)(attempt.image_bgr).levels["cedd"]
+    levels = ViewDescriber(s.bench.config.view, ("cedd",))(attempt.image_bgr).levels["cedd"]
     assert (levels == hbr.describe(attempt.image_bgr[y : y + height, x : x + width])).all()
 
 

@@ -15,7 +15,6 @@ from rig.views.description import (
     EnrollmentDescriber,
     SearchDescriber,
     ViewDescriber,
-    describe_alone,
 )
 
 WHOLE = ViewConfig(roi=None)
@@ -37,7 +36,7 @@ def _with_object(table: NDArray[np.uint8], left: int = 60, gain: float = 1.0) ->
 
 def test_paper_descriptor_describes_the_whole_region() -> None:
     frame = _with_object(_table())
-    described = ViewDescriber(ViewConfig(roi=(20, 0, 120, 120)), empty_table=_table())(frame)
+    described = ViewDescriber(ViewConfig(roi=(20, 0, 120, 120)), DESCRIPTORS, _table())(frame)
     assert tuple(described.levels) == DESCRIPTORS
     assert np.array_equal(described.levels[PAPER_DESCRIPTOR], hbr.describe(frame[:, 20:140]))
 
@@ -82,8 +81,8 @@ def test_search_in_motion_learns_the_background_and_leaves_earlier_views_alone()
 
 def test_empty_table_image_of_another_size_is_not_used_and_reported() -> None:
     frame = _with_object(np.full((120, 160, 3), 128, np.uint8))
-    without = ViewDescriber(WHOLE)(frame)
-    described = ViewDescriber(WHOLE, empty_table=_table(240, 320))(frame)
+    without = ViewDescriber(WHOLE, DESCRIPTORS)(frame)
+    described = ViewDescriber(WHOLE, DESCRIPTORS, _table(240, 320))(frame)
     assert described.segmentation is not None
     issue = described.segmentation["issues"][0]
     assert issue == {"code": "empty-table-size", "table_px": [320, 240], "frame_px": [160, 120]}
@@ -121,20 +120,23 @@ def test_first_view_of_a_search_shows_whether_the_bench_is_that_of_the_enrollmen
         assert describe(_with_object(other)).same_bench is expected  # the first view decides for the whole search
 
 
-@pytest.mark.parametrize("change", ["none", "noise", "arm"])
-def test_enrolled_view_is_described_the_same_from_its_first_segmentation(change: str) -> None:
+def test_view_is_only_segmented_without_descriptors_and_silhouettes_are_those_of_a_description() -> None:
     table = _table()
-    image = _with_object(table)
-    rng = np.random.default_rng(3)
-    if change == "noise":
-        image = np.clip(image + rng.normal(0, 8, image.shape), 0, 255).astype(np.uint8)
-    elif change == "arm":  # a thin part that differs from the empty table; the network leaves it out
-        image[70:80, 100:135] = (200, 200, 60)
-    describer = EnrollmentDescriber(WHOLE, (BENCH_DESCRIPTOR,), table)
-    expected = describer.describe(describer.learn(image), image)
-    segmented = ViewDescriber(WHOLE, DESCRIPTORS, table)(image).segmented
-    assert segmented is not None
-    assert (expected.segmentation["box_px"] == list(segmented.found.box)) is (change != "arm")
-    found = describe_alone(segmented, (BENCH_DESCRIPTOR,))
-    assert found.evidence == expected.segmentation
-    assert np.array_equal(found.levels[BENCH_DESCRIPTOR], expected.levels[BENCH_DESCRIPTOR])
+    frame = _with_object(table)
+    segmented = ViewDescriber(WHOLE, empty_table=table)(frame)
+    assert segmented.levels == {}
+    assert segmented.segmentation == ViewDescriber(WHOLE, DESCRIPTORS, table)(frame).segmentation
+
+
+def test_enrolled_view_keeps_its_silhouette() -> None:
+    table = _table()
+    frames = [_with_object(table, left) for left in (20, 60, 100)]
+    together = EnrollmentDescriber(WHOLE, (BENCH_DESCRIPTOR,))
+    for frame in frames:
+        together.learn(frame)
+    enrolled = together.describe(1, frames[1])
+    assert enrolled.segmentation is not None
+    assert enrolled.segmentation["together"] == 3
+    cut = ViewDescriber(WHOLE).segment(frames[1], enrolled.segmentation)
+    levels = hbr.descriptor(BENCH_DESCRIPTOR).describe(cut)
+    assert np.array_equal(levels, enrolled.levels[BENCH_DESCRIPTOR])

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rig.bench import Bench
-from rig.catalog import Catalog
+from rig.catalog import Catalog, derived
 from rig.config import RigConfig, load_config
 from rig.core.errors import StateNotStored, TableNotEmpty, UsageError, ViewRejected
 from rig.core.next_steps import Do
@@ -227,13 +227,14 @@ def test_enrolled_views_have_both_descriptors_evidence_and_the_image(simulated: 
     with Catalog.open(tmp_path, clock=s.bench.clock) as catalog:
         events = list(enroll(s.bench, catalog, "toy-car", views=4))
         details = catalog.object("toy-car")
-        loaded = catalog.views(BENCH_DESCRIPTOR).views
-        (session,) = details.enrollments[0].sessions
-        assert session.empty_table_image is not None
-        assert (tmp_path / session.empty_table_image).exists()
+        loaded = derived.views(catalog, BENCH_DESCRIPTOR)
+        (session,) = details.complete.sessions
+        assert session.empty_table is not None
+        assert np.array_equal(catalog.read_image(session.empty_table), empty_table_status(s.bench).table.image_bgr)
+        evidence = derived.described(catalog, details.complete, "toy-car").segmentation
     assert loaded.descriptor == BENCH_DESCRIPTOR
     assert len(loaded) == 4
-    summary = SegmentationSummary.of(view.record.segmentation for view in details.views)
+    summary = SegmentationSummary.of(evidence)
     assert (summary.views, summary.found, summary.guessed, summary.corrected) == (4, 4, 0, 4)
     assert summary.text.startswith("object found in 4 of 4 views, illumination corrected in 4")
     assert f"{taken.taken_utc:.10}" in session.provenance.conditions["empty_table"]["taken_utc"]
@@ -246,11 +247,11 @@ def test_changed_surroundings_are_reported_once_and_stored(simulated: Open, tmp_
     s.operator.change_bench(CHANGES["bench"])
     with Catalog.open(tmp_path, clock=s.bench.clock) as catalog:
         warned = [event for event in enroll(s.bench, catalog, "toy-car", views=6) if isinstance(event, Warned)]
-        views = catalog.object("toy-car").views
+        evidence = derived.described(catalog, catalog.object("toy-car").complete, "toy-car").segmentation
     assert [event.index for event in warned] == [2]
     assert warned[0].note.code is NoteCode.EMPTY_TABLE_CHANGED
     assert Do.EMPTY_TABLE() in note_steps(warned[0].note)
-    assert all(view.record.segmentation["issues"][0]["code"] == "empty-table-differs" for view in views)
+    assert all(one["issues"][0]["code"] == "empty-table-differs" for one in evidence)
     *_, problem = empty_table_status(s.bench).problems
     assert (problem.code, problem.parameters["frames"]) == (TableProblemCode.SURROUNDINGS, 3)
     assert "3 frames in a row" in note_words(warned[0].note)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rig.catalog import Catalog
+from rig.catalog import Catalog, derived
 from rig.core.errors import DeviceSilent
 from rig.events.events import Failed, Identified, Waiting
 from rig.plans.enroll import enroll
@@ -129,7 +129,7 @@ def test_watch_identifies_objects_and_continues_after_a_failure(simulated, tmp_p
     with Catalog.open(tmp_path, clock=s.bench.clock) as catalog:
         for name in ("toy-car", "book-night"):
             list(enroll(s.bench, catalog, name, views=6))
-        index = model_of(catalog.views().views)
+        index = model_of(derived.views(catalog))
     s.world.put(None)
     s.bench.placer = TableWatcher(s.bench)
     upcoming = [("toy-car", 30.0), ("radio", 0.0), ("book-night", 200.0)]
