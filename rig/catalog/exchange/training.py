@@ -64,14 +64,19 @@ class TrainingExport:
     without_mask: int
 
 
-class _Task(NamedTuple):
-    """A view to be annotated: the names of its image and its empty-table image, and its stored segmentation."""
+class _Picture(NamedTuple):
+    """A view of the object of this number, both numbered from 0, with its stored segmentation as JSON."""
 
-    image: str
+    id: int
+    number: int
+    view: View
+    session: Session
     region: Region | None
-    empty_table: str | None
     segmentation: str
-    """As JSON."""
+
+    @property
+    def file(self) -> str:
+        return path_of(self.view.image)
 
 
 class _Mask(NamedTuple):
@@ -86,19 +91,7 @@ class _Mask(NamedTuple):
     polygon: list[list[float]]
 
 
-class _Picture(NamedTuple):
-    """A view of the object of this number, both numbered from 0, and what was found in it."""
-
-    id: int
-    number: int
-    view: View
-    session: Session
-    task: _Task
-    mask: _Mask = _Mask(0, 0, "", None, 0, [], [])
-
-    @property
-    def file(self) -> str:
-        return path_of(self.task.image)
+_Annotated = tuple[_Picture, _Mask]
 
 
 class _Enrolled(CatalogSource):
@@ -156,16 +149,14 @@ def write_training(
             yield from transfer(_Enrolled(source.catalog, source.names), copy, jobs=jobs)
         # Find the objects in the images, in processes.
         pictures = _pictures(source, objects)
-        tasks = [picture.task for picture in pictures]
-        masks: dict[str, _Mask] = {}
-        yield JobProgress(0, len(tasks))
+        masks: dict[int, _Mask] = {}
+        yield JobProgress(0, len(pictures))
         work = partial(_annotate, made)
-        for portion, found in map_in_processes(work, portions(tasks), processes(jobs, len(tasks))):
-            masks.update(zip((task.image for task in portion), found, strict=True))
-            yield JobProgress(len(masks), len(tasks))
+        for portion, found in map_in_processes(work, portions(pictures), processes(jobs, len(pictures))):
+            masks.update(zip((picture.id for picture in portion), found, strict=True))
+            yield JobProgress(len(masks), len(pictures))
         # Write the annotations, in the order of the catalog.
-        annotated = [picture._replace(mask=masks[picture.task.image]) for picture in pictures]
-        by_part = _divided(annotated, parts, split, fractions, seed)
+        by_part = _divided([(picture, masks[picture.id]) for picture in pictures], parts, split, fractions, seed)
         items = [item for item, *_ in objects]
         if form is Annotations.COCO:
             _write_coco(made, items, by_part, intrinsics)
@@ -182,8 +173,8 @@ def _pictures(source: CatalogSource, objects: Iterable[Enrolled]) -> list[_Pictu
         evidence = described(source.catalog, enrollment, item.name).segmentation
         for view, region, found in zip(enrollment.views, regions, evidence, strict=True):
             session = enrollment.sessions[view.session]
-            task = _Task(view.image, region, session.empty_table, json.dumps(found))
-            pictures.setdefault(view.image, _Picture(len(pictures), number, view, session, task))
+            picture = _Picture(len(pictures), number, view, session, region, json.dumps(found))
+            pictures.setdefault(view.image, picture)
     return list(pictures.values())
 
 
@@ -199,20 +190,17 @@ def _check_fractions(fractions: Sequence[float]) -> None:
 
 
 def _divided(
-    pictures: Sequence[_Picture], parts: Sequence[str], split: Split | None, fractions: Sequence[float], seed: int
-) -> dict[str, list[_Picture]]:
-    """Return the pictures of each part, in their order."""
-    divided: dict[str, list[_Picture]] = {part: [] for part in parts}
-    if split is None:
-        divided[parts[0]] = list(pictures)
-        return divided
+    annotated: Sequence[_Annotated], parts: Sequence[str], split: Split | None, fractions: Sequence[float], seed: int
+) -> dict[str, list[_Annotated]]:
+    """Return the views of each part, in their order."""
+    divided: dict[str, list[_Annotated]] = {part: [] for part in parts}
     rng = np.random.default_rng(seed)
-    of_objects = [list(own) for _, own in groupby(pictures, lambda picture: picture.number)]
-    drawn = _drawn(len(of_objects), fractions, rng) if split is Split.OBJECT else None
-    for place, own in enumerate(of_objects):
-        part_of = [drawn[place]] * len(own) if drawn else _drawn(len(own), fractions, rng)
-        for picture, part in zip(own, part_of, strict=True):
-            divided[parts[part]].append(picture)
+    of_objects = [list(own) for _, own in groupby(annotated, lambda one: one[0].number)]
+    drawn = _drawn(len(of_objects), fractions, rng) if split is Split.OBJECT else [0] * len(of_objects)
+    for part, own in zip(drawn, of_objects, strict=True):
+        part_of = _drawn(len(own), fractions, rng) if split is Split.VIEW else [part] * len(own)
+        for one, number in zip(own, part_of, strict=True):
+            divided[parts[number]].append(one)
     return divided
 
 
@@ -224,18 +212,19 @@ def _drawn(count: int, fractions: Sequence[float], rng: np.random.Generator) -> 
     return drawn
 
 
-def _annotate(folder: Path, portion: tuple[_Task, ...]) -> list[_Mask]:
+def _annotate(folder: Path, portion: tuple[_Picture, ...]) -> list[_Mask]:
     """Return where the objects are in images of the catalog in a folder. Runs in a worker process."""
-    store = FolderImages(folder)
-    return [_mask(folder, task, store.pixels(task.image)) for task in portion]
+    return [_mask(folder, picture) for picture in portion]
 
 
-def _mask(folder: Path, task: _Task, image: NDArray[np.uint8]) -> _Mask:
-    found = _describer(folder, task.region, task.empty_table).segment(image, json.loads(task.segmentation))
+def _mask(folder: Path, picture: _Picture) -> _Mask:
+    image = FolderImages(folder).pixels(picture.view.image)
+    describer = _describer(folder, picture.region, picture.session.empty_table)
+    found = describer.segment(image, json.loads(picture.segmentation))
     height, width = image.shape[:2]
-    x0, y0, w, h = task.region or (0, 0, width, height)
+    x0, y0, w, h = picture.region or (0, 0, width, height)
     whole = np.zeros((height, width), np.bool_)
-    part = within(whole, task.region)  # type: ignore[arg-type] # a view of it
+    part = within(whole, picture.region)  # type: ignore[arg-type] # a view of it
     part[:] = found.frame_mask(w, h)
     if found.box is None or not part.any():
         part[:] = True
@@ -269,7 +258,7 @@ def _outline(mask: NDArray[np.bool_]) -> list[list[int]]:
 
 
 def _write_coco(
-    folder: Path, items: Sequence[Item], parts: Mapping[str, Sequence[_Picture]], intrinsics: Intrinsics
+    folder: Path, items: Sequence[Item], parts: Mapping[str, Sequence[_Annotated]], intrinsics: Intrinsics
 ) -> None:
     about = {
         "info": {
@@ -287,33 +276,32 @@ def _write_coco(
     for part, own in parts.items():
         content = {
             **about,
-            "images": [_coco_image(one, intrinsics(one.session)) for one in own],
-            "annotations": [_coco_annotation(one) for one in own],
+            "images": [_coco_image(picture, mask, intrinsics) for picture, mask in own],
+            "annotations": [_coco_annotation(picture, mask) for picture, mask in own],
         }
         text = json.dumps(content, ensure_ascii=False, allow_nan=False)
         (folder / "annotations" / f"instances_{part}.json").write_text(text, encoding="utf-8")
 
 
-def _coco_image(picture: _Picture, intrinsics: Mapping[str, float] | None) -> dict[str, Any]:
+def _coco_image(picture: _Picture, mask: _Mask, intrinsics: Intrinsics) -> dict[str, Any]:
     time = picture.view.captured_utc
     return {
         "id": picture.id + 1,
         "file_name": picture.file,
-        "width": picture.mask.width,
-        "height": picture.mask.height,
+        "width": mask.width,
+        "height": mask.height,
         "date_captured": None if time is None else time.isoformat(),
         "azimuth_deg": picture.view.azimuth_deg,
-        "intrinsics": intrinsics,
+        "intrinsics": intrinsics(picture.session),
     }
 
 
-def _coco_annotation(picture: _Picture) -> dict[str, Any]:
-    mask = picture.mask
+def _coco_annotation(picture: _Picture, mask: _Mask) -> dict[str, Any]:
     return {
         "id": picture.id + 1,
         "image_id": picture.id + 1,
         "category_id": picture.number + 1,
-        "bbox": list(mask.box or picture.task.region or (0, 0, mask.width, mask.height)),
+        "bbox": list(mask.box or picture.region or (0, 0, mask.width, mask.height)),
         "area": mask.area,
         "segmentation": {"size": [mask.height, mask.width], "counts": mask.counts},
         "iscrowd": int(mask.box is None),  # a region that trainers and evaluators ignore
@@ -322,15 +310,16 @@ def _coco_annotation(picture: _Picture) -> dict[str, Any]:
     }
 
 
-def _write_yolo(folder: Path, items: Sequence[Item], parts: Mapping[str, Sequence[_Picture]]) -> None:
+def _write_yolo(folder: Path, items: Sequence[Item], parts: Mapping[str, Sequence[_Annotated]]) -> None:
     for part, own in parts.items():
-        labelled = [one for one in own if one.mask.box is not None]  # without a label it would count as background
-        for one in labelled:
-            file = (folder / "labels" / Path(one.file).relative_to(IMAGE_FOLDER)).with_suffix(".txt")
+        labelled = [one for one in own if one[1].box is not None]  # without a label it would count as background
+        for picture, mask in labelled:
+            file = (folder / "labels" / Path(picture.file).relative_to(IMAGE_FOLDER)).with_suffix(".txt")
             file.parent.mkdir(parents=True, exist_ok=True)
-            corners = " ".join(f"{number:.6f}" for corner in one.mask.polygon for number in corner)
-            file.write_text(f"{one.number} {corners}\n", encoding="utf-8")
-        (folder / f"{part}.txt").write_text("".join(f"./{one.file}\n" for one in labelled), encoding="utf-8")
+            corners = " ".join(f"{number:.6f}" for corner in mask.polygon for number in corner)
+            file.write_text(f"{picture.number} {corners}\n", encoding="utf-8")
+        listed = "".join(f"./{picture.file}\n" for picture, _ in labelled)
+        (folder / f"{part}.txt").write_text(listed, encoding="utf-8")
     # YAML reads JSON strings; names can contain any character.
     lines = [f"{part}: {part}.txt" for part in parts]
     lines += ["val: train.txt"] if "val" not in parts else []  # trainers need one
