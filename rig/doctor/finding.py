@@ -138,7 +138,7 @@ class FindingCode(Enum):
     # catalog, calibration
     NO_CATALOG = "none yet in {path}; the first enrollment creates it"
     CATALOG = "{path}: {objects} objects, {views} views; database undamaged, {images} images verified"
-    DATABASE_DAMAGED = "{path}: the database is damaged: {damage}, {orphans} orphaned rows"
+    DATABASE_DAMAGED = "{path}: the database is damaged: {damage}"
     IMAGES_DAMAGED = "{broken} of {images} verified images are damaged: {first}"
     UNFINISHED = "unfinished enrollments: {objects}"
     CALIBRATION = "{calibration}"

@@ -6,7 +6,7 @@ from rig.calibrations import CalibrationStatus, CalibrationStore, apparatus, app
 from rig.calibrations.store import BenchCalibration
 from rig.catalog import Catalog
 from rig.core.errors import CatalogError
-from rig.core.next_steps import Do, SomeSteps
+from rig.core.next_steps import Do
 from rig.doctor.context import DoctorContext
 from rig.doctor.finding import Finding, FindingCode, Severity, bad, fine, of_error, warning
 from rig.views.stream import exposed_before_stamp_ns
@@ -25,30 +25,29 @@ def catalog(context: DoctorContext) -> Iterator[Finding]:
         yield fine("catalog", FindingCode.NO_CATALOG, path=path)
         return
     with Catalog.open(place, clock=context.computer.clock, read_only=True) as opened:
-        with opened.database.catalog_errors(), opened.database.read() as connection:
-            checked = opened.database.damage(connection)
-            orphans = len(opened.database.orphans(connection))
-        if checked or orphans:
-            fix: SomeSteps = Do.REPAIR_CATALOG()
-            yield bad("catalog", FindingCode.DATABASE_DAMAGED, fix, 7, path=path, damage=checked, orphans=orphans)
-        objects = opened.objects()
-        ids = opened.views().view_ids.tolist()
+        with opened.database.read() as transaction:
+            checked = opened.database.damage(transaction)
+        if checked:
+            yield bad("catalog", FindingCode.DATABASE_DAMAGED, Do.VERIFY_CATALOG(), 7, path=path, damage=checked)
+        if (changed := opened.damage()) is not None:
+            raise changed
+        objects, ids = opened.objects(), list(opened.first_views().values())
         chosen = ids[:: max(len(ids) // IMAGES, 1)][:IMAGES]
         broken = []
         for view_id in chosen:
             try:
-                opened.read_image(opened.view(view_id))
+                opened.read_image(opened.view(view_id).image)
             except CatalogError as error:
                 broken.append(error)
         if broken:
             found = {"broken": len(broken), "images": len(chosen), "first": broken[0].what}
-            yield bad("catalog", FindingCode.IMAGES_DAMAGED, Do.REPAIR_CATALOG(), 7, **found)
+            yield bad("catalog", FindingCode.IMAGES_DAMAGED, Do.VERIFY_CATALOG(), 7, **found)
         unfinished = [item.name for item in objects if item.unfinished_views is not None]
         if unfinished:
-            fix = Do.CONTINUE_ENROLLMENT(name=unfinished[0])
-            yield warning("catalog", FindingCode.UNFINISHED, fix, objects=unfinished)
-        if not checked and not orphans and not broken:
-            counts = {"objects": len(objects), "views": len(ids), "images": len(chosen)}
+            steps = Do.CONTINUE_ENROLLMENT(name=unfinished[0])
+            yield warning("catalog", FindingCode.UNFINISHED, steps, objects=unfinished)
+        if not checked and not broken:
+            counts = {"objects": len(objects), "views": sum(item.views for item in objects), "images": len(chosen)}
             yield fine("catalog", FindingCode.CATALOG, path=path, **counts)
 
 

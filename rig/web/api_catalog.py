@@ -12,12 +12,12 @@ from pydantic import Field
 from starlette.background import BackgroundTask
 
 from rig.catalog import ObjectSummary
-from rig.catalog.edit import delete, deleted_objects, rename, set_texts, undelete
+from rig.catalog.derived import views
 from rig.catalog.exchange import Conflict, import_objects, plan_import, read_bundle, read_objects, write_bundle
 from rig.catalog.jobs import finished
-from rig.catalog.prepared import searched_views
 from rig.core.json_form import plain
 from rig.plans.similar_objects import similar_objects
+from rig.views.description import BENCH_DESCRIPTOR
 from rig.web.picture import jpeg
 from rig.web.server import API, NameBody, ObjectBody, Page, Routes, Server, cached, long_work, time_text
 
@@ -57,7 +57,7 @@ def add_catalog(routes: Routes, server: Server) -> None:
     ) -> Response:
         """List the objects by name."""
         with server.catalog.open_to_read() as catalog:
-            found = deleted_objects(catalog) if deleted else catalog.objects()
+            found = catalog.objects(deleted=deleted)
             pictures = {} if deleted else catalog.first_views()
         wanted = search.casefold()
         rows = [
@@ -72,26 +72,26 @@ def add_catalog(routes: Routes, server: Server) -> None:
         """Return an object with its enrollments and views."""
         with server.catalog.open_to_read() as catalog:
             found = catalog.object(name)
-            similar = similar_objects(searched_views(catalog)[0], found.summary.name) if found.views else None
+            similar = similar_objects(views(catalog, BENCH_DESCRIPTOR), found.summary.name) if found.views else None
         return {
             **_summary(found.summary),
             "enrollments": [
                 {
                     "status": one.status,
-                    "started_utc": time_text(one.started_utc),
+                    "started_utc": time_text(one.enrollment.started_utc),
                     "finished_utc": time_text(one.finished_utc),
-                    "planned_views": len(one.planned_azimuth_deg),
-                    "stored_views": len(one.present),
-                    "sessions": [plain(session.provenance) for session in one.sessions],
+                    "planned_views": len(one.enrollment.planned_azimuth_deg),
+                    "stored_views": len(one.enrollment.views),
+                    "sessions": [plain(session.provenance) for session in one.enrollment.sessions],
                 }
                 for one in found.enrollments
             ],
             "views_taken": [
                 {
                     "id": view.id,
-                    "index": view.record.index,
-                    "azimuth_deg": view.record.azimuth_deg,
-                    "evidence": view.record.evidence,
+                    "index": view.index,
+                    "azimuth_deg": view.azimuth_deg,
+                    "evidence": view.evidence,
                     "captured_utc": time_text(view.captured_utc),
                 }
                 for view in found.views
@@ -103,23 +103,23 @@ def add_catalog(routes: Routes, server: Server) -> None:
     def change(name: str, body: ObjectBody) -> dict[str, Any]:
         """Rename or label an object."""
         with server.catalog.open_to_change() as catalog:
-            set_texts(catalog, name, label=body.label, note=body.note)
+            catalog.set_texts(name, label=body.label, note=body.note)
             if body.name is not None:
-                rename(catalog, name, body.name)
+                catalog.rename(name, body.name)
             return _summary(catalog.summary(body.name or name))
 
     @routes.operate.delete("/objects/{name:path}", tags=["catalog"])
     def remove(name: str) -> dict[str, Any]:
         """Delete an object. It can be restored until rig catalog gc removes it."""
         with server.catalog.open_to_change() as catalog:
-            delete(catalog, name)
+            catalog.delete(name)
         return {"deleted": name}
 
     @routes.operate.post("/undelete", tags=["catalog"])
     def restore(body: NameBody) -> dict[str, Any]:
         """Restore a deleted object."""
         with server.catalog.open_to_change() as catalog:
-            undelete(catalog, body.name)
+            catalog.undelete(body.name)
             return _summary(catalog.summary(body.name))
 
     @routes.watch.get("/views/{view_id}/image", tags=["catalog"], response_class=Response)
@@ -130,13 +130,14 @@ def add_catalog(routes: Routes, server: Server) -> None:
     ) -> Response:
         """Return the image of a view."""
         with server.catalog.open_to_read() as catalog:
-            view = catalog.view(view_id)
-            digest = f"{view.image_sha256}-{'full' if full else THUMB_PX}"
+            name = catalog.view(view_id).image
+            digest = f"{name}-{'full' if full else THUMB_PX}"
 
             def answer() -> Response:
-                pixels = catalog.read_image(view)  # and check them
+                pixels = catalog.read_image(name)  # and check them
                 if full:
-                    return Response(catalog.image_path(view).read_bytes(), media_type="image/png")
+                    kind = "image/png" if name.endswith(".png") else "image/jpeg"
+                    return Response(catalog.database.images.content(name), media_type=kind)
                 return Response(jpeg(pixels, THUMB_PX), media_type="image/jpeg")
 
             return cached(request, digest, answer, {"Cache-Control": "private, max-age=86400"})

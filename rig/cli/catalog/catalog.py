@@ -1,7 +1,7 @@
 """`rig catalog ...`: the objects of a catalog, one by one."""
 
 from fnmatch import fnmatchcase
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
@@ -15,7 +15,8 @@ from rig.core.errors import UsageError
 from rig.core.phrases import counted, number
 
 if TYPE_CHECKING:
-    from rig.catalog import ObjectDetails, ObjectSummary
+    from rig.catalog import ObjectDetails, ObjectSummary, Session, View
+    from rig.catalog.derived import Described
 
 app = typer.Typer(help="Manage the enrolled objects.", no_args_is_help=True)
 
@@ -40,10 +41,8 @@ def list_(
 
     Example: rig catalog list 'mug-*' --label kitchen --bench sim
     """
-    from rig.catalog.edit import deleted_objects
-
     with settings.open_catalog(read_only=True) as catalog:
-        found = deleted_objects(catalog) if deleted else catalog.objects()
+        found = catalog.objects(deleted=deleted)
         objects = [
             item
             for item in found
@@ -91,40 +90,102 @@ def show(
 
     Example: rig catalog show mug-white --bench sim
     """
+    from rig.catalog.derived import Described, described
+    from rig.core.errors import CatalogError
+
+    found, problem = Described({}, ()), None
+    with settings.open_catalog(read_only=True) as catalog:
+        details = catalog.object(name)
+        folder = catalog.database.images.where("")
+        try:
+            if details.complete is not None:
+                found = described(catalog, details.complete, details.summary.name)
+        except CatalogError as error:  # an image is missing: the rest is shown before
+            problem = error
+    if settings.json:
+        settings.print_json(_as_json(details, found))
+    else:
+        _print_object(details, found, folder, full=full)
+    if problem is not None:
+        raise problem
+
+
+def _as_json(details: "ObjectDetails", described: "Described") -> dict[str, Any]:
+    """Return an object with its views and their descriptions as JSON values."""
+    from rig.catalog.images import path_of
     from rig.core.json_form import plain
     from rig.views.segmentation_evidence import SegmentationSummary
 
-    with settings.open_catalog(read_only=True) as catalog:
-        details = catalog.object(name)
-        folder, damage = catalog.database.images.where(""), catalog.damage(name)
-    if settings.json:
-        shown = plain(details)
-        for view, shown_view in zip(details.views, shown["views"], strict=True):
-            levels = {name: found.tolist() for name, found in view.record.descriptors.items()}
-            shown_view["record"]["descriptors"] = levels
-        shown["segmentation"] = plain(SegmentationSummary.of(view.record.segmentation for view in details.views))
-        settings.print_json(shown)
-    else:
-        _print_object(details, folder, full=full)
-    if damage is not None:
-        raise damage
+    def session(one: "Session") -> dict[str, Any]:
+        return {
+            "number": one.number,
+            "started_utc": one.started_utc,
+            "provenance": one.provenance,
+            "empty_table_image": one.empty_table and path_of(one.empty_table),
+        }
+
+    def view(place: int, one: "View") -> dict[str, Any]:
+        record = {key: getattr(one, key) for key in _OF_A_RECORD}
+        record["descriptors"] = {name: levels[place].tolist() for name, levels in described.levels.items()}
+        record["segmentation"] = described.segmentation[place] if described.segmentation else None
+        return {
+            "id": one.id,
+            "object_name": details.summary.name,
+            "enrollment_id": one.enrollment_id,
+            "session": session(sessions[one.session]),
+            "record": record,
+            "captured_utc": one.captured_utc,
+            "image": path_of(one.image),
+            "image_sha256": one.image.partition(".")[0],
+            "image_bytes": one.image_bytes,
+        }
+
+    sessions = () if details.complete is None else details.complete.sessions
+    enrollments = [
+        {
+            "id": one.enrollment.id,
+            "status": one.status,
+            "started_utc": one.enrollment.started_utc,
+            "finished_utc": one.finished_utc,
+            "planned_azimuth_deg": one.enrollment.planned_azimuth_deg,
+            "present": one.enrollment.present,
+            "sessions": [session(part) for part in one.enrollment.sessions],
+        }
+        for one in details.enrollments
+    ]
+    shown: dict[str, Any] = plain(
+        {
+            "summary": details.summary,
+            "enrollments": enrollments,
+            "views": [view(place, one) for place, one in enumerate(details.views)],
+            "segmentation": SegmentationSummary.of(described.segmentation),
+        }
+    )
+    return shown
 
 
-def _print_object(details: "ObjectDetails", folder: str, *, full: bool) -> None:
+_OF_A_RECORD: Final = (
+    *("index", "commanded_deg", "encoder_deg", "azimuth_deg", "captured_ns", "imu_deg", "imu_sigma_deg"),
+    *("evidence", "region"),
+)
+
+
+def _print_object(details: "ObjectDetails", described: "Described", folder: str, *, full: bool) -> None:
     from rig.views.segmentation_evidence import SegmentationSummary
 
     summary = details.summary
     print("  ".join(text for text in (summary.name, summary.label) if text))
     if summary.note:
         print(summary.note)
-    for enrollment in details.enrollments:
+    for one in details.enrollments:
+        enrollment = one.enrollment
         print(
-            f"enrollment {enrollment.id}: {enrollment.status}, {len(enrollment.present)} of "
+            f"enrollment {enrollment.id}: {one.status}, {len(enrollment.present)} of "
             f"{len(enrollment.planned_azimuth_deg)} views, started {enrollment.started_utc:%Y-%m-%d %H:%M} UTC"
         )
         for session in enrollment.sessions:
             provenance = session.provenance
-            devices = provenance.devices if full else {part: _model(one) for part, one in provenance.devices.items()}
+            devices = {part: value if full else _model(value) for part, value in provenance.devices.items()}
             source = {"bench": provenance.bench, "software": provenance.software, **devices}
             print(f"  {session.started_utc:%Y-%m-%d %H:%M} UTC: {_in_one_line(source)}")
             if full:
@@ -133,15 +194,14 @@ def _print_object(details: "ObjectDetails", folder: str, *, full: bool) -> None:
                 print(f"    {counted(_count(provenance.conditions), 'setting')}: --full")
     if not details.views:
         return
-    if segmentation := SegmentationSummary.of(view.record.segmentation for view in details.views).text:
+    if segmentation := SegmentationSummary.of(described.segmentation).text:
         print(segmentation)
-    print(f"images in {folder.rstrip('/')}/{details.views[0].image.rpartition('/')[0]}")
+    print(f"images in {folder}")
     print("view  azimuth   encoder       IMU  sharpness")
     for view in details.views:
-        record = view.record
         print(
-            f"{record.index:4d}  {record.azimuth_deg:6.2f}°  {_number(record.encoder_deg, 7, 2)}°  "
-            f"{_number(record.imu_deg, 7, 2)}°  {_number(record.evidence.get('sharpness'), 9, 1)}"
+            f"{view.index:4d}  {view.azimuth_deg:6.2f}°  {_number(view.encoder_deg, 7, 2)}°  "
+            f"{_number(view.imu_deg, 7, 2)}°  {_number(view.evidence.get('sharpness'), 9, 1)}"
         )
 
 
@@ -156,10 +216,8 @@ def rename_(
 
     Example: rig catalog rename mug-whit mug-white --bench sim
     """
-    from rig.catalog.edit import rename
-
     with settings.open_catalog() as catalog:
-        rename(catalog, name, new_name)
+        catalog.rename(name, new_name)
     settings.say(f"Renamed {name} to {new_name}.", {"name": new_name, "before": name})
 
 
@@ -175,13 +233,11 @@ def label_(
 
     Example: rig catalog label mug-white kitchen --note "a chip at the rim" --bench sim
     """
-    from rig.catalog.edit import set_texts
-
     if label is None and note is None:
         raise UsageError("Neither a label nor a note is given.", next_step="Give a label, --note, or both.")
     with settings.open_catalog() as catalog:
-        set_texts(catalog, name, label=label, note=note)
-        summary = catalog.object(name).summary
+        catalog.set_texts(name, label=label, note=note)
+        summary = catalog.summary(name)
     settings.say(
         f"{summary.name}: label {summary.label or '–'}, note {summary.note or '–'}",
         {"name": summary.name, "label": summary.label, "note": summary.note},
@@ -201,8 +257,6 @@ def delete_(
 
     Example: rig catalog delete mug-white --yes --bench sim
     """
-    from rig.catalog.edit import delete
-
     with settings.open_catalog() as catalog:
         found = [catalog.summary(name) for name in dict.fromkeys(names)]
         views = sum(item.views for item in found)
@@ -211,7 +265,7 @@ def delete_(
             yes=yes,
             settings=settings,
         )
-        delete(catalog, *names)
+        catalog.delete(*names)
     deleted = [item.name for item in found]
     settings.say(f"Deleted {', '.join(deleted)}. To restore: rig catalog undelete NAME", {"deleted": deleted})
 
@@ -225,11 +279,9 @@ def undelete_(
 
     Example: rig catalog undelete mug-white --bench sim
     """
-    from rig.catalog.edit import undelete
-
     with settings.open_catalog() as catalog:
-        undelete(catalog, name)
-        views = catalog.object(name).summary.views
+        catalog.undelete(name)
+        views = catalog.summary(name).views
     settings.say(f"Restored {name} with {counted(views, 'view')}.", {"name": name, "views": views})
 
 
@@ -264,7 +316,7 @@ def stats(settings: Settings) -> None:
         + (", ".join(f"{bench or '(imported)'} {count}" for bench, count in found.benches.items()) or "none")
     )
     for kind in found.descriptors:
-        state = "" if kind.current else ", a version that this program cannot compare"
+        state = "" if kind.current else ", by another version of the program: they are computed again"
         print(f"descriptor   {kind.name} {kind.version}: {kind.views} views{state}")
     print(f"log          {found.log_entries} entries")
     print(f"results      {found.results}, {size_words(found.result_image_bytes)} of images")

@@ -49,8 +49,8 @@ def fit(
     Example: rig catalog fit --bench sim --error-rate 0.005
     """
     from hbr import DenseIndex, fit_stopping_rule
+    from rig.catalog.derived import views as enrolled_views
     from rig.catalog.jobs import JobProgress
-    from rig.catalog.prepared import prepared_views
     from rig.catalog.unfinished import UnfinishedJob
     from rig.cli.ui.present import Progress
     from rig.core.json_form import plain
@@ -60,8 +60,8 @@ def fit(
 
     clock = SystemClock()
     with settings.open_catalog(read_only=True) as catalog:
-        with Progress("Preparing objects for searches") as progress:
-            views = prepared_views(catalog, BENCH_DESCRIPTOR, progress)
+        with Progress("Describing the enrolled views") as progress:
+            views = enrolled_views(catalog, BENCH_DESCRIPTOR, progress)
         if not len(views):
             raise CatalogError("The catalog is empty.", next_step=Do.ENROLL())
         path = catalog.path / FILE

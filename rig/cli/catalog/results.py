@@ -90,9 +90,10 @@ def show(settings: Settings, result: ResultArgument) -> None:
 
     with settings.open_catalog(read_only=True) as catalog:
         found = find_result(catalog, result)
-        folder = catalog.path
+        image = "–" if found.image is None else catalog.database.images.where(found.image)
     if settings.json:
         shown = plain(found) | {"answered": found.answered._asdict(), "current": found.current._asdict()}
+        shown |= {"image": found.image_path, "image_sha256": found.image_sha256}
         shown["time_utc"] = found.time_utc.isoformat()
         for correction, one in zip(shown["corrections"], found.corrections, strict=True):
             correction |= {"time_utc": one.time_utc.isoformat(), "corrected": one.corrected._asdict()}
@@ -109,7 +110,7 @@ def show(settings: Settings, result: ResultArgument) -> None:
         "views": f"{len(found.azimuths_deg)}",
         "bench": f"{found.provenance.bench}, {found.provenance.software}",
         "catalog": f"version {found.catalog_version[:12]}",
-        "image": str(folder / found.image) if found.image else "–",
+        "image": image,
     }
     for name, text in lines.items():
         print(f"  {name:10} {text}")

@@ -24,38 +24,37 @@ from rig.core.phrases import angle_words, counted
 @command
 def verify(
     settings: Settings,
-    repair: Annotated[bool, typer.Option("--repair", help="Repair what can be repaired. Nothing is deleted.")] = False,
-    quick: Annotated[bool, typer.Option("--quick", help="Only compare the hashes of the files.")] = False,
+    quick: Annotated[bool, typer.Option("--quick", help="Only compare digests; do not describe the images.")] = False,
     resume: Annotated[
         bool, typer.Option("--resume", help="Continue an interrupted check. Do not check again what it found right.")
     ] = False,
     jobs: JobsOption = None,
     cluster: ClusterOption = None,
 ) -> None:
-    """Check whether everything is as it was stored. The exit code is 7 if a problem is left.
+    """Check whether everything is as it was stored. The exit code is 7 if it is not. Nothing is changed.
 
-    Example: rig catalog verify --repair --bench sim
+    Example: rig catalog verify --quick --bench sim
     """
     from rig.catalog.unfinished import UnfinishedJob
     from rig.catalog.verify import verify as job
     from rig.cli.catalog.findings import finding_text
 
     with (
-        settings.open_catalog(read_only=not repair) as catalog,
+        settings.open_catalog(read_only=True) as catalog,
         UnfinishedJob(catalog.path / "verify.unfinished", "verify") as unfinished,
     ):
         if not resume:
             unfinished.remove()
         else:
             unfinished.load()
-            known = counted(len(unfinished.found), "image")
+            known = counted(sum(count for count in unfinished.found.values() if isinstance(count, int)), "image")
             print(
                 f"The interrupted check found {known} right." if unfinished.found else "No check was interrupted.",
                 file=sys.stderr,
             )
         found = run_job(
             "verifying",
-            job(catalog, repair=repair, quick=quick, jobs=jobs_of(jobs, cluster), unfinished=unfinished),
+            job(catalog, quick=quick, jobs=jobs_of(jobs, cluster), unfinished=unfinished),
             interrupted=lambda: (
                 "Interrupted; nothing was changed."
                 + (" To continue: rig catalog verify --resume" if unfinished.is_stored else "")
@@ -67,18 +66,14 @@ def verify(
     else:
         for finding in found.findings:
             print(finding_text(finding))
-        outcome = "everything is as it was stored"
-        if found.findings:
-            repaired = len(found.findings) - len(found.unrepaired)
-            outcome = f"{counted(len(found.findings), 'problem')}, {repaired} repaired"
-            if not repair:
-                outcome += ". To repair what can be repaired: rig catalog verify --repair"
+        problems = counted(len(found.findings), "problem")
+        outcome = problems if found.findings else "everything is as it was stored"
         checked = ", ".join(
             counted(number, noun)
             for number, noun in ((found.objects, "object"), (found.views, "view"), (found.results, "result"))
         )
         print(f"{checked}, {size_words(found.image_bytes)} of images: {outcome}")
-    if found.unrepaired:
+    if found.findings:
         raise typer.Exit(EXIT_CATALOG)
 
 
@@ -97,40 +92,27 @@ def redescribe(
     jobs: JobsOption = None,
     cluster: ClusterOption = None,
 ) -> None:
-    """Describe the stored images again, after a descriptor or its settings have changed.
+    """Describe the enrolled views now: those that no search has described since the program or the region changed.
 
-    After an interruption, the same command continues.
+    A search does this, too. After an interruption, the command continues if it is given without --again.
 
     Example: rig catalog redescribe --region config --bench sim
 
     Example: rig catalog redescribe --descriptor edges+colours --bench sim
     """
-    from rig.catalog.redescribe import redescribe as job
-    from rig.catalog.unfinished import UnfinishedJob
+    from rig.catalog.derived import choose_region
+    from rig.catalog.derived import redescribe as job
 
-    part, name = _region(settings, region), descriptor_name(descriptor)
-    with (
-        settings.open_catalog() as catalog,
-        UnfinishedJob(catalog.path / "redescribe.unfinished", f"{name}, {part}") as unfinished,
-    ):
-        if again:
-            unfinished.load()
-        if unfinished.found:
-            print(f"The interrupted command described {counted(len(unfinished.found), 'view')}.", file=sys.stderr)
+    name = descriptor_name(descriptor)
+    with settings.open_catalog() as catalog:
+        if region != "stored":
+            choose_region(catalog, _region(settings, region))
         done = run_job(
             "describing",
-            job(
-                catalog,
-                name,
-                region=part,
-                again=again,
-                jobs=jobs_of(jobs, cluster),
-                unfinished=unfinished if again else None,
-            ),
-            interrupted="Interrupted; the results so far are stored. The same command continues.",
+            job(catalog, name, again=again, jobs=jobs_of(jobs, cluster)),
+            interrupted="Interrupted; the results so far are stored. "
+            f"To continue: rig catalog redescribe --descriptor {name}",
         )
-        if again:
-            unfinished.remove()
     if settings.json:
         settings.print_json(done)
     else:
@@ -152,7 +134,7 @@ def gc(
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Only report what would be removed.")] = False,
     yes: YesOption = False,
 ) -> None:
-    """Remove deleted objects permanently, files that verify moved to lost+found, and files of interrupted imports.
+    """Remove deleted objects permanently, and images of interrupted work that are older than a day.
 
     Example: rig catalog gc --dry-run --bench sim
     """
@@ -173,7 +155,7 @@ def gc(
         if not dry_run:
             if not nothing:
                 confirm(f"Remove {words(found)} permanently?", yes=yes, settings=settings)
-            # Levels by earlier versions of a descriptor are removed without a question: they can be computed again.
+            # What was computed from removed objects is removed without a question.
             found = collect_garbage(catalog, old=old)
     text = f"{'Would remove' if dry_run else 'Removed'} {words(found)}."
     settings.say("There is nothing to remove." if nothing else text, {"dry_run": dry_run, **plain(found)})
@@ -277,12 +259,9 @@ def _detail(key: str, value: Any) -> str:
 
 
 def _region(settings: Settings, text: str) -> Any:
-    from rig.catalog.exchange.batch import parse_region
-    from rig.catalog.redescribe import Stored
+    from rig.catalog.exchange.tables import parse_region
 
     match text:
-        case "stored":
-            return Stored.REGION
         case "config":
             return settings.load().view.roi
         case "whole":
@@ -355,10 +334,8 @@ def deliver(
 
     Example: rig catalog deliver --rename mug-white mug-white-2
     """
-    from rig.catalog import edit
-    from rig.catalog.journal import Journal
-    from rig.catalog.journal import discard as remove
-    from rig.catalog.shared import deliver_journal, delivery_words
+    from rig.catalog.shared import Journal, deliver_journal, delivery_words
+    from rig.catalog.shared import discard as remove
 
     place = settings.place
     if place.url is None:
@@ -371,7 +348,7 @@ def deliver(
             for name in replace or ():
                 journal.summary(name)  # there must be one
             if rename is not None:
-                edit.rename(journal, *rename)
+                journal.rename(*rename)
             if discard is not None:
                 remove(journal, discard)
     done = deliver_journal(place, SystemClock(), replacing=replace or ())
