@@ -10,7 +10,6 @@ from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import func, select
 from sqlalchemy.orm import Session as Transaction
 
 from rig.catalog import log, state
@@ -21,7 +20,7 @@ from rig.catalog.records import EnrollmentStatus, Provenance, check_azimuth, che
 from rig.catalog.state import EnrollmentState, ObjectDetails, ObjectSummary
 from rig.config.catalog_place import CatalogPlace
 from rig.core.clock import Clock
-from rig.core.errors import CatalogDamaged, CatalogError, UsageError
+from rig.core.errors import CatalogDamaged, UsageError
 from rig.views import image_files as images
 
 
@@ -135,8 +134,8 @@ class Catalog(AbstractContextManager["Catalog"]):
         """Return the id of one view of each object in use, to show the object by."""
         with self.database.read() as transaction:
             names = {one.enrollment_id: one.name for one in state.used(transaction)}
-            rows = transaction.execute(select(View.enrollment_id, func.min(View.id)).group_by(View.enrollment_id))
-            return {names[enrollment_id]: view_id for enrollment_id, view_id in rows if enrollment_id in names}
+            rows = state.first_views(transaction, View.enrollment_id, View.id)
+            return {names[enrollment_id]: view_id for enrollment_id, view_id in rows}
 
     def version(self) -> str:
         """Return a digest of what searches compare with, SHA-256: another one after every change of the objects."""
@@ -167,15 +166,7 @@ class Catalog(AbstractContextManager["Catalog"]):
             There is no view with that id, or it is not as it was stored.
         """
         with self.database.read() as transaction:
-            view = transaction.get(View, int(view_id))
-            if view is None:
-                raise CatalogError(
-                    f"There is no view {view_id} in the catalog {self.place}.", next_step="Load the views again."
-                )
-            key = transaction.scalar(select(Enrollment.key).where(Enrollment.id == view.enrollment_id))
-            if view.digest != digest_of(view, str(key)):
-                raise state.changed([f"view {view_id}"])
-            return view
+            return state.view(transaction, int(view_id))
 
     def image_path(self, image: str) -> Path:
         """Return a file with an image; an image of an object store is fetched.

@@ -32,6 +32,7 @@ from hbr.descriptors import Descriptor, descriptor, names
 from rig.calibrations.store import CALIBRATIONS
 from rig.catalog import log, state
 from rig.catalog.catalog import Catalog
+from rig.catalog.columns import damaged
 from rig.catalog.database import Database
 from rig.catalog.facts import Action, Derived, Enrollment, Entry, Session, View, seal_of
 from rig.catalog.images import Images
@@ -39,6 +40,7 @@ from rig.catalog.jobs import JobProgress, finished, processes
 from rig.catalog.records import EnrollmentStatus, JsonObject, Region
 from rig.config import ViewConfig
 from rig.core.errors import CatalogDamaged, CatalogError, RigError, UsageError
+from rig.core.files import json_values
 from rig.core.next_steps import Do
 from rig.core.processes import Jobs, map_in_processes
 from rig.views.description import (
@@ -144,7 +146,10 @@ def described(catalog: Catalog, enrollment: Enrollment, name: str, *wanted: str)
     levels = {name: _records(descriptor(name), stored[name][seal])["packed"] for name in kinds if seal in stored[name]}
     if len(levels) == len(kinds) and seal in stored[SEGMENTATION]:
         unpacked = {name: descriptor(name).unpack_rows(packed.tobytes()) for name, packed in levels.items()}
-        return Described(unpacked, _evidence(stored[SEGMENTATION][seal]))
+        with suppress(
+            ValueError, TypeError, AttributeError, RigError
+        ):  # computed again if this program has not made it
+            return Described(unpacked, _evidence(stored[SEGMENTATION][seal], len(enrollment.views)))
     task = _task(enrollment, seal, name, kinds, region)
     with catalog.database.catalog_errors():
         found = _describe(catalog.database.images.pixels, task, threads=THREADS)
@@ -175,12 +180,15 @@ def load_views(catalog: Catalog, descriptor: str) -> Generator[JobProgress, None
         found[task.seal] = _content(task, result)[kind.name]
     if not wanted:
         return hbr.Views.empty(kind.name)
-    parts = [_records(kind, found[one.seal]) for one in wanted]
-    records = np.concatenate(parts)
+    contents = [found[one.seal] for one in wanted]
+    records = _records(kind, b"".join(contents))
+    azimuth_deg = np.ascontiguousarray(records["azimuth_deg"])
+    if not ((azimuth_deg >= 0) & (azimuth_deg < 360)).all():
+        raise damaged("an azimuth of a stored description", azimuth_deg.min())
     return hbr.PackedViews(
         records["packed"],
-        np.ascontiguousarray(records["azimuth_deg"]),
-        np.repeat(np.arange(len(wanted)), [len(part) for part in parts]),
+        azimuth_deg,
+        np.repeat(np.arange(len(wanted)), [len(content) // records.itemsize for content in contents]),
         tuple(one.name for one in wanted),
         kind.name,
     )
@@ -307,49 +315,54 @@ class EmptyTables(NamedTuple):
 
 def empty_tables(catalog: Catalog) -> EmptyTables:
     """Return which of the objects in use were enrolled with an empty-table image."""
-    newest = None
+    newest: tuple[int, int] | None = None
     with_image: dict[str, bool] = {}
     with catalog.database.read() as transaction:
         owner = {one.enrollment_id: one.name for one in state.used(transaction)}
-        rows = transaction.execute(select(Session.enrollment_id, Session.empty_table).order_by(Session.started_utc))
-        for enrollment_id, image in rows:
+        rows = transaction.execute(
+            select(Session.enrollment_id, Session.number, Session.empty_table).order_by(Session.started_utc)
+        )
+        for enrollment_id, number, image in rows:
             if (name := owner.get(enrollment_id)) is not None:
                 with_image[name] = with_image.get(name, False) or image is not None
-                newest = newest if image is None else image
+                newest = newest if image is None else (enrollment_id, number)
+        image = None if newest is None else state.session(transaction, *newest).empty_table
     with_one = tuple(name for name in owner.values() if with_image.get(name))
-    return EmptyTables(with_one, tuple(name for name in owner.values() if not with_image.get(name)), newest)
+    return EmptyTables(with_one, tuple(name for name in owner.values() if not with_image.get(name)), image)
 
 
 def camera_settings(catalog: Catalog) -> list[dict[str, Any]]:
     """Return the camera's settings (`rig.devices.camera.CameraLocks`) of the objects in use, each combination once."""
     with catalog.database.read() as transaction:
-        ids = {one.enrollment_id for one in state.used(transaction)}
-        rows = transaction.execute(select(View.enrollment_id, View.evidence).where(View.index == 0).order_by(View.id))
-        return _settings(evidence for enrollment_id, evidence in rows if enrollment_id in ids)
+        shown = _settings((view.id, view.evidence) for view in state.first_views(transaction, View.id, View.evidence))
+        for view_id, _ in shown:
+            state.view(transaction, view_id)  # of an edited one nothing is believed
+    return [settings for _, settings in shown]
 
 
 def unfinished_camera_settings(catalog: Catalog, name: str) -> list[dict[str, Any]]:
     """Return the camera's settings of the views of an unfinished enrollment, each combination once."""
     begun = catalog.resumable(name)
-    return [] if begun is None else _settings(view.evidence for view in begun.enrollment.views)
+    shown = () if begun is None else _settings((view.id, view.evidence) for view in begun.enrollment.views)
+    return [settings for _, settings in shown]
 
 
-def _settings(evidence: Iterable[JsonObject]) -> list[dict[str, Any]]:
-    settings: list[dict[str, Any]] = []
-    for one in evidence:
+def _settings(evidence: Iterable[tuple[int, JsonObject]]) -> list[tuple[int, dict[str, Any]]]:
+    """Return each combination of the camera's settings once, with the first view that has it."""
+    found: list[tuple[int, dict[str, Any]]] = []
+    for view_id, one in evidence:
         locks = one.get("locks")
-        if isinstance(locks, dict) and locks not in settings:
-            settings.append(locks)
-    return settings
+        if isinstance(locks, dict) and all(locks != known for _, known in found):
+            found.append((view_id, locks))
+    return found
 
 
 def newest_view(catalog: Catalog) -> str | None:
     """Return the image of the first view of the newest enrollment in use; None if there is none."""
     with catalog.database.read() as transaction:
-        ids = [one.enrollment_id for one in state.used(transaction)]
-        return transaction.scalar(
-            select(View.image).where(View.index == 0, View.enrollment_id == max(ids, default=0)).limit(1)
-        )
+        newest = max((one.enrollment_id for one in state.used(transaction)), default=0)
+        view_id = transaction.scalar(select(View.id).where(View.index == 0, View.enrollment_id == newest))
+        return None if view_id is None else state.view(transaction, view_id).image
 
 
 def described_regions(catalog: Catalog, bench: str) -> set[tuple[Region | None, tuple[str, ...]]]:
@@ -568,8 +581,15 @@ def content_of(kind: Descriptor, packed: NDArray[np.uint8], azimuth_deg: ArrayLi
 
 def row_of(seal: str, what: str, region: tuple[Region | None] | None, content: bytes) -> dict[str, Any]:
     """Return the columns of a row of `Derived` by this program; ``region`` is the one that was chosen later."""
-    sha256 = hashlib.sha256(content).hexdigest()
-    return {"seal": seal, "what": what, "made_by": _made_by(what, region), "content": content, "sha256": sha256}
+    row = {"seal": seal, "what": what, "made_by": _made_by(what, region), "content": content}
+    return {**row, "sha256": digest_of(**row)}
+
+
+def digest_of(seal: str, what: str, made_by: str, content: bytes) -> str:
+    """Return the digest of a row of `Derived`; a content in the place of another one has another digest."""
+    digest = hashlib.sha256(ascii((seal, what, made_by)).encode())
+    digest.update(content)
+    return digest.hexdigest()
 
 
 def _content(task: Task, found: Described) -> dict[str, bytes]:
@@ -616,8 +636,9 @@ def _stored(
     wanted = set(seals)
     found: dict[str, dict[str, bytes]] = {}
     for what in kinds:
+        made_by = _made_by(what, region)
         query = select(Derived.seal, Derived.content, Derived.sha256).where(
-            Derived.what == what, Derived.made_by == _made_by(what, region)
+            Derived.what == what, Derived.made_by == made_by
         )
         if len(wanted) < 100:
             query = query.where(Derived.seal.in_(wanted))
@@ -625,13 +646,19 @@ def _stored(
         found[what] = {
             seal: content
             for seal, content, sha256 in transaction.execute(query)
-            if seal in wanted and hashlib.sha256(content).hexdigest() == sha256 and content and not len(content) % size
+            if seal in wanted
+            and digest_of(seal, what, made_by, content) == sha256
+            and content
+            and not len(content) % size
         }
     return found
 
 
-def _evidence(content: bytes) -> tuple[dict[str, Any], ...]:
-    found = tuple(json.loads(content))
+def _evidence(content: bytes, views: int) -> tuple[dict[str, Any], ...]:
+    """Return the evidence of each view; an error if there is none that this program would have stored."""
+    found = tuple(json_values(content))
+    if len(found) != views:
+        raise ValueError("the evidence of other views")
     for one in found:
         check_evidence(one)
     return found
@@ -669,7 +696,7 @@ def to_compare(
     rows = select(Derived.what, Derived.made_by, Derived.content, Derived.sha256).where(Derived.seal == seal)
     for what, made_by, content, sha256 in transaction.execute(rows.order_by(Derived.what)):
         stored.append(f"{what} {made_by} {sha256}")
-        if hashlib.sha256(content).hexdigest() != sha256:
+        if digest_of(seal, what, made_by, content) != sha256:
             damaged.append(what)
         elif what in (SEGMENTATION, *names()) and made_by == _made_by(what, region):
             used.append(what)

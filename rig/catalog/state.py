@@ -11,13 +11,14 @@ from difflib import get_close_matches
 from hashlib import sha256
 from typing import Any
 
-from sqlalchemy import ColumnElement, Select, and_, exists, false, func, select, true
+from sqlalchemy import ColumnElement, Row, Select, and_, exists, false, func, select, true
 from sqlalchemy.orm import Session as Transaction
 from sqlalchemy.orm import aliased, selectinload
 
 from rig.catalog import digests, log
 from rig.catalog.columns import damaged
-from rig.catalog.facts import Enrollment, Entry, View, damaged_parts
+from rig.catalog.facts import Enrollment, Entry, View, damaged_parts, digest_of
+from rig.catalog.facts import Session as EnrollmentSession
 from rig.catalog.records import EnrollmentStatus, clean_name
 from rig.core.errors import CatalogDamaged, CatalogError, ObjectExists, ObjectNotFound
 from rig.core.next_steps import Do
@@ -121,6 +122,17 @@ def used(transaction: Transaction, *, checked: bool = False) -> list[Used]:
     return [Used(*row[:6]) for row in rows]
 
 
+def first_views(transaction: Transaction, *columns: Any) -> list[Row[Any]]:
+    """Return these columns of the first view of each enrollment that searches use."""
+    ids = sorted(one.enrollment_id for one in used(transaction))
+    wanted = select(*columns).where(View.index == 0).order_by(View.enrollment_id)
+    return [
+        row
+        for part in digests.portions(ids, 500)
+        for row in transaction.execute(wanted.where(View.enrollment_id.in_(part)))
+    ]
+
+
 def version(transaction: Transaction) -> str:
     """Return a digest of what searches compare with: the names of the objects and the seals of their enrollments."""
     return sha256(ascii([(one.name, one.seal) for one in used(transaction)]).encode()).hexdigest()
@@ -222,7 +234,11 @@ def summaries(transaction: Transaction, *, deleted: bool = False, object_id: int
     log.check_complete(transaction)
     conditions = _among(deleted) if object_id is None else [IS_STATE, Named.object_id == object_id]
     count = select(func.count()).where(View.enrollment_id == Ended.enrollment_id).correlate(Ended).scalar_subquery()
-    states = transaction.scalars(select(Named).where(*conditions).order_by(Named.object_id)).all()
+    columns = (
+        *(Named.id, Named.object_id, Named.object_name, Named.label, Named.note),
+        *(Named.created_utc, Named.time_utc, Named.deleted),
+    )
+    states = transaction.execute(select(*columns).where(*conditions).order_by(Named.object_id)).all()
     planned = func.json_array_length(Enrollment.planned_azimuth_deg)
     wanted = (
         select(Ended.object_id, Ended.status, Ended.finished_utc, count, planned, Ended.id)
@@ -300,6 +316,30 @@ def is_possible(enrollment: Enrollment, ended: Entry) -> bool:
         )
         and (ended.status != EnrollmentStatus.COMPLETE or (ended.finished_utc is not None and not enrollment.missing))
     )
+
+
+def view(transaction: Transaction, view_id: int) -> View:
+    """Return one view; a `CatalogError` if there is none, or it is not as it was written."""
+    found = transaction.get(View, view_id)
+    if found is None:
+        raise CatalogError(f"There is no view {view_id} in the catalog.", next_step="Load the views again.")
+    _check_part(transaction, found, f"view {view_id}")
+    return found
+
+
+def session(transaction: Transaction, enrollment_id: int, number: int) -> EnrollmentSession:
+    """Return a session of an enrollment; a `CatalogDamaged` if it is missing or not as it was written."""
+    found = transaction.get(EnrollmentSession, (enrollment_id, number))
+    if found is None:
+        raise damaged("a session of an enrollment", None)
+    _check_part(transaction, found, f"the session of {found.started_utc:%Y-%m-%d %H:%M}")
+    return found
+
+
+def _check_part(transaction: Transaction, part: View | EnrollmentSession, name: str) -> None:
+    key = transaction.scalar(select(Enrollment.key).where(Enrollment.id == part.enrollment_id))
+    if part.digest != digest_of(part, str(key)):
+        raise changed([name])
 
 
 def unfinished(transaction: Transaction, state: Entry) -> EnrollmentState:
