@@ -8,7 +8,6 @@ import os
 import signal
 import sqlite3
 import sys
-from collections.abc import Sequence
 from contextlib import closing
 from itertools import count
 from pathlib import Path
@@ -19,14 +18,12 @@ import pytest
 from numpy.typing import NDArray
 from sqlalchemy import Engine, event
 
-import hbr
-from rig.catalog import Catalog, Provenance, ViewRecord
+from rig.catalog import Catalog, Provenance, View
 from rig.catalog.jobs import finished as finished
 from rig.catalog.records import Outcome
 from rig.catalog.results import Answer, NewResult
 from rig.catalog.results import record as record_result
 from rig.core.clock import SystemClock
-from rig.views.description import within
 from tests.programs import Program
 from tests.servers.postgres import use_postgres
 
@@ -44,47 +41,32 @@ def plan(views: int) -> list[float]:
 
 
 def image(seed: int) -> NDArray[np.uint8]:
-    return np.random.default_rng(seed).integers(0, 256, (12, 16, 3), np.uint8)
+    return np.random.default_rng(seed).integers(0, 256, (24, 32, 3), np.uint8)
 
 
-def record(index: int, /, **changes: Any) -> ViewRecord:
+def record(index: int, /, **changes: Any) -> View:
     values: dict[str, Any] = {
         "index": index,
         "commanded_deg": -5.0 * index,
         "encoder_deg": -5.0 * index + 0.03,
         "azimuth_deg": 5.0 * index % 360,
-        "descriptors": {"cedd": np.random.default_rng(index).integers(0, 8, 144, np.uint8)},
         "captured_ns": 0,
     }
-    return ViewRecord(**values | changes)
+    return View(**values | changes)
 
 
-def fill(catalog: Catalog, name: str, views: int, **begin: Any) -> None:
-    enrollment = catalog.begin(name, planned_azimuth_deg=plan(views), provenance=PROVENANCE, **begin)
-    for index in range(views):
-        enrollment.add(record(index), image(index))
-    enrollment.finish()
-
-
-def described(
-    index: int,
-    seed: int,
+def fill(
+    catalog: Catalog,
+    name: str,
+    views: int,
+    seed: int = 0,
     region: tuple[int, int, int, int] | None = None,
-    names: Sequence[str] = ("cedd",),
-    **changes: Any,
-) -> ViewRecord:
-    """A view whose descriptors are those of ``image(seed)``."""
-    levels = {name: hbr.describe(within(image(seed), region), descriptor=name) for name in names}
-    return record(index, descriptors=levels, region=region, **changes)
-
-
-def true_fill(
-    catalog: Catalog, name: str, views: int, seed: int, region: tuple[int, int, int, int] | None = None, **begin: Any
+    **begin: Any,
 ) -> None:
-    """Enroll an object with the descriptors of its images."""
+    """Enroll an object with the images of ``seed`` and the numbers after it."""
     enrollment = catalog.begin(name, planned_azimuth_deg=plan(views), provenance=PROVENANCE, **begin)
     for index in range(views):
-        enrollment.add(described(index, seed + index, region), image(seed + index))
+        enrollment.add(record(index, region=region), image(seed + index))
     enrollment.finish()
 
 
