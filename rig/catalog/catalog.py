@@ -279,8 +279,7 @@ class Catalog(AbstractContextManager["Catalog"]):
                 self.clock,
                 Action.ENROLLMENT_STARTED,
                 name,
-                **(state.columns(known, now, **texts) if changed_texts else {}),
-                object_id=object_id,
+                **{**(state.columns(known, now, texts) if changed_texts else {}), "object_id": object_id},
                 enrollment_id=enrollment.id,
                 status=EnrollmentStatus.IN_PROGRESS,
                 details={"enrollment_id": enrollment.id, "views": len(plan), "replace": replace},
@@ -364,7 +363,7 @@ class Catalog(AbstractContextManager["Catalog"]):
         with self.database.write() as transaction:
             known = state.find(transaction, name)
             if texts:
-                columns = state.columns(known, known.time_utc, **texts)
+                columns = state.columns(known, known.time_utc, texts)
                 log.append(transaction, self.clock, Action.LABELLED, known.object_name, **columns, details=texts)
 
     def delete(self, *names: str) -> None:

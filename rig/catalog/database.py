@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
-from sqlalchemy import Connection, select
+from sqlalchemy import Connection, insert, select
 from sqlalchemy.orm import Session as Transaction
 
 from rig.catalog.columns import damaged
@@ -102,7 +102,7 @@ def create_tables(connection: Connection) -> None:
     """Create the tables of a new catalog."""
     Row.metadata.create_all(connection)
     first = {"application": APPLICATION, "version": str(SCHEMA_VERSION), "id": uuid.uuid4().hex, "head": "0  0 0"}
-    connection.execute(Property.__table__.insert(), [{"key": key, "value": value} for key, value in first.items()])
+    connection.execute(insert(Property), [{"key": key, "value": value} for key, value in first.items()])
 
 
 def properties(connection: Connection | Transaction) -> dict[str, str]:

@@ -581,8 +581,9 @@ def content_of(kind: Descriptor, packed: NDArray[np.uint8], azimuth_deg: ArrayLi
 
 def row_of(seal: str, what: str, region: tuple[Region | None] | None, content: bytes) -> dict[str, Any]:
     """Return the columns of a row of `Derived` by this program; ``region`` is the one that was chosen later."""
-    row = {"seal": seal, "what": what, "made_by": _made_by(what, region), "content": content}
-    return {**row, "sha256": digest_of(**row)}
+    made_by = _made_by(what, region)
+    sha256 = digest_of(seal, what, made_by, content)
+    return {"seal": seal, "what": what, "made_by": made_by, "content": content, "sha256": sha256}
 
 
 def digest_of(seal: str, what: str, made_by: str, content: bytes) -> str:

@@ -5,7 +5,7 @@ from itertools import groupby
 from operator import itemgetter
 from typing import Any, Final
 
-from sqlalchemy import Column, ColumnElement, Integer, Text, cast, func, select, type_coerce
+from sqlalchemy import ColumnElement, Integer, Text, cast, func, select, type_coerce
 from sqlalchemy.orm import Session as Transaction
 from sqlalchemy.orm import aliased
 from sqlalchemy.types import NullType
@@ -72,7 +72,7 @@ def _raw(transaction: Transaction, table: type[Row]) -> list[ColumnElement[Any]]
     return [_as_stored(column, is_postgres).label(f"raw_{name}") for name, column in digested(table)]
 
 
-def _as_stored(column: Column[Any], is_postgres: bool) -> ColumnElement[Any]:
+def _as_stored(column: ColumnElement[Any], is_postgres: bool) -> ColumnElement[Any]:
     if is_postgres and isinstance(column.type, Utc):
         return func.to_char(column, "YYYY-MM-DD HH24:MI:SS.US")
     if is_postgres and isinstance(column.type, JsonText | Truth):

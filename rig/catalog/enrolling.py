@@ -182,7 +182,7 @@ class OpenEnrollment:
                 transaction,
                 self._catalog.clock,
                 Action.ENROLLMENT_DISCARDED,
-                self.object_name,
+                known.object_name,
                 **(gone if others is None else {}),
                 enrollment_id=self.id,
                 details={"enrollment_id": self.id},
@@ -195,13 +195,14 @@ class OpenEnrollment:
         status: EnrollmentStatus,
         ended: state.EnrollmentState | None = None,
     ) -> None:
+        """End an enrollment, this one or the ``ended`` one; the object may have another name now."""
         enrollment = self.enrollment if ended is None else ended.enrollment
         finished_utc = self._catalog.clock.utc() if ended is None else ended.finished_utc
         log.append(
             transaction,
             self._catalog.clock,
             action,
-            self.object_name,
+            state.by_id(transaction, enrollment.object_id).object_name,
             object_id=enrollment.object_id,
             enrollment_id=enrollment.id,
             status=status,

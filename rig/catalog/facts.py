@@ -16,7 +16,7 @@ from typing import Any, Final
 
 from sqlalchemy import (
     CheckConstraint,
-    Column,
+    ColumnElement,
     ForeignKey,
     ForeignKeyConstraint,
     Index,
@@ -299,7 +299,7 @@ def json_text(value: Any) -> str:
     return json.dumps(value, sort_keys=True, separators=(",", ":"))
 
 
-def digested(table: type[Row]) -> list[tuple[str, Column[Any]]]:
+def digested(table: type[Row]) -> list[tuple[str, ColumnElement[Any]]]:
     """Return the columns that a digest covers, with the names of their attributes."""
     left_out = {"digest"} if table is Entry else _LOCAL
     return [
@@ -336,7 +336,7 @@ def damaged_parts(enrollment: Enrollment, seal: str | None) -> list[Enrollment |
     return wrong
 
 
-def _as_stored(column: Column[Any], value: Any) -> Any:
+def _as_stored(column: ColumnElement[Any], value: Any) -> Any:
     """Return a value as both databases give it without its type (`rig.catalog.digests`)."""
     if value is None:
         return None

@@ -128,7 +128,7 @@ def entries(transaction: Transaction, since: datetime | None = None, object_name
     return found
 
 
-def author() -> dict[str, str]:
+def author() -> dict[str, Any]:
     """Return the columns that say who changes the catalog: account, computer and program."""
     try:
         user = pwd.getpwuid(os.getuid()).pw_name  # the account, not LOGNAME, which any user can change

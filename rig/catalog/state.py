@@ -4,14 +4,14 @@ The last line that gives an object a state counts, and the last line that gives 
 says which these are.
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from difflib import get_close_matches
 from hashlib import sha256
 from typing import Any
 
-from sqlalchemy import ColumnElement, Row, Select, and_, exists, false, func, select, true
+from sqlalchemy import ColumnElement, and_, exists, false, func, select, true
 from sqlalchemy.orm import Session as Transaction
 from sqlalchemy.orm import aliased, selectinload
 
@@ -119,10 +119,11 @@ def used(transaction: Transaction, *, checked: bool = False) -> list[Used]:
         check_lines(transaction, {line for row in rows for line in row[5:]})
     if wrong := [str(row[1]) for row in rows if None in row]:  # the enrollment is missing, or no program wrote this
         raise changed(wrong)
-    return [Used(*row[:6]) for row in rows]
+    found: Sequence[Sequence[Any]] = rows
+    return [Used(*row[:6]) for row in found]
 
 
-def first_views(transaction: Transaction, *columns: Any) -> list[Row[Any]]:
+def first_views(transaction: Transaction, *columns: Any) -> list[Any]:
     """Return these columns of the first view of each enrollment that searches use."""
     ids = sorted(one.enrollment_id for one in used(transaction))
     wanted = select(*columns).where(View.index == 0).order_by(View.enrollment_id)
@@ -197,7 +198,7 @@ def state_of(transaction: Transaction, name: str) -> Entry | None:
     return found
 
 
-def by_id(transaction: Transaction, object_id: int) -> Entry:
+def by_id(transaction: Transaction, object_id: int | None) -> Entry:
     """Return the state of an object, in use or deleted."""
     found = transaction.scalar(select(Named).where(IS_STATE, Named.object_id == object_id))
     if found is None:
@@ -206,11 +207,19 @@ def by_id(transaction: Transaction, object_id: int) -> Entry:
     return found
 
 
-def columns(known: Entry | None, now: datetime, *, deleted: bool = False, **texts: str) -> dict[str, Any]:
-    """Return the columns of a line of the log that gives an object this state; what is not given stays as it is."""
+def columns(
+    known: Entry | None, now: datetime, texts: Mapping[str, str] | None = None, *, deleted: bool = False
+) -> dict[str, Any]:
+    """Return the columns of a line of the log that gives an object this state; other texts stay as they are."""
     label, note = ("", "") if known is None else (known.label or "", known.note or "")
     created_utc = now if known is None else known.created_utc
-    found: dict[str, Any] = {"label": label, "note": note, "deleted": deleted, "created_utc": created_utc, **texts}
+    found: dict[str, Any] = {
+        "label": label,
+        "note": note,
+        "deleted": deleted,
+        "created_utc": created_utc,
+        **(texts or {}),
+    }
     return found if known is None else {**found, "object_id": known.object_id}
 
 
@@ -278,7 +287,7 @@ def enrollments(transaction: Transaction, *conditions: ColumnElement[bool]) -> l
     CatalogDamaged
         They are not.
     """
-    wanted: Select[Any] = (
+    wanted = (
         select(Enrollment, Ended)
         .join(Ended, Ended.enrollment_id == Enrollment.id)
         .where(IS_STATUS, *conditions)
@@ -292,7 +301,11 @@ def enrollments(transaction: Transaction, *conditions: ColumnElement[bool]) -> l
         if damaged_parts(enrollment, ended.seal) or not is_possible(enrollment, ended):
             raise changed([str(by_id(transaction, enrollment.object_id).object_name)])
     transaction.expunge_all()
-    return [EnrollmentState(one, ended.status, ended.finished_utc, ended.seal) for one, ended in rows]
+    return [
+        EnrollmentState(one, ended.status, ended.finished_utc, ended.seal)
+        for one, ended in rows
+        if ended.status is not None
+    ]
 
 
 def is_possible(enrollment: Enrollment, ended: Entry) -> bool:
