@@ -18,8 +18,9 @@ from hbr.core.angles import wrap360
 from rig.catalog.exchange.tables import ANGLES, NAMES, parse_region
 from rig.catalog.facts import Enrollment, Session, View
 from rig.catalog.records import EnrollmentStatus, Provenance, clean_name, this_software
+from rig.catalog.rejected import Gap, ImportProblem, Reason, RejectedFile
 from rig.catalog.state import EnrollmentState
-from rig.catalog.transfer import Gap, ImportProblem, Item, Reason, RejectedFile
+from rig.catalog.transfer import Item
 from rig.core.errors import ImportRejected, UsageError
 from rig.core.next_steps import Do
 from rig.views.image_files import read_file
@@ -94,7 +95,8 @@ class Photographs:
         """Yield the objects in the order of the folder or the table."""
         yield from self._items
 
-    def content(self, image: str) -> bytes:
+    @staticmethod
+    def content(image: str) -> bytes:
         """Return the bytes of an image file; an `OSError` if it cannot be read."""
         return read_file(Path(image))
 

@@ -12,7 +12,7 @@ from datetime import datetime
 from enum import StrEnum
 from io import TextIOWrapper
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any, Final, NamedTuple
+from typing import IO, Any, Final, NamedTuple
 
 import numpy as np
 
@@ -23,13 +23,11 @@ from rig.catalog.facts import Enrollment, View
 from rig.catalog.images import path_of
 from rig.catalog.records import EnrollmentStatus, Region
 from rig.catalog.results import Result
+from rig.catalog.transfer import CatalogSource, Item
 from rig.core.errors import ExportFailed
 from rig.core.next_steps import Do
 from rig.views.description import PAPER_DESCRIPTOR
 from rig.views.image_files import IMAGE_FOLDER
-
-if TYPE_CHECKING:
-    from rig.catalog.transfer import CatalogSource, Item
 
 TABLE: Final = "views.csv"
 NAMES: Final = "objects.csv"
@@ -78,12 +76,12 @@ class TableFormat(StrEnum):
 class Enrolled(NamedTuple):
     """An object and its complete enrollment, with the part of the image that is described of each view."""
 
-    item: "Item"
+    item: Item
     enrollment: Enrollment
     regions: tuple[Region | None, ...]
 
 
-def enrolled(source: "CatalogSource") -> Iterator[Enrolled]:
+def enrolled(source: CatalogSource) -> Iterator[Enrolled]:
     """Yield the objects that are completely enrolled, with the enrollment that searches use."""
     for item in source.items():
         for one in item.enrollments:
@@ -91,7 +89,7 @@ def enrolled(source: "CatalogSource") -> Iterator[Enrolled]:
                 yield Enrolled(item, one.enrollment, regions_of(source.catalog, one.enrollment))
 
 
-def write_folder(folder: Path, source: "CatalogSource") -> int:
+def write_folder(folder: Path, source: CatalogSource) -> int:
     """Write the views as ``obj{N}__{azimuth}.png``, and the names of the objects in ``objects.csv``.
 
     The files are copies of the stored ones, and the azimuths are exact.
@@ -127,7 +125,7 @@ def write_folder(folder: Path, source: "CatalogSource") -> int:
     return count
 
 
-def write_table(target: Path, source: "CatalogSource") -> int:
+def write_table(target: Path, source: CatalogSource) -> int:
     """Write the views as a CSV file, with copies of their images.
 
     ``target`` is the file (suffix ``.csv``; the images are in a folder beside it), or a folder for ``views.csv`` and
@@ -141,7 +139,7 @@ def write_table(target: Path, source: "CatalogSource") -> int:
         return _write_table(file, made / IMAGE_FOLDER, IMAGE_FOLDER, source)
 
 
-def _write_table(file: IO[bytes], images: Path, link: str, source: "CatalogSource") -> int:
+def _write_table(file: IO[bytes], images: Path, link: str, source: CatalogSource) -> int:
     """Write the table to ``file`` and the images into ``images``; ``link`` is its path from the table."""
     count = 0
     with _csv(file, _CSV) as table:
@@ -155,7 +153,7 @@ def _write_table(file: IO[bytes], images: Path, link: str, source: "CatalogSourc
     return count
 
 
-def write_parquet(path: Path, source: "CatalogSource") -> int:
+def write_parquet(path: Path, source: CatalogSource) -> int:
     """Write the views as a Parquet table, with their CEDD levels, without their images.
 
     Raises
@@ -201,7 +199,7 @@ def plain_row(result: Result) -> dict[str, Any]:
     return {k: v.isoformat() if isinstance(v, datetime) else v for k, v in result.as_row().items()}
 
 
-def _rows(source: "CatalogSource") -> Iterator[list[tuple[dict[str, Any], View]]]:
+def _rows(source: CatalogSource) -> Iterator[list[tuple[dict[str, Any], View]]]:
     """Yield the rows of each object, with all columns of both formats, and their views."""
     kind = descriptor(PAPER_DESCRIPTOR)
     for item, enrollment, regions in enrolled(source):

@@ -6,8 +6,8 @@ Decision: docs/decisions/0038.
 """
 
 import json
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from enum import StrEnum
 from functools import lru_cache, partial
 from itertools import groupby
@@ -26,7 +26,7 @@ from rig.catalog.exchange.tables import Enrolled, enrolled
 from rig.catalog.facts import Session, View
 from rig.catalog.images import FolderImages, path_of
 from rig.catalog.jobs import JobProgress, portions, processes
-from rig.catalog.records import EnrollmentStatus, Region, this_software
+from rig.catalog.records import Region, this_software
 from rig.catalog.transfer import CatalogSource, Item, transfer
 from rig.config import ViewConfig
 from rig.config.catalog_place import DATABASE_NAME
@@ -94,16 +94,6 @@ class _Mask(NamedTuple):
 _Annotated = tuple[_Picture, _Mask]
 
 
-class _Enrolled(CatalogSource):
-    """The objects of a catalog with the enrollments that searches use, and no others."""
-
-    def items(self) -> Iterator[Item]:
-        for item in super().items():
-            used = tuple(one for one in item.enrollments if one.status is EnrollmentStatus.COMPLETE)
-            if used:
-                yield replace(item, enrollments=used)
-
-
 def write_training(
     folder: Path,
     source: CatalogSource,
@@ -146,7 +136,7 @@ def write_training(
         # Copy the objects. The images get the permissions of the database: who may enter the folder may read them.
         with Catalog.open(made, clock=source.catalog.clock) as copy:
             (made / DATABASE_NAME).chmod(0o644)
-            yield from transfer(_Enrolled(source.catalog, source.names), copy, jobs=jobs)
+            yield from transfer(CatalogSource(source.catalog, source.names, used_only=True), copy, jobs=jobs)
         # Find the objects in the images, in processes.
         pictures = _pictures(source, objects)
         masks: dict[int, _Mask] = {}
