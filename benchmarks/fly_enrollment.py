@@ -27,6 +27,7 @@ from hbr.evaluation.statistics import mcnemar_exact
 from rig import Catalog, enroll
 from rig.bench import Bench
 from rig.calibrations import CalibrationResult, apply_results
+from rig.catalog import derived
 from rig.config import load_config
 from rig.events.events import Accepted, Enrolled
 from rig.motion.turntable import Turntable
@@ -90,7 +91,7 @@ def main() -> None:
                                 middle = exposed + round(NOISE.camera_readout_ms * 1e6 * row) + 5_000_000
                                 angle_errors.append(motion.angle_deg - world.table_deg(middle))
                     print(f"{kind} {name} {time.process_time() - begun:.1f} s of CPU time", file=sys.stderr, flush=True)
-                views[kind] = catalog.views(descriptor=BENCH_DESCRIPTOR).views
+                views[kind] = derived.views(catalog, BENCH_DESCRIPTOR)
         for name in names:
             same_angle += similar_at_rest(bench, views["motion"], name)
     report: dict[str, Any] = {"objects": len(names), "views": given.views}

@@ -31,7 +31,7 @@ from rig.devices.camera import Frame
 from rig.motion.flight_views import FlightFrames
 from rig.motion.turntable import Turntable
 from rig.views.description import BENCH_DESCRIPTOR, SearchDescriber
-from rig.views.stream import FrameStream, StreamFrame
+from rig.views.stream import FrameStream
 from sim.bench import ShelfOperator, open_sim_bench
 from sim.change import another_bench
 from sim.objects.projection import Image
@@ -39,7 +39,7 @@ from sim.objects.shelf import shelf
 from sim.world import World
 
 FPS = 30
-Work = Callable[[StreamFrame], None]
+Work = Callable[[Frame], None]
 
 
 def main() -> None:
@@ -94,7 +94,7 @@ def measured(index: hbr.DenseIndex, background: str) -> tuple[dict[str, list[flo
                 describe, session = begun(index, config)
                 return lambda frame: work(frame, describe, session)
 
-            def work(frame: StreamFrame, describe: SearchDescriber, session: ArcSession) -> None:
+            def work(frame: Frame, describe: SearchDescriber, session: ArcSession) -> None:
                 started = time.thread_time()
                 trajectory = timed(spent["angle"], frames.recorder.fit)
                 if trajectory is None:
@@ -109,7 +109,7 @@ def measured(index: hbr.DenseIndex, background: str) -> tuple[dict[str, list[flo
 
             use = begin()
 
-            def take(frame: StreamFrame) -> None:
+            def take(frame: Frame) -> None:
                 images.append(frame.image_bgr)
                 use(frame)
 

@@ -27,6 +27,7 @@ from hbr.core.angles import size_deg
 from hbr.descriptors.shift import Shift
 from rig.bench import Bench
 from rig.config import RigConfig, load_config
+from rig.devices.camera import Frame
 from rig.motion.flight_views import FlightFrames
 from rig.motion.motion_model import MotionModel
 from rig.motion.move import equivalent_within
@@ -36,7 +37,7 @@ from rig.search.model import DenseModel, Model, begin_search
 from rig.search.strategies import Finish
 from rig.views.capture import Viewer
 from rig.views.description import BENCH_DESCRIPTOR, DescribedView, ViewDescriber
-from rig.views.stream import StreamFrame, middle_ns
+from rig.views.stream import middle_ns
 from sim.bench import ShelfOperator, open_sim_bench
 from sim.objects.shelf import shelf
 from sim.world import World
@@ -84,8 +85,8 @@ def revolution(bench: Bench, table: Turntable, describe: ViewDescriber) -> Seen:
     frames = FlightFrames(bench, table)
     seen: list[tuple[int, Any]] = []
 
-    def take(frame: StreamFrame) -> None:
-        middle = middle_ns(frame.stamp_ns, bench.config.camera_time)
+    def take(frame: Frame) -> None:
+        middle = middle_ns(frame.exposed_ns, bench.config.camera_time)
         seen.append((middle, describe(frame.image_bgr).levels[BENCH_DESCRIPTOR]))
 
     speed = bench.config.table.velocity_dps

@@ -31,12 +31,12 @@ from rig.bench import Bench
 from rig.calibrations import CalibrationResult, RejectionCode
 from rig.charts.xy import MEASURED, MODEL, Axis, Chart, Series
 from rig.core.phrases import filled
+from rig.devices.camera import Frame
 from rig.jobs.desk import Progress
 from rig.motion.flight_views import FlightFrames
 from rig.motion.trajectory import SLIP_DEG
 from rig.motion.turntable import Turntable
 from rig.views.description import within
-from rig.views.stream import StreamFrame
 
 NAME = "camera.time"
 
@@ -141,11 +141,11 @@ def _take_pass(
     images: list[NDArray[np.float32]] = []
     usable = True
 
-    def take(frame: StreamFrame) -> None:
+    def take(frame: Frame) -> None:
         nonlocal usable
         usable = usable and frame.stamped
         if not frame.repeated:
-            stamps.append(frame.stamp_ns)
+            stamps.append(frame.exposed_ns)
             images.append(small(frame.image_bgr, bench))
 
     table.fly(ends_deg[1 if way > 0 else 0], flights.flight(take, ends_deg, speed_dps))

@@ -61,12 +61,14 @@ class CameraLocks:
 class Frame:
     """An image; ``exposed_ns`` is the start of its exposure on the bench's clock.
 
-    ``stamped`` says that the camera's own time stamp gave the time, and not the frame's arrival.
+    ``stamped`` says that the camera's own time stamp gave the time, and not the frame's arrival. ``repeated`` says that
+    the image is that of the frame before (`rig.views.stream`).
     """
 
     image_bgr: NDArray[np.uint8]
     exposed_ns: int
     stamped: bool = True
+    repeated: bool = False
 
 
 class Camera(Protocol):

@@ -7,12 +7,12 @@ from typing import Any, Final
 import numpy as np
 
 from rig.bench import Bench
-from rig.devices.camera import CameraLocks
+from rig.devices.camera import CameraLocks, Frame
 from rig.motion.scan_speed import smear_px, time_sigma_ms
 from rig.motion.trajectory import Trajectory
 from rig.motion.turntable import Flight, Turntable
 from rig.views.capture import Attempt, ImageQuality, MotionEvidence, RejectReason, ViewEvidence
-from rig.views.stream import FrameStream, StreamFrame, after_middle_row_ns, irregular_stamps, middle_ns
+from rig.views.stream import FrameStream, after_middle_row_ns, irregular_stamps, middle_ns
 
 READINGS: Final = 8
 """Readings of the encoder from which the angle of a frame is estimated during a flight."""
@@ -49,7 +49,7 @@ class FlightFrames:
 
     def flight(
         self,
-        take: Callable[[StreamFrame], float | None],
+        take: Callable[[Frame], float | None],
         reach_deg: tuple[float, float],
         velocity_dps: float,
         *,
@@ -63,14 +63,14 @@ class FlightFrames:
             frame = self.stream.next(self.table.collect_gyro, newest=self.newest)
             if frame is None:
                 return None
-            self._stamps_ns.append(frame.stamp_ns)
+            self._stamps_ns.append(frame.exposed_ns)
             return take(frame)
 
         return Flight(each, reach_deg, self.recorder, velocity_dps, quiet)
 
-    def about_deg(self, frame: StreamFrame) -> float:
+    def about_deg(self, frame: Frame) -> float:
         """Return the approximate angle of a frame during a flight, from the last readings of the encoder."""
-        time_ns = middle_ns(frame.stamp_ns, self.bench.config.camera_time)
+        time_ns = middle_ns(frame.exposed_ns, self.bench.config.camera_time)
         readings = self.recorder.readings[-READINGS:]
         if len(readings) < 2:
             return readings[-1][1] if readings else self.table.rest_deg
@@ -89,7 +89,7 @@ class FlightFrames:
 
     def attempt(
         self,
-        frame: StreamFrame,
+        frame: Frame,
         trajectory: Trajectory,
         locks: CameraLocks,
         *,
@@ -107,7 +107,7 @@ class FlightFrames:
         """
         config = self.bench.config
         quality = ImageQuality.of(frame.image_bgr, config.view)
-        middle = middle_ns(frame.stamp_ns, config.camera_time)
+        middle = middle_ns(frame.exposed_ns, config.camera_time)
         motion = trajectory.at([middle])
         speed_dps = abs(float(motion.rate_dps[0]))
         time_deg = speed_dps * time_sigma_ms(config) * 1e-3
@@ -120,7 +120,7 @@ class FlightFrames:
             trajectory.residual_deg,
         )
         reasons = []
-        if not frame.stamped or frame.stamp_ns in self.irregular_ns(stamps):
+        if not frame.stamped or frame.exposed_ns in self.irregular_ns(stamps):
             reasons.append(RejectReason.TIME_UNCERTAIN)
         if evidence.angle_sigma_deg > config.view.max_angle_sigma_deg or not trajectory.consistent:
             reasons.append(RejectReason.ANGLE_UNCERTAIN)
@@ -136,7 +136,7 @@ class FlightFrames:
             frame.image_bgr,
             ViewEvidence(
                 settled_ns=self._begun_ns,
-                exposed_ns=frame.stamp_ns,
+                exposed_ns=frame.exposed_ns,
                 sharpness=quality.sharpness,
                 mean_level=quality.mean_level,
                 dark_share=quality.dark_share,

@@ -24,6 +24,7 @@ from rig.core.errors import LimitExceeded, ObjectMoved, RotationDisagreement
 from rig.core.json_form import plain
 from rig.core.next_steps import Do
 from rig.core.phrases import angle_words
+from rig.devices.camera import Frame
 from rig.events.events import Event, Rejected, ScanStarted
 from rig.motion.flight_views import FlightFrames
 from rig.motion.move import Move
@@ -33,7 +34,6 @@ from rig.plans.capture import accepted, announced, capture, check_object, moved,
 from rig.views.capture import Attempt, Viewer, image_similarity
 from rig.views.description import DescribedView, ViewDescriber
 from rig.views.image_files import Encoder
-from rig.views.stream import StreamFrame
 
 SAME_SIMILARITY: Final = 0.97
 """Two images of an object at one angle are more similar; after a shift by a centimetre they are less similar."""
@@ -163,9 +163,9 @@ class EnrollmentViews:
         self._first = _Seen(0, start_deg, before.image_bgr)
         yield ScanStarted(speed.dps, speed.limit, speed.value, start_deg, end_deg)
         frames = FlightFrames(self.bench, table)
-        nearest: dict[int, tuple[float, StreamFrame]] = {}
+        nearest: dict[int, tuple[float, Frame]] = {}
 
-        def hold_nearest(frame: StreamFrame) -> None:
+        def hold_nearest(frame: Frame) -> None:
             about_deg = frames.about_deg(frame)
             for index, angle_deg in angles_deg.items():
                 away_deg = abs(angle_deg - about_deg)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from hbr.core.angles import wrap360
 from rig.bench import Bench
 from rig.core.clock import seconds_between
-from rig.devices.camera import CameraLocks
+from rig.devices.camera import CameraLocks, Frame
 from rig.events.events import Event, FrameUsed, Moved, Rejected
 from rig.motion.flight_views import FlightFrames
 from rig.motion.move import Move
@@ -30,7 +30,6 @@ from rig.search.session import Search
 from rig.search.strategies import Finish, Rotate
 from rig.views.capture import Viewer
 from rig.views.description import SearchDescriber
-from rig.views.stream import StreamFrame
 
 FIRST_REST_IN_MOTION_S: Final = 0.15
 """Time over which the gyro is averaged before a search in motion; the fit of the trajectory corrects the bias later."""
@@ -185,7 +184,7 @@ class ViewsInMotion(ViewsAtRest):
         self.number += 1
         yield self._rested(self.table.hold())
 
-    def _take(self, frame: StreamFrame) -> float | None:
+    def _take(self, frame: Frame) -> float | None:
         """Take a frame as evidence; return a new goal, or the stopping angle if the search has ended."""
         if self.is_over or self.rejected_in_a_row >= MOST_REJECTED:
             return self.goal_deg

@@ -3,16 +3,22 @@
 Decision: docs/decisions/0028.
 """
 
-import hashlib
-from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass
-from datetime import datetime
-from typing import Any, Final, Self
+from typing import Annotated, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import (
+    AwareDatetime,
+    BaseModel,
+    ConfigDict,
+    Field,
+    PlainSerializer,
+    PlainValidator,
+    SkipValidation,
+    ValidationError,
+)
 
 from rig.bench import Bench
 from rig.core.errors import StateNotStored
@@ -27,9 +33,19 @@ _FILE: Final = "empty-table.json"
 _VERSION: Final = 1
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class EmptyTable:
-    """An empty-table image, and how it was taken.
+def _problem(values: object) -> TableProblem | None:
+    """Return the problem of its JSON values."""
+    if values is None or isinstance(values, TableProblem):
+        return values
+    if not isinstance(values, dict):
+        raise ValueError("a problem of an empty-table image that is not an object")
+    return TableProblem(
+        TableProblemCode(str(values.get("code"))), {name: values[name] for name in values.keys() - {"code"}}
+    )
+
+
+class EmptyTable(BaseModel):
+    """An empty-table image, and how it was taken; without its pixels, the content of the JSON file beside it.
 
     Attributes
     ----------
@@ -43,14 +59,22 @@ class EmptyTable:
         The measurements that the image was accepted with.
     noticed
         A problem that a search or an enrollment has noticed since then.
+    image
+        The file, whose name contains the SHA-256 of its bytes.
     """
 
-    image_bgr: NDArray[np.uint8]
-    taken_utc: datetime
+    model_config = ConfigDict(frozen=True, extra="forbid", arbitrary_types_allowed=True)
+
+    version: int = _VERSION
+    image_bgr: SkipValidation[NDArray[np.uint8]] = Field(np.empty((0, 0, 3), np.uint8), exclude=True, repr=False)
+    taken_utc: AwareDatetime
     camera: CameraIdentity
     locks: CameraLocks
-    evidence: Mapping[str, Any]
-    noticed: TableProblem | None = None
+    evidence: dict[str, Any]
+    noticed: Annotated[
+        TableProblem | None, PlainValidator(_problem), PlainSerializer(lambda one: one and one.as_json())
+    ] = None
+    image: str = Field("", pattern=r"^empty-table-[0-9a-f]{64}\.png$")
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,21 +122,24 @@ def store_empty_table(bench: Bench, table: EmptyTable) -> None:
         The disk is full or not writable.
     """
     png = images.encode(table.image_bgr)
-    stored = _Stored.of(table, png)
-    before = _metadata(bench, quiet=True)
+    stored = table.model_copy(update={"image": f"empty-table-{images.digest(png)}.png"})
+    before = _described(bench, quiet=True)
     bench.state.store_file(stored.image, png)
-    bench.state.store_file(_FILE, stored.model_dump_json(indent=1).encode())
+    _store(bench, stored)
     if before is not None and before.image != stored.image:
         bench.state.remove_file(before.image)
 
 
 def store_table_problem(bench: Bench, problem: TableProblem) -> None:
     """Store a problem with the bench's image, so that the next command asks for a new image."""
-    before = _metadata(bench, quiet=True)
+    before = _described(bench, quiet=True)
     if before is not None:
-        changed = before.model_copy(update={"noticed": problem.as_json()})
         with suppress(StateNotStored):  # the warning was shown; other writes report a full disk
-            bench.state.store_file(_FILE, changed.model_dump_json(indent=1).encode())
+            _store(bench, before.model_copy(update={"noticed": problem}))
+
+
+def _store(bench: Bench, table: EmptyTable) -> None:
+    bench.state.store_file(_FILE, table.model_dump_json(indent=1).encode())
 
 
 def _unusable(table: EmptyTable, bench: Bench) -> TableProblem | None:
@@ -143,77 +170,37 @@ class _Unreadable(Exception):
     pass
 
 
-class _Stored(BaseModel):
-    """Content of the JSON file beside the image."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    version: int = _VERSION
-    taken_utc: AwareDatetime
-    camera: CameraIdentity
-    locks: CameraLocks
-    evidence: dict[str, Any]
-    image: str = Field(pattern=r"^empty-table-[0-9TZ.]+\.png$")
-    sha256: str
-    noticed: dict[str, Any] | None = None
-
-    @classmethod
-    def of(cls, table: EmptyTable, png: bytes) -> Self:
-        return cls(
-            taken_utc=table.taken_utc,
-            camera=table.camera,
-            locks=table.locks,
-            evidence=dict(table.evidence),
-            image=f"empty-table-{table.taken_utc:%Y%m%dT%H%M%S.%fZ}.png",
-            sha256=hashlib.sha256(png).hexdigest(),
-            noticed=None if table.noticed is None else table.noticed.as_json(),
-        )
-
-    @field_validator("noticed")
-    @classmethod
-    def _has_code(cls, noticed: dict[str, Any] | None) -> dict[str, Any] | None:
-        if noticed is not None:
-            TableProblemCode(str(noticed.get("code")))
-        return noticed
-
-    def problem(self) -> TableProblem | None:
-        if self.noticed is None:
-            return None
-        parameters = {name: value for name, value in self.noticed.items() if name != "code"}
-        return TableProblem(TableProblemCode(self.noticed["code"]), parameters)
-
-
-def _metadata(bench: Bench, *, quiet: bool = False) -> _Stored | None:
+def _described(bench: Bench, *, quiet: bool = False) -> EmptyTable | None:
+    """Return the stored image without its pixels; None if there is none, or if ``quiet`` and it is not readable."""
     try:
         text = bench.state.read_file(_FILE)
-        stored = None if text is None else _Stored.model_validate_json(text)
+        found = None if text is None else EmptyTable.model_validate_json(text)
     except StateNotStored as error:
         detail = error.what.rstrip(".")
     except ValidationError as error:
         detail = f"{_FILE} is damaged ({error.errors(include_url=False)[0]['msg']})"
     else:
-        if stored is None or stored.version == _VERSION:
-            return stored
-        detail = f"{_FILE} has version {stored.version}, this program reads version {_VERSION}"
+        if found is None or found.version == _VERSION:
+            return found
+        detail = f"{_FILE} has version {found.version}, this program reads version {_VERSION}"
     if quiet:
         return None
     raise _Unreadable(detail)
 
 
 def _read(bench: Bench) -> EmptyTable | None:
-    stored = _metadata(bench)
-    if stored is None:
+    table = _described(bench)
+    if table is None:
         return None
     try:
-        png = bench.state.read_file(stored.image)
+        png = bench.state.read_file(table.image)
     except StateNotStored as error:
         raise _Unreadable(error.what.rstrip(".")) from error
     if png is None:
-        raise _Unreadable(f"{stored.image} is missing")
-    if hashlib.sha256(png).hexdigest() != stored.sha256:
-        raise _Unreadable(f"{stored.image} is damaged")
+        raise _Unreadable(f"{table.image} is missing")
+    if images.digest(png) not in table.image:
+        raise _Unreadable(f"{table.image} is damaged")
     try:
-        image = images.decode(png)
+        return table.model_copy(update={"image_bgr": images.decode(png)})
     except images.BadImage as error:
-        raise _Unreadable(f"{stored.image} is not readable: {error}") from error
-    return EmptyTable(image, stored.taken_utc, stored.camera, stored.locks, stored.evidence, stored.problem())
+        raise _Unreadable(f"{table.image} is not readable: {error}") from error

@@ -4,9 +4,6 @@ Decision: docs/decisions/0005.
 """
 
 import hashlib
-import re
-import unicodedata
-from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Final
@@ -16,12 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.core import files
-from rig.core.errors import CatalogError, UsageError
-from rig.core.next_steps import Do
+from rig.core.errors import UsageError
 from rig.views import jpeg_files
 
 IMAGE_FOLDER: Final = "images"
-MAX_SLUG_LENGTH: Final = 40
 
 MAX_FILE_BYTES: Final = 256_000_000
 MAX_SIDE: Final = 20_000
@@ -134,33 +129,3 @@ def _png_size(content: bytes) -> tuple[int, int] | None:
     if content[12:16] != b"IHDR" or len(content) < 24:
         return None
     return int.from_bytes(content[16:20], "big"), int.from_bytes(content[20:24], "big")
-
-
-def checked(fetch: Callable[[], bytes], where: str, sha256: str) -> NDArray[np.uint8]:
-    """Return the stored pixels, uint8 (H, W, 3) BGR, of the file at ``where`` that ``fetch`` reads.
-
-    Raises
-    ------
-    CatalogError
-        The file is missing or differs from the one that was stored.
-    """
-    fix = ("To find a copy,", Do.REPAIR_CATALOG(), "Otherwise,", Do.ENROLL_AGAIN())
-    try:
-        content = fetch()
-    except FileNotFoundError as error:
-        raise CatalogError(f"The image {where} is missing.", next_step=fix) from error
-    except OSError as error:
-        raise CatalogError(f"The image {where} cannot be read: {error.strerror}.", next_step=fix) from error
-    if digest(content) != sha256:
-        raise CatalogError(f"The image {where} is not the one that was stored.", next_step=fix)
-    try:
-        return decode(content)
-    except BadImage as error:
-        raise CatalogError(f"The image {where} is not readable: {error}.", next_step=fix) from error
-
-
-def folder(object_id: int, object_name: str, enrollment_id: int) -> Path:
-    """Return an enrollment's folder, relative to the catalog. The id makes it unique, the name helps the reader."""
-    ascii_name = unicodedata.normalize("NFKD", object_name).encode("ascii", "ignore").decode().lower()
-    slug = re.sub(r"[^a-z0-9]+", "-", ascii_name)[:MAX_SLUG_LENGTH].strip("-")
-    return Path(IMAGE_FOLDER, f"{object_id:06d}-{slug}".rstrip("-"), f"{enrollment_id:06d}")

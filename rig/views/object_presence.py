@@ -3,6 +3,7 @@
 Decision: docs/decisions/0019.
 """
 
+from collections.abc import Iterator
 from typing import Final
 
 import cv2
@@ -62,25 +63,18 @@ class TableWatcher:
         """
         if name is not None:
             return
-        clock = self._bench.clock
-        before = self._capture()
-        old: Cells | None = None
+        frames = self._frames()
+        first, _ = next(frames)
+        old = None if self._empty is None else first
         if self._empty is None:
-            self._empty = before
-        else:
-            old = before
-        still_since_ns = clock.now_ns()
-        while True:
-            clock.sleep(self._poll_s)
-            now = self._capture()
-            if changed(before, now):
-                still_since_ns = clock.now_ns()
-            elif seconds_between(still_since_ns, clock.now_ns()) >= self._still_s:
-                if not changed(self._empty, now):
-                    self._empty, old = now, None  # follow slow changes of the daylight
-                elif old is None or changed(old, now):
-                    return
-            before = now
+            self._empty = first
+        for now, still_s in frames:
+            if still_s < self._still_s:
+                continue
+            if not changed(self._empty, now):
+                self._empty, old = now, None  # follow slow changes of the daylight
+            elif old is None or changed(old, now):
+                return
 
     def wait_until_still(self) -> None:
         """Wait until nothing moves before the camera, for example after the operator has scanned a barcode.
@@ -90,19 +84,26 @@ class TableWatcher:
         DeviceSilent
             The camera gives no frame.
         """
-        clock = self._bench.clock
-        before = self._capture()
-        still_since_ns = clock.now_ns()
-        while seconds_between(still_since_ns, clock.now_ns()) < self._still_s:
-            clock.sleep(self._poll_s)
-            now = self._capture()
-            if changed(before, now):
-                still_since_ns = clock.now_ns()
-            before = now
+        for _, still_s in self._frames():
+            if still_s >= self._still_s:
+                return
 
     def clear(self) -> bool:
         """Return whether the table is empty: it must be until `place` has waited for the first object."""
         return self._empty is None
+
+    def _frames(self) -> Iterator[tuple[Cells, float]]:
+        """Yield one frame after the other, and for how long nothing has moved."""
+        clock = self._bench.clock
+        before, still_since_ns = self._capture(), clock.now_ns()
+        yield before, 0.0
+        while True:
+            clock.sleep(self._poll_s)
+            now = self._capture()
+            if changed(before, now):
+                still_since_ns = clock.now_ns()
+            yield now, seconds_between(still_since_ns, clock.now_ns())
+            before = now
 
     def _capture(self) -> Cells:
         frame = self._bench.camera.capture(self._bench.clock.now_ns())

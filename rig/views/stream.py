@@ -5,7 +5,7 @@ the time from the frame's time stamp to that moment.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from math import hypot, isfinite, nan
 from typing import Final
 
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from rig.config import CameraTimeConfig, RigConfig
 from rig.core.clock import Clock
-from rig.devices.camera import Camera
+from rig.devices.camera import Camera, Frame
 
 LATEST_S: Final = 1.0
 """Largest time from the stamp to the arrival of a frame whose time can be trusted."""
@@ -26,22 +26,6 @@ PATIENCE_S: Final = 0.1
 """Longest wait of the control loop of a moving table for a frame, because it must also feed the servo's watchdog."""
 SURE_SIGMAS: Final = 2.0
 """Smallest difference of the camera's time from that of its stamps that counts, in standard uncertainties."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class StreamFrame:
-    """A frame of the stream, uint8 (H, W, 3) BGR; times in ns on the bench's clock.
-
-    ``repeated`` says whether the image is that of the frame before. ``stamped`` is False if the camera's time stamps
-    cannot be used.
-    """
-
-    number: int
-    image_bgr: NDArray[np.uint8]
-    stamp_ns: int
-    arrived_ns: int
-    repeated: bool
-    stamped: bool
 
 
 class _NoFrameYet(Exception):
@@ -60,7 +44,8 @@ class FrameStream:
     def __init__(self, camera: Camera, clock: Clock) -> None:
         self._camera = camera
         self._clock = clock
-        self._last: StreamFrame | None = None
+        self._last: Frame | None = None
+        self._delay_ns = 0
         self._after_ns = clock.now_ns()
         self.skipped = 0
 
@@ -70,7 +55,7 @@ class FrameStream:
         fps = self._camera.identity.fps
         return 1 / fps if 1 <= fps <= 1000 else 1 / 30
 
-    def next(self, meanwhile: Callable[[], object], *, newest: bool = False) -> StreamFrame | None:
+    def next(self, meanwhile: Callable[[], object], *, newest: bool = False) -> Frame | None:
         """Return the next frame; None if the camera has delivered none after `PATIENCE_S`, so that the caller can work.
 
         Parameters
@@ -87,8 +72,7 @@ class FrameStream:
         """
         after_ns = self._after_ns
         if newest and self._last is not None:
-            delay_ns = self._last.arrived_ns - self._last.stamp_ns
-            oldest_ns = self._clock.now_ns() - min(delay_ns, round(LATEST_S * 1e9)) - round(2e9 * self.period_s)
+            oldest_ns = self._clock.now_ns() - min(self._delay_ns, round(LATEST_S * 1e9)) - round(2e9 * self.period_s)
             if oldest_ns > after_ns:
                 self.skipped += max(int((oldest_ns - after_ns) * 1e-9 / self.period_s), 0)
                 after_ns = oldest_ns
@@ -103,17 +87,11 @@ class FrameStream:
             frame = self._camera.capture(after_ns, waited)
         except _NoFrameYet:
             return None
-        last = self._last
-        found = StreamFrame(
-            0 if last is None else last.number + 1,
-            frame.image_bgr,
-            frame.exposed_ns,
-            self._clock.now_ns(),
-            last is not None and np.array_equal(frame.image_bgr, last.image_bgr),
-            frame.stamped,
-        )
-        self._last, self._after_ns = found, frame.exposed_ns + 1
-        return found
+        if self._last is not None and np.array_equal(frame.image_bgr, self._last.image_bgr):
+            frame = replace(frame, repeated=True)
+        self._last, self._after_ns = frame, frame.exposed_ns + 1
+        self._delay_ns = self._clock.now_ns() - frame.exposed_ns
+        return frame
 
 
 def middle_ns(stamp_ns: int, config: CameraTimeConfig) -> int:
