@@ -42,6 +42,7 @@ from rig.core.errors import (
     CatalogDamaged,
     CatalogError,
     CatalogUnavailable,
+    ImportRejected,
     ObjectExists,
     ObjectNotFound,
     RigError,
@@ -331,9 +332,8 @@ def _deliver(journal: Catalog, server: Catalog, name: str, *, replaces: bool) ->
     try:
         enrollment = journal.object(name).complete
         assert enrollment is not None
-        _check_images(journal, enrollment)
         conflict = Conflict.REPLACE if replaces or _replaces(journal, enrollment) else Conflict.REJECT
-        finished(transfer(CatalogSource(journal, [name]), server, conflict=conflict))
+        finished(transfer(CatalogSource(journal, [name], used_only=True), server, conflict=conflict, once=True, jobs=1))
     except ObjectExists:
         return ObjectExists(
             f"The journal has {name!r}, and the catalog has another object of that name. Nothing is lost.",
@@ -344,6 +344,12 @@ def _deliver(journal: Catalog, server: Catalog, name: str, *, replaces: bool) ->
                 "Or",
                 Do.DISCARD(name=name),
             ),
+        )
+    except ImportRejected as error:
+        return CatalogDamaged(
+            f"An image of {name!r} in the journal is not the one that was stored.",
+            next_step=("Restore it from a backup, or", Do.DISCARD(name=name), "Then enroll the object again."),
+            evidence=error.evidence,
         )
     except (CatalogDamaged, ObjectNotFound) as error:
         return error
@@ -358,20 +364,6 @@ def _replaces(journal: Catalog, enrollment: Enrollment) -> bool:
             select(Entry.details).where(Entry.enrollment_id == enrollment.id, Entry.action == Action.ENROLLMENT_STARTED)
         )
         return any(details.get("replace") for details in begun)
-
-
-def _check_images(journal: Catalog, enrollment: Enrollment) -> None:
-    """Raise `CatalogDamaged` if an image is not the one that was stored."""
-    names = {part.image for part in enrollment.views} | {part.empty_table for part in enrollment.sessions}
-    for image in filter(None, names):
-        try:
-            with journal.database.catalog_errors():
-                journal.database.images.content(image)
-        except CatalogError as error:
-            raise CatalogDamaged(
-                f"The image {journal.database.images.where(image)} of the journal is not the one that was stored.",
-                next_step=("Restore it from a backup, or", Do.DISCARD(), "Then enroll the object again."),
-            ) from error
 
 
 def _forget(journal: Catalog, name: str, key: str) -> None:

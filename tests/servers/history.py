@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from rig.catalog import Catalog
-from rig.catalog.edit import delete, rename, undelete
 from rig.config.catalog_place import CatalogPlace
 from rig.core.clock import SystemClock
 from rig.core.errors import RigError
@@ -201,14 +200,15 @@ def main() -> None:
                     if enrollment is None:
                         continue
                     for index in range(VIEWS):
-                        logged("add", owner, index, call=lambda i=index, e=enrollment: e.add(record(i), image(i)))
+                        view = record(index)
+                        logged("add", owner, index, call=lambda v=view, e=enrollment: e.add(v, image(v.index)))
                     logged("finish", owner, call=enrollment.finish)
                 case "rename":
-                    logged("rename", name, other, call=lambda a=name, b=other: rename(catalog, a, b))
+                    logged("rename", name, other, call=lambda a=name, b=other: catalog.rename(a, b))
                 case "delete":
-                    logged("delete", name, call=lambda a=name: delete(catalog, a))
+                    logged("delete", name, call=lambda a=name: catalog.delete(a))
                 case "undelete":
-                    logged("undelete", name, call=lambda a=name: undelete(catalog, a))
+                    logged("undelete", name, call=lambda a=name: catalog.undelete(a))
                 case "list":
 
                     def listed() -> list[Any]:

@@ -168,23 +168,25 @@ def _copy_schema(url: str, source: Path, target: Path) -> None:
     """Give the copy of a folder a copy of its catalog."""
     from sqlalchemy import text
 
+    from rig.catalog.database import properties
+    from rig.catalog.facts import Property, Row
     from rig.catalog.postgres import PostgresDatabase
-    from rig.catalog.schema import METADATA
 
     before = place_in(url, source.absolute())
     place = place_in(url, target.absolute())
     schema = str(before.url).rpartition("%3D")[2]
     (target / "catalog-id").unlink(missing_ok=True)
     made = PostgresDatabase(place, create=True, read_only=False, busy_timeout_s=5.0)
-    with closing(made), made._writing.begin() as connection:
-        if connection.execute(text(f"SELECT to_regclass('{schema}.objects')")).scalar() is None:
+    with closing(made), made._changes.begin() as connection:
+        if connection.execute(text(f"SELECT to_regclass('{schema}.{Property.__tablename__}')")).scalar() is None:
             return
-        connection.execute(text("DELETE FROM catalog_properties"))
-        for table in ("catalog_properties", *(table.name for table in METADATA.sorted_tables)):
-            connection.execute(text(f"INSERT INTO {table} SELECT * FROM {schema}.{table}"))
-        for name in ("objects", "enrollments", "sessions", "views"):
+        connection.execute(text(f"DELETE FROM {Property.__tablename__}"))
+        for table in Row.metadata.sorted_tables:
+            columns = ", ".join(f'"{column.name}"' for column in table.columns)
+            connection.execute(text(f"INSERT INTO {table} ({columns}) SELECT {columns} FROM {schema}.{table}"))
+        for name in ("enrollments", "views"):
             connection.execute(
                 text(f"SELECT setval('{name}_id_seq', last_value, is_called) FROM {schema}.{name}_id_seq")
             )
-        mark = connection.execute(text("SELECT value FROM catalog_properties WHERE key = 'id'")).scalar_one()
+        mark = properties(connection)["id"]
     (target / "catalog-id").write_text(str(mark))

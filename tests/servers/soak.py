@@ -15,14 +15,14 @@ from typing import Any
 import numpy as np
 
 import hbr
-from rig.catalog import Catalog, Enrollment
-from rig.catalog.delivery import deliver
-from rig.catalog.journal import Journal
+from rig.catalog import Catalog, OpenEnrollment, View
+from rig.catalog.shared import Journal, deliver
 from rig.config.catalog_place import CatalogPlace
 from rig.core.clock import SystemClock
 from rig.core.errors import RigError
 from rig.search.current_model import CurrentModel
-from tests.rig.catalog.catalog_samples import PROVENANCE, image, plan, record
+from rig.views.description import PAPER_DESCRIPTOR
+from tests.rig.catalog.catalog_samples import PROVENANCE, image, plan
 
 VIEWS = 4
 CLOCK = SystemClock()
@@ -30,18 +30,22 @@ WORK = {"enroll": "log", "identify": "answers"}
 """The ending of the file that a program of each kind appends a line to for each thing it has done."""
 
 
+def picture(name: str, index: int) -> np.ndarray[Any, Any]:
+    return image(100 * hash_of(name) + index)
+
+
 def levels(name: str, index: int) -> np.ndarray[Any, Any]:
-    return np.random.default_rng(100 * hash_of(name) + index).integers(0, 8, 144, np.uint8)
+    return hbr.describe(picture(name, index), descriptor=PAPER_DESCRIPTOR)
 
 
 def hash_of(name: str) -> int:
     return int.from_bytes(name.encode()[-7:], "big")
 
 
-def fill_with_levels(enrollment: Enrollment, name: str) -> None:
+def take(enrollment: OpenEnrollment, name: str) -> None:
     """Take the views of an object and complete its enrollment."""
     for index in range(VIEWS):
-        enrollment.add(record(index, descriptors={"cedd": levels(name, index)}), image(index))
+        enrollment.add(View(index=index, azimuth_deg=plan(VIEWS)[index]), picture(name, index))
     enrollment.finish()
 
 
@@ -59,7 +63,7 @@ def enroll_forever() -> None:
             try:
                 with Journal.of(place, CLOCK) as journal:
                     enrollment = journal.begin(name, planned_azimuth_deg=plan(VIEWS), provenance=PROVENANCE)
-                    fill_with_levels(enrollment, name)
+                    take(enrollment, name)
                     log.write(name + "\n")
                     with Catalog.open(place, clock=CLOCK) as shared:
                         deliver(journal, shared)
@@ -104,7 +108,7 @@ def identify_forever() -> None:
         while True:
             try:
                 with Catalog.open(place, clock=CLOCK, read_only=True) as catalog:
-                    current, model = CurrentModel(catalog, "cedd"), ""
+                    current, model = CurrentModel(catalog, PAPER_DESCRIPTOR), ""
                     for _ in range(50):
                         index = current().index
                         known = index.views.object_names
@@ -152,8 +156,8 @@ class Answers:
             for model, names in sorted(self.models.items(), key=lambda one: len(one[1])):
                 for name in names:
                     if (enrollment := begun.pop(name, None)) is not None:
-                        fill_with_levels(enrollment, name)
-                with CurrentModel(serial, "cedd") as current:
+                        take(enrollment, name)
+                with CurrentModel(serial, PAPER_DESCRIPTOR) as current:
                     index = current().index
                 if digest(index.views) != model:
                     other.append(model)

@@ -13,17 +13,16 @@ from pathlib import Path
 import pytest
 
 from rig.catalog import Catalog
-from rig.catalog.delivery import deliver
-from rig.catalog.enrollment import Enrollment
-from rig.catalog.journal import Journal, waiting
+from rig.catalog.jobs import finished
 from rig.catalog.results import find_results
 from rig.catalog.results import record as record_result
+from rig.catalog.shared import Journal, deliver, waiting
 from rig.catalog.verify import verify
 from rig.config.catalog_place import CatalogPlace
 from rig.core.clock import SystemClock
 from rig.core.errors import CatalogError
 from rig.core.next_steps import Do
-from tests.rig.catalog.catalog_samples import PROVENANCE, described, finished, image, new_result, plan
+from tests.rig.catalog.catalog_samples import PROVENANCE, image, new_result, plan, record
 from tests.servers.postgres import place_in, server
 
 CLOCK = SystemClock()
@@ -62,7 +61,6 @@ def full(action: Callable[[], object]) -> bool:
 
 def take(journal: Journal, name: str, number: int) -> None:
     """Take the views of an object that the journal does not have, and complete it."""
-    enrollment: Enrollment
     known = {one.name: one for one in journal.objects()}.get(name)
     if known is None:
         enrollment = journal.begin(name, planned_azimuth_deg=plan(VIEWS), provenance=PROVENANCE)
@@ -72,7 +70,7 @@ def take(journal: Journal, name: str, number: int) -> None:
     else:
         return
     for index in enrollment.missing():
-        enrollment.add(described(index, number + index), image(number + index))
+        enrollment.add(record(index), image(VIEWS * number + index))
     enrollment.finish()
 
 

@@ -1,4 +1,4 @@
-"""A bench works without its server, and delivers later, each object exactly once, whenever it is killed."""
+"""A bench works without its server, and delivers later, each object and answer exactly once, whenever it is killed."""
 
 import errno
 import json
@@ -7,21 +7,18 @@ import sys
 import uuid
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 from click import Command, Context
 from sqlalchemy import text
 from typer.testing import Result
 
-from rig.catalog import Catalog, edit
-from rig.catalog.delivery import deliver
-from rig.catalog.journal import Journal, journal_folder, waiting
-from rig.catalog.local_copy import open_copy, open_or_copy, update_copy
-from rig.catalog.results import find_results
+from rig.catalog import Catalog, derived
+from rig.catalog.jobs import finished
+from rig.catalog.results import correct, find_results
 from rig.catalog.results import record as record_result
-from rig.catalog.verify import verify
-from rig.catalog.verify_images import Problem
+from rig.catalog.shared import Journal, deliver, journal_folder, open_copy, open_or_copy, update_copy, waiting
+from rig.catalog.verify import Problem, verify
 from rig.cli.ui.complete import object_names
 from rig.config.catalog_place import CatalogPlace
 from rig.core.clock import SystemClock
@@ -30,16 +27,7 @@ from rig.events.events import NoteCode
 from rig.plans.tray import TrayItem, left_to_enroll
 from rig.search.current_model import CurrentModel
 from tests.programs import Program
-from tests.rig.catalog.catalog_samples import (
-    PROVENANCE,
-    described,
-    die_at,
-    finished,
-    image,
-    new_result,
-    record,
-    true_fill,
-)
+from tests.rig.catalog.catalog_samples import PROVENANCE, die_at, fill, image, new_result, record
 from tests.servers.postgres import PostgresServer, place_in
 
 CLOCK = SystemClock()
@@ -50,8 +38,8 @@ def place(postgres: PostgresServer, tmp_path: Path) -> CatalogPlace:
     """The catalog of a bench, with two objects and a local copy; a second bench has `other_bench`."""
     made = place_in(postgres.url, tmp_path / uuid.uuid4().hex, str(tmp_path / "shared"))
     with Catalog.open(made, clock=CLOCK) as catalog:
-        true_fill(catalog, "mug", 2, 0)
-        true_fill(catalog, "tin", 2, 10)
+        fill(catalog, "mug", 2, 0)
+        fill(catalog, "tin", 2, 10)
         update_copy(catalog)
     return made
 
@@ -66,22 +54,60 @@ def settings_of(place: CatalogPlace) -> list[str]:
     return [f"catalog.{key}={json.dumps(value)}" for key, value in values.items()]
 
 
+def same_copy(place: CatalogPlace, catalog: Catalog) -> Catalog:
+    """Return the local copy, which has what searches compare with."""
+    copy = open_copy(place, CLOCK)
+    assert copy.version() == catalog.version()
+    assert copy.damage() is None
+    assert copy.objects() == catalog.objects()
+    return copy
+
+
 def test_copy_has_the_searched_views_and_is_updated(place: CatalogPlace) -> None:
     with Catalog.open(place, clock=CLOCK) as catalog:
         assert not update_copy(catalog)
-        with open_copy(place, CLOCK) as copy:
-            assert copy.version() == catalog.version()
-            assert copy.damage() is None
-        edit.rename(catalog, "mug", "cup")
-        true_fill(catalog, "tin", 3, 20, replace=True)
+        same_copy(place, catalog).close()
+        catalog.rename("mug", "cup")
+        catalog.set_texts("cup", label="kitchen")
+        fill(catalog, "tin", 3, 20, replace=True, empty_table=image(99))
+        record_result(catalog, new_result(), image(1))
         assert update_copy(catalog)
-        with open_copy(place, CLOCK) as copy:
-            assert copy.version() == catalog.version()
-            assert copy.damage() is None
-        edit.delete(catalog, "cup")
+        with same_copy(place, catalog) as copy:
+            assert derived.views(copy).object_names == ("cup", "tin")
+            assert copy.database.images.names() == {derived.empty_tables(catalog).newest}
+        derived.choose_region(catalog, (0, 0, 16, 16))
+        expected = derived.views(catalog)
+        catalog.delete("cup")
         assert update_copy(catalog)
-        with open_copy(place, CLOCK) as copy:
-            assert copy.views().views.object_names == ("tin",)
+        with same_copy(place, catalog) as copy:  # which has no images to describe
+            views = derived.views(copy)
+            assert views.object_names == ("tin",)
+            assert views.packed().tolist() == expected.select(expected.object_index == 1).packed().tolist()
+            assert derived.described_regions(copy, PROVENANCE.bench) == {((0, 0, 16, 16), ())}
+        catalog.undelete("cup")
+        assert update_copy(catalog)
+        with same_copy(place, catalog) as copy:
+            assert derived.views(copy).object_names == ("cup", "tin")
+
+
+def test_damaged_copy_and_copy_of_another_catalog_are_made_again(
+    postgres: PostgresServer, place: CatalogPlace, tmp_path: Path
+) -> None:
+    file = place.copy_folder / "catalog.sqlite"
+    file.write_bytes(file.read_bytes()[:8000])
+    with pytest.raises(CatalogUnavailable, match="no copy"):
+        open_copy(place, CLOCK)
+    with Catalog.open(place, clock=CLOCK) as catalog:
+        assert update_copy(catalog)
+        same_copy(place, catalog).close()
+    other = place_in(postgres.url, tmp_path / uuid.uuid4().hex, str(tmp_path / "other"))
+    moved = CatalogPlace(place.path, other.url, other.images)
+    with pytest.raises(CatalogUnavailable, match="no copy"):
+        open_copy(moved, CLOCK)
+    with Catalog.open(moved, clock=CLOCK) as catalog:
+        fill(catalog, "jar", 1, 30)
+        assert update_copy(catalog)
+        same_copy(moved, catalog).close()
 
 
 def test_bench_works_without_its_server(postgres: PostgresServer, place: CatalogPlace) -> None:
@@ -98,7 +124,7 @@ def test_bench_works_without_its_server(postgres: PostgresServer, place: Catalog
             (note,) = (note for note in model.notes if note.code is NoteCode.LOCAL_COPY)
             assert str(note.values["copied_utc"]).endswith("UTC")
             with Journal.of(place, CLOCK) as journal:
-                true_fill(journal, "star", 2, 30)
+                fill(journal, "star", 2, 30)
                 assert isinstance(journal.unreachable, CatalogUnavailable)
                 record_result(journal, new_result("found", "star"), image(1))
                 assert waiting(place, CLOCK) == 2
@@ -111,27 +137,54 @@ def test_bench_works_without_its_server(postgres: PostgresServer, place: Catalog
             assert deliver(journal, shared) == []
             assert [one.current.object_name for one in find_results(shared)] == ["star"]
             assert finished(verify(shared, jobs=1)).findings == ()
-            assert journal.objects() == []
+            assert journal.objects() == journal.objects(deleted=True) == []
         assert waiting(place, CLOCK) == 0
-        assert current().index.views.object_names == ("mug", "tin", "star")
+        assert current().views.object_names == ("mug", "tin", "star")
 
 
-def test_name_is_reserved_while_the_server_answers(place: CatalogPlace) -> None:
+def test_answer_is_delivered_once_with_its_corrections(place: CatalogPlace) -> None:
     with Journal.of(place, CLOCK) as journal, Catalog.open(place, clock=CLOCK) as shared:
-        true_fill(journal, "star", 2, 30)
-        with pytest.raises(CatalogError, match="unfinished"):
-            true_fill(shared, "star", 2, 40)
-        with pytest.raises(ObjectExists):
-            true_fill(journal, "mug", 2, 40)
-        assert [one.conflict for one in deliver(journal, shared)] == [None]
-        with shared.database.read() as connection:
-            assert shared.database.orphans(connection) == []
-        begun = journal.begin(
-            "gone", planned_azimuth_deg=[0.0], provenance=shared.object("tin").views[0].session.provenance
-        )
-        begun.discard()
+        record_result(shared, new_result("found", "tin"), None)
+        unconfirmed = new_result("found", "mug")
+        record_result(shared, unconfirmed, image(1))  # the bench did not get the confirmation
+        for answer in (unconfirmed, new_result("found", "mug", sample="7")):
+            record_result(journal, answer, image(1))
+        correct(journal, 2, reason="wrong", object_name=None, unknown=True)
+        assert waiting(place, CLOCK) == 3
         deliver(journal, shared)
-        true_fill(shared, "gone", 1, 50)  # the reservation was given up
+        correct(journal, 2, reason="sample", sample="8")
+        assert waiting(place, CLOCK) == 1
+        deliver(journal, shared)
+        found = find_results(shared)
+        assert [one.id for one in found] == [1, 2, 3]
+        assert [one.current[1:] for one in found] == [("tin", None), ("mug", None), (None, "8")]
+        assert [one.reason for one in found[2].corrections] == ["wrong", "sample"]
+        assert [one.time_utc for one in found[1:]][1] == find_results(journal)[1].time_utc
+        assert finished(verify(shared, jobs=1)).findings == ()
+
+
+def test_second_bench_with_a_name_gets_a_conflict(place: CatalogPlace) -> None:
+    other_bench = CatalogPlace(place.path / "other", place.url, place.images)
+    with (
+        Journal.of(place, CLOCK) as first,
+        Journal.of(other_bench, CLOCK) as second,
+        Catalog.open(place, clock=CLOCK) as shared,
+    ):
+        with pytest.raises(ObjectExists):
+            fill(first, "mug", 2, 40)
+        fill(first, "star", 2, 30)
+        fill(second, "star", 2, 40)
+        assert [one.conflict for one in deliver(first, shared)] == [None]
+        (done,) = deliver(second, shared)
+        assert isinstance(done.conflict, ObjectExists)
+        assert [one.name for one in second.objects()] == ["star"]
+        second.rename("star", "star-2")
+        assert [one.conflict for one in deliver(second, shared)] == [None]
+        fill(first, "mug", 3, 50, replace=True)
+        assert [one.conflict for one in deliver(first, shared)] == [None]
+        assert names(place) == {"mug": 3, "tin": 2, "star": 2, "star-2": 2}
+        assert [one.status for one in shared.object("mug").enrollments] == ["complete", "superseded"]
+        assert finished(verify(shared, jobs=1)).findings == ()
 
 
 def test_conflict_stays_until_the_operator_resolves_it(
@@ -140,14 +193,14 @@ def test_conflict_stays_until_the_operator_resolves_it(
     postgres.stop()
     try:
         with Journal.of(place, CLOCK) as journal:
-            true_fill(journal, "star", 2, 30)
-            true_fill(journal, "cube", 2, 35)
-            true_fill(journal, "cone", 2, 37)
+            fill(journal, "star", 2, 30)
+            fill(journal, "cube", 2, 35)
+            fill(journal, "cone", 2, 37)
     finally:
         postgres.start()
     with Catalog.open(place, clock=CLOCK) as shared:
         for number, name in enumerate(("star", "cube", "cone")):
-            true_fill(shared, name, 3, 40 + 3 * number)
+            fill(shared, name, 3, 40 + 3 * number)
     words = [word for one in settings_of(place) for word in ("--set", one)]
     reported = rig("catalog", "deliver", *words)
     assert reported.exit_code == 7, reported.output
@@ -166,7 +219,7 @@ def test_names_of_the_server_are_known_before_the_table_is_cleared(
     postgres: PostgresServer, place: CatalogPlace
 ) -> None:
     with Journal.of(place, CLOCK) as journal:
-        true_fill(journal, "star", 2, 30)
+        fill(journal, "star", 2, 30)
         unfinished = journal.begin("cube", planned_azimuth_deg=[0.0], provenance=PROVENANCE)
         unfinished.add(record(0), image(1))
         with pytest.raises(ObjectExists, match="'mug' is enrolled already"):
@@ -192,31 +245,17 @@ def test_completion_offers_the_names_of_the_local_copy(place: CatalogPlace, monk
     assert object_names(context, "m") == ["mug"]
 
 
-def test_name_reserved_by_a_program_that_was_killed_is_free_for_its_bench(place: CatalogPlace) -> None:
-    with Journal.of(place, CLOCK) as journal, Catalog.open(place, clock=CLOCK) as shared:
-        with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt):
-            patch.setattr(journal.database, "write", _interrupt)
-            journal.begin("star", planned_azimuth_deg=[0.0], provenance=PROVENANCE)
-        assert shared.summary("star").unfinished_views == 0
-        journal.check_enrollable("star")
-        true_fill(journal, "star", 1, 30)
-        assert [one.conflict for one in deliver(journal, shared)] == [None]
-
-
-def _interrupt(*_: object, **__: object) -> Any:
-    raise KeyboardInterrupt
-
-
 def test_damage_in_the_journal_stays_there_and_is_reported(place: CatalogPlace) -> None:
     with Journal.of(place, CLOCK) as journal, Catalog.open(place, clock=CLOCK) as shared:
         for number, name in enumerate(("star", "cube", "cone")):
-            true_fill(journal, name, 2, 30 + 3 * number)
-        record_result(journal, new_result("found", "star"), image(1))
+            fill(journal, name, 2, 30 + 3 * number)
+        record_result(journal, new_result("found", "star"), image(77))
         (recorded,) = find_results(journal)
         store = journal.database.images
         assert recorded.image is not None
         store.remove([recorded.image, journal.object("cube").views[1].image])
-        store.write(journal.object("star").views[0].image, store.read(journal.object("star").views[1].image))
+        swapped, other = (view.image for view in journal.object("star").views)
+        store.file(swapped).write_bytes(store.read(other))
         done = deliver(journal, shared)
         assert [(one.name, type(one.conflict)) for one in done] == [
             ("star", CatalogDamaged),
@@ -248,8 +287,8 @@ def test_wrong_password_and_absent_server_have_their_own_messages(
     missing = rig("catalog", "deliver", "--replace", "star", *words)
     assert "There is no object 'star'" in missing.stderr
     with Journal.of(place, CLOCK) as journal:
-        true_fill(journal, "star", 2, 30)
-    monkeypatch.setattr("rig.catalog.image_store.write_local", _full)
+        fill(journal, "star", 2, 30)
+    monkeypatch.setattr("rig.catalog.images.open_new", _full)
     full = rig("identify", *words)
     assert "is full" in full.stderr
     assert "What is in the journal of this computer is delivered later" in full.stderr
@@ -269,7 +308,7 @@ def test_bench_works_while_its_share_is_not_mounted(place: CatalogPlace, tmp_pat
         with open_or_copy(place, CLOCK) as copy:
             assert copy.copied_utc is not None
         with Journal.of(place, CLOCK) as journal:
-            true_fill(journal, f"star {mount_point}", 2, 30)
+            fill(journal, f"star {mount_point}", 2, 30)
             assert journal.unreachable is not None
             assert "Mount the network share" in journal.unreachable.next_step
     share.rmdir()
@@ -304,7 +343,7 @@ def test_each_object_of_a_tray_is_delivered_and_none_is_asked_for_again(
         assert f"Delivered {listed[min(1, len(listed) - 1)]} with 4 views" in done.stderr
         with Catalog.open(place, clock=CLOCK) as other_bench:
             if "mug" not in names(place):
-                true_fill(other_bench, "mug", 2, 0)
+                fill(other_bench, "mug", 2, 0)
     assert seen == [
         [("toy-house", "enroll")],
         [("toy-house", "skip"), ("toy-car", "enroll"), ("mug", "skip")],
@@ -319,7 +358,7 @@ def killed(kind: str) -> None:
     with Journal.of(here, CLOCK) as journal, Catalog.open(here, clock=CLOCK) as shared:
         die_at(int(step))
         if kind == "enrollment":
-            true_fill(journal, f"object {step}", 2, int(step))
+            fill(journal, f"object {step}", 2, int(step))
         else:
             deliver(journal, shared)
     print("not killed", flush=True)
@@ -330,11 +369,11 @@ def finish(journal: Journal, name: str, step: int) -> None:
     """Enroll an object, or complete the enrollment of a killed program."""
     known = {one.name: one for one in journal.known_objects()}.get(name)
     if known is None:
-        true_fill(journal, name, 2, step)
+        fill(journal, name, 2, step)
     elif known.unfinished_views is not None:
         enrollment = journal.resume(name, provenance=PROVENANCE)
         for index in enrollment.missing():
-            enrollment.add(described(index, step + index), image(step + index))
+            enrollment.add(record(index), image(step + index))
         enrollment.finish()
 
 
@@ -347,7 +386,7 @@ def test_kill_at_any_point_loses_and_doubles_nothing(place: CatalogPlace, kind: 
         expected[name] = 2
         if kind == "delivery":
             with Journal.of(place, CLOCK) as journal:
-                true_fill(journal, name, 2, step)
+                fill(journal, name, 2, step)
         code = f"from tests.servers.test_offline import killed; killed({kind!r})"
         program = Program(str(place.path), str(place.url), str(place.images), str(step), code=code)
         out, errors = program.communicate(60)
@@ -363,8 +402,7 @@ def test_kill_at_any_point_loses_and_doubles_nothing(place: CatalogPlace, kind: 
         raise AssertionError(f"the {kind} has more steps")
     assert step > 10
     with Catalog.open(place, clock=CLOCK) as shared:
-        found = {one.problem for one in finished(verify(shared, quick=True, jobs=1)).findings}
-        assert found <= ({Problem.ORPHANED_FILE} if kind == "delivery" else set())
+        assert finished(verify(shared, quick=True, jobs=1)).findings == ()
         assert {one.unfinished_views for one in shared.objects()} == {None}
 
 
@@ -377,8 +415,8 @@ def test_catalog_of_another_version_is_not_used(
 ) -> None:
     with Catalog.open(place, clock=CLOCK) as catalog:
         with catalog.database.write() as connection:
-            connection.execute(text(f"UPDATE catalog_properties SET value = '{version}' WHERE key = 'version'"))
-        for attempt in (catalog.objects, lambda: true_fill(catalog, "jar", 1, 9)):
+            connection.execute(text(f"UPDATE properties SET value = '{version}' WHERE key = 'version'"))
+        for attempt in (catalog.objects, lambda: fill(catalog, "jar", 1, 9)):
             with pytest.raises(error, match=words):
                 attempt()
     for read_only in (False, True):

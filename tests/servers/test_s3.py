@@ -15,20 +15,17 @@ import numpy as np
 import pytest
 from sqlalchemy import text
 
-from rig.catalog import Catalog
-from rig.catalog.copying import copy_catalog
-from rig.catalog.edit import delete
-from rig.catalog.exchange import Conflict, import_objects, plan_import
-from rig.catalog.exchange.catalog_reader import read_catalog
+from rig.catalog import Catalog, derived
+from rig.catalog.jobs import finished
 from rig.catalog.results import record as record_result
+from rig.catalog.transfer import CatalogSource, copy, transfer
 from rig.catalog.upkeep import collect_garbage
-from rig.catalog.verify import verify
-from rig.catalog.verify_images import Problem, Repair
+from rig.catalog.verify import Problem, verify
 from rig.config.catalog_place import CatalogPlace
 from rig.core.clock import SystemClock
 from rig.core.errors import CatalogError, CatalogUnavailable
 from sim.clock import VirtualClock
-from tests.rig.catalog.catalog_samples import finished, image, new_result, true_fill
+from tests.rig.catalog.catalog_samples import PROVENANCE, fill, image, new_result
 from tests.servers.postgres import PostgresServer, place_in
 
 
@@ -105,31 +102,25 @@ def opened(place: CatalogPlace | Path, **options: bool) -> Catalog:
 def test_catalog_with_images_in_s3_does_everything(postgres: PostgresServer, s3: S3Server, tmp_path: Path) -> None:
     place = in_s3(postgres, tmp_path / "shared")
     with opened(place) as catalog:
-        true_fill(catalog, "mug", 2, 0)
-        true_fill(catalog, "tin", 2, 10)
+        fill(catalog, "mug", 2, 0)
+        fill(catalog, "tin", 2, 10)
         record_result(catalog, new_result(), image(1))
         (first, second) = catalog.object("mug").views
-        assert np.array_equal(catalog.read_image(second), image(1))
-        assert catalog.image_path(first).is_relative_to(tmp_path)
+        assert np.array_equal(catalog.read_image(second.image), image(1))
+        assert catalog.image_path(first.image).is_relative_to(tmp_path)
         assert finished(verify(catalog)).findings == ()
-        # Damage: one image is lost, one is swapped for another; a copy of the first lies under another name.
         store = catalog.database.images
-        content = store.read(first.image)
-        store.write("images/left/000.png", content)
+        content = store.content(first.image)
         store.remove([first.image])
         with pytest.raises(CatalogError, match="missing"):
-            catalog.read_image(first)
-        found = finished(verify(catalog, repair=True)).findings
-        assert [(one.problem, one.repair) for one in found] == [
-            (Problem.MISSING_IMAGE, Repair.RESTORED),
-            (Problem.ORPHANED_FILE, Repair.MOVED),
-        ]
+            catalog.read_image(first.image)
+        assert [one.problem for one in finished(verify(catalog)).findings] == [Problem.MISSING_IMAGE]
+        assert store.put(content) == first.image
         assert finished(verify(catalog)).findings == ()
-        delete(catalog, "tin")
+        catalog.delete("tin")
         removed = collect_garbage(catalog)
-        assert (removed.objects, removed.views, removed.files) == (("tin",), 2, 3)
+        assert (removed.objects, removed.views, removed.files) == (("tin",), 2, 2)
         assert finished(verify(catalog)).findings == ()
-        assert store.lost() == set()
     with pytest.raises(CatalogError, match=r"images of the catalog .* are not in"):
         opened(CatalogPlace(tmp_path / "other", place.url, "s3://rig/elsewhere"))
     with pytest.raises(CatalogError, match="does not exist") as error:
@@ -139,40 +130,36 @@ def test_catalog_with_images_in_s3_does_everything(postgres: PostgresServer, s3:
 
 def test_objects_are_imported_into_s3(postgres: PostgresServer, s3: S3Server, tmp_path: Path) -> None:
     with opened(tmp_path / "local") as local, opened(in_s3(postgres, tmp_path / "shared")) as catalog:
-        true_fill(local, "mug", 2, 0)
-        batch = read_catalog(local)
-        finished(import_objects(catalog, plan_import(catalog, batch, Conflict.REJECT), jobs=1))
-        assert catalog.views().views.object_names == ("mug",)
+        fill(local, "mug", 2, 0)
+        finished(transfer(CatalogSource(local), catalog))
+        assert derived.views(catalog).object_names == ("mug",)
         assert finished(verify(catalog, jobs=1)).findings == ()
 
 
 def test_copies_in_both_directions_are_equal(postgres: PostgresServer, s3: S3Server, tmp_path: Path) -> None:
     with opened(tmp_path / "local") as local, opened(in_s3(postgres, tmp_path / "shared")) as shared:
-        true_fill(local, "mug", 2, 0)
-        true_fill(local, "gone", 1, 5)
-        delete(local, "gone")
+        fill(local, "mug", 2, 0)
+        fill(local, "gone", 1, 5)
+        local.delete("gone")
         collect_garbage(local)
-        true_fill(local, "tin", 2, 10)
-        local.begin(
-            "half", planned_azimuth_deg=[0.0], provenance=local.object("mug").enrollments[0].sessions[0].provenance
-        )
+        fill(local, "tin", 2, 10)
+        local.begin("half", planned_azimuth_deg=[0.0], provenance=PROVENANCE)
         record_result(local, new_result(), image(1))
-        done = finished(copy_catalog(local, shared))
+        done = finished(copy(local, shared))
         assert (done.objects, done.views, done.results, done.images) == (3, 4, 1, 5)
         assert shared.version() == local.version()
         assert finished(verify(shared, jobs=1)).findings == ()
         with pytest.raises(CatalogError, match="not empty"):
-            finished(copy_catalog(local, shared))
+            finished(copy(local, shared))
         with opened(tmp_path / "back") as back:
-            finished(copy_catalog(shared, back))
+            finished(copy(shared, back))
             assert back.version() == local.version()
             assert finished(verify(back, jobs=1)).findings == ()
             assert [entry.action for entry in back.log()][-2:] == ["copied", "copied"]
-            ids = {name: back.object(name).enrollments[0].id for name in ("mug", "tin")}
-            assert ids == {name: local.object(name).enrollments[0].id for name in ("mug", "tin")}
-            true_fill(back, "new", 1, 20)
-            true_fill(shared, "new", 1, 20)
-            assert back.object("new").enrollments[0].id == shared.object("new").enrollments[0].id == 5
+            ids = [[catalog.object(name).complete.id for name in ("mug", "tin")] for catalog in (local, back)]
+            assert ids[0] == ids[1]
+            fill(back, "new", 1, 20)
+            fill(shared, "new", 1, 20)
 
 
 def test_transaction_without_locks_may_wait_and_one_with_locks_may_not(
@@ -180,7 +167,7 @@ def test_transaction_without_locks_may_wait_and_one_with_locks_may_not(
 ) -> None:
     monkeypatch.setattr("rig.catalog.postgres.LOST_BENCH_S", 1)
     with opened(place_in(postgres.url, tmp_path / "shared")) as catalog:
-        true_fill(catalog, "mug", 1, 0)
+        fill(catalog, "mug", 1, 0)
         with catalog.database.read() as reading:
             before = reading.scalar(text("SELECT count(*) FROM views"))
             SystemClock().sleep(1.5)  # an export writes its files
@@ -193,10 +180,10 @@ def test_transaction_without_locks_may_wait_and_one_with_locks_may_not(
 
 def test_store_that_does_not_answer_is_reported(postgres: PostgresServer, s3: S3Server, tmp_path: Path) -> None:
     with opened(in_s3(postgres, tmp_path / "shared")) as catalog:
-        true_fill(catalog, "mug", 1, 0)
+        fill(catalog, "mug", 1, 0)
         endpoint = os.environ["AWS_ENDPOINT_URL"]
         s3.stop()
         with pytest.raises(CatalogUnavailable, match="cannot be reached") as error:
-            catalog.read_image(catalog.object("mug").views[0])
+            catalog.read_image(catalog.object("mug").views[0].image)
         assert endpoint in str(error.value.evidence)
-        assert catalog.views().views.object_names == ("mug",)
+        assert derived.views(catalog).object_names == ("mug",)

@@ -9,17 +9,16 @@ from typing import Any
 
 import pytest
 
-from rig.catalog import Catalog
-from rig.catalog.journal import Journal, waiting
-from rig.catalog.local_copy import open_copy, update_copy
+from rig.catalog import Catalog, derived
+from rig.catalog.jobs import finished
 from rig.catalog.results import find_results
-from rig.catalog.shared import BackgroundDelivery, JournalState
+from rig.catalog.shared import BackgroundDelivery, Journal, JournalState, open_copy, update_copy, waiting
 from rig.catalog.verify import verify
 from rig.config.catalog_place import CatalogPlace
 from rig.core.clock import SystemClock
 from rig.events.events import NoteCode
 from rig.search.current_model import CurrentModel
-from tests.rig.catalog.catalog_samples import finished, true_fill
+from tests.rig.catalog.catalog_samples import fill
 from tests.rig.web.conftest import Served, serve  # noqa: F401 - a fixture
 from tests.servers.postgres import PostgresServer, place_in
 
@@ -75,7 +74,7 @@ def test_served_bench_works_without_the_server_and_delivers_once(
     finally:
         postgres.start()
     with Catalog.open(place, clock=CLOCK) as other_bench:
-        true_fill(other_bench, "mug-star", 2, 30)
+        fill(other_bench, "mug-star", 2, 30)
     with catalog.background_delivery():  # beside the worker, which is idle
         state = wait_until(lambda: catalog.state["reasons"] and waiting(place, CLOCK) == 1 and catalog.state)
     (conflict,) = state["reasons"]
@@ -99,14 +98,14 @@ def test_served_bench_works_without_the_server_and_delivers_once(
 
 def test_journal_is_delivered_in_the_middle_of_a_run(postgres: PostgresServer, place: CatalogPlace) -> None:
     with Catalog.open(place, clock=CLOCK) as shared:
-        true_fill(shared, "mug", 2, 0)
+        fill(shared, "mug", 2, 0)
         update_copy(shared)
     postgres.stop()
     said: list[str] = []
     states: list[JournalState] = []
     try:
         with Journal.of(place, CLOCK) as journal:
-            true_fill(journal, "star", 2, 30)
+            fill(journal, "star", 2, 30)
         begun = (
             open_copy(place, CLOCK),
             BackgroundDelivery(place, CLOCK, said.append, changed=states.append, check_s=0.01, retry_s=0.05),
@@ -117,7 +116,7 @@ def test_journal_is_delivered_in_the_middle_of_a_run(postgres: PostgresServer, p
             assert NoteCode.LOCAL_COPY in {note.code for note in model().notes}
             postgres.start()
             wait_until(lambda: states[-1] == JournalState())
-            found = wait_until(lambda: "star" in model().index.views.object_names and model())
+            found = wait_until(lambda: "star" in model().views.object_names and model())
             assert NoteCode.LOCAL_COPY not in {note.code for note in found.notes}
     finally:
         if not postgres.runs:
@@ -128,4 +127,4 @@ def test_journal_is_delivered_in_the_middle_of_a_run(postgres: PostgresServer, p
     assert all("is delivered later" in words for words in said[:-1])
     assert said[-1].startswith("Delivered star with 2 views")
     with open_copy(place, CLOCK) as copy:  # it follows the first search after the outage
-        assert copy.views().views.object_names == ("mug", "star")
+        assert derived.views(copy).object_names == ("mug", "star")
