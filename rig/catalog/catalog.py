@@ -257,7 +257,7 @@ class Catalog(AbstractContextManager["Catalog"]):
         for azimuth_deg in plan:
             check_azimuth(azimuth_deg)
         texts = checked_texts(label, note)
-        image = None if empty_table is None else self._put(empty_table)
+        png = None if empty_table is None else images.encode(empty_table)
         now = self.clock.utc()
         with self.database.write() as transaction:
             known = state.state_of(transaction, name)
@@ -284,7 +284,7 @@ class Catalog(AbstractContextManager["Catalog"]):
                 status=EnrollmentStatus.IN_PROGRESS,
                 details={"enrollment_id": enrollment.id, "views": len(plan), "replace": replace},
             )
-            return self._start_session(transaction, enrollment, name, provenance, image)
+            return self._start_session(transaction, enrollment, name, provenance, png)
 
     def resumable(self, name: str) -> EnrollmentState | None:
         """Return the unfinished enrollment of an object, or None.
@@ -311,7 +311,7 @@ class Catalog(AbstractContextManager["Catalog"]):
         CatalogBusy
             Another process is writing for longer than the timeout.
         """
-        image = None if empty_table is None else self._put(empty_table)
+        png = None if empty_table is None else images.encode(empty_table)
         with self.database.write() as transaction:
             found = state.find(transaction, name)
             enrollment = state.unfinished(transaction, found).enrollment
@@ -323,7 +323,7 @@ class Catalog(AbstractContextManager["Catalog"]):
                 name,
                 details={"enrollment_id": enrollment.id},
             )
-            return self._start_session(transaction, enrollment, name, provenance, image)
+            return self._start_session(transaction, enrollment, name, provenance, png)
 
     # Change objects
 
@@ -423,27 +423,22 @@ class Catalog(AbstractContextManager["Catalog"]):
                 details={"enrollment_id": begun.enrollment.id},
             )
 
-    def _put(self, image_bgr: NDArray[np.uint8]) -> tuple[str, int]:
-        """Store an image, and return its name and its size in bytes."""
-        png = images.encode(image_bgr)
-        with self.database.catalog_errors():
-            return self.database.images.put(png), len(png)
-
     def _start_session(
         self,
         transaction: Transaction,
         enrollment: Enrollment,
         name: str,
         provenance: Provenance,
-        empty_table: tuple[str, int] | None,
+        empty_table: bytes | None,
     ) -> OpenEnrollment:
-        image, size = empty_table or (None, None)
+        # While this process may write, no other one removes the image as garbage before its row is there.
+        image = None if empty_table is None else self.database.images.put(empty_table)
         session = Session(
             number=len(enrollment.sessions),
             started_utc=self.clock.utc(),
             provenance=provenance,
             empty_table=image,
-            empty_table_bytes=size,
+            empty_table_bytes=None if empty_table is None else len(empty_table),
         )
         session.enrollment_id = enrollment.id
         session.digest = digest_of(session, enrollment.key)

@@ -99,6 +99,8 @@ class OpenEnrollment:
                     f"View {view.index} of {self.object_name!r} is stored already.",
                     next_step="Continue with the missing views; check that no other process enrolls this object.",
                 )
+            if database.images.size(view.image) != len(png):  # `collect_garbage` removed it: an older view had it, too
+                database.images.put(png)
             view.enrollment_id, view.session = self.id, self.session.number
             view.digest = digest_of(view, self.enrollment.key)
             transaction.add(view)
@@ -241,6 +243,9 @@ def check_view(view: View) -> None:
     UsageError
         A number is out of range or not finite, or the evidence is not JSON.
     """
+    view.index = int(view.index)
+    if view.captured_ns is not None:
+        view.captured_ns = int(view.captured_ns)
     if view.index < 0:
         raise UsageError(f"View index {view.index} is negative.", next_step="Number the views of a plan from 0.")
     for name in ("commanded_deg", "encoder_deg", "azimuth_deg", "imu_deg", "imu_sigma_deg"):

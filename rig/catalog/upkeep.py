@@ -111,7 +111,7 @@ def statistics(catalog: Catalog) -> Statistics:
             database_bytes=catalog.database.size_bytes(transaction),
             free_disk_bytes=catalog.database.images.free_bytes(),
             labels=by_label,
-            benches=dict(benches.tuples().all()),
+            benches=dict(benches.all()),
             descriptors=tuple(DescriptorStatistics(*one) for one in derived.counts(transaction)),
             log_entries=log.head(transaction)[0],
             results=recorded,
@@ -172,8 +172,9 @@ def collect_garbage(catalog: Catalog, *, old: bool = False, dry_run: bool = Fals
                     record={COLLECTED: sorted(ids)},
                 )
     if not dry_run:
-        with catalog.database.catalog_errors():
-            store.remove(sizes)
+        # What another process names meanwhile stays. One that names an image later looks for it, and stores it again.
+        with catalog.database.write() as transaction:
+            store.remove(sizes.keys() - {row.image for row in transaction.execute(_NAMED_IMAGES)})
     return collected
 
 

@@ -1,14 +1,16 @@
 """Sample views for the tests of the catalog, and a program that enrolls them.
 
-The program prints the index of each stored view, and kills itself before a durable step. Steps count from 1: sync of
-the image, rename, sync of the folder, commit, then those of the next view.
+The program prints the index of each stored view, and kills itself before a durable step. Steps count from 1: two syncs
+for a new folder, sync of the image, rename, sync of its folder, commit, then those of the next view.
 """
 
 import os
 import signal
 import sqlite3
 import sys
+from collections.abc import Callable
 from contextlib import closing
+from datetime import UTC, datetime
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -27,6 +29,8 @@ from rig.core.clock import SystemClock
 from tests.programs import Program
 from tests.servers.postgres import use_postgres
 
+NOW = datetime(2026, 3, 1, tzinfo=UTC)
+OpenCatalog = Callable[[str], Catalog]
 PROVENANCE = Provenance("bench-1", {"servo": {"model": "XL430-W250", "id": 1}}, {"noise": "defaults"})
 
 
@@ -131,3 +135,15 @@ def sql(catalog: Catalog, statement: str) -> None:
     """Change the database directly."""
     with closing(sqlite3.connect(catalog.path / "catalog.sqlite", isolation_level=None)) as connection:
         connection.execute(statement)
+
+
+def edit(path: Path, *statements: str) -> None:
+    """Change rows of a SQLite catalog in a way that its triggers prevent, as another program could."""
+    with closing(sqlite3.connect(path / "catalog.sqlite", isolation_level=None)) as connection:
+        triggers = connection.execute("SELECT name, sql FROM sqlite_master WHERE type = 'trigger'").fetchall()
+        for name, _ in triggers:
+            connection.execute(f"DROP TRIGGER {name}")
+        for statement in statements:
+            connection.execute(statement)
+        for _, definition in triggers:
+            connection.execute(definition)

@@ -9,8 +9,7 @@ import pytest
 from rig.catalog import Catalog
 from rig.config.catalog_place import CatalogPlace
 from sim.clock import VirtualClock
-from tests.rig.catalog.catalog_samples import without_waiting
-from tests.rig.catalog.exchange.exchange_samples import NOW, OpenCatalog
+from tests.rig.catalog.catalog_samples import NOW, OpenCatalog, without_waiting
 from tests.servers.postgres import VARIABLE, server, use_postgres
 
 

@@ -13,8 +13,11 @@ import numpy as np
 import pytest
 from sqlalchemy import Engine, event
 
-from rig.catalog import Catalog, Enrollment
+from rig.catalog import Catalog, OpenEnrollment
+from rig.catalog.derived import views as searched
+from rig.catalog.jobs import finished
 from rig.catalog.sqlite_database import SqliteDatabase
+from rig.catalog.verify import verify
 from rig.config.catalog_place import CatalogPlace
 from rig.core.errors import CatalogBusy, CatalogError
 from rig.core.next_steps import Do
@@ -24,7 +27,7 @@ from tests.rig.catalog.catalog_samples import PROVENANCE, fill, image, other_pro
 VIEWS = 12
 
 
-def begin(catalog: Catalog, name: str, views: int = VIEWS) -> Enrollment:
+def begin(catalog: Catalog, name: str, views: int = VIEWS) -> OpenEnrollment:
     return catalog.begin(name, planned_azimuth_deg=plan(views), provenance=PROVENANCE)
 
 
@@ -33,23 +36,23 @@ def assert_resumes_whole(path: Path, name: str, reported: set[int]) -> None:
     with Catalog.open(path, clock=VirtualClock()) as catalog:
         unfinished = catalog.resumable(name)
         assert unfinished is not None
-        assert reported <= set(unfinished.present)
-        assert len(unfinished.present) <= len(reported) + 1
+        assert reported <= set(unfinished.enrollment.present)
+        assert len(unfinished.enrollment.present) <= len(reported) + 1
         enrollment = catalog.resume(name, provenance=PROVENANCE)
         for index in enrollment.missing():
             enrollment.add(record(index), image(index))
         enrollment.finish()
         views = catalog.object(name).views
-        assert [view.record.index for view in views] == list(range(VIEWS))
+        assert [view.index for view in views] == list(range(VIEWS))
         for view in views:
-            assert np.array_equal(catalog.read_image(view), image(view.record.index))
-            assert np.array_equal(view.record.descriptors["cedd"], record(view.record.index).descriptors["cedd"])
-        assert {file.name for file in catalog.image_path(views[0]).parent.iterdir()} == {
-            f"{index:03d}.png" for index in range(VIEWS)
-        }
+            assert np.array_equal(catalog.read_image(view.image), image(view.index))
+        others = catalog.database.images.names() - {view.image for view in views}
+        assert all(name.endswith(".part") for name in others)  # `collect_garbage` removes it
+        assert len(others) <= 1
+        assert finished(verify(catalog, jobs=1)).findings == ()
 
 
-@pytest.mark.parametrize("die_before", [5, 6, 7, 8], ids=["sync-image", "rename", "sync-folder", "commit"])
+@pytest.mark.parametrize("die_before", [9, 10, 11, 12], ids=["sync-image", "rename", "sync-folder", "commit"])
 def test_process_killed_in_add_loses_only_that_view(tmp_path: Path, die_before: int) -> None:
     child = other_program(tmp_path, "mug", VIEWS, die_before)
     out, err = child.communicate()
@@ -92,15 +95,19 @@ def test_image_is_durable_before_its_row(tmp_path: Path, monkeypatch: pytest.Mon
             enrollment.add(record(0), image(0))
         finally:
             event.remove(Engine, "commit", record_commit)
-    assert steps == ["sync 000.png.part", "rename 000.png.part 000.png", f"sync {enrollment.folder.name}", "commit"]
+    (name,) = (path.name for path in tmp_path.rglob("*.png"))
+    part = next(step.removeprefix("sync ") for step in steps if step.endswith(".part"))
+    assert part.startswith(name)
+    stored = [f"sync {part}", f"rename {part} {name}", f"sync {name[:2]}", "commit"]
+    assert [step for step in steps if step in stored] == stored == steps[-len(stored) :]
 
 
 @pytest.mark.sqlite
 def test_database_commits_durably_and_checks_foreign_keys(tmp_path: Path) -> None:
     database = SqliteDatabase(CatalogPlace(tmp_path), create=True, read_only=False, busy_timeout_s=1.0)
-    with database.write() as connection:
+    with database.write() as transaction:
         settings = {
-            name: connection.exec_driver_sql(f"PRAGMA {name}").scalar_one()
+            name: transaction.connection().exec_driver_sql(f"PRAGMA {name}").scalar_one()
             for name in ("journal_mode", "synchronous", "foreign_keys")
         }
     database.close()
@@ -128,7 +135,7 @@ def test_full_disk_loses_only_the_present_view(
                 enrollment.add(record(1), image(1))
         assert Do.FREE_DISK() in error.value.steps
         assert enrollment.missing() == (1,)
-        assert [file.name for file in (tmp_path / enrollment.folder).iterdir()] == ["000.png"]
+        assert len([path for path in tmp_path.joinpath("images").rglob("*") if path.is_file()]) == 1
         enrollment.add(record(1), image(1))
         enrollment.finish()
 
@@ -137,19 +144,19 @@ def test_full_disk_loses_only_the_present_view(
 def test_database_that_cannot_grow_is_reported_as_full_disk(tmp_path: Path) -> None:
     with Catalog.open(tmp_path, clock=VirtualClock()) as catalog:
         enrollment = begin(catalog, "mug", 1)
-        with catalog.database.write() as connection:
-            pages = connection.exec_driver_sql("PRAGMA page_count").scalar_one()
-            connection.exec_driver_sql(f"PRAGMA max_page_count = {pages}")
+        with catalog.database.write() as transaction:
+            pages = transaction.connection().exec_driver_sql("PRAGMA page_count").scalar_one()
+            transaction.connection().exec_driver_sql(f"PRAGMA max_page_count = {pages}")
         with pytest.raises(CatalogError, match="full"):
             enrollment.add(record(0, evidence={"long": "x" * 20_000}), image(0))
         assert enrollment.missing() == (0,)
 
 
-def test_begin_fails_if_the_folder_cannot_be_created(tmp_path: Path) -> None:
+def test_begin_fails_if_the_empty_table_image_cannot_be_stored(tmp_path: Path) -> None:
     with Catalog.open(tmp_path, clock=VirtualClock()) as catalog:
         (tmp_path / "images").write_text("in the way")
         with pytest.raises(CatalogError):
-            begin(catalog, "mug")
+            catalog.begin("mug", planned_azimuth_deg=plan(1), provenance=PROVENANCE, empty_table=image(0))
         assert catalog.objects() == []
 
 
@@ -163,8 +170,7 @@ def test_second_writer_gets_busy_error_after_the_timeout(tmp_path: Path) -> None
             with pytest.raises(CatalogBusy, match=r"0\.02 s\. Nothing was changed") as error:
                 enrollment.add(record(0), image(0))
             assert error.value.exit_code == 9
-            assert len(catalog.views().views) == 1  # readers do not wait
-        assert not (tmp_path / enrollment.folder / "000.png").exists()
+            assert len(searched(catalog)) == 1  # readers do not wait
         enrollment.add(record(0), image(0))
 
 
@@ -180,13 +186,12 @@ def test_several_processes_share_one_catalog(tmp_path: Path) -> None:
         while any(child.poll() is None for child in children.values()):
             summaries = catalog.objects()
             seen.append(sum(s.views + (s.unfinished_views or 0) for s in summaries))
-            assert len(catalog.views().views) in (0, VIEWS, 2 * VIEWS)
+            assert len(searched(catalog)) in (0, VIEWS, 2 * VIEWS)
         for child in children.values():
             _, err = child.communicate()
             assert child.returncode == 0, err
         assert seen == sorted(seen)
-        model, view_ids = catalog.views()
-        assert sorted(model.object_names) == ["mug", "tin"]
-        for view_id in view_ids:
-            view = catalog.view(view_id)
-            assert np.array_equal(catalog.read_image(view), image(view.record.index))
+        assert sorted(searched(catalog).object_names) == ["mug", "tin"]
+        for name in children:
+            for view in catalog.object(name).views:
+                assert np.array_equal(catalog.read_image(view.image), image(view.index))
