@@ -43,7 +43,7 @@ def test_each_answer_is_recorded_with_its_sample_and_its_first_image(recorder, t
     first = next(event for event in shown if isinstance(event, Accepted))
     with Catalog.open(tmp_path, clock=recorder.clock, read_only=True) as catalog:
         for result in find_results(catalog):
-            assert np.array_equal(catalog.database.images.pixels(result.image, result.image_sha256), first.image_bgr)
+            assert np.array_equal(catalog.read_image(result.image), first.image_bgr)
             assert len(result.azimuths_deg) == result.details["views"]
             assert result.provenance.devices["camera"]
 
