@@ -80,6 +80,7 @@ def _portions(catalog: Catalog) -> Iterator[Callable[[Transaction], None]]:
     for first in range(1, last + 1, _LINES):
         yield partial(_check_lines, first, min(first + _LINES - 1, last))
     yield partial(_check_lines, last + 1, None)  # the lines since then, and the end of the log
+    yield log.check_complete
     yield _check_missing
     yield from (partial(_check_enrollment, number) for number in ids)
 

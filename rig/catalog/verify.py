@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sqlalchemy import and_, func, select
 from sqlalchemy.orm import Session as Transaction
+from sqlalchemy.orm import selectinload
 
 from rig.catalog import derived, digests, log, state
 from rig.catalog.catalog import Catalog
@@ -201,15 +202,19 @@ def _check_rows(catalog: Catalog, transaction: Transaction, rows: _Rows) -> None
     for number in sorted(wrong):
         name = transaction.scalar(select(Entry.object_name).where(Entry.id == number))
         rows.findings.append(Finding(Problem.LOG_CHANGED, name, details={"entry_id": number}))
+    try:
+        log.check_complete(transaction)
+    except CatalogDamaged as damage:
+        rows.findings.append(Finding(Problem.DAMAGED_DATABASE, details={"message": damage.what}))
     answers = transaction.scalars(select(Entry.id).where(Entry.action == Action.IDENTIFIED).order_by(Entry.id))
     rows.answers = [line for line in answers if line not in wrong]
     # The enrollments.
     rows.findings += missing_enrollments(transaction)
     wanted = select(Enrollment.id, state.Named.object_name)
     owners = wanted.outerjoin(state.Named, and_(state.Named.object_id == Enrollment.object_id, state.IS_STATE))
-    rows.owners = dict(transaction.execute(owners.order_by(Enrollment.id)).tuples().all())
+    rows.owners = dict(transaction.execute(owners.order_by(Enrollment.id)).all())
     ended = transaction.execute(select(state.Ended.enrollment_id, state.Ended.seal).where(state.IS_STATUS))
-    seals = {number: seal for number, seal in ended if number is not None}
+    seals = {number: seal for number, seal in ended if number in rows.owners}
     changed = {*digests.damaged_enrollments(transaction, seals), *(rows.owners.keys() - seals.keys())}
     for number in sorted(changed):
         name = rows.owners.pop(number)
@@ -222,8 +227,13 @@ def _groups(catalog: Catalog, rows: _Rows, quick: bool) -> Iterator[_Group]:
     """Yield what is to be checked further. A large catalog is read in portions."""
     for ids in digests.portions(list(rows.owners), _AT_ONCE):
         with catalog.database.read() as transaction:
-            enrollments = [one.enrollment for one in state.enrollments(transaction, Enrollment.id.in_(ids))]
-            groups = [_group(transaction, one, rows.owners[one.id], quick) for one in enrollments[::-1]]
+            enrollments = transaction.scalars(
+                select(Enrollment)
+                .where(Enrollment.id.in_(ids))
+                .options(selectinload(Enrollment.sessions), selectinload(Enrollment.views))
+                .order_by(Enrollment.id)
+            )
+            groups = [_group(transaction, one, rows.owners[one.id], quick) for one in enrollments]
         yield from groups
     for lines in digests.portions(rows.answers, PORTION):
         image = (Entry.record["image"].as_string(), Entry.record["image_bytes"].as_integer())
