@@ -119,7 +119,7 @@ def describe_new(catalog: Catalog, enrollment: Enrollment, held: Mapping[str, ND
     """
     store = catalog.database.images
     seal = seal_of(enrollment)
-    task = _task(enrollment, seal, name, DESCRIPTORS, None)
+    task = task_of(enrollment, seal, name, DESCRIPTORS, None)
 
     def pixels(image: str) -> NDArray[np.uint8]:
         return held[image] if image in held else store.pixels(image)
@@ -150,7 +150,7 @@ def described(catalog: Catalog, enrollment: Enrollment, name: str, *wanted: str)
             ValueError, TypeError, AttributeError, RigError
         ):  # computed again if this program has not made it
             return Described(unpacked, _evidence(stored[SEGMENTATION][seal], len(enrollment.views)))
-    task = _task(enrollment, seal, name, kinds, region)
+    task = task_of(enrollment, seal, name, kinds, region)
     with catalog.database.catalog_errors():
         found = _describe(catalog.database.images.pixels, task, threads=THREADS)
     _store(catalog, [(task, found)])
@@ -432,13 +432,14 @@ def _missing(catalog: Catalog, name: str, found: dict[str, bytes]) -> tuple[list
         for one in missing:
             (known,) = state.enrollments(transaction, Enrollment.id == one.enrollment_id)
             compute = DESCRIPTORS if name in DESCRIPTORS and SEGMENTATION in kinds else (name,)
-            tasks.append(_task(known.enrollment, one.seal, one.name, compute, chosen[one.seal]))
+            tasks.append(task_of(known.enrollment, one.seal, one.name, compute, chosen[one.seal]))
     return wanted, tasks
 
 
-def _task(
+def task_of(
     enrollment: Enrollment, seal: str, name: str, names: tuple[str, ...], region: tuple[Region | None] | None
 ) -> Task:
+    """Return the task to describe an enrollment; ``region`` is the one that was chosen later."""
     views = tuple(
         _Image(view.image, view.session, view.region if region is None else region[0], view.azimuth_deg)
         for view in enrollment.views
@@ -623,11 +624,17 @@ def _store(catalog: Catalog, done: Sequence[tuple[Task, Described]]) -> None:
             database.close()
 
 
-def _write(database: Database, rows: Collection[dict[str, Any]]) -> None:
+def _write(database: Database, rows: Sequence[dict[str, Any]]) -> None:
     with database.write() as transaction:
-        for row in rows:
-            transaction.execute(delete(Derived).where(Derived.seal == row["seal"], Derived.what == row["what"]))
-        transaction.execute(insert(Derived), list(rows))
+        add(transaction, rows)
+
+
+def add(transaction: Transaction, rows: Sequence[dict[str, Any]]) -> None:
+    """Add rows of `Derived`, in the place of earlier ones of the same kind."""
+    for row in rows:
+        transaction.execute(delete(Derived).where(Derived.seal == row["seal"], Derived.what == row["what"]))
+    if rows:
+        transaction.execute(insert(Derived), rows)
 
 
 def _stored(
@@ -704,7 +711,7 @@ def to_compare(
     kinds = tuple(what for what in used if what != SEGMENTATION)
     if SEGMENTATION in used and all(descriptor(what).whole_image for what in kinds):
         kinds = (*kinds, BENCH_DESCRIPTOR)
-    return tuple(stored), tuple(damaged), _task(enrollment, seal, name, kinds, region) if used else None
+    return tuple(stored), tuple(damaged), task_of(enrollment, seal, name, kinds, region) if used else None
 
 
 def contents(pixels: _Pixels, task: Task) -> dict[str, bytes]:

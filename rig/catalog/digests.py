@@ -3,7 +3,7 @@
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from itertools import groupby
 from operator import itemgetter
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 from sqlalchemy import ColumnElement, Integer, Text, cast, func, select, type_coerce
 from sqlalchemy.orm import Session as Transaction
@@ -12,6 +12,8 @@ from sqlalchemy.types import NullType
 
 from rig.catalog.columns import JsonText, Number, Truth, Utc
 from rig.catalog.facts import Enrollment, Entry, Row, Session, View, digested, sha256_of
+
+_T = TypeVar("_T")
 
 AT_ONCE: Final = 100
 """Enrollments whose rows are in memory at once."""
@@ -60,8 +62,8 @@ def damaged_enrollments(transaction: Transaction, seals: Mapping[int, str | None
         yield from sorted(wrong)
 
 
-def portions(ids: Sequence[int], size: int) -> Iterator[Sequence[int]]:
-    """Yield ids in portions."""
+def portions(ids: Sequence[_T], size: int) -> Iterator[Sequence[_T]]:
+    """Yield ids or keys in portions."""
     for start in range(0, len(ids), size):
         yield ids[start : start + size]
 
