@@ -115,7 +115,8 @@ def test_a_missing_image_leaves_the_answer_as_it_is(enrolled: tuple[Bench, Catal
     assert any(isinstance(event, Compared) for event in events)
     assert isinstance(events[-1], Identified)
     assert events[-1].outcome is hbr.Outcome.AMBIGUOUS
-    hidden = [image.rename(image.with_suffix(".away")) for image in catalog.path.glob("images/*-vase-blue/*/*.png")]
+    images = [catalog.image_path(view.image) for view in catalog.object("vase-blue").views]
+    hidden = [image.rename(image.with_suffix(".away")) for image in images]
     try:
         *_, warned, answer = identify(bench, model)
     finally:
