@@ -13,7 +13,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Collection, Generator, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 from functools import partial
 from itertools import groupby
@@ -237,7 +237,7 @@ def redescribe(
             transaction.execute(delete(Derived).where(Derived.what.in_((kind.name, SEGMENTATION))))
     found: dict[str, bytes] = {}
     _, tasks = _missing(catalog, kind.name, found)
-    results = yield from _described_now(catalog, tasks, jobs)
+    results = yield from _described_now(catalog, tasks, jobs, required=True)
     failed = [(task.name, result) for task, result in results if isinstance(result, str)]
     described = sum(len(task.views) for task, result in results if not isinstance(result, str))
     unchanged = sum(len(_records(kind, content)) for content in found.values())
@@ -448,7 +448,7 @@ def task_of(
 
 
 def _described_now(
-    catalog: Catalog, tasks: Sequence[Task], jobs: Jobs | None
+    catalog: Catalog, tasks: Sequence[Task], jobs: Jobs | None, *, required: bool = False
 ) -> Generator[JobProgress, None, list[tuple[Task, Described | str]]]:
     """Describe enrollments in processes and store the results; a text is the reason why one cannot be described."""
     done: list[tuple[Task, Described | str]] = []
@@ -458,7 +458,7 @@ def _described_now(
     count = sum(len(task.views) for task in tasks)
     for task, result in map_in_processes(work, tasks, processes(jobs, count)):
         if not isinstance(result, str):
-            _store(catalog, [(task, result)])
+            _store(catalog, [(task, result)], required=required)
         done.append((task, result))
         yield JobProgress(len(done), len(tasks))
     return done
@@ -606,17 +606,18 @@ def _content(task: Task, found: Described) -> dict[str, bytes]:
     return contents
 
 
-def _store(catalog: Catalog, done: Sequence[tuple[Task, Described]]) -> None:
-    """Store descriptions. A catalog that cannot be written keeps none: they are computed again."""
+def _store(catalog: Catalog, done: Sequence[tuple[Task, Described]], *, required: bool = False) -> None:
+    """Store descriptions. Unless it is ``required``, they are only computed again if this fails."""
     rows = [
         row_of(task.seal, what, task.region, content)
         for task, found in done
         for what, content in _content(task, found).items()
     ]
-    if not catalog.database.read_only:
-        _write(catalog.database, rows)
-        return
-    with suppress(RigError):  # derived data may also be added to a catalog that is open for reading
+    with nullcontext() if required else suppress(RigError):
+        if not catalog.database.read_only:
+            _write(catalog.database, rows)
+            return
+        # Derived data may also be added to a catalog that is open for reading.
         database = Database.open(catalog.place, create=False, read_only=False, busy_timeout_s=1.0)
         try:
             _write(database, rows)

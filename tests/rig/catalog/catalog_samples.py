@@ -131,19 +131,11 @@ def files(catalog: Catalog) -> set[str]:
     return {path.relative_to(catalog.path).as_posix() for path in catalog.path.rglob("*.png")}
 
 
-def sql(catalog: Catalog, statement: str) -> None:
-    """Change the database directly."""
-    with closing(sqlite3.connect(catalog.path / "catalog.sqlite", isolation_level=None)) as connection:
-        connection.execute(statement)
-
-
-def edit(path: Path, *statements: str) -> None:
-    """Change rows of a SQLite catalog in a way that its triggers prevent, as another program could."""
-    with closing(sqlite3.connect(path / "catalog.sqlite", isolation_level=None)) as connection:
+def sql(catalog: Catalog | Path, *statements: str) -> None:
+    """Change the database directly, as somebody could who removes what refuses it and puts it back."""
+    root = catalog if isinstance(catalog, Path) else catalog.path
+    with closing(sqlite3.connect(root / "catalog.sqlite", isolation_level=None)) as connection:
         triggers = connection.execute("SELECT name, sql FROM sqlite_master WHERE type = 'trigger'").fetchall()
-        for name, _ in triggers:
-            connection.execute(f"DROP TRIGGER {name}")
-        for statement in statements:
+        removed = [f"DROP TRIGGER {name}" for name, _ in triggers]
+        for statement in (*removed, *statements, *(definition for _, definition in triggers)):
             connection.execute(statement)
-        for _, definition in triggers:
-            connection.execute(definition)

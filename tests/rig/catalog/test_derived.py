@@ -1,0 +1,397 @@
+"""What is computed from the facts can be lost, damaged, old or of another enrollment, and searches stay the same."""
+
+import json
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from sqlalchemy import delete, insert, select, update
+
+import hbr
+from rig.catalog import Catalog, Enrollment, derived
+from rig.catalog.derived import SEGMENTATION
+from rig.catalog.facts import Derived, seal_of
+from rig.catalog.jobs import JobProgress, finished
+from rig.catalog.verify import Problem, verify
+from rig.config import ViewConfig
+from rig.core.errors import CatalogBusy, CatalogDamaged, CatalogError, UsageError
+from rig.search.model import load_model
+from rig.views.description import BENCH_DESCRIPTOR, DESCRIPTORS, PAPER_DESCRIPTOR, EnrollmentDescriber
+from rig.views.segmentation_evidence import SegmentationSummary
+from sim.clock import VirtualClock
+from tests.rig.catalog.catalog_samples import PROVENANCE, OpenCatalog, plan, record, sql, without_waiting
+
+REGION = (8, 0, 64, 64)
+VIEWS = 4
+NAMES = ("box", "can", "cup")
+
+
+def table() -> NDArray[np.uint8]:
+    coarse = np.random.default_rng(5).integers(60, 200, (8, 10, 3), np.uint8)
+    return cv2.resize(coarse, (80, 64), interpolation=cv2.INTER_CUBIC).astype(np.uint8)
+
+
+def view(index: int, number: int = 0) -> NDArray[np.uint8]:
+    image = table()
+    image[20:50, 25 + 3 * index : 50 + 3 * index] = (20, 20 + 90 * number, 230)
+    image[28:38, 30 + 3 * index : 40 + 3 * index] = (230, 230, 20)
+    return image
+
+
+def enroll(catalog: Catalog, name: str, number: int = 0, *, empty_table: bool = True, **begin: Any) -> None:
+    enrollment = catalog.begin(
+        name,
+        planned_azimuth_deg=plan(VIEWS),
+        provenance=PROVENANCE,
+        empty_table=table() if empty_table else None,
+        **begin,
+    )
+    for index in range(VIEWS):
+        enrollment.add(record(index, region=REGION), view(index, number))
+    enrollment.finish()
+
+
+@pytest.fixture(scope="module")
+def enrolled(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("derived") / "catalog"
+    with pytest.MonkeyPatch.context() as patch, Catalog.open(path, clock=VirtualClock()) as catalog:
+        without_waiting(patch)
+        for number, name in enumerate(NAMES):
+            enroll(catalog, name, number)
+    return path
+
+
+@pytest.fixture
+def catalog(enrolled: Path, tmp_path: Path) -> Iterator[Catalog]:
+    with Catalog.open(shutil.copytree(enrolled, tmp_path / "catalog"), clock=VirtualClock()) as catalog:
+        yield catalog
+
+
+def complete(catalog: Catalog, name: str) -> Enrollment:
+    enrollment = catalog.object(name).complete
+    assert enrollment is not None
+    return enrollment
+
+
+def load(catalog: Catalog, kind: str = BENCH_DESCRIPTOR) -> tuple[hbr.Views, int]:
+    """Return the views, and how many enrollments were described for them."""
+    steps: list[JobProgress] = []
+    views = derived.views(catalog, kind, steps.append)
+    return views, steps[-1].total if steps else 0
+
+
+def equal(one: hbr.Views, other: hbr.Views) -> bool:
+    return one.object_names == other.object_names and all(
+        np.array_equal(getattr(one, name), getattr(other, name))
+        for name in ("descriptors", "azimuth_deg", "object_index")
+    )
+
+
+def rows(catalog: Catalog) -> dict[tuple[str, str], tuple[str, bytes, str]]:
+    with catalog.database.read() as transaction:
+        found = transaction.scalars(select(Derived)).all()
+        return {(one.seal, one.what): (one.made_by, one.content, one.sha256) for one in found}
+
+
+def change(catalog: Catalog, **values: Any) -> None:
+    with catalog.database.write() as transaction:
+        transaction.execute(update(Derived).values(**values))
+
+
+def forget(catalog: Catalog) -> None:
+    with catalog.database.write() as transaction:
+        transaction.execute(delete(Derived))
+
+
+@pytest.mark.parametrize("kind", [BENCH_DESCRIPTOR, PAPER_DESCRIPTOR])
+def test_an_enrollment_is_described_once_when_it_ends(catalog: Catalog, kind: str) -> None:
+    views, described = load(catalog, kind)
+    assert described == 0
+    assert isinstance(views, hbr.PackedViews)
+    assert views.object_names == NAMES
+    describer = EnrollmentDescriber(ViewConfig(roi=REGION), DESCRIPTORS, table())
+    numbers = [describer.learn(view(index)) for index in range(VIEWS)]
+    expected = [describer.describe(number, view(index)).levels[kind] for index, number in enumerate(numbers)]
+    assert np.array_equal(views.descriptors[:VIEWS], expected)
+
+
+def test_deleting_everything_that_is_computed_loses_nothing(catalog: Catalog) -> None:
+    before, stored = [load(catalog, kind)[0] for kind in DESCRIPTORS], rows(catalog)
+    version = catalog.version()
+    forget(catalog)
+    assert catalog.version() == version
+    assert load(catalog)[1] == len(NAMES)  # all descriptors of an enrollment are computed together
+    after = [load(catalog, kind) for kind in DESCRIPTORS]
+    assert [described for _, described in after] == [0] * len(DESCRIPTORS)
+    assert all(equal(one, other) for one, (other, _) in zip(before, after, strict=True))
+    assert rows(catalog) == stored
+    assert finished(verify(catalog, jobs=1)).findings == ()
+
+
+@pytest.mark.parametrize(
+    ("values", "lost"),
+    [
+        ({"made_by": f"{BENCH_DESCRIPTOR} 0, segmentation 1"}, 3),
+        ({"content": b""}, 3),
+        ({"content": bytes(VIEWS * 100)}, 3),
+        ({"sha256": "0" * 64}, 3),
+        ({"sha256": ""}, 3),
+    ],
+)
+def test_a_wrong_or_old_result_is_computed_again(catalog: Catalog, values: dict[str, Any], lost: int) -> None:
+    before, stored = load(catalog)[0], rows(catalog)
+    change(catalog, **values)
+    after, described = load(catalog)
+    assert described == lost
+    assert equal(before, after)
+    for kind in DESCRIPTORS:
+        load(catalog, kind)
+    finished(derived.redescribe(catalog, jobs=1))
+    assert rows(catalog) == stored
+    assert load(catalog)[1] == 0
+
+
+def test_a_flipped_byte_is_computed_again_and_found_by_verify(catalog: Catalog) -> None:
+    before = load(catalog)[0]
+    ((seal, what), (_, content, _)) = next(one for one in rows(catalog).items() if one[0][1] == BENCH_DESCRIPTOR)
+    spoilt = content[:5] + bytes([content[5] ^ 1]) + content[6:]
+    with catalog.database.write() as transaction:
+        transaction.execute(update(Derived).where(Derived.seal == seal, Derived.what == what).values(content=spoilt))
+    assert [one.problem for one in finished(verify(catalog, jobs=1)).findings] == [Problem.DESCRIPTION_DAMAGED]
+    after, described = load(catalog)
+    assert (described, equal(before, after)) == (1, True)
+    assert finished(verify(catalog, jobs=1)).findings == ()
+
+
+def test_results_of_another_enrollment_are_not_used(catalog: Catalog) -> None:
+    """Two enrollments exchange their results, with the digests."""
+    before = load(catalog)[0]
+    stored = [(key, value) for key, value in rows(catalog).items() if key[1] == BENCH_DESCRIPTOR]
+    (first, (made_by, one, one_digest)), (second, (_, other, other_digest)), _ = stored
+    forget(catalog)
+    exchanged = ((first, other, other_digest), (second, one, one_digest))
+    with catalog.database.write() as transaction:
+        for (seal, what), content, digest in exchanged:
+            row = {"seal": seal, "what": what, "made_by": made_by, "content": content, "sha256": digest}
+            transaction.execute(insert(Derived).values(row))
+    after, described = load(catalog)
+    assert (described, equal(before, after)) == (3, True)
+
+
+def test_only_new_objects_are_described(catalog: Catalog) -> None:
+    enroll(catalog, "new", 1)
+    assert load(catalog)[1] == 0
+    catalog.rename("new", "newer")
+    catalog.delete("box")
+    catalog.undelete("box")
+    views, described = load(catalog)
+    assert described == 0
+    assert views.object_names == (*NAMES, "newer")
+    enroll(catalog, "can", 2, replace=True)
+    assert load(catalog)[1] == 0
+
+
+def test_an_interrupted_description_continues(catalog: Catalog) -> None:
+    before = load(catalog)[0]
+    forget(catalog)
+    loading = derived.load_views(catalog, BENCH_DESCRIPTOR)
+    assert [next(loading).done for _ in range(2)] == [0, 1]
+    loading.close()
+    after, described = load(catalog)
+    assert (described, equal(before, after)) == (len(NAMES) - 1, True)
+
+
+def test_a_catalog_that_is_read_only_is_described_in_memory(catalog: Catalog, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = load(catalog)[0]
+    forget(catalog)
+
+    def busy(*_: object) -> None:
+        raise CatalogBusy("Another process writes.", next_step="Wait.")
+
+    with monkeypatch.context() as patch, Catalog.open(catalog.path, clock=VirtualClock(), read_only=True) as reader:
+        patch.setattr(derived, "_write", busy)
+        for opened in (reader, catalog):
+            after, described = load(opened)
+            assert (described, equal(before, after)) == (len(NAMES), True)
+    with Catalog.open(catalog.path, clock=VirtualClock(), read_only=True) as reader:
+        assert [load(reader)[1] for _ in range(2)] == [len(NAMES), 0]
+
+
+@pytest.mark.parametrize("evidence", ["[]", "{}", "[1]", "[NaN, NaN, NaN, NaN]", "null", "[" * 5000, '[{"issues": 5}]'])
+def test_evidence_that_no_program_wrote_is_computed_again(catalog: Catalog, evidence: str) -> None:
+    enrollment = complete(catalog, "box")
+    expected = derived.described(catalog, enrollment, "box")
+    assert SegmentationSummary.of(expected.segmentation).found == VIEWS
+    (seal,) = {seal for seal, what in rows(catalog) if seal == seal_of(enrollment)}
+    with catalog.database.write() as transaction:
+        transaction.execute(delete(Derived).where(Derived.seal == seal, Derived.what == SEGMENTATION))
+        transaction.execute(insert(Derived).values(derived.row_of(seal, SEGMENTATION, None, evidence.encode())))
+    found = derived.described(catalog, enrollment, "box")
+    assert found.segmentation == expected.segmentation
+    assert all(np.array_equal(found.levels[name], expected.levels[name]) for name in DESCRIPTORS)
+
+
+def test_azimuths_that_no_program_wrote_are_not_searched(catalog: Catalog) -> None:
+    kind = hbr.descriptor(BENCH_DESCRIPTOR)
+    enrollment = complete(catalog, "box")
+    seal, packed = seal_of(enrollment), np.zeros((VIEWS, kind.size_bytes), np.uint8)
+    with catalog.database.write() as transaction:
+        transaction.execute(delete(Derived).where(Derived.seal == seal, Derived.what == kind.name))
+        content = derived.content_of(kind, packed, [0.0, 90.0, np.nan, 270.0])
+        transaction.execute(insert(Derived).values(derived.row_of(seal, kind.name, None, content)))
+    with pytest.raises(CatalogDamaged, match="azimuth"):
+        load(catalog)
+
+
+@pytest.mark.sqlite
+@pytest.mark.parametrize(
+    "edit",
+    [
+        "log SET object_name = 'cap' WHERE id = 1",
+        "log SET seal = lower(hex(zeroblob(32))) WHERE id = 2",
+        "log SET status = NULL WHERE id = 2",
+    ],
+)
+def test_a_changed_name_or_seal_is_found_at_every_start(catalog: Catalog, edit: str) -> None:
+    load(catalog)
+    sql(catalog, f"UPDATE {edit}")
+    for _ in range(2):
+        with pytest.raises(CatalogDamaged):
+            load(catalog)
+
+
+@pytest.mark.sqlite
+def test_a_changed_view_is_not_described(catalog: Catalog) -> None:
+    forget(catalog)
+    sql(catalog, "UPDATE views SET azimuth_deg = 1.5 WHERE id = 2")
+    with pytest.raises(CatalogDamaged, match="box"):
+        load(catalog)
+
+
+def test_an_object_whose_image_is_missing_is_named(catalog: Catalog) -> None:
+    forget(catalog)
+    catalog.image_path(catalog.object("can").views[1].image).unlink()
+    with pytest.raises(CatalogError, match=r"'can' cannot be described: .* is missing"):
+        load(catalog)
+    done = finished(derived.redescribe(catalog, BENCH_DESCRIPTOR, jobs=1))
+    assert done.unchanged + done.described == (len(NAMES) - 1) * VIEWS
+    assert [name for name, _ in done.failed] == ["can"]
+    with pytest.raises(UsageError, match="no descriptor 'edgy'"):
+        load(catalog, "edgy")
+
+
+def test_describing_again_gives_the_same_levels(catalog: Catalog) -> None:
+    before, stored = load(catalog)[0], rows(catalog)
+    done = finished(derived.redescribe(catalog, BENCH_DESCRIPTOR, again=True, jobs=1))
+    assert (done.described, done.unchanged, done.failed) == (len(NAMES) * VIEWS, 0, ())
+    assert rows(catalog) == stored
+    assert equal(load(catalog)[0], before)
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_views_are_described_the_same_in_several_threads(
+    catalog: Catalog, threads: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stored = rows(catalog)
+    forget(catalog)
+    monkeypatch.setattr(derived, "THREADS", threads)
+    for name in NAMES:
+        enrollment = complete(catalog, name)
+        derived.described(catalog, enrollment, name)
+    assert rows(catalog) == stored
+
+
+def test_a_region_that_is_chosen_later_is_described_and_can_be_taken_back(catalog: Catalog) -> None:
+    before = load(catalog, PAPER_DESCRIPTOR)[0]
+    derived.choose_region(catalog, (0, 0, 80, 64))
+    other, described = load(catalog, PAPER_DESCRIPTOR)
+    assert described == len(NAMES)
+    assert not np.array_equal(other.descriptors, before.descriptors)
+    derived.choose_region(catalog, REGION)
+    assert equal(load(catalog, PAPER_DESCRIPTOR)[0], before)
+    enroll(catalog, "later")
+    assert load(catalog, PAPER_DESCRIPTOR)[1] == 0  # it has a region of its own
+
+
+def test_local_views_are_cut_by_the_stored_silhouettes(catalog: Catalog) -> None:
+    near = derived.local_views(catalog, "box", [10.0])
+    assert near
+    forget(catalog)
+    again = derived.local_views(catalog, "box", [10.0])
+    assert [one.azimuth_deg for one in near] == [one.azimuth_deg for one in again]
+    assert all(np.array_equal(one.mask, other.mask) for one, other in zip(near, again, strict=True))
+
+
+def test_search_compares_the_bench_with_the_newest_enrollment(open_catalog: OpenCatalog) -> None:
+    catalog = open_catalog("new")
+    enroll(catalog, "box", empty_table=False)
+    enroll(catalog, "can", empty_table=False)
+    model = load_model(catalog)
+    assert model.empty_table is None
+    assert model.bench_image is not None
+    assert np.array_equal(model.bench_image, view(0))
+    catalog.image_path(catalog.object("can").views[0].image).unlink()
+    assert load_model(catalog).bench_image is None
+
+
+def test_a_changed_empty_table_image_is_found_and_not_used(catalog: Catalog) -> None:
+    enrollment = complete(catalog, "box")
+    image = enrollment.sessions[0].empty_table
+    assert image is not None
+    path = catalog.image_path(image)
+    path.write_bytes(path.read_bytes()[:-20])
+    found = finished(verify(catalog, jobs=1)).findings
+    assert {finding.problem for finding in found} == {Problem.CHANGED_IMAGE}
+    done = finished(derived.redescribe(catalog, BENCH_DESCRIPTOR, again=True, jobs=1))
+    assert (done.described, len(done.failed)) == (0, len(NAMES))
+
+
+@pytest.mark.parametrize(("levels", "step", "found"), [(1, 1, 0), (1, 2, 1), (100, 1, 1)])
+def test_verify_tolerates_rounded_levels(catalog: Catalog, levels: int, step: int, found: int) -> None:
+    kind = hbr.descriptor(BENCH_DESCRIPTOR)
+    views = load(catalog)[0]
+    own = views.of(0)
+    off = views.descriptors[own].copy()
+    entries = np.arange(levels)
+    off[0, entries] = np.where(off[0, entries] >= 2, off[0, entries] - step, off[0, entries] + step)
+    enrollment = complete(catalog, "box")
+    seal = seal_of(enrollment)
+    content = derived.content_of(kind, kind.pack_rows(off), views.azimuth_deg[own])
+    with catalog.database.write() as transaction:
+        transaction.execute(delete(Derived).where(Derived.seal == seal, Derived.what == kind.name))
+        transaction.execute(insert(Derived).values(derived.row_of(seal, kind.name, None, content)))
+    seen = finished(verify(catalog, jobs=1)).findings
+    assert [finding.problem for finding in seen] == [Problem.DESCRIPTION_DIFFERS] * found
+    finished(derived.redescribe(catalog, BENCH_DESCRIPTOR, again=True, jobs=1))
+    assert finished(verify(catalog, jobs=1)).findings == ()
+
+
+def test_a_silhouette_that_is_not_that_of_the_image_is_found(catalog: Catalog) -> None:
+    stored = rows(catalog)
+    (seal,) = {one for one, _ in stored if one == seal_of(complete(catalog, "box"))}
+    evidence = json.loads(stored[seal, SEGMENTATION][1])
+    evidence[2] = evidence[0]
+    with catalog.database.write() as transaction:
+        transaction.execute(delete(Derived).where(Derived.seal == seal, Derived.what == SEGMENTATION))
+        content = json.dumps(evidence).encode()
+        transaction.execute(insert(Derived).values(derived.row_of(seal, SEGMENTATION, None, content)))
+    found = finished(verify(catalog, jobs=1)).findings
+    assert [(one.problem, one.object_name) for one in found] == [(Problem.DESCRIPTION_DIFFERS, "box")]
+
+
+def test_a_short_session_learns_from_all_views(open_catalog: Callable[[str], Catalog]) -> None:
+    """After an interruption, one view alone would not show what the background is."""
+    whole, interrupted = open_catalog("whole"), open_catalog("interrupted")
+    enroll(whole, "box", empty_table=False)
+    begun = interrupted.begin("box", planned_azimuth_deg=plan(VIEWS), provenance=PROVENANCE)
+    for index in range(VIEWS - 1):
+        begun.add(record(index, region=REGION), view(index))
+    resumed = interrupted.resume("box", provenance=PROVENANCE)
+    resumed.add(record(VIEWS - 1, region=REGION), view(VIEWS - 1))
+    resumed.finish()
+    assert equal(load(whole)[0], load(interrupted)[0])
