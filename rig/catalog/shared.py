@@ -17,7 +17,7 @@ from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Any, Final, Self, TypeVar
 
 import numpy as np
 from sqlalchemy import ColumnElement, Table, and_, delete, func, insert, select
@@ -50,6 +50,8 @@ from rig.core.errors import (
 from rig.core.files import json_values, no_follow
 from rig.core.next_steps import Do
 from rig.views.description import BENCH_DESCRIPTOR
+
+T = TypeVar("T")
 
 CHECK_S: Final = 2.0
 """Time between two checks of the journal."""
@@ -188,9 +190,8 @@ class Journal(Catalog):
         """Return the objects of the journal, and those that the server has, by its local copy if it does not answer."""
         own = self.objects()
         names = {one.name for one in own}
-        with self._shared() as shared:
-            others = [] if shared is None else [one for one in shared.objects() if one.enrolled_utc is not None]
-        return [*own, *(one for one in others if one.name not in names)]
+        others = self._ask(lambda shared: [one for one in shared.objects() if one.enrolled_utc is not None])
+        return [*own, *(one for one in others or () if one.name not in names)]
 
     def check_enrollable(
         self,
@@ -204,30 +205,24 @@ class Journal(Catalog):
         """Raise what `begin` or `resume` would raise; for a new object also if the server has the name."""
         super().check_enrollable(name, label=label, note=note, resume=resume, replace=replace)
         if not resume:
-            with self._shared() as shared:
-                if shared is not None:
-                    shared.check_enrollable(name, replace=replace)
+            self._ask(lambda shared: shared.check_enrollable(name, replace=replace))
 
     def begin(self, name: str, *, replace: bool = False, **others: Any) -> OpenEnrollment:
         """Start to enroll an object that the server does not have, or with ``replace`` one that it has."""
         self.check_enrollable(name, replace=replace)
         return super().begin(name, replace=replace, **others)
 
-    @contextmanager
-    def _shared(self) -> Iterator[Catalog | None]:
-        """Yield the catalog of the server; its local copy while it does not answer; None if there is no copy."""
+    def _ask(self, question: Callable[[Catalog], T]) -> T | None:
+        """Ask the catalog of the server, or its local copy while it does not answer; return None without a copy."""
         self.unreachable = None
         try:
-            shared = self._attempts.open(self.server, create=True)
+            with self._attempts.open(self.server, create=True) as shared:
+                return question(shared)
         except CatalogUnavailable as error:
             self.unreachable = error
-            try:
-                shared = open_copy(self.server, self.clock)
-            except CatalogUnavailable:
-                yield None
-                return
-        with shared:
-            yield shared
+        with suppress(CatalogUnavailable), open_copy(self.server, self.clock) as copy:
+            return question(copy)
+        return None
 
 
 def journal_words(catalog: Catalog) -> str:
@@ -246,9 +241,8 @@ def waiting(place: CatalogPlace, clock: Clock) -> int:
         Catalog.open(journal_folder(place), clock=clock, read_only=True) as journal,
         journal.database.read() as transaction,
     ):
-        return len(state.used(transaction)) + (
-            transaction.scalar(select(func.count()).where(_is_waiting(transaction))) or 0
-        )
+        answers = transaction.scalar(select(func.count()).where(_is_waiting(transaction)))
+        return len(state.used(transaction)) + (answers or 0)
 
 
 def discard(journal: Catalog, name: str) -> None:
@@ -307,7 +301,7 @@ def deliver(journal: Catalog, server: Catalog, *, replacing: Collection[str] = (
             if one.enrolled_utc is not None:
                 conflict = _deliver(journal, server, one.name, replaces=one.name in replacing)
                 done.append(Delivery(one.name, one.views, conflict))
-        if any(one.conflict is None for one in done):
+        if journal.objects(deleted=True):
             collect_garbage(journal)
         _deliver_answers(journal, server)
     return done
