@@ -6,7 +6,7 @@ import os
 import shutil
 import signal
 import sqlite3
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 
@@ -14,24 +14,15 @@ import numpy as np
 import pytest
 
 from rig.catalog import Catalog
-from rig.catalog.edit import delete, rename
-from rig.catalog.exchange import read_objects, write_bundle
 from rig.catalog.exchange.tables import RESULTS, TableFormat, write_results
 from rig.catalog.records import Outcome
 from rig.catalog.results import ResultFilter, correct, find_result, find_results, record
+from rig.catalog.transfer import CatalogSource, transfer
 from rig.catalog.upkeep import collect_garbage
-from rig.catalog.verify import verify
-from rig.catalog.verify_images import Problem
-from rig.core.errors import CatalogError, ExportFailed, ObjectNotFound, UsageError
+from rig.catalog.verify import Problem, verify
+from rig.core.errors import CatalogDamaged, CatalogError, ExportFailed, ObjectNotFound, UsageError
 from sim.clock import VirtualClock
-from tests.rig.catalog.catalog_samples import (
-    finished,
-    image,
-    new_result,
-    other_program,
-    true_fill,
-    without_waiting,
-)
+from tests.rig.catalog.catalog_samples import fill, finished, image, new_result, other_program, sql, without_waiting
 
 
 @pytest.fixture(scope="module")
@@ -40,8 +31,8 @@ def three_results(tmp_path_factory: pytest.TempPathFactory) -> Path:
     clock = VirtualClock()
     with pytest.MonkeyPatch.context() as patch, Catalog.open(path, clock=clock) as opened:
         without_waiting(patch)
-        true_fill(opened, "mug", 1, 0)
-        true_fill(opened, "tin", 1, 10)
+        fill(opened, "mug", 1, 0)
+        fill(opened, "tin", 1, 10)
         record(opened, new_result(sample="S-1"), image(1))
         clock.sleep(3600)
         record(opened, new_result("ambiguous", "tin", " S-2 ", operator="A. Silva"), image(2))
@@ -69,8 +60,8 @@ def test_result_has_everything_about_the_answer(catalog: Catalog) -> None:
     assert first.details["yaw_deg"] == 70.0
     assert first.azimuths_deg == (0.0, 60.0)
     assert first.image is not None
-    assert first.image_sha256 is not None
-    assert np.array_equal(catalog.database.images.pixels(str(first.image), str(first.image_sha256)), image(1))
+    assert np.array_equal(catalog.read_image(first.image), image(1))
+    assert (catalog.path / str(first.image_path)).is_file()
     assert third.image is None
 
 
@@ -126,60 +117,60 @@ def test_impossible_corrections_change_nothing(catalog: Catalog, changes: dict[s
     assert find_result(catalog, 1).corrections == ()
 
 
-def test_results_outlive_their_objects_and_stay_out_of_bundles(catalog: Catalog, tmp_path: Path) -> None:
-    rename(catalog, "tin", "box")
-    delete(catalog, "mug")
+def test_results_outlive_their_objects_and_stay_out_of_transfers(catalog: Catalog, tmp_path: Path) -> None:
+    catalog.rename("tin", "box")
+    catalog.delete("mug")
     collect_garbage(catalog, old=True)
     assert [result.answered.object_name for result in find_results(catalog)] == ["mug", "tin", None]
     assert finished(verify(catalog, jobs=1)).findings == ()
-    write_bundle(tmp_path / "a.zip", read_objects(catalog))  # it would reject an image that belongs to no view
+    with Catalog.open(tmp_path / "other", clock=VirtualClock()) as other:
+        finished(transfer(CatalogSource(catalog), other))
+        assert find_results(other) == []
 
 
 def test_version_of_the_catalog_changes_with_the_views_of_searches(catalog: Catalog) -> None:
     first = catalog.version()
     record(catalog, new_result(), None)
     assert catalog.version() == first
-    true_fill(catalog, "box", 1, 20)
-    rename(catalog, "box", "case")
-    delete(catalog, "case")
+    fill(catalog, "box", 1, 20)
+    catalog.rename("box", "case")
+    catalog.delete("case")
     assert catalog.version() == first
-    rename(catalog, "tin", "can")
+    catalog.rename("tin", "can")
     assert catalog.version() != first
 
 
-def changed(connection: sqlite3.Connection) -> None:
-    connection.execute("UPDATE results SET object_name = 'tin' WHERE id = 1")
-
-
-def deleted_first(connection: sqlite3.Connection) -> None:
-    connection.execute("DELETE FROM results WHERE id = 1")
-
-
-def deleted_last(connection: sqlite3.Connection) -> None:
-    connection.execute("DELETE FROM corrections WHERE id = 1")
-
-
-@pytest.mark.parametrize(("spoil", "row"), [(changed, 1), (deleted_first, 2), (deleted_last, 1)])
+@pytest.mark.parametrize(
+    ("change", "line"),
+    [
+        ("UPDATE log SET object_name = 'tin' WHERE result = 1 AND action = 'identified'", 5),
+        ("UPDATE log SET record = replace(record, 'bench-1', 'bench-2') WHERE result = 1", 5),
+        ("DELETE FROM log WHERE result = 2", 6),
+        ("DELETE FROM log WHERE action = 'result corrected'", 8),
+    ],
+)
 @pytest.mark.sqlite
-def test_rows_cannot_change_and_verify_finds_a_change_without_triggers(
-    catalog: Catalog, spoil: Callable[[sqlite3.Connection], None], row: int
+def test_lines_cannot_change_and_verify_finds_a_change_without_triggers(
+    catalog: Catalog, change: str, line: int
 ) -> None:
     correct(catalog, 1, unknown=True, reason="why")
-    with closing(sqlite3.connect(catalog.path / "catalog.sqlite", isolation_level=None)) as connection:
-        with pytest.raises(sqlite3.IntegrityError, match="only appended to"):
-            spoil(connection)
-        triggers = connection.execute("SELECT name, sql FROM sqlite_master WHERE type = 'trigger'").fetchall()
-        for name, _ in triggers:
-            connection.execute(f"DROP TRIGGER {name}")
-        spoil(connection)
-        for _, statement in triggers:
-            connection.execute(statement)
-    found = finished(verify(catalog, repair=True, jobs=1)).unrepaired
-    assert (Problem.RESULT_CHANGED, row) in [(one.problem, one.details.get("entry_id")) for one in found]
+    with (
+        closing(sqlite3.connect(catalog.path / "catalog.sqlite", isolation_level=None)) as connection,
+        pytest.raises(sqlite3.IntegrityError, match="a fact is written once"),
+    ):
+        connection.execute(change)
+    sql(catalog, change)
+    found = finished(verify(catalog, jobs=1)).findings
+    assert (Problem.LOG_CHANGED, line) in [(one.problem, one.details.get("entry_id")) for one in found]
+    if change.startswith("UPDATE"):
+        for read in (lambda: find_results(catalog), lambda: find_result(catalog, 1)):
+            with pytest.raises(CatalogDamaged, match="Result 1 in the catalog changed after it was recorded"):
+                read()
+        assert find_result(catalog, 2).answered.sample == "S-2"
 
 
 def test_verify_finds_a_changed_image(catalog: Catalog) -> None:
-    path = find_result(catalog, 1).image
+    path = find_result(catalog, 1).image_path
     assert path is not None
     (catalog.path / path).write_bytes(b"x")
     (finding,) = finished(verify(catalog, jobs=1)).findings
@@ -194,7 +185,7 @@ def test_process_killed_while_recording_leaves_nothing_half_written(tmp_path: Pa
         killed = program.returncode == -signal.SIGKILL
         assert numbers(catalog) == ([1] if killed else [1, 2])
         record(catalog, new_result(), image(3))
-        assert finished(verify(catalog, jobs=1)).findings == ()  # the image without a row was replaced
+        assert finished(verify(catalog, jobs=1)).findings == ()
 
 
 def test_table_has_a_row_for_each_result(catalog: Catalog, tmp_path: Path) -> None:

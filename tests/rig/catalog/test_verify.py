@@ -21,13 +21,13 @@ from rig.views.description import BENCH_DESCRIPTOR
 from sim.clock import VirtualClock
 from tests.rig.catalog.catalog_samples import (
     PROVENANCE,
-    edit,
     files,
     fill,
     finished,
     image,
     plan,
     record,
+    sql,
 )
 
 REGION = (4, 0, 24, 24)
@@ -75,7 +75,7 @@ class TestVerify:
     def test_continued_check_looks_at_objects_whose_rows_changed(self, catalog: Catalog) -> None:
         with UnfinishedJob(catalog.path / "unfinished", "verify") as unfinished:
             assert problems(finished(verify(catalog, unfinished=unfinished))) == []
-        edit(catalog.path, "UPDATE derived SET sha256 = 'another' WHERE what = 'cedd'")
+        sql(catalog, "UPDATE derived SET sha256 = 'another' WHERE what = 'cedd'")
         with UnfinishedJob(catalog.path / "unfinished", "verify") as unfinished:
             unfinished.load()
             assert list(unfinished.found.values()) == [3, 3]
@@ -146,7 +146,7 @@ class TestVerify:
         ],
     )
     def test_changed_rows_are_found(self, catalog: Catalog, statement: str, found: tuple[Problem, str | None]) -> None:
-        edit(catalog.path, statement)
+        sql(catalog, statement)
         for quick in (True, False):
             with Catalog.open(catalog.path, clock=VirtualClock(), read_only=True) as reader:
                 assert found in concerned(finished(verify(reader, quick=quick, jobs=1)))
@@ -154,15 +154,15 @@ class TestVerify:
     @pytest.mark.sqlite
     def test_images_are_checked_although_lines_of_the_log_are_damaged(self, catalog: Catalog) -> None:
         lost = self.images(catalog, "tin")[1]
-        edit(catalog.path, "UPDATE log SET user = 'x' WHERE id = 2", "DELETE FROM log WHERE id = 3")
+        sql(catalog, "UPDATE log SET user = 'x' WHERE id = 2", "DELETE FROM log WHERE id = 3")
         lost.unlink()
         found = concerned(finished(verify(catalog, jobs=1)))
         assert {(Problem.LOG_CHANGED, "mug"), (Problem.LOG_CHANGED, None), (Problem.MISSING_IMAGE, None)} <= set(found)
 
     @pytest.mark.sqlite
     def test_removed_and_added_enrollments_are_found(self, catalog: Catalog) -> None:
-        edit(
-            catalog.path,
+        sql(
+            catalog,
             "UPDATE views SET enrollment_id = 7 WHERE enrollment_id = 2",
             "UPDATE sessions SET enrollment_id = 7 WHERE enrollment_id = 2",
             "UPDATE enrollments SET id = 7 WHERE id = 2",
@@ -176,7 +176,7 @@ class TestVerify:
     @pytest.mark.sqlite
     def test_wrong_descriptions_are_found_and_computed_again(self, catalog: Catalog) -> None:
         before = derived.views(catalog, BENCH_DESCRIPTOR).descriptors
-        edit(catalog.path, "UPDATE derived SET content = zeroblob(length(content)) WHERE what != 'cedd'")
+        sql(catalog, "UPDATE derived SET content = zeroblob(length(content)) WHERE what != 'cedd'")
         found = finished(verify(catalog, jobs=1))
         assert concerned(found) == [(Problem.DESCRIPTION_DAMAGED, name) for name in ("mug", "mug", "tin", "tin")]
         assert finding_text(found.findings[0]) == (
