@@ -39,7 +39,7 @@ from rig.catalog.jobs import JobProgress
 from rig.catalog.records import EnrollmentStatus, check_text, clean_name
 from rig.catalog.rejected import Gap, RejectedFile
 from rig.catalog.state import Ended, EnrollmentState, Named
-from rig.core.errors import CatalogError, ImportRejected, ObjectExists, UsageError
+from rig.core.errors import CatalogDamaged, CatalogError, ImportRejected, ObjectExists, RigError, UsageError
 from rig.core.next_steps import Do
 from rig.core.processes import Jobs
 
@@ -248,6 +248,8 @@ def transfer(
         There is no such descriptor.
     ImportRejected
         Nothing is left to transfer, or an image was rejected and the transfer is strict.
+    CatalogDamaged
+        Something in a catalog is not as it was stored.
     ObjectExists
         Some objects are in the catalog already, and conflicts are rejected.
     CatalogError, CatalogBusy
@@ -313,11 +315,18 @@ def transfer(
     )
 
 
-def _rejection(source: Source, rejected: Sequence[RejectedFile]) -> ImportRejected:
+def _rejection(source: Source, rejected: Sequence[RejectedFile]) -> RigError:
+    evidence = {"rejected": [f"{file.path}: {file.reason}" for file in rejected[:20]]}
+    if isinstance(source, CatalogSource) and source.own:
+        return CatalogDamaged(
+            f"{len(rejected)} images of the catalog {source.origin} are missing or are not those that were stored.",
+            next_step=(Do.VERIFY_CATALOG(), "Then restore them from a backup, or", Do.ENROLL_AGAIN()),
+            evidence=evidence,
+        )
     return ImportRejected(
         f"{source.origin} was not imported: {len(rejected)} of its files cannot be used.",
         next_step="Fix or remove the listed files and import it again.",
-        evidence={"rejected": [f"{file.path}: {file.reason}" for file in rejected[:20]]},
+        evidence=evidence,
     )
 
 

@@ -13,11 +13,12 @@ from starlette.background import BackgroundTask
 
 from rig.catalog import ObjectSummary
 from rig.catalog.derived import views
-from rig.catalog.exchange import Conflict, import_objects, plan_import, read_bundle, read_objects, write_bundle
+from rig.catalog.exchange.bundle import read_bundle, write_bundle
 from rig.catalog.jobs import finished
+from rig.catalog.transfer import CatalogSource, Conflict, transfer
 from rig.core.json_form import plain
 from rig.plans.similar_objects import similar_objects
-from rig.views.description import BENCH_DESCRIPTOR
+from rig.views.description import BENCH_DESCRIPTOR, PAPER_DESCRIPTOR
 from rig.web.picture import jpeg
 from rig.web.server import API, NameBody, ObjectBody, Page, Routes, Server, cached, long_work, time_text
 
@@ -167,7 +168,7 @@ def add_catalog(routes: Routes, server: Server) -> None:
 
         def write() -> None:
             with server.catalog.open_to_read() as catalog:
-                write_bundle(path, read_objects(catalog, name or [one.name for one in catalog.objects()]))
+                write_bundle(path, CatalogSource(catalog, name or ()))
 
         try:
             await long_work(write)
@@ -187,9 +188,11 @@ def add_catalog(routes: Routes, server: Server) -> None:
 
 
 def _import(server: Server, path: Path, on_conflict: str) -> dict[str, Any]:
-    with server.catalog.open_to_change() as catalog:
-        plan = plan_import(catalog, read_bundle(path), Conflict(on_conflict))
-        return dict(plain(finished(import_objects(catalog, plan, jobs=1))))
+    with server.catalog.open_to_change() as catalog, read_bundle(path, catalog.clock) as source:
+        job = transfer(
+            source, catalog, conflict=Conflict(on_conflict), descriptors=(PAPER_DESCRIPTOR,), strict=True, jobs=1
+        )
+        return dict(plain(finished(job)))
 
 
 def _summary(one: ObjectSummary) -> dict[str, Any]:

@@ -1,7 +1,7 @@
 """`rig import` and `rig export`."""
 
 import sys
-from contextlib import nullcontext
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from enum import StrEnum
 from functools import cache
@@ -21,12 +21,11 @@ from rig.core.next_steps import Do
 from rig.core.phrases import counted
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
     from rig.catalog import Session
-    from rig.catalog.exchange import ImportBatch, Imported
     from rig.catalog.exchange.training import Intrinsics
-    from rig.catalog.transfer import CatalogSource
+    from rig.catalog.transfer import CatalogSource, Source, Transferred
     from rig.core.processes import Jobs
 
 SHOWN = 20
@@ -96,21 +95,22 @@ def import_(
 
     Example: rig import coil-100 --label coil --bench sim
     """
-    run_import(
-        settings,
-        _read_batch(source, pattern, table_angles),
-        on_conflict=on_conflict,
-        label=label,
-        descriptors=[descriptor_name(one) for one in descriptor or ()],
-        strict=strict,
-        dry_run=dry_run,
-        jobs=jobs_of(jobs, cluster),
-    )
+    with _source(source, pattern, table_angles) as objects:
+        run_import(
+            settings,
+            objects,
+            on_conflict=on_conflict,
+            label=label,
+            descriptors=[descriptor_name(one) for one in descriptor or ()],
+            strict=strict,
+            dry_run=dry_run,
+            jobs=jobs_of(jobs, cluster),
+        )
 
 
 def run_import(
     settings: Settings,
-    batch: "ImportBatch",
+    source: "Source",
     *,
     on_conflict: str,
     label: str | None,
@@ -119,8 +119,9 @@ def run_import(
     dry_run: bool,
     jobs: "Jobs | None",
 ) -> None:
-    """Import a batch, or check it, and report."""
-    from rig.catalog.exchange import Conflict, import_objects, plan_import, preview_import
+    """Import objects, or check them, and report."""
+    from rig.catalog.transfer import Conflict, transfer
+    from rig.views.description import PAPER_DESCRIPTOR
 
     try:
         conflict = Conflict(on_conflict)
@@ -130,45 +131,59 @@ def run_import(
         ) from error
     clock = SystemClock()
     begin_ns = clock.now_ns()
-    nothing = "Interrupted; nothing was imported."
-    if dry_run:
-        existing = settings.open_catalog(read_only=True) if settings.place.may_exist() else nullcontext()
-        with existing as catalog:
-            plan = plan_import(catalog, batch, conflict)
-        done = run_job("checking", preview_import(plan, strict=strict, jobs=jobs), interrupted=nothing)
-    else:
-        with settings.open_catalog(create=True) as catalog:
-            plan = plan_import(catalog, batch, conflict)
-            job = import_objects(catalog, plan, label=label, descriptors=descriptors, strict=strict, jobs=jobs)
-            done = run_job("importing", job, interrupted=nothing)
+    nothing = dry_run and not settings.place.may_exist()
+    opened = nullcontext() if nothing else settings.open_catalog(read_only=dry_run, create=not dry_run)
+    with opened as catalog:
+        job = transfer(
+            source,
+            catalog,
+            conflict=conflict,
+            label=label,
+            descriptors=(PAPER_DESCRIPTOR, *descriptors),
+            strict=strict,
+            jobs=jobs,
+            dry_run=dry_run,
+        )
+        what = "checking" if dry_run else "importing"
+        done = run_job(what, job, interrupted="Interrupted; nothing was imported.")
     _report(settings, done, seconds_between(begin_ns, clock.now_ns()), dry_run=dry_run)
 
 
-def _read_batch(source: Path, pattern: str | None, table_angles: bool) -> "ImportBatch":
-    from rig.catalog.exchange import DEFAULT_PATTERN, read_bundle, read_folder, read_table, read_unpacked
-    from rig.catalog.exchange.bundle import MANIFEST
+@contextmanager
+def _source(source: Path, pattern: str | None, table_angles: bool) -> "Iterator[Source]":
+    """Yield what is imported: a bundle, a catalog such as a training set, or photographs."""
+    from rig.catalog import Catalog
+    from rig.catalog.exchange.bundle import read_bundle
+    from rig.catalog.exchange.photographs import DEFAULT_PATTERN, read_folder, read_table
+    from rig.catalog.transfer import CatalogSource
+    from rig.config.catalog_place import DATABASE_NAME
 
-    now = SystemClock().utc()
-    if source.is_dir():
-        if (source / "catalog.sqlite").exists():
-            raise UsageError(f"{source} is a catalog.", next_step=Do.MERGE(source=str(source)))
-        if (source / MANIFEST).exists():
-            return read_unpacked(source)
-        return read_folder(source, pattern=pattern or DEFAULT_PATTERN, table_angles=table_angles, now=now)
-    if pattern is not None or table_angles:
-        raise UsageError(f"{source} is not a folder.", next_step="Use --pattern and --table-angles only with a folder.")
-    if not source.exists():
+    clock = SystemClock()
+    is_folder = source.is_dir() and not (source / DATABASE_NAME).exists()
+    if (pattern is not None or table_angles) and not is_folder:
+        raise UsageError(
+            f"{source} is not a folder of photographs.",
+            next_step="Use --pattern and --table-angles only with a folder of photographs.",
+        )
+    if is_folder:
+        yield read_folder(source, pattern=pattern or DEFAULT_PATTERN, table_angles=table_angles, now=clock.utc())
+    elif source.is_dir():
+        with Catalog.open(source, clock=clock, create=False, read_only=True) as catalog:
+            yield CatalogSource(catalog, own=False)
+    elif not source.exists():
         raise ImportRejected(f"{source} does not exist.", next_step="Check the path.")
-    if source.suffix.lower() == ".zip":
-        return read_bundle(source)
-    if source.suffix.lower() == ".csv":
-        return read_table(source, now=now)
-    raise ImportRejected(
-        f"{source} is not a folder, a .zip file or a .csv file.", next_step="Give one of these: rig import --help"
-    )
+    elif source.suffix.lower() == ".zip":
+        with read_bundle(source, clock) as bundle:
+            yield bundle
+    elif source.suffix.lower() == ".csv":
+        yield read_table(source, now=clock.utc())
+    else:
+        raise ImportRejected(
+            f"{source} is not a folder, a .zip file or a .csv file.", next_step="Give one of these: rig import --help"
+        )
 
 
-def _report(settings: Settings, done: "Imported", seconds: float, *, dry_run: bool) -> None:
+def _report(settings: Settings, done: "Transferred", seconds: float, *, dry_run: bool) -> None:
     if settings.json:
         from rig.core.json_form import plain
 
