@@ -144,7 +144,7 @@ def test_copies_in_both_directions_are_equal(postgres: PostgresServer, s3: S3Ser
         collect_garbage(local)
         fill(local, "tin", 2, 10)
         local.begin("half", planned_azimuth_deg=[0.0], provenance=PROVENANCE)
-        record_result(local, new_result(), image(1))
+        record_result(local, new_result(), image(77))
         done = finished(copy(local, shared))
         assert (done.objects, done.views, done.results, done.images) == (3, 4, 1, 5)
         assert shared.version() == local.version()
