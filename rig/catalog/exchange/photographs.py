@@ -6,7 +6,6 @@ In a folder the names of the files tell object and angle, such as ``obj12__355.p
 import csv
 import math
 import re
-import secrets
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -111,8 +110,8 @@ class Photographs:
 
     def _item(self, name: str, found: dict[float, tuple[Path, _Row, dict[str, Any]]]) -> Item:
         azimuths_deg = tuple(sorted(found))
-        enrollment = Enrollment(
-            key=secrets.token_hex(32), object_id=0, started_utc=self.now, planned_azimuth_deg=azimuths_deg
+        enrollment = Enrollment(  # the transfer replaces the key by a digest of the images
+            key=name, object_id=0, started_utc=self.now, planned_azimuth_deg=azimuths_deg
         )
         sessions: dict[tuple[str, str], Session] = {}
         texts = {"label": "", "note": ""}
