@@ -401,7 +401,7 @@ class _Plan:
         """Return the plan after a comparison with the target. `ObjectExists` if a conflict is rejected."""
         known = _known(transaction, [key for item in self.wanted for key in item.keys])
         ids = _ids(transaction, [item.name for item in self.wanted])
-        wanted = [item for item in self.wanted if not _is_there(item, ids.get(item.name), known, conflict, once=once)]
+        wanted = [item for item in self.wanted if not _is_there(item, ids.get(item.name), known, once=once)]
         both = [item.name for item in wanted if item.name in ids]
         if both and conflict is Conflict.REJECT:
             raise ObjectExists(
@@ -443,13 +443,8 @@ def _ids(transaction: Transaction, names: Sequence[str]) -> dict[str, int]:
     return found
 
 
-def _is_there(
-    item: Item, object_id: int | None, known: Mapping[str, _Known], conflict: Conflict, *, once: bool
-) -> bool:
-    """Return whether nothing is to be added of an object.
-
-    If it replaces an object, its enrollments must also have the same status there.
-    """
+def _is_there(item: Item, object_id: int | None, known: Mapping[str, _Known], *, once: bool) -> bool:
+    """Return whether the target has the enrollments of an object, and an object of its name has them in use alike."""
     if not item.enrollments or not item.keys <= known.keys():
         return False
     if once:
@@ -458,8 +453,7 @@ def _is_there(
         there = known[one.enrollment.key]
         if not there.in_use or seal_of(there.state.enrollment) != seal_of(one.enrollment):
             return False
-        is_same = (there.object_id, there.state.status) == (object_id, one.status)
-        if conflict is Conflict.REPLACE and object_id is not None and not is_same:
+        if object_id is not None and (there.object_id, there.state.status) != (object_id, one.status):
             return False
     return True
 

@@ -6,21 +6,16 @@ from pathlib import Path
 import pytest
 
 from rig.catalog import Catalog
-from rig.catalog.exchange import (
-    read_objects,
-    write_bundle,
-)
+from rig.catalog.exchange.bundle import write_bundle
+from rig.catalog.transfer import CatalogSource
 from sim.clock import VirtualClock
-from tests.rig.catalog.catalog_samples import (
-    true_fill,
-    without_waiting,
-)
-from tests.rig.catalog.exchange.exchange_samples import NOW, OpenCatalog, fill_full
+from tests.rig.catalog.catalog_samples import NOW, OpenCatalog, fill, without_waiting
+from tests.rig.catalog.exchange.exchange_samples import fill_full
 
 
 @pytest.fixture(scope="session")
 def full_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A catalog with replaced and unfinished enrollments, regions, a segmentation and an empty-table image."""
+    """A catalog with replaced and unfinished enrollments, regions and an empty-table image."""
     folder = tmp_path_factory.mktemp("exchange") / "full"
     with pytest.MonkeyPatch.context() as patch, Catalog.open(folder, clock=VirtualClock(NOW)) as catalog:
         without_waiting(patch)
@@ -39,8 +34,8 @@ def full(full_folder: Path, open_catalog: OpenCatalog, tmp_path: Path) -> Catalo
 def good_bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("bundle")
     with Catalog.open(folder / "source", clock=VirtualClock(NOW)) as catalog:
-        true_fill(catalog, "mug", 2, 0)
-        write_bundle(folder / "mug.rigcat.zip", read_objects(catalog))
+        fill(catalog, "mug", 2)
+        write_bundle(folder / "mug.rigcat.zip", CatalogSource(catalog))
     return folder / "mug.rigcat.zip"
 
 

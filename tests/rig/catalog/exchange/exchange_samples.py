@@ -1,76 +1,66 @@
 """Catalogs, photographs and bundles for the tests of imports and exports."""
 
-import json
+import sqlite3
 import struct
 import zipfile
 import zlib
-from collections.abc import Callable
-from datetime import UTC, datetime
+from collections.abc import Mapping
+from contextlib import closing
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import cv2
 import numpy as np
 
 from rig.catalog import Catalog
-from rig.catalog.edit import delete
-from rig.catalog.exchange import (
-    Conflict,
-    ImportBatch,
-    Imported,
-    import_objects,
-    plan_import,
-)
-from rig.catalog.exchange.bundle import MANIFEST, OBJECTS
-from rig.views import image_files as images
-from tests.rig.catalog.catalog_samples import (
-    PROVENANCE,
-    described,
-    finished,
-    image,
-    plan,
-    true_fill,
-)
-
-BOTH = ("cedd", "cedd-blurred")
-NOW = datetime(2026, 3, 1, tzinfo=UTC)
-OpenCatalog = Callable[[str], Catalog]
+from rig.catalog.derived import views
+from rig.catalog.exchange.bundle import read_bundle
+from rig.catalog.transfer import Conflict, Source, Transferred, transfer
+from rig.config.catalog_place import DATABASE_NAME
+from sim.clock import VirtualClock
+from tests.rig.catalog.catalog_samples import NOW, PROVENANCE, fill, finished, image, plan, record, sql
+from tests.rig.catalog.catalog_samples import OpenCatalog as OpenCatalog
+from tests.rig.catalog.test_hostile_catalogs import seal_as_the_sender
 
 
 def fill_full(catalog: Catalog) -> None:
-    true_fill(catalog, "gone", 1, 90)
-    true_fill(catalog, "mug-white", 3, 0, (2, 0, 12, 12), label="kitchen", note='a chip,\n"at" the rim')
-    true_fill(catalog, "Tässe =2+2", 2, 10)
-    true_fill(catalog, "mug-white", 4, 20, (0, 0, 10, 10), replace=True)
-    delete(catalog, "gone")
-    tin = catalog.begin("tin", planned_azimuth_deg=plan(3), provenance=PROVENANCE)
-    tin.store_empty_table(image(99))
-    tin.add(
-        described(0, 30, None, BOTH, imu_deg=0.1, imu_sigma_deg=0.5, segmentation={"method": "none"}),
-        image(30),
-    )
+    fill(catalog, "gone", 1, 90)
+    fill(catalog, "mug-white", 3, 0, (2, 0, 20, 20), label="kitchen", note='a chip,\n"at" the rim')
+    fill(catalog, "Tässe =2+2", 2, 10)
+    fill(catalog, "mug-white", 4, 20, (0, 0, 18, 18), replace=True)
+    catalog.delete("gone")
+    tin = catalog.begin("tin", planned_azimuth_deg=plan(3), provenance=PROVENANCE, empty_table=image(99))
+    tin.add(record(0, imu_deg=0.1, imu_sigma_deg=0.5), image(30))
     tin = catalog.resume("tin", provenance=PROVENANCE)
-    tin.add(described(2, 32, evidence={"sharpness": 12.5, "locks": {"gain": None}}), image(32))
+    tin.add(record(2, evidence={"sharpness": 12.5, "locks": {"gain": None}}), image(32))
 
 
-def run_import(catalog: Catalog, batch: ImportBatch, conflict: Conflict = Conflict.REJECT, **options: Any) -> Imported:
-    return finished(import_objects(catalog, plan_import(catalog, batch, conflict), jobs=1, **options))
+def run_import(catalog: Catalog, source: Source, conflict: Conflict = Conflict.REJECT, **options: Any) -> Transferred:
+    return finished(transfer(source, catalog, conflict=conflict, **{"jobs": 1, "descriptors": ["cedd"], **options}))
 
 
-def untouched(catalog: Catalog) -> bool:
-    """Return whether nothing was imported."""
+def import_bundle(catalog: Catalog, path: Path, **options: Any) -> Transferred:
+    with read_bundle(path, VirtualClock(NOW)) as source:
+        return run_import(catalog, source, **options)
+
+
+def untouched(catalog: Catalog, *, images: bool = False) -> bool:
+    """Return whether nothing was imported; but there may be ``images`` that no row names."""
     left = [path for path in catalog.path.rglob("*") if path.is_file() and not path.name.startswith("catalog")]
-    return catalog.objects() == [] and left == [] and catalog.log() == []
+    return catalog.objects() == [] and catalog.log() == [] and (images or left == [])
 
 
 def model(catalog: Catalog) -> tuple[Any, ...]:
-    views = catalog.views().views
-    return views.object_names, views.descriptors.tolist(), views.azimuth_deg.tolist(), views.object_index.tolist()
+    found = views(catalog)
+    return found.object_names, found.descriptors.tolist(), found.azimuth_deg.tolist(), found.object_index.tolist()
 
 
 def pictures(catalog: Catalog) -> list[bytes]:
     return [
-        catalog.image_path(view).read_bytes() for item in catalog.objects() for view in catalog.object(item.name).views
+        catalog.image_path(view.image).read_bytes()
+        for item in catalog.objects()
+        for view in catalog.object(item.name).views
     ]
 
 
@@ -94,24 +84,22 @@ def png_of(width: int, height: int) -> bytes:
     )
 
 
-def rewritten(bundle: Path, change: Callable[[dict[str, Any]], None] | None = None, **more: bytes) -> Path:
-    """A consistent bundle with a changed line of the object, and with ``more`` members."""
+def rewritten(bundle: Path, *statements: str, sealed: bool = True, **members: bytes | None) -> Path:
+    """A bundle with a changed database, with right digests if it is ``sealed``, and with other ``members``."""
     with zipfile.ZipFile(bundle) as archive:
-        members = {info.filename: archive.read(info) for info in archive.infolist()}
-    line = json.loads(members[OBJECTS])
-    if change:
-        change(line)
-    members[OBJECTS] = (json.dumps(line) + "\n").encode()
-    manifest = json.loads(members[MANIFEST])
-    manifest["objects_sha256"] = images.hashlib.sha256(members[OBJECTS]).hexdigest()
-    members[MANIFEST] = json.dumps(manifest).encode()
+        found: Mapping[str, bytes | None] = {info.filename: archive.read(info) for info in archive.infolist()}
+    with TemporaryDirectory() as folder:
+        database = Path(folder, DATABASE_NAME)
+        database.write_bytes(found[DATABASE_NAME] or b"")
+        sql(database.parent, "PRAGMA ignore_check_constraints = ON", *statements)
+        if sealed:
+            seal_as_the_sender(database.parent)
+        with closing(sqlite3.connect(database)) as connection:
+            connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+        found = {**found, DATABASE_NAME: database.read_bytes(), **members}
     target = bundle.with_name("changed.rigcat.zip")
-    with zipfile.ZipFile(target, "w") as archive:
-        for name, content in (members | more).items():
-            archive.writestr(name, content)
+    with zipfile.ZipFile(target, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in found.items():
+            if content is not None:
+                archive.writestr(name, content)
     return target
-
-
-def view_of(line: dict[str, Any], place: int = 0) -> dict[str, Any]:
-    view: dict[str, Any] = line["enrollments"][0]["views"][place]
-    return view

@@ -1,5 +1,6 @@
-"""An import happens completely or not at all, after any interruption."""
+"""An import happens completely or not at all, after any interruption, and only once."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -7,50 +8,44 @@ import pytest
 
 import hbr
 from rig.catalog import Catalog
-from rig.catalog.exchange import (
-    Conflict,
-    ImportBatch,
-    import_objects,
-    plan_import,
-    read_folder,
-)
-from rig.catalog.places import LOST
+from rig.catalog.derived import views
+from rig.catalog.exchange.photographs import Photographs, read_folder
+from rig.catalog.transfer import CatalogSource, Conflict, transfer
 from rig.catalog.verify import verify
-from rig.core.errors import CatalogError, ObjectExists
+from rig.core.errors import CatalogDamaged, CatalogError, ObjectExists
 from sim.clock import VirtualClock
 from tests.programs import server
-from tests.rig.catalog.catalog_samples import (
-    finished,
-    true_fill,
-)
-from tests.rig.catalog.exchange.exchange_samples import NOW, OpenCatalog, model, photograph, run_import, untouched
+from tests.rig.catalog.catalog_samples import NOW, PROVENANCE, OpenCatalog, fill, finished, image, record
+from tests.rig.catalog.exchange.exchange_samples import model, photograph, run_import, untouched
+
+
+@pytest.fixture
+def photographs(tmp_path: Path) -> Callable[[], Photographs]:
+    for name in ("mug", "tin"):
+        for angle in range(0, 360, 60):
+            photograph(tmp_path / "in" / f"{name}__{angle}.png", angle + len(name))
+    return lambda: read_folder(tmp_path / "in", now=NOW)
 
 
 class TestAllOrNothing:
-    @pytest.fixture
-    def batch(self, tmp_path: Path) -> ImportBatch:
-        for angle in range(0, 360, 60):
-            photograph(tmp_path / "in" / f"mug__{angle}.png", angle)
-        return read_folder(tmp_path / "in", now=NOW)
-
     @pytest.mark.parametrize("after", [0, 1, 2])
-    def test_interrupted_import_leaves_nothing(
-        self, batch: ImportBatch, open_catalog: OpenCatalog, monkeypatch: pytest.MonkeyPatch, after: int
+    def test_interrupted_import_leaves_no_object(
+        self, photographs: Callable[[], Photographs], open_catalog: OpenCatalog, after: int
     ) -> None:
-        monkeypatch.setattr("rig.catalog.jobs.PORTION", 2)
         catalog = open_catalog("catalog")
-        job = import_objects(catalog, plan_import(catalog, batch), jobs=1)
+        job = transfer(photographs(), catalog, descriptors=["cedd"], jobs=1)
         for _ in range(after + 1):
             next(job)
         job.close()
-        assert untouched(catalog)
-        assert run_import(catalog, batch).views == 6
+        assert untouched(catalog, images=True)
+        assert run_import(catalog, photographs()).views == 12
+        assert finished(verify(catalog)).findings == ()
 
-    @pytest.mark.parametrize("step", ["rig.catalog.exchange.insert.sync_folder", "rig.catalog.audit.append"])
+    @pytest.mark.parametrize("step", ["rig.catalog.images.FolderImages.settle", "rig.catalog.log.append"])
     @pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError(28, "No space left on device")])
-    def test_import_that_fails_in_its_transaction_leaves_nothing(
+    def test_import_that_fails_at_its_end_leaves_no_object(
         self,
-        batch: ImportBatch,
+        photographs: Callable[[], Photographs],
         open_catalog: OpenCatalog,
         monkeypatch: pytest.MonkeyPatch,
         step: str,
@@ -63,54 +58,130 @@ class TestAllOrNothing:
         with monkeypatch.context() as patch:
             patch.setattr(step, fail)
             with pytest.raises((KeyboardInterrupt, CatalogError)):
-                run_import(catalog, batch)
-        assert untouched(catalog)
-        assert run_import(catalog, batch).views == 6
+                run_import(catalog, photographs())
+        assert untouched(catalog, images=True)
+        assert run_import(catalog, photographs()).views == 12
         assert finished(verify(catalog)).findings == ()
 
-    def test_files_of_a_killed_import_are_moved_away(self, batch: ImportBatch, open_catalog: OpenCatalog) -> None:
+    def test_full_disk_ends_an_import(
+        self, photographs: Callable[[], Photographs], open_catalog: OpenCatalog, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        def full(*_: object, **__: object) -> str:
+            raise OSError(28, "No space left on device")
+
         catalog = open_catalog("catalog")
-        left = catalog.path / "images" / "000001-mug" / "000001" / "old.png"
-        left.parent.mkdir(parents=True)
-        left.write_bytes(b"left behind")
-        run_import(catalog, batch)
-        assert finished(verify(catalog)).findings == ()
-        assert (catalog.path / LOST / left.relative_to(catalog.path)).read_bytes() == b"left behind"
+        monkeypatch.setattr("rig.catalog.images.FolderImages.put", full)
+        with pytest.raises(CatalogError, match="is full"):
+            run_import(catalog, photographs())
+        assert untouched(catalog)
 
     def test_import_notices_an_object_of_another_process_and_keeps_replaced_enrollments(
-        self, batch: ImportBatch, open_catalog: OpenCatalog
+        self, photographs: Callable[[], Photographs], open_catalog: OpenCatalog
     ) -> None:
         catalog = open_catalog("catalog")
-        job = import_objects(catalog, plan_import(catalog, batch), jobs=1)
+        job = transfer(photographs(), catalog, jobs=1)
         next(job)
-        true_fill(catalog, "mug", 1, 0)
+        fill(catalog, "mug", 1)
         with pytest.raises(ObjectExists):
             finished(job)
         assert catalog.object("mug").summary.views == 1
         assert finished(verify(catalog)).findings == ()
-        done = run_import(catalog, batch, Conflict.REPLACE)
+        done = run_import(catalog, photographs(), Conflict.REPLACE)
         assert done.replaced == ("mug",)
         assert [e.status for e in catalog.object("mug").enrollments] == ["complete", "superseded"]
         assert catalog.object("mug").summary.views == 6
 
     def test_several_processes_import_the_same(
-        self, batch: ImportBatch, open_catalog: OpenCatalog, monkeypatch: pytest.MonkeyPatch
+        self, photographs: Callable[[], Photographs], open_catalog: OpenCatalog, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr("rig.catalog.exchange.importing.processes", lambda wanted, _: wanted)
-        monkeypatch.setattr("rig.catalog.jobs.PORTION", 2)
+        monkeypatch.setattr("rig.catalog.incoming.processes", lambda wanted, _: wanted)
         context = server()
         monkeypatch.setattr("rig.core.processes.get_context", lambda _: context)  # starts sooner
         alone, together = open_catalog("alone"), open_catalog("together")
-        run_import(alone, batch)
-        finished(import_objects(together, plan_import(together, batch), jobs=2))
+        run_import(alone, photographs())
+        run_import(together, photographs(), jobs=2)
         assert model(alone) == model(together)
         assert np.array_equal(
-            together.views().views.descriptors[0], hbr.describe(together.read_image(together.object("mug").views[0]))
+            views(together).descriptors[0], hbr.describe(together.read_image(together.object("mug").views[0].image))
         )
 
-    def test_read_only_catalog_rejects_an_import(self, batch: ImportBatch, open_catalog: OpenCatalog) -> None:
+    def test_read_only_catalog_rejects_an_import(
+        self, photographs: Callable[[], Photographs], open_catalog: OpenCatalog
+    ) -> None:
         path = open_catalog("catalog").path
         with Catalog.open(path, clock=VirtualClock(), read_only=True) as catalog:
             with pytest.raises(CatalogError, match="reading only"):
-                run_import(catalog, batch)
-            assert untouched(catalog)
+                run_import(catalog, photographs())
+            assert untouched(catalog, images=True)
+
+
+class TestOnlyOnce:
+    def test_enrollment_is_not_added_a_second_time(self, full: Catalog, open_catalog: OpenCatalog) -> None:
+        catalog = open_catalog("catalog")
+        run_import(catalog, CatalogSource(full))
+        before = catalog.log()[-1].id
+        catalog.rename("mug-white", "cup")
+        done = run_import(catalog, CatalogSource(full))
+        assert (done.objects, done.skipped) == (0, ("mug-white", "Tässe =2+2", "tin"))
+        assert [line.action for line in catalog.log()[before:]] == ["renamed", "imported"]
+        assert finished(verify(catalog)).findings == ()
+
+    def test_earlier_enrollment_comes_into_use_again(self, full: Catalog, open_catalog: OpenCatalog) -> None:
+        catalog = open_catalog("catalog")
+        run_import(catalog, CatalogSource(full))
+        fill(catalog, "mug-white", 2, 50, replace=True)
+        with pytest.raises(ObjectExists):
+            run_import(catalog, CatalogSource(full, ["mug-white"]))
+        assert run_import(catalog, CatalogSource(full, ["mug-white"]), once=True).objects == 0
+        done = run_import(catalog, CatalogSource(full, ["mug-white"]), Conflict.REPLACE)
+        assert done.replaced == ("mug-white",)
+        assert [one.status for one in catalog.object("mug-white").enrollments] == [
+            "superseded",
+            "complete",
+            "superseded",
+        ]
+        assert catalog.object("mug-white").summary.views == 4
+        assert finished(verify(catalog)).findings == ()
+
+    def test_deleted_object_is_added_again_unless_it_was_delivered(
+        self, full: Catalog, open_catalog: OpenCatalog
+    ) -> None:
+        catalog = open_catalog("catalog")
+        run_import(catalog, CatalogSource(full))
+        catalog.delete("mug-white")
+        assert run_import(catalog, CatalogSource(full), once=True).objects == 0
+        assert run_import(catalog, CatalogSource(full)).objects == 1
+        assert [item.name for item in catalog.objects()] == ["Tässe =2+2", "tin", "mug-white"]
+        assert model(catalog)[0] == ("Tässe =2+2", "mug-white")
+        assert finished(verify(catalog)).findings == ()
+
+    def test_enrollment_that_was_continued_elsewhere_is_another_one(
+        self, full: Catalog, open_catalog: OpenCatalog
+    ) -> None:
+        catalog = open_catalog("catalog")
+        run_import(catalog, CatalogSource(full))
+        there = full.resume("tin", provenance=PROVENANCE)
+        there.add(record(1), image(31))
+        there.finish()
+        with pytest.raises(ObjectExists):
+            run_import(catalog, CatalogSource(full, ["tin"]))
+        run_import(catalog, CatalogSource(full, ["tin"]), Conflict.REPLACE)
+        assert [one.status for one in catalog.object("tin").enrollments] == ["complete", "in progress"]
+        assert finished(verify(catalog)).findings == ()
+
+    def test_what_was_computed_goes_with_a_delivery(
+        self, full: Catalog, open_catalog: OpenCatalog, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        catalog = open_catalog("catalog")
+        run_import(catalog, CatalogSource(full), once=True, descriptors=[])
+        expected = model(full)
+        monkeypatch.setattr("rig.catalog.derived._describe", None)
+        assert model(catalog) == expected
+
+    def test_damaged_image_of_a_catalog_is_not_transferred(self, full: Catalog, open_catalog: OpenCatalog) -> None:
+        path = full.image_path(full.object("mug-white").views[0].image)
+        path.write_bytes(path.read_bytes()[:-1] + b"x")
+        catalog = open_catalog("catalog")
+        with pytest.raises(CatalogDamaged, match="are missing or are not those"):
+            run_import(catalog, CatalogSource(full))
+        assert untouched(catalog, images=True)
