@@ -12,18 +12,18 @@ import numpy as np
 import pytest
 import yaml
 from numpy.typing import NDArray
-from typer.testing import CliRunner
+from typer.testing import CliRunner, Result
 
 from rig.calibrations import CalibrationResult, CalibrationStore, Estimate
-from rig.catalog import Catalog, Provenance
-from rig.catalog.exchange import import_objects, plan_import, read_objects, read_unpacked, write_bundle
+from rig.catalog import Catalog, Provenance, View
+from rig.catalog.derived import described
 from rig.catalog.exchange.training import Annotations, Split, write_training
+from rig.catalog.transfer import CatalogSource
+from rig.catalog.verify import verify
 from rig.cli.main import app
-from rig.config import ViewConfig
-from rig.core.errors import ExportFailed, ImportRejected, UsageError
-from rig.views.description import ViewDescriber
+from rig.core.errors import ExportFailed, UsageError
 from sim.clock import VirtualClock
-from tests.rig.catalog.catalog_samples import PROVENANCE, finished, plan, record, without_waiting
+from tests.rig.catalog.catalog_samples import PROVENANCE, finished, plan, sql, without_waiting
 
 REGION = (16, 0, 160, 144)
 VIEWS = 4
@@ -46,22 +46,12 @@ def enroll(
     table: Any = None,
     provenance: Provenance = PROVENANCE,
 ) -> None:
-    enrollment = catalog.begin(name, planned_azimuth_deg=plan(len(frames)), provenance=provenance, label="toys")
-    if table is not None:
-        enrollment.store_empty_table(table)
-    describe = ViewDescriber(ViewConfig(roi=region), empty_table=table)
+    azimuths_deg = plan(len(frames))
+    enrollment = catalog.begin(
+        name, planned_azimuth_deg=azimuths_deg, provenance=provenance, label="toys", empty_table=table
+    )
     for index, frame in enumerate(frames):
-        found = describe(frame)
-        enrollment.add(
-            record(
-                index,
-                azimuth_deg=plan(len(frames))[index],
-                descriptors=found.levels,
-                region=region,
-                segmentation=found.segmentation,
-            ),
-            frame,
-        )
+        enrollment.add(View(index=index, azimuth_deg=azimuths_deg[index], region=region), frame)
     enrollment.finish()
 
 
@@ -83,7 +73,7 @@ def catalog(sample: Path) -> Iterator[Catalog]:
 
 
 def export(catalog: Catalog, folder: Path, form: Annotations = Annotations.COCO, **options: Any) -> Any:
-    return finished(write_training(folder, list(read_objects(catalog)), form, jobs=1, **options))
+    return finished(write_training(folder, CatalogSource(catalog), form, jobs=1, **options))
 
 
 def parts_of(folder: Path) -> dict[str, Any]:
@@ -98,14 +88,17 @@ def test_coco_has_the_stored_boxes_and_azimuths(catalog: Catalog, tmp_path: Path
         ("mug", "toys"),
         ('tin: "7"', "toys"),
     ]
-    views = [view for name in ("mug", 'tin: "7"') for view in catalog.object(name).views]
-    for view, picture, annotation in zip(views, content["images"], content["annotations"], strict=True):
-        assert (tmp_path / "out" / picture["file_name"]).read_bytes() == catalog.image_path(view).read_bytes()
-        assert picture["azimuth_deg"] == annotation["azimuth_deg"] == view.record.azimuth_deg
+    views: list[tuple[View, dict[str, Any]]] = []
+    for name in ("mug", 'tin: "7"'):
+        found = catalog.object(name)
+        assert found.complete is not None
+        views += zip(found.views, described(catalog, found.complete, name).segmentation, strict=True)
+    for (view, evidence), picture, annotation in zip(views, content["images"], content["annotations"], strict=True):
+        assert (tmp_path / "out" / picture["file_name"]).read_bytes() == catalog.image_path(view.image).read_bytes()
+        assert picture["azimuth_deg"] == annotation["azimuth_deg"] == view.azimuth_deg
         assert (picture["width"], picture["height"], picture["intrinsics"]) == (192, 144, {"fx": 700.0})
-        assert view.record.segmentation is not None
-        stored = view.record.segmentation["box_px"]
-        x0, y0, *_ = view.record.region or (0, 0)
+        stored = evidence["box_px"]
+        x0, y0, *_ = view.region or (0, 0)
         expected = [0, 0, 192, 144] if stored is None else [stored[0] + x0, stored[1] + y0, *stored[2:]]
         assert annotation["bbox"] == expected
         assert annotation["iscrowd"] == (stored is None)
@@ -144,9 +137,10 @@ def test_intrinsics_are_those_of_the_calibration_in_force(tmp_path: Path) -> Non
     )
     CalibrationStore(tmp_path / "calibration" / "sim").add(result)
     with Catalog.open(tmp_path / "catalog", clock=VirtualClock()) as catalog:
-        for name, conditions in (("before", {}), ("after", {"calibrations": ["imu.scale@1", result.id]})):
-            enroll(catalog, name, [scene(1)], provenance=Provenance("sim", {}, conditions))
-        enroll(catalog, "elsewhere", [scene(1)], provenance=Provenance("../sim", {}, {"calibrations": [result.id]}))
+        enroll(catalog, "before", [scene(1)], provenance=Provenance("sim", {}))
+        conditions = {"calibrations": ["imu.scale@1", result.id]}
+        enroll(catalog, "after", [scene(2)], provenance=Provenance("sim", {}, conditions))
+        enroll(catalog, "elsewhere", [scene(3)], provenance=Provenance("../sim", {}, {"calibrations": [result.id]}))
     folders = {"catalog.path": "catalog", "calibration_dir": "calibration"}
     places = [word for key, name in folders.items() for word in ("--set", f"{key}={tmp_path / name}")]
     target = str(tmp_path / "out")
@@ -156,26 +150,48 @@ def test_intrinsics_are_those_of_the_calibration_in_force(tmp_path: Path) -> Non
     assert [one["intrinsics"] for one in content["images"]] == [None, {"fx": 701.5, "k1": -0.1}, None]
 
 
+def contents(catalog: Catalog) -> list[object]:
+    found = [catalog.object(item.name) for item in catalog.objects()]
+    return [
+        (one.summary, [(e.enrollment.key, e.status, e.finished_utc, e.seal) for e in one.enrollments]) for one in found
+    ]
+
+
+def import_(folder: Path, catalog: Path) -> Result:
+    return CliRunner().invoke(app, ["import", str(folder), "--bench", "sim", "--set", f"catalog.path={catalog}"])
+
+
 @pytest.mark.parametrize("form", Annotations)
 def test_import_restores_everything(catalog: Catalog, tmp_path: Path, form: Annotations) -> None:
     export(catalog, tmp_path / "out", form, split=Split.VIEW)
+    done = import_(tmp_path / "out", tmp_path / "new")
+    assert done.exit_code == 0, done.output
     with Catalog.open(tmp_path / "new", clock=VirtualClock()) as new:
-        finished(import_objects(new, plan_import(new, read_unpacked(tmp_path / "out")), jobs=1))
-        for which, opened in (("old", catalog), ("new", new)):
-            write_bundle(tmp_path / f"{which}.zip", read_objects(opened))
-    assert (tmp_path / "old.zip").read_bytes() == (tmp_path / "new.zip").read_bytes()
+        assert contents(new) == contents(catalog)
+        assert finished(verify(new)).findings == ()
+
+
+def test_image_that_two_objects_share_is_annotated_once(tmp_path: Path) -> None:
+    with Catalog.open(tmp_path / "catalog", clock=VirtualClock()) as shared:
+        enroll(shared, "mug", [scene(i) for i in range(VIEWS)])
+        enroll(shared, "cup", [scene(i) for i in range(1, VIEWS + 1)])
+        done = export(shared, tmp_path / "out", split=Split.VIEW)
+    assert (done.objects, sum(done.views.values())) == (2, VIEWS + 1)
+    names = [one["file_name"] for content in parts_of(tmp_path / "out").values() for one in content["images"]]
+    assert len(names) == len(set(names)) == VIEWS + 1
 
 
 def test_split_by_view_divides_the_views_of_each_object(catalog: Catalog, tmp_path: Path) -> None:
-    def split(name: str, seed: int) -> dict[str, list[str]]:
+    def split(name: str, seed: int) -> dict[str, list[tuple[int, int]]]:
         export(catalog, tmp_path / name, split=Split.VIEW, fractions=(0.5, 0.25, 0.25), seed=seed)
         return {
-            part: [one["file_name"] for one in content["images"]] for part, content in parts_of(tmp_path / name).items()
+            part: [(one["category_id"], one["image_id"]) for one in content["annotations"]]
+            for part, content in parts_of(tmp_path / name).items()
         }
 
     first = split("a", 1)
     for part, count in (("train", 2), ("val", 1), ("test", 1)):
-        assert [sum(key in name for name in first[part]) for key in ("-mug", "-tin")] == [count, count]
+        assert [sum(category == key for category, _ in first[part]) for key in (1, 2)] == [count, count]
     assert split("b", 1) == first
     assert split("c", 2) != first
 
@@ -195,11 +211,12 @@ def test_yolo_has_outlines_and_leaves_out_views_without_an_object(catalog: Catal
     assert about == {"train": "train.txt", "val": "train.txt", "names": {0: "mug", 1: 'tin: "7"'}}
     names = (tmp_path / "out" / "train.txt").read_text().split()
     assert len(names) == 2 * VIEWS - 1
+    first = {view.image for view in catalog.object("mug").views}
     for name in names:
         assert (tmp_path / "out" / name).is_file()
         label = (tmp_path / "out" / name.replace("/images/", "/labels/")).with_suffix(".txt").read_text().split()
         corners = np.array(label[1:], float).reshape(-1, 2) * (192, 144)
-        assert label[0] == ("0" if "-mug" in name else "1")
+        assert label[0] == ("0" if Path(name).name in first else "1")
         assert cv2.contourArea(corners.astype(np.float32)) == pytest.approx(AREA, rel=0.15)
 
 
@@ -211,12 +228,10 @@ def test_impossible_fractions_are_rejected(catalog: Catalog, tmp_path: Path, fra
 
 
 def test_interrupted_or_failed_export_leaves_nothing(catalog: Catalog, tmp_path: Path) -> None:
-    job = write_training(tmp_path / "out", list(read_objects(catalog)), Annotations.COCO, jobs=1)
+    job = write_training(tmp_path / "out", CatalogSource(catalog), Annotations.COCO, jobs=1)
     next(job)
     job.close()
     assert list(tmp_path.iterdir()) == []
-    with pytest.raises(ExportFailed, match="no complete enrollments"):
-        finished(write_training(tmp_path / "out", [], Annotations.COCO))
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "diary.txt").touch()
     with pytest.raises(ExportFailed, match="exists already"):
@@ -224,13 +239,20 @@ def test_interrupted_or_failed_export_leaves_nothing(catalog: Catalog, tmp_path:
     assert [path.name for path in tmp_path.rglob("*")] == ["full", "diary.txt"]
 
 
-def remove_index(folder: Path) -> None:
-    (folder / "objects.jsonl").unlink()
+def test_catalog_without_complete_enrollments_gives_no_training_set(tmp_path: Path) -> None:
+    with Catalog.open(tmp_path / "catalog", clock=VirtualClock()) as empty:
+        empty.begin("mug", planned_azimuth_deg=plan(2), provenance=PROVENANCE)
+        with pytest.raises(ExportFailed, match="no complete enrollments"):
+            export(empty, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
-def change_index(folder: Path) -> None:
-    text = (folder / "objects.jsonl").read_text()
-    (folder / "objects.jsonl").write_text(text.replace('"mug"', '"jug"'))
+def remove_catalog(folder: Path) -> None:
+    (folder / "catalog.sqlite").unlink()
+
+
+def change_name(folder: Path) -> None:
+    sql(folder, "UPDATE log SET object_name = 'jug' WHERE object_name = 'mug'")
 
 
 def link_image(folder: Path) -> None:
@@ -239,25 +261,40 @@ def link_image(folder: Path) -> None:
     image.symlink_to(folder.parent / "elsewhere.png")
 
 
+def remove_image(folder: Path) -> None:
+    next((folder / "images").rglob("*.png")).unlink()
+
+
 def link_images(folder: Path) -> None:
     (folder / "images").rename(folder.parent / "elsewhere")
     (folder / "images").symlink_to(folder.parent / "elsewhere")
 
 
-@pytest.mark.parametrize("spoil", [remove_index, change_index, link_image, link_images])
+@pytest.mark.parametrize("spoil", [remove_catalog, change_name, remove_image, link_image, link_images])
 def test_damaged_training_set_is_not_imported(catalog: Catalog, tmp_path: Path, spoil: Callable[[Path], None]) -> None:
     export(catalog, tmp_path / "out")
     spoil(tmp_path / "out")
-    with pytest.raises(ImportRejected):
-        read_unpacked(tmp_path / "out")
+    done = import_(tmp_path / "out", tmp_path / "new")
+    assert isinstance(done.exception, SystemExit)
+    assert done.exit_code > 0
+    assert nothing_in(tmp_path / "new")
 
 
 def test_image_that_was_changed_is_not_imported(catalog: Catalog, tmp_path: Path) -> None:
     export(catalog, tmp_path / "out")
-    one, other = sorted((tmp_path / "out" / "images").rglob("00[01].png"))[:2]
+    one, other = sorted((tmp_path / "out" / "images").rglob("*.png"))[:2]
     size = one.stat().st_size
     shutil.copy(other, one)
     with one.open("r+b") as file:
         file.truncate(size)
-    with Catalog.open(tmp_path / "new", clock=VirtualClock()) as new, pytest.raises(ImportRejected):
-        finished(import_objects(new, plan_import(new, read_unpacked(tmp_path / "out")), jobs=1))
+    done = import_(tmp_path / "out", tmp_path / "new")
+    assert isinstance(done.exception, SystemExit)
+    assert done.exit_code > 0
+    assert nothing_in(tmp_path / "new")
+
+
+def nothing_in(folder: Path) -> bool:
+    if not (folder / "catalog.sqlite").exists():
+        return True
+    with Catalog.open(folder, clock=VirtualClock()) as catalog:
+        return catalog.objects() == [] and not list(folder.rglob("*.png"))

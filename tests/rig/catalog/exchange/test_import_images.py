@@ -55,4 +55,4 @@ class TestImages:
     def test_size_of_jpeg_is_read(self) -> None:
         for progressive in (0, 1):
             content = cv2.imencode(".jpg", image(1), [cv2.IMWRITE_JPEG_PROGRESSIVE, progressive])[1].tobytes()
-            assert images.decode(content).shape == (12, 16, 3)
+            assert images.decode(content).shape == image(1).shape

@@ -6,20 +6,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rig.catalog.exchange import (
-    ImportProblem,
-    plan_import,
-    preview_import,
-    read_folder,
-    read_table,
-)
+from rig.catalog.derived import views
+from rig.catalog.exchange.photographs import read_folder, read_table
+from rig.catalog.rejected import ImportProblem
+from rig.catalog.transfer import transfer
 from rig.catalog.verify import verify
 from rig.core.errors import ImportRejected, UsageError
 from rig.core.next_steps import Do
-from tests.rig.catalog.catalog_samples import (
-    finished,
-)
-from tests.rig.catalog.exchange.exchange_samples import NOW, OpenCatalog, photograph, run_import, untouched
+from tests.rig.catalog.catalog_samples import NOW, OpenCatalog, finished
+from tests.rig.catalog.exchange.exchange_samples import photograph, run_import, untouched
 
 
 class TestFolders:
@@ -35,13 +30,13 @@ class TestFolders:
         (rejected,) = done.rejected
         assert (rejected.path, rejected.reason.code) == ("IMG_0001.png", ImportProblem.NAME_PATTERN)
         assert str(rejected.reason) == "does not match the pattern {object}__{angle}"
-        views = catalog.views().views
-        assert views.object_names == ("mug", "obj2", "obj10")
-        assert views.azimuth_deg.tolist() == [10.0, 0.0, 355.0, 0.0, 90.5]
+        found = views(catalog)
+        assert found.object_names == ("mug", "obj2", "obj10")
+        assert found.azimuth_deg.tolist() == [10.0, 0.0, 355.0, 0.0, 90.5]
         assert {item.label for item in catalog.objects()} == {"coil"}
         (first, _) = catalog.object("obj10").views
-        assert (first.record.encoder_deg, first.record.captured_ns, first.captured_utc) == (None, None, None)
-        assert catalog.image_path(first).read_bytes() == (tmp_path / "in" / "obj10__0.png").read_bytes()
+        assert (first.encoder_deg, first.captured_ns, first.captured_utc) == (None, None, None)
+        assert catalog.image_path(first.image).read_bytes() == (tmp_path / "in" / "obj10__0.png").read_bytes()
         assert catalog.object("obj2").views[1].image.endswith(".jpg")
         assert finished(verify(catalog)).findings == ()
 
@@ -57,12 +52,12 @@ class TestFolders:
     def test_pattern_matches_other_names(self, tmp_path: Path, pattern: str, names: list[str]) -> None:
         for seed, name in enumerate(names):
             photograph(tmp_path / name, seed)
-        batch = read_folder(tmp_path, pattern=pattern, now=NOW)
-        assert {item.name: item.enrollments[0].planned_azimuth_deg for item in batch.objects} == {
+        source = read_folder(tmp_path, pattern=pattern, now=NOW)
+        assert {item.name: item.enrollments[0].enrollment.planned_azimuth_deg for item in source.items()} == {
             "mug": (0.0, 90.0),
             "tin": (0.0,),
         }
-        assert batch.rejected == ()
+        assert source.rejected == []
 
     @pytest.mark.parametrize("pattern", ["", "{object}", "{angle}", "{object}{object}{angle}", "image"])
     def test_invalid_pattern_is_rejected(self, tmp_path: Path, pattern: str) -> None:
@@ -72,8 +67,8 @@ class TestFolders:
     def test_table_angles_run_in_the_opposite_direction(self, tmp_path: Path) -> None:
         for angle in (0, 5, 355):
             photograph(tmp_path / f"obj1__{angle}.png", angle)
-        (item,) = read_folder(tmp_path, table_angles=True, now=NOW).objects
-        shown = {Path(view.image).stem: view.azimuth_deg for view in item.enrollments[0].views}
+        (item,) = read_folder(tmp_path, table_angles=True, now=NOW).items()
+        shown = {Path(view.image).stem: view.azimuth_deg for view in item.enrollments[0].enrollment.views}
         assert shown == {"obj1__0": 0.0, "obj1__5": 355.0, "obj1__355": 5.0}
 
     def test_gaps_in_the_even_spacing_are_reported(self, tmp_path: Path) -> None:
@@ -113,7 +108,7 @@ class TestFolders:
         (folder / "mug__47.png").mkdir()
         batch = read_folder(folder, now=NOW)
         catalog = open_catalog("catalog")
-        checked = finished(preview_import(plan_import(None, batch)))
+        checked = finished(transfer(batch, None, dry_run=True))
         done = run_import(catalog, batch)
         assert {(Path(file.path).name, file.reason.code) for file in done.rejected} == {
             ("mug__90.png", ImportProblem.INVALID_IMAGE),
@@ -125,7 +120,7 @@ class TestFolders:
         }
         assert (done.objects, done.views) == (checked.objects, checked.views) == (1, 3)
         assert checked.rejected == done.rejected
-        assert catalog.views().views.azimuth_deg.tolist() == [0.0, 180.0, 270.0]
+        assert views(catalog).azimuth_deg.tolist() == [0.0, 180.0, 270.0]
         assert finished(verify(catalog)).findings == ()
 
     def test_strict_import_rejects_all_for_one_file(self, tmp_path: Path, open_catalog: OpenCatalog) -> None:
@@ -170,15 +165,15 @@ class TestTables:
         )
         catalog = open_catalog("catalog")
         done = run_import(catalog, read_table(table, now=NOW))
-        assert catalog.views().views.azimuth_deg.tolist() == [0.0, 270.0]
+        assert views(catalog).azimuth_deg.tolist() == [0.0, 270.0]
         assert [str(file.reason) for file in done.rejected] == [
             "azimuth_deg is 'north', not an angle in degrees",
             "azimuth_deg missing",
             "there is no image 7.png",
             "the image ../outside.png is not in the folder of the table",
             "azimuth_deg is 'nan', not an angle in degrees",
-            f"the image {tmp_path / 'outside.png'} is not in the folder of the table",
             "shows 'mug' from the same azimuth as 0.png",
+            f"the image {tmp_path / 'outside.png'} is not in the folder of the table",
         ]
         assert done.rejected[0].path == "views.csv, line 4"
 

@@ -1,0 +1,163 @@
+"""Folders of photographs and tables contain the views that searches use, and can be imported without loss."""
+
+import csv
+import io
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from rig.catalog import Catalog, View
+from rig.catalog.derived import choose_region, views
+from rig.catalog.exchange.photographs import read_folder, read_table
+from rig.catalog.exchange.tables import write_folder, write_parquet, write_table
+from rig.catalog.transfer import CatalogSource
+from rig.catalog.verify import verify
+from rig.core.errors import CatalogError, ExportFailed
+from rig.core.next_steps import Do
+from rig.report.catalog_page import write_catalog_page, write_sheets
+from sim.clock import VirtualClock
+from tests.rig.catalog.catalog_samples import NOW, PROVENANCE, OpenCatalog, finished, plan, without_waiting
+from tests.rig.catalog.exchange.exchange_samples import model, pictures, run_import
+
+REGION = (2, 0, 60, 44)
+NOTE = 'a chip,\n"at" the rim'
+
+
+def noise(seed: int) -> NDArray[np.uint8]:
+    return np.random.default_rng(seed).integers(0, 256, (48, 64, 3), np.uint8)
+
+
+def enroll(catalog: Catalog, name: str, count: int, seed: int, region: object = None, **begin: object) -> None:
+    enrollment = catalog.begin(name, planned_azimuth_deg=plan(count), provenance=PROVENANCE, **begin)  # type: ignore[arg-type]
+    for index, azimuth_deg in enumerate(plan(count)):
+        angles = {"commanded_deg": -azimuth_deg, "encoder_deg": 0.03 - azimuth_deg, "captured_ns": 0}
+        view = View(index=index, azimuth_deg=azimuth_deg, region=region, **angles)  # type: ignore[arg-type]
+        enrollment.add(view, noise(seed + index))
+    enrollment.finish()
+
+
+@pytest.fixture(scope="module")
+def sample(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A catalog with a replaced, a deleted and an unfinished enrollment, and a region."""
+    folder = tmp_path_factory.mktemp("tables") / "full"
+    with pytest.MonkeyPatch.context() as patch, Catalog.open(folder, clock=VirtualClock(NOW)) as catalog:
+        without_waiting(patch)
+        enroll(catalog, "gone", 1, 90)
+        enroll(catalog, "mug-white", 3, 0, label="kitchen", note=NOTE)
+        enroll(catalog, "Tässe =2+2", 2, 10)
+        enroll(catalog, "mug-white", 4, 20, REGION, replace=True)
+        catalog.delete("gone")
+        catalog.begin("tin", planned_azimuth_deg=plan(3), provenance=PROVENANCE)
+    return folder
+
+
+@pytest.fixture
+def full(sample: Path) -> Iterator[Catalog]:
+    with Catalog.open(sample, clock=VirtualClock(NOW), read_only=True) as catalog:
+        yield catalog
+
+
+def test_coil_folder_round_trip_keeps_views_and_images(
+    full: Catalog, open_catalog: OpenCatalog, tmp_path: Path
+) -> None:
+    assert write_folder(tmp_path / "coil", CatalogSource(full)) == 2
+    copy = open_catalog("copy")
+    run_import(copy, read_folder(tmp_path / "coil", now=NOW))
+    assert model(copy) == model(full)
+    assert pictures(copy) == pictures(full)
+    assert copy.object("mug-white").summary.note == NOTE
+    assert finished(verify(copy)).findings == ()
+    write_folder(tmp_path / "again", CatalogSource(copy))
+    for path in (tmp_path / "coil").iterdir():
+        assert path.read_bytes() == (tmp_path / "again" / path.name).read_bytes()
+
+
+@pytest.mark.parametrize(("target", "table"), [("table", "table/views.csv"), ("a.csv", "a.csv")])
+def test_table_round_trip_keeps_views_images_and_angles(
+    full: Catalog, open_catalog: OpenCatalog, tmp_path: Path, target: str, table: str
+) -> None:
+    for folder in ("old", "new"):
+        (tmp_path / folder).mkdir()
+    assert write_table(tmp_path / "old" / target, CatalogSource(full)) == 2
+    copy = open_catalog("copy")
+    run_import(copy, read_table(tmp_path / "old" / table, now=NOW))
+    assert model(copy) == model(full)
+    assert pictures(copy) == pictures(full)
+    for name in ("mug-white", "Tässe =2+2"):
+        for ours, theirs in zip(copy.object(name).views, full.object(name).views, strict=True):
+            assert (ours.encoder_deg, ours.captured_utc) == (theirs.encoder_deg, theirs.captured_utc)
+        (session,) = copy.object(name).enrollments[0].enrollment.sessions
+        assert session.provenance.bench == "bench-1"
+    assert finished(verify(copy)).findings == ()
+    write_table(tmp_path / "new" / target, CatalogSource(copy))
+    before, after = ((tmp_path / name / table).read_text() for name in ("old", "new"))
+    assert before == after
+    assert len(list(csv.DictReader(io.StringIO(before)))) == 6
+
+
+def test_parquet_contains_the_levels(full: Catalog, tmp_path: Path) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet")
+    assert write_parquet(tmp_path / "a.parquet", CatalogSource(full)) == 2
+    rows = parquet.read_table(tmp_path / "a.parquet").to_pylist()
+    expected = views(full)
+    assert [row["object"] for row in rows] == [expected.object_names[i] for i in expected.object_index]
+    assert [row["levels"] for row in rows] == expected.descriptors.tolist()
+    assert [row["azimuth_deg"] for row in rows] == expected.azimuth_deg.tolist()
+    assert rows[0]["captured_utc"].tzinfo is not None
+    assert full.image_path(f"{rows[0]['image_sha256']}.png") == full.path / rows[0]["image"]
+
+
+def test_parquet_without_pyarrow_names_the_extra(
+    full: Catalog, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "pyarrow", None)
+    with pytest.raises(ExportFailed) as error:
+        write_parquet(tmp_path / "a.parquet", CatalogSource(full))
+    assert error.value.steps == (Do.INSTALL_EXTRA(extra="parquet"),)
+
+
+def test_exports_contain_the_region_that_was_chosen_last(open_catalog: OpenCatalog, tmp_path: Path) -> None:
+    catalog = open_catalog("regions")
+    enroll(catalog, "mug", 2, 0, REGION)
+    choose_region(catalog, (0, 0, 48, 48))
+    write_table(tmp_path / "table", CatalogSource(catalog))
+    rows = csv.DictReader(io.StringIO((tmp_path / "table" / "views.csv").read_text()))
+    assert {row["region"] for row in rows} == {"0 0 48 48"}
+    levels = views(catalog).descriptors
+    copy = open_catalog("copy")
+    run_import(copy, read_table(tmp_path / "table" / "views.csv", now=NOW))
+    assert np.array_equal(views(copy).descriptors, levels)
+
+
+WRITERS: dict[str, Callable[[Path, CatalogSource], int]] = {
+    "coil": write_folder,
+    "table": write_table,
+    "a.csv": write_table,
+    "sheets": write_sheets,
+    "page": write_catalog_page,
+    "page.html": write_catalog_page,
+}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_export_overwrites_nothing_and_leaves_no_partial_files(sample: Path, tmp_path: Path, name: str) -> None:
+    with Catalog.open(sample, clock=VirtualClock(NOW), read_only=True) as catalog:
+        (tmp_path / "old" / name).mkdir(parents=True)
+        (tmp_path / "old" / name / "mine").touch()
+        with pytest.raises(ExportFailed, match="exists already"):
+            WRITERS[name](tmp_path / "old" / name, CatalogSource(catalog))
+        assert [path.name for path in (tmp_path / "old").rglob("*")] == [name, "mine"]
+        (tmp_path / "new").mkdir()
+        image = catalog.image_path(catalog.object("mug-white").views[3].image)
+        stored = image.read_bytes()
+        try:
+            image.write_bytes(b"x")
+            with pytest.raises(CatalogError, match="not the one that was stored") as error:
+                WRITERS[name](tmp_path / "new" / name, CatalogSource(catalog))
+        finally:
+            image.write_bytes(stored)
+        assert "verify" in error.value.next_step
+        assert list((tmp_path / "new").iterdir()) == []
