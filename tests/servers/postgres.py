@@ -150,7 +150,9 @@ def use_postgres() -> None:
 
     def of(cls: type[CatalogPlace], place: Any) -> CatalogPlace:
         found: CatalogPlace = original(cls, place)
-        return found if found.url is not None else place_in(url, found.path)
+        if found.url is not None or found.path.name.startswith((".", "rig-export-")) or found.database_file.exists():
+            return found  # an export is a folder
+        return place_in(url, found.path)
 
     copy_folder = shutil.copytree
 
