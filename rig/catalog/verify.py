@@ -187,6 +187,14 @@ def missing_enrollments(transaction: Transaction) -> list[Finding]:
     ]
 
 
+def some_images(catalog: Catalog, count: int) -> list[str]:
+    """Return the names of at most ``count`` images of views, spread over the catalog."""
+    with catalog.database.read() as transaction:
+        ids = transaction.scalars(select(View.id).order_by(View.id)).all()
+        chosen = ids[:: max(len(ids) // count, 1)][:count]
+        return list(transaction.scalars(select(View.image).where(View.id.in_(chosen)).order_by(View.id)))
+
+
 def _check_rows(catalog: Catalog, transaction: Transaction, rows: _Rows) -> None:
     """Check the structure of the database, the log, and the rows of the enrollments; write the result into ``rows``."""
     # What there is. A damaged table may not be readable further down.
@@ -215,7 +223,12 @@ def _check_rows(catalog: Catalog, transaction: Transaction, rows: _Rows) -> None
     rows.owners = dict(transaction.execute(owners.order_by(Enrollment.id)).all())
     ended = transaction.execute(select(state.Ended.enrollment_id, state.Ended.seal).where(state.IS_STATUS))
     seals = {number: seal for number, seal in ended if number in rows.owners}
-    changed = {*digests.damaged_enrollments(transaction, seals), *(rows.owners.keys() - seals.keys())}
+    moved = transaction.scalars(
+        select(Enrollment.id)
+        .join(state.Ended, state.Ended.enrollment_id == Enrollment.id)
+        .where(state.IS_STATUS, state.Ended.object_id.is_distinct_from(Enrollment.object_id))
+    )
+    changed = {*moved, *digests.damaged_enrollments(transaction, seals), *(rows.owners.keys() - seals.keys())}
     for number in sorted(changed):
         name = rows.owners.pop(number)
         rows.findings.append(Finding(Problem.ENROLLMENT_CHANGED, name, details={"enrollment_id": number}))

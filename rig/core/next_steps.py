@@ -94,7 +94,6 @@ class Do(StrEnum):
     UNDELETE = "undelete", "restore the object", "rig catalog undelete {name}"
     REMOVE_DELETED = "remove-deleted", "remove deleted objects from the disk", "rig catalog gc"
     VERIFY_CATALOG = "verify-catalog", "check the catalog", "rig catalog verify"
-    REPAIR_CATALOG = "repair-catalog", "repair the catalog", "rig catalog verify --repair"
     REDESCRIBE = "redescribe", "describe the stored images again", "rig catalog redescribe"
     FIT_STOPPING_RULE = "fit-stopping-rule", "fit the stopping rule again", "rig catalog fit"
     MERGE = "merge", "add the objects to a catalog", "rig catalog merge {source}"

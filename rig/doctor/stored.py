@@ -5,6 +5,7 @@ from collections.abc import Iterable, Iterator
 from rig.calibrations import CalibrationStatus, CalibrationStore, apparatus, apply_results
 from rig.calibrations.store import BenchCalibration
 from rig.catalog import Catalog
+from rig.catalog.verify import some_images
 from rig.core.errors import CatalogError
 from rig.core.next_steps import Do
 from rig.doctor.context import DoctorContext
@@ -31,12 +32,11 @@ def catalog(context: DoctorContext) -> Iterator[Finding]:
             yield bad("catalog", FindingCode.DATABASE_DAMAGED, Do.VERIFY_CATALOG(), 7, path=path, damage=checked)
         if (changed := opened.damage()) is not None:
             raise changed
-        objects, ids = opened.objects(), list(opened.first_views().values())
-        chosen = ids[:: max(len(ids) // IMAGES, 1)][:IMAGES]
+        objects, chosen = opened.objects(), some_images(opened, IMAGES)
         broken = []
-        for view_id in chosen:
+        for image in chosen:
             try:
-                opened.read_image(opened.view(view_id).image)
+                opened.read_image(image)
             except CatalogError as error:
                 broken.append(error)
         if broken:

@@ -259,7 +259,7 @@ def test_catalog_is_checked(bench):
     problem = bench.problem("catalog")
     assert problem.code is FindingCode.IMAGES_DAMAGED
     assert (problem.parameters["broken"], problem.parameters["images"]) == (1, 6)
-    assert problem.steps == (Do.REPAIR_CATALOG(),)
+    assert problem.steps == (Do.VERIFY_CATALOG(),)
     image.unlink()
     (path / "catalog.sqlite").write_bytes(b"SQLite format 3\0" + b"rubbish" * 999)
     (finding,) = bench.findings("catalog")
