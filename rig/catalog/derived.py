@@ -142,14 +142,16 @@ def described(catalog: Catalog, enrollment: Enrollment, name: str, *wanted: str)
     seal = seal_of(enrollment)
     with catalog.database.read() as transaction:
         region = _regions(transaction).of(transaction, enrollment.id)
-        stored = _stored(transaction, [seal], (SEGMENTATION, *kinds), region)
-    levels = {name: _records(descriptor(name), stored[name][seal])["packed"] for name in kinds if seal in stored[name]}
-    if len(levels) == len(kinds) and seal in stored[SEGMENTATION]:
-        unpacked = {name: descriptor(name).unpack_rows(packed.tobytes()) for name, packed in levels.items()}
-        with suppress(
-            ValueError, TypeError, AttributeError, RigError
-        ):  # computed again if this program has not made it
-            return Described(unpacked, _evidence(stored[SEGMENTATION][seal], len(enrollment.views)))
+        needed = kinds if all(descriptor(kind).whole_image for kind in kinds) else (SEGMENTATION, *kinds)
+        stored = {kind: found.get(seal, b"") for kind, found in _stored(transaction, [seal], needed, region).items()}
+    if all(stored.values()):
+        packed = {kind: _records(descriptor(kind), stored[kind])["packed"].tobytes() for kind in kinds}
+        levels = {kind: descriptor(kind).unpack_rows(content) for kind, content in packed.items()}
+        count = len(enrollment.views)
+        # What this program has not made is computed again.
+        with suppress(ValueError, TypeError, AttributeError, RigError):
+            evidence = _evidence(stored[SEGMENTATION], count) if SEGMENTATION in needed else ({},) * count
+            return Described(levels, evidence)
     task = task_of(enrollment, seal, name, kinds, region)
     with catalog.database.catalog_errors():
         found = _describe(catalog.database.images.pixels, task, threads=THREADS)

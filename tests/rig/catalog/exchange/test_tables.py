@@ -20,7 +20,7 @@ from rig.core.next_steps import Do
 from rig.report.catalog_page import write_catalog_page, write_sheets
 from sim.clock import VirtualClock
 from tests.rig.catalog.catalog_samples import NOW, PROVENANCE, OpenCatalog, finished, plan, without_waiting
-from tests.rig.catalog.exchange.exchange_samples import model, pictures, run_import
+from tests.rig.catalog.exchange.exchange_samples import model, photograph, pictures, run_import
 
 REGION = (2, 0, 60, 44)
 NOTE = 'a chip,\n"at" the rim'
@@ -161,3 +161,16 @@ def test_export_overwrites_nothing_and_leaves_no_partial_files(sample: Path, tmp
             image.write_bytes(stored)
         assert "verify" in error.value.next_step
         assert list((tmp_path / "new").iterdir()) == []
+
+
+def test_description_of_a_table_is_computed_once(
+    open_catalog: OpenCatalog, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("pyarrow")
+    photograph(tmp_path / "in" / "mug__0.png", 1)
+    catalog = open_catalog("catalog")
+    run_import(catalog, read_folder(tmp_path / "in", now=NOW))
+    write_parquet(tmp_path / "a.parquet", CatalogSource(catalog))
+    monkeypatch.setattr("rig.catalog.derived._describe", None)
+    write_parquet(tmp_path / "b.parquet", CatalogSource(catalog))
+    assert (tmp_path / "a.parquet").read_bytes() == (tmp_path / "b.parquet").read_bytes()
