@@ -4,6 +4,7 @@ import pytest
 
 from rig.web.access import Role
 from rig.web.front import checked_catalog
+from tests.rig.catalog.catalog_samples import fill, sql
 
 API = "/api/v1"
 
@@ -154,8 +155,9 @@ def test_lists_have_pages_and_etags(serve):
 
 def test_damage_of_the_catalog_is_in_the_status(serve, capsys):
     served = serve()
-    with served.server.catalog.open_to_change() as catalog, catalog.database.write() as connection:
-        connection.exec_driver_sql("INSERT INTO objects (name, label, note, created_utc) VALUES ('a', '', '', '')")
+    with served.server.catalog.open_to_change() as catalog:
+        fill(catalog, "a", 1)
+        sql(catalog, "UPDATE log SET label = 'x' WHERE id = 1")
     assert served.client.get(f"{API}/status").json()["problem"] is None
     with checked_catalog(served.server) as check:
         check.wait()
