@@ -130,20 +130,21 @@ def _read(reading: Reading, task: derived.Task) -> ReadImages:
 def _pixels(reading: Reading, image: str, found: ReadImages) -> NDArray[np.uint8]:
     try:
         content = reading.content(image)
-        pixels = decode(content) if reading.decodes else _NO_PIXELS
         name = name_of(content)
+        if reading.is_named and name != image:
+            found.rejected[image] = Reason(ImportProblem.OTHER_IMAGE)
+            raise _Rejected(image)
+        pixels = decode(content) if reading.decodes else _NO_PIXELS
     except BadImage as error:
         found.rejected[image] = Reason(ImportProblem.INVALID_IMAGE, {"error": str(error)})
+        raise _Rejected(image) from error
     except (CatalogDamaged, *_READ_ERRORS) as error:  # a link that leads out of a catalog is damage
         found.rejected[image] = Reason(ImportProblem.UNREADABLE, {"error": str(error)})
-    else:
-        if not reading.is_named or name == image:
-            if reading.store is not None and image not in found.images:
-                reading.store.put(content, settled=False)
-            found.images[image] = name, len(content)
-            return pixels
-        found.rejected[image] = Reason(ImportProblem.OTHER_IMAGE)
-    raise _Rejected(image)
+        raise _Rejected(image) from error
+    if reading.store is not None and image not in found.images:
+        reading.store.put(content, settled=False)
+    found.images[image] = name, len(content)
+    return pixels
 
 
 def _names(task: derived.Task) -> list[str]:

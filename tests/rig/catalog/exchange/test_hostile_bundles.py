@@ -1,12 +1,9 @@
 """Bundles that are falsified or damaged are rejected and change nothing."""
 
-import json
 import stat
 import struct
 import zipfile
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -15,65 +12,49 @@ from hypothesis import strategies as st
 
 import hbr
 from rig.catalog import Catalog
-from rig.catalog.exchange import (
-    read_bundle,
-    read_objects,
-    write_bundle,
-)
-from rig.catalog.exchange.bundle import MANIFEST, OBJECTS
+from rig.catalog.derived import views
+from rig.catalog.exchange.bundle import write_bundle
+from rig.catalog.facts import json_text
+from rig.catalog.images import name_of, path_of
+from rig.catalog.transfer import CatalogSource
 from rig.catalog.verify import verify
 from rig.core.errors import ImportRejected
-from rig.views import image_files as images
+from rig.views.image_files import encode
 from sim.clock import VirtualClock
 from tests.fuzzing import examples
-from tests.rig.catalog.catalog_samples import (
-    finished,
-    image,
-    true_fill,
-)
-from tests.rig.catalog.exchange.exchange_samples import (
-    NOW,
-    OpenCatalog,
-    png_of,
-    rewritten,
-    run_import,
-    untouched,
-    view_of,
-)
+from tests.rig.catalog.catalog_samples import NOW, OpenCatalog, fill, finished, image
+from tests.rig.catalog.exchange.exchange_samples import import_bundle, png_of, rewritten, untouched
+
+FIRST = path_of(name_of(encode(image(0))))
+"""Member with the image of the first view."""
 
 
 class TestHostileBundles:
     def rejection(self, open_catalog: OpenCatalog, path: Path) -> str:
         catalog = open_catalog("victim")
         with pytest.raises(ImportRejected) as error:
-            run_import(catalog, read_bundle(path))
+            import_bundle(catalog, path)
         assert untouched(catalog)
         return f"{error.value.what} {error.value.evidence}"
 
     @pytest.mark.parametrize(
         "name",
         [
-            *("../evil.png", "/etc/evil.png", "images/../../evil.png"),
-            *("images\\..\\evil.png", "C:/evil.png", "images/a\0b.png"),
+            *("../evil.png", "/etc/evil.png", "images/../../evil.png", "catalog.sqlite-wal"),
+            *("images\\..\\evil.png", "C:/evil.png", "images/a\0b.png", "images/evil.png"),
         ],
     )
-    def test_paths_outside_the_catalog_are_rejected(
-        self, bundle: Path, open_catalog: OpenCatalog, name: str, tmp_path: Path
-    ) -> None:
-        def move(line: dict[str, Any]) -> None:
-            view_of(line)["image"] = name
-
+    def test_other_paths_are_rejected(self, bundle: Path, open_catalog: OpenCatalog, name: str, tmp_path: Path) -> None:
         info = zipfile.ZipInfo(name)
         info.filename = name  # ZipInfo itself would correct the name
-        path = rewritten(bundle, move)
-        with zipfile.ZipFile(path, "a") as archive:
+        with zipfile.ZipFile(bundle, "a") as archive:
             archive.writestr(info, b"x")
-        assert "was not imported" in self.rejection(open_catalog, path)
+        assert "was not imported" in self.rejection(open_catalog, bundle)
         assert not list(tmp_path.rglob("evil.png"))
 
     @pytest.mark.parametrize("kind", [stat.S_IFLNK, stat.S_IFIFO, stat.S_IFCHR])
     def test_links_and_devices_are_rejected(self, bundle: Path, open_catalog: OpenCatalog, kind: int) -> None:
-        info = zipfile.ZipInfo("images/link.png")
+        info = zipfile.ZipInfo(FIRST.replace("images", "images/0"))
         info.external_attr = (kind | 0o777) << 16
         with zipfile.ZipFile(bundle, "a") as archive:
             archive.writestr(info, "/etc/passwd")
@@ -89,77 +70,99 @@ class TestHostileBundles:
 
     def test_huge_image_is_rejected(self, bundle: Path, open_catalog: OpenCatalog) -> None:
         bomb = png_of(60_000, 60_000)
-
-        def enlarge(line: dict[str, Any]) -> None:
-            view_of(line).update(image_bytes=len(bomb), image_sha256=images.digest(bomb))
-
-        with zipfile.ZipFile(bundle) as archive:
-            replaced = json.loads(archive.read(OBJECTS))["enrollments"][0]["views"][0]["image"]
-        assert "60000 x 60000 pixels" in self.rejection(open_catalog, rewritten(bundle, enlarge, **{replaced: bomb}))
+        changed = rewritten(
+            bundle,
+            f"UPDATE views SET image = '{name_of(bomb)}', image_bytes = {len(bomb)} WHERE view_index = 0",
+            **{FIRST: None, path_of(name_of(bomb)): bomb},
+        )
+        assert "60000 x 60000 pixels" in self.rejection(open_catalog, changed)
 
     @pytest.mark.parametrize(
-        ("change", "words"),
+        ("statement", "words"),
         [
-            (lambda line: line.update(name="a\nb"), "cannot be printed"),
-            (lambda line: line.update(name=" mug"), "outer spaces"),
-            (lambda line: line.update(label="\x1b[2Jmug"), "control characters"),
-            (lambda line: line.update(note="a\u202eb"), "control characters"),
-            (lambda line: line.update(colour="red"), "colour"),
-            (lambda line: view_of(line).update(azimuth_deg=360.0), "azimuth_deg"),
-            (lambda line: view_of(line).update(azimuth_deg="north"), "azimuth_deg"),
-            (lambda line: view_of(line).update(azimuth_deg=float("nan")), "azimuth_deg"),
-            (lambda line: view_of(line).update(index=1), "twice"),
-            (lambda line: view_of(line).update(index=7), "planned"),
-            (lambda line: view_of(line).update(session=1), "session"),
-            (lambda line: view_of(line).update(imu_deg=1.0), "imu_sigma_deg"),
-            (lambda line: view_of(line).update(image=view_of(line, 1)["image"]), "two views|size"),
-            (lambda line: view_of(line).update(image="objects.jsonl"), "is missing"),
-            (lambda line: view_of(line).update(image_sha256="0" * 64), "not the stored image"),
-            (lambda line: view_of(line).update(image_bytes=1), "size"),
-            (lambda line: view_of(line)["descriptors"][0].update(packed="ff"), "descriptors"),
-            (lambda line: view_of(line)["descriptors"][0].update(packed="00" * 54), "not that of the image"),
-            (lambda line: view_of(line)["descriptors"][0].update(settings={"region": "evil"}), "settings"),
-            (lambda line: view_of(line)["descriptors"][0].update(settings={"region": [0, 0, 99, 99]}), "region"),
-            (lambda line: view_of(line)["descriptors"][0].update(version=True), "version"),
-            (lambda line: view_of(line)["descriptors"][0].update(version=2**31), "version"),
-            (lambda line: view_of(line)["descriptors"][0].update(version=2**70), "version"),
-            (lambda line: view_of(line).update(captured_utc="9999-12-31T23:59:59-14:00"), "calendar"),
-            (lambda line: line.update(created_utc="0001-01-01T00:00:00+14:00"), "calendar"),
-            (lambda line: view_of(line).update(segmentation={"issues": 5}), "segmentation"),
-            (lambda line: view_of(line).update(captured_ns=2**70), "captured_ns"),
-            (lambda line: view_of(line).update(captured_utc="2026-01-01T00:00:00"), "captured_utc"),
-            (lambda line: line["enrollments"][0]["views"].pop(), "complete"),
-            (lambda line: line["enrollments"][0].update(status="in progress"), "finished_utc"),
-            (lambda line: line["enrollments"].append(line["enrollments"][0]), "two enrollments|two views"),
-            (lambda line: line["enrollments"][0].update(planned_azimuth_deg=[0.0] * 20_000), "planned_azimuth_deg"),
+            ("UPDATE log SET object_name = 'a' || char(10) || 'b'", "cannot be printed"),
+            ("UPDATE log SET object_name = ' mug'", "name of an object"),
+            ("UPDATE log SET label = char(27) || '[2Jmug' WHERE id = 1", "control characters"),
+            ("UPDATE log SET note = 'a' || char(8238) || 'b' WHERE id = 1", "control characters"),
+            ("UPDATE sessions SET bench = char(27) || '[2J'", "control characters"),
+            ("ALTER TABLE views ADD COLUMN colour TEXT", "other tables"),
+            ("CREATE VIEW others AS SELECT 1", "other tables"),
+            ("UPDATE views SET azimuth_deg = 360.0", "changed after"),
+            ("UPDATE views SET azimuth_deg = 'north'", "finite number"),
+            ("UPDATE views SET azimuth_deg = 9e999", "finite number"),
+            ("UPDATE views SET view_index = 7 WHERE view_index = 0", "changed after"),
+            ("UPDATE sessions SET number = 1", "changed after|missing row"),
+            ("UPDATE views SET imu_deg = 1.0", "changed after"),
+            ("UPDATE views SET image = '../../etc/passwd'", "not one of an image"),
+            (f"UPDATE views SET image = '{'0' * 64}.png'", "is missing"),
+            ("UPDATE views SET image_bytes = 1", "another size"),
+            ("UPDATE views SET evidence = '[]'", "type dict"),
+            ("UPDATE views SET evidence = '{\"a\": NaN}'", "NaN"),
+            ("UPDATE views SET region = '[0, 0, -1, 5]'", "region"),
+            ("UPDATE views SET captured_ns = 'x'", "type int"),
+            ("UPDATE views SET captured_utc = 'yesterday'", "yesterday|datetime"),
+            ("DELETE FROM views WHERE view_index = 1", "belongs to no view|changed after"),
+            ("UPDATE log SET finished_utc = NULL", "changed after"),
+            ("UPDATE log SET status = 'in progress'", "end of an enrollment"),
+            ("UPDATE log SET status = 'finished'", "finished"),
+            ("UPDATE log SET object_id = 9", "owner of an enrollment"),
+            ("UPDATE properties SET value = '2' WHERE key = 'version'", "another version"),
+            ("UPDATE properties SET value = 'x' WHERE key = 'head'", "end of its log"),
+            ("PRAGMA user_version = 2", "another version of the program"),
+            ("PRAGMA application_id = 2", "another program"),
         ],
     )
-    def test_invalid_lines_are_rejected(
-        self, bundle: Path, open_catalog: OpenCatalog, change: Callable[[dict[str, Any]], None], words: str
+    @pytest.mark.parametrize("sealed", [True, False])
+    def test_impossible_rows_are_rejected(
+        self, bundle: Path, open_catalog: OpenCatalog, statement: str, words: str, sealed: bool
     ) -> None:
-        said = self.rejection(open_catalog, rewritten(bundle, change))
+        sealed = sealed and "properties" not in statement
+        said = self.rejection(open_catalog, rewritten(bundle, statement, sealed=sealed))
+        assert not sealed or any(word in said for word in words.split("|")), said
+
+    @pytest.mark.parametrize(
+        ("views", "words"),
+        [(20_000, "number of planned views"), (0, "number of planned views|changed after")],
+    )
+    def test_impossible_plans_are_rejected(
+        self, bundle: Path, open_catalog: OpenCatalog, views: int, words: str
+    ) -> None:
+        plan = f"UPDATE enrollments SET planned_azimuth_deg = '{json_text([0.0] * views)}'"
+        unfinished = "UPDATE log SET status = 'in progress', finished_utc = NULL WHERE status IS NOT NULL"
+        said = self.rejection(open_catalog, rewritten(bundle, plan, unfinished))
         assert any(word in said for word in words.split("|")), said
 
-    @pytest.mark.parametrize("version", [0, -1, True, "2", 2.0, None])
-    def test_impossible_version_is_rejected(self, bundle: Path, open_catalog: OpenCatalog, version: object) -> None:
-        manifest = json.dumps({"format": "rigcat", "version": version}).encode()
-        assert "has version" in self.rejection(open_catalog, rewritten(bundle, None, **{MANIFEST: manifest}))
+    def test_image_that_is_another_one_is_rejected(self, bundle: Path, open_catalog: OpenCatalog) -> None:
+        other = bytearray(encode(image(0)))
+        other[-20] ^= 1
+        assert "is not the stored image" in self.rejection(open_catalog, rewritten(bundle, **{FIRST: bytes(other)}))
 
-    def test_bundle_of_another_version_and_other_zip_file_are_rejected(
-        self, bundle: Path, tmp_path: Path, open_catalog: OpenCatalog
-    ) -> None:
-        manifest = json.dumps({"format": "rigcat", "version": 2}).encode()
-        said = self.rejection(open_catalog, rewritten(bundle, None, **{MANIFEST: manifest}))
-        assert "another version of the program" in said
+    def test_image_that_is_no_image_is_rejected(self, bundle: Path, open_catalog: OpenCatalog) -> None:
+        name = name_of(b"I am no image")
+        changed = rewritten(
+            bundle,
+            f"UPDATE views SET image = '{name}', image_bytes = 13 WHERE view_index = 0",
+            **{FIRST: None, path_of(name): b"I am no image"},
+        )
+        assert "neither a PNG nor a JPEG" in self.rejection(open_catalog, changed)
+
+    def test_what_is_computed_is_not_taken_from_a_bundle(self, bundle: Path, open_catalog: OpenCatalog) -> None:
+        forged = "INSERT INTO derived VALUES ((SELECT seal FROM log WHERE seal IS NOT NULL), '{}', 'x', x'00', 'x')"
+        catalog = open_catalog("catalog")
+        import_bundle(catalog, rewritten(bundle, *(forged.format(name) for name in ("cedd", "edges+colours"))))
+        assert np.array_equal(views(catalog).descriptors[0], hbr.describe(image(0)))
+        assert finished(verify(catalog, jobs=1)).findings == ()
+
+    def test_other_zip_file_is_rejected(self, tmp_path: Path, open_catalog: OpenCatalog) -> None:
         with zipfile.ZipFile(tmp_path / "holiday.zip", "w") as archive:
-            archive.writestr("images/beach.png", b"x")
-        assert "does not contain rigcat.json" in self.rejection(open_catalog, tmp_path / "holiday.zip")
+            archive.writestr(FIRST, b"x")
+        assert "does not contain catalog.sqlite" in self.rejection(open_catalog, tmp_path / "holiday.zip")
 
     def test_damaged_bundle_is_rejected_or_unchanged(self, tmp_path_factory: pytest.TempPathFactory) -> None:
         folder = tmp_path_factory.mktemp("spoiled")
         with Catalog.open(folder / "source", clock=VirtualClock(NOW)) as source:
-            true_fill(source, "mug", 1, 0)
-            write_bundle(folder / "good.zip", read_objects(source))
+            fill(source, "mug", 1)
+            write_bundle(folder / "good.zip", CatalogSource(source))
         good = (folder / "good.zip").read_bytes()
         victims = [Catalog.open(folder / "victim", clock=VirtualClock(NOW))]
 
@@ -180,14 +183,14 @@ class TestHostileBundles:
             path.write_bytes(content)
             victim = victims[-1]
             try:
-                run_import(victim, read_bundle(path))
+                import_bundle(victim, path)
             except ImportRejected:
                 assert untouched(victim)
                 return
             assert finished(verify(victim, jobs=1)).findings == ()
             (view,) = victim.object("mug").views
-            assert np.array_equal(victim.read_image(view), image(0))
-            assert np.array_equal(view.record.descriptors["cedd"], hbr.describe(image(0)))
+            assert np.array_equal(victim.read_image(view.image), image(0))
+            assert np.array_equal(views(victim).descriptors[0], hbr.describe(image(0)))
             victim.close()
             victims.append(Catalog.open(folder / f"victim-{len(victims)}", clock=VirtualClock(NOW)))
 
