@@ -78,25 +78,28 @@ def head(transaction: Transaction) -> tuple[int, str]:
 
 
 def check_complete(transaction: Transaction) -> None:
-    """Raise `CatalogDamaged` if a line that gives a state or a status is missing, or was changed to give none.
+    """Raise `CatalogDamaged` if a line that gives a state or a status is missing, or was changed not to give one.
 
     Without it, the line before would count. A line that counts is compared with its digest where it is used.
     """
+    if not _is_complete(transaction):
+        raise CatalogDamaged(
+            "Lines of the catalog's log are missing or were changed.",
+            next_step=(Do.VERIFY_CATALOG(), "Then use a backup."),
+        )
+
+
+def _is_complete(transaction: Transaction) -> bool:
     end = _end(transaction)
-    found = tuple(
+    found = [
         transaction.scalar(select(counted).where(condition)) or 0
         for counted, condition in (
             (func.max(Entry.id), true()),
             (func.count(), Entry.deleted.is_not(None)),
             (func.count(), Entry.status.is_not(None)),
         )
-    )
-    if found != (end.line, end.states, end.statuses):
-        raise CatalogDamaged(
-            "Lines of the catalog's log are missing or were changed.",
-            next_step=(Do.VERIFY_CATALOG(), "Then use a backup."),
-            evidence={"last_line_states_statuses": found, "stored": (end.line, end.states, end.statuses)},
-        )
+    ]
+    return found == [end.line, end.states, end.statuses]
 
 
 def wrong_lines(transaction: Transaction, first: int = 1, last: int | None = None) -> Iterator[int]:
@@ -110,8 +113,14 @@ def wrong_lines(transaction: Transaction, first: int = 1, last: int | None = Non
         yield from (number for number in numbers if number in wrong or number not in present)
     newest = transaction.scalar(select(Entry.digest).where(Entry.id == end)) or ""
     beyond = transaction.scalar(select(func.max(Entry.id))) or 0
-    if last is None and (newest != digest or beyond > end):
+    if last is None and (newest != digest or beyond > end or not _is_complete(transaction)):
         yield max(end, beyond)
+
+
+def shown(entry: Entry) -> dict[str, Any]:
+    """Return what readers of the log see of a line, as JSON values but for its time."""
+    names = ("id", "time_utc", "user", "host", "software", "action", "object_name", "details")
+    return {name: getattr(entry, name) for name in names}
 
 
 def entries(transaction: Transaction, since: datetime | None = None, object_name: str | None = None) -> list[Entry]:

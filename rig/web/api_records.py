@@ -9,6 +9,7 @@ from pydantic import Field
 
 from rig.calibrations import CalibrationStore
 from rig.catalog.exchange.tables import plain_row
+from rig.catalog.log import shown
 from rig.catalog.records import Outcome
 from rig.catalog.results import ResultFilter, correct, find_result, find_results
 from rig.core.errors import JobNotFound
@@ -124,5 +125,5 @@ def add_records(routes: Routes, server: Server) -> None:
         """List the catalog's log, the newest first."""
         with server.catalog.open_to_read() as catalog:
             entries = catalog.log()
-        rows = [{**plain(entry), "id": str(entry.id), "time_utc": time_text(entry.time_utc)} for entry in entries]
+        rows = [{**shown(entry), "id": str(entry.id), "time_utc": time_text(entry.time_utc)} for entry in entries]
         return page.of(rows[::-1], "id")

@@ -221,15 +221,15 @@ def log(
 
     Example: rig log --since 7d --bench sim
     """
+    from rig.catalog.log import shown
     from rig.cli.ui.present import print_table
-    from rig.core.json_form import plain
 
     begin = parse_time(since, "--since")
     with settings.open_catalog(read_only=True) as catalog:
         entries = catalog.log(since=begin, object_name=name)
     if settings.json:
         for entry in entries:
-            settings.print_json(plain(entry) | {"time_utc": entry.time_utc.isoformat()})
+            settings.print_json(shown(entry) | {"time_utc": entry.time_utc.isoformat()})
         return
     if not entries:
         print("No entries since then." if since else "No entries yet.")
