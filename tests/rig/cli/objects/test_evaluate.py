@@ -13,7 +13,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from rig.catalog import Catalog, Provenance, ViewRecord
+from rig.catalog import Catalog, Provenance, View
 from rig.cli.objects.evaluate import evaluate
 from rig.cli.ui.settings import Settings
 from rig.core.clock import SystemClock
@@ -208,8 +208,8 @@ def test_catalog_is_evaluated_if_no_folder_is_named(tmp_path: Path, monkeypatch:
                 name, planned_azimuth_deg=list(range(0, 360, 30)), provenance=Provenance("bench", {}, {})
             )
             for index in range(12):
-                record = ViewRecord(index, 0.0, 0.0, 30.0 * index + 0.25, {"cedd": np.zeros(144, np.uint8)}, 0)
-                enrollment.add(record, cv2.copyMakeBorder(drawing(number, 30 * index), 0, 0, 4, 4, 0))
+                view = View(index=index, azimuth_deg=30.0 * index + 0.25)
+                enrollment.add(view, cv2.copyMakeBorder(drawing(number, 30 * index), 0, 0, 4, 4, 0))
             enrollment.finish()
     done = run(*QUICK, "--out", "out")
     assert done.exit_code == 0, done.output

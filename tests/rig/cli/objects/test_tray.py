@@ -88,10 +88,10 @@ def test_tray_is_enrolled_with_two_interruptions_and_identified(folder):
         }
         for name in NAMES[2], killed["name"]:
             details = catalog.object(name)
-            assert [view.record.index for view in details.views] == list(range(VIEWS))
-            assert len({view.session.id for view in details.views}) == 2
+            assert [view.index for view in details.views] == list(range(VIEWS))
+            assert len({view.session for view in details.views}) == 2
             for view in details.views:
-                catalog.read_image(view)  # raises if it is not the stored image
+                catalog.read_image(view.image)  # raises if it is not the stored image
 
     things = f"bench.sim.object={json.dumps(NAMES)}"
     words = ("identify", "--watch", "--save-run", "runs", "--seed", "3", "--json")

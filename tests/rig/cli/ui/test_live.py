@@ -208,10 +208,10 @@ def test_live_table_shows_whether_the_plan_pauses(kind, width):
 
 STOPPING = """
 import os, signal
-from rig.catalog.enrollment import Enrollment
+from rig.catalog import OpenEnrollment
 from rig.cli.main import main
 
-add, added = Enrollment.add, []
+add, added = OpenEnrollment.add, []
 
 def add_and_stop(*arguments):
     stored = add(*arguments)
@@ -220,7 +220,7 @@ def add_and_stop(*arguments):
         os.kill(os.getpid(), signal.SIGSTOP)
     return stored
 
-Enrollment.add = add_and_stop
+OpenEnrollment.add = add_and_stop
 main()
 """
 """The program stops itself when it has stored its second view: a busy test acts before the third."""
