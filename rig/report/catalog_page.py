@@ -11,7 +11,7 @@ from urllib.parse import quote
 import cv2
 import numpy as np
 
-from rig.catalog.exchange.new_files import new_file, new_folder
+from rig.catalog.exchange.new_files import new_document, new_folder
 from rig.catalog.exchange.tables import enrolled
 from rig.catalog.facts import Enrollment, Session
 from rig.catalog.transfer import CatalogSource, Item
@@ -61,16 +61,9 @@ def write_catalog_page(target: Path, source: CatalogSource) -> int:
     ExportFailed
         As `write_sheets`.
     """
-    if target.suffix.lower() == ".html":
-        sheets = target.with_name(f"{target.stem}-{SHEETS}")
-        with new_file(target) as file, new_folder(sheets) as made:
-            shown = list(_shown(made, sheets.name, source))
-            file.write(_page(shown))
-    else:
-        with new_folder(target) as made:
-            (made / SHEETS).mkdir()
-            shown = list(_shown(made / SHEETS, SHEETS, source))
-            (made / "index.html").write_bytes(_page(shown))
+    with new_document(target, "index.html", SHEETS) as (file, sheets, link):
+        shown = list(_shown(sheets, link, source))
+        file.write(_page(shown))
     return len(shown)
 
 

@@ -59,6 +59,23 @@ def new_folder(path: Path) -> Iterator[Path]:
             shutil.rmtree(made, ignore_errors=True)
 
 
+@contextmanager
+def new_document(target: Path, name: str, pictures: str) -> Iterator[tuple[IO[bytes], Path, str]]:
+    """Yield a file to write, a folder for its pictures, and the path of that folder from the file.
+
+    ``target`` is the file, if it has the suffix of ``name``: the folder is then beside it. Otherwise it is a folder for
+    both. Errors are those of `new_folder`.
+    """
+    if target.suffix.lower() == Path(name).suffix:
+        beside = target.with_name(f"{target.stem}-{pictures}")
+        with new_file(target) as file, new_folder(beside) as made:
+            yield file, made, beside.name
+    else:
+        with new_folder(target) as made, (made / name).open("wb") as file:
+            (made / pictures).mkdir()
+            yield file, made / pictures, pictures
+
+
 def _exists(path: Path) -> ExportFailed:
     return ExportFailed(f"{path} exists already.", next_step="Give another name, or remove it.")
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from hbr.descriptors import descriptor
 from rig.catalog.derived import described, regions_of
-from rig.catalog.exchange.new_files import new_file, new_folder
+from rig.catalog.exchange.new_files import new_document, new_file, new_folder
 from rig.catalog.facts import Enrollment, View
 from rig.catalog.images import path_of
 from rig.catalog.records import EnrollmentStatus, Region
@@ -131,23 +131,13 @@ def write_table(target: Path, source: CatalogSource) -> int:
     ``target`` is the file (suffix ``.csv``; the images are in a folder beside it), or a folder for ``views.csv`` and
     the images. Errors are those of `write_folder`.
     """
-    if target.suffix.lower() == ".csv":
-        images = target.with_name(f"{target.stem}-{IMAGE_FOLDER}")
-        with new_file(target) as file, new_folder(images) as made:
-            return _write_table(file, made, images.name, source)
-    with new_folder(target) as made, (made / TABLE).open("wb") as file:
-        return _write_table(file, made / IMAGE_FOLDER, IMAGE_FOLDER, source)
-
-
-def _write_table(file: IO[bytes], images: Path, link: str, source: CatalogSource) -> int:
-    """Write the table to ``file`` and the images into ``images``; ``link`` is its path from the table."""
     count = 0
-    with _csv(file, _CSV) as table:
+    with new_document(target, TABLE, IMAGE_FOLDER) as (file, images, link), _csv(file, _CSV) as table:
         for rows in _rows(source):
             count += 1
             for row, view in rows:
                 within = Path(row["image"]).relative_to(IMAGE_FOLDER)
-                (images / within).parent.mkdir(parents=True, exist_ok=True)
+                (images / within).parent.mkdir(exist_ok=True)
                 (images / within).write_bytes(source.content(view.image))
                 table.writerow({**row, "image": Path(link, within).as_posix()})
     return count
@@ -259,6 +249,7 @@ def _write_parquet(path: Path, columns: Mapping[str, type], portions: Iterable[l
     schema = pa.schema([(name, kinds[kind]) for name, kind in columns.items()])
     count = 0
     with new_file(path) as file, pq.ParquetWriter(file, schema) as writer:
-        for count, rows in enumerate(portions, 1):  # noqa: B007
+        for rows in portions:
+            count += 1
             writer.write_table(pa.Table.from_pylist(rows, schema))
     return count

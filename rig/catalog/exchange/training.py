@@ -6,7 +6,7 @@ Decision: docs/decisions/0038.
 """
 
 import json
-from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import lru_cache, partial
@@ -138,7 +138,7 @@ def write_training(
             (made / DATABASE_NAME).chmod(0o644)
             yield from transfer(CatalogSource(source.catalog, source.names, used_only=True), copy, jobs=jobs)
         # Find the objects in the images, in processes.
-        pictures = _pictures(source, objects)
+        pictures = yield from _pictures(source, objects)
         masks: dict[int, _Mask] = {}
         yield JobProgress(0, len(pictures))
         work = partial(_annotate, made)
@@ -156,10 +156,11 @@ def write_training(
     return TrainingExport(len(objects), {part: len(own) for part, own in by_part.items()}, without)
 
 
-def _pictures(source: CatalogSource, objects: Iterable[Enrolled]) -> list[_Picture]:
-    """Return the views of objects. Of several views with the same image it is the first one."""
+def _pictures(source: CatalogSource, objects: Sequence[Enrolled]) -> Generator[JobProgress, None, list[_Picture]]:
+    """Return the views of objects, with progress in objects. Of several views with the same image it is the first."""
     pictures: dict[str, _Picture] = {}
     for number, (item, enrollment, regions) in enumerate(objects):
+        yield JobProgress(number, len(objects))
         evidence = described(source.catalog, enrollment, item.name).segmentation
         for view, region, found in zip(enrollment.views, regions, evidence, strict=True):
             session = enrollment.sessions[view.session]
