@@ -3,7 +3,6 @@
 import json
 import shutil
 import sqlite3
-import zipfile
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -13,28 +12,20 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from rig.catalog import Catalog
-from rig.catalog.edit import set_texts
-from rig.catalog.exchange import import_objects, plan_import, read_bundle, read_objects, write_bundle
-from rig.catalog.exchange.bundle import MANIFEST, OBJECTS
-from rig.catalog.failures import DATABASE_NAME
+from rig.catalog.exchange.bundle import read_bundle, write_bundle
+from rig.catalog.facts import SCHEMA_VERSION, View
 from rig.catalog.results import correct, record
-from rig.catalog.schema import SCHEMA_VERSION
+from rig.catalog.transfer import CatalogSource
 from rig.catalog.verify import verify
+from rig.config.catalog_place import DATABASE_NAME
 from rig.core.errors import ImportRejected, RigError
-from rig.views import image_files as images
 from sim.clock import VirtualClock
 from tests.fuzz.commands import Commands, cases
 from tests.fuzzing import fuzz_settings, limited
-from tests.rig.catalog.catalog_samples import (
-    PROVENANCE,
-    described,
-    finished,
-    image,
-    new_result,
-    plan,
-    true_fill,
-    without_waiting,
-)
+from tests.rig.catalog import catalog_samples as samples
+from tests.rig.catalog.catalog_samples import PROVENANCE, fill, finished, image, new_result, plan, without_waiting
+from tests.rig.catalog.exchange.exchange_samples import changed_bundle, facts, import_bundle
+from tests.rig.catalog.test_hostile_catalogs import seal_as_the_sender
 
 pytestmark = pytest.mark.timeout(7200)
 
@@ -56,13 +47,12 @@ def sample(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("fuzz")
     with pytest.MonkeyPatch.context() as patch, Catalog.open(folder / "catalog", clock=VirtualClock()) as catalog:
         without_waiting(patch)
-        true_fill(catalog, "mug", 2, 0, (2, 0, 12, 12))
-        tin = catalog.begin("tin", planned_azimuth_deg=plan(2), provenance=PROVENANCE)
-        tin.store_empty_table(image(9))
-        tin.add(described(0, 3, segmentation={"method": "none", "issues": []}), image(3))
+        fill(catalog, "mug", 2, 0, (2, 0, 20, 20))
+        tin = catalog.begin("tin", planned_azimuth_deg=plan(2), provenance=PROVENANCE, empty_table=image(9))
+        tin.add(samples.record(0), image(3))
         record(catalog, new_result(), image(4))
         correct(catalog, 1, object_name="tin", reason="read the label")
-        write_bundle(folder / "good.zip", read_objects(catalog))
+        write_bundle(folder / "good.zip", CatalogSource(catalog))
     return folder
 
 
@@ -141,40 +131,34 @@ def test_any_catalog_ends_with_a_documented_exit_code(
     commands.run(*command.split(), "--bench", "sim")
 
 
-def _leaves(value: Any) -> list[tuple[Any, Any]]:
-    """Return container and key of every value in JSON."""
-    items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
-    return [place for key, inner in items for place in [(value, key), *_leaves(inner)]]
-
-
-@given(data=st.data())
+@given(kind=st.sampled_from(["value", "value", "value", "bytes", "schema", "version"]), data=st.data())
 @fuzz_settings(0.06)
 def test_bundle_with_any_value_is_imported_or_rejected(
-    sample: Path, tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
+    sample: Path, tmp_path_factory: pytest.TempPathFactory, kind: str, data: st.DataObject
 ) -> None:
-    with zipfile.ZipFile(sample / "good.zip") as archive:
-        members = {info.filename: archive.read(info) for info in archive.infolist()}
-    lines = [json.loads(line) for line in members[OBJECTS].splitlines()]
-    manifest = json.loads(members[MANIFEST])
-    container, key = data.draw(
-        st.sampled_from([*_leaves(lines), *((manifest, name) for name in ("format", "version"))])
-    )
-    container[key] = data.draw(HOSTILE)
-    members[OBJECTS] = "".join(json.dumps(line) + "\n" for line in lines).encode()
-    members[MANIFEST] = json.dumps(manifest | {"objects_sha256": images.digest(members[OBJECTS])}).encode()
     folder = tmp_path_factory.mktemp("victim")
-    with zipfile.ZipFile(folder / "a.zip", "w") as target:
-        for name, content in members.items():
-            target.writestr(name, content)
+
+    def change(database: Path) -> None:
+        spoil(database, kind, data)
+        if kind == "value" and data.draw(st.booleans()):
+            try:
+                seal_as_the_sender(database.parent)
+            except (ValueError, KeyError, TypeError, sqlite3.Error):
+                assume(False)
+
+    bundle = changed_bundle(sample / "good.zip", folder / "a.zip", change)
     with limited(), Catalog.open(folder / "catalog", clock=VirtualClock()) as catalog:
         try:
-            finished(import_objects(catalog, plan_import(catalog, read_bundle(folder / "a.zip")), jobs=1))
+            import_bundle(catalog, bundle)
         except ImportRejected:
             assert catalog.objects() == []
         else:
             assert finished(verify(catalog, jobs=1)).findings == ()
-            write_bundle(folder / "b.zip", read_objects(catalog))
-            read_bundle(folder / "b.zip")
+            write_bundle(folder / "b.zip", CatalogSource(catalog))
+            with read_bundle(folder / "b.zip", VirtualClock()) as source:
+                assert [facts(item) for item in source.items()] == [
+                    facts(item) for item in CatalogSource(catalog).items()
+                ]
     shutil.rmtree(folder)
 
 
@@ -207,19 +191,18 @@ def test_everything_that_the_catalog_accepts_survives_export_and_import(
     ):
         try:
             begun = catalog.begin(name, planned_azimuth_deg=[azimuth_deg], provenance=PROVENANCE)
-            within = region if region and min(region) >= 0 and min(region[2:]) else None
-            view = described(0, 1, within, azimuth_deg=azimuth_deg, evidence=evidence, captured_ns=captured_ns)
-            if region != within:
-                described(0, 1, None, region=region)
+            view = View(index=0, azimuth_deg=azimuth_deg, evidence=evidence, captured_ns=captured_ns, region=region)
             begun.add(view, image(1))
             begun.finish()
-            set_texts(catalog, begun.object_name, label=texts[0], note=texts[1])
+            catalog.set_texts(begun.object_name, label=texts[0], note=texts[1])
         except (RigError, TypeError, OverflowError):
             pass
         if not catalog.objects() or not catalog.objects()[0].views:
             return
-        assert write_bundle(folder / "a.zip", read_objects(catalog)) == 1
-        finished(import_objects(copy, plan_import(copy, read_bundle(folder / "a.zip")), jobs=1))
-        assert [item for item, _ in read_objects(copy)] == [item for item, _ in read_objects(catalog)]
+        assert write_bundle(folder / "a.zip", CatalogSource(catalog)) == 1
+        import_bundle(copy, folder / "a.zip")
+        assert [facts(item) for item in CatalogSource(copy).items()] == [
+            facts(item) for item in CatalogSource(catalog).items()
+        ]
         assert finished(verify(copy, jobs=1)).findings == ()
     shutil.rmtree(folder)

@@ -4,8 +4,8 @@ import sqlite3
 import struct
 import zipfile
 import zlib
-from collections.abc import Mapping
-from contextlib import closing
+from collections.abc import Callable
+from contextlib import closing, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -16,7 +16,8 @@ import numpy as np
 from rig.catalog import Catalog
 from rig.catalog.derived import views
 from rig.catalog.exchange.bundle import read_bundle
-from rig.catalog.transfer import Conflict, Source, Transferred, transfer
+from rig.catalog.facts import seal_of
+from rig.catalog.transfer import Conflict, Item, Source, Transferred, transfer
 from rig.config.catalog_place import DATABASE_NAME
 from sim.clock import VirtualClock
 from tests.rig.catalog.catalog_samples import NOW, PROVENANCE, fill, finished, image, plan, record, sql
@@ -86,20 +87,37 @@ def png_of(width: int, height: int) -> bytes:
 
 def rewritten(bundle: Path, *statements: str, sealed: bool = True, **members: bytes | None) -> Path:
     """A bundle with a changed database, with right digests if it is ``sealed``, and with other ``members``."""
-    with zipfile.ZipFile(bundle) as archive:
-        found: Mapping[str, bytes | None] = {info.filename: archive.read(info) for info in archive.infolist()}
-    with TemporaryDirectory() as folder:
-        database = Path(folder, DATABASE_NAME)
-        database.write_bytes(found[DATABASE_NAME] or b"")
+
+    def change(database: Path) -> None:
         sql(database.parent, "PRAGMA ignore_check_constraints = ON", *statements)
         if sealed:
             seal_as_the_sender(database.parent)
-        with closing(sqlite3.connect(database)) as connection:
+
+    return changed_bundle(bundle, bundle.with_name("changed.rigcat.zip"), change, **members)
+
+
+def changed_bundle(bundle: Path, target: Path, change: Callable[[Path], None], **members: bytes | None) -> Path:
+    """A bundle after a ``change`` of its database, and with other ``members``."""
+    with zipfile.ZipFile(bundle) as archive:
+        found: dict[str, bytes | None] = {info.filename: archive.read(info) for info in archive.infolist()}
+    with TemporaryDirectory() as folder:
+        database = Path(folder, DATABASE_NAME)
+        database.write_bytes(found[DATABASE_NAME] or b"")
+        change(database)
+        with suppress(sqlite3.Error), closing(sqlite3.connect(database)) as connection:
             connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
-        found = {**found, DATABASE_NAME: database.read_bytes(), **members}
-    target = bundle.with_name("changed.rigcat.zip")
+        found |= {DATABASE_NAME: database.read_bytes(), **members}
     with zipfile.ZipFile(target, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, content in found.items():
             if content is not None:
                 archive.writestr(name, content)
     return target
+
+
+def facts(item: Item) -> tuple[object, ...]:
+    """Everything that a transfer keeps of an object."""
+    enrollments = [
+        (one.enrollment.key, seal_of(one.enrollment), one.status, one.finished_utc, one.seal)
+        for one in item.enrollments
+    ]
+    return item.name, item.label, item.note, item.created_utc, enrollments

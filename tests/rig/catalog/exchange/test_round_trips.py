@@ -10,9 +10,8 @@ import cv2
 import numpy as np
 import pytest
 
-from rig.catalog import Catalog, EnrollmentState
+from rig.catalog import Catalog
 from rig.catalog.exchange.bundle import read_bundle, write_bundle
-from rig.catalog.facts import seal_of
 from rig.catalog.results import find_results, record
 from rig.catalog.transfer import CatalogSource, Conflict, copy, transfer
 from rig.catalog.verify import verify
@@ -20,16 +19,11 @@ from rig.core.errors import CatalogDamaged, CatalogError, ExportFailed, ObjectEx
 from rig.core.next_steps import Do
 from sim.clock import VirtualClock
 from tests.rig.catalog.catalog_samples import NOW, PROVENANCE, OpenCatalog, fill, finished, image, new_result, sql
-from tests.rig.catalog.exchange.exchange_samples import import_bundle, model, pictures, run_import, untouched
+from tests.rig.catalog.exchange.exchange_samples import facts, import_bundle, model, pictures, run_import, untouched
 
 
-def enrollments(catalog: Catalog) -> list[list[tuple[object, ...]]]:
-    """Everything that a transfer keeps of the objects of a catalog."""
-
-    def facts(one: EnrollmentState) -> tuple[object, ...]:
-        return one.enrollment.key, seal_of(one.enrollment), one.status, one.finished_utc, one.seal
-
-    return [[facts(one) for one in catalog.object(item.name).enrollments] for item in catalog.objects()]
+def everything(catalog: Catalog) -> list[tuple[object, ...]]:
+    return [facts(item) for item in CatalogSource(catalog).items()]
 
 
 class TestBundles:
@@ -39,8 +33,7 @@ class TestBundles:
         done = import_bundle(other, tmp_path / "a.rigcat.zip")
         assert (done.objects, done.views) == (3, 11)
         assert finished(verify(other)).findings == ()
-        assert enrollments(other) == enrollments(full)
-        assert [one.note for one in other.objects()] == [one.note for one in full.objects()]
+        assert everything(other) == everything(full)
         assert model(other) == model(full)
         assert pictures(other) == pictures(full)
         tin = other.resume("tin", provenance=PROVENANCE)  # an unfinished enrollment continues in the copy
@@ -65,7 +58,7 @@ class TestBundles:
         stored = cv2.imread(str(tmp_path / "unpacked" / "images" / rows[0][1][:2] / rows[0][1]))
         assert np.array_equal(stored, image(20))
         with Catalog.open(tmp_path / "unpacked", clock=VirtualClock(NOW), create=False, read_only=True) as unpacked:
-            assert enrollments(unpacked) == enrollments(full)
+            assert everything(unpacked) == everything(full)
 
     def test_check_of_a_bundle_changes_nothing(self, bundle: Path, open_catalog: OpenCatalog) -> None:
         catalog = open_catalog("catalog")
@@ -121,7 +114,7 @@ class TestCopy:
         assert (done.objects, done.views, done.results) == (3, 13, 1)
         assert [line.digest for line in other.log()[:-1]] == [line.digest for line in full.log()]
         assert other.log()[-1].action == "copied"
-        assert enrollments(other) == enrollments(full)
+        assert everything(other) == everything(full)
         assert pictures(other) == pictures(full)
         assert [one.answered for one in find_results(other)] == [one.answered for one in find_results(full)]
         other.undelete("last")
