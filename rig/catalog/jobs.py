@@ -1,9 +1,9 @@
 """Parts that the long jobs of a catalog share: progress, and portions of images for processes."""
 
 import os
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator
 from dataclasses import dataclass
-from itertools import groupby, islice
+from itertools import islice
 from typing import Final, TypeVar
 
 from rig.core.cluster import Cluster
@@ -39,18 +39,6 @@ def portions(items: Iterable[_T]) -> Iterator[tuple[_T, ...]]:
     waiting = iter(items)
     while portion := tuple(islice(waiting, PORTION)):
         yield portion
-
-
-def portions_of_groups(items: Sequence[_T], group: Callable[[_T], object]) -> Iterator[tuple[_T, ...]]:
-    """Yield the items in portions that divide no group; the items of a group follow each other."""
-    portion: list[_T] = []
-    for _, own in groupby(items, group):
-        portion += own
-        if len(portion) >= PORTION:
-            yield tuple(portion)
-            portion = []
-    if portion:
-        yield tuple(portion)
 
 
 def processes(wanted: Jobs | None, items: int) -> Jobs:
