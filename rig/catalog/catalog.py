@@ -127,8 +127,7 @@ class Catalog(AbstractContextManager["Catalog"]):
         with self.database.read() as transaction:
             found = state.find(transaction, name)
             (summary,) = state.summaries(transaction, object_id=found.object_id)
-            own = state.Ended.object_id == found.object_id
-            return ObjectDetails(summary, tuple(state.enrollments(transaction, own)))
+            return ObjectDetails(summary, tuple(state.enrollments(transaction, state.of_object(found.object_id))))
 
     def first_views(self) -> dict[str, int]:
         """Return the id of one view of each object in use, to show the object by."""
@@ -151,7 +150,7 @@ class Catalog(AbstractContextManager["Catalog"]):
             with self.database.read() as transaction:
                 conditions = []
                 if name is not None:
-                    conditions = [state.Ended.object_id == state.find(transaction, name).object_id]
+                    conditions = [state.of_object(state.find(transaction, name).object_id)]
                 state.check(transaction, *conditions)
         except CatalogDamaged as error:
             return error

@@ -101,7 +101,7 @@ def _transaction(connection: Connection) -> Transaction:
 def create_tables(connection: Connection) -> None:
     """Create the tables of a new catalog."""
     Row.metadata.create_all(connection)
-    first = {"application": APPLICATION, "version": str(SCHEMA_VERSION), "id": uuid.uuid4().hex, "head": "0  0 0"}
+    first = {"application": APPLICATION, "version": str(SCHEMA_VERSION), "id": uuid.uuid4().hex, "head": "0  0 0 0"}
     connection.execute(insert(Property), [{"key": key, "value": value} for key, value in first.items()])
 
 

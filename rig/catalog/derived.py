@@ -349,10 +349,12 @@ def unfinished_camera_settings(catalog: Catalog, name: str) -> list[dict[str, An
     return [settings for _, settings in shown]
 
 
-def _settings(evidence: Iterable[tuple[int, JsonObject]]) -> list[tuple[int, dict[str, Any]]]:
+def _settings(evidence: Iterable[tuple[int, JsonObject | None]]) -> list[tuple[int, dict[str, Any]]]:
     """Return each combination of the camera's settings once, with the first view that has it."""
     found: list[tuple[int, dict[str, Any]]] = []
     for view_id, one in evidence:
+        if one is None:
+            raise damaged("the evidence of a view", None)
         locks = one.get("locks")
         if isinstance(locks, dict) and all(locks != known for _, known in found):
             found.append((view_id, locks))
@@ -364,6 +366,8 @@ def newest_view(catalog: Catalog) -> str | None:
     with catalog.database.read() as transaction:
         newest = max((one.enrollment_id for one in state.used(transaction)), default=0)
         view_id = transaction.scalar(select(View.id).where(View.index == 0, View.enrollment_id == newest))
+        if view_id is None and newest:
+            raise state.changed(["the first view of the newest enrollment"])
         return None if view_id is None else state.view(transaction, view_id).image
 
 

@@ -26,7 +26,7 @@ def catalog_errors(root: Path, busy_timeout_s: float) -> Iterator[None]:
         if known is None:
             raise
         raise known from error
-    except UnicodeDecodeError as error:  # SQLite quotes what it cannot read in its message
+    except (UnicodeDecodeError, OverflowError) as error:  # text that is none, or a number that no program stored
         raise _damaged(root, {"sqlite": str(error)}) from error
     except OSError as error:
         raise _of_system(error, root) from error

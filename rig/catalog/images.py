@@ -193,12 +193,12 @@ class FolderImages(Images):
 
     def size(self, name: str) -> int:
         with suppress(FileNotFoundError):
-            return (self.root / path_of(name)).lstat().st_size
+            return self.file(name).lstat().st_size
         return 0
 
     def remove(self, names: Iterable[str]) -> None:
         for name in names:
-            path = self.root / path_of(name)
+            path = self.file(name)
             path.unlink(missing_ok=True)
             with suppress(OSError):  # its folder is not empty
                 path.parent.rmdir()

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from datetime import datetime
 from typing import Any, Final, NamedTuple
 
-from sqlalchemy import func, insert, select, true, update
+from sqlalchemy import func, insert, select, update
 from sqlalchemy.orm import Session as Transaction
 
 from rig.catalog import digests
@@ -23,7 +23,9 @@ from rig.core.errors import CatalogDamaged
 from rig.core.masking import masked
 from rig.core.next_steps import Do
 
-_HEAD: Final = re.compile(r"([0-9]{1,15}) ([0-9a-f]{64}|) ([0-9]{1,15}) ([0-9]{1,15})")
+_HEAD: Final = re.compile(r"([0-9]{1,15}) ([0-9a-f]{64}|) ([0-9]{1,15}) ([0-9]{1,15}) ([0-9]{1,15})")
+_COUNTED: Final = (Entry.deleted, Entry.status, Entry.result)
+"""A line counts for the state of an object, the status of an enrollment, or a result if it has a value here."""
 _COLUMNS: Final = tuple(column.name for column in Entry.__table__.columns)
 
 
@@ -41,35 +43,35 @@ def append(
 
 def add(transaction: Transaction, *entries: Entry) -> None:
     """Add lines to the log after its last one; each gets its number and its digest."""
-    last, before, states, statuses = _end(transaction)
+    last, before, counts = _end(transaction)
     rows = []
     for entry in entries:
         last += 1
-        states += entry.deleted is not None
-        statuses += entry.status is not None
+        counts = tuple(
+            count + (getattr(entry, column.key) is not None) for count, column in zip(counts, _COUNTED, strict=True)
+        )
         entry.id = last
         entry.digest = before = digest_of(entry, before)
         rows.append({name: getattr(entry, name) for name in _COLUMNS})
     if rows:
         transaction.execute(insert(Entry), rows)
-        value = f"{last} {before} {states} {statuses}"
+        value = " ".join(map(str, (last, before, *counts)))
         transaction.execute(update(Property).where(Property.key == "head").values(value=value))
 
 
 class _End(NamedTuple):
-    """The last line and its digest; how many lines give an object a state, and how many an enrollment a status."""
+    """The last line and its digest, and how many lines have a value in each column of `_COUNTED`."""
 
     line: int
     digest: str
-    states: int
-    statuses: int
+    counts: tuple[int, ...]
 
 
 def _end(transaction: Transaction) -> _End:
     found = transaction.scalar(select(Property.value).where(Property.key == "head"))
     if (parts := _HEAD.fullmatch(str(found))) is None:
         raise damaged("the end of its log", found)
-    return _End(int(parts[1]), parts[2], int(parts[3]), int(parts[4]))
+    return _End(int(parts[1]), parts[2], (int(parts[3]), int(parts[4]), int(parts[5])))
 
 
 def head(transaction: Transaction) -> tuple[int, str]:
@@ -78,28 +80,18 @@ def head(transaction: Transaction) -> tuple[int, str]:
 
 
 def check_complete(transaction: Transaction) -> None:
-    """Raise `CatalogDamaged` if a line that gives a state or a status is missing, or was changed not to give one.
+    """Raise `CatalogDamaged` if a line that counts for the state or the results is missing, or counts no more.
 
-    Without it, the line before would count. A line that counts is compared with its digest where it is used.
+    The line before would count instead. A line that counts is compared with its digest where it is used.
     """
-    if not _is_complete(transaction):
+    end = _end(transaction)
+    found = [transaction.scalar(select(func.max(Entry.id))) or 0]
+    found += [transaction.scalar(select(func.count()).where(column.is_not(None))) or 0 for column in _COUNTED]
+    if found != [end.line, *end.counts]:
         raise CatalogDamaged(
             "Lines of the catalog's log are missing or were changed.",
             next_step=(Do.VERIFY_CATALOG(), "Then use a backup."),
         )
-
-
-def _is_complete(transaction: Transaction) -> bool:
-    end = _end(transaction)
-    found = [
-        transaction.scalar(select(counted).where(condition)) or 0
-        for counted, condition in (
-            (func.max(Entry.id), true()),
-            (func.count(), Entry.deleted.is_not(None)),
-            (func.count(), Entry.status.is_not(None)),
-        )
-    ]
-    return found == [end.line, end.states, end.statuses]
 
 
 def wrong_lines(transaction: Transaction, first: int = 1, last: int | None = None) -> Iterator[int]:
@@ -113,7 +105,7 @@ def wrong_lines(transaction: Transaction, first: int = 1, last: int | None = Non
         yield from (number for number in numbers if number in wrong or number not in present)
     newest = transaction.scalar(select(Entry.digest).where(Entry.id == end)) or ""
     beyond = transaction.scalar(select(func.max(Entry.id))) or 0
-    if last is None and (newest != digest or beyond > end or not _is_complete(transaction)):
+    if last is None and (newest != digest or beyond > end):
         yield max(end, beyond)
 
 

@@ -240,12 +240,13 @@ def find_results(catalog: Catalog, wanted: ResultFilter = ResultFilter()) -> lis
     CatalogDamaged
         A result or a correction is not as it was recorded.
     """
-    is_wanted = Entry.action == Action.IDENTIFIED
+    is_wanted: ColumnElement[bool] = Entry.result.is_not(None)
     if wanted.since is not None:
         is_wanted = and_(is_wanted, Entry.time_utc >= wanted.since)
     if wanted.before is not None:
         is_wanted = and_(is_wanted, Entry.time_utc < wanted.before)
     with catalog.database.read() as transaction:
+        log.check_complete(transaction)
         found = _load(transaction, or_(is_wanted, Entry.action == Action.RESULT_CORRECTED))
     return [result for result in found if wanted.accepts(result)]
 

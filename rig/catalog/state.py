@@ -11,7 +11,7 @@ from difflib import get_close_matches
 from hashlib import sha256
 from typing import Any
 
-from sqlalchemy import ColumnElement, and_, exists, false, func, select, true
+from sqlalchemy import ColumnElement, and_, exists, false, func, or_, select, true, union
 from sqlalchemy.orm import Session as Transaction
 from sqlalchemy.orm import aliased, selectinload
 
@@ -107,7 +107,7 @@ def used(transaction: Transaction, *, checked: bool = False) -> list[Used]:
         They are ``checked``, and the name or the seal of an object is not as it was written.
     """
     wanted = (
-        select(Named.object_id, Named.object_name, Ended.enrollment_id, Enrollment.key, Ended.seal, Ended.id, Named.id)
+        select(Named.object_id, Named.object_name, Ended.enrollment_id, Enrollment.key, Ended.seal, Ended.id)
         .join(Ended, Ended.object_id == Named.object_id)
         .outerjoin(Enrollment, Enrollment.id == Ended.enrollment_id)
         .where(IN_USE, IS_STATUS, Ended.status == EnrollmentStatus.COMPLETE)
@@ -115,12 +115,11 @@ def used(transaction: Transaction, *, checked: bool = False) -> list[Used]:
     )
     rows = transaction.execute(wanted).all()
     if checked:
-        log.check_complete(transaction)
-        check_lines(transaction, {line for row in rows for line in row[5:]})
+        check_fold(transaction)
     if wrong := [str(row[1]) for row in rows if None in row]:  # the enrollment is missing, or no program wrote this
         raise changed(wrong)
     found: Sequence[Sequence[Any]] = rows
-    return [Used(*row[:6]) for row in found]
+    return [Used(*row) for row in found]
 
 
 def first_views(transaction: Transaction, *columns: Any) -> list[Any]:
@@ -137,6 +136,16 @@ def first_views(transaction: Transaction, *columns: Any) -> list[Any]:
 def version(transaction: Transaction) -> str:
     """Return a digest of what searches compare with: the names of the objects and the seals of their enrollments."""
     return sha256(ascii([(one.name, one.seal) for one in used(transaction)]).encode()).hexdigest()
+
+
+def check_fold(transaction: Transaction) -> None:
+    """Raise `CatalogDamaged` if a line that gives a present state or status is missing or not as it was written."""
+    log.check_complete(transaction)
+    lines = [
+        transaction.scalars(select(Named.id).where(IS_STATE)),
+        transaction.scalars(select(Ended.id).where(IS_STATUS)),
+    ]
+    check_lines(transaction, {line for found in lines for line in found})
 
 
 def check_lines(transaction: Transaction, ids: Collection[int]) -> None:
@@ -172,7 +181,7 @@ def find(transaction: Transaction, name: str, *, deleted: bool = False) -> Entry
     if found is not None:
         check_lines(transaction, [found.id])
         return found
-    check_states(transaction)  # or its name was changed
+    check_fold(transaction)  # its name or its state may have been changed
     by_folded = {str(known).casefold(): known for known in transaction.scalars(select(Named.object_name).where(*among))}
     near = [by_folded[folded] for folded in get_close_matches(name.casefold(), by_folded)]
     state = "deleted object" if deleted else "object"
@@ -240,7 +249,6 @@ def summaries(transaction: Transaction, *, deleted: bool = False, object_id: int
     CatalogDamaged
         The state of an object is not as it was written, or the views of its complete enrollment are not all there.
     """
-    log.check_complete(transaction)
     conditions = _among(deleted) if object_id is None else [IS_STATE, Named.object_id == object_id]
     count = select(func.count()).where(View.enrollment_id == Ended.enrollment_id).correlate(Ended).scalar_subquery()
     columns = (
@@ -251,13 +259,21 @@ def summaries(transaction: Transaction, *, deleted: bool = False, object_id: int
     planned = func.json_array_length(Enrollment.planned_azimuth_deg)
     wanted = (
         select(Ended.object_id, Ended.status, Ended.finished_utc, count, planned, Ended.id)
-        .join(Enrollment, Enrollment.id == Ended.enrollment_id)
-        .where(IS_STATUS, Ended.status.in_([EnrollmentStatus.COMPLETE, EnrollmentStatus.IN_PROGRESS]))
+        .outerjoin(Enrollment, Enrollment.id == Ended.enrollment_id)
+        .where(
+            or_(Enrollment.id.is_not(None), Ended.status == EnrollmentStatus.COMPLETE),  # or it was discarded
+            IS_STATUS,
+            Ended.status.in_([EnrollmentStatus.COMPLETE, EnrollmentStatus.IN_PROGRESS]),
+        )
     )
     if object_id is not None:
         wanted = wanted.where(Ended.object_id == object_id)
     current = {(row[0], row[1]): row[2:] for row in transaction.execute(wanted)}
-    check_lines(transaction, {one.id for one in states} | {row[3] for row in current.values()})
+    if object_id is None:
+        check_fold(transaction)
+    else:
+        log.check_complete(transaction)
+        check_lines(transaction, {one.id for one in states} | {row[3] for row in current.values()})
     found = []
     for one in states:
         enrolled_utc, views, planned_views, _ = current.get((one.object_id, EnrollmentStatus.COMPLETE), (None, 0, 0, 0))
@@ -277,6 +293,13 @@ def summaries(transaction: Transaction, *, deleted: bool = False, object_id: int
             )
         )
     return found
+
+
+def of_object(object_id: int | None) -> ColumnElement[bool]:
+    """Return the condition for the enrollments of an object: those that say so, and those of which the log says so."""
+    own = select(Enrollment.id).where(Enrollment.object_id == object_id)
+    logged = select(_Later.enrollment_id).where(_Later.object_id == object_id, _Later.status.is_not(None))
+    return Ended.enrollment_id.in_(union(own, logged))
 
 
 def enrollments(transaction: Transaction, *conditions: ColumnElement[bool]) -> list[EnrollmentState]:
@@ -367,7 +390,7 @@ def unfinished(transaction: Transaction, state: Entry) -> EnrollmentState:
 
 def of_status(transaction: Transaction, state: Entry, status: EnrollmentStatus) -> EnrollmentState | None:
     """Return the enrollment of an object that is complete or in progress; None if there is none."""
-    return next(iter(enrollments(transaction, Ended.object_id == state.object_id, Ended.status == status)), None)
+    return next(iter(enrollments(transaction, of_object(state.object_id), Ended.status == status)), None)
 
 
 def check_not_enrolled(transaction: Transaction, state: Entry) -> None:
@@ -392,24 +415,15 @@ def check_not_enrolled(transaction: Transaction, state: Entry) -> None:
 
 def check(transaction: Transaction, *conditions: ColumnElement[bool]) -> None:
     """Raise `CatalogDamaged` if objects or enrollments, all or some, are not as they were written."""
-    log.check_complete(transaction)
+    check_fold(transaction)
     rows = transaction.execute(
-        select(Enrollment.id, Ended.seal, Ended.object_id, Ended.id, Enrollment.object_id)
+        select(Enrollment.id, Ended.seal, Ended.object_id, Enrollment.object_id)
         .join(Ended, Ended.enrollment_id == Enrollment.id)
         .where(IS_STATUS, *conditions)
     ).all()
-    check_lines(transaction, [row[3] for row in rows])
     owner = {row[0]: row[2] for row in rows}
-    wrong = [row[2] for row in rows if row[2] != row[4]]
+    wrong = [row[2] for row in rows if row[2] != row[3]]
     wrong += [owner[one] for one in digests.damaged_enrollments(transaction, {row[0]: row[1] for row in rows})]
     if wrong:
         raise changed([str(by_id(transaction, one).object_name) for one in dict.fromkeys(wrong)])
-    if not conditions:
-        check_states(transaction)
-        used(transaction)
-
-
-def check_states(transaction: Transaction) -> None:
-    """Raise `CatalogDamaged` if the state of an object, in use or deleted, is not as it was written."""
-    log.check_complete(transaction)
-    check_lines(transaction, list(transaction.scalars(select(Named.id).where(IS_STATE))))
+    used(transaction)

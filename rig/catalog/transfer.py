@@ -146,17 +146,16 @@ class CatalogSource:
             Something is not as it was stored, or this program would not have stored it.
         """
         with self.catalog.database.read() as transaction:
-            log.check_complete(transaction)
+            state.used(transaction, checked=True)
             if self.names:
                 by_id = {one.id: one for one in (state.find(transaction, name) for name in self.names)}
                 wanted: Sequence[Entry] = sorted(by_id.values(), key=lambda one: one.object_id or 0)
             else:
                 wanted = transaction.scalars(select(Named).where(state.IN_USE).order_by(Named.object_id)).all()
-                state.check_lines(transaction, [one.id for one in wanted])
             transaction.expunge_all()
             used: set[str] = set()
             for known in wanted:
-                conditions = [Ended.object_id == known.object_id]
+                conditions = [state.of_object(known.object_id)]
                 conditions += [Ended.status == EnrollmentStatus.COMPLETE] if self.used_only else []
                 found = state.enrollments(transaction, *conditions)
                 item = Item(
