@@ -26,7 +26,7 @@ from calibration.procedures import Backlash, CameraModel, Encoder, GyroScale, Mo
 from hbr.evaluation.statistics import wilson
 from rig.bench import Bench, calibrate
 from rig.calibrations import CalibrationResult, CalibrationStore
-from rig.catalog import Catalog
+from rig.catalog import Catalog, derived
 from rig.config import load_config
 from rig.core.errors import RigError
 from rig.events.events import Identified, Moved
@@ -109,7 +109,7 @@ def run(seed: int, noise: NoiseModel, orientation: str, calibrated: bool, folder
                             enroll(bench, catalog, name, views=VIEWS), operator, orientation
                         )
                     continue
-                index = model_of(catalog.views().views)
+                index = model_of(derived.views(catalog))
             rng = np.random.default_rng(seed)
             for name in names * TRIALS:
                 operator.next_object, operator.yaw_deg = name, float(rng.uniform(0, 360))

@@ -24,7 +24,7 @@ COMMANDS = {
     "gc": ("catalog", "gc", "--yes"),
     "redescribe": ("catalog", "redescribe", "--descriptor", "edges", "--jobs", "1"),
     "calibrate": ("catalog", "fit"),
-    "verify": ("catalog", "verify", "--repair", "--jobs", "1"),
+    "verify": ("catalog", "verify", "--jobs", "1"),
     "configuration": ("config", "set", "identify.max_views", "5"),
     "search": ("identify", "--save-run", "run", "--set", "bench.sim.object=dice"),
 }
