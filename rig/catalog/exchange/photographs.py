@@ -57,6 +57,7 @@ class Photographs:
     folder: Path
     now: datetime
     rejected: list[RejectedFile] = field(default_factory=list)
+    _software: str = field(default_factory=this_software)
     _found: dict[str, dict[float, tuple[Path, _Row, dict[str, Any]]]] = field(default_factory=dict)
     _inside: dict[Path, bool] = field(default_factory=dict)
 
@@ -117,7 +118,7 @@ class Photographs:
         texts = {"label": "", "note": ""}
         for index, azimuth_deg in enumerate(azimuths_deg):
             path, row, values = found[azimuth_deg]
-            by = (row.get("bench", ""), row.get("software") or this_software())
+            by = (row.get("bench", ""), row.get("software") or self._software)
             if by not in sessions:
                 provenance = Provenance(by[0], {}, {"imported_from": self.origin}, by[1])
                 sessions[by] = Session(number=len(sessions), started_utc=self.now, provenance=provenance)
