@@ -141,7 +141,6 @@ def hypotheses(
     empty_table: Background | ImageArray | None = None,
     learned: Background | None = None,
     alone: Callable[[], Sequence[Segmentation | Found]] | None = None,
-    first: Segmentation | None = None,
     most: int = MOST_HYPOTHESES,
 ) -> tuple[Segmentation, ...]:
     """Return several segmentations of a frame, the likeliest first, whose boxes differ.
@@ -159,8 +158,6 @@ def hypotheses(
     alone : callable, optional
         Returns what `without_background` returns for this frame: segmentations that count besides those with the
         learned background. No other view changes them. By default the network's alone counts.
-    first : Segmentation, optional
-        What `segment` returned for this frame and this empty-table image, if that is known.
     most : int
         Largest number of segmentations.
 
@@ -174,17 +171,16 @@ def hypotheses(
     by_picture = difference is not None and difference.reliable
     found: list[Segmentation | Found]
     if learned is None or by_picture or frame.differs is not None:
-        like = _found(frame, background, difference) if first is None else _as_found(frame, first)
-        likeliest = like if first is None else first
+        like = _found(frame, background, difference)
         if like.method is Method.PLAIN_BACKGROUND or (most == 1 and not by_picture):
-            return (_cut_out(likeliest),)
+            return (like.cut_out(),)
         share = shares(frame.small, difference if by_picture else None).object
         if by_picture:
-            found = [likeliest, *_by_network(share, Method.EMPTY_TABLE, like)]
-            if most == 1 and not _same(likeliest, found[-1]):  # an enrollment: the network's box is right more often
+            found = [like, *_by_network(share, Method.EMPTY_TABLE, like)]
+            if most == 1 and not _same(like, found[-1]):  # an enrollment: the network's box is right more often
                 found.reverse()
         else:
-            found = [likeliest, *_by_network(share, Method.NETWORK, like)]
+            found = [like, *_by_network(share, Method.NETWORK, like)]
     else:
         issues = [Issue(IssueCode.BACKGROUND_NOT_PLAIN)]
         if difference is not None:
@@ -207,11 +203,6 @@ def hypotheses(
 
 def _cut_out(found: Segmentation | Found) -> Segmentation:
     return found.cut_out() if isinstance(found, Found) else found
-
-
-def _as_found(frame: Frame, one: Segmentation) -> Found:
-    """Return the silhouette or box of a segmentation of this frame."""
-    return Found(frame.image, one.silhouette, None, one.correction, one.agreement, one.method, one.issues)
 
 
 def without_background(frame: Frame) -> tuple[Found, ...]:

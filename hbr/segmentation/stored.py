@@ -1,7 +1,6 @@
-"""Segmentations that are stored with a view: its evidence holds the silhouette.
+"""Segmentations as evidence that can be stored: it holds the silhouette.
 
-A silhouette depends on the other views of an enrollment and on the network. With the stored silhouette, a view is
-described again from its image alone: on another computer, with a later network, or after other views were lost.
+A silhouette depends on the other views of an enrollment. With it, one view is cut out again without the others.
 """
 
 import zlib

@@ -1,10 +1,12 @@
 """Takes frames while the table rotates, and checks them as `rig.views.capture` does for frames at rest."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from math import isfinite, nan
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rig.bench import Bench
 from rig.devices.camera import CameraLocks, Frame
@@ -12,10 +14,14 @@ from rig.motion.scan_speed import smear_px, time_sigma_ms
 from rig.motion.trajectory import Trajectory
 from rig.motion.turntable import Flight, Turntable
 from rig.views.capture import Attempt, ImageQuality, MotionEvidence, RejectReason, ViewEvidence
-from rig.views.stream import FrameStream, after_middle_row_ns, irregular_stamps, middle_ns
+from rig.views.stream import FrameStream, after_middle_row_ns, middle_ns
 
 READINGS: Final = 8
 """Readings of the encoder from which the angle of a frame is estimated during a flight."""
+GRID_MS: Final = 1.5
+"""Smallest tolerance for the distance of a stamp from the camera's regular rhythm."""
+GRID_SIGMAS: Final = 5.0
+FEWEST_STAMPS: Final = 4
 
 
 @dataclass(eq=False)
@@ -164,3 +170,37 @@ class FlightFrames:
         angle_deg = float(trajectory.at([middle_ns]).angle_deg[0])
         motion = replace(motion, middle_ns=middle_ns, angle_deg=angle_deg)
         return replace(attempt, evidence=replace(attempt.evidence, motion=motion))
+
+
+def irregular_stamps(stamps_ns: Sequence[int], period_s: float, jitter_ms: float) -> NDArray[np.bool_]:
+    """Return which time stamps do not fit the camera's regular rhythm, bool (n,).
+
+    Lost frames leave gaps of whole periods. The rhythm is that of most frames. Stamps that jumped, or that the computer
+    set late, do not fit it. Fewer than `FEWEST_STAMPS` stamps are compared with the period alone.
+    """
+    if len(stamps_ns) < 2:
+        return np.zeros(len(stamps_ns), np.bool_)
+    times = (np.asarray(stamps_ns, np.int64) - stamps_ns[0]) * 1e-9
+    limit_s = max(GRID_MS, GRID_SIGMAS * (jitter_ms if isfinite(jitter_ms) else 0.0)) * 1e-3
+    steps = np.diff(times)
+    whole = np.maximum(np.rint(steps / period_s), 1)
+    if len(times) < FEWEST_STAMPS:
+        off = np.abs(steps - whole * period_s) > limit_s
+        return np.concatenate([[off.all()], off])
+    # The camera's own period: it may differ by a thousandth from the nominal one.
+    regular = np.abs(steps - whole * period_s) < 0.05 * period_s
+    period_s = float(np.median(steps[regular] / whole[regular])) if regular.any() else period_s
+    numbers = np.concatenate([[0.0], np.cumsum(whole)])
+    phase = times - numbers * period_s
+    off = np.abs(phase - _densest(phase, limit_s)) > limit_s
+    return np.asarray(off, np.bool_)
+
+
+def _densest(values: NDArray[np.float64], width: float) -> float:
+    """Return the middle of the densest group of values within ``width``; nan if there are none."""
+    if not len(values):
+        return nan
+    ordered = np.sort(values)
+    ends = np.searchsorted(ordered, ordered + 2 * width, side="right")
+    first = int((ends - np.arange(len(ordered))).argmax())
+    return float(np.median(ordered[first : ends[first]]))

@@ -6,11 +6,10 @@ the time from the frame's time stamp to that moment.
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from math import hypot, isfinite, nan
+from math import hypot
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rig.config import CameraTimeConfig, RigConfig
 from rig.core.clock import Clock
@@ -18,10 +17,6 @@ from rig.devices.camera import Camera, Frame
 
 LATEST_S: Final = 1.0
 """Largest time from the stamp to the arrival of a frame whose time can be trusted."""
-GRID_MS: Final = 1.5
-"""Smallest tolerance for the distance of a stamp from the camera's regular rhythm."""
-GRID_SIGMAS: Final = 5.0
-FEWEST_STAMPS: Final = 4
 PATIENCE_S: Final = 0.1
 """Longest wait of the control loop of a moving table for a frame, because it must also feed the servo's watchdog."""
 SURE_SIGMAS: Final = 2.0
@@ -118,37 +113,3 @@ def exposed_before_stamp_ns(config: RigConfig) -> int:
     begins_ms = time.offset_ms - (exposure_us * 1e-3 + time.readout_ms) / 2
     unsure_ms = SURE_SIGMAS * hypot(time.uncertainty_ms, time.jitter_ms)
     return round(max(-begins_ms - unsure_ms, 0.0) * 1e6)
-
-
-def irregular_stamps(stamps_ns: Sequence[int], period_s: float, jitter_ms: float) -> NDArray[np.bool_]:
-    """Return which time stamps do not fit the camera's regular rhythm, bool (n,).
-
-    Lost frames leave gaps of whole periods. The rhythm is that of most frames. Stamps that jumped, or that the computer
-    set late, do not fit it. Fewer than `FEWEST_STAMPS` stamps are compared with the period alone.
-    """
-    if len(stamps_ns) < 2:
-        return np.zeros(len(stamps_ns), np.bool_)
-    times = (np.asarray(stamps_ns, np.int64) - stamps_ns[0]) * 1e-9
-    limit_s = max(GRID_MS, GRID_SIGMAS * (jitter_ms if isfinite(jitter_ms) else 0.0)) * 1e-3
-    steps = np.diff(times)
-    whole = np.maximum(np.rint(steps / period_s), 1)
-    if len(times) < FEWEST_STAMPS:
-        off = np.abs(steps - whole * period_s) > limit_s
-        return np.concatenate([[off.all()], off])
-    # The camera's own period: it may differ by a thousandth from the nominal one.
-    regular = np.abs(steps - whole * period_s) < 0.05 * period_s
-    period_s = float(np.median(steps[regular] / whole[regular])) if regular.any() else period_s
-    numbers = np.concatenate([[0.0], np.cumsum(whole)])
-    phase = times - numbers * period_s
-    off = np.abs(phase - _densest(phase, limit_s)) > limit_s
-    return np.asarray(off, np.bool_)
-
-
-def _densest(values: NDArray[np.float64], width: float) -> float:
-    """Return the middle of the densest group of values within ``width``; nan if there are none."""
-    if not len(values):
-        return nan
-    ordered = np.sort(values)
-    ends = np.searchsorted(ordered, ordered + 2 * width, side="right")
-    first = int((ends - np.arange(len(ordered))).argmax())
-    return float(np.median(ordered[first : ends[first]]))

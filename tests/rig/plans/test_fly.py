@@ -15,11 +15,12 @@ from rig.core.errors import DeviceSilent, LimitExceeded, ObjectMoved, RigError, 
 from rig.core.next_steps import Do
 from rig.events.events import Accepted, Enrolled, Event, ScanStarted
 from rig.events.lines import line
+from rig.motion.flight_views import irregular_stamps
 from rig.motion.scan_speed import SpeedLimit
 from rig.plans.estimate import dry_run
 from rig.plans.tray import TrayItem, enroll_tray
 from rig.safety.saved_state import StateStore
-from rig.views.stream import FrameStream, after_middle_row_ns, irregular_stamps
+from rig.views.stream import FrameStream, after_middle_row_ns
 from sim.bench import ShelfOperator, open_sim_bench
 from sim.faults import Fault
 from sim.noise import NoiseModel
