@@ -16,7 +16,9 @@ from benchmarks.bench_search import VIEWS_OF_AN_OBJECT, model
 from benchmarks.large_catalog import build
 from hbr import describe, pack
 from rig.catalog import Catalog
-from rig.catalog.exchange import import_objects, plan_import, read_folder
+from rig.catalog.exchange.photographs import read_folder
+from rig.catalog.jobs import finished
+from rig.catalog.transfer import transfer
 from rig.cli.ui.exit_codes import EXIT_AMBIGUOUS, EXIT_UNKNOWN
 from rig.core.clock import SystemClock, seconds_between
 
@@ -113,16 +115,14 @@ def imports(folder: Path, photographs: Path) -> None:
     bare_s, bare_cpu_s = bare_loop(files[:half])
     begin_ns, before_s = _CLOCK.now_ns(), cpu_s()
     with Catalog.open(folder / "coil", clock=_CLOCK) as catalog:
-        package = read_folder(photographs, now=_CLOCK.utc())
-        for _ in import_objects(catalog, plan_import(catalog, package)):
-            pass
+        done = finished(transfer(read_folder(photographs, now=_CLOCK.utc()), catalog, descriptors=["cedd"]))
     import_s, import_cpu_s = seconds_between(begin_ns, _CLOCK.now_ns()), cpu_s() - before_s
     rest_s, rest_cpu_s = bare_loop(files[half:])
     bare_s, bare_cpu_s = bare_s + rest_s, bare_cpu_s + rest_cpu_s
-    bare, whole = len(files) / bare_s, package.views / import_s
+    bare, whole = len(files) / bare_s, done.views / import_s
     print(f"\n{'photographs into a catalog':<64} {'wall s':>7} {'CPU s':>6} {'images/s':>9} {'ratio':>6}")
     print(f"{'decode and CEDD alone, one process':<64} {bare_s:7.1f} {bare_cpu_s:6.1f} {bare:9.0f} {1:6.2f}")
-    label = f"import of {package.views}, {len(package.gaps)} gaps, durable, {os.cpu_count()} processes"
+    label = f"import of {done.views}, {len(done.gaps)} gaps, durable, {os.cpu_count()} processes"
     print(f"{label:<64} {import_s:7.1f} {import_cpu_s:6.1f} {whole:9.0f} {whole / bare:6.2f}")
 
 
