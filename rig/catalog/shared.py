@@ -14,7 +14,7 @@ import shutil
 import threading
 from collections.abc import Callable, Collection, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any, Final, Self, TypeVar
@@ -565,6 +565,7 @@ class JournalState:
     reasons: tuple[str, ...] = ()
 
 
+@dataclass(eq=False)
 class BackgroundDelivery(AbstractContextManager["BackgroundDelivery"]):
     """A thread that delivers the journal, whenever the server answers, during the work of a ``with`` block.
 
@@ -572,26 +573,18 @@ class BackgroundDelivery(AbstractContextManager["BackgroundDelivery"]):
     object was not delivered. ``changed`` gets each new state. Both are called in the thread.
     """
 
-    def __init__(
-        self,
-        place: CatalogPlace,
-        clock: Clock,
-        report: Callable[[str], None],
-        *,
-        changed: Callable[[JournalState], None] | None = None,
-        check_s: float = CHECK_S,
-        retry_s: float = RETRY_S,
-    ) -> None:
-        self.state = JournalState()
-        self._place = place
-        self._clock = clock
-        self._report = report
-        self._changed = changed
-        self._check_s = check_s
-        self._retry_s = retry_s
+    place: CatalogPlace
+    clock: Clock
+    report: Callable[[str], None]
+    changed: Callable[[JournalState], None] = lambda _: None
+    check_s: float = CHECK_S
+    retry_s: float = RETRY_S
+    state: JournalState = field(default=JournalState(), init=False)
+
+    def __post_init__(self) -> None:
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._run, name="catalog delivery", daemon=True)
-        if place.url is not None:
+        if self.place.url is not None:
             self._thread.start()
 
     def __exit__(self, *_: object) -> None:
@@ -606,24 +599,23 @@ class BackgroundDelivery(AbstractContextManager["BackgroundDelivery"]):
                 self.state = state
                 for reason in state.reasons:
                     if reason not in before.reasons:
-                        self._report(reason)
-                if self._changed is not None:
-                    self._changed(state)
-            if self._ended.wait(self._retry_s if state.reasons else self._check_s):
+                        self.report(reason)
+                self.changed(state)
+            if self._ended.wait(self.retry_s if state.reasons else self.check_s):
                 return
 
     def _attempt(self) -> JournalState:
         """Deliver what is in the journal; return what stays there."""
         left = self.state.waiting
         try:
-            left = waiting(self._place, self._clock)
+            left = waiting(self.place, self.clock)
             if not left:
                 return JournalState()
-            done = deliver_journal(self._place, self._clock)
+            done = deliver_journal(self.place, self.clock)
             for one in done:
                 if one.conflict is None:
-                    self._report(delivery_words(one, self._place))
-            reasons = tuple(delivery_words(one, self._place) for one in done if one.conflict is not None)
-            return JournalState(waiting(self._place, self._clock), reasons)
+                    self.report(delivery_words(one, self.place))
+            reasons = tuple(delivery_words(one, self.place) for one in done if one.conflict is not None)
+            return JournalState(waiting(self.place, self.clock), reasons)
         except RigError as error:
             return JournalState(left, (failure_words(error),))
