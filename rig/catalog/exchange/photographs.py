@@ -9,7 +9,6 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from functools import cached_property
 from pathlib import Path
 from typing import Any, Final
 
@@ -93,7 +92,8 @@ class Photographs:
 
     def items(self) -> Iterator[Item]:
         """Yield the objects in the order of the folder or the table."""
-        yield from self._items
+        for name, views in self._found.items():
+            yield self._item(name, views)
 
     @staticmethod
     def content(image: str) -> bytes:
@@ -104,10 +104,6 @@ class Photographs:
     def gaps(self) -> tuple[Gap, ...]:
         """The missing views of objects that are seen from most sides at even steps; each object has its own step."""
         return tuple(Gap(name, azimuth_deg) for name, views in self._found.items() for azimuth_deg in _gaps(views))
-
-    @cached_property
-    def _items(self) -> list[Item]:
-        return [self._item(name, views) for name, views in self._found.items()]
 
     def _item(self, name: str, found: dict[float, tuple[Path, _Row, dict[str, Any]]]) -> Item:
         azimuths_deg = tuple(sorted(found))
@@ -200,7 +196,7 @@ def read_table(path: Path, *, now: datetime) -> Photographs:
         try:
             _add_row(photographs, {key: text.strip() for key, text in row.items()})
             used += 1
-        except (ValueError, OSError) as error:
+        except (ValueError, OverflowError, OSError) as error:
             photographs.reject(f"{path.name}, line {line}", ImportProblem.INVALID_VALUE, error=str(error))
     if not used:
         raise ImportRejected(
@@ -224,7 +220,10 @@ def _add_row(photographs: Photographs, row: _Row) -> None:
     if (values.get("imu_deg") is None) != (values.get("imu_sigma_deg") is None):
         raise ValueError("imu_deg and imu_sigma_deg: give both or none")
     if row.get("captured_utc"):
-        values["captured_utc"] = _time(row["captured_utc"])
+        time = datetime.fromisoformat(row["captured_utc"])
+        if time.tzinfo is None:
+            raise ValueError(f"captured_utc {row['captured_utc']} has no time zone")
+        values["captured_utc"] = time.astimezone(UTC)
     azimuth_deg = wrap360(_number(row["azimuth_deg"], "azimuth_deg"))
     photographs.add(path, row, azimuth_deg, region=parse_region(row.get("region", "")), **values)
 
@@ -288,16 +287,6 @@ def _number(text: str, name: str) -> float:
     if not abs(number) < 1e9:
         raise ValueError(f"{name} is {text!r}, not an angle in degrees")
     return number
-
-
-def _time(text: str) -> datetime:
-    time = datetime.fromisoformat(text)
-    if time.tzinfo is None:
-        raise ValueError(f"captured_utc {text} has no time zone")
-    try:
-        return time.astimezone(UTC)
-    except OverflowError as error:
-        raise ValueError("a time beyond the calendar") from error
 
 
 def _gaps(azimuths_deg: Mapping[float, object]) -> list[float]:

@@ -178,6 +178,22 @@ class TestTables:
         assert done.rejected[0].path == "views.csv, line 4"
 
     @pytest.mark.parametrize(
+        ("values", "words"),
+        [
+            ("2026-03-01T10:00:00,,", "captured_utc 2026-03-01T10:00:00 has no time zone"),
+            ("0001-01-01T00:00:00+14:00,,", "date value out of range"),
+            (",1,", "imu_deg and imu_sigma_deg: give both or none"),
+            (",,1 2 3", "the region '1 2 3' is not of the form x y width height, in pixels"),
+        ],
+    )
+    def test_row_with_an_impossible_value_is_rejected(self, tmp_path: Path, values: str, words: str) -> None:
+        photograph(tmp_path / "0.png", 0)
+        first = "object,azimuth_deg,image,captured_utc,imu_deg,region\n"
+        (tmp_path / "views.csv").write_text(f"{first}mug,0,0.png,,,\nmug,10,0.png,{values}\n")
+        (rejected,) = read_table(tmp_path / "views.csv", now=NOW).rejected
+        assert (rejected.path, str(rejected.reason)) == ("views.csv, line 3", words)
+
+    @pytest.mark.parametrize(
         ("content", "words"),
         [
             *((b"", None), (b"\xff\xfe\x00", None), (b"object,azimuth_deg,image\n", None)),
