@@ -662,8 +662,8 @@ def _stored(
             seal: content
             for seal, content, sha256 in transaction.execute(query)
             if seal in wanted
-            and digest_of(seal, what, made_by, content) == sha256
             and content
+            and digest_of(seal, what, made_by, content) == sha256
             and not len(content) % size
         }
     return found
@@ -688,8 +688,8 @@ def counts(transaction: Transaction) -> list[tuple[str, int, int, bool]]:
     )
     found: Counter[tuple[str, int]] = Counter()
     for what, made_by, size in rows:
-        if version := re.match(r"\S+ (\d+)\b", made_by):
-            found[what, int(version[1])] += size // _record(descriptor(what)).itemsize
+        if version := re.match(r"\S+ ([0-9]{1,9})\b", made_by or ""):
+            found[what, int(version[1])] += (size or 0) // _record(descriptor(what)).itemsize
     return [
         (name, version, views, version == descriptor(name).version) for (name, version), views in sorted(found.items())
     ]
@@ -711,7 +711,7 @@ def to_compare(
     rows = select(Derived.what, Derived.made_by, Derived.content, Derived.sha256).where(Derived.seal == seal)
     for what, made_by, content, sha256 in transaction.execute(rows.order_by(Derived.what)):
         stored.append(f"{what} {made_by} {sha256}")
-        if digest_of(seal, what, made_by, content) != sha256:
+        if None in (made_by, content, sha256) or digest_of(seal, what, made_by, content) != sha256:
             damaged.append(what)
         elif what in (SEGMENTATION, *names()) and made_by == _made_by(what, region):
             used.append(what)

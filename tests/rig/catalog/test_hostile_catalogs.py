@@ -101,6 +101,7 @@ def seal_as_the_sender(root: Path) -> None:
         return ", ".join(column.name for _, column in digested(table))
 
     with closing(sqlite3.connect(root / "catalog.sqlite")) as connection:
+        connection.text_factory = lambda stored: stored.decode(errors="surrogateescape")
         for number, key, *values in connection.execute(f"SELECT id, key, {names(Enrollment)} FROM enrollments"):
             digests = [sha256_of((key, *values))]
             statements.append(f"UPDATE enrollments SET digest = '{digests[0]}' WHERE id = {number}")
@@ -687,10 +688,10 @@ VALUES = (
             "views SET image_bytes = -1",
             "views SET imu_deg = 1, imu_sigma_deg = NULL",
             "views SET imu_deg = 1, imu_sigma_deg = -1",
-            "views SET enrollment_id = 'x'",
+            "views SET enrollment_id = 'x' WHERE id = 5",
             "enrollments SET started_utc = ''",
             "enrollments SET key = NULL",
-            "enrollments SET key = 5",
+            "enrollments SET key = 5 WHERE id = 2",
             "log SET label = x'ff', note = CAST(x'ff' AS TEXT)",
             "log SET object_id = 'x'",
             "log SET time_utc = NULL",
@@ -701,6 +702,9 @@ VALUES = (
             "sessions SET empty_table_bytes = -1",
             "sessions SET empty_table = 'x'",
             "derived SET made_by = NULL",
+            "derived SET content = NULL",
+            "derived SET sha256 = NULL",
+            f"derived SET made_by = 'cedd {'9' * 5000}' WHERE what = 'cedd'",
             "derived SET seal = 5 WHERE what = 'segmentation' AND rowid = 1",
         )
     ),
