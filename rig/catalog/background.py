@@ -14,9 +14,10 @@ from typing import Final
 from sqlalchemy import select
 from sqlalchemy.orm import Session as Transaction
 
-from rig.catalog import log, state
+from rig.catalog import digests, log, state
 from rig.catalog.catalog import Catalog
 from rig.catalog.facts import Enrollment, Entry
+from rig.catalog.state import Ended
 from rig.catalog.verify import missing_enrollments
 from rig.config.catalog_place import CatalogPlace
 from rig.core.clock import Clock, seconds_between
@@ -100,7 +101,11 @@ def _check_lines(first: int, last: int | None, transaction: Transaction) -> None
 
 
 def _check_enrollment(number: int, transaction: Transaction) -> None:
-    state.check(transaction, Enrollment.id == number)
+    found = transaction.execute(
+        select(Ended.seal, Ended.object_id).where(state.IS_STATUS, Ended.enrollment_id == number)
+    ).first()
+    if found is not None and any(digests.damaged_enrollments(transaction, {number: found[0]})):
+        raise state.changed([str(state.by_id(transaction, found[1]).object_name)])
 
 
 def _check_missing(transaction: Transaction) -> None:

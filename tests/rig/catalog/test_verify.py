@@ -141,7 +141,7 @@ class TestVerify:
                 "(SELECT digest FROM log WHERE id = 3)) WHERE key = 'head'",
                 (Problem.LOG_CHANGED, "tin"),
             ),
-            ("UPDATE properties SET value = value || '0' WHERE key = 'head'", (Problem.DAMAGED_DATABASE, None)),
+            ("UPDATE properties SET value = value || '7' WHERE key = 'head'", (Problem.DAMAGED_DATABASE, None)),
             ("UPDATE log SET enrollment_id = 'x' WHERE id = 1", (Problem.DAMAGED_DATABASE, None)),
         ],
     )
