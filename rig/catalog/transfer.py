@@ -8,13 +8,13 @@ Decisions: docs/decisions/0015, docs/decisions/0054.
 
 import secrets
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from enum import StrEnum
 from typing import Any, Final, NamedTuple, Protocol
 
-from sqlalchemy import func, insert, select, text, update
+from sqlalchemy import select
 from sqlalchemy.orm import Session as Transaction
 
 from rig.catalog import derived, digests, log, state
@@ -26,7 +26,6 @@ from rig.catalog.facts import (
     Derived,
     Enrollment,
     Entry,
-    Property,
     Session,
     View,
     digest_of,
@@ -39,12 +38,18 @@ from rig.catalog.jobs import JobProgress
 from rig.catalog.records import EnrollmentStatus, check_text, clean_name
 from rig.catalog.rejected import Gap, RejectedFile
 from rig.catalog.state import Ended, EnrollmentState, Named
-from rig.core.errors import CatalogDamaged, CatalogError, ImportRejected, ObjectExists, RigError, UsageError
+from rig.core.errors import CatalogDamaged, ImportRejected, ObjectExists, RigError, UsageError
 from rig.core.next_steps import Do
 from rig.core.processes import Jobs
 
 MAX_VIEWS: Final = 10_000
 """Most views of one enrollment: one every 0.036°."""
+
+_CURRENT: Final = {
+    EnrollmentStatus.COMPLETE: (EnrollmentStatus.SUPERSEDED, Action.ENROLLMENT_SUPERSEDED),
+    EnrollmentStatus.IN_PROGRESS: (EnrollmentStatus.ABANDONED, Action.ENROLLMENT_ABANDONED),
+}
+"""An object has one enrollment of each such status. What becomes of it if it gets another one."""
 
 _OF_SESSION: Final = ("number", "started_utc", "provenance", "empty_table", "empty_table_bytes")
 _OF_VIEW: Final = tuple(name for name, _ in digested(View) if name != "session")
@@ -73,35 +78,25 @@ class Item:
     def keys(self) -> set[str]:
         return {one.enrollment.key for one in self.enrollments}
 
-    @property
-    def statuses(self) -> set[EnrollmentStatus]:
-        return {one.status for one in self.enrollments}
-
 
 class Source(Protocol):
-    """Objects that can be transferred.
-
-    Attributes
-    ----------
-    origin
-        Where they are, for the log.
-    rejected, gaps
-        What cannot be transferred, and what is missing.
-    content
-        Returns the bytes of an image. It can be sent to other processes.
-    """
+    """Objects that can be transferred."""
 
     @property
-    def origin(self) -> str: ...
+    def origin(self) -> str:
+        """Where they are, for the log."""
 
     @property
-    def rejected(self) -> Sequence[RejectedFile]: ...
+    def rejected(self) -> Sequence[RejectedFile]:
+        """What cannot be transferred."""
 
     @property
-    def gaps(self) -> Sequence[Gap]: ...
+    def gaps(self) -> Sequence[Gap]:
+        """What is missing."""
 
     @property
-    def content(self) -> Callable[[str], bytes]: ...
+    def content(self) -> Callable[[str], bytes]:
+        """Function that returns the bytes of an image. It can be sent to other processes."""
 
     def items(self) -> Iterator[Item]:
         """Yield the objects."""
@@ -172,21 +167,17 @@ class CatalogSource:
 
 def _check(item: Item) -> None:
     """Raise `CatalogDamaged` if this program would not have stored an object. Its digests are those of its rows."""
+    sessions = [session.provenance for one in item.enrollments for session in one.enrollment.sessions]
     try:
         if clean_name(item.name) != item.name:
             raise damaged("the name of an object", item.name)
-        texts = {"label": [item.label], "note": [item.note], "bench": [], "software": []}
-        for one in item.enrollments:
-            texts["bench"] += [session.provenance.bench for session in one.enrollment.sessions]
-            texts["software"] += [session.provenance.software for session in one.enrollment.sessions]
-        for what, found in texts.items():
-            for text in found:
-                check_text(text, what)
+        for text in (item.label, item.note, *(text for by in sessions for text in (by.bench, by.software))):
+            check_text(text, "text")
     except UsageError as error:
         raise damaged(error.what.rstrip("."), item.name) from error
-    for status in (EnrollmentStatus.COMPLETE, EnrollmentStatus.IN_PROGRESS):
-        if sum(one.status == status for one in item.enrollments) > 1:
-            raise damaged(f"the number of {status} enrollments", item.name)
+    current = [one.status for one in item.enrollments if one.status in _CURRENT]
+    if len(set(current)) < len(current):
+        raise damaged(f"the number of enrollments of {item.name!r} that are {current[0]}", len(current))
     for one in item.enrollments:
         if not 1 <= len(one.enrollment.planned_azimuth_deg) <= MAX_VIEWS:
             raise damaged("the number of planned views", len(one.enrollment.planned_azimuth_deg))
@@ -280,38 +271,33 @@ def transfer(
         is_named=catalog is not None,
         decodes=bool(names) or not is_own,
     )
-    with _errors_of(target):
+    with nullcontext() if target is None else target.database.catalog_errors():
         found = yield from read_images(reading, tasks, strict=strict and not dry_run, jobs=jobs)
     rejected = (*source.rejected, *found.rejected_files)
-    wanted = [kept for item in plan.wanted if (kept := _kept(item, found)).enrollments or not item.enrollments]
-    if (strict and rejected) or (rejected and plan.wanted and not wanted):
+    plan = replace(plan, wanted=_kept(plan.wanted, found, are_photographs=catalog is None))
+    if (strict and rejected) or (found.rejected and not plan.wanted):
         raise _rejection(source, rejected)
 
     # Store the images of a strict transfer, now that all of them are right. Then add all rows.
     if store is not None and target is not None:
         with target.database.catalog_errors():
             if reading.store is None:
-                again = [task._replace(names=()) for task in tasks]
                 storing = replace(reading, store=store, decodes=False)
-                stored = yield from read_images(storing, again, strict=True, jobs=jobs)
-                if stored.images != found.images:  # the source has just been changed
-                    raise _rejection(source, stored.rejected_files)
+                again = yield from read_images(
+                    storing, [task._replace(names=()) for task in tasks], strict=True, jobs=jobs
+                )
+                if again.rejected:  # the source has just been changed
+                    raise _rejection(source, again.rejected_files)
             store.settle({name for name, _ in found.images.values()})
         with target.database.write() as transaction:
-            # Compare again: another process may have added objects meanwhile.
-            plan = replace(plan, wanted=tuple(wanted)).compared(transaction, conflict, once=once)
-            addition = _Addition(source, target, transaction, label, found.contents, plan.known)
-            addition.add(plan, with_computed=once)
-            wanted = list(plan.wanted)
-    return Transferred(
-        len(wanted),
-        _Plan(tuple(wanted)).views,
-        sum(dict(found.images.values()).values()),
-        plan.skipped,
-        plan.replaced,
-        rejected,
-        tuple(source.gaps),
-    )
+            plan = plan.compared(transaction, conflict, once=once)  # another process may have added objects
+            new = _add(transaction, target, plan, label)
+            details = {"origin": source.origin, "objects": plan.names, "views": plan.views}
+            log.append(transaction, target.clock, Action.IMPORTED, details={**details, "replaced": list(plan.replaced)})
+            derived.add(transaction, _computed(source, new, found.contents, copied=once))
+    size = sum(dict(found.images.values()).values())
+    counts = (len(plan.wanted), plan.views, size)
+    return Transferred(*counts, plan.skipped, plan.replaced, rejected, tuple(source.gaps))
 
 
 def _rejection(source: Source, rejected: Sequence[RejectedFile]) -> RigError:
@@ -329,37 +315,39 @@ def _rejection(source: Source, rejected: Sequence[RejectedFile]) -> RigError:
     )
 
 
-def _errors_of(target: Catalog | None) -> AbstractContextManager[None]:
-    return nullcontext() if target is None else target.database.catalog_errors()
+def _kept(items: Sequence[Item], found: ReadImages, *, are_photographs: bool) -> tuple[Item, ...]:
+    """Return new rows of objects with the stored images, without the views whose images were rejected."""
+    kept = []
+    for item in items:
+        new = [
+            replace(one, enrollment=_new(item.name, one.enrollment, found, is_photographed=are_photographs))
+            for one in item.enrollments
+            if not one.enrollment.views or any(view.image in found.images for view in one.enrollment.views)
+        ]
+        if new or not item.enrollments:
+            kept.append(replace(item, enrollments=tuple(new)))
+    return tuple(kept)
 
 
-def _kept(item: Item, found: ReadImages) -> Item:
-    """Return an object with the stored images, without the views whose images were rejected."""
-    return replace(item, enrollments=tuple(kept for one in item.enrollments if (kept := _kept_views(item, one, found))))
-
-
-def _kept_views(item: Item, state: EnrollmentState, found: ReadImages) -> EnrollmentState | None:
-    old = state.enrollment
+def _new(name: str, old: Enrollment, found: ReadImages, *, is_photographed: bool) -> Enrollment:
+    """Return new rows of an enrollment. Photographs have no key: it is the digest of what they are."""
     good = [view for view in old.views if view.image in found.images]
-    if old.views and not good:
-        return None
     plan, key = old.planned_azimuth_deg, old.key
-    if found.rejected or any(found.images[view.image][0] != view.image for view in good):  # photographs
+    if is_photographed:
         plan = tuple(old.planned_azimuth_deg[view.index] for view in good)
-        content = ((view.azimuth_deg, found.images[view.image], view.region) for view in good)
-        key = sha256_of((item.name, *content))
+        key = sha256_of((name, *((view.azimuth_deg, found.images[view.image], view.region) for view in good)))
         found.contents[key] = found.contents.pop(old.key, {})
     new = Enrollment(key=key, object_id=0, started_utc=old.started_utc, planned_azimuth_deg=plan)
     for session in old.sessions:
         new.sessions.append(Session(**{name: getattr(session, name) for name in _OF_SESSION}))
-    for index, view in enumerate(good):
+    for place, view in enumerate(good):
         copy = View(**{name: getattr(view, name) for name in _OF_VIEW})
         copy.session = view.session
-        copy.index = view.index if key == old.key else index
+        copy.index = place if is_photographed else view.index
         copy.image, copy.image_bytes = found.images[view.image]
         new.views.append(copy)
     _digest(new, key)
-    return replace(state, enrollment=new)
+    return new
 
 
 def _digest(enrollment: Enrollment, key: str) -> None:
@@ -393,13 +381,17 @@ class _Plan:
     known: Mapping[str, _Known] = field(default_factory=dict)
 
     @property
+    def names(self) -> list[str]:
+        return [item.name for item in self.wanted]
+
+    @property
     def views(self) -> int:
         return sum(len(one.enrollment.views) for item in self.wanted for one in item.enrollments)
 
     def compared(self, transaction: Transaction, conflict: Conflict, *, once: bool) -> "_Plan":
         """Return the plan after a comparison with the target. `ObjectExists` if a conflict is rejected."""
         known = _known(transaction, [key for item in self.wanted for key in item.keys])
-        ids = _ids(transaction, [item.name for item in self.wanted])
+        ids = _ids(transaction, self.names)
         wanted = [item for item in self.wanted if not _is_there(item, ids.get(item.name), known, once=once)]
         both = [item.name for item in wanted if item.name in ids]
         if both and conflict is Conflict.REJECT:
@@ -450,7 +442,7 @@ def _is_there(item: Item, object_id: int | None, known: Mapping[str, _Known], *,
         return True
     for one in item.enrollments:
         there = known[one.enrollment.key]
-        if not there.in_use or seal_of(there.state.enrollment) != seal_of(one.enrollment):
+        if not there.in_use or not _are_equal(there.state, one):
             return False
         if object_id is not None and (there.object_id, there.state.status) != (object_id, one.status):
             return False
@@ -460,202 +452,79 @@ def _is_there(item: Item, object_id: int | None, known: Mapping[str, _Known], *,
 # Add
 
 
-@dataclass
-class _Addition:
-    """Adds objects to the target: rows of enrollments, and a line of the log for each new state and status."""
-
-    source: Source
-    target: Catalog
-    transaction: Transaction
-    label: str | None
-    contents: Mapping[str, Mapping[str, bytes]]
-    known: Mapping[str, _Known]
-    _lines: list[tuple[Entry, Enrollment | None]] = field(default_factory=list)
-    _new: dict[str, Enrollment] = field(default_factory=dict)
-    """New enrollments by their keys in the source."""
-
-    def add(self, plan: _Plan, *, with_computed: bool) -> None:
-        ids = _ids(self.transaction, [item.name for item in plan.wanted])
-        first = log.head(self.transaction)[0] + 1
-        for item in plan.wanted:
-            if item.name in ids:
-                self._end_others(item, ids[item.name])
-                self._add_object(item, ids[item.name])
-            else:
-                texts = {"label": item.label or self.label or "", "note": item.note}
-                columns = state.columns(None, item.created_utc, texts)
-                self._add_object(item, first + len(self._lines), **columns)
-        self._store_new()
-        for entry, enrollment in self._lines:
-            if enrollment is not None:
-                entry.enrollment_id = enrollment.id
-                entry.details = {"enrollment_id": enrollment.id, "views": len(enrollment.views)}
-                if entry.status in (EnrollmentStatus.COMPLETE, EnrollmentStatus.SUPERSEDED):
-                    entry.seal = seal_of(enrollment)
-        log.add(self.transaction, *(entry for entry, _ in self._lines))
-        self._store_computed(with_computed=with_computed)
-        log.append(
-            self.transaction,
-            self.target.clock,
-            Action.IMPORTED,
-            details={
-                "origin": self.source.origin,
-                "objects": [item.name for item in plan.wanted],
-                "views": plan.views,
-                "replaced": list(plan.replaced),
-            },
-        )
-
-    def _end_others(self, item: Item, object_id: int) -> None:
-        """End the enrollments of an object in the target that those of the item replace."""
-        known = state.by_id(self.transaction, object_id)
-        for status, ended, action in (
-            (EnrollmentStatus.COMPLETE, EnrollmentStatus.SUPERSEDED, Action.ENROLLMENT_SUPERSEDED),
-            (EnrollmentStatus.IN_PROGRESS, EnrollmentStatus.ABANDONED, Action.ENROLLMENT_ABANDONED),
-        ):
-            before = state.of_status(self.transaction, known, status) if status in item.statuses else None
+def _add(transaction: Transaction, target: Catalog, plan: _Plan, label: str | None) -> dict[str, Enrollment]:
+    """Add the rows of objects, and a line of the log for each enrollment; return the new ones by their earlier keys."""
+    new: dict[str, Enrollment] = {}
+    for item in plan.wanted:
+        found = state.state_of(transaction, item.name)
+        object_id = found.object_id if found is not None else log.head(transaction)[0] + 1
+        about: dict[str, Any] = {"object_name": item.name, "object_id": object_id}
+        texts = {"label": item.label or label or "", "note": item.note}
+        columns = {} if found is not None else state.columns(None, item.created_utc, texts)
+        # End what the new enrollments replace.
+        for status in _CURRENT.keys() & {one.status for one in item.enrollments}:
+            before = None if found is None else state.of_status(transaction, found, status)
             if before is not None and before.enrollment.key not in item.keys:
-                when = before.finished_utc or self.target.clock.utc()
-                self._line(action, item, object_id, before.enrollment, status=ended, finished_utc=when)
-
-    def _add_object(self, item: Item, object_id: int, **columns: Any) -> None:
+                ended, action = _CURRENT[status]
+                one = replace(before, status=ended, finished_utc=before.finished_utc or target.clock.utc())
+                log.append(transaction, target.clock, action, **about, **_status_of(one))
+        # Add them, or bring those that the object has already into use again.
         for one in item.enrollments:
-            enrollment, there = one.enrollment, self.known.get(one.enrollment.key)
-            if there is None or there.object_id != object_id or seal_of(there.state.enrollment) != seal_of(enrollment):
-                self._new[enrollment.key] = enrollment
+            key, there = one.enrollment.key, plan.known.get(one.enrollment.key)
+            if there is None or there.object_id != object_id or not _are_equal(there.state, one):
                 if there is not None:  # with other views, or of an object that is deleted or has another name
-                    _digest(enrollment, secrets.token_hex(32))
-                enrollment.object_id = object_id
+                    _digest(one.enrollment, secrets.token_hex(32))
+                new[key] = _store(transaction, one.enrollment, about["object_id"])
             elif there.state.status == one.status:
                 continue
             else:
-                enrollment = there.state.enrollment
-            ended = {"status": one.status, "finished_utc": one.finished_utc}
-            self._line(Action.IMPORTED, item, object_id, enrollment, **ended, **columns)
+                one = replace(one, enrollment=there.state.enrollment)
+            log.append(transaction, target.clock, Action.IMPORTED, **about, **_status_of(one), **columns)
             columns = {}
         if columns:
-            self._line(Action.IMPORTED, item, object_id, None, **columns)
-
-    def _line(self, action: Action, item: Item, object_id: int, enrollment: Enrollment | None, **columns: Any) -> None:
-        about = {"object_name": item.name, "object_id": object_id, **log.author()}
-        entry = Entry(id=0, time_utc=self.target.clock.utc(), action=action, **about, **columns)
-        self._lines.append((entry, enrollment))
-
-    def _store_new(self) -> None:
-        views = []
-        for enrollment in self._new.values():  # the views refer to the sessions, so these are stored first
-            views.append(list(enrollment.views))
-            enrollment.views.clear()
-        self.transaction.add_all(self._new.values())
-        self.transaction.flush()
-        for enrollment, own in zip(self._new.values(), views, strict=True):
-            enrollment.views.extend(own)
-        self.transaction.flush()
-
-    def _store_computed(self, *, with_computed: bool) -> None:
-        rows = [
-            derived.row_of(seal_of(enrollment), what, None, content)
-            for key, enrollment in self._new.items()
-            for what, content in self.contents.get(key, {}).items()
-        ]
-        if with_computed and isinstance(self.source, CatalogSource):
-            seals = [seal_of(enrollment) for enrollment in self._new.values()]
-            with self.source.catalog.database.read() as reading:
-                for part in portions(seals, digests.AT_ONCE):
-                    found = reading.execute(select(Derived.__table__).where(Derived.seal.in_(part)))
-                    rows += map(dict, found.mappings())
-        derived.add(self.transaction, rows)
+            log.append(transaction, target.clock, Action.IMPORTED, **about, **columns)
+    return new
 
 
-# Copy
+def _are_equal(one: EnrollmentState, other: EnrollmentState) -> bool:
+    return seal_of(one.enrollment) == seal_of(other.enrollment)
 
 
-class Copied(NamedTuple):
-    """What was copied."""
-
-    objects: int
-    views: int
-    results: int
-    images: int
-    image_bytes: int
-
-
-def copy(source: Catalog, target: Catalog) -> Generator[JobProgress, None, Copied]:
-    """Copy everything from a catalog into an empty one. The target stays empty if the call does not end.
-
-    Every row keeps its id and its digest. An interrupted copy can be repeated.
-
-    Raises
-    ------
-    CatalogError, CatalogBusy
-        The target is not empty, or one of them cannot be used.
-    CatalogDamaged
-        Something in the source is not as it was stored.
-    """
-    with source.database.read() as reading:
-        _check_all(reading)
-        with target.database.read() as transaction:
-            _check_empty(transaction, target)
-        size = 0
-        wanted = sorted(_images(reading))
-        for done, name in enumerate(wanted):
-            if done % 50 == 0:
-                yield JobProgress(done, len(wanted))
-            with source.database.catalog_errors():
-                content = source.database.images.content(name)
-            size += len(content)
-            with target.database.catalog_errors():
-                target.database.images.put(content, settled=False)
-        yield JobProgress(len(wanted), len(wanted))
-        with target.database.catalog_errors():
-            target.database.images.settle(wanted)
-        with target.database.write() as writing:
-            _check_empty(writing, target)
-            for table in (Entry, Enrollment, Session, View, Derived):
-                for part in reading.execute(select(table.__table__)).mappings().partitions(500):
-                    writing.execute(insert(table.__table__), list(map(dict, part)))  # type: ignore[arg-type]
-            head = reading.scalar(select(Property.value).where(Property.key == "head"))
-            writing.execute(update(Property).where(Property.key == "head").values(value=head))
-            _set_last_ids(writing)
-            _check_all(writing)
-            results = writing.scalar(select(func.count()).where(Entry.action == Action.IDENTIFIED)) or 0
-        objects = len(target.objects())
-        views = reading.scalar(select(func.count()).select_from(View)) or 0
-    copied = Copied(objects, views, results, len(wanted), size)
-    target.note(Action.COPIED, origin=str(source.place), **copied._asdict())
-    return copied
+def _status_of(one: EnrollmentState) -> dict[str, Any]:
+    """Return the columns of a line of the log that gives an enrollment this status."""
+    is_sealed = one.status in (EnrollmentStatus.COMPLETE, EnrollmentStatus.SUPERSEDED)
+    return {
+        "enrollment_id": one.enrollment.id,
+        "status": one.status,
+        "finished_utc": one.finished_utc,
+        "seal": seal_of(one.enrollment) if is_sealed else None,
+        "details": {"enrollment_id": one.enrollment.id, "views": len(one.enrollment.views)},
+    }
 
 
-def _check_all(transaction: Transaction) -> None:
-    """Raise `CatalogDamaged` if a line of the log or a row of an enrollment is not as it was written."""
-    state.check(transaction)
-    wrong = next(log.wrong_lines(transaction), None)
-    if wrong is not None:
-        raise damaged("its log", f"wrong at line {wrong}")
+def _store(transaction: Transaction, enrollment: Enrollment, object_id: int) -> Enrollment:
+    enrollment.object_id = object_id
+    views = list(enrollment.views)
+    enrollment.views.clear()
+    transaction.add(enrollment)
+    transaction.flush()  # the views refer to the sessions
+    enrollment.views.extend(views)
+    transaction.flush()
+    return enrollment
 
 
-def _check_empty(transaction: Transaction, target: Catalog) -> None:
-    if log.head(transaction)[0] or transaction.scalar(select(Enrollment.id).limit(1)) is not None:
-        raise CatalogError(
-            f"The catalog {target.place} is not empty.",
-            next_step=("Give a new place, or", Do.MERGE()),
-        )
-
-
-def _images(transaction: Transaction) -> set[str]:
-    """Return the names of all images that rows or answers name."""
-    answers = select(Entry.record["image"].as_string()).where(Entry.action == Action.IDENTIFIED)
-    named = (select(View.image), select(Session.empty_table), answers)
-    return {image for query in named for image in transaction.scalars(query) if image is not None}
-
-
-def _set_last_ids(transaction: Transaction) -> None:
-    """Let the next enrollment and the next view have new ids: an id that was given once must not be given again."""
-    enrollment = transaction.scalar(select(func.max(Entry.enrollment_id))) or 0
-    for table, last in (("enrollments", enrollment), ("views", transaction.scalar(select(func.max(View.id))) or 0)):
-        values = {"name": table, "last": last}
-        if last and transaction.get_bind().dialect.name == "postgresql":
-            transaction.execute(text(f"SELECT setval('{table}_id_seq', :last)"), values)
-        elif last:
-            transaction.execute(text("DELETE FROM sqlite_sequence WHERE name = :name"), values)
-            transaction.execute(text("INSERT INTO sqlite_sequence (name, seq) VALUES (:name, :last)"), values)
+def _computed(
+    source: Source, new: Mapping[str, Enrollment], contents: Mapping[str, Mapping[str, bytes]], *, copied: bool
+) -> list[dict[str, Any]]:
+    """Return the rows of what was computed from new enrollments, here or by their catalog."""
+    rows = [
+        derived.row_of(seal_of(enrollment), what, None, content)
+        for key, enrollment in new.items()
+        for what, content in contents.get(key, {}).items()
+    ]
+    if copied and isinstance(source, CatalogSource):
+        with source.catalog.database.read() as reading:
+            for part in portions([seal_of(enrollment) for enrollment in new.values()], digests.AT_ONCE):
+                found = reading.execute(select(Derived.__table__).where(Derived.seal.in_(part)))
+                rows += map(dict, found.mappings())
+    return rows

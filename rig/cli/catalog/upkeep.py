@@ -177,7 +177,7 @@ def copy(
     Example: rig catalog copy ~/catalog postgresql+psycopg://rig@server/rig --images s3://rig/catalog
     """
     from rig.catalog import Catalog
-    from rig.catalog.transfer import copy as job
+    from rig.catalog.copying import copy_catalog
     from rig.config.catalog_place import CatalogPlace
 
     def place(text: str) -> CatalogPlace:
@@ -192,7 +192,7 @@ def copy(
         Catalog.open(place(target), clock=clock, create=True) as after,
     ):
         interrupted = "Interrupted; the copy is empty. The same command continues with the images."
-        done = run_job("copying", job(before, after), interrupted=interrupted)
+        done = run_job("copying", copy_catalog(before, after), interrupted=interrupted)
         words = (
             f"Copied {counted(done.objects, 'object')} with {counted(done.views, 'view')}, "
             f"{counted(done.results, 'result')} and {size_words(done.image_bytes)} of images from {before.place} to "

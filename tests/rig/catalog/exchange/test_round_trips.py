@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 
 from rig.catalog import Catalog
+from rig.catalog.copying import copy_catalog
 from rig.catalog.exchange.bundle import read_bundle, write_bundle
 from rig.catalog.results import find_results, record
-from rig.catalog.transfer import CatalogSource, Conflict, copy, transfer
+from rig.catalog.transfer import CatalogSource, Conflict, transfer
 from rig.catalog.verify import verify
 from rig.core.errors import CatalogDamaged, CatalogError, ExportFailed, ObjectExists
 from rig.core.next_steps import Do
@@ -56,6 +57,7 @@ class TestBundles:
             ).fetchall()
         assert [name for name, _ in rows] == ["mug-white", "Tässe =2+2"]
         stored = cv2.imread(str(tmp_path / "unpacked" / "images" / rows[0][1][:2] / rows[0][1]))
+        assert stored is not None
         assert np.array_equal(stored, image(20))
         with Catalog.open(tmp_path / "unpacked", clock=VirtualClock(NOW), create=False, read_only=True) as unpacked:
             assert everything(unpacked) == everything(full)
@@ -110,7 +112,7 @@ class TestCopy:
         full.delete("last")
         record(full, new_result(object_name="mug-white"), image(7))
         other = open_catalog("copy")
-        done = finished(copy(full, other))
+        done = finished(copy_catalog(full, other))
         assert (done.objects, done.views, done.results) == (3, 13, 1)
         assert [line.digest for line in other.log()[:-1]] == [line.digest for line in full.log()]
         assert other.log()[-1].action == "copied"
@@ -124,7 +126,7 @@ class TestCopy:
     def test_id_of_a_removed_enrollment_is_not_given_again(self, full: Catalog, open_catalog: OpenCatalog) -> None:
         full.begin("last", planned_azimuth_deg=[0.0], provenance=PROVENANCE).discard()
         other = open_catalog("copy")
-        finished(copy(full, other))
+        finished(copy_catalog(full, other))
         ids = [catalog.begin("new", planned_azimuth_deg=[0.0], provenance=PROVENANCE).id for catalog in (full, other)]
         assert ids[0] == ids[1]
 
@@ -132,7 +134,7 @@ class TestCopy:
         other = open_catalog("copy")
         fill(other, "mine", 1)
         with pytest.raises(CatalogError, match="is not empty") as error:
-            finished(copy(full, other))
+            finished(copy_catalog(full, other))
         assert Do.MERGE() in error.value.steps
 
     @pytest.mark.sqlite
@@ -150,5 +152,5 @@ class TestCopy:
         damage(full)
         other = open_catalog("copy")
         with pytest.raises(CatalogError):
-            finished(copy(full, other))
+            finished(copy_catalog(full, other))
         assert untouched(other, images=True)
