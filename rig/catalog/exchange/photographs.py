@@ -15,7 +15,7 @@ from typing import Any, Final
 from hbr.core.angles import wrap360
 from rig.catalog.exchange.tables import ANGLES, NAMES, parse_region
 from rig.catalog.facts import Enrollment, Session, View
-from rig.catalog.records import EnrollmentStatus, Provenance, clean_name, this_software
+from rig.catalog.records import EnrollmentStatus, Provenance, check_text, clean_name, this_software
 from rig.catalog.rejected import Gap, ImportProblem, Reason, RejectedFile
 from rig.catalog.state import EnrollmentState
 from rig.catalog.transfer import Item
@@ -63,10 +63,12 @@ class Photographs:
     def add(self, path: Path, row: _Row, azimuth_deg: float, **values: Any) -> None:
         """Add a file that shows the object of a row; ``values`` are other fields of `View`.
 
-        It is rejected if the name of the object is not possible, or if the object has a view from this azimuth.
+        It is rejected if the name or a text cannot be stored, or if the object has a view from this azimuth.
         """
         try:
             name = clean_name(row["object"])
+            for what in ("label", "note", "bench", "software"):
+                check_text(row.get(what, ""), what)
         except UsageError as error:
             self.reject(str(path), ImportProblem.INVALID_VALUE, error=error.what.rstrip("."))
             return

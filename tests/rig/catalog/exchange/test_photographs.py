@@ -193,6 +193,18 @@ class TestTables:
         (rejected,) = read_table(tmp_path / "views.csv", now=NOW).rejected
         assert (rejected.path, str(rejected.reason)) == ("views.csv, line 3", words)
 
+    @pytest.mark.parametrize("column", ["label", "note", "bench", "software"])
+    def test_text_with_control_characters_is_rejected(
+        self, tmp_path: Path, open_catalog: OpenCatalog, column: str
+    ) -> None:
+        photograph(tmp_path / "0.png", 0)
+        rows = "mug,0,0.png,\x1b[2J\ntin,0,0.png,a tin\n"
+        (tmp_path / "views.csv").write_text(f"object,azimuth_deg,image,{column}\n{rows}")
+        catalog = open_catalog("catalog")
+        (rejected,) = run_import(catalog, read_table(tmp_path / "views.csv", now=NOW)).rejected
+        assert str(rejected.reason) == f"The {column} '\\x1b[2J' contains control characters"
+        assert [item.name for item in catalog.objects()] == ["tin"]
+
     @pytest.mark.parametrize(
         ("content", "words"),
         [
