@@ -518,9 +518,7 @@ def _copy_derived(reading: Transaction, writing: Transaction) -> None:
     columns = select(Derived.seal, Derived.what, Derived.made_by, Derived.sha256)
     there = {tuple(row) for row in reading.execute(columns) if row.seal in used}
     here = {tuple(row) for row in writing.execute(columns)}
-    seals = sorted({str(row[0]) for row in there ^ here})
-    for start in range(0, len(seals), _AT_ONCE):
-        part = seals[start : start + _AT_ONCE]
+    for part in portions(sorted({str(row[0]) for row in there ^ here}), _AT_ONCE):
         writing.execute(delete(Derived).where(Derived.seal.in_(part)))
         _copy_rows(reading, writing, Derived, Derived.seal.in_(used.intersection(part)))
 

@@ -17,9 +17,14 @@ from rig.catalog.digests import portions
 from rig.catalog.facts import SCHEMA_VERSION, Action, Derived, Enrollment, Entry, Session, View
 from rig.catalog.records import EnrollmentStatus
 from rig.catalog.state import Ended, Named
+from rig.core.errors import CatalogBusy
+from rig.core.next_steps import Do
 
 COLLECTED: Final = "enrollments"
 """Key of the record of a line `Action.GARBAGE_COLLECTED`: the ids of the removed enrollments."""
+
+_AT_ONCE: Final = 500
+"""Images that are removed in one transaction: other benches wait for it."""
 
 YOUNG_S: Final = 86_400
 """An image that no row names is kept for this time: another process may be about to name it."""
@@ -141,40 +146,48 @@ def collect_garbage(catalog: Catalog, *, old: bool = False, dry_run: bool = Fals
     CatalogError, CatalogBusy
         The catalog cannot be written.
     """
-    store = catalog.database.images
+    database, store = catalog.database, catalog.database.images
     unused = or_(Named.deleted == true(), Ended.status.in_(_OLD if old else ()))
     rows = _states(Enrollment.id, Enrollment.object_id, Named.object_name, Named.deleted).where(unused)
-    with catalog.database.read() if dry_run else catalog.database.write() as transaction:
-        # The files are listed before the rows: an image whose row is committed in the meantime is named.
+    # An object store may need minutes: its files are listed outside of a transaction, so that nobody waits. They are
+    # listed before the rows: an image whose row is committed in the meantime is named.
+    with database.catalog_errors():
         lost = store.names(before_s=catalog.clock.utc().timestamp() - YOUNG_S)
+    with database.read() as transaction:
         found = transaction.execute(rows.order_by(Enrollment.object_id)).all()
-        ids = {row.id for row in found}
-        deleted = tuple({row.object_id: str(row.object_name) for row in found if row.deleted}.values())
         images = transaction.execute(_NAMED_IMAGES).all()
-        named = {row.image for row in images if row.enrollment_id not in ids}
-        lost |= {row.image for row in images if row.enrollment_id in ids}
+    ids = {row.id for row in found}
+    deleted = tuple({row.object_id: str(row.object_name) for row in found if row.deleted}.values())
+    named = {row.image for row in images if row.enrollment_id not in ids}
+    lost |= {row.image for row in images if row.enrollment_id in ids}
+    with database.catalog_errors():
         sizes = {name: size for name in sorted(lost - named) if (size := store.size(name))}
-        views = sum(row.view_id is not None for row in images if row.enrollment_id in ids)
-        collected = GarbageReport(deleted, len(ids), views, len(sizes), sum(sizes.values()))
-        if not dry_run:
-            _remove_rows(transaction, ids)
-            if ids or sizes:
-                log.append(
-                    transaction,
-                    catalog.clock,
-                    Action.GARBAGE_COLLECTED,
-                    details={
-                        "objects": list(deleted),
-                        "enrollments": len(ids),
-                        "views": views,
-                        "freed_bytes": collected.bytes,
-                    },
-                    record={COLLECTED: sorted(ids)},
-                )
-    if not dry_run:
-        # What another process names meanwhile stays. One that names an image later looks for it, and stores it again.
-        with catalog.database.write() as transaction:
-            store.remove(sizes.keys() - {row.image for row in transaction.execute(_NAMED_IMAGES)})
+    views = sum(row.view_id is not None for row in images if row.enrollment_id in ids)
+    collected = GarbageReport(deleted, len(ids), views, len(sizes), sum(sizes.values()))
+    if dry_run or not (ids or sizes):
+        return collected
+    with database.write() as transaction:
+        if not ids <= {row.id for row in transaction.execute(rows)}:
+            raise CatalogBusy(
+                "Another process restored a deleted object meanwhile. Nothing was removed.", next_step=Do.RUN_AGAIN()
+            )
+        _remove_rows(transaction, ids)
+        log.append(
+            transaction,
+            catalog.clock,
+            Action.GARBAGE_COLLECTED,
+            details={
+                "objects": list(deleted),
+                "enrollments": len(ids),
+                "views": views,
+                "freed_bytes": collected.bytes,
+            },
+            record={COLLECTED: sorted(ids)},
+        )
+    # What another process names meanwhile stays. One that names an image later looks for it, and stores it again.
+    for part in portions(sorted(sizes), _AT_ONCE):
+        with database.write() as transaction:
+            store.remove(set(part) - {row.image for row in transaction.execute(_NAMED_IMAGES)})
     return collected
 
 

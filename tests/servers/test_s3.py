@@ -16,9 +16,11 @@ import pytest
 from sqlalchemy import text
 
 from rig.catalog import Catalog, derived
+from rig.catalog.copying import copy_catalog
+from rig.catalog.images import FsspecImages
 from rig.catalog.jobs import finished
 from rig.catalog.results import record as record_result
-from rig.catalog.transfer import CatalogSource, copy, transfer
+from rig.catalog.transfer import CatalogSource, transfer
 from rig.catalog.upkeep import collect_garbage
 from rig.catalog.verify import Problem, verify
 from rig.config.catalog_place import CatalogPlace
@@ -128,6 +130,24 @@ def test_catalog_with_images_in_s3_does_everything(postgres: PostgresServer, s3:
     assert "Create its bucket" in error.value.next_step
 
 
+def test_garbage_is_collected_in_a_slow_store(
+    postgres: PostgresServer, s3: S3Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("rig.catalog.postgres.LOST_BENCH_S", 1)
+    listed = FsspecImages.names
+
+    def slowly(store: FsspecImages, **options: float) -> set[str]:
+        SystemClock().sleep(1.5)  # longer than the server lets others wait
+        return listed(store, **options)
+
+    monkeypatch.setattr(FsspecImages, "names", slowly)
+    with opened(in_s3(postgres, tmp_path / "shared")) as catalog:
+        fill(catalog, "mug", 2, 0)
+        catalog.delete("mug")
+        assert collect_garbage(catalog).files == 2
+        assert collect_garbage(catalog).files == 0
+
+
 def test_objects_are_imported_into_s3(postgres: PostgresServer, s3: S3Server, tmp_path: Path) -> None:
     with opened(tmp_path / "local") as local, opened(in_s3(postgres, tmp_path / "shared")) as catalog:
         fill(local, "mug", 2, 0)
@@ -145,14 +165,14 @@ def test_copies_in_both_directions_are_equal(postgres: PostgresServer, s3: S3Ser
         fill(local, "tin", 2, 10)
         local.begin("half", planned_azimuth_deg=[0.0], provenance=PROVENANCE)
         record_result(local, new_result(), image(77))
-        done = finished(copy(local, shared))
+        done = finished(copy_catalog(local, shared))
         assert (done.objects, done.views, done.results, done.images) == (3, 4, 1, 5)
         assert shared.version() == local.version()
         assert finished(verify(shared, jobs=1)).findings == ()
         with pytest.raises(CatalogError, match="not empty"):
-            finished(copy(local, shared))
+            finished(copy_catalog(local, shared))
         with opened(tmp_path / "back") as back:
-            finished(copy(shared, back))
+            finished(copy_catalog(shared, back))
             assert back.version() == local.version()
             assert finished(verify(back, jobs=1)).findings == ()
             assert [entry.action for entry in back.log()][-2:] == ["copied", "copied"]
