@@ -222,11 +222,13 @@ def record(catalog: Catalog, new: NewResult, image_bgr: NDArray[np.uint8] | None
         "image_bytes": None,
     }
     operator = _operator(new.operator)
-    if image_bgr is not None:
-        png = images.encode(image_bgr)
+    store, png = catalog.database.images, None if image_bgr is None else images.encode(image_bgr)
+    if png is not None:
         with catalog.database.catalog_errors():
-            fact |= {"image": catalog.database.images.put(png), "image_bytes": len(png)}
+            fact |= {"image": store.put(png), "image_bytes": len(png)}
     with catalog.database.write() as transaction:
+        if png is not None and store.size(fact["image"]) != len(png):  # `collect_garbage` removed it meanwhile
+            store.put(png)
         number = 1 + (transaction.scalar(select(func.max(Entry.result))) or 0)
         _append(catalog, transaction, Action.IDENTIFIED, number, new.answered._replace(sample=sample), operator, fact)
     return number

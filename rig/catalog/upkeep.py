@@ -23,7 +23,7 @@ from rig.core.next_steps import Do
 COLLECTED: Final = "enrollments"
 """Key of the record of a line `Action.GARBAGE_COLLECTED`: the ids of the removed enrollments."""
 
-_AT_ONCE: Final = 500
+_AT_ONCE: Final = 200
 """Images that are removed in one transaction: other benches wait for it."""
 
 YOUNG_S: Final = 86_400
@@ -187,7 +187,8 @@ def collect_garbage(catalog: Catalog, *, old: bool = False, dry_run: bool = Fals
     # What another process names meanwhile stays. One that names an image later looks for it, and stores it again.
     for part in portions(sorted(sizes), _AT_ONCE):
         with database.write() as transaction:
-            store.remove(set(part) - {row.image for row in transaction.execute(_NAMED_IMAGES)})
+            kept = transaction.scalars(select(_NAMED.c.image).where(_NAMED.c.image.in_(part)))
+            store.remove(set(part) - set(kept))
     return collected
 
 
@@ -197,6 +198,7 @@ _NAMED_IMAGES: Final = union_all(
     select(null(), null(), Entry.record["image"].as_string()).where(Entry.action == Action.IDENTIFIED),
 )
 """Every image that a row names, with its enrollment and view."""
+_NAMED: Final = _NAMED_IMAGES.subquery()
 
 
 def _remove_rows(transaction: Transaction, ids: Collection[int]) -> None:
