@@ -35,7 +35,7 @@ from rig.catalog.facts import (
 )
 from rig.catalog.incoming import ReadImages, Reading, read_images
 from rig.catalog.jobs import JobProgress
-from rig.catalog.records import EnrollmentStatus, check_text, clean_name
+from rig.catalog.records import EnrollmentStatus, check_text, checked_texts, clean_name
 from rig.catalog.rejected import Gap, RejectedFile
 from rig.catalog.state import Ended, EnrollmentState, Named
 from rig.core.errors import CatalogDamaged, ImportRejected, ObjectExists, RigError, UsageError
@@ -235,7 +235,7 @@ def transfer(
     Raises
     ------
     UsageError
-        There is no such descriptor.
+        There is no such descriptor, or the label cannot be stored.
     ImportRejected
         Nothing is left to transfer, or an image was rejected and the transfer is strict.
     CatalogDamaged
@@ -245,6 +245,7 @@ def transfer(
     CatalogError, CatalogBusy
         A catalog cannot be used.
     """
+    checked_texts(label, None)
     for name in descriptors:
         derived.known_descriptor(name)
     catalog = source if isinstance(source, CatalogSource) else None

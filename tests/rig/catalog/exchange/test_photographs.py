@@ -132,6 +132,13 @@ class TestFolders:
         assert "mug__5.png" in str(error.value.evidence["rejected"])
         assert untouched(catalog)
 
+    def test_label_with_control_characters_is_rejected(self, tmp_path: Path, open_catalog: OpenCatalog) -> None:
+        photograph(tmp_path / "in" / "mug__0.png", 0)
+        catalog = open_catalog("catalog")
+        with pytest.raises(UsageError, match="control characters"):
+            run_import(catalog, read_folder(tmp_path / "in", now=NOW), label="\x1b[2J")
+        assert untouched(catalog)
+
     def test_folder_without_photographs_is_rejected(self, tmp_path: Path) -> None:
         photograph(tmp_path / "IMG.png", 0)
         with pytest.raises(ImportRejected) as error:
