@@ -118,7 +118,7 @@ def _as_json(details: "ObjectDetails", described: "Described") -> dict[str, Any]
 
     def session(one: "Session") -> dict[str, Any]:
         return {
-            "number": one.number,
+            "id": one.number,
             "started_utc": one.started_utc,
             "provenance": one.provenance,
             "empty_table_image": one.empty_table and path_of(one.empty_table),
