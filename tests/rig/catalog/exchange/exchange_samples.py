@@ -104,7 +104,7 @@ def changed_bundle(bundle: Path, target: Path, change: Callable[[Path], None], *
         database = Path(folder, DATABASE_NAME)
         database.write_bytes(found[DATABASE_NAME] or b"")
         change(database)
-        with suppress(sqlite3.Error), closing(sqlite3.connect(database)) as connection:
+        with suppress(sqlite3.Error, ValueError), closing(sqlite3.connect(database)) as connection:
             connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
         found |= {DATABASE_NAME: database.read_bytes(), **members}
     with zipfile.ZipFile(target, "w", zipfile.ZIP_DEFLATED) as archive:
