@@ -149,7 +149,7 @@ def collect_garbage(catalog: Catalog, *, old: bool = False, dry_run: bool = Fals
     database, store = catalog.database, catalog.database.images
     unused = or_(Named.deleted == true(), Ended.status.in_(_OLD if old else ()))
     rows = _states(Enrollment.id, Enrollment.object_id, Named.object_name, Named.deleted).where(unused)
-    # An object store may need minutes: its files are listed outside of a transaction, so that nobody waits. They are
+    # An object store may need minutes: its files are listed outside of a transaction, so that no bench waits. They are
     # listed before the rows: an image whose row is committed in the meantime is named.
     with database.catalog_errors():
         lost = store.names(before_s=catalog.clock.utc().timestamp() - YOUNG_S)

@@ -8,7 +8,7 @@ _EVIDENCE: Final = {
     Problem.DAMAGED_DATABASE: "{message}",
     Problem.LOG_CHANGED: "entry {entry_id} of the log is not the one that was written, or one before is missing",
     Problem.ENROLLMENT_CHANGED: "something in enrollment {enrollment_id} is not what was stored",
-    Problem.MISSING_ENROLLMENT: "enrollment {enrollment_id} is in the log, and nobody removed it",
+    Problem.MISSING_ENROLLMENT: "enrollment {enrollment_id} is in the log, and this program did not remove it",
     Problem.MISSING_IMAGE: "{reason}",
     Problem.CHANGED_IMAGE: "{bytes} bytes now, {stored_bytes} when it was stored",
     Problem.UNREADABLE_IMAGE: "{reason}",
