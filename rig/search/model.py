@@ -53,8 +53,8 @@ class Model(ABC):
     bench_image : uint8 array (H, W, 3), optional
         An image that shows the bench of the newest enrollment: its empty-table image, or one of its views.
     leader_views
-        Returns the enrolled views of an object near some azimuths (`rig.catalog.derived.local_views`); None if the model
-        does not come from a catalog.
+        Returns the enrolled views of an object near some azimuths (`rig.catalog.derived.local_views`); None if the
+        model does not come from a catalog.
     """
 
     index: hbr.ViewIndex | hbr.DenseIndex
