@@ -69,7 +69,7 @@ _COPY: Final = "copy"
 _SAME_ANSWER: Final = timedelta(hours=1)
 """An answer is recorded at most so long after a first attempt whose commit the server could not confirm."""
 _AT_ONCE: Final = 100
-"""Enrollments that are read from the server at once."""
+"""Enrollments, and lines of the log, that are read from the server at once."""
 
 
 # Open
@@ -489,9 +489,10 @@ def _update(catalog: Catalog, folder: Path) -> bool:
 
 def _copy_log(reading: Transaction, writing: Transaction, *, after: int) -> None:
     """Add the new lines of the catalog's log to that of the copy, without answers: so it has the same state."""
-    new = select(Entry).where(Entry.id > after, Entry.result.is_(None)).order_by(Entry.id)
-    for part in reading.scalars(new.execution_options(yield_per=1000)).partitions():
+    new = select(Entry).where(Entry.result.is_(None)).order_by(Entry.id).limit(_AT_ONCE)
+    while part := reading.scalars(new.where(Entry.id > after)).all():
         log.add(writing, *map(_same, part))
+        after = part[-1].id
         reading.expunge_all()
 
 
