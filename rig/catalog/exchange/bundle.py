@@ -7,6 +7,7 @@ name. Nothing that can be computed is taken from a bundle.
 Decision: docs/decisions/0015.
 """
 
+import shutil
 import stat
 import zlib
 from collections.abc import Iterable, Iterator, Mapping
@@ -55,11 +56,12 @@ def write_bundle(path: Path, source: CatalogSource) -> int:
         with Catalog.open(folder, clock=source.catalog.clock) as made:
             made.database.images = _ArchivedImages(archive)
             done = finished(transfer(source, made, jobs=1))
+        # Nothing is compressed: the images are, and a reader rejects what grows much, as a long text would.
+        made_file = Path(folder, DATABASE_NAME)
         info = _member(DATABASE_NAME)
-        info.compress_type = ZIP_DEFLATED
-        with archive.open(info, "w") as packed, Path(folder, DATABASE_NAME).open("rb") as database:
-            while part := database.read(_CHUNK):
-                packed.write(part)
+        info.file_size = made_file.stat().st_size
+        with archive.open(info, "w") as stored, made_file.open("rb") as database:
+            shutil.copyfileobj(database, stored)
         archive.close()
         try:
             with read_bundle(Path(file.name), source.catalog.clock):
@@ -83,7 +85,7 @@ class _ArchivedImages(FolderImages):
     def put(self, content: bytes, *, settled: bool = True) -> str:  # noqa: ARG002
         name = name_of(content)
         if name not in self._names:
-            self._archive.writestr(_member(path_of(name)), content, ZIP_STORED)
+            self._archive.writestr(_member(path_of(name)), content)
             self._names.add(name)
         return name
 
