@@ -338,7 +338,7 @@ def camera_settings(catalog: Catalog) -> list[dict[str, Any]]:
     with catalog.database.read() as transaction:
         shown = _settings((view.id, view.evidence) for view in state.first_views(transaction, View.id, View.evidence))
         for view_id, _ in shown:
-            state.view(transaction, view_id)  # of an edited one nothing is believed
+            state.view(transaction, view_id)  # of an edited one nothing is used
     return [settings for _, settings in shown]
 
 

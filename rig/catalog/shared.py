@@ -391,7 +391,7 @@ def _deliver_answers(journal: Catalog, server: Catalog) -> None:
     for image in {(one.record or {}).get("image") for one in entries if one.id in waiting} - {None}:
         try:
             content = journal.database.images.content(str(image))
-        except CatalogError:  # it is lost; rig catalog verify says so at the server
+        except CatalogError:  # it is lost; rig catalog verify reports it at the server
             continue
         with server.database.catalog_errors():
             server.database.images.put(content)

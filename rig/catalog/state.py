@@ -296,7 +296,7 @@ def summaries(transaction: Transaction, *, deleted: bool = False, object_id: int
 
 
 def of_object(object_id: int | None) -> ColumnElement[bool]:
-    """Return the condition for the enrollments of an object: those that say so, and those of which the log says so."""
+    """Return the condition for the enrollments of an object: by their own rows, and by the log."""
     own = select(Enrollment.id).where(Enrollment.object_id == object_id)
     logged = select(_Later.enrollment_id).where(_Later.object_id == object_id, _Later.status.is_not(None))
     return Ended.enrollment_id.in_(union(own, logged))

@@ -42,7 +42,6 @@ RETIRED = (
     r"likeness(?:es)?",
     r"believe(?:d|s)?",
     r"next look",
-    r"facts?",
     r"(?:the|its|their|gears'|no|without) play",
     r"judg(?:e|es|ed|ing)",
     r"attendants?",

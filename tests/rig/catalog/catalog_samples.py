@@ -132,7 +132,7 @@ def files(catalog: Catalog) -> set[str]:
 
 
 def sql(catalog: Catalog | Path, *statements: str) -> None:
-    """Change the database directly, as somebody could who removes what refuses it and puts it back."""
+    """Change the database directly, as a person could who removes its triggers and puts them back."""
     root = catalog if isinstance(catalog, Path) else catalog.path
     with closing(sqlite3.connect(root / "catalog.sqlite", isolation_level=None)) as connection:
         triggers = connection.execute("SELECT name, sql FROM sqlite_master WHERE type = 'trigger'").fetchall()

@@ -541,18 +541,18 @@ def test_no_edited_fact_is_believed(root: Path, sample: Path, reader: str, tmp_p
     """Each command shows what was stored, or that the catalog is damaged."""
     with opened(root) as catalog:
         expected = SHOWN[reader](catalog)
-    believed = []
+    accepted = []
     for number, statement in enumerate(STATEMENTS):
         edited = Path(shutil.copytree(sample, tmp_path / str(number)))
         sql(edited, "PRAGMA foreign_keys = OFF", "PRAGMA ignore_check_constraints = ON", statement)
         try:
             with opened(edited) as catalog:
                 if SHOWN[reader](catalog) != expected:
-                    believed.append(statement)
+                    accepted.append(statement)
         except CatalogDamaged as error:
             if not error.next_step:
-                believed.append(f"{statement}: no next step")
-    assert believed == []
+                accepted.append(f"{statement}: no next step")
+    assert accepted == []
 
 
 def test_an_edited_state_is_not_written_again(root: Path) -> None:
