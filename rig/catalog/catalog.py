@@ -16,6 +16,7 @@ from rig.catalog import log, state
 from rig.catalog.database import Database
 from rig.catalog.enrolling import OpenEnrollment
 from rig.catalog.facts import Action, Enrollment, Entry, Session, View, digest_of
+from rig.catalog.opening import open_database
 from rig.catalog.records import EnrollmentStatus, Provenance, check_azimuth, checked_texts, clean_name
 from rig.catalog.state import EnrollmentState, ObjectDetails, ObjectSummary
 from rig.config.catalog_place import CatalogPlace
@@ -84,7 +85,7 @@ class Catalog(AbstractContextManager["Catalog"]):
             The server of the catalog does not answer.
         """
         place = CatalogPlace.of(path)
-        return cls(Database.open(place, create=create, read_only=read_only, busy_timeout_s=busy_timeout_s), clock)
+        return cls(open_database(place, create=create, read_only=read_only, busy_timeout_s=busy_timeout_s), clock)
 
     def __exit__(self, *_: object) -> None:
         self.close()

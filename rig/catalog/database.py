@@ -36,17 +36,6 @@ class Database(ABC):
     images: Images
     read_only: bool
 
-    @classmethod
-    def open(cls, place: CatalogPlace, *, create: bool, read_only: bool, busy_timeout_s: float) -> "Database":
-        """Open the database at a place; parameters and errors as for `rig.catalog.Catalog.open`."""
-        if place.url is None:
-            from rig.catalog.sqlite_database import SqliteDatabase
-
-            return SqliteDatabase(place, create=create, read_only=read_only, busy_timeout_s=busy_timeout_s)
-        from rig.catalog.postgres import PostgresDatabase
-
-        return PostgresDatabase(place, create=create, read_only=read_only, busy_timeout_s=busy_timeout_s)
-
     @property
     def root(self) -> Path:
         """Folder of the catalog on this computer."""

@@ -37,6 +37,7 @@ from rig.catalog.database import Database
 from rig.catalog.facts import Action, Derived, Enrollment, Entry, Session, View, seal_of
 from rig.catalog.images import Images
 from rig.catalog.jobs import JobProgress, finished, processes
+from rig.catalog.opening import open_database
 from rig.catalog.records import EnrollmentStatus, JsonObject, Region
 from rig.config import ViewConfig
 from rig.core.errors import CatalogDamaged, CatalogError, RigError, UsageError
@@ -624,7 +625,7 @@ def _store(catalog: Catalog, done: Sequence[tuple[Task, Described]], *, required
             _write(catalog.database, rows)
             return
         # Derived data may also be added to a catalog that is open for reading.
-        database = Database.open(catalog.place, create=False, read_only=False, busy_timeout_s=1.0)
+        database = open_database(catalog.place, create=False, read_only=False, busy_timeout_s=1.0)
         try:
             _write(database, rows)
         finally:
