@@ -202,7 +202,8 @@ def load_model(
 def _loaded(catalog: Catalog, views: hbr.Views) -> Model:
     camera = tuple(derived.camera_settings(catalog))
     if not len(views) or views.descriptor != BENCH_DESCRIPTOR:
-        return PaperModel(hbr.ViewIndex(views), camera=camera)
+        # without views, any search may say that the catalog is empty
+        return PaperModel(hbr.ViewIndex(views if len(views) else hbr.Views.empty()), camera=camera)
     index = hbr.DenseIndex(views)
     rule, notes = stopping_rule_of(catalog.path, index)
     before = derived.empty_tables(catalog)
