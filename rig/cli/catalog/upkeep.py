@@ -152,10 +152,8 @@ def gc(
     with settings.open_catalog() as catalog:
         found = collect_garbage(catalog, old=old, dry_run=True)
         nothing = found == GarbageReport((), 0, 0, 0, 0)
-        if not dry_run:
-            if not nothing:
-                confirm(f"Remove {words(found)} permanently?", yes=yes, settings=settings)
-            # What was computed from removed objects is removed without a question.
+        if not dry_run and not nothing:
+            confirm(f"Remove {words(found)} permanently?", yes=yes, settings=settings)
             found = collect_garbage(catalog, old=old)
     text = f"{'Would remove' if dry_run else 'Removed'} {words(found)}."
     settings.say("There is nothing to remove." if nothing else text, {"dry_run": dry_run, **plain(found)})
