@@ -3,7 +3,7 @@
 Everything is checked first. The images are stored next, which does no harm if nothing follows: an image has its SHA-256
 as its name. At last, one transaction adds all rows and lines of the log.
 
-Decisions: docs/decisions/0015, docs/decisions/0054.
+Decision: docs/decisions/0015.
 """
 
 import secrets
@@ -17,7 +17,7 @@ from typing import Any, Final, NamedTuple, Protocol
 from sqlalchemy import select
 from sqlalchemy.orm import Session as Transaction
 
-from rig.catalog import derived, digests, log, state
+from rig.catalog import describing, digests, log, state
 from rig.catalog.catalog import Catalog
 from rig.catalog.columns import damaged
 from rig.catalog.digests import portions
@@ -247,7 +247,7 @@ def transfer(
     """
     checked_texts(label, None)
     for name in descriptors:
-        derived.known_descriptor(name)
+        describing.known_descriptor(name)
     catalog = source if isinstance(source, CatalogSource) else None
     is_own = catalog is not None and catalog.own
     strict = strict or catalog is not None
@@ -262,7 +262,7 @@ def transfer(
             plan = plan.compared(transaction, conflict, once=once)
     names = tuple(dict.fromkeys(descriptors))
     tasks = [
-        derived.task_of(one.enrollment, one.enrollment.key, item.name, names, None)
+        describing.task_of(one.enrollment, one.enrollment.key, item.name, names, None)
         for item in plan.wanted
         for one in item.enrollments
     ]
@@ -295,7 +295,7 @@ def transfer(
             new = _add(transaction, target, plan, label)
             details = {"origin": source.origin, "objects": plan.names, "views": plan.views}
             log.append(transaction, target.clock, Action.IMPORTED, details={**details, "replaced": list(plan.replaced)})
-            derived.add(transaction, _computed(source, new, found.contents, copied=once))
+            describing.add(transaction, _computed(source, new, found.contents, copied=once))
     size = sum(dict(found.images.values()).values())
     counts = (len(plan.wanted), plan.views, size)
     return Transferred(*counts, plan.skipped, plan.replaced, rejected, tuple(source.gaps))
@@ -519,7 +519,7 @@ def _computed(
 ) -> list[dict[str, Any]]:
     """Return the rows of what was computed from new enrollments, here or by their catalog."""
     rows = [
-        derived.row_of(seal_of(enrollment), what, None, content)
+        describing.row_of(seal_of(enrollment), what, None, content)
         for key, enrollment in new.items()
         for what, content in contents.get(key, {}).items()
     ]

@@ -20,7 +20,7 @@ MAX_OUTPUT = 1 << 20
 def main() -> None:
     import cv2
 
-    import rig.catalog.exchange
+    import rig.catalog.exchange.bundle
     import rig.evaluation.plan
     import rig.plans.identify
     import rig.report
