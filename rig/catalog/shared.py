@@ -42,7 +42,6 @@ from rig.core.errors import (
     CatalogDamaged,
     CatalogError,
     CatalogUnavailable,
-    ImportRejected,
     ObjectExists,
     ObjectNotFound,
     RigError,
@@ -339,14 +338,11 @@ def _deliver(journal: Catalog, server: Catalog, name: str, *, replaces: bool) ->
                 Do.DISCARD(name=name),
             ),
         )
-    except ImportRejected as error:
-        return CatalogDamaged(
-            f"An image of {name!r} in the journal is not the one that was stored.",
-            next_step=("Restore it from a backup, or", Do.DISCARD(name=name), "Then enroll the object again."),
-            evidence=error.evidence,
-        )
     except (CatalogDamaged, ObjectNotFound) as error:
-        return error
+        if "rejected" not in error.evidence:  # it is not about images of the journal
+            return error
+        fix = ("Restore them from a backup, or", Do.DISCARD(name=name), "Then enroll the object again.")
+        return CatalogDamaged(error.what, next_step=fix, evidence=error.evidence)
     _forget(journal, name, enrollment.key)
     return None
 

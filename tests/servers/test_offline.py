@@ -23,6 +23,7 @@ from rig.cli.ui.complete import object_names
 from rig.config.catalog_place import CatalogPlace
 from rig.core.clock import SystemClock
 from rig.core.errors import CatalogDamaged, CatalogError, CatalogUnavailable, ObjectExists
+from rig.core.next_steps import Do
 from rig.events.events import NoteCode
 from rig.plans.tray import TrayItem, left_to_enroll
 from rig.search.current_model import CurrentModel
@@ -263,6 +264,8 @@ def test_damage_in_the_journal_stays_there_and_is_reported(place: CatalogPlace) 
             ("cube", CatalogDamaged),
             ("cone", type(None)),
         ]
+        assert done[0].conflict is not None
+        assert Do.DISCARD(name="star") in done[0].conflict.steps
         assert set(names(place)) == {"mug", "tin", "cone"}
         assert [one.name for one in journal.objects()] == ["star", "cube"]
         (finding,) = finished(verify(shared, jobs=1)).findings
