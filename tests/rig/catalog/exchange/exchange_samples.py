@@ -4,7 +4,7 @@ import sqlite3
 import struct
 import zipfile
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import closing, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -23,6 +23,10 @@ from sim.clock import VirtualClock
 from tests.rig.catalog.catalog_samples import NOW, PROVENANCE, fill, finished, image, plan, record, sql
 from tests.rig.catalog.catalog_samples import OpenCatalog as OpenCatalog
 from tests.rig.catalog.test_hostile_catalogs import seal_as_the_sender
+
+Members = Mapping[str, bytes | None]
+"""Members of a bundle by their names; None removes one."""
+NO_OTHERS: Members = {}
 
 
 def fill_full(catalog: Catalog) -> None:
@@ -85,7 +89,7 @@ def png_of(width: int, height: int) -> bytes:
     )
 
 
-def rewritten(bundle: Path, *statements: str, sealed: bool = True, **members: bytes | None) -> Path:
+def rewritten(bundle: Path, *statements: str, sealed: bool = True, members: Members = NO_OTHERS) -> Path:
     """A bundle with a changed database, with right digests if it is ``sealed``, and with other ``members``."""
 
     def change(database: Path) -> None:
@@ -93,10 +97,10 @@ def rewritten(bundle: Path, *statements: str, sealed: bool = True, **members: by
         if sealed:
             seal_as_the_sender(database.parent)
 
-    return changed_bundle(bundle, bundle.with_name("changed.rigcat.zip"), change, **members)
+    return changed_bundle(bundle, bundle.with_name("changed.rigcat.zip"), change, members)
 
 
-def changed_bundle(bundle: Path, target: Path, change: Callable[[Path], None], **members: bytes | None) -> Path:
+def changed_bundle(bundle: Path, target: Path, change: Callable[[Path], None], members: Members = NO_OTHERS) -> Path:
     """A bundle after a ``change`` of its database, and with other ``members``."""
     with zipfile.ZipFile(bundle) as archive:
         found: dict[str, bytes | None] = {info.filename: archive.read(info) for info in archive.infolist()}

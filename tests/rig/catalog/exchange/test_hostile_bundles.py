@@ -73,7 +73,7 @@ class TestHostileBundles:
         changed = rewritten(
             bundle,
             f"UPDATE views SET image = '{name_of(bomb)}', image_bytes = {len(bomb)} WHERE view_index = 0",
-            **{FIRST: None, path_of(name_of(bomb)): bomb},
+            members={FIRST: None, path_of(name_of(bomb)): bomb},
         )
         assert "60000 x 60000 pixels" in self.rejection(open_catalog, changed)
 
@@ -135,14 +135,16 @@ class TestHostileBundles:
     def test_image_that_is_another_one_is_rejected(self, bundle: Path, open_catalog: OpenCatalog) -> None:
         other = bytearray(encode(image(0)))
         other[-20] ^= 1
-        assert "is not the stored image" in self.rejection(open_catalog, rewritten(bundle, **{FIRST: bytes(other)}))
+        assert "is not the stored image" in self.rejection(
+            open_catalog, rewritten(bundle, members={FIRST: bytes(other)})
+        )
 
     def test_image_that_is_no_image_is_rejected(self, bundle: Path, open_catalog: OpenCatalog) -> None:
         name = name_of(b"I am no image")
         changed = rewritten(
             bundle,
             f"UPDATE views SET image = '{name}', image_bytes = 13 WHERE view_index = 0",
-            **{FIRST: None, path_of(name): b"I am no image"},
+            members={FIRST: None, path_of(name): b"I am no image"},
         )
         assert "neither a PNG nor a JPEG" in self.rejection(open_catalog, changed)
 
