@@ -15,12 +15,16 @@ from sqlalchemy import Engine, event
 
 from rig.catalog import Catalog, OpenEnrollment
 from rig.catalog.derived import views as searched
+from rig.catalog.images import FolderImages, name_of
 from rig.catalog.jobs import finished
 from rig.catalog.sqlite_database import SqliteDatabase
+from rig.catalog.upkeep import collect_garbage
 from rig.catalog.verify import verify
 from rig.config.catalog_place import CatalogPlace
+from rig.core.clock import SystemClock
 from rig.core.errors import CatalogBusy, CatalogError
 from rig.core.next_steps import Do
+from rig.views.image_files import encode
 from sim.clock import VirtualClock
 from tests.rig.catalog.catalog_samples import PROVENANCE, fill, image, other_program, plan, record
 
@@ -195,3 +199,49 @@ def test_several_processes_share_one_catalog(tmp_path: Path) -> None:
         for name in children:
             for view in catalog.object(name).views:
                 assert np.array_equal(catalog.read_image(view.image), image(view.index))
+
+
+def test_processes_that_store_the_same_image_do_not_disturb_each_other(tmp_path: Path) -> None:
+    """All sessions of a bench store the same empty-table image."""
+    contents = [encode(image(seed)) for seed in range(30)]
+    store = FolderImages(tmp_path)
+    children = []
+    for _ in range(3):
+        if (child := os.fork()) == 0:
+            try:
+                for content in contents:
+                    store.put(content)
+                os._exit(0)
+            finally:
+                os._exit(1)
+        children.append(child)
+    running = set(children)
+    while running:
+        for name in store.names():
+            if name.endswith(".png"):
+                store.content(name)  # it is complete
+        running -= {child for child in running if os.waitpid(child, os.WNOHANG) == (child, 0)}
+    assert store.names() == {name_of(content) for content in contents}
+
+
+def test_an_image_that_is_collected_before_its_row_is_stored_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A deleted object had the same image, and another process removes it between the image and the row."""
+    with Catalog.open(tmp_path, clock=SystemClock()) as catalog, Catalog.open(tmp_path, clock=SystemClock()) as other:
+        fill(catalog, "gone", 1)
+        catalog.delete("gone")
+        enrollment = begin(catalog, "mug", 1)
+        put = FolderImages.put
+
+        def put_and_collect(store: FolderImages, content: bytes, *, settled: bool = True) -> str:
+            name = put(store, content, settled=settled)
+            monkeypatch.setattr(FolderImages, "put", put)
+            assert collect_garbage(other).files == 1
+            return name
+
+        monkeypatch.setattr(FolderImages, "put", put_and_collect)
+        enrollment.add(record(0), image(0))
+        enrollment.finish()
+        assert np.array_equal(catalog.read_image(catalog.object("mug").views[0].image), image(0))
+        assert finished(verify(catalog, jobs=1)).findings == ()
