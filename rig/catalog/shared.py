@@ -447,13 +447,23 @@ def update_copy(catalog: Catalog) -> bool:
     """Bring the local copy up to date; return whether anything had changed. Only what is new is read.
 
     A copy that is damaged, or of another catalog, is made again.
+
+    Raises
+    ------
+    CatalogDamaged
+        The catalog is not as it was stored; the copy stays as it is.
+    CatalogError, CatalogBusy
+        One of them cannot be used, or another program updates the copy.
     """
     folder = catalog.place.copy_folder
     try:
         changed = _update(catalog, folder)
     except CatalogDamaged:
+        made = folder.with_name(f"{folder.name}.new")
+        shutil.rmtree(made, ignore_errors=True)
+        changed = _update(catalog, made)
         shutil.rmtree(folder, ignore_errors=True)
-        changed = _update(catalog, folder)
+        made.rename(folder)
     with suppress(FileNotFoundError):
         shutil.copyfile(catalog.path / RULES, folder / RULES)
     return changed
@@ -487,6 +497,7 @@ def _copy_log(reading: Transaction, writing: Transaction, *, after: int) -> None
     """Add the new lines of the catalog's log to that of the copy, without answers: so it has the same state."""
     new = select(Entry).where(Entry.result.is_(None)).order_by(Entry.id).limit(_AT_ONCE)
     while part := reading.scalars(new.where(Entry.id > after)).all():
+        state.check_lines(reading, [one.id for one in part])
         log.add(writing, *map(_same, part))
         after = part[-1].id
         reading.expunge_all()

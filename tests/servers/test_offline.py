@@ -144,6 +144,20 @@ def test_bench_works_without_its_server(postgres: PostgresServer, place: Catalog
         assert current().views.object_names == ("mug", "tin", "star")
 
 
+def test_damaged_catalog_leaves_its_copy_alone(place: CatalogPlace) -> None:
+    with Catalog.open(place, clock=CLOCK) as catalog:
+        before = catalog.version()
+        catalog.rename("mug", "cup")
+        with catalog.database.write() as transaction:
+            transaction.execute(text("ALTER TABLE log DISABLE TRIGGER USER"))
+            transaction.execute(text("UPDATE log SET object_name = 'pot' WHERE object_name = 'cup'"))
+        with pytest.raises(CatalogDamaged, match="pot"):
+            update_copy(catalog)
+        with open_copy(place, CLOCK) as copy:
+            assert copy.version() == before
+            assert copy.damage() is None
+
+
 def test_answer_is_delivered_once_with_its_corrections(place: CatalogPlace) -> None:
     with Journal.of(place, CLOCK) as journal, Catalog.open(place, clock=CLOCK) as shared:
         record_result(shared, new_result("found", "tin"), None)
