@@ -22,7 +22,19 @@ from sqlalchemy.orm import Session as Transaction
 from benchmarks.bench_search import VIEWS_OF_AN_OBJECT, model
 from hbr import Views, descriptor
 from hbr.core.arrays import LevelArray
-from rig.catalog import Action, Catalog, Enrollment, EnrollmentStatus, Provenance, Session, View, derived, log
+from rig.catalog import (
+    Action,
+    Catalog,
+    Enrollment,
+    EnrollmentStatus,
+    Provenance,
+    Session,
+    View,
+    derived,
+    describing,
+    log,
+    state,
+)
 from rig.catalog.facts import Derived, Entry, digest_of, seal_of
 from rig.core.clock import SystemClock
 from rig.views import image_files
@@ -146,16 +158,18 @@ def _entries(
 def _describe(catalog: Catalog, views: Views) -> None:
     """Store descriptors that differ from object to object, as if the images did."""
     with catalog.database.write() as transaction:
-        for j, one in enumerate(derived.state.used(transaction)):
+        for j, one in enumerate(state.used(transaction)):
             own = views.of(j)
             for kind in (descriptor(PAPER_DESCRIPTOR), descriptor(BENCH_DESCRIPTOR)):
                 packed = _rotating(kind.size_bytes, VIEWS_OF_AN_OBJECT, j)
                 if kind.name == PAPER_DESCRIPTOR:
                     packed = kind.pack_rows(views.descriptors[own])
-                content = derived.content_of(kind, packed, views.azimuth_deg[own])
-                transaction.execute(insert(Derived).values(derived.row_of(one.seal, kind.name, None, content)))
+                content = describing.content_of(kind, packed, views.azimuth_deg[own])
+                transaction.execute(insert(Derived).values(describing.row_of(one.seal, kind.name, None, content)))
             evidence = json.dumps([{}] * VIEWS_OF_AN_OBJECT).encode()
-            transaction.execute(insert(Derived).values(derived.row_of(one.seal, derived.SEGMENTATION, None, evidence)))
+            transaction.execute(
+                insert(Derived).values(describing.row_of(one.seal, describing.SEGMENTATION, None, evidence))
+            )
 
 
 def _frames() -> list[list[NDArray[np.uint8]]]:

@@ -444,4 +444,4 @@ class Catalog(AbstractContextManager["Catalog"]):
         session.digest = digest_of(session, enrollment.key)
         transaction.add(session)
         transaction.flush()
-        return OpenEnrollment(self, enrollment, name, session)
+        return OpenEnrollment(self.database, self.clock, enrollment, name, session)

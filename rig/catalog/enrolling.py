@@ -4,7 +4,7 @@ from concurrent.futures import Future
 from dataclasses import dataclass, field
 from datetime import timedelta
 from math import isfinite
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,14 +12,14 @@ from sqlalchemy import delete, select
 from sqlalchemy.orm import Session as Transaction
 
 from rig.catalog import log, state
+from rig.catalog.database import Database
+from rig.catalog.describing import describe_new
 from rig.catalog.facts import Action, Enrollment, Session, View, digest_of
 from rig.catalog.records import EnrollmentStatus, as_json, check_azimuth, is_region
+from rig.core.clock import Clock
 from rig.core.errors import CatalogError, UsageError
 from rig.core.next_steps import Do
 from rig.views import image_files as images
-
-if TYPE_CHECKING:
-    from rig.catalog.catalog import Catalog
 
 MOST_HELD_BYTES: Final = 256_000_000
 """Pixels of one enrollment that are held in memory until it is described: 277 views of 640x480."""
@@ -41,7 +41,8 @@ class OpenEnrollment:
         The present session.
     """
 
-    _catalog: "Catalog"
+    _database: Database
+    _clock: Clock
     enrollment: Enrollment
     object_name: str
     session: Session
@@ -58,7 +59,7 @@ class OpenEnrollment:
 
     def missing(self) -> tuple[int, ...]:
         """Return the indices of the planned views that are not stored yet, ascending."""
-        with self._catalog.database.read() as transaction:
+        with self._database.read() as transaction:
             return self._missing(transaction)
 
     def add(self, view: View, image_bgr: NDArray[np.uint8], encoded: Future[bytes] | None = None) -> View:
@@ -85,7 +86,7 @@ class OpenEnrollment:
                 next_step="Start a new enrollment with a larger plan.",
             )
         check_view(view)
-        clock, database = self._catalog.clock, self._catalog.database
+        clock, database = self._clock, self._database
         png = images.encode(image_bgr) if encoded is None else encoded.result()
         if view.captured_ns is not None:
             age_ns = clock.now_ns() - view.captured_ns
@@ -119,10 +120,8 @@ class OpenEnrollment:
         CatalogError
             Planned views are missing, an image cannot be read, or the enrollment is no longer in progress.
         """
-        from rig.catalog.derived import describe_new
-
-        catalog = self._catalog
-        with catalog.database.read() as transaction:
+        database, clock = self._database, self._clock
+        with database.read() as transaction:
             self._check_in_progress(transaction)
             (found,) = state.enrollments(transaction, Enrollment.id == self.id)
         enrollment = found.enrollment
@@ -133,8 +132,8 @@ class OpenEnrollment:
                 next_step=(Do.CONTINUE_ENROLLMENT(name=self.object_name), "Or abandon it."),
                 evidence={"missing_views": list(missing)},
             )
-        seal = describe_new(catalog, enrollment, self._held, self.object_name)
-        with catalog.database.write() as transaction:
+        seal = describe_new(database, enrollment, self._held, self.object_name)
+        with database.write() as transaction:
             self._check_in_progress(transaction)
             known = state.by_id(transaction, enrollment.object_id)
             before = state.of_status(transaction, known, EnrollmentStatus.COMPLETE)
@@ -142,20 +141,20 @@ class OpenEnrollment:
                 self._end(transaction, Action.ENROLLMENT_SUPERSEDED, EnrollmentStatus.SUPERSEDED, before)
             log.append(
                 transaction,
-                catalog.clock,
+                clock,
                 Action.ENROLLED,
                 known.object_name,
                 object_id=enrollment.object_id,
                 enrollment_id=self.id,
                 status=EnrollmentStatus.COMPLETE,
-                finished_utc=catalog.clock.utc(),
+                finished_utc=clock.utc(),
                 seal=seal,
                 details={"enrollment_id": self.id, "views": len(self.planned_azimuth_deg)},
             )
 
     def abandon(self) -> None:
         """Abandon the enrollment. Its images stay, and the complete enrollment before it stays in use."""
-        with self._catalog.database.write() as transaction:
+        with self._database.write() as transaction:
             self._check_in_progress(transaction)
             self._end(transaction, Action.ENROLLMENT_ABANDONED, EnrollmentStatus.ABANDONED)
 
@@ -167,7 +166,7 @@ class OpenEnrollment:
         CatalogError
             The enrollment has views or is no longer in progress.
         """
-        with self._catalog.database.write() as transaction:
+        with self._database.write() as transaction:
             self._check_in_progress(transaction)
             if len(self._missing(transaction)) < len(self.planned_azimuth_deg):
                 raise CatalogError(
@@ -182,7 +181,7 @@ class OpenEnrollment:
             gone = state.columns(known, self.session.started_utc, deleted=True)
             log.append(
                 transaction,
-                self._catalog.clock,
+                self._clock,
                 Action.ENROLLMENT_DISCARDED,
                 known.object_name,
                 **(gone if others is None else {}),
@@ -199,10 +198,10 @@ class OpenEnrollment:
     ) -> None:
         """End an enrollment, this one or the ``ended`` one; the object may have another name now."""
         enrollment = self.enrollment if ended is None else ended.enrollment
-        finished_utc = self._catalog.clock.utc() if ended is None else ended.finished_utc
+        finished_utc = self._clock.utc() if ended is None else ended.finished_utc
         log.append(
             transaction,
-            self._catalog.clock,
+            self._clock,
             action,
             state.by_id(transaction, enrollment.object_id).object_name,
             object_id=enrollment.object_id,

@@ -11,7 +11,7 @@ from zipfile import BadZipFile
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.catalog import derived
+from rig.catalog import describing
 from rig.catalog.images import Images, name_of
 from rig.catalog.jobs import JobProgress, processes
 from rig.catalog.rejected import ImportProblem, Reason, RejectedFile
@@ -58,7 +58,7 @@ class Reading:
 class ReadImages:
     """What was read: name and size in bytes of each image, or the reason why it cannot be used.
 
-    ``contents`` are the descriptions of enrollments by their keys (`derived.contents`).
+    ``contents`` are the descriptions of enrollments by their keys (`describing.contents`).
     """
 
     images: dict[str, tuple[str, int]] = field(default_factory=dict)
@@ -80,7 +80,7 @@ class _Rejected(Exception):
 
 
 def read_images(
-    reading: Reading, tasks: Sequence[derived.Task], *, strict: bool, jobs: Jobs | None
+    reading: Reading, tasks: Sequence[describing.Task], *, strict: bool, jobs: Jobs | None
 ) -> Generator[JobProgress, None, ReadImages]:
     """Read the images of enrollments; with ``strict`` it ends at the first enrollment with a rejected one."""
     total, done = sum(len(_names(task)) for task in tasks), 0
@@ -95,7 +95,7 @@ def read_images(
     return found
 
 
-def _read(reading: Reading, task: derived.Task) -> ReadImages:
+def _read(reading: Reading, task: describing.Task) -> ReadImages:
     """Read the images of an enrollment, and describe those that can be used. Runs in a worker process."""
     found = ReadImages()
     last = ""
@@ -113,7 +113,7 @@ def _read(reading: Reading, task: derived.Task) -> ReadImages:
 
     while task.names and task.views:
         try:
-            found.contents[task.seal] = derived.contents(pixels, task)
+            found.contents[task.seal] = describing.contents(pixels, task)
             break
         except _Rejected:
             read_others()
@@ -147,6 +147,6 @@ def _pixels(reading: Reading, image: str, found: ReadImages) -> NDArray[np.uint8
     return pixels
 
 
-def _names(task: derived.Task) -> list[str]:
+def _names(task: describing.Task) -> list[str]:
     """Return the images of an enrollment, each once."""
     return list(dict.fromkeys([*(view.image for view in task.views), *filter(None, task.empty_tables)]))

@@ -13,7 +13,7 @@ from sqlalchemy import and_, func, select
 from sqlalchemy.orm import Session as Transaction
 from sqlalchemy.orm import selectinload
 
-from rig.catalog import derived, digests, log, state
+from rig.catalog import derived, describing, digests, log, state
 from rig.catalog.catalog import Catalog
 from rig.catalog.enrolling import MOST_HELD_BYTES
 from rig.catalog.facts import Action, Enrollment, Entry, Session, View
@@ -95,7 +95,7 @@ class _Group(NamedTuple):
     images: tuple[_Image, ...]
     stored: tuple[str, ...] = ()
     damaged: tuple[str, ...] = ()
-    task: derived.Task | None = None
+    task: describing.Task | None = None
     number: int = 0
 
     def finding(self, problem: Problem, image: _Image | None = None, **details: Any) -> Finding:
@@ -298,7 +298,7 @@ def _check(store: Images, quick: bool, group: _Group) -> tuple[list[Finding], di
     if group.task is None or findings:
         return findings, {}
     try:
-        return [], derived.contents(lambda name: pixels[name] if name in pixels else store.pixels(name), group.task)
+        return [], describing.contents(lambda name: pixels[name] if name in pixels else store.pixels(name), group.task)
     except CatalogError:  # these images cannot have been described so
         return [group.finding(Problem.DESCRIPTION_DIFFERS, descriptor=name) for name in group.task.names], {}
 

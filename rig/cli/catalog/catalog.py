@@ -16,7 +16,7 @@ from rig.core.phrases import counted, number
 
 if TYPE_CHECKING:
     from rig.catalog import ObjectDetails, ObjectSummary, Session, View
-    from rig.catalog.derived import Described
+    from rig.catalog.describing import Described
 
 app = typer.Typer(help="Manage the enrolled objects.", no_args_is_help=True)
 
@@ -90,7 +90,8 @@ def show(
 
     Example: rig catalog show mug-white --bench sim
     """
-    from rig.catalog.derived import Described, described
+    from rig.catalog.derived import described
+    from rig.catalog.describing import Described
     from rig.core.errors import CatalogError
 
     found, problem = Described({}, ()), None

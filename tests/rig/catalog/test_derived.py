@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from sqlalchemy import delete, insert, select, update
 
 import hbr
-from rig.catalog import Catalog, Enrollment, derived
-from rig.catalog.derived import SEGMENTATION
+from rig.catalog import Catalog, Enrollment, derived, describing
+from rig.catalog.describing import SEGMENTATION
 from rig.catalog.facts import Derived, seal_of
 from rig.catalog.jobs import JobProgress, finished
 from rig.catalog.verify import Problem, verify
@@ -214,7 +214,7 @@ def test_a_catalog_that_is_read_only_is_described_in_memory(catalog: Catalog, mo
         raise CatalogBusy("Another process writes.", next_step="Wait.")
 
     with monkeypatch.context() as patch, Catalog.open(catalog.path, clock=VirtualClock(), read_only=True) as reader:
-        patch.setattr(derived, "_write", busy)
+        patch.setattr(describing, "_write", busy)
         for opened in (reader, catalog):
             after, described = load(opened)
             assert (described, equal(before, after)) == (len(NAMES), True)
@@ -230,7 +230,7 @@ def test_evidence_that_no_program_wrote_is_computed_again(catalog: Catalog, evid
     (seal,) = {seal for seal, what in rows(catalog) if seal == seal_of(enrollment)}
     with catalog.database.write() as transaction:
         transaction.execute(delete(Derived).where(Derived.seal == seal, Derived.what == SEGMENTATION))
-        transaction.execute(insert(Derived).values(derived.row_of(seal, SEGMENTATION, None, evidence.encode())))
+        transaction.execute(insert(Derived).values(describing.row_of(seal, SEGMENTATION, None, evidence.encode())))
     found = derived.described(catalog, enrollment, "box")
     assert found.segmentation == expected.segmentation
     assert all(np.array_equal(found.levels[name], expected.levels[name]) for name in DESCRIPTORS)
@@ -242,8 +242,8 @@ def test_azimuths_that_no_program_wrote_are_not_searched(catalog: Catalog) -> No
     seal, packed = seal_of(enrollment), np.zeros((VIEWS, kind.size_bytes), np.uint8)
     with catalog.database.write() as transaction:
         transaction.execute(delete(Derived).where(Derived.seal == seal, Derived.what == kind.name))
-        content = derived.content_of(kind, packed, [0.0, 90.0, np.nan, 270.0])
-        transaction.execute(insert(Derived).values(derived.row_of(seal, kind.name, None, content)))
+        content = describing.content_of(kind, packed, [0.0, 90.0, np.nan, 270.0])
+        transaction.execute(insert(Derived).values(describing.row_of(seal, kind.name, None, content)))
     with pytest.raises(CatalogDamaged, match="azimuth"):
         load(catalog)
 
@@ -361,10 +361,10 @@ def test_verify_tolerates_rounded_levels(catalog: Catalog, levels: int, step: in
     off[0, entries] = np.where(off[0, entries] >= 2, off[0, entries] - step, off[0, entries] + step)
     enrollment = complete(catalog, "box")
     seal = seal_of(enrollment)
-    content = derived.content_of(kind, kind.pack_rows(off), views.azimuth_deg[own])
+    content = describing.content_of(kind, kind.pack_rows(off), views.azimuth_deg[own])
     with catalog.database.write() as transaction:
         transaction.execute(delete(Derived).where(Derived.seal == seal, Derived.what == kind.name))
-        transaction.execute(insert(Derived).values(derived.row_of(seal, kind.name, None, content)))
+        transaction.execute(insert(Derived).values(describing.row_of(seal, kind.name, None, content)))
     seen = finished(verify(catalog, jobs=1)).findings
     assert [finding.problem for finding in seen] == [Problem.DESCRIPTION_DIFFERS] * found
     finished(derived.redescribe(catalog, BENCH_DESCRIPTOR, again=True, jobs=1))
@@ -379,7 +379,7 @@ def test_a_silhouette_that_is_not_that_of_the_image_is_found(catalog: Catalog) -
     with catalog.database.write() as transaction:
         transaction.execute(delete(Derived).where(Derived.seal == seal, Derived.what == SEGMENTATION))
         content = json.dumps(evidence).encode()
-        transaction.execute(insert(Derived).values(derived.row_of(seal, SEGMENTATION, None, content)))
+        transaction.execute(insert(Derived).values(describing.row_of(seal, SEGMENTATION, None, content)))
     found = finished(verify(catalog, jobs=1)).findings
     assert [(one.problem, one.object_name) for one in found] == [(Problem.DESCRIPTION_DIFFERS, "box")]
 

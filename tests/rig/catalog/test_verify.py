@@ -9,7 +9,7 @@ import pytest
 import hbr
 from hbr.descriptors import descriptor, registry
 from hbr.descriptors.plain_cedd import Cedd
-from rig.catalog import Catalog, derived
+from rig.catalog import Catalog, derived, describing
 from rig.catalog.facts import seal_of
 from rig.catalog.jobs import JobProgress
 from rig.catalog.unfinished import UnfinishedJob
@@ -195,8 +195,9 @@ class TestVerify:
         changed = slice(0, round(off * levels.shape[1]))  # as if another computer had rounded them
         levels[:, changed] += np.where(levels[:, changed] > 0, -1, 1)
         packed = np.stack([np.frombuffer(kind.pack(one.astype(np.uint8)), np.uint8) for one in levels])
-        row = derived.row_of(seal_of(enrollment), kind.name, None, derived.content_of(kind, packed, tin))
-        derived._write(catalog.database, [row])
+        row = describing.row_of(seal_of(enrollment), kind.name, None, describing.content_of(kind, packed, tin))
+        with catalog.database.write() as transaction:
+            describing.add(transaction, [row])
         expected = [(Problem.DESCRIPTION_DIFFERS, "tin")] if differs else []
         assert concerned(finished(verify(catalog, jobs=1))) == expected
         assert finished(verify(catalog, quick=True)).findings == ()

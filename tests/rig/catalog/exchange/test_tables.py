@@ -171,6 +171,6 @@ def test_description_of_a_table_is_computed_once(
     catalog = open_catalog("catalog")
     run_import(catalog, read_folder(tmp_path / "in", now=NOW))
     write_parquet(tmp_path / "a.parquet", CatalogSource(catalog))
-    monkeypatch.setattr("rig.catalog.derived._describe", None)
+    monkeypatch.setattr("rig.catalog.derived.describe", None)
     write_parquet(tmp_path / "b.parquet", CatalogSource(catalog))
     assert (tmp_path / "a.parquet").read_bytes() == (tmp_path / "b.parquet").read_bytes()
