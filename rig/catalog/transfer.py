@@ -292,10 +292,13 @@ def transfer(
             store.settle({name for name, _ in found.images.values()})
         with target.database.write() as transaction:
             plan = plan.compared(transaction, conflict, once=once)  # another process may have added objects
-            new = _add(transaction, target, plan, label)
-            details = {"origin": source.origin, "objects": plan.names, "views": plan.views}
-            log.append(transaction, target.clock, Action.IMPORTED, details={**details, "replaced": list(plan.replaced)})
-            describing.add(transaction, _computed(source, new, found.contents, copied=once))
+            if plan.wanted:
+                new = _add(transaction, target, plan, label)
+                details = {"origin": source.origin, "objects": plan.names, "views": plan.views}
+                log.append(
+                    transaction, target.clock, Action.IMPORTED, details={**details, "replaced": list(plan.replaced)}
+                )
+                describing.add(transaction, _computed(source, new, found.contents, copied=once))
     size = sum(dict(found.images.values()).values())
     counts = (len(plan.wanted), plan.views, size)
     return Transferred(*counts, plan.skipped, plan.replaced, rejected, tuple(source.gaps))
@@ -462,24 +465,31 @@ def _add(transaction: Transaction, target: Catalog, plan: _Plan, label: str | No
         about: dict[str, Any] = {"object_name": item.name, "object_id": object_id}
         texts = {"label": item.label or label or "", "note": item.note}
         columns = {} if found is not None else state.columns(None, item.created_utc, texts)
+        there = {
+            key: known.state
+            for one in item.enrollments
+            if (known := plan.known.get(key := one.enrollment.key)) is not None
+            and known.object_id == object_id
+            and _are_equal(known.state, one)
+        }
         # End what the new enrollments replace.
         for status in _CURRENT.keys() & {one.status for one in item.enrollments}:
             before = None if found is None else state.of_status(transaction, found, status)
-            if before is not None and before.enrollment.key not in item.keys:
+            if before is not None and before.enrollment.key not in there:
                 ended, action = _CURRENT[status]
                 one = replace(before, status=ended, finished_utc=before.finished_utc or target.clock.utc())
                 log.append(transaction, target.clock, action, **about, **_status_of(one))
         # Add them, or bring those that the object has already into use again.
         for one in item.enrollments:
-            key, there = one.enrollment.key, plan.known.get(one.enrollment.key)
-            if there is None or there.object_id != object_id or not _are_equal(there.state, one):
-                if there is not None:  # with other views, or of an object that is deleted or has another name
+            key = one.enrollment.key
+            if key not in there:
+                if key in plan.known:  # with other views, or of an object that is deleted or has another name
                     _digest(one.enrollment, secrets.token_hex(32))
                 new[key] = _store(transaction, one.enrollment, about["object_id"])
-            elif there.state.status == one.status:
+            elif there[key].status == one.status:
                 continue
             else:
-                one = replace(one, enrollment=there.state.enrollment)
+                one = replace(one, enrollment=there[key].enrollment)
             log.append(transaction, target.clock, Action.IMPORTED, **about, **_status_of(one), **columns)
             columns = {}
         if columns:
@@ -488,7 +498,9 @@ def _add(transaction: Transaction, target: Catalog, plan: _Plan, label: str | No
 
 
 def _are_equal(one: EnrollmentState, other: EnrollmentState) -> bool:
-    return seal_of(one.enrollment) == seal_of(other.enrollment)
+    """Return whether two enrollments with one key have the same views: one of them may have been continued."""
+    digests = [[view.digest for view in each.enrollment.views] for each in (one, other)]
+    return digests[0] == digests[1]
 
 
 def _status_of(one: EnrollmentState) -> dict[str, Any]:

@@ -123,7 +123,28 @@ class TestOnlyOnce:
         catalog.rename("mug-white", "cup")
         done = run_import(catalog, CatalogSource(full))
         assert (done.objects, done.skipped) == (0, ("mug-white", "Tässe =2+2", "tin"))
-        assert [line.action for line in catalog.log()[before:]] == ["renamed", "imported"]
+        assert [line.action for line in catalog.log()[before:]] == ["renamed"]
+        assert finished(verify(catalog)).findings == ()
+
+    def test_photographs_are_not_added_a_second_time(
+        self, photographs: Callable[[], Photographs], open_catalog: OpenCatalog, tmp_path: Path
+    ) -> None:
+        catalog = open_catalog("catalog")
+        run_import(catalog, photographs())
+        with pytest.raises(ObjectExists):
+            run_import(catalog, photographs())
+        done = run_import(catalog, photographs(), Conflict.REPLACE)
+        assert (done.objects, done.replaced, done.skipped) == (0, (), ("mug", "tin"))
+        photograph(tmp_path / "in" / "mug__10.png", 10)
+        done = run_import(catalog, photographs(), Conflict.REPLACE)
+        assert (done.replaced, done.skipped) == (("mug",), ("tin",))
+        assert [one.status for one in catalog.object("mug").enrollments] == ["complete", "superseded"]
+        (tmp_path / "in" / "mug__10.png").unlink()
+        run_import(catalog, photographs(), Conflict.REPLACE)
+        assert [one.status for one in catalog.object("mug").enrollments] == ["superseded", "complete"]
+        assert catalog.object("mug").summary.views == 6
+        catalog.delete("mug")
+        run_import(catalog, photographs(), Conflict.REPLACE)
         assert finished(verify(catalog)).findings == ()
 
     def test_earlier_enrollment_comes_into_use_again(self, full: Catalog, open_catalog: OpenCatalog) -> None:
