@@ -299,8 +299,7 @@ def transfer(
                     transaction, target.clock, Action.IMPORTED, details={**details, "replaced": list(plan.replaced)}
                 )
                 describing.add(transaction, _computed(source, new, found.contents, copied=once))
-    size = sum(dict(found.images.values()).values())
-    counts = (len(plan.wanted), plan.views, size)
+    counts = (len(plan.wanted), plan.views, plan.bytes)
     return Transferred(*counts, plan.skipped, plan.replaced, rejected, tuple(source.gaps))
 
 
@@ -391,6 +390,14 @@ class _Plan:
     @property
     def views(self) -> int:
         return sum(len(one.enrollment.views) for item in self.wanted for one in item.enrollments)
+
+    @property
+    def bytes(self) -> int:
+        """Sizes of all images, each once."""
+        enrollments = [one.enrollment for item in self.wanted for one in item.enrollments]
+        sizes: dict[str | None, int] = {view.image: view.image_bytes for one in enrollments for view in one.views}
+        sizes |= {part.empty_table: part.empty_table_bytes or 0 for one in enrollments for part in one.sessions}
+        return sum(sizes.values())
 
     def compared(self, transaction: Transaction, conflict: Conflict, *, once: bool) -> "_Plan":
         """Return the plan after a comparison with the target. `ObjectExists` if a conflict is rejected."""
