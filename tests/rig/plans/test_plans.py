@@ -7,6 +7,7 @@ import pytest
 import hbr
 from hbr.core.angles import wrap180
 from rig.catalog import Catalog, derived
+from rig.catalog.describing import FEWEST_VIEWS
 from rig.core.errors import (
     CameraSettingsDiffer,
     CatalogError,
@@ -82,7 +83,7 @@ def test_enrolled_views_are_described_together(simulated, catalog, interrupted_a
     found = derived.described(catalog, stored, "teapot")
     for index, image in enumerate(images):
         own = [n for n, session in enumerate(sessions) if session == sessions[index]]
-        learned = own if len(own) >= derived.FEWEST_VIEWS else range(VIEWS)
+        learned = own if len(own) >= FEWEST_VIEWS else range(VIEWS)
         describer = EnrollmentDescriber(s.bench.config.view, (BENCH_DESCRIPTOR,), tables[sessions[index]])
         numbers = {n: describer.learn(images[n]) for n in learned}
         expected = describer.describe(numbers[index], image)
