@@ -721,18 +721,17 @@ def without_constraints(root: Path) -> Path:
     return root
 
 
-@pytest.mark.parametrize("sealed", [False, True], ids=["edited", "sealed"])
+@pytest.mark.parametrize(
+    "sealed", [pytest.param(False, marks=pytest.mark.nightly, id="edited"), pytest.param(True, id="sealed")]
+)
 @pytest.mark.parametrize("edit", VALUES)
 def test_invalid_values_end_in_an_error(without_constraints: Path, tmp_path: Path, edit: str, sealed: bool) -> None:
     """Values that no program stored end in an error, even if a sender gave them the right digests."""
     root, strange = without_constraints, ("properties", "derived", "log SET result", "log SET record")
-    with closing(sqlite3.connect(root / "catalog.sqlite", isolation_level=None)) as connection:
-        good = connection.execute("SELECT name, sql FROM sqlite_master WHERE sql LIKE 'CREATE TABLE%'").fetchall()
     sql(root, "PRAGMA foreign_keys = OFF", "PRAGMA ignore_check_constraints = ON", f"UPDATE {edit}")
     if sealed and not edit.startswith("properties"):
         seal_as_the_sender(root)
     restore_schema(root)
-    assert good
     if not edit.startswith(strange) and not sealed:
         with pytest.raises(RigError):
             reported(root)
