@@ -210,11 +210,12 @@ def test_some_objects_and_pages_are_exported(two: Rig) -> None:
 
 def test_merge_is_all_or_nothing(two: Rig) -> None:
     other = ("--set", "catalog.path=other")
-    assert two("import", "photographs", *other).exit_code == 0
+    assert two("import", "photographs", "--table-angles", *other).exit_code == 0
     assert two("catalog", "rename", "tin", "jar", *other).exit_code == 0
     assert two("catalog", "merge", "other").exit_code == 7
     assert names(two) == ["mug", "tin"]
     assert two("import", "other").exit_code == 7  # the folder of a catalog is an unpacked bundle
+    assert two("catalog", "merge", "catalog").exit_code == 0  # with what it has already
     assert result(two("catalog", "merge", "other", "--on-conflict", "skip", "--json"))["objects"] == 1
     assert names(two) == ["mug", "tin", "jar"]
 
