@@ -6,7 +6,7 @@ and it can be copied again without harm. An image is complete under its name or 
 
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from datetime import datetime
 from math import inf
@@ -111,6 +111,10 @@ class Images(ABC):
     def size(self, name: str) -> int:
         """Return the size of an image in bytes; 0 if there is none."""
 
+    def missing(self, names: Collection[str]) -> set[str]:
+        """Return which of these images are not there."""
+        return {name for name in names if not self.size(name)}
+
     @abstractmethod
     def remove(self, names: Iterable[str]) -> None:
         """Remove images. A missing one is no error."""
@@ -160,7 +164,7 @@ class FolderImages(Images):
                 sync_file(path)  # the process that wrote it may not have waited, or was killed before it did
         else:
             if not path.parent.is_dir():
-                make_folder_within(self.root, path.parent)
+                make_folder_within(self.root, path.parent, settled=settled)
             # a name of its own: another process may write the same image now
             part = path.with_name(f"{name}.{token_hex(8)}.part")
             try:
@@ -185,7 +189,7 @@ class FolderImages(Images):
             return
         for path in paths:
             sync_file(path)
-        for folder in {path.parent for path in paths}:
+        for folder in {path.parent for path in paths} | {self.root / FOLDER, self.root}:
             sync_folder(folder)
 
     def names(self, *, before_s: float = inf) -> set[str]:
@@ -273,6 +277,9 @@ class FsspecImages(Images):
         with suppress(FileNotFoundError):
             return self._size(name)
         return 0
+
+    def missing(self, names: Collection[str]) -> set[str]:
+        return set(names) - self.names()  # in a few requests
 
     def _size(self, name: str) -> int:
         with self._store() as (store, root):

@@ -112,10 +112,19 @@ def file_mode(root: Path) -> int:
     return stat.S_IMODE((file if file.exists() else root).stat().st_mode) & 0o666
 
 
-def make_folder_within(root: Path, folder: Path) -> None:
-    """Create ``folder`` of the catalog in ``root``; who may read its files may also enter it."""
+def make_folder_within(root: Path, folder: Path, *, settled: bool = True) -> None:
+    """Create ``folder`` of the catalog in ``root``; who may read its files may also enter it.
+
+    Its name is on the disk on return if it is ``settled``.
+    """
     mode = file_mode(root)
-    make_folder(folder, within=root, mode=mode | (mode & 0o444) >> 2)
+    mode |= (mode & 0o444) >> 2
+    if settled:
+        make_folder(folder, within=root, mode=mode)
+        return
+    for one in reversed([folder, *folder.parents]):
+        if one.is_relative_to(root):
+            one.mkdir(mode=mode, exist_ok=True)
 
 
 def _leads_out(path: Path) -> CatalogDamaged:

@@ -14,7 +14,7 @@ from datetime import datetime
 from enum import StrEnum
 from typing import Any, Final, NamedTuple, Protocol
 
-from sqlalchemy import select
+from sqlalchemy import insert, select
 from sqlalchemy.orm import Session as Transaction
 
 from rig.catalog import describing, digests, log, state
@@ -292,6 +292,10 @@ def transfer(
             store.settle({name for name, _ in found.images.values()})
         with target.database.write() as transaction:
             plan = plan.compared(transaction, conflict, once=once)  # another process may have added objects
+            missing = store.missing({name for name, _ in found.images.values()})
+            for image, (name, _) in found.images.items():
+                if name in missing:  # `collect_garbage` removed it: an object that was deleted had it, too
+                    store.put(source.content(image))
             if plan.wanted:
                 new = _add(transaction, target, plan, label)
                 details = {"origin": source.origin, "objects": plan.names, "views": plan.views}
@@ -528,8 +532,11 @@ def _store(transaction: Transaction, enrollment: Enrollment, object_id: int) -> 
     enrollment.views.clear()
     transaction.add(enrollment)
     transaction.flush()  # the views refer to the sessions
-    enrollment.views.extend(views)
-    transaction.flush()
+    rows = [{name: getattr(view, name) for name in (*_OF_VIEW, "session", "digest")} for view in views]
+    if rows:
+        transaction.execute(insert(View), [{"enrollment_id": enrollment.id, **row} for row in rows])
+    transaction.expunge(enrollment)
+    enrollment.views = views
     return enrollment
 
 

@@ -10,7 +10,7 @@ Decision: docs/decisions/0015.
 import shutil
 import stat
 import zlib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import lru_cache, partial
 from pathlib import Path, PurePosixPath
@@ -90,6 +90,9 @@ class _ArchivedImages(FolderImages):
 
     def settle(self, names: Iterable[str]) -> None:
         """Do nothing: the file of the bundle is made durable as a whole."""
+
+    def missing(self, names: Collection[str]) -> set[str]:
+        return set(names) - self._names
 
 
 @contextmanager

@@ -501,7 +501,7 @@ def test_edited_rows_are_found(root: Path, statement: str) -> None:
     sql(root, "PRAGMA foreign_keys = OFF", "PRAGMA ignore_check_constraints = ON", statement)
     try:
         with opened(root) as catalog:
-            assert finished(verify(catalog, quick=True, jobs=1)).findings
+            assert finished(verify(catalog, jobs=1)).findings
     except CatalogDamaged:
         pass
 
@@ -537,7 +537,7 @@ SHOWN: dict[str, Callable[[Catalog], Any]] = {
 
 
 @pytest.mark.parametrize("reader", SHOWN)
-def test_no_edited_fact_is_believed(root: Path, sample: Path, reader: str, tmp_path: Path) -> None:
+def test_no_edited_fact_is_accepted(root: Path, sample: Path, reader: str, tmp_path: Path) -> None:
     """Each command shows what was stored, or that the catalog is damaged."""
     with opened(root) as catalog:
         expected = SHOWN[reader](catalog)
@@ -612,7 +612,7 @@ def flip(root: Path, intact: Path, expected: Any, seed: int) -> bool:
     (root / "catalog.sqlite").write_bytes(spoiled)
     try:
         with opened(root) as catalog:
-            if finished(verify(catalog, quick=True, jobs=1)).findings:
+            if finished(verify(catalog, jobs=1)).findings:
                 return True
     except RigError:
         return True
@@ -767,7 +767,7 @@ def test_swapped_truncated_and_foreign_images_are_found(root: Path) -> None:
         for spoilt in ((whole[1], whole[0]), (whole[0][:-1], whole[1]), (images.encode(image(77)), whole[1])):
             first.write_bytes(spoilt[0])
             second.write_bytes(spoilt[1])
-            found = finished(verify(catalog, quick=True, jobs=1)).findings
+            found = finished(verify(catalog, jobs=1)).findings
             wrong = sum(one != other for one, other in zip(spoilt, whole, strict=True))
             assert [(one.problem, one.object_name) for one in found] == [(Problem.CHANGED_IMAGE, "mug")] * wrong
             with pytest.raises(RigError, match="not the one that was stored"):
