@@ -5,20 +5,14 @@ log and the results are compared here. The images are compared by `rig catalog v
 """
 
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import AbstractContextManager
-from functools import partial
 from pathlib import Path
 from typing import Final
 
-from sqlalchemy import select
-from sqlalchemy.orm import Session as Transaction
-
-from rig.catalog import digests, log, state
+from rig.catalog import state
 from rig.catalog.catalog import Catalog
-from rig.catalog.facts import Enrollment, Entry
-from rig.catalog.state import Ended
-from rig.catalog.verify import missing_enrollments
+from rig.catalog.verify import Finding, Problem, row_checks
 from rig.config.catalog_place import CatalogPlace
 from rig.core.clock import Clock, seconds_between
 from rig.core.errors import CatalogDamaged, RigError
@@ -27,8 +21,6 @@ from rig.core.next_steps import Do
 SHARE: Final = 0.05
 """Largest share of a processor core, after the first `BURST_S` of work: small catalogs are compared at once."""
 BURST_S: Final = 0.1
-_LINES: Final = 100
-"""Lines of the log in a portion, so that the other threads of the program wait for milliseconds at most."""
 
 
 class BackgroundCheck(AbstractContextManager["BackgroundCheck"]):
@@ -59,9 +51,12 @@ class BackgroundCheck(AbstractContextManager["BackgroundCheck"]):
         spent_s = 0.0
         try:
             with Catalog.open(self._place, clock=self._clock, create=False, read_only=True) as catalog:
-                for check in _portions(catalog):
+                with catalog.database.read() as transaction:
+                    checks = list(row_checks(transaction))
+                for check in checks:
                     with catalog.database.read() as transaction:
-                        check(transaction)
+                        for finding in check(transaction):
+                            raise _error(finding)
                     now_ns = self._clock.now_ns()
                     spent_s += seconds_between(begun_ns, now_ns)
                     if self._ended.wait((spent_s - BURST_S) / SHARE - seconds_between(start_ns, now_ns)):
@@ -73,41 +68,12 @@ class BackgroundCheck(AbstractContextManager["BackgroundCheck"]):
             pass  # the catalog was moved or is locked: the work itself reports it
 
 
-def _portions(catalog: Catalog) -> Iterator[Callable[[Transaction], None]]:
-    """Yield the checks of portions of the rows, which raise `CatalogDamaged`."""
-    with catalog.database.read() as transaction:
-        last, _ = log.head(transaction)
-        ids = transaction.scalars(select(Enrollment.id).order_by(Enrollment.id)).all()
-    for first in range(1, last + 1, _LINES):
-        yield partial(_check_lines, first, min(first + _LINES - 1, last))
-    yield partial(_check_lines, last + 1, None)  # the lines since then, and the end of the log
-    yield log.check_complete
-    yield _check_missing
-    yield from (partial(_check_enrollment, number) for number in ids)
-
-
-def _check_lines(first: int, last: int | None, transaction: Transaction) -> None:
-    wrong = next(log.wrong_lines(transaction, first, last), None)
-    if wrong is None:
-        return
-    line = transaction.execute(select(Entry.object_name).where(Entry.id == wrong, Entry.deleted.is_not(None))).scalar()
-    if line is not None:
-        raise state.changed([line])
-    raise CatalogDamaged(
-        f"Entry {wrong} of the log of the catalog is not the one that was written, or entries are missing.",
+def _error(finding: Finding) -> CatalogDamaged:
+    if finding.problem is not Problem.LOG_CHANGED:
+        return state.changed([str(finding.object_name)])
+    line = finding.details["entry_id"]
+    return CatalogDamaged(
+        f"Entry {line} of the log of the catalog is not the one that was written, or entries are missing.",
         next_step=(Do.VERIFY_CATALOG(), "Then use a backup."),
-        evidence={"log_entry": wrong},
+        evidence={"log_entry": line},
     )
-
-
-def _check_enrollment(number: int, transaction: Transaction) -> None:
-    found = transaction.execute(
-        select(Ended.seal, Ended.object_id).where(state.IS_STATUS, Ended.enrollment_id == number)
-    ).first()
-    if found is not None and any(digests.damaged_enrollments(transaction, {number: found[0]})):
-        raise state.changed([str(state.by_id(transaction, found[1]).object_name)])
-
-
-def _check_missing(transaction: Transaction) -> None:
-    if missing := missing_enrollments(transaction):
-        raise state.changed([str(one.object_name) for one in missing])

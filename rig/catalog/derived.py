@@ -35,11 +35,8 @@ from rig.catalog.describing import (
     contents_of,
     describe,
     describe_task,
-    digest_of,
     evidence_of,
-    is_near,
     known_descriptor,
-    made_by_of,
     record_of,
     records_of,
     store,
@@ -405,38 +402,4 @@ def counts(transaction: Transaction) -> list[tuple[str, int, int, bool]]:
             found[what, int(version[1])] += (size or 0) // record_of(descriptor(what)).itemsize
     return [
         (name, version, views, version == descriptor(name).version) for (name, version), views in sorted(found.items())
-    ]
-
-
-# Compare what is stored with the images
-
-
-def to_compare(
-    transaction: Transaction, enrollment: Enrollment, name: str
-) -> tuple[tuple[str, ...], tuple[str, ...], Task | None]:
-    """Return the digests of what is stored for an enrollment, the damaged kinds, and the task that computes the others.
-
-    The task is None if this program would use nothing of it.
-    """
-    seal = seal_of(enrollment)
-    region = _regions(transaction).of(transaction, enrollment.id)
-    stored, damaged, used = [], [], []
-    rows = select(Derived.what, Derived.made_by, Derived.content, Derived.sha256).where(Derived.seal == seal)
-    for what, made_by, content, sha256 in transaction.execute(rows.order_by(Derived.what)):
-        stored.append(f"{what} {made_by} {sha256}")
-        if None in (made_by, content, sha256) or digest_of(seal, what, made_by, content) != sha256:
-            damaged.append(what)
-        elif what in (SEGMENTATION, *names()) and made_by == made_by_of(what, region):
-            used.append(what)
-    kinds = tuple(what for what in used if what != SEGMENTATION)
-    if SEGMENTATION in used and all(descriptor(what).whole_image for what in kinds):
-        kinds = (*kinds, BENCH_DESCRIPTOR)
-    return tuple(stored), tuple(damaged), task_of(enrollment, seal, name, kinds, region) if used else None
-
-
-def differing(transaction: Transaction, task: Task, found: Mapping[str, bytes]) -> list[str]:
-    """Return the kinds of stored contents that are not those that were ``found`` for the same task."""
-    stored = stored_contents(transaction, [task.seal], found, task.region)
-    return [
-        what for what in found if task.seal in stored[what] and not is_near(what, stored[what][task.seal], found[what])
     ]

@@ -38,8 +38,6 @@ SEGMENTATION_VERSION: Final = 1
 """Increases when the same images give other silhouettes."""
 FEWEST_VIEWS: Final = 4
 """A session with fewer views, after an interruption, learns its background from all views of the enrollment."""
-ROUNDED: Final = 0.02
-"""Largest share of a view's levels that another computer may have rounded to the neighbouring level."""
 
 Levels = NDArray[np.uint8]
 
@@ -332,23 +330,3 @@ def evidence_of(content: bytes, views: int) -> tuple[dict[str, Any], ...]:
 def contents(pixels: _Pixels, task: Task) -> dict[str, bytes]:
     """Compute what a task would store, by kind; errors as `described`."""
     return contents_of(task, describe(pixels, task))
-
-
-def is_near(what: str, stored: bytes, found: bytes) -> bool:
-    """Return whether two contents are equal, or differ as if another computer had rounded the other way."""
-    if stored == found:
-        return True
-    if what == SEGMENTATION:
-        try:
-            ours, theirs = ([(one.get("method"), one.get("box_px")) for one in json.loads(t)] for t in (found, stored))
-        except (ValueError, TypeError, AttributeError):  # this program has not written it
-            return False
-        return ours == theirs
-    kind = descriptor(what)
-    if kind.whole_image or len(stored) != len(found):
-        return False
-    one, other = (records_of(kind, content) for content in (found, stored))
-    levels = [kind.unpack_rows(records["packed"].tobytes()).astype(np.int16) for records in (one, other)]
-    off = np.abs(levels[0] - levels[1])
-    same_places = bool((one["azimuth_deg"] == other["azimuth_deg"]).all())
-    return same_places and int(off.max()) <= 1 and float((off > 0).mean(axis=1).max()) <= ROUNDED

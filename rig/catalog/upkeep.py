@@ -155,7 +155,7 @@ def collect_garbage(catalog: Catalog, *, old: bool = False, dry_run: bool = Fals
         lost = store.names(before_s=catalog.clock.utc().timestamp() - YOUNG_S)
     with database.read() as transaction:
         found = transaction.execute(rows.order_by(Enrollment.object_id)).all()
-        images = transaction.execute(_NAMED_IMAGES).all()
+        images = transaction.execute(select(NAMED_IMAGES)).all()
     ids = {row.id for row in found}
     deleted = tuple({row.object_id: str(row.object_name) for row in found if row.deleted}.values())
     named = {row.image for row in images if row.enrollment_id not in ids}
@@ -187,18 +187,24 @@ def collect_garbage(catalog: Catalog, *, old: bool = False, dry_run: bool = Fals
     # What another process names meanwhile stays. One that names an image later looks for it, and stores it again.
     for part in portions(sorted(sizes), _AT_ONCE):
         with database.write() as transaction:
-            kept = transaction.scalars(select(_NAMED.c.image).where(_NAMED.c.image.in_(part)))
+            kept = transaction.scalars(select(NAMED_IMAGES.c.image).where(NAMED_IMAGES.c.image.in_(part)))
             store.remove(set(part) - set(kept))
     return collected
 
 
-_NAMED_IMAGES: Final = union_all(
-    select(View.enrollment_id, View.id.label("view_id"), View.image),
-    select(Session.enrollment_id, null(), Session.empty_table).where(Session.empty_table.is_not(None)),
-    select(null(), null(), Entry.record["image"].as_string()).where(Entry.action == Action.IDENTIFIED),
-)
-"""Every image that a row names, with its enrollment and view."""
-_NAMED: Final = _NAMED_IMAGES.subquery()
+NAMED_IMAGES: Final = union_all(
+    select(View.enrollment_id, View.id.label("view_id"), View.image, View.image_bytes),
+    select(Session.enrollment_id, null(), Session.empty_table, func.coalesce(Session.empty_table_bytes, 0)).where(
+        Session.empty_table.is_not(None)
+    ),
+    select(
+        null(),
+        null(),
+        Entry.record["image"].as_string(),
+        func.coalesce(Entry.record["image_bytes"].as_integer(), 0),
+    ).where(Entry.action == Action.IDENTIFIED),
+).subquery()
+"""Every image that a row names, with its enrollment, view and size. A result may have none."""
 
 
 def _remove_rows(transaction: Transaction, ids: Collection[int]) -> None:

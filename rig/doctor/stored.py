@@ -2,10 +2,12 @@
 
 from collections.abc import Iterable, Iterator
 
+from sqlalchemy import select
+
 from rig.calibrations import CalibrationStatus, CalibrationStore, apparatus, apply_results
 from rig.calibrations.store import BenchCalibration
 from rig.catalog import Catalog
-from rig.catalog.verify import some_images
+from rig.catalog.facts import View
 from rig.core.errors import CatalogError
 from rig.core.next_steps import Do
 from rig.doctor.context import DoctorContext
@@ -32,7 +34,7 @@ def catalog(context: DoctorContext) -> Iterator[Finding]:
             yield bad("catalog", FindingCode.DATABASE_DAMAGED, Do.VERIFY_CATALOG(), 7, path=path, damage=checked)
         if (changed := opened.damage()) is not None:
             raise changed
-        objects, chosen = opened.objects(), some_images(opened, IMAGES)
+        objects, chosen = opened.objects(), _some_images(opened)
         broken = []
         for image in chosen:
             try:
@@ -49,6 +51,14 @@ def catalog(context: DoctorContext) -> Iterator[Finding]:
         if not checked and not broken:
             counts = {"objects": len(objects), "views": sum(item.views for item in objects), "images": len(chosen)}
             yield fine("catalog", FindingCode.CATALOG, path=path, **counts)
+
+
+def _some_images(opened: Catalog) -> list[str]:
+    """Return the names of images of views, spread over the catalog."""
+    with opened.database.read() as transaction:
+        ids = transaction.scalars(select(View.id).order_by(View.id)).all()
+        chosen = ids[:: max(len(ids) // IMAGES, 1)][:IMAGES]
+        return list(transaction.scalars(select(View.image).where(View.id.in_(chosen)).order_by(View.id)))
 
 
 def calibrations(context: DoctorContext) -> Iterator[Finding]:

@@ -72,7 +72,7 @@ def views_in_progress(found: dict[str, Any], name: str) -> set[int]:
 def check_clean(home: Path) -> None:
     for name in ("catalog", "other"):
         with opened(home, name) as catalog:
-            assert finished(verify(catalog, quick=True, jobs=1)).findings == ()
+            assert finished(verify(catalog, jobs=1)).findings == ()
             names = [view.image for one in catalog.objects() for view in catalog.object(one.name).views]
             assert catalog.database.images.names() >= set(names)
 

@@ -69,4 +69,4 @@ def test_random_operations_have_a_serial_order(postgres: PostgresServer, tmp_pat
     seen = {one.result for one in history if isinstance(one.result, str)}
     assert {"done", "ObjectExists", "ObjectNotFound"} <= seen
     with Catalog.open(place, clock=SystemClock()) as catalog:
-        assert finished(verify(catalog, quick=True, jobs=1)).findings == ()
+        assert finished(verify(catalog, jobs=1)).findings == ()

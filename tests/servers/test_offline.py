@@ -420,7 +420,7 @@ def test_kill_at_any_point_loses_and_doubles_nothing(place: CatalogPlace, kind: 
         raise AssertionError(f"the {kind} has more steps")
     assert step > 10
     with Catalog.open(place, clock=CLOCK) as shared:
-        assert finished(verify(shared, quick=True, jobs=1)).findings == ()
+        assert finished(verify(shared, jobs=1)).findings == ()
         assert {one.unfinished_views for one in shared.objects()} == {None}
 
 

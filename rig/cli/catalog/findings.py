@@ -11,11 +11,7 @@ _EVIDENCE: Final = {
     Problem.MISSING_ENROLLMENT: "enrollment {enrollment_id} is in the log, and this program did not remove it",
     Problem.MISSING_IMAGE: "{reason}",
     Problem.CHANGED_IMAGE: "{bytes} bytes now, {stored_bytes} when it was stored",
-    Problem.UNREADABLE_IMAGE: "{reason}",
-    Problem.SIZES_DIFFER: "{size_px[0]} x {size_px[1]} pixels, the first view of its enrollment has "
-    "{first_size_px[0]} x {first_size_px[1]}",
     Problem.DESCRIPTION_DAMAGED: "the stored {descriptor} is not the one that was computed",
-    Problem.DESCRIPTION_DIFFERS: "the stored {descriptor} is not that of the images",
 }
 
 
@@ -27,17 +23,12 @@ def finding_text(finding: Finding) -> str:
 
 
 def _fix(finding: Finding) -> str:
-    again = "enroll the object again: rig enroll --replace"
     match finding.problem:
         case Problem.DESCRIPTION_DAMAGED:
-            return "the next search computes it again"
-        case Problem.DESCRIPTION_DIFFERS:
-            return "to compute it again: rig catalog redescribe --again"
+            return "it is computed again when it is needed"
         case Problem.ENROLLMENT_CHANGED | Problem.MISSING_ENROLLMENT:
             return "restore the catalog from a backup, or delete the object and enroll it again"
-        case Problem.UNREADABLE_IMAGE | Problem.SIZES_DIFFER:
-            return again if finding.object_name else "nothing can be done"
         case Problem.MISSING_IMAGE | Problem.CHANGED_IMAGE if finding.object_name:
-            return f"restore it from a backup, or {again}"
+            return "restore it from a backup, or enroll the object again: rig enroll --replace"
         case _:
             return "restore it from a backup"

@@ -24,43 +24,22 @@ from rig.core.phrases import angle_words, counted
 @command
 def verify(
     settings: Settings,
-    quick: Annotated[bool, typer.Option("--quick", help="Only compare digests; do not describe the images.")] = False,
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Continue an interrupted check. Do not check again what it found right.")
-    ] = False,
     jobs: JobsOption = None,
     cluster: ClusterOption = None,
 ) -> None:
     """Check whether everything is as it was stored. The exit code is 7 if it is not. Nothing is changed.
 
-    Example: rig catalog verify --quick --bench sim
+    Example: rig catalog verify --bench sim
     """
-    from rig.catalog.unfinished import UnfinishedJob
     from rig.catalog.verify import verify as job
     from rig.cli.catalog.findings import finding_text
 
-    with (
-        settings.open_catalog(read_only=True) as catalog,
-        UnfinishedJob(catalog.path / "verify.unfinished", "verify") as unfinished,
-    ):
-        if not resume:
-            unfinished.remove()
-        else:
-            unfinished.load()
-            known = counted(sum(count for count in unfinished.found.values() if isinstance(count, int)), "image")
-            print(
-                f"The interrupted check found {known} right." if unfinished.found else "No check was interrupted.",
-                file=sys.stderr,
-            )
+    with settings.open_catalog(read_only=True) as catalog:
         found = run_job(
             "verifying",
-            job(catalog, quick=quick, jobs=jobs_of(jobs, cluster), unfinished=unfinished),
-            interrupted=lambda: (
-                "Interrupted; nothing was changed."
-                + (" To continue: rig catalog verify --resume" if unfinished.is_stored else "")
-            ),
+            job(catalog, jobs=jobs_of(jobs, cluster)),
+            interrupted="Interrupted; nothing was changed.",
         )
-        unfinished.remove()
     if settings.json:
         settings.print_json(found)
     else:

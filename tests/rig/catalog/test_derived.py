@@ -1,6 +1,5 @@
 """What is computed from the facts can be lost, damaged, old or of another enrollment, and searches stay the same."""
 
-import json
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -349,39 +348,6 @@ def test_a_changed_empty_table_image_is_found_and_not_used(catalog: Catalog) -> 
     assert {finding.problem for finding in found} == {Problem.CHANGED_IMAGE}
     done = finished(derived.redescribe(catalog, BENCH_DESCRIPTOR, again=True, jobs=1))
     assert (done.described, len(done.failed)) == (0, len(NAMES))
-
-
-@pytest.mark.parametrize(("levels", "step", "found"), [(1, 1, 0), (1, 2, 1), (100, 1, 1)])
-def test_verify_tolerates_rounded_levels(catalog: Catalog, levels: int, step: int, found: int) -> None:
-    kind = hbr.descriptor(BENCH_DESCRIPTOR)
-    views = load(catalog)[0]
-    own = views.of(0)
-    off = views.descriptors[own].copy()
-    entries = np.arange(levels)
-    off[0, entries] = np.where(off[0, entries] >= 2, off[0, entries] - step, off[0, entries] + step)
-    enrollment = complete(catalog, "box")
-    seal = seal_of(enrollment)
-    content = describing.content_of(kind, kind.pack_rows(off), views.azimuth_deg[own])
-    with catalog.database.write() as transaction:
-        transaction.execute(delete(Derived).where(Derived.seal == seal, Derived.what == kind.name))
-        transaction.execute(insert(Derived).values(describing.row_of(seal, kind.name, None, content)))
-    seen = finished(verify(catalog, jobs=1)).findings
-    assert [finding.problem for finding in seen] == [Problem.DESCRIPTION_DIFFERS] * found
-    finished(derived.redescribe(catalog, BENCH_DESCRIPTOR, again=True, jobs=1))
-    assert finished(verify(catalog, jobs=1)).findings == ()
-
-
-def test_a_silhouette_that_is_not_that_of_the_image_is_found(catalog: Catalog) -> None:
-    stored = rows(catalog)
-    (seal,) = {one for one, _ in stored if one == seal_of(complete(catalog, "box"))}
-    evidence = json.loads(stored[seal, SEGMENTATION][1])
-    evidence[2] = evidence[0]
-    with catalog.database.write() as transaction:
-        transaction.execute(delete(Derived).where(Derived.seal == seal, Derived.what == SEGMENTATION))
-        content = json.dumps(evidence).encode()
-        transaction.execute(insert(Derived).values(describing.row_of(seal, SEGMENTATION, None, content)))
-    found = finished(verify(catalog, jobs=1)).findings
-    assert [(one.problem, one.object_name) for one in found] == [(Problem.DESCRIPTION_DIFFERS, "box")]
 
 
 def test_a_short_session_learns_from_all_views(open_catalog: Callable[[str], Catalog]) -> None:

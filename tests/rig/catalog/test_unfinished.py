@@ -13,7 +13,7 @@ from tests.fuzzing import examples
 RESULTS: dict[str, Any] = {"a": [1, 2], "b": None, "ü": {"x": "0x1.8p+1"}}
 
 
-def stored(path: Path, job: str = "verify") -> Path:
+def stored(path: Path, job: str = "fit") -> Path:
     with UnfinishedJob(path, job) as unfinished:
         unfinished.store({"a": RESULTS["a"]})
         unfinished.store({key: RESULTS[key] for key in ("b", "ü")})
@@ -21,7 +21,7 @@ def stored(path: Path, job: str = "verify") -> Path:
     return path
 
 
-def loaded(path: Path, job: str = "verify") -> UnfinishedJob:
+def loaded(path: Path, job: str = "fit") -> UnfinishedJob:
     unfinished = UnfinishedJob(path, job)
     unfinished.load()
     return unfinished
@@ -39,7 +39,7 @@ def test_results_are_read_as_they_were_stored_and_continued(tmp_path: Path) -> N
 
 
 def test_results_of_another_job_are_not_used(tmp_path: Path) -> None:
-    assert loaded(stored(tmp_path / "job"), "calibrate").found == {}
+    assert loaded(stored(tmp_path / "job"), "another").found == {}
 
 
 @examples(30)
@@ -57,7 +57,7 @@ def test_file_that_was_cut_off_or_damaged_keeps_the_lines_before(tmp_path_factor
 
 
 def test_folder_that_cannot_be_written_stops_nothing(tmp_path: Path) -> None:
-    unfinished = UnfinishedJob(tmp_path / "missing" / "job", "verify")
+    unfinished = UnfinishedJob(tmp_path / "missing" / "job", "fit")
     unfinished.load()
     unfinished.store({"a": 1})
     assert not unfinished.is_stored

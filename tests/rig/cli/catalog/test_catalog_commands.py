@@ -127,7 +127,7 @@ def test_verify_names_the_object_and_sets_the_exit_code(two: Rig) -> None:
     )
     assert "2 objects, 8 views, 0 results" in found.stdout
     assert "1 problem" in found.stdout
-    (finding,) = json.loads(two("catalog", "verify", "--quick", "--json").stdout)["findings"]
+    (finding,) = json.loads(two("catalog", "verify", "--json").stdout)["findings"]
     assert (finding["problem"], finding["object_name"]) == ("image missing", "mug")
     image.write_bytes(content)
     assert two("catalog", "verify").exit_code == 0
