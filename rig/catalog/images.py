@@ -112,8 +112,8 @@ class Images(ABC):
         """Return the size of an image in bytes; 0 if there is none."""
 
     def missing(self, names: Collection[str]) -> set[str]:
-        """Return which of these images are not there."""
-        return {name for name in names if not self.size(name)}
+        """Return which of these images are not there. The caller has just stored them."""
+        return set(names) - self.names()
 
     @abstractmethod
     def remove(self, names: Iterable[str]) -> None:
@@ -183,10 +183,11 @@ class FolderImages(Images):
         return name
 
     def settle(self, names: Iterable[str]) -> None:
-        paths = [self.file(name) for name in names]
-        if len(paths) > MAX_SINGLE_SYNCS:
+        several = set(names)
+        if len(several) > MAX_SINGLE_SYNCS:
             os.sync()  # one by one, thousands of small files take minutes on some disks
             return
+        paths = [self.file(name) for name in several]
         for path in paths:
             sync_file(path)
         for folder in {path.parent for path in paths} | {self.root / FOLDER, self.root}:
@@ -194,6 +195,9 @@ class FolderImages(Images):
 
     def names(self, *, before_s: float = inf) -> set[str]:
         return {path.name for path in files_within(self.root / FOLDER) if path.lstat().st_mtime < before_s}
+
+    def missing(self, names: Collection[str]) -> set[str]:
+        return {name for name in names if not os.path.lexists(self.root / path_of(name))}
 
     def size(self, name: str) -> int:
         with suppress(FileNotFoundError):
@@ -277,9 +281,6 @@ class FsspecImages(Images):
         with suppress(FileNotFoundError):
             return self._size(name)
         return 0
-
-    def missing(self, names: Collection[str]) -> set[str]:
-        return set(names) - self.names()  # in a few requests
 
     def _size(self, name: str) -> int:
         with self._store() as (store, root):

@@ -8,7 +8,7 @@ import shlex
 import stat
 from collections.abc import Iterator
 from contextlib import suppress
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Final
 
 from rig.catalog.columns import FIX
@@ -85,14 +85,12 @@ def image_file(root: Path, path: str) -> Path:
     CatalogDamaged
         A link leads out of the images of the catalog, or the file is a pipe or a device.
     """
-    file = root / path
-    real = os.path.realpath(root)
-    if not os.path.realpath(file).startswith(f"{real}{os.sep}{IMAGE_FOLDER}{os.sep}"):
-        raise _leads_out(file)
-    with suppress(FileNotFoundError):
-        if stat.S_IFMT(file.stat().st_mode) not in (stat.S_IFREG, stat.S_IFDIR):
-            raise _leads_out(file)
-    return file
+    for part in (*reversed(PurePosixPath(path).parents), PurePosixPath(path)):
+        with suppress(FileNotFoundError):
+            kind = stat.S_IFMT((root / part).stat(follow_symlinks=part == PurePosixPath()).st_mode)
+            if kind not in (stat.S_IFREG, stat.S_IFDIR):
+                raise _leads_out(root / part)
+    return root / path
 
 
 def files_within(folder: Path) -> Iterator[Path]:
