@@ -4,6 +4,7 @@ The last line that gives an object a state counts, and the last line that gives 
 says which these are.
 """
 
+from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
@@ -116,7 +117,9 @@ def used(transaction: Transaction, *, checked: bool = False) -> list[Used]:
     rows = transaction.execute(wanted).all()
     if checked:
         check_fold(transaction)
-    if wrong := [str(row[1]) for row in rows if None in row]:  # the enrollment is missing, or no program wrote this
+    owners = Counter(row[0] for row in rows)
+    # An enrollment is missing, or no program wrote this.
+    if wrong := [str(row[1]) for row in rows if None in row or owners[row[0]] > 1]:
         raise changed(wrong)
     found: Sequence[Sequence[Any]] = rows
     return [Used(*row) for row in found]
