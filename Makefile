@@ -40,7 +40,7 @@ test: $(READY) $(LIBRARY)
 test-nightly: $(READY) $(LIBRARY)
 	@$(BIN)/python -m pytest -n auto --dist worksteal -rs -m "not kernel" --timeout 1800 --hypothesis-profile=nightly
 
-# Kill the program a hundred times at different points of eleven kinds of work, or a thousand times with KILLS=90.
+# Kill the program a hundred times at different points of the commands and of the work on a catalog, or a thousand times with KILLS=90.
 KILLS ?= 8
 test-kills: $(READY) $(LIBRARY)
 	@RIG_TEST_KILLS=$(KILLS) $(BIN)/python -m pytest -n auto --dist worksteal --timeout 3600 tests/faults/test_kill*.py
