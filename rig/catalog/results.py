@@ -7,8 +7,7 @@ Decision: docs/decisions/0036.
 
 import secrets
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Any, Final, NamedTuple
@@ -41,18 +40,12 @@ class Answer(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class NewResult:
-    """An answer to be recorded.
+    """An answer to be recorded, with the event `identified` as its ``details``, JSON values.
 
     Attributes
     ----------
-    answered
-        The outcome, the object, and the sample, as the operator typed or scanned it.
-    details
-        The event `identified` as JSON values.
     azimuths_deg
         Azimuths of the views, from any zero.
-    provenance
-        The bench that took the views.
     catalog_version
         `Catalog.version` when the enrolled views were loaded.
     operator
@@ -118,24 +111,19 @@ class Result:
 
         Rotation and confidence are those of the answer: they are left out if a correction names another object.
         """
-        last = self.corrections[-1] if self.corrections else None
-        same = self.current[:2] == self.answered[:2]
-        own = {name: _number(self.details, name) if same else None for name in _OF_ITS_OBJECT}
-        numbers = {name: _number(self.details, name) for name in ("score", "margin")}
+        now, last = self.current, self.corrections[-1] if self.corrections else None
+        same = now[:2] == self.answered[:2]
         return {
             "result": self.id,
             "time_utc": self.time_utc,
-            "sample": self.current.sample,
-            "outcome": self.current.outcome.value,
-            "object": self.current.object_name,
-            **own,
-            **numbers,
+            "sample": now.sample,
+            "outcome": now.outcome.value,
+            "object": now.object_name,
+            **{name: _number(self.details, name) if same else None for name in _OF_ITS_OBJECT},
+            **{name: _number(self.details, name) for name in ("score", "margin")},
             "views": len(self.azimuths_deg),
-            "operator": self.operator,
-            "user": self.user,
-            "host": self.host,
-            "bench": self.provenance.bench,
-            "software": self.provenance.software,
+            **{name: getattr(self, name) for name in ("operator", "user", "host")},
+            **{name: getattr(self.provenance, name) for name in ("bench", "software")},
             "catalog_version": self.catalog_version,
             "image": self.image_path,
             "image_sha256": self.image_sha256,
@@ -164,15 +152,18 @@ class ResultFilter:
     before: datetime | None = None
     corrected: bool = False
 
+    def lines(self) -> ColumnElement[bool]:
+        """Return which answers have the right time; the other values may be corrected."""
+        times = [] if self.since is None else [Entry.time_utc >= self.since]
+        times += [] if self.before is None else [Entry.time_utc < self.before]
+        return and_(Entry.result.is_not(None), *times)
+
     def accepts(self, result: Result) -> bool:
-        now = result.current
-        return (
-            self.bench in (None, result.provenance.bench)
-            and self.sample in (None, now.sample)
-            and self.object_name in (None, now.object_name)
-            and self.outcome in (None, now.outcome)
-            and (not self.corrected or bool(result.corrections))
-        )
+        """Return whether the values after the last correction are the wanted ones."""
+        now = (result.provenance.bench, result.current.sample, result.current.object_name, result.current.outcome)
+        wanted = (self.bench, self.sample, self.object_name, self.outcome)
+        same = all(one in (None, value) for one, value in zip(wanted, now, strict=True))
+        return same and bool(result.corrections or not self.corrected)
 
 
 def clean_text(text: str, what: str) -> str:
@@ -184,16 +175,15 @@ def clean_text(text: str, what: str) -> str:
         It is empty, too long, or contains characters that cannot be printed.
     """
     cleaned = text.strip()
-    if not cleaned or len(cleaned) > MAX_TEXT_LENGTH or not cleaned.isprintable():
-        problem = (
-            "is empty"
-            if not cleaned
-            else f"has {len(cleaned)} characters; at most {MAX_TEXT_LENGTH} are allowed"
-            if len(cleaned) > MAX_TEXT_LENGTH
-            else f"contains characters that cannot be printed: {cleaned[:100]!a}"
-        )
-        raise UsageError(f"The {what} {problem}.", next_step=f"Give the {what} as one line of text.")
-    return cleaned
+    if not cleaned:
+        problem = "is empty"
+    elif len(cleaned) > MAX_TEXT_LENGTH:
+        problem = f"has {len(cleaned)} characters; at most {MAX_TEXT_LENGTH} are allowed"
+    elif not cleaned.isprintable():
+        problem = f"contains characters that cannot be printed: {cleaned[:100]!a}"
+    else:
+        return cleaned
+    raise UsageError(f"The {what} {problem}.", next_step=f"Give the {what} as one line of text.")
 
 
 def record(catalog: Catalog, new: NewResult, image_bgr: NDArray[np.uint8] | None) -> int:
@@ -210,17 +200,9 @@ def record(catalog: Catalog, new: NewResult, image_bgr: NDArray[np.uint8] | None
         The catalog cannot be written.
     """
     sample = None if new.answered.sample is None else clean_text(new.answered.sample, "sample")
-    fact: dict[str, Any] = {
-        "key": new.key,
-        "answer": new.details,
-        "azimuths_deg": new.azimuths_deg,
-        "bench": new.provenance.bench,
-        "devices": new.provenance.devices,
-        "conditions": new.provenance.conditions,
-        "catalog_version": new.catalog_version,
-        "image": None,
-        "image_bytes": None,
-    }
+    fact: dict[str, Any] = {"answer": new.details, "image": None, "image_bytes": None}
+    fact |= {name: getattr(new, name) for name in ("key", "azimuths_deg", "catalog_version")}
+    fact |= {name: getattr(new.provenance, name) for name in ("bench", "devices", "conditions")}
     operator = _operator(new.operator)
     store, png = catalog.database.images, None if image_bgr is None else images.encode(image_bgr)
     if png is not None:
@@ -242,14 +224,9 @@ def find_results(catalog: Catalog, wanted: ResultFilter = ResultFilter()) -> lis
     CatalogDamaged
         A result or a correction is not as it was recorded.
     """
-    is_wanted: ColumnElement[bool] = Entry.result.is_not(None)
-    if wanted.since is not None:
-        is_wanted = and_(is_wanted, Entry.time_utc >= wanted.since)
-    if wanted.before is not None:
-        is_wanted = and_(is_wanted, Entry.time_utc < wanted.before)
     with catalog.database.read() as transaction:
         log.check_complete(transaction)
-        found = _load(transaction, or_(is_wanted, Entry.action == Action.RESULT_CORRECTED))
+        found = _load(transaction, or_(wanted.lines(), Entry.action == Action.RESULT_CORRECTED))
     return [result for result in found if wanted.accepts(result)]
 
 
@@ -279,18 +256,8 @@ def correct(
 ) -> Answer:
     """Correct the object or the sample of a result, and return the new answer. The recorded answer does not change.
 
-    Parameters
-    ----------
-    reason
-        The reason; stored with the correction and in the log.
-    object_name
-        The right object, which is in the catalog.
-    unknown
-        The object is not in the catalog.
-    sample
-        The right sample.
-    operator
-        The operator who corrects it; None for the user's account.
+    The ``reason`` is stored with the correction and in the log. An ``unknown`` object is not in the catalog. The
+    ``operator`` corrects it; None for the user's account.
 
     Raises
     ------
@@ -372,51 +339,28 @@ def _load(transaction: Transaction, wanted: ColumnElement[bool]) -> list[Result]
             next_step=(Do.VERIFY_CATALOG(), "Then use a backup."),
             evidence={"results": numbers[:20]},
         )
-    corrections: dict[int | None, list[Correction]] = defaultdict(list)
-    for line in lines:
-        if line.action == Action.RESULT_CORRECTED:
-            corrections[line.result].append(_correction(line))
-    return [_result(line, corrections[line.result]) for line in lines if line.action == Action.IDENTIFIED]
-
-
-def _correction(entry: Entry) -> Correction:
-    with _record_of(entry) as found:
-        operator, reason = str(found["operator"]), str(found["reason"])
-        return Correction(entry.time_utc, operator, entry.user, entry.host, _answer(found), reason)
-
-
-def _result(entry: Entry, corrections: Sequence[Correction]) -> Result:
-    with _record_of(entry) as found:
-        if found["image"] is not None:
-            ImageName().check(found["image"])
-        return Result(
-            id=int(found["result"]),
-            time_utc=entry.time_utc,
-            operator=str(found["operator"]),
-            user=entry.user,
-            host=entry.host,
-            answered=_answer(found),
-            details=dict(found["answer"]),
-            azimuths_deg=tuple(map(float, found["azimuths_deg"])),
-            provenance=Provenance(str(found["bench"]), found["devices"], found["conditions"], entry.software),
-            catalog_version=str(found["catalog_version"]),
-            image=found["image"],
-            corrections=tuple(corrections),
-        )
+    corrections, answers = defaultdict[int | None, list[Correction]](list), list[Result]()
+    for line in sorted(lines, key=lambda line: line.action == Action.IDENTIFIED):  # the corrections first
+        try:
+            found: Mapping[str, Any] = line.record or {}
+            said = (line.time_utc, str(found["operator"]), line.user, line.host, _answer(found))
+            if line.action == Action.RESULT_CORRECTED:
+                corrections[line.result].append(Correction(*said, str(found["reason"])))
+            elif line.action == Action.IDENTIFIED and line.result is not None:
+                details, azimuths_deg = dict(found["answer"]), tuple(map(float, found["azimuths_deg"]))
+                bench = Provenance(str(found["bench"]), found["devices"], found["conditions"], line.software)
+                version, image, later = str(found["catalog_version"]), found["image"], tuple(corrections[line.result])
+                if image is not None:
+                    ImageName().check(image)
+                answers.append(Result(line.result, *said, details, azimuths_deg, bench, version, image, later))
+        except (KeyError, TypeError, ValueError, UsageError) as error:  # this program has not written it
+            raise damaged(f"the record of result {line.result}", line.record) from error
+    return answers
 
 
 def _answer(found: Mapping[str, Any]) -> Answer:
     name, sample = (None if found[key] is None else str(found[key]) for key in ("object", "sample"))
     return Answer(Outcome(found["outcome"]), name, sample)
-
-
-@contextmanager
-def _record_of(entry: Entry) -> Iterator[dict[str, Any]]:
-    """Yield the record of a line and its number of the result; a record that this program did not write is damage."""
-    try:
-        yield {**(entry.record or {}), "result": entry.result}
-    except (KeyError, TypeError, ValueError, UsageError) as error:
-        raise damaged(f"the record of result {entry.result}", entry.record) from error
 
 
 def _number(details: Mapping[str, Any], name: str) -> float | None:

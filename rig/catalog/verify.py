@@ -1,6 +1,4 @@
-"""Check whether a catalog is as it was stored: the log, the enrollments, the images, and what was computed from them.
-
-Only digests are compared. That is enough, because everything that is stored has one.
+"""Check whether a catalog is as it was stored. Only digests are compared: everything that is stored has one.
 
 Decision: docs/decisions/0034.
 """
@@ -104,14 +102,12 @@ def verify(catalog: Catalog, *, jobs: Jobs | None = None) -> Generator[JobProgre
                 damages[damage.what] = None
     changed = {one.details["enrollment_id"] for one in findings if one.problem is Problem.ENROLLMENT_CHANGED}
     yield JobProgress(0, images)
-    done = image_bytes = 0
+    done, image_bytes, work = 0, 0, partial(_check_images, catalog.database.images)
     try:
-        work = partial(_check_images, catalog.database.images)
         for portion, found in map_in_processes(work, portions(_images(catalog, changed)), processes(jobs, images)):
             of_images += found
             image_bytes += sum(image.stored_bytes for image in portion)
-            done += len(portion)
-            yield JobProgress(done, images)
+            yield JobProgress(done := done + len(portion), images)
     except CatalogDamaged as damage:
         damages[damage.what] = None
     damaged = [Finding(Problem.DAMAGED_DATABASE, details={"message": message}) for message in damages]
@@ -126,8 +122,7 @@ def row_checks(transaction: Transaction) -> Iterator[Callable[[Transaction], Ite
     for first in range(1, last + 1, _LINES):
         yield partial(_lines, first, min(first + _LINES - 1, last))
     yield partial(_lines, last + 1, None)  # the lines since then, and the end of the log
-    yield _end
-    yield _missing
+    yield from (_end, _missing)
     yield from (partial(_enrollments, part) for part in digests.portions(ids, _ENROLLMENTS))
 
 
