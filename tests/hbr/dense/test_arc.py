@@ -1,12 +1,14 @@
 """Searches in motion: when they decide, and by which rule."""
 
 from dataclasses import replace
+from math import ceil
 
 import numpy as np
 import pytest
 
 from hbr import DenseIndex, DenseSession, Outcome, Views, leave_one_out
 from hbr.dense.arc import (
+    ARC_DEG,
     DECISIONS,
     MOTION_LOSS,
     SIDE_DEG,
@@ -95,6 +97,7 @@ def test_search_ends_after_the_arc_as_ambiguous_or_unknown(index: DenseIndex, re
     session = ArcSession(index, later, 2.0)
     outcomes = pass_by(session, index.views, 0, 240.0)
     assert outcomes[-1] is Outcome.AMBIGUOUS
+    assert outcomes.index(Outcome.AMBIGUOUS) == ceil(ARC_DEG / 4)
     assert session.decisions >= DECISIONS
     short = ArcSession(index, later, 2.0)
     pass_by(short, index.views, 0, 45.0)

@@ -59,6 +59,24 @@ def test_views_of_a_twin_are_recognised_by_its_sticker(objects, sticker: bool) -
     assert away[1] < 16
 
 
+def test_enrolled_views_of_twins_score_as_their_own_object(objects) -> None:
+    queries = [shown(side, sticker=True, noise=90) for side in (4.0, 24.0)]
+    found = compare_objects(queries, objects, ([0.0], [0.0]))
+    assert found.expected == pytest.approx((1, -1), abs=0.2)
+
+
+def test_comparison_names_no_winner_if_it_is_unclear_or_its_error_rate_is_too_high(objects) -> None:
+    plain, marked = (shown(14.0, sticker=kind, noise=90) for kind in (False, True))
+    pale = replace(plain, crop=cv2.addWeighted(plain.crop, 0.5, marked.crop, 0.5, 0))
+    between = compare_objects([pale], objects, ([0.0], [0.0]))
+    assert between.fits
+    assert between.error_bound <= 0.01
+    assert abs(between.score) < 0.3
+    assert between.winner is None
+    for max_error, winner in ((0.01, 1), (0.0001, None)):
+        assert compare_objects([marked], objects, ([0.0], [0.0]), max_error=max_error).winner == winner
+
+
 def test_comparison_decides_nothing_if_twins_look_the_same(objects) -> None:
     plain, _ = objects
     found = compare_objects([shown(4.0, sticker=False, noise=91)], (plain, plain[::-1]), ([0.0], [0.0]))

@@ -13,8 +13,8 @@ from hbr.dense.fitting import (
     rule_from_searches,
     with_false_accepts,
 )
-from hbr.dense.leave_one_out import STRENGTHS, ShiftedSearches, leave_one_out
-from hbr.dense.open_set import NUMBERS, OpenSetModel
+from hbr.dense.leave_one_out import STRENGTHS, LeaveOneOut, ShiftedSearches, leave_one_out
+from hbr.dense.open_set import NUMBERS, Leaders, OpenSetModel
 from hbr.dense.stopping import LimitationCode, StoppingRule, StopReason
 from tests.hbr.dense.searches import belief_after
 from tests.hbr.dense.test_stopping import catalog
@@ -136,6 +136,17 @@ def test_rule_states_that_twins_are_accepted_more_often_than_promised(plain: Sto
         assert [one.code for one in found.limitations] == codes
         for one in found.limitations:
             assert one.values["accepted"] > one.values["rate"] * one.values["searches"]
+
+
+@pytest.mark.parametrize("accepted", [0, 1, 2])
+def test_rule_states_no_limitation_at_exactly_the_promised_share(plain: StoppingRule, accepted: int) -> None:
+    score = np.zeros((50, VIEWS))  # of which the promised share is one search
+    score[:accepted, 0] = 1.0
+    leaders = Leaders(np.zeros((50, VIEWS), np.intp), score, score)
+    none = np.zeros((50, VIEWS), np.bool_)
+    searches = LeaveOneOut(1, np.zeros(50, np.intp), leaders, leaders, score, none, plain.beta)
+    rule = replace(plain, usual_scores=np.zeros((1, VIEWS)), open_set_thresholds=(0.5,) * VIEWS, limitations=())
+    assert bool(with_false_accepts(rule, searches).limitations) == (accepted > 1)
 
 
 def renamed(views: Views) -> Views:

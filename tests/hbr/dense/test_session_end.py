@@ -9,7 +9,7 @@ import pytest
 import hbr
 from hbr import Outcome, StopReason
 from hbr.dense.arc import ArcSession
-from hbr.dense.last_steps import NeedEnrolledViews, Verification, answered
+from hbr.dense.last_steps import NeedEnrolledViews, Verification, answered, compare_leaders
 from hbr.dense.local_difference import LocalView
 from tests.hbr.dense.test_local_difference import shown
 from tests.hbr.dense.test_stopping import catalog
@@ -62,6 +62,36 @@ def test_the_views_that_the_search_asks_for_distinguish_near_twins(session, enro
     session.add(session.belief.levels[0], 0.0)
     assert session.comparison is None
     assert session.end().reason is not StopReason.LOCAL_DIFFERENCE
+
+
+@pytest.mark.parametrize(
+    ("before", "are_twins", "is_enrolled", "after"),
+    [
+        (Outcome.AMBIGUOUS, True, True, Outcome.FOUND),
+        (Outcome.AMBIGUOUS, False, True, Outcome.FOUND),
+        (Outcome.AMBIGUOUS, True, False, Outcome.AMBIGUOUS),
+        (Outcome.UNKNOWN, True, True, Outcome.FOUND),
+        (Outcome.UNKNOWN, False, True, Outcome.UNKNOWN),
+        (Outcome.UNKNOWN, True, False, Outcome.UNKNOWN),
+    ],
+)
+def test_a_comparison_decides_an_unknown_search_only_for_an_object_that_fits_one_of_two_twins(
+    session, enrolled, before: Outcome, are_twins: bool, is_enrolled: bool, after: Outcome
+) -> None:
+    plain, marked = enrolled
+    second = marked if are_twins else [recoloured(view) for view in plain]
+    query = shown(4.0, sticker=False, noise=90)
+    step = compare_leaders(
+        session.belief, before, lambda _: [query if is_enrolled else recoloured(query)], beta=60.0, max_error=0.01
+    )
+    found = answered(step, lambda leader, _: second if leader == 4 else plain)
+    assert found is not None
+    assert (found.outcome, found.winner) == (after, 0 if after is Outcome.FOUND else None)
+
+
+def recoloured(view: LocalView) -> LocalView:
+    """Return the view of an object of the same shape, in other colours."""
+    return replace(view, crop=np.roll(view.crop, 1, axis=2))
 
 
 def test_without_enrolled_views_the_decision_stays(session) -> None:

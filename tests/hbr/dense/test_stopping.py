@@ -185,6 +185,21 @@ def test_leave_one_out_searches_for_some_of_many_objects_among_all_of_them() -> 
     assert (found.unknown.margin < alone.unknown.margin).any()  # among more others
 
 
+def test_leave_one_out_takes_a_view_twice_only_in_motion() -> None:
+    index = DenseIndex(catalog())  # a view each 20 degrees
+    for weight, is_same in ((None, True), (0.5, False)):
+        near, far = (leave_one_out(index, beta=BETA, views=2, step_deg=step, weight=weight) for step in (1.0, 20.0))
+        assert (near.known.score[:, 0] == far.known.score[:, 0]).all()
+        assert (near.known.score[:, 1] == far.known.score[:, 1]).all() == is_same
+
+
+def test_rule_is_fitted_to_at_least_one_search_for_each_object() -> None:
+    index = DenseIndex(catalog(8))
+    for most, searches in ((4, 8), (8, 8), (20, 16)):
+        found = fit_stopping_rule(index, most_searches=most)
+        assert (found.rule.searches, found.searched) == (searches, 8)
+
+
 def test_leave_one_out_rejects_catalogs_without_enough_views() -> None:
     with pytest.raises(ValueError, match="at least two"):
         leave_one_out(DenseIndex(catalog(1)), beta=BETA)

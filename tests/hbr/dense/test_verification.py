@@ -56,6 +56,23 @@ def test_fit_is_high_for_the_same_object_in_other_light_and_low_for_another_obje
     assert other < 0.5
 
 
+def test_fit_stays_high_where_a_shade_lies_across_the_object() -> None:
+    view = painted(1)
+    shade = np.linspace(1, 0.5, SIDE)[:, None]
+    assert fit(Pixels.of(replace(view, crop=(view.crop * shade).astype(np.uint8))), Pixels.of(view)) > 0.75
+
+
+@pytest.mark.parametrize("across", [False, True])
+def test_no_scale_is_changed_where_only_the_colours_would_show_it(across: bool) -> None:
+    half = np.where(np.arange(SIDE) < SIDE // 2, 0, 30)
+    tint = np.random.default_rng(1).integers(-40, 41, 16).repeat(SIDE // 16) * np.ones((SIDE, 1), np.intp)
+    tint = tint if across else tint.T
+    bright = 100 + half + half[:, None]  # at any scale the same four quarters
+    crop = np.dstack([bright + tint, bright, bright - tint]).astype(np.uint8)
+    view = Pixels.of(LocalView(crop, np.full((SIDE, SIDE), 255, np.uint8), 0.0))
+    assert fit(view, view) > 0.95
+
+
 def test_nothing_is_explained_without_common_pixels() -> None:
     view = painted(1)
     nothing = LocalView(view.crop, np.zeros_like(view.mask), 0.0)

@@ -1,14 +1,23 @@
 """A stop stays within the limits, uses only readings that agree, and ends with the torque off and read back."""
 
 import ast
+import os
+from contextlib import ExitStack, closing
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from rig.core.errors import DeviceSilent, TorqueStaysOn, UsageError
+from rig.config import load_config
+from rig.core.clock import seconds_between
+from rig.core.errors import BenchBusy, DeviceSilent, TorqueStaysOn, UsageError
+from rig.motion.stop_request import stop
 from rig.motion.turntable import Turntable
+from rig.safety.bench_lock import BenchLock
+from rig.safety.saved_state import Holder
+from rig.safety.stop_channel import listen
 from rig.safety.supervisor import TableState
+from sim.world import World
 from tests.rig.bench_parts import motion_bench, open_servo, servo_wires
 
 FAST = "table.velocity_dps=200", "table.acceleration_dps2=500", "imu.range_dps=500"
@@ -174,3 +183,27 @@ def test_bus_that_damages_every_instruction_counts_as_silent(monkeypatch):
     monkeypatch.setattr(wires.serial, "write", lambda data: write(data[:-1] + bytes((data[-1] ^ 1,))))
     with pytest.raises(DeviceSilent, match="does not answer"):
         servo.torque_off()
+
+
+@pytest.mark.parametrize("pid", [os.getpid(), 1, 0], ids=["usual", "first of a container", "unknown"])
+def test_program_that_does_not_answer_is_signalled_after_two_seconds(tmp_path, monkeypatch, pid):
+    clock, config, signalled = World().clock, load_config(None, [f"state_dir={str(tmp_path)!r}"]), []
+    path = config.state_path("sim")
+    with ExitStack() as program:
+        program.enter_context(closing(BenchLock(path, clock)))
+        program.enter_context(closing(listen(path)))
+        (path / "lock").write_text(Holder(pid=pid, command="rig", since_utc="2026-01-02").model_dump_json())
+        start_ns = clock.now_ns()
+
+        def kill(pid: int, _number: int) -> None:
+            signalled.append((pid, seconds_between(start_ns, clock.now_ns())))
+            program.close()
+
+        monkeypatch.setattr("os.kill", kill)
+        if pid:
+            assert stop("sim", config, clock).signalled
+            assert signalled == [(pid, pytest.approx(2.0, abs=0.05))]
+        else:  # 0 would signal this program, too
+            with pytest.raises(BenchBusy):
+                stop("sim", config, clock)
+            assert not signalled

@@ -96,6 +96,19 @@ def test_missing_gyro_samples_widen_the_uncertainty_where_they_are_missing() -> 
     assert inside > 10 * outside
     later = trajectory.at([2_300_000_000]).sigma_deg[0]
     assert later > 5.0  # nothing was measured then
+    assert (trajectory.start_ns, trajectory.end_ns) == (times[0], times[-1])
+
+
+def test_short_gap_of_the_gyro_adds_little_uncertainty_even_without_later_readings() -> None:
+    recorder = TrajectoryRecorder(0.088, 0.5, 0.01, 0.0035, 0.0, 0.005)
+    for begin_ns, end_ns in ((0, 1_000_000_000), (1_015_000_000, 1_100_000_000)):
+        times = np.arange(begin_ns, end_ns, 5_000_000)
+        recorder.add_samples(times, np.full(len(times), 60.0))
+    for t in range(0, 1_000_000_000, 33_000_000):
+        recorder.add_reading(t, 60e-9 * t)
+    trajectory = recorder.fit()
+    assert trajectory is not None
+    assert trajectory.at([1_080_000_000]).sigma_deg[0] < 0.2
 
 
 def test_slip_of_the_platter_shows_in_the_residuals() -> None:
@@ -131,6 +144,33 @@ def test_goal_may_change_without_a_stop_and_speed_returns_to_the_usual() -> None
         assert max(speeds) < 50.0
         assert min(speeds[10:25]) > 40.0  # from the goal 100° to the goal 300° it did not stop
         assert table.goto(90.0).seconds < 1.5
+
+
+def test_angle_of_a_stop_includes_the_rotation_since_the_reading() -> None:
+    with motion_bench(seed=1) as (bench, wires), Turntable(bench) as table:
+        stops_deg: list[float] = []
+
+        def each() -> None:
+            wires.world.clock.sleep(0.033)
+            state = bench.servo.read_state()
+            if not stops_deg and wires.world.table_deg() > 60.0:
+                wires.world.clock.sleep(0.2)
+                stops_deg.extend(map(table.stopping_deg, (state, bench.servo.read_state())))
+
+        table.fly(200.0, Flight(each, (0.0, 200.0), table.recorder(), 45.0))
+    assert stops_deg[0] == pytest.approx(stops_deg[1], abs=1.0)
+    assert stops_deg[0] > 69.0
+
+
+def test_small_change_of_the_goal_of_a_flight_is_followed() -> None:
+    with motion_bench(seed=1) as (bench, wires), Turntable(bench) as table:
+        goal_deg = 60.0 + bench.config.table.tolerance_deg
+
+        def each() -> float:
+            wires.world.clock.sleep(0.033)
+            return goal_deg
+
+        assert table.fly(60.0, Flight(each, (0.0, 70.0), table.recorder(), 45.0)).commanded_deg == goal_deg
 
 
 def test_goal_beyond_the_reach_of_a_flight_is_moved_into_it_and_the_usual_speed_returns() -> None:

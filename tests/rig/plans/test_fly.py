@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,14 +14,17 @@ from rig.bench import Bench
 from rig.config import load_config
 from rig.core.errors import DeviceSilent, LimitExceeded, ObjectMoved, RigError, RotationDisagreement, UsageError
 from rig.core.next_steps import Do
+from rig.devices.camera import Frame
 from rig.events.events import Accepted, Enrolled, Event, ScanStarted
 from rig.events.lines import line
-from rig.motion.flight_views import irregular_stamps
+from rig.motion.flight_views import FlightFrames, irregular_stamps
 from rig.motion.scan_speed import SpeedLimit
+from rig.motion.turntable import Turntable
 from rig.plans.estimate import dry_run
 from rig.plans.tray import TrayItem, enroll_tray
 from rig.safety.saved_state import StateStore
-from rig.views.stream import FrameStream, after_middle_row_ns
+from rig.views.capture import RejectReason
+from rig.views.stream import FrameStream, after_middle_row_ns, middle_ns
 from sim.bench import ShelfOperator, open_sim_bench
 from sim.faults import Fault
 from sim.noise import NoiseModel
@@ -110,6 +114,7 @@ def test_rolling_shutter_exposes_the_rows_of_the_object_later() -> None:
         ((), SpeedLimit.TABLE, "table.velocity_dps allows 90 °/s"),
         (FAST, SpeedLimit.FRAME_RATE, "30 frames/s allow 135 °/s"),
         (("camera_time.jitter_ms=5",), SpeedLimit.TIME, "uncertain by 5.0 ms"),
+        (("view.max_angle_sigma_deg=0.06",), SpeedLimit.TIME, "uncertain by 0.4 ms allow 85 °/s"),
     ],
 )
 def test_speed_is_the_fastest_that_the_limits_allow(
@@ -121,6 +126,35 @@ def test_speed_is_the_fastest_that_the_limits_allow(
         events.close()
     assert started.limit is limit
     assert words in line(started)
+
+
+def test_frames_without_a_sure_angle_are_rejected(tmp_path: Path) -> None:
+    with flying(tmp_path) as (bench, _, _), Turntable(bench) as table:
+        frames = FlightFrames(bench, table)
+        taken: list[Frame] = []
+        table.fly(60.0, frames.flight(taken.append, (0.0, 60.0), 45.0))
+        trajectory, locks = frames.recorder.fit(), bench.camera.read_locks()
+        assert trajectory is not None
+        frame = taken[len(taken) // 2]
+        late = replace(frame, exposed_ns=trajectory.end_ns + 500_000_000)  # nothing was measured then
+        slipped = replace(trajectory, residual_deg=1.0)
+        assert RejectReason.ANGLE_UNCERTAIN not in frames.attempt(frame, trajectory, locks).reasons
+        assert RejectReason.ANGLE_UNCERTAIN in frames.attempt(late, trajectory, locks).reasons
+        assert RejectReason.ANGLE_UNCERTAIN in frames.attempt(frame, slipped, locks).reasons
+
+
+def test_approximate_angle_of_a_frame_lies_between_its_readings_or_after_the_last(tmp_path: Path) -> None:
+    with flying(tmp_path) as (bench, _, _), Turntable(bench) as table:
+        frames = FlightFrames(bench, table)
+        frame = frames.stream.next(table.collect_gyro)
+        assert frame is not None
+        time_ns = middle_ns(frame.exposed_ns, bench.config.camera_time)
+        for ms, angle_deg in ((-300, 0.0), (-100, 10.0)):
+            frames.recorder.add_reading(time_ns + ms * 1_000_000, angle_deg)
+        assert frames.about_deg(frame) == pytest.approx(15.0)
+        for ms, angle_deg in ((100, 30.0), (200, 30.0)):
+            frames.recorder.add_reading(time_ns + ms * 1_000_000, angle_deg)
+        assert frames.about_deg(frame) == pytest.approx(20.0)
 
 
 def outcome(tmp_path: Path, *faults: str) -> tuple[RigError | None, list[Event], float]:

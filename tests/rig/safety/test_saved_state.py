@@ -16,8 +16,19 @@ from rig.config import load_config
 from rig.core.clock import SystemClock
 from rig.core.errors import BenchBusy, Stalled, StateNotStored
 from rig.core.next_steps import Do
-from rig.safety.bench_lock import BenchLock, holder
-from rig.safety.saved_state import LATCH_BYTES, SESSION, BenchState, FileStore, Holder, LatchedFault, SavedTable
+from rig.safety.bench_lock import BenchLock, busy, holder
+from rig.safety.saved_state import (
+    LATCH_BYTES,
+    SERVER_FILE,
+    SERVER_FOLDER,
+    SESSION,
+    BenchState,
+    FileStore,
+    Holder,
+    LatchedFault,
+    SavedTable,
+    ServerAddress,
+)
 from sim import disk
 from tests.fuzzing import fuzz_settings
 
@@ -221,6 +232,16 @@ def test_second_program_reports_the_one_that_uses_the_bench(tmp_path, other_prog
         BenchLock(tmp_path, SystemClock())
     assert caught.value.exit_code == 9
     assert Do.STOP() in caught.value.steps
+
+
+@pytest.mark.parametrize("served", [True, False])
+def test_bench_of_a_server_is_reported_with_its_page(tmp_path, other_program, served):
+    with closing(BenchLock(tmp_path / SERVER_FOLDER, SystemClock())):
+        address = ServerAddress(pid=os.getpid(), url="http://localhost:8000", token="t")
+        (tmp_path / SERVER_FOLDER / SERVER_FILE).write_text(address.model_dump_json())
+        error = busy(tmp_path, holder(tmp_path / SERVER_FOLDER if served else tmp_path))
+    assert ("http://localhost:8000" in error.next_step) == served
+    assert f"process {os.getpid() if served else other_program.pid} " in str(error)
 
 
 def test_killed_program_releases_the_bench(tmp_path, other_program):
