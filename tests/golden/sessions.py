@@ -202,8 +202,9 @@ def _normal(value: Any, folder: str) -> Any:
         case {"free_gb": _}:
             return "DISK"
         case dict():
-            measured = {"seconds"} if "dry_run" in value else set()  # an import takes real time
-            return {key: _normal(one, folder) for key, one in value.items() if not _is_time(key) and key not in measured}
+            left_out = {"seconds"} if "dry_run" in value else set()  # an import takes real time
+            left_out |= {key for key in value if _is_time(key)}
+            return {key: _normal(one, folder) for key, one in value.items() if key not in left_out}
         case list() if len(value) > LONGEST and all(isinstance(one, int | float) for one in value):
             return {
                 "numbers": len(value),
