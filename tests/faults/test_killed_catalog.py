@@ -166,7 +166,7 @@ def test_a_full_disk_at_any_step_loses_nothing(folder: Path, tmp_path: Path, nam
     before = state(folder / "home")
     run(name, whole := Path(shutil.copytree(folder / "home", tmp_path / "complete")), lambda _: None)
     complete = state(whole)
-    for step in count(1, 1 if KILLS > 1 else 10):
+    for step in count(1, 1 if KILLS > 1 else 25):
         home = Path(shutil.copytree(folder / "home", tmp_path / str(step)))
         reported: list[int] = []
         with full_disk(step) as passed, suppress_full_disk():
