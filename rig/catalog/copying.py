@@ -14,6 +14,7 @@ from rig.catalog.catalog import Catalog
 from rig.catalog.columns import damaged
 from rig.catalog.facts import Action, Derived, Enrollment, Entry, Property, Session, View
 from rig.catalog.jobs import JobProgress
+from rig.catalog.upkeep import NAMED_IMAGES
 from rig.core.errors import CatalogError
 from rig.core.next_steps import Do
 
@@ -92,9 +93,7 @@ def _check_empty(transaction: Transaction, target: Catalog) -> None:
 
 def _images(transaction: Transaction) -> set[str]:
     """Return the names of all images that rows or answers name."""
-    answers = select(Entry.record["image"].as_string()).where(Entry.action == Action.IDENTIFIED)
-    named = (select(View.image), select(Session.empty_table), answers)
-    return {image for query in named for image in transaction.scalars(query) if image is not None}
+    return {image for image in transaction.scalars(select(NAMED_IMAGES.c.image)) if image is not None}
 
 
 def _set_last_ids(transaction: Transaction) -> None:

@@ -9,7 +9,7 @@ Decisions: docs/decisions/0042, docs/decisions/0053.
 
 import re
 from collections import Counter
-from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
@@ -36,6 +36,7 @@ from rig.catalog.describing import (
     describe,
     describe_task,
     evidence_of,
+    held_pixels,
     known_descriptor,
     record_of,
     records_of,
@@ -84,7 +85,7 @@ def described(catalog: Catalog, enrollment: Enrollment, name: str, *wanted: str)
             return Described(levels, evidence)
     task = task_of(enrollment, seal, name, kinds, region)
     with catalog.database.catalog_errors():
-        found = describe(catalog.database.images.pixels, task, threads=THREADS)
+        found = describe(held_pixels(catalog.database.images), task, threads=THREADS)
     store(catalog.database, [(task, found)])
     return found
 
@@ -201,10 +202,23 @@ def local_views(catalog: Catalog, name: str, azimuths_deg: Sequence[float]) -> l
     if enrollment is None:
         return []
     evidence = described(catalog, enrollment, name, BENCH_DESCRIPTOR).segmentation
-    near_ones = near([view.azimuth_deg for view in enrollment.views], azimuths_deg)
-    return [
-        LocalView(cut.crop, cut.mask, view.azimuth_deg) for view, cut in _cut(catalog, enrollment, evidence, near_ones)
-    ]
+    regions = regions_of(catalog, enrollment)
+    describers: dict[tuple[Region | None, str | None], ViewDescriber] = {}
+    cut_out = []
+    for place in near([view.azimuth_deg for view in enrollment.views], azimuths_deg):
+        view, region = enrollment.views[place], regions[place]
+        table = enrollment.sessions[view.session].empty_table
+        if (region, table) not in describers:  # it prepares the empty-table image
+            empty = None if table is None else catalog.read_image(table)
+            describers[region, table] = ViewDescriber(ViewConfig(roi=region), (BENCH_DESCRIPTOR,), empty)
+        try:
+            cut = describers[region, table].segment(catalog.read_image(view.image), evidence[place])
+        except ValueError as error:
+            raise CatalogDamaged(
+                f"The view {view.id} cannot be segmented: {error}.", next_step=Do.VERIFY_CATALOG()
+            ) from error
+        cut_out.append(LocalView(cut.crop, cut.mask, view.azimuth_deg))
+    return cut_out
 
 
 def regions_of(catalog: Catalog, enrollment: Enrollment) -> tuple[Region | None, ...]:
@@ -212,26 +226,6 @@ def regions_of(catalog: Catalog, enrollment: Enrollment) -> tuple[Region | None,
     with catalog.database.read() as transaction:
         chosen = _regions(transaction).of(transaction, enrollment.id)
     return tuple(view.region if chosen is None else chosen[0] for view in enrollment.views)
-
-
-def _cut(
-    catalog: Catalog, enrollment: Enrollment, evidence: Sequence[Mapping[str, Any]], places: Iterable[int]
-) -> list[tuple[View, hbr.Segmentation]]:
-    """Return views of an enrollment with their stored segmentation."""
-    regions = regions_of(catalog, enrollment)
-    found = []
-    for place in places:
-        view = enrollment.views[place]
-        table = enrollment.sessions[view.session].empty_table
-        empty = None if table is None else catalog.read_image(table)
-        describer = ViewDescriber(ViewConfig(roi=regions[place]), (BENCH_DESCRIPTOR,), empty)
-        try:
-            found.append((view, describer.segment(catalog.read_image(view.image), evidence[place])))
-        except ValueError as error:
-            raise CatalogDamaged(
-                f"The view {view.id} cannot be segmented: {error}.", next_step=Do.VERIFY_CATALOG()
-            ) from error
-    return found
 
 
 # What the enrolled views have in common
@@ -354,7 +348,8 @@ def _regions(transaction: Transaction) -> _Regions:
 
 def _missing(catalog: Catalog, name: str, found: dict[str, bytes]) -> tuple[list[state.Used], list[Task]]:
     """Return the enrollments in use, and those to be described; put the stored levels of the others into ``found``."""
-    kinds = (name,) if descriptor(name).whole_image else (name, SEGMENTATION)
+    # The descriptors of every enrolled view are computed from one segmentation.
+    compute = DESCRIPTORS if name in DESCRIPTORS and not descriptor(name).whole_image else (name,)
     with catalog.database.read() as transaction:
         wanted = state.used(transaction, checked=True)
         regions = _regions(transaction)
@@ -367,7 +362,6 @@ def _missing(catalog: Catalog, name: str, found: dict[str, bytes]) -> tuple[list
         tasks = []
         for one in missing:
             (known,) = state.enrollments(transaction, Enrollment.id == one.enrollment_id)
-            compute = DESCRIPTORS if name in DESCRIPTORS and SEGMENTATION in kinds else (name,)
             tasks.append(task_of(known.enrollment, one.seal, one.name, compute, chosen[one.seal]))
     return wanted, tasks
 

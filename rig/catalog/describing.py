@@ -39,6 +39,9 @@ SEGMENTATION_VERSION: Final = 1
 FEWEST_VIEWS: Final = 4
 """A session with fewer views, after an interruption, learns its background from all views of the enrollment."""
 
+MOST_HELD_BYTES: Final = 256_000_000
+"""Pixels of one enrollment that are held in memory until it is described: 277 views of 640x480."""
+
 Levels = NDArray[np.uint8]
 
 
@@ -98,11 +101,8 @@ def describe_new(database: Database, enrollment: Enrollment, held: Mapping[str, 
     seal = seal_of(enrollment)
     task = task_of(enrollment, seal, name, DESCRIPTORS, None)
 
-    def pixels(image: str) -> NDArray[np.uint8]:
-        return held[image] if image in held else images.pixels(image)
-
     with database.catalog_errors():
-        found = describe(pixels, task, threads=THREADS)
+        found = describe(held_pixels(images, held), task, threads=THREADS)
     store(database, [(task, found)])
     return seal
 
@@ -118,10 +118,28 @@ def task_of(
     return Task(seal, name, names, region, views, tuple(session.empty_table for session in enrollment.sessions))
 
 
+def held_pixels(images: Images, held: Mapping[str, NDArray[np.uint8]] | None = None) -> _Pixels:
+    """Return a function that reads each image once: it holds pixels, ``held`` ones first, up to `MOST_HELD_BYTES`.
+
+    Decoding takes longer than describing, and a view is used several times.
+    """
+    known = dict(held or {})
+
+    def pixels(image: str) -> NDArray[np.uint8]:
+        if image in known:
+            return known[image]
+        found = images.pixels(image)
+        if sum(one.nbytes for one in known.values()) + found.nbytes <= MOST_HELD_BYTES:
+            known[image] = found
+        return found
+
+    return pixels
+
+
 def describe_task(images: Images, task: Task) -> Described | str:
     """Describe an enrollment in a worker process; a text says why it cannot be described."""
     try:
-        return describe(images.pixels, task)
+        return describe(held_pixels(images), task)
     except (CatalogError, UsageError) as error:
         return error.what.rstrip(".")
 

@@ -4,7 +4,6 @@ from concurrent.futures import Future
 from dataclasses import dataclass, field
 from datetime import timedelta
 from math import isfinite
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,16 +12,13 @@ from sqlalchemy.orm import Session as Transaction
 
 from rig.catalog import log, state
 from rig.catalog.database import Database
-from rig.catalog.describing import describe_new
+from rig.catalog.describing import MOST_HELD_BYTES, describe_new
 from rig.catalog.facts import Action, Enrollment, Session, View, digest_of
 from rig.catalog.records import EnrollmentStatus, as_json, check_azimuth, is_region
 from rig.core.clock import Clock
 from rig.core.errors import CatalogError, UsageError
 from rig.core.next_steps import Do
 from rig.views import image_files as images
-
-MOST_HELD_BYTES: Final = 256_000_000
-"""Pixels of one enrollment that are held in memory until it is described: 277 views of 640x480."""
 
 
 @dataclass(eq=False)
