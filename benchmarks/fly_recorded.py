@@ -8,7 +8,7 @@ revolution in motion and 24 views at rest, which are searched for. RECORDING sto
 those of the bench (`rig.search.session`); their times come from the motion profile, not from a bench.
 
 Each of four catalogs leaves out four objects that are unknown then; one search in five is for one of these. With
-``--strength`` the descriptions change as those of another bench would (`hbr.descriptors.shift`).
+``--strength`` the descriptions change as those of another bench would (`hbr.descriptors.base`).
 """
 
 import argparse
@@ -24,13 +24,12 @@ import hbr
 from benchmarks.fly_enrollment import NOISE, value_of
 from benchmarks.fly_search import summary
 from hbr.core.angles import size_deg
-from hbr.descriptors.shift import Shift
+from hbr.descriptors.base import Shift
 from rig.bench import Bench
 from rig.config import RigConfig, load_config
 from rig.devices.camera import Frame
 from rig.motion.flight_views import FlightFrames
-from rig.motion.motion_model import MotionModel
-from rig.motion.move import equivalent_within
+from rig.motion.move import MotionModel, equivalent_within
 from rig.motion.turntable import Turntable
 from rig.plans.capture import capture
 from rig.search.model import DenseModel, Model, begin_search

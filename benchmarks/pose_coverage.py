@@ -17,8 +17,7 @@ import numpy as np
 from hbr import DenseIndex, Views, describe, update_belief
 from hbr.core.angles import wrap180
 from hbr.core.arrays import FloatArray, LevelArray
-from hbr.dense.filter import Belief
-from hbr.dense.pose import Pose, pose
+from hbr.dense.filter import Belief, Pose, pose
 from hbr.evaluation.condition import Condition
 from hbr.evaluation.datasets import load_coil, read_photograph
 from hbr.evaluation.draws import generator

@@ -1,10 +1,4 @@
-"""Search with a strategy of your own, beside those that come with the rig.
-
-For `rig identify --strategy golden`, a package names the strategy in the entry-point group `rig.strategies`:
-
-    [project.entry-points."rig.strategies"]
-    golden = "my_package:Golden"
-"""
+"""Search with a strategy of your own, beside those that come with the rig."""
 
 import tempfile
 

@@ -1,16 +1,14 @@
 """Retrieval: arrays in, decisions out."""
 
 from hbr.dense.filter import Belief, update_belief
-from hbr.dense.fitting import FittedRule, fit_stopping_rule, rule_from_searches
+from hbr.dense.fitting import FittedRule, LeaveOneOut, fit_stopping_rule, leave_one_out, rule_from_searches
 from hbr.dense.index import DenseIndex
-from hbr.dense.leave_one_out import LeaveOneOut, leave_one_out
 from hbr.dense.next_view import NextBestView, next_best_view
 from hbr.dense.session import DenseSession
 from hbr.dense.stopping import Outcome, StopDecision, StoppingRule, StopReason
 from hbr.descriptors import Descriptor, descriptor
-from hbr.descriptors.cedd import cedd
-from hbr.descriptors.cedd_packing import pack, unpack, unpack_rows
-from hbr.descriptors.describe import describe
+from hbr.descriptors.cedd import cedd, pack, unpack, unpack_rows
+from hbr.descriptors.registry import describe
 from hbr.descriptors.tanimoto import tanimoto
 from hbr.descriptors.together import ViewsTogether
 from hbr.model.views import PackedViews, Views

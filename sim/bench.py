@@ -17,8 +17,7 @@ from rig.bench.hardware import assemble
 from rig.config import RigConfig, Section
 from rig.core.clock import SystemClock
 from rig.core.errors import ObjectNotFound, UsageError
-from rig.safety.bench_lock import BenchLock
-from rig.safety.saved_state import FileStore, MemoryStore, StateStore
+from rig.safety.saved_state import BenchLock, FileStore, MemoryStore, StateStore
 from sim.calibration_board import calibration_targets
 from sim.camera import CAMERA_DEVICE
 from sim.change import Change

@@ -48,18 +48,6 @@ def means_network() -> bytes:
     return network([node([b"x"], b"p", b"GlobalAveragePool"), node([b"p"], b"y", b"Flatten")], [], b"y", 3)
 
 
-def early_network() -> bytes:
-    """Return a model with a convolution, ``early``, whose means it returns."""
-    values = np.random.default_rng(0).normal(0, 0.3, (6, 3, 8, 8)).astype(np.float32)
-    nodes = [
-        node([b"x", b"w"], b"c", b"Conv", kernel_shape=[8, 8], strides=[8, 8]),
-        node([b"c"], b"early", b"Relu"),
-        node([b"early"], b"p", b"GlobalAveragePool"),
-        node([b"p"], b"y", b"Flatten"),
-    ]
-    return network(nodes, [weights(b"w", values)], b"y", 6)
-
-
 def _attribute(name: bytes, value: int | list[int]) -> bytes:
     if isinstance(value, int):
         return field(1, name) + field(3, value) + field(20, 2)

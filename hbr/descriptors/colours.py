@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hbr.core.arrays import FloatArray, ImageArray, IndexArray, LevelArray
-from hbr.descriptors.base import CompiledDescriptor
-from hbr.descriptors.shift import Shift
+from hbr.descriptors.base import CompiledDescriptor, Shift
 from hbr.kernels import images
 from hbr.kernels.calls import Measure
 from hbr.segmentation import CROP_PX, Segmentation, segment

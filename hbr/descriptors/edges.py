@@ -11,9 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hbr.core.arrays import FloatArray, ImageArray, LevelArray
-from hbr.descriptors.base import CompiledDescriptor
+from hbr.descriptors.base import CompiledDescriptor, Shift
 from hbr.descriptors.cosine import WholeCosine
-from hbr.descriptors.shift import Shift
 from hbr.kernels import images
 from hbr.kernels.calls import Measure
 from hbr.segmentation import CROP_PX, Segmentation, segment

@@ -1,21 +1,116 @@
-"""The known descriptors and their names."""
+"""The known descriptors by their names, several descriptors as one, and the description of an image by any of them."""
 
-import warnings
-from functools import cache
-from importlib.metadata import entry_points
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from hbr.descriptors.base import Descriptor
+import numpy as np
+
+from hbr.core.arrays import FloatArray, ImageArray, IndexArray, LevelArray
+from hbr.descriptors.base import Comparison, CompiledDescriptor, Descriptor, Shift
+from hbr.descriptors.cedd import Cedd
+from hbr.descriptors.cedd import describe as describe_by_cedd
 from hbr.descriptors.colours import Colours
 from hbr.descriptors.edges import Edges
-from hbr.descriptors.embedding import MODEL_NAME, PREFIX, Embedding, read_model
-from hbr.descriptors.joined import Joined
-from hbr.descriptors.layer_embedding import MAGIC, LayerEmbedding, load_layer
-from hbr.descriptors.plain_cedd import Cedd
+from hbr.descriptors.embedding import MODEL_NAME, PREFIX, Embedding
+from hbr.kernels.calls import Measure
+from hbr.segmentation import Background, Box, Segmentation, segment
 
-GROUP: Final = "hbr.descriptors"
-"""Entry-point group in which packages name their descriptors: instances, not classes."""
+
+@dataclass(frozen=True)
+class Joined(CompiledDescriptor):
+    """Descriptors side by side. The similarity is the mean of theirs, with weights that add up to 1."""
+
+    name: str = ""
+    version: int = 1
+    parts: tuple[Descriptor, ...] = ()
+    weights: tuple[float, ...] = ()
+
+    @property
+    def size_bytes(self) -> int:
+        return sum(part.size_bytes for part in self.parts)
+
+    @property
+    def length(self) -> int:
+        return sum(part.length for part in self.parts)
+
+    def describe(self, view: ImageArray | Segmentation, /) -> LevelArray:
+        found = view if isinstance(view, Segmentation) else segment(view)
+        return np.concatenate([part.describe(found) for part in self.parts])
+
+    def compared(self, rows: LevelArray, /) -> "_Average":
+        columns = self._columns()
+        parts = [part.prepared(rows[:, own]) for part, own in zip(self.parts, columns, strict=True)]
+        return _Average(parts, self.weights, columns)
+
+    def measure(self) -> Measure | None:
+        """Return how edges and colours, in this order, are compared; other pairs are left to NumPy."""
+        measures = [part.measure() if isinstance(part, CompiledDescriptor) else None for part in self.parts]
+        edges, colours = measures if len(measures) == 2 else (None, None)
+        if edges is None or colours is None or edges.edges_at or colours.colours_at:
+            return None
+        edges_share, colours_share = self.weights
+        return colours._replace(
+            edges_at=0,
+            colours_at=self.parts[0].size_bytes,
+            edge_values=edges.edge_values,
+            edges_share=edges_share,
+            colours_share=colours_share,
+        )
+
+    def entries(self, rows: LevelArray) -> FloatArray:
+        return np.concatenate(
+            [part.entries(rows[:, own]) for part, own in zip(self.parts, self._columns(), strict=True)], axis=1
+        )
+
+    def shifted(self, levels: LevelArray, shift: Shift) -> LevelArray:
+        parts = zip(self.parts, self._columns(), strict=True)
+        return np.concatenate([part.shifted(levels[own], shift) for part, own in parts])
+
+    def pack_rows(self, rows: LevelArray) -> LevelArray:
+        columns = zip(self.parts, self._columns(), strict=True)
+        return np.concatenate([part.pack_rows(rows[:, own]) for part, own in columns], axis=1)
+
+    def unpack_rows(self, packed: bytes) -> LevelArray:
+        rows = self.packed_rows(packed)
+        columns = zip(self.parts, _slices([part.size_bytes for part in self.parts]), strict=True)
+        return np.concatenate([part.unpack_rows(rows[:, own].tobytes()) for part, own in columns], axis=1)
+
+    def check_levels(self, rows: LevelArray) -> None:
+        for part, columns in zip(self.parts, self._columns(), strict=True):
+            part.check_levels(rows[:, columns])
+
+    def _columns(self) -> list[slice]:
+        return _slices([part.length for part in self.parts])
+
+
+class _Average:
+    def __init__(self, parts: Sequence[Comparison], weights: Sequence[float], columns: Sequence[slice]) -> None:
+        self._parts, self._weights, self._columns = parts, weights, columns
+
+    def similarity(self, queries: LevelArray, /) -> FloatArray:
+        return self._weighted(
+            [p.similarity(queries[:, own]) for p, own in zip(self._parts, self._columns, strict=True)]
+        )
+
+    def only(self, rows: IndexArray, /) -> "_Average":
+        return _Average([part.only(rows) for part in self._parts], self._weights, self._columns)
+
+    def among(self, rows: IndexArray, /) -> FloatArray:
+        return self._weighted([part.among(rows) for part in self._parts])
+
+    def _weighted(self, similar: Sequence[FloatArray]) -> FloatArray:
+        total = self._weights[0] * similar[0]
+        for weight, part in zip(self._weights[1:], similar[1:], strict=True):
+            total += weight * part
+        return total
+
+
+def _slices(lengths: list[int]) -> list[slice]:
+    ends = np.cumsum(lengths).tolist()
+    return [slice(end - length, end) for end, length in zip(ends, lengths, strict=True)]
+
 
 _CEDD: Final = Cedd()
 _EDGES: Final = Edges()
@@ -32,8 +127,7 @@ _KNOWN: Final[dict[str, Descriptor]] = {
     )
 }
 
-Model = Embedding | LayerEmbedding
-_MODELS: Final[dict[str, Model]] = {}
+_MODELS: Final[dict[str, Embedding]] = {}
 
 
 def descriptor(name: str) -> Descriptor:
@@ -44,7 +138,7 @@ def descriptor(name: str) -> Descriptor:
     ValueError
         The name is unknown (the message lists the known ones), or it names a model that is not loaded.
     """
-    known = _KNOWN.get(name) or _MODELS.get(name) or _plugins().get(name)
+    known = _KNOWN.get(name) or _MODELS.get(name)
     if known is None and name.startswith(PREFIX):
         raise ValueError(f"the model of descriptor {name!r} is not loaded; load its file first")
     if known is None:
@@ -53,7 +147,7 @@ def descriptor(name: str) -> Descriptor:
 
 
 def register(added: Descriptor) -> None:
-    """Make a descriptor known by its name in this process; an entry point does so in every process.
+    """Make a descriptor known by its name in this process.
 
     Raises
     ------
@@ -62,19 +156,6 @@ def register(added: Descriptor) -> None:
     """
     if added.name.startswith(PREFIX) or _KNOWN.setdefault(added.name, added) != added:
         raise ValueError(f"the name {added.name!r} is taken; choose another one")
-
-
-@cache
-def _plugins() -> dict[str, Descriptor]:
-    """Return the descriptors of other packages. One that cannot be loaded is left out, with a warning."""
-    found: dict[str, Descriptor] = {}
-    for point in entry_points(group=GROUP):
-        try:
-            plugged: Descriptor = point.load()
-            found[plugged.name] = plugged
-        except (ImportError, AttributeError) as error:
-            warnings.warn(f"the descriptor {point.name!r} of {point.value} cannot be loaded: {error}", stacklevel=2)
-    return found
 
 
 def load_descriptor(given: str) -> Descriptor:
@@ -90,25 +171,80 @@ def load_descriptor(given: str) -> Descriptor:
     return descriptor(given)
 
 
-def load_model(path: Path) -> Model:
-    """Load a model file, or a file of `hbr.descriptors.layer_embedding.fit_layer`; `descriptor` knows it by its digest.
+def load_model(path: Path) -> Embedding:
+    """Load a model file; `descriptor` knows it by its digest.
 
     Raises
     ------
     ValueError
         The model file cannot be used.
     """
-    content = read_model(path)
-    is_layer = content.startswith(MAGIC)
-    model = load_layer(path, content, _KNOWN["edges+colours"]) if is_layer else Embedding(path)
+    model = Embedding(path)
     return _MODELS.setdefault(model.name, model)
 
 
-def loaded_models() -> tuple[Model, ...]:
+def loaded_models() -> tuple[Embedding, ...]:
     """Return the models that were loaded."""
     return tuple(_MODELS.values())
 
 
 def names() -> tuple[str, ...]:
     """Return the names of all descriptors apart from networks, the paper's first."""
-    return tuple(_KNOWN | _plugins())
+    return tuple(_KNOWN)
+
+
+_named = descriptor  # `describe` has a parameter of this name
+
+
+def describe(
+    image_bgr: ImageArray,
+    *,
+    size: tuple[int, int] | None = None,
+    descriptor: str | Descriptor = "cedd",
+    empty_table: Background | ImageArray | None = None,
+    box: Box | None = None,
+) -> LevelArray:
+    """Return the levels of an image by the paper's CEDD, or by another descriptor.
+
+    ``describe(image)`` is the paper's descriptor of the whole image, scaled to a size that CEDD's grid covers.
+    ``describe(image, descriptor="edges+colours", empty_table=empty)`` is the rig's own: the object is cut out and
+    scaled, and its illumination corrected to that of the empty-table image (`hbr.segment`), if that is reliable. Enroll
+    and search by the same descriptor, and compare by its ``similarity``::
+
+        table = hbr.Background(cv2.imread("empty.png"))
+        levels = hbr.describe(frame, descriptor="edges+colours", empty_table=table)
+        hbr.descriptor("edges+colours").similarity(levels[None], enrolled)
+
+    Parameters
+    ----------
+    image_bgr : uint8 array (H, W, 3)
+        The image, in OpenCV's channel order. No side may be 0.
+    size : (int, int), optional
+        Width and height, multiples of 80, to which the whole image is scaled; only for CEDD. By default, an image with
+        a side above 640 pixels is scaled down to that side; then each side becomes the nearest multiple of 80.
+    descriptor : str or Descriptor
+        One of `hbr.descriptors.names`.
+    empty_table : Background, or uint8 array (H, W, 3), optional
+        The empty-table image, from the same camera position: of today, or of the day of the enrollment. Pass a
+        `Background` for many frames. An image that does not fit the frame is not used.
+    box : (int, int, int, int), optional
+        The object's x, y, width, height in pixels. By default, the object is searched for.
+
+    Returns
+    -------
+    uint8 array (length,)
+        The descriptor's levels; 144 for CEDD.
+
+    Raises
+    ------
+    TypeError, ValueError
+        The array is no such image, the descriptor is unknown, or the options contradict each other.
+    """
+    if descriptor == "cedd" and empty_table is None and box is None:
+        return describe_by_cedd(image_bgr, size=size)
+    if size is not None:
+        raise ValueError(f"size is {size}; it is possible only with plain CEDD of the whole image")
+    chosen = _named(descriptor) if isinstance(descriptor, str) else descriptor
+    if empty_table is None and box is None:
+        return chosen.describe(image_bgr)
+    return chosen.describe(segment(image_bgr, empty_table=empty_table, box=box))

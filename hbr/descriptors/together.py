@@ -1,9 +1,12 @@
 """Description of views that belong together: those of one search, or of one enrollment.
 
-They share a background, which is learned while the table rotates (`hbr.segmentation.learned`). So the second view also
+While the table rotates, the background stands still, and the object and the platter's marks move. So a view is compared
+with the median of the other views: behind the object most of them show the background. Such a median can show the
+object, too; the network was trained with such medians and combines them with the frame. So the second view also
 improves the segmentation of the first one. Further views hardly improve those that were segmented by rotation.
 """
 
+from collections.abc import Sequence
 from functools import partial
 from typing import Final
 
@@ -12,11 +15,69 @@ import numpy as np
 from hbr.core.arrays import ImageArray, LevelArray
 from hbr.descriptors.base import Descriptor
 from hbr.descriptors.registry import descriptor as descriptor_of
-from hbr.segmentation import Background, Method, Segmentation, hypotheses
+from hbr.segmentation import Method, Segmentation, hypotheses
+from hbr.segmentation.background import Background, Frame, shrunk
 from hbr.segmentation.cut_out import Found
-from hbr.segmentation.frame import Frame
-from hbr.segmentation.learned import LearnedBackground
 from hbr.segmentation.segment import MOST_HYPOTHESES, without_background
+
+#: Largest number of views that the background is learned from.
+_MOST: Final = 9
+
+
+class LearnedBackground:
+    """The views of one search or enrollment, from one camera before one background in one light."""
+
+    def __init__(self) -> None:
+        self._shape: tuple[int, int] | None = None
+        self._small: list[ImageArray] = []
+
+    def __len__(self) -> int:
+        return len(self._small)
+
+    def add(self, image_bgr: ImageArray, small: ImageArray | None = None) -> None:
+        """Add a view, uint8 (H, W, 3); ``small`` is what `shrunk` returns for it, if that is known.
+
+        Raises
+        ------
+        ValueError
+            The view has another size than the others.
+        """
+        height, width = image_bgr.shape[:2]
+        if self._shape is not None and self._shape != (height, width):
+            raise ValueError(
+                f"the view has {width} x {height} pixels, the others {self._shape[1]} x {self._shape[0]}; "
+                "views of one search need one size"
+            )
+        self._shape = height, width
+        self._small.append(shrunk(image_bgr) if small is None else small)
+
+    def of(self, view: int) -> Background | None:
+        """Return the background of a view, learned from the others; None with a single view."""
+        others = [n for n in range(len(self)) if n != view]
+        if not others or self._shape is None:
+            return None
+        if len(others) > _MOST:  # evenly spread over all views
+            others = [others[n * len(others) // _MOST] for n in range(_MOST)]
+        return Background.learned(median([self._small[n] for n in others]), self._shape)
+
+
+def median(images: Sequence[ImageArray]) -> ImageArray:
+    """Return the median of each value of at most a few images of one shape, uint8, rounded down.
+
+    The images are sorted up to their middle by pairwise minima and maxima, which is ten times faster than a partition
+    of each pixel.
+    """
+    ranked = [image.copy() for image in images]
+    middle = len(ranked) // 2
+    for rank in range(middle + 1):
+        for n in range(len(ranked) - 1, rank, -1):
+            lower = np.minimum(ranked[n - 1], ranked[n])
+            np.maximum(ranked[n - 1], ranked[n], out=ranked[n])
+            ranked[n - 1] = lower
+    if len(ranked) % 2:
+        return ranked[middle]
+    return ((ranked[middle - 1].astype(np.uint16) + ranked[middle]) // 2).astype(np.uint8)
+
 
 #: Methods whose segmentations are as good as those of enrolled views.
 _EXACT: Final = (Method.PLAIN_BACKGROUND, Method.EMPTY_TABLE)

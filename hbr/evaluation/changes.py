@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 from hbr.core.angles import wrap180
 from hbr.core.arrays import ImageArray, LevelArray
 from hbr.dense.index import DenseIndex
-from hbr.dense.last_steps import answered, near
 from hbr.dense.local_difference import LocalView
-from hbr.dense.session import DenseSession
+from hbr.dense.session import DenseSession, answered, near
 from hbr.dense.stopping import Outcome, StoppingRule
 from hbr.descriptors.together import ViewsTogether
 from hbr.evaluation.changed_bench import ENROLLMENT, HARD, MILD, Bench, Visit
@@ -82,11 +81,11 @@ class SearchResult:
     views : int
         Views until the end.
     compared : bool
-        Whether its two leaders were compared pixel by pixel (`hbr.dense.last_steps`).
+        Whether its two leaders were compared pixel by pixel (`hbr.dense.session`).
     by_comparison : bool
         Whether that comparison changed the outcome.
     verified : bool
-        Whether the leader was doubtful, and compared with the views pixel by pixel (`hbr.dense.last_steps`).
+        Whether the leader was doubtful, and compared with the views pixel by pixel (`hbr.dense.session`).
     left_out : Outcome, optional
         Outcome of the same search if the object is not enrolled; None if it never was.
     """

@@ -7,7 +7,7 @@ import numpy as np
 
 from hbr.core.arrays import ImageArray, LevelArray
 from hbr.descriptors import descriptor
-from hbr.descriptors.describe import describe
+from hbr.descriptors.registry import describe
 from hbr.evaluation.condition import Condition, EvaluationImage
 from hbr.evaluation.datasets import Dataset, read_photograph
 from hbr.evaluation.draws import generator

@@ -11,7 +11,7 @@ from hbr.core.angles import wrap180
 from hbr.core.arrays import LevelArray
 from hbr.dense.filter import Belief, update_belief
 from hbr.dense.index import DenseIndex
-from hbr.descriptors.describe import describe
+from hbr.descriptors.registry import describe
 from hbr.evaluation.condition import Condition
 from hbr.evaluation.datasets import Dataset, read_photograph
 from hbr.evaluation.draws import generator

@@ -1,10 +1,10 @@
-"""The images of a data set as views for the comparison of two leaders (`hbr.dense.last_steps`)."""
+"""The images of a data set as views for the comparison of two leaders (`hbr.dense.session`)."""
 
 from collections.abc import Sequence
 
 from hbr.core.arrays import IndexArray
-from hbr.dense.last_steps import near
 from hbr.dense.local_difference import LocalView
+from hbr.dense.session import near
 from hbr.descriptors import descriptor
 from hbr.evaluation.condition import Condition, EvaluationImage
 from hbr.evaluation.datasets import Dataset

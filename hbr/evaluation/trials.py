@@ -16,9 +16,8 @@ from hbr.core.arrays import FloatArray, IndexArray, LevelArray
 from hbr.dense.filter import Belief, update_belief
 from hbr.dense.fitting import fit_stopping_rule
 from hbr.dense.index import DenseIndex
-from hbr.dense.last_steps import answered
 from hbr.dense.local_difference import LocalView
-from hbr.dense.session import DenseSession
+from hbr.dense.session import DenseSession, answered
 from hbr.dense.stopping import Outcome, StoppingRule
 from hbr.descriptors import descriptor
 from hbr.evaluation.draws import generator

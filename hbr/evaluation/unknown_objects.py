@@ -7,8 +7,7 @@ import numpy as np
 
 from hbr.core.arrays import BoolArray
 from hbr.dense.fitting import conformal_threshold
-from hbr.dense.open_set import Leaders, usual_scores
-from hbr.dense.stopping import StoppingRule
+from hbr.dense.stopping import Leaders, StoppingRule, usual_scores
 from hbr.evaluation.draws import generator
 from hbr.evaluation.protocol import Protocol, Runs
 

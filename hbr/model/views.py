@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hbr.core.angles import wrap360
-from hbr.core.arrays import FloatArray, IndexArray, LevelArray
-from hbr.core.segments import ranges
+from hbr.core.arrays import FloatArray, IndexArray, LevelArray, ranges
 from hbr.descriptors import Comparison
 from hbr.descriptors import descriptor as descriptor_of
 

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from hbr.core.angles import revolutions_between
-from hbr.core.arrays import FloatArray, IndexArray, LevelArray
-from hbr.core.segments import first_maximum, lengths, ranges
+from hbr.core.arrays import FloatArray, IndexArray, LevelArray, first_maximum, lengths, ranges
 from hbr.descriptors.tanimoto import tanimoto
 from hbr.kernels import calls
 from hbr.model.views import Views

@@ -1,8 +1,7 @@
 """Segmentation: finds the object in a frame, corrects its illumination, and brings it to a fixed size."""
 
-from hbr.segmentation.background import MIN_AGREEMENT, Background
+from hbr.segmentation.background import MIN_AGREEMENT, Background, Issue, IssueCode, Method
 from hbr.segmentation.cut_out import CROP_PX, Box, Segmentation
-from hbr.segmentation.evidence import Issue, IssueCode, Method
 from hbr.segmentation.segment import hypotheses, segment
 
 __all__ = [

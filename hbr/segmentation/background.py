@@ -1,15 +1,18 @@
-"""Comparison of a frame with the empty-table image: difference of illumination, and pixels that show the object.
+"""A frame, its backgrounds, and the difference between them.
 
-The comparison uses small images and the logarithm of the grey levels. There a change of exposure, of white balance or
-of a lamp's position adds a plane to each channel, and a shadow subtracts the same amount from all three channels.
+`Background` compares with the empty-table image, or with a background that was learned. The comparison uses small
+images and the logarithm of the grey levels. There a change of exposure, of white balance or of a lamp's position adds a
+plane to each channel, and a shadow subtracts the same amount from all three channels. `plain_difference` needs no
+image: the background is plain.
 
 Decision: docs/decisions/0024.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import StrEnum
 from functools import cached_property, lru_cache
-from typing import Final
+from typing import Any, Final
 
 import cv2
 import numpy as np
@@ -18,7 +21,6 @@ from numpy.typing import NDArray
 from hbr.core.arrays import FloatArray, ImageArray
 from hbr.core.validation import check_frame
 from hbr.kernels import images
-from hbr.segmentation.evidence import IssueCode
 
 Mask = NDArray[np.bool_]
 Floats = NDArray[np.float32]
@@ -48,6 +50,62 @@ _NEAR_GREY: Final = 0.35
 #: Grey level that a plain backdrop is corrected to, and the largest correction of the exposure, as a logarithm.
 _BACKDROP_LEVEL: Final = 128.0
 _MAX_EXPOSURE: Final = np.log(1.7)
+
+
+class Method(StrEnum):
+    """The methods of finding the object's box."""
+
+    EMPTY_TABLE = "empty-table"
+    """The object differs from the empty-table image."""
+    PLAIN_BACKGROUND = "plain-background"
+    """The object differs from a plain background."""
+    NETWORK = "network"
+    """A small neural network found the object, without any background."""
+    ROTATION = "rotation"
+    """The same network, with the background that the other views of the search or enrollment show."""
+    GUESS = "guess"
+    """The object has other colours than the frame's border. Often wrong."""
+    GIVEN_BOX = "given-box"
+    """The caller gave the box."""
+    NONE = "none"
+    """No object was found."""
+
+
+class IssueCode(StrEnum):
+    """The issues of a segmentation. The parameters of an issue are listed with its code."""
+
+    TABLE_SIZE = "empty-table-size"
+    """The empty-table image has another size: ``table_px`` and ``frame_px``, [width, height]."""
+    TABLE_DIFFERS = "empty-table-differs"
+    """The frame's border does not look like the empty-table image: ``agreement``, 0..1."""
+    BACKDROP_EXPOSURE = "backdrop-exposure"
+    """Most of the backdrop is too dark or overexposed: its colour is not measurable."""
+    BACKDROP_COLOURS = "backdrop-several-colours"
+    """The backdrop has several colours: none of them is known to be grey."""
+    BACKDROP_COLOURFUL = "backdrop-colourful"
+    """The backdrop's colour is too far from grey."""
+    BACKDROP_LEVEL = "backdrop-level"
+    """The backdrop is too dark or too bright to correct the exposure with it."""
+    BACKGROUND_NOT_PLAIN = "background-not-plain"
+    """The background is not plain: the object can only be guessed from its colours, or found by rotation."""
+    NO_OBJECT = "no-object"
+    """The network found no object."""
+    NO_GUESS = "no-guess"
+    """No part of the frame stands out by its colours."""
+    NO_DIFFERENCE = "no-difference"
+    """Nothing differs from the plain background."""
+
+
+@dataclass(frozen=True, slots=True)
+class Issue:
+    """An issue: its code, such as an `IssueCode`, and the JSON values that are listed with the code."""
+
+    code: StrEnum
+    parameters: Mapping[str, Any] = field(default_factory=dict)
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the code and the parameters in one flat mapping."""
+        return {"code": self.code.value, **self.parameters}
 
 
 @dataclass(frozen=True, eq=False)
@@ -342,3 +400,106 @@ def _inliers(
     away = np.maximum.reduce(np.abs(values - fitted).T)
     inlier = np.flatnonzero(away <= max(tolerance, float(np.partition(away, quarter)[quarter])))
     return basis.take(inlier, axis=0), values.take(inlier, axis=0)
+
+
+#: A pixel differs from the background by at least this many grey levels, and by this share of the object's contrast.
+_LEAST_LEVELS: Final = 12.0
+_SHARE: Final = 0.25
+#: A backdrop is plain if three corners of the frame have the same colour within this many grey levels (two corners are
+#: enough if they are darker than `_DARK`),
+_ONE_COLOUR: Final = 12.0
+_DARK: Final = 40.0
+#: and if the smoothest corner differs from the background by at most this, plus its noise.
+_SMOOTH: Final = 3.0
+_GRAIN: Final = 1.5
+
+
+def plain_difference(small: ImageArray) -> Mask | None:
+    """Return where a small image differs from its background, bool (h, w); None if the background is not plain.
+
+    The background of each row is interpolated between its two ends, so that a horizon does not matter.
+    """
+    height, width = small.shape[:2]
+    image = cv2.GaussianBlur(small, (7, 7), 1.3)
+    corners = _corners(height, width)
+    if not _one_colour([image[corner] for corner in corners]):
+        return None
+    edge = max(2, width // 32)
+    left, right = (
+        cv2.blur(np.sort(part, axis=1)[:, part.shape[1] // 2, None].astype(np.float32), (1, 9)).reshape(height, 1, 3)
+        for part in (image[:, :edge], image[:, -edge:])
+    )
+    across = ((np.arange(width, dtype=np.float32) + 0.5) / width)[None, :, None]
+    apart = cv2.split(cv2.absdiff(image.astype(np.float32), left + (right - left) * across))
+    away = cv2.max(cv2.max(apart[0], apart[1]), apart[2])
+    border = np.concatenate([away[:edge].ravel(), away[:, :edge].ravel(), away[:, -edge:].ravel()])
+    threshold = max(_LEAST_LEVELS, 4 * float(np.median(border)))
+    if not _smooth(corners, away, cv2.absdiff(small, image), edge + 2):
+        return None
+    # the object's contrast: 5 % of the frame exceed it; every third pixel in each direction is enough
+    sample = np.sort(away[::3, ::3], axis=None)
+    contrast = float(sample[-(len(sample) // 20 + 1)])
+    differs: Mask = away > max(threshold, _SHARE * contrast)
+    return differs
+
+
+def _corners(height: int, width: int) -> list[tuple[slice, slice]]:
+    height, width = max(1, height // 8), max(1, width // 8)
+    return [(rows, part) for rows in (np.s_[:height], np.s_[-height:]) for part in (np.s_[:width], np.s_[-width:])]
+
+
+def _one_colour(corners: list[cv2.typing.MatLike]) -> bool:
+    """Return whether the corners show one backdrop, and not a wall and a table."""
+    colours = np.array([_median(corner.reshape(-1, 3)) for corner in corners])
+    same = (np.abs(colours[:, None] - colours).max(axis=2) <= _ONE_COLOUR).sum(axis=1)
+    dark = colours.max(axis=1) < _DARK
+    return bool((same >= np.where(dark, 2, 3)).any())
+
+
+def _median(rows: cv2.typing.MatLike) -> FloatArray:
+    """Return the median of each column: as np.median, which takes four times as long for few values."""
+    columns, middle = np.sort(rows.T, axis=1), len(rows) // 2
+    return (columns[:, middle] + columns[:, -middle - 1].astype(np.float64)) / 2
+
+
+def _smooth(corners: list[tuple[slice, slice]], away: cv2.typing.MatLike, noise: cv2.typing.MatLike, edge: int) -> bool:
+    """Return whether the smoothest corner shows no pattern."""
+    edge = min(edge, (away.shape[1] - 1) // 2)
+    # not at the edges: the background is interpolated from them, so that the difference is always small there
+    inner = away[:, edge : -edge or None], noise[:, edge : -edge or None]
+    difference, grain = min(
+        (float(np.median(inner[0][corner])), float(inner[1][corner].max(axis=2).mean())) for corner in corners
+    )
+    return difference <= _SMOOTH + _GRAIN * grain
+
+
+class Frame:
+    """A frame, uint8 (H, W, 3), and its small image.
+
+    Raises
+    ------
+    TypeError, ValueError
+        The array is no such image.
+    """
+
+    def __init__(self, image_bgr: ImageArray) -> None:
+        check_frame(image_bgr)
+        self.image = image_bgr
+        self.small = shrunk(image_bgr)
+        self._compared: tuple[Background, Difference] | None = None
+
+    @classmethod
+    def of(cls, image_bgr: "ImageArray | Frame") -> "Frame":
+        """Return the frame of an image, or the frame itself."""
+        return image_bgr if isinstance(image_bgr, Frame) else cls(image_bgr)
+
+    def difference(self, background: Background) -> Difference:
+        """Return the difference from a background. The last one is cached for further segmentations of the frame."""
+        if self._compared is None or self._compared[0] is not background:
+            self._compared = background, background.difference(self.small)
+        return self._compared[1]
+
+    @cached_property
+    def differs(self) -> Mask | None:
+        """Return where the small image differs from a plain background, bool (h, w); None if it is not plain."""
+        return plain_difference(self.small)

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from hbr.core.arrays import ImageArray
 from hbr.kernels import images
-from hbr.segmentation.background import Illumination
-from hbr.segmentation.evidence import Issue, Method
+from hbr.segmentation.background import Illumination, Issue, Method
 
 #: Side of the square crop around an object.
 CROP_PX: Final = 160

@@ -1,23 +1,24 @@
-"""Segmentation of a frame: the object's box, mask and illumination, and a crop of fixed size."""
+"""Segmentation of a frame: the object's box, mask and illumination, and a crop of fixed size.
 
-from collections.abc import Callable, Sequence
+A silhouette depends on the other views of an enrollment. It is stored with the evidence of a view
+(`evidence_together`), so that one view is cut out again without the others (`stored_segmentation`).
+"""
+
+import zlib
+from base64 import b64decode, b64encode
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hbr.core.arrays import ImageArray
-from hbr.segmentation.background import Background, Difference, Illumination, Mask
+from hbr.segmentation.background import Background, Difference, Frame, Illumination, Issue, IssueCode, Mask, Method
 from hbr.segmentation.cut_out import Box, Found, Segmentation
-from hbr.segmentation.evidence import Issue, IssueCode, Method
-from hbr.segmentation.frame import Frame
 from hbr.segmentation.guess import guess_object
 from hbr.segmentation.network import shares
 from hbr.segmentation.silhouette import silhouette
-
-#: A patch whose grey levels differ by more than this is uneven.
-_PATCH_SPREAD: Final = 12.0
 
 #: Probabilities above which a pixel belongs to the object: of the first segmentation, and of further ones.
 _LEVELS: Final = (0.5, 0.2, 0.8)
@@ -34,7 +35,6 @@ def segment(
     *,
     empty_table: Background | ImageArray | None = None,
     box: Box | None = None,
-    grey_patch: Box | None = None,
 ) -> Segmentation:
     """Find the object in a frame, crop it to a fixed size, and correct its illumination.
 
@@ -49,14 +49,11 @@ def segment(
     Parameters
     ----------
     image_bgr : uint8 array (H, W, 3)
-        The frame; or a `hbr.segmentation.frame.Frame`, if the frame is segmented more than once.
+        The frame; or a `hbr.segmentation.background.Frame`, if the frame is segmented more than once.
     empty_table : Background, or uint8 array (H, W, 3), optional
         The empty-table image. For many frames, pass a `Background`: it is prepared only once.
     box : (int, int, int, int), optional
         The object's x, y, width, height in pixels, if they are known. The object is not searched for then.
-    grey_patch : (int, int, int, int), optional
-        Box of a neutral grey in the frame. Exposure and white balance are corrected by it, not by the empty-table
-        image.
 
     Returns
     -------
@@ -66,15 +63,18 @@ def segment(
     Raises
     ------
     TypeError, ValueError
-        The frame is no such image, the empty-table image has another size, or a box is outside the frame.
+        The frame is no such image, the empty-table image has another size, or the box is outside the frame.
     """
     frame = Frame.of(image_bgr)
     background, difference = compared(frame, empty_table)
     height, width = frame.image.shape[:2]
-    for name, part in (("box", box), ("grey_patch", grey_patch)):
-        if part is not None:
-            _check_box(name, part, width, height)
-    return _found(frame, background, difference, box, grey_patch).cut_out()
+    if box is not None:
+        x, y, w, h = box
+        if w < 2 or h < 2 or x < 0 or y < 0 or x + w > width or y + h > height:
+            raise ValueError(
+                f"box {box} is not within the frame of {width} x {height} pixels; give x, y, width, height"
+            )
+    return _found(frame, background, difference, box).cut_out()
 
 
 def compared(frame: Frame, empty_table: Background | ImageArray | None) -> tuple[Background | None, Difference | None]:
@@ -96,7 +96,6 @@ def _found(
     background: Background | None,
     difference: Difference | None,
     box: Box | None = None,
-    grey_patch: Box | None = None,
 ) -> Found:
     issues: list[Issue] = []
     correction: Illumination | None = None
@@ -127,10 +126,6 @@ def _found(
         method = Method.GIVEN_BOX
     elif found is None:
         method = Method.NONE
-    if grey_patch is not None:
-        correction, problem = _patch_correction(frame.image, grey_patch)
-        if problem is not None:
-            issues.append(Issue(problem))
     agreement = None if difference is None else difference.agreement
     return Found(frame.image, found, box, correction, agreement, method, tuple(issues))
 
@@ -151,9 +146,9 @@ def hypotheses(
     Parameters
     ----------
     image_bgr, empty_table
-        As for `segment`; or a `hbr.segmentation.frame.Frame`, if the frame is segmented more than once.
+        As for `segment`; or a `hbr.segmentation.background.Frame`, if the frame is segmented more than once.
     learned : Background, optional
-        The background that the other views of the search show (`hbr.segmentation.learned.LearnedBackground.of`). The
+        The background that the other views of the search show (`hbr.descriptors.together.LearnedBackground.of`). The
         object is not guessed then.
     alone : callable, optional
         Returns what `without_background` returns for this frame: segmentations that count besides those with the
@@ -240,21 +235,77 @@ def _overlap(a: Box, b: Box) -> float:
     return both / (a[2] * a[3] + b[2] * b[3] - both)
 
 
-def _patch_correction(image: ImageArray, patch: Box) -> tuple[Illumination | None, IssueCode | None]:
-    x, y, w, h = patch
-    pixels = image[y : y + h, x : x + w].reshape(-1, 3).astype(np.float64)
-    level = np.median(pixels, axis=0)
-    spread = np.quantile(np.abs(pixels - level), 0.9)
-    if spread > _PATCH_SPREAD:
-        return None, IssueCode.PATCH_UNEVEN
-    if level.max() >= 250 or level.min() < 16:
-        return None, IssueCode.PATCH_EXPOSURE
-    slopes = np.zeros((3, 3))
-    slopes[0] = np.log(128.0 / level)
-    return Illumination(slopes), None
+#: Keys of the evidence: the silhouette, and how many views were segmented together.
+MASK: Final = "mask"
+TOGETHER: Final = "together"
 
 
-def _check_box(name: str, box: Box, width: int, height: int) -> None:
-    x, y, w, h = box
-    if w < 2 or h < 2 or x < 0 or y < 0 or x + w > width or y + h > height:
-        raise ValueError(f"{name} {box} is not within the frame of {width} x {height} pixels; give x, y, width, height")
+def evidence_together(found: Segmentation, views: int) -> dict[str, Any]:
+    """Return the evidence of a view that was segmented together with others, ``views`` in all, with its silhouette."""
+    evidence = {**found.evidence(), TOGETHER: views}
+    if found.silhouette is not None:
+        evidence[MASK] = mask_text(found.silhouette)
+    return evidence
+
+
+def stored_segmentation(
+    image_bgr: ImageArray | Frame,
+    evidence: Mapping[str, Any] | None,
+    *,
+    empty_table: Background | ImageArray | None = None,
+) -> Segmentation:
+    """Return the segmentation of a stored view: by its silhouette, or by `hbr.segment` if it was segmented alone.
+
+    Parameters
+    ----------
+    image_bgr, empty_table
+        As for `hbr.segment`.
+    evidence
+        As it is stored with the view (`evidence_together` or `Segmentation.evidence`).
+
+    Raises
+    ------
+    TypeError, ValueError
+        As for `hbr.segment`, or the evidence is damaged.
+    """
+    if evidence is None or TOGETHER not in evidence:
+        return segment(image_bgr, empty_table=empty_table)
+    frame = Frame.of(image_bgr)
+    background, difference = compared(frame, empty_table)
+    correction = None
+    if background is not None and difference is not None and difference.reliable:
+        correction = background.whole_correction(difference)
+    found = mask_from(evidence[MASK], frame.small.shape[:2]) if MASK in evidence else None
+    issues = tuple(_issue(one) for one in evidence.get("issues", ()))
+    agreement = None if difference is None else difference.agreement
+    return Found(frame.image, found, None, correction, agreement, Method(evidence["method"]), issues).cut_out()
+
+
+def mask_text(found: Mask) -> str:
+    """Return a silhouette, bool (h, w), as text of about 200 characters: its packed bits, compressed, in Base64."""
+    return b64encode(zlib.compress(np.packbits(found).tobytes(), 9)).decode()
+
+
+def mask_from(text: str, shape: tuple[int, int]) -> Mask:
+    """Return the silhouette of this height and width from its text.
+
+    Raises
+    ------
+    ValueError
+        The text is damaged, or the silhouette has another size.
+    """
+    pixels = shape[0] * shape[1]
+    try:
+        packed = zlib.decompressobj().decompress(b64decode(text, validate=True), pixels)
+    except (TypeError, ValueError, zlib.error) as error:
+        raise ValueError("the stored silhouette of a view is damaged") from error
+    if len(packed) != (pixels + 7) // 8:
+        raise ValueError(f"the stored silhouette of a view does not have {shape[1]} x {shape[0]} pixels")
+    found: Mask = np.unpackbits(np.frombuffer(packed, np.uint8), count=pixels).astype(np.bool_).reshape(shape)
+    if not found.any():
+        raise ValueError("the stored silhouette of a view is empty")
+    return found
+
+
+def _issue(stored: Mapping[str, Any]) -> Issue:
+    return Issue(IssueCode(stored["code"]), {name: value for name, value in stored.items() if name != "code"})

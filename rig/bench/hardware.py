@@ -32,8 +32,7 @@ from rig.devices.open_imu import open_imu
 from rig.devices.opencv_camera import CameraSettings, OpenCvCamera
 from rig.devices.opencv_capture import Capture
 from rig.devices.servo import Servo
-from rig.safety.bench_lock import BenchLock
-from rig.safety.saved_state import FileStore, StateStore
+from rig.safety.saved_state import BenchLock, FileStore, StateStore
 
 
 class NoOptions(Section):

@@ -242,7 +242,7 @@ def view_values(event: Accepted) -> dict[str, Any]:
 
 
 class FlyScan:
-    """The fly scan as a Flyer: it enrolls an object in one revolution without a stop (`rig.plans.enroll_views`).
+    """The fly scan as a Flyer: it enrolls an object in one revolution without a stop (`rig.plans.enroll`).
 
     Parameters
     ----------

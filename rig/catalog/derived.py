@@ -21,8 +21,8 @@ from sqlalchemy.orm import Session as Transaction
 
 import hbr
 from hbr.core.cores import THREADS
-from hbr.dense.last_steps import near
 from hbr.dense.local_difference import LocalView
+from hbr.dense.session import near
 from hbr.descriptors import descriptor, names
 from rig.calibrations.store import CALIBRATIONS
 from rig.catalog import log, state
@@ -189,7 +189,7 @@ def choose_region(catalog: Catalog, region: Region | None) -> None:
 def local_views(catalog: Catalog, name: str, azimuths_deg: Sequence[float]) -> list[LocalView]:
     """Return the enrolled views of an object that are nearest to each of these azimuths, by azimuth.
 
-    They are cut out as at the enrollment (`hbr.dense.local_difference`). Which these are, `hbr.dense.last_steps.near`
+    They are cut out as at the enrollment (`hbr.dense.local_difference`). Which these are, `hbr.dense.session.near`
     decides for the bench and for the evaluation.
 
     Raises

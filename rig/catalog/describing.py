@@ -33,7 +33,7 @@ from rig.views.description import DESCRIPTORS, EnrollmentDescriber, within
 from rig.views.segmentation_evidence import check_evidence
 
 SEGMENTATION: Final = "segmentation"
-"""The kind of the stored silhouettes: a list of the evidence of each view (`hbr.segmentation.stored`)."""
+"""The kind of the stored silhouettes: a list of the evidence of each view (`hbr.segmentation.segment`)."""
 SEGMENTATION_VERSION: Final = 1
 """Increases when the same images give other silhouettes."""
 FEWEST_VIEWS: Final = 4

@@ -11,8 +11,7 @@ from rig.bench.computer import Computer, ComputerProvider
 from rig.config import RigConfig
 from rig.config.values import validate
 from rig.core.next_steps import Do, NextStep
-from rig.safety.bench_lock import busy, holder
-from rig.safety.saved_state import Holder
+from rig.safety.saved_state import Holder, busy, holder
 
 
 @dataclass

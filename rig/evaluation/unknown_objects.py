@@ -7,9 +7,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from hbr.dense.fitting import fitting_searches, rule_from_searches
+from hbr.dense.fitting import LeaveOneOut, fitting_searches, rule_from_searches
 from hbr.dense.index import DenseIndex
-from hbr.dense.leave_one_out import LeaveOneOut
 from hbr.dense.stopping import StoppingRule
 from hbr.evaluation.descriptors import query_levels
 from hbr.evaluation.methods import METHODS

@@ -15,7 +15,7 @@ from rig.jobs.table_image import refresh_table_image
 from rig.plans.identify import identify as identify_one
 from rig.plans.identify import watch as watch_table
 from rig.plans.record import ResultRecorder
-from rig.search.current_model import CurrentModel
+from rig.search.model import CurrentModel
 from rig.search.saved_run import saving
 from rig.search.session import SHOWN
 from rig.search.strategies import descriptor_for

@@ -11,8 +11,7 @@ from rig.config import RigConfig
 from rig.core.clock import Clock, seconds_between
 from rig.core.errors import BenchBusy, DeviceSilent, StateNotStored, TorqueStaysOn
 from rig.core.next_steps import Do
-from rig.safety.bench_lock import holder
-from rig.safety.saved_state import SERVER_FOLDER, FileStore, Holder, LatchedFault
+from rig.safety.saved_state import SERVER_FOLDER, FileStore, Holder, LatchedFault, holder
 from rig.safety.stop_channel import StopAnswer, StopRequest
 
 REACTION_S = 2.0

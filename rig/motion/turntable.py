@@ -17,16 +17,13 @@ from rig.core.next_steps import START_AGAIN
 from rig.core.phrases import angle_words, budget_words
 from rig.core.signals import uninterrupted
 from rig.devices.servo import MotionProfile, ServoState
-from rig.motion.arrival import Arrival, causes_found
-from rig.motion.halt import QUIET_COUNTS, MotionPath, halt
-from rig.motion.move import Move, equivalent_within, motion_seconds
+from rig.motion.arrival import QUIET_COUNTS, Arrival, MotionPath, causes_found, halt
+from rig.motion.move import FIRST_REST_S, Move, equivalent_within, motion_seconds
 from rig.motion.trajectory import TrajectoryRecorder
 from rig.safety.gyro_rotation import GyroRotationMeter, Stillness, compare
 from rig.safety.motion_checks import MotionMonitor, SlipMonitor
 from rig.safety.supervisor import Motion, TableState
 
-FIRST_REST_S = 0.6
-"""Time over which the gyro is averaged for its first bias."""
 SETTLE_ALLOWANCE_S = 2.5
 """Time for ringing to die down and for a slow bus, in addition to the motion."""
 

@@ -1,27 +1,318 @@
-"""The plan that enrolls an object: one revolution, with a checked view at every step.
+"""The plan that enrolls an object: one revolution, with a checked view at every step, or a fly scan without a stop.
 
-Each view is stored before the table rotates to the next one.
+Each view is stored before the table rotates to the next one. In a fly scan the table rotates from rest to rest by one
+revolution. For each planned angle the plan holds the nearest frame in memory. After the revolution, the trajectory of
+the platter gives each frame its angle, and each frame is checked like a view at rest. Nothing is stored before that, so
+an interrupted revolution leaves no view. Views that fail or are missing are then taken at rest.
 
-Decision: docs/decisions/0002.
+Decisions: docs/decisions/0002, docs/decisions/0047.
 """
 
-from collections.abc import Generator
+from collections.abc import Generator, Mapping
 from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import partial
+from math import inf
+from typing import Final
 
+import numpy as np
+from numpy.typing import NDArray
+
+from hbr.core.angles import wrap360
 from rig.bench import Bench
-from rig.catalog import Catalog, Provenance
+from rig.catalog import Catalog, OpenEnrollment, Provenance, View
 from rig.catalog.derived import unfinished_camera_settings
 from rig.core.clock import seconds_between
-from rig.core.errors import RigError
-from rig.events.events import Enrolled, Event, Started
-from rig.motion.scan_speed import require_camera_time, takes_in_motion
-from rig.motion.turntable import Turntable
-from rig.plans.capture import check_camera
-from rig.plans.enroll_views import EnrollmentViews
+from rig.core.errors import LimitExceeded, ObjectMoved, RigError, RotationDisagreement
+from rig.core.json_form import plain
+from rig.core.next_steps import Do
+from rig.core.phrases import angle_words
+from rig.devices.camera import Frame
+from rig.events.events import Enrolled, Event, Rejected, ScanStarted, Started
+from rig.motion.flight_views import FlightFrames
+from rig.motion.move import Move
+from rig.motion.scan_speed import require_camera_time, scan_speed, takes_in_motion
+from rig.motion.turntable import Flight, Turntable
+from rig.plans.capture import accepted, announced, capture, check_camera, check_object, moved, warn_of_table
 from rig.plans.estimate import even_azimuths, table_angles
-from rig.views.capture import Viewer
-from rig.views.description import ViewDescriber
+from rig.views.capture import Attempt, Viewer, image_similarity
+from rig.views.description import DescribedView, ViewDescriber
 from rig.views.empty_table import empty_table_status
+from rig.views.image_files import Encoder
+
+SAME_SIMILARITY: Final = 0.97
+"""Two images of an object at one angle are more similar; after a shift by a centimetre they are less similar."""
+NEAR_SHARE: Final = 0.6
+"""Largest distance of a frame from its planned angle, as a share of the step."""
+HELD_DEG: Final = 15.0
+"""Largest distance of a frame from its planned angle, as far as it is known during the revolution."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """An image at rest, with the index of its view and its table angle."""
+
+    index: int
+    angle_deg: float
+    image_bgr: NDArray[np.uint8]
+
+
+@dataclass(eq=False)
+class EnrollmentViews:
+    """Takes and stores the views of one session of an enrollment.
+
+    Attributes
+    ----------
+    retakes
+        The number of images that were taken again.
+    """
+
+    bench: Bench
+    enrollment: OpenEnrollment
+    segment: ViewDescriber
+    table: Turntable
+    viewer: Viewer
+    retakes: int = 0
+    _first: _Seen | None = None
+
+    def take(self, angles_deg: Mapping[int, float], *, in_motion: bool) -> Generator[Event, None, None]:
+        """Take and store the views at these table angles; check that the object was not moved; return to 0.
+
+        Raises
+        ------
+        LimitExceeded
+            The cable budget does not allow a revolution.
+        NoObject
+            The table is empty.
+        RotationDisagreement
+            Encoder and gyro disagree: no view is stored at an uncertain angle, and none of a revolution.
+        ObjectMoved
+            The object was moved between any two views, so all views of this session are abandoned.
+        """
+        left = dict(angles_deg)
+        if in_motion:
+            stored = yield from self._fly(angles_deg)
+            left = {index: angle_deg for index, angle_deg in angles_deg.items() if index not in stored}
+            self.retakes += len(left)
+        if not left:
+            self._park()
+            return
+        last = yield from self._step(left)
+        # Return to the first view to check that the object was not moved, then to 0 to free the cable: without its
+        # supply the servo loses the count of revolutions, and the next enrollment would wind up the cable further.
+        first = self._first or last
+        if first is not last:
+            move = yield from announced(first.index, self.table, first.angle_deg)
+            again = yield from capture(first.index, self.viewer, self.table, move.settled_ns)
+            self._require_not_moved(first, again)
+        if first is last or first.angle_deg != 0.0:
+            yield from announced(last.index, self.table, 0.0)
+
+    def _step(self, angles_deg: Mapping[int, float]) -> Generator[Event, None, _Seen]:
+        """Take and store the views at these table angles at rest; return the last one."""
+        imu_deg, imu_sigma_deg = None, 0.0
+        for index, angle_deg in angles_deg.items():
+            move = yield from announced(index, self.table, angle_deg)
+            yield moved(index, move)
+            if move.agreement is None or not move.agreement.agrees:
+                disagreement = _disagreement(move)
+                if move.agreement is not None:
+                    self.bench.safety.latch(disagreement)  # a platter that has slipped once will slip again
+                raise disagreement
+            # The angle by the gyro alone, from the first one of the encoder.
+            if imu_deg is None:
+                imu_deg = move.commanded_deg if move.by_gyro else move.encoder_deg
+            else:
+                imu_deg += move.gyro.angle_deg
+                imu_sigma_deg += move.gyro.sigma_deg  # added linearly: all moves share the same bias and scale error
+            attempt = yield from capture(index, self.viewer, self.table, move.settled_ns)
+            self.retakes += attempt.number - 1
+            if self._first is None:
+                check_object(self.bench, attempt.image_bgr, self.segment.empty_table)
+            segmented = self.segment(attempt.image_bgr)
+            yield from self._store(
+                index,
+                attempt,
+                segmented,
+                commanded_deg=move.commanded_deg,
+                encoder_deg=move.encoder_deg,
+                table_deg=imu_deg if move.by_gyro else move.encoder_deg,
+                imu_deg=imu_deg,
+                imu_sigma_deg=imu_sigma_deg,
+            )
+            last = _Seen(index, angle_deg, attempt.image_bgr)
+            self._first = self._first or last
+        return last
+
+    def _fly(self, angles_deg: Mapping[int, float]) -> Generator[Event, None, set[int]]:
+        """Take the views at these table angles in one revolution, store those that pass their checks; return them."""
+        # Plan the revolution and its speed.
+        config, table = self.bench.config, self.table
+        low_deg, high_deg = config.table.limits_deg
+        ordered = sorted(angles_deg.values())
+        start_deg = min(ordered[0], high_deg - 360.0)
+        if start_deg < low_deg or ordered[-1] > start_deg + 360.0:
+            raise LimitExceeded(
+                "A scan needs a revolution upwards. The cable budget does not allow that.",
+                next_step="Increase table.limits_deg if the cable is long enough, or take the views at rest.",
+                evidence={"limits_deg": list(config.table.limits_deg)},
+            )
+        end_deg = start_deg + 360.0
+        spacing_deg = min(np.diff(ordered).tolist(), default=360.0)
+        speed = scan_speed(config, self.bench.imu.range_dps, spacing_deg, self.bench.camera.identity.fps)
+        # Rotate, between two frames at rest of the same side.
+        if abs(table.rest_deg - start_deg) > config.table.tolerance_deg:
+            yield moved(0, (yield from announced(0, table, start_deg)))
+        before = yield from capture(0, self.viewer, table, self.bench.clock.now_ns())
+        check_object(self.bench, before.image_bgr, self.segment.empty_table)
+        self._first = _Seen(0, start_deg, before.image_bgr)
+        yield ScanStarted(speed.dps, speed.limit, speed.value, start_deg, end_deg)
+        frames = FlightFrames(self.bench, table)
+        nearest: dict[int, tuple[float, Frame]] = {}
+
+        def hold_nearest(frame: Frame) -> None:
+            about_deg = frames.about_deg(frame)
+            for index, angle_deg in angles_deg.items():
+                away_deg = abs(angle_deg - about_deg)
+                if away_deg < nearest.get(index, (HELD_DEG, None))[0]:
+                    nearest[index] = away_deg, frame
+
+        move = table.fly(end_deg, frames.flight(hold_nearest, (start_deg, end_deg), speed.dps))
+        yield moved(len(angles_deg), move)
+        trajectory = frames.recorder.fit()
+        if trajectory is None or move.agreement is None or not (move.agreement.agrees and trajectory.consistent):
+            disagreement = _flight_disagreement(move, None if trajectory is None else trajectory.residual_deg)
+            if move.gyro.valid:
+                self.bench.safety.latch(disagreement)
+            raise disagreement
+        after = yield from capture(0, self.viewer, table, move.settled_ns)
+        # Check the nearest frame to each angle, and store the accepted ones.
+        locks, locks_hold = before.evidence.locks, before.evidence.locks_hold and after.evidence.locks_hold
+        stored: set[int] = set()
+        encoder = Encoder()
+        for index, angle_deg in angles_deg.items():
+            _, frame = nearest.pop(index, (inf, None))
+            if frame is None:
+                continue
+            attempt = frames.attempt(frame, trajectory, locks, locks_hold=locks_hold)
+            assert attempt.evidence.motion is not None
+            if abs(attempt.evidence.motion.angle_deg - angle_deg) > NEAR_SHARE * spacing_deg:
+                continue  # the frames near this angle were lost
+            if not attempt.accepted:
+                yield Rejected(index, attempt.number, attempt.reasons, attempt.evidence)
+                continue
+            attempt = replace(attempt, encoded=encoder.begin(attempt.image_bgr))
+            segmented = self.segment(attempt.image_bgr)
+            attempt = frames.at_the_object(attempt, segmented.segmentation, trajectory)
+            assert attempt.evidence.motion is not None
+            measured_deg = attempt.evidence.motion.angle_deg
+            yield from self._store(
+                index, attempt, segmented, commanded_deg=angle_deg, encoder_deg=measured_deg, table_deg=measured_deg
+            )
+            stored.add(index)
+        self._require_not_moved(self._first, after)
+        return stored
+
+    def _store(
+        self,
+        index: int,
+        attempt: Attempt,
+        segmented: DescribedView,
+        *,
+        commanded_deg: float,
+        encoder_deg: float,
+        table_deg: float,
+        imu_deg: float | None = None,
+        imu_sigma_deg: float | None = None,
+    ) -> Generator[Event, None, None]:
+        """Store an accepted view; ``table_deg`` is the best measurement of its table angle."""
+        view = View(
+            index=index,
+            commanded_deg=commanded_deg,
+            encoder_deg=encoder_deg,
+            azimuth_deg=float(wrap360(self.bench.config.table.orientation_sign * table_deg)),
+            captured_ns=attempt.evidence.exposed_ns,
+            imu_deg=imu_deg,
+            imu_sigma_deg=imu_sigma_deg,
+            evidence=plain(attempt.evidence),
+            region=self.bench.config.view.roi,
+        )
+        self.enrollment.add(view, attempt.image_bgr, attempt.encoded)
+        yield accepted(index, view.azimuth_deg, attempt, segmented)
+        yield from warn_of_table(self.bench, index, segmented)
+
+    def _require_not_moved(self, first: _Seen, again: Attempt) -> None:
+        """Compare two frames of one angle; abandon the enrollment and raise `ObjectMoved` if the object moved."""
+        alike = image_similarity(first.image_bgr, again.image_bgr, self.bench.config.view)
+        if alike < SAME_SIMILARITY:
+            self.enrollment.abandon()
+            raise ObjectMoved(
+                f"{self.enrollment.object_name} is not where it was for view {first.index + 1}: it fell, was pushed, "
+                "or slid on the platter. The views of this session are abandoned.",
+                next_step=(
+                    "Put the object back on its mark, and fasten it.",
+                    Do.ENROLL_AGAIN(name=self.enrollment.object_name),
+                ),
+                evidence={
+                    "similarity": round(alike, 3),
+                    "smallest_similarity": SAME_SIMILARITY,
+                    "table_deg": first.angle_deg,
+                },
+            )
+
+    def _park(self) -> None:
+        """Return to 0 to free the cable; the table need not be quiet there, because no view follows."""
+        table, config = self.table, self.bench.config.table
+        reach_deg = min(0.0, table.rest_deg), max(0.0, table.rest_deg)
+        pause = partial(self.bench.clock.sleep, config.poll_s)
+        table.fly(0.0, Flight(pause, reach_deg, table.recorder(), config.velocity_dps, quiet=False))
+
+
+def _disagreement(move: Move) -> RotationDisagreement:
+    if move.agreement is None:
+        return RotationDisagreement(
+            "It is not known whether the platter followed the servo's rotation of "
+            f"{angle_words(move.rotation_encoder_deg, 2)}: {move.gyro.reason}.",
+            next_step=("If nothing hit the table,", Do.CONTINUE_ENROLLMENT(), "Otherwise,", Do.ENROLL_AGAIN()),
+            evidence={"table_deg": round(move.encoder_deg, 2)},
+        )
+    return RotationDisagreement(
+        f"The servo rotated {angle_words(move.rotation_encoder_deg, 2)}, but the platter "
+        f"{angle_words(move.gyro.angle_deg, 2)}.",
+        next_step=(
+            "Tighten the platter.",
+            Do.ACKNOWLEDGE(),
+            Do.ENROLL_AGAIN(),
+            "Views from before and after a slip do not fit together.",
+        ),
+        evidence={
+            "difference_deg": round(move.agreement.difference_deg, 3),
+            "bound_deg": round(move.agreement.bound_deg, 3),
+            "table_deg": round(move.encoder_deg, 2),
+        },
+    )
+
+
+def _flight_disagreement(move: Move, residual_deg: float | None) -> RotationDisagreement:
+    servo, platter = (angle_words(angle_deg, 2) for angle_deg in (move.rotation_encoder_deg, move.gyro.angle_deg))
+    what = f"The servo rotated {servo}, the platter {platter}"
+    if residual_deg is not None:
+        what += f", and on the way they differed by up to {residual_deg:.2f}°"
+    return RotationDisagreement(
+        f"{what}. No view of this revolution is stored.",
+        next_step=(
+            "Tighten the platter.",
+            Do.ACKNOWLEDGE(),
+            Do.ENROLL_AGAIN(),
+            "If the gyro lost samples, check the IMU's cable, and",
+            Do.CONTINUE_ENROLLMENT(),
+        ),
+        evidence={
+            "table_deg": round(move.encoder_deg, 2),
+            "residual_deg": None if residual_deg is None else round(residual_deg, 3),
+            "gyro": move.gyro.reason or "valid",
+        },
+    )
 
 
 def enroll(
@@ -44,7 +335,7 @@ def enroll(
     enrollment keeps its views: ``resume`` takes the missing ones, provided that the object was not moved. Closing the
     generator switches the torque off.
 
-    With ``fly`` the views are taken in one revolution without a stop (`rig.plans.enroll_views`). Views that fail or are
+    With ``fly`` the views are taken in one revolution without a stop (`rig.plans.enroll`). Views that fail or are
     missing are then taken at rest. The default is ``enroll.mode``; "auto" means at rest.
 
     Every view is segmented for its checks and its event, with the bench's empty-table image if there is one

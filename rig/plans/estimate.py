@@ -14,7 +14,7 @@ from rig.core.clock import seconds_between
 from rig.core.errors import LimitExceeded
 from rig.core.next_steps import Do
 from rig.events.events import Accepted, Event
-from rig.motion.motion_model import MotionModel
+from rig.motion.move import MotionModel
 from rig.motion.scan_speed import takes_in_motion
 from rig.motion.turntable import Turntable
 

@@ -14,7 +14,7 @@ from rig.core.phrases import percent
 from rig.events.events import EmptyTableImage, Event, Note, NoteCode, Warned
 from rig.motion.turntable import Turntable
 from rig.plans.capture import announced, capture
-from rig.plans.enroll_views import SAME_SIMILARITY
+from rig.plans.enroll import SAME_SIMILARITY
 from rig.views.capture import Viewer, image_similarity
 from rig.views.description import within
 from rig.views.empty_table import EmptyTable, empty_table_status, store_empty_table

@@ -1,15 +1,23 @@
 """Supervision of the table: whether it may move, and what must happen before it may move again.
 
-`rig.safety.state_machine` has the states and their transitions. A motion is a `with` block that can only end by
-arriving, by a stop or by a latched fault. A fault outlives the process and an unplugged cable. It ends when its cause
-is removed and the operator acknowledges it.
+    DISCONNECTED ──connect──▶ CONNECTED ──refer──▶ READY ──start──▶ MOVING ──arrive──▶ READY
+                                  │                  ▲                 └──────stop───▶ STOPPED ──recheck──▶ CONNECTED
+                                  └─doubt─▶ UNREFERENCED (refer)
+
+    any state ──lose──▶ DISCONNECTED;   any state ──latch──▶ FAULT ──acknowledge──▶ CONNECTED
+
+A state cannot be set: it changes only by an event in the table of transitions. A motion is a `with` block that can only
+end by arriving, by a stop or by a latched fault. A fault outlives the process and an unplugged cable. It ends when its
+cause is removed and the operator acknowledges it.
 
 Decision: docs/decisions/0008.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import replace
+from enum import Enum, StrEnum, auto
+from types import MappingProxyType
 from typing import Final, TypeGuard
 
 from rig.config import RigConfig
@@ -28,7 +36,7 @@ from rig.core.next_steps import START_AGAIN, Do, NextStep, NextSteps
 from rig.core.phrases import angle_range, angle_words
 from rig.core.signals import uninterrupted
 from rig.devices.servo import Servo, ServoCondition, ServoState
-from rig.safety.angle_reference import AngleFinding, AngleReference, SavedAngleCheck
+from rig.safety.angle_reference import AngleFinding, AngleReference, SavedAngleCheck, TableRecord
 from rig.safety.motion_checks import find_servo_fault
 from rig.safety.saved_state import (
     LatchedFault,
@@ -39,9 +47,66 @@ from rig.safety.saved_state import (
     begin_session,
     end_session,
 )
-from rig.safety.state_machine import StateEvent, StateMachine
-from rig.safety.state_machine import TableState as TableState
-from rig.safety.table_record import TableRecord
+
+
+class TableState(StrEnum):
+    """State of a bench's table."""
+
+    DISCONNECTED = "disconnected"
+    CONNECTED = "connected"
+    UNREFERENCED = "unreferenced"
+    READY = "ready"
+    MOVING = "moving"
+    STOPPED = "stopped"
+    FAULT = "fault"
+
+
+class StateEvent(Enum):
+    """Event that takes the machine from one state to another."""
+
+    CONNECT = auto()
+    REFER = auto()
+    DOUBT = auto()
+    START = auto()
+    ARRIVE = auto()
+    STOP = auto()
+    RECHECK = auto()
+    LATCH = auto()
+    ACKNOWLEDGE = auto()
+    LOSE = auto()
+
+
+_S, _E = TableState, StateEvent
+_ALWAYS = {_E.LATCH: _S.FAULT, _E.LOSE: _S.DISCONNECTED}
+_REFERENCE = {_E.REFER: _S.READY, _E.DOUBT: _S.UNREFERENCED}
+TRANSITIONS: Mapping[TableState, Mapping[StateEvent, TableState]] = MappingProxyType(
+    {
+        _S.DISCONNECTED: {**_ALWAYS, _E.CONNECT: _S.CONNECTED},
+        _S.CONNECTED: {**_ALWAYS, **_REFERENCE},
+        _S.UNREFERENCED: {**_ALWAYS, **_REFERENCE},
+        _S.READY: {**_ALWAYS, **_REFERENCE, _E.START: _S.MOVING},
+        _S.MOVING: {**_ALWAYS, _E.ARRIVE: _S.READY, _E.STOP: _S.STOPPED},
+        _S.STOPPED: {**_ALWAYS, _E.RECHECK: _S.CONNECTED},
+        # A fault stays when the cable is unplugged and plugged in again.
+        _S.FAULT: {_E.LATCH: _S.FAULT, _E.LOSE: _S.FAULT, _E.CONNECT: _S.FAULT, _E.ACKNOWLEDGE: _S.CONNECTED},
+    }
+)
+
+
+class StateMachine:
+    """The state of one table."""
+
+    def __init__(self, *, faulty: bool) -> None:
+        self.state = TableState.FAULT if faulty else TableState.DISCONNECTED
+
+    def accepts(self, event: StateEvent) -> bool:
+        """Return whether ``event`` is possible in this state."""
+        return event in TRANSITIONS[self.state]
+
+    def apply(self, event: StateEvent) -> None:
+        """Change the state by ``event``; raises KeyError if the event is not possible in this state."""
+        self.state = TRANSITIONS[self.state][event]
+
 
 _CHECK_CABLE: Final[NextSteps] = (
     "Look at the cable. If it hangs free,",

@@ -1,5 +1,7 @@
 """The model of a search: the enrolled views by one descriptor, and the stopping rule. A search begins with it.
 
+`CurrentModel` is that of a catalog, loaded again when the catalog has changed.
+
 Decision: docs/decisions/0030.
 """
 
@@ -9,7 +11,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,13 +21,13 @@ from hbr.dense.arc import ArcSession, fit_arc_confidence
 from rig.bench import Bench
 from rig.catalog import Catalog, derived
 from rig.catalog.jobs import JobProgress
+from rig.catalog.shared import Attempts, update_copy
 from rig.config import RigConfig
-from rig.core.errors import CatalogError, UsageError
+from rig.core.errors import CatalogError, CatalogUnavailable, RigError, UsageError
 from rig.core.next_steps import Do
 from rig.events.events import Note, NoteCode
-from rig.search.comparison import EnrolledViews
-from rig.search.session import SHOWN, ArcSearch, DenseSearch, HoughSearch, Search
-from rig.search.stopping_rules import stopping_rule_of, write_stopping_rule
+from rig.search.session import SHOWN, ArcSearch, DenseSearch, EnrolledViews, HoughSearch, Search
+from rig.search.stopping_rules import FILE, stopping_rule_of, write_stopping_rule
 from rig.search.strategies import AnyStrategy, descriptor_for, is_in_motion, strategy_for
 from rig.search.strategies import strategy as strategy_named
 from rig.views.description import BENCH_DESCRIPTOR
@@ -238,3 +240,74 @@ def empty_table_for(bench: Bench, model: Model) -> tuple[NDArray[np.uint8] | Non
     if model.empty_table is None:
         return None, (Note(NoteCode.EMPTY_TABLE_MISSING, problems),)
     return model.empty_table, (Note(NoteCode.EMPTY_TABLE_OF_ENROLLMENT, problems),)
+
+
+@dataclass(eq=False)
+class CurrentModel:
+    """Loads the enrolled views, and again after a change of the catalog or of its stopping rule.
+
+    If the catalog is on a server, it brings the local copy up to date, too. While the server does not answer, the
+    loaded model stays in use, with a note about its age. When the server answers again, the catalog replaces the local
+    copy. Use the model in a ``with`` block, which closes the opened catalogs.
+
+    Attributes
+    ----------
+    version
+        `Catalog.version` of the loaded views; empty before the first call.
+    """
+
+    catalog: Catalog
+    descriptor: str | None = None
+    version: str = field(default="", init=False)
+    _loaded_state: object = field(default=None, init=False)
+    _model: Model | None = field(default=None, init=False)
+    _seen: str = field(default="", init=False)
+    _server: Catalog | None = field(default=None, init=False)
+
+    def __post_init__(self) -> None:
+        self._attempts = Attempts(self.catalog.clock)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._server is not None:
+            self._server.close()
+
+    def __call__(self, progress: Callable[[JobProgress], None] | None = None) -> Model:
+        """Return the model; errors as `load_model`, and `CatalogUnavailable` if none was loaded before.
+
+        ``progress`` is called while views are described.
+        """
+        try:
+            self._leave_copy()
+            rules = self.catalog.path / FILE
+            changed = self.catalog.database.may_have_changed()
+            version = self.catalog.version() if changed or not self.version else self.version
+            state = version, rules.stat().st_mtime_ns if rules.exists() else None
+            if state != self._loaded_state:
+                self._model = load_model(self.catalog, descriptor=self.descriptor, progress=progress)
+                self._loaded_state, self.version = state, version
+                if self.catalog.place.url is not None:
+                    with suppress(RigError):  # the copy is for later; the search has its model already
+                        update_copy(self.catalog)
+        except CatalogUnavailable:
+            if self._model is None:
+                raise
+            if not self._seen:  # the model of the copy has its note
+                return self._model
+            note = Note(NoteCode.LOCAL_COPY, {"copied_utc": self._seen})
+            return replace(self._model, notes=(note, *self._model.notes))
+        assert self._model is not None
+        if self.catalog.copied_utc is None:
+            self._seen = f"{self.catalog.clock.utc():%Y-%m-%d %H:%M:%S} UTC"
+        return self._model
+
+    def _leave_copy(self) -> None:
+        """Replace a local copy by the catalog itself when its server answers again."""
+        place = self.catalog.copy_of
+        if place is None:
+            return
+        with suppress(RigError):
+            self._server = self._attempts.open(place)
+            self.catalog, self._loaded_state, self.version = self._server, None, ""

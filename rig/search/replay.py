@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 from math import isclose
 from typing import Any, Final
 
-from hbr.dense.last_steps import Verification, answered
+from hbr.dense.session import Verification, answered
 from rig.core.json_form import plain
 from rig.events.compared import Compared, Verified
 from rig.events.events import (
@@ -18,10 +18,9 @@ from rig.events.events import (
     Ranked,
     event_dict,
 )
-from rig.search.comparison import saved_enrolled_views
 from rig.search.model import begin_search
 from rig.search.saved_run import SavedRun
-from rig.search.session import Search
+from rig.search.session import Search, saved_enrolled_views
 from rig.search.strategies import AnyStrategy, Rotate
 from rig.views.description import SearchDescriber
 

@@ -16,8 +16,7 @@ import numpy as np
 import hbr
 from hbr.dense.filter import BETA
 from hbr.dense.index import POWER
-from hbr.dense.open_set import NUMBERS, OpenSetModel
-from hbr.dense.stopping import Limitation, LimitationCode, ShiftRates
+from hbr.dense.stopping import NUMBERS, Limitation, LimitationCode, OpenSetModel, ShiftRates
 from hbr.descriptors import descriptor
 from rig.core.errors import CatalogError, os_errors_as
 from rig.core.files import json_values, read, write

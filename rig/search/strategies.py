@@ -1,8 +1,8 @@
 """Strategies: after each view, rotate to the next view or finish.
 
-`identify` asks one strategy after every view. Five come with the rig; others are passed as an object, or plug in by
-name through the entry-point group `rig.strategies`. The attribute ``descriptor`` of a strategy selects its search:
-without it, the paper's (`SearchState`); with the bench's own descriptor, the dense search (`DenseSearchState`).
+`identify` asks one strategy after every view. Six come with the rig; others are passed as an object. The attribute
+``descriptor`` of a strategy selects its search: without it, the paper's (`SearchState`); with the bench's own
+descriptor, the dense search (`DenseSearchState`).
 
 Decision: docs/decisions/0017.
 """
@@ -10,7 +10,6 @@ Decision: docs/decisions/0017.
 from collections.abc import Callable
 from dataclasses import dataclass
 from difflib import get_close_matches
-from importlib.metadata import entry_points
 from typing import ClassVar, Final, Protocol, TypeVar
 
 import numpy as np
@@ -23,12 +22,9 @@ from hbr.dense.arc import ARC_DEG, STEP_DEG
 from rig.config import IdentifyConfig, RigConfig
 from rig.core.errors import UsageError
 from rig.events.events import RotationReason, Weighed
-from rig.motion.motion_model import MotionModel
-from rig.motion.move import equivalent_within
+from rig.motion.move import MotionModel, equivalent_within
 from rig.motion.scan_speed import scan_speed
 from rig.views.description import BENCH_DESCRIPTOR, PAPER_DESCRIPTOR
-
-GROUP: Final = "rig.strategies"
 
 ROTATION_STEP_DEG: Final = 5.0
 """Step between the rotations that the dense search weighs."""
@@ -326,35 +322,19 @@ BUILT_IN: Final = {strategy.name: strategy for strategy in _OWN}
 """The rig's own strategies. ``hbr`` takes all allowed views at random, as the paper measures HBR."""
 
 
-def names() -> list[str]:
-    """Return the names of all strategies: the rig's own, then the plug-ins."""
-    return [*BUILT_IN, *sorted({point.name for point in entry_points(group=GROUP)} - set(BUILT_IN))]
-
-
 def strategy(name: str) -> AnyStrategy:
     """Return the strategy of that name.
 
     Raises
     ------
     UsageError
-        There is none, or its plug-in cannot be loaded.
+        There is none.
     """
     if name in BUILT_IN:
         return BUILT_IN[name]
-    for point in entry_points(group=GROUP):
-        if point.name == name:
-            try:
-                plugged: AnyStrategy = point.load()()
-            except (ImportError, AttributeError, TypeError) as error:
-                raise UsageError(
-                    f"The strategy {name!r} of {point.value} cannot be loaded.",
-                    next_step="Fix or uninstall the package that provides it, or choose another strategy.",
-                    evidence={"reason": str(error)},
-                ) from error
-            return plugged
-    near = get_close_matches(name, names(), n=1)
+    near = get_close_matches(name, BUILT_IN, n=1)
     raise UsageError(
         f"There is no strategy {name!r}.",
         next_step=f"Did you mean {near[0]}?" if near else "Choose one of those listed.",
-        evidence={"strategies": names()},
+        evidence={"strategies": list(BUILT_IN)},
     )

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 import hbr
+from hbr.descriptors.together import LearnedBackground
 from hbr.segmentation import MIN_AGREEMENT, Issue, IssueCode
-from hbr.segmentation.frame import Frame
-from hbr.segmentation.learned import LearnedBackground
-from hbr.segmentation.stored import evidence_together, stored_segmentation
+from hbr.segmentation.background import Frame
+from hbr.segmentation.segment import evidence_together, stored_segmentation
 from rig.config import ViewConfig
 from rig.core.errors import UsageError
 from rig.views.table_problems import TableProblem, TableProblemCode
@@ -126,7 +126,7 @@ class ViewDescriber:
     def segment(self, image_bgr: NDArray[np.uint8], stored: Mapping[str, Any] | None = None) -> hbr.Segmentation:
         """Return the segmentation of the region of interest in a frame, uint8 (H, W, 3).
 
-        ``stored`` is the evidence of an enrolled view, which keeps its silhouette (`hbr.segmentation.stored`).
+        ``stored`` is the evidence of an enrolled view, which keeps its silhouette (`hbr.segmentation.segment`).
 
         Raises
         ------

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import hbr
-from hbr.segmentation.frame import Frame
+from hbr.segmentation.background import Frame
 from rig.bench import Bench
 from rig.config import ViewConfig
 from rig.core.clock import seconds_between

@@ -18,8 +18,6 @@ _TEXT: Final = {
     IssueCode.NO_GUESS: "no part of the frame stands out",
     IssueCode.NO_OBJECT: "no object was found while the table rotated",
     IssueCode.NO_DIFFERENCE: "nothing differs from the background",
-    IssueCode.PATCH_UNEVEN: "the grey patch is uneven",
-    IssueCode.PATCH_EXPOSURE: "the grey patch is overexposed or too dark",
 }
 
 

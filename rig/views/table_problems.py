@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from enum import StrEnum
 from typing import Any
 
-from hbr.segmentation.evidence import Issue
+from hbr.segmentation.background import Issue
 from rig.core.phrases import filled
 
 

@@ -25,7 +25,7 @@ from rig.jobs.enroll import enroll, enroll_list, plan
 from rig.jobs.identify import identify
 from rig.jobs.table import acknowledge, goto, home, refer
 from rig.jobs.table_image import take_table_image
-from rig.motion.motion_model import MotionModel
+from rig.motion.move import MotionModel
 from rig.plans.estimate import TimeLeft
 from rig.plans.operator import Choice, Operator, Question
 from rig.plans.tray import TrayItem

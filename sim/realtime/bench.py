@@ -15,7 +15,7 @@ from rig.core.errors import ConfigError, DeviceNotFound
 from rig.core.next_steps import Do
 from rig.devices.dynamixel.port import SerialConnection
 from rig.devices.opencv_capture import Capture
-from rig.safety.bench_lock import holder
+from rig.safety.saved_state import holder
 from sim.camera import CAMERA_DEVICE
 from sim.realtime.client import RemoteCapture, RemoteI2c, camera_node
 from sim.realtime.wire import COMPUTER, CONFIG, DEFAULT_FOLDER, SERVO, STATE, not_running

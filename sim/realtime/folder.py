@@ -15,7 +15,7 @@ from rig.config.wording import blank_file
 from rig.core.clock import SystemClock
 from rig.core.errors import BenchBusy, UsageError, os_errors_as
 from rig.core.next_steps import Do
-from rig.safety.bench_lock import BenchLock, holder
+from rig.safety.saved_state import BenchLock, holder
 from sim.bench import SimOptions
 from sim.realtime.wire import COMPUTER, CONFIG, DEFAULT_FOLDER, HEAD, SERVO, SOCKET, STATE
 

@@ -8,7 +8,7 @@ import cv2
 from rig import Catalog, enroll
 from rig.config import load_config
 from rig.events.events import Enrolled
-from rig.safety.state_machine import TableState
+from rig.safety.supervisor import TableState
 from sim.bench import ShelfOperator
 from sim.devices import SimDevices
 from sim.objects.shelf import shelf

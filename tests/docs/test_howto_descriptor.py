@@ -1,16 +1,12 @@
 """docs/how-to/add-a-descriptor.md"""
 
-import os
-import subprocess
-import sys
-
 import cv2
 import numpy as np
 import pytest
 
 import hbr
 from hbr.descriptors import names, register, registry
-from tests.docs.pages import blocks, install, run
+from tests.docs.pages import blocks, run
 
 
 @pytest.fixture
@@ -49,21 +45,3 @@ def test_name_of_another_descriptor_is_not_replaced(page):
             register(page["GreyHistogram"](name=name))
     assert names()[-1] == "grey"
     assert hbr.descriptor("cedd").length == 144
-
-
-def test_descriptor_of_a_package_is_known_in_every_process(tmp_path):
-    definition, registration, _ = blocks("add-a-descriptor")
-    (toml,) = blocks("add-a-descriptor", "toml")
-    toml += 'broken = "no_such_module:GREY"\n'
-    package = install(
-        tmp_path / "package", {"my_package": definition + registration.replace("register(GREY)", "")}, toml
-    )
-    code = "import hbr; print(hbr.descriptor('grey').length, hbr.descriptors.names()[-1])"
-    done = subprocess.run(
-        [sys.executable, "-c", code],
-        capture_output=True,
-        text=True,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(package), *sys.path])},
-    )
-    assert done.stdout.split() == ["16", "grey"]
-    assert "'broken' of no_such_module:GREY cannot be loaded" in done.stderr

@@ -12,7 +12,7 @@ from rig.core.errors import ConfigError
 from rig.devices.dynamixel.opening import open_servo
 from rig.events.events import Enrolled, Moved
 from rig.safety.saved_state import MemoryStore
-from rig.safety.state_machine import TableState
+from rig.safety.supervisor import TableState
 from sim.bench import ShelfOperator, open_sim_bench
 from sim.devices import SimDevices
 from sim.motion import to_position, to_velocity

@@ -20,7 +20,7 @@ from rig.catalog.shared import Journal, deliver
 from rig.config.catalog_place import CatalogPlace
 from rig.core.clock import SystemClock
 from rig.core.errors import RigError
-from rig.search.current_model import CurrentModel
+from rig.search.model import CurrentModel
 from rig.views.description import PAPER_DESCRIPTOR
 from tests.rig.catalog.catalog_samples import PROVENANCE, image, plan
 

@@ -24,7 +24,7 @@ from rig.catalog import Catalog  # noqa: E402
 from rig.config import load_config  # noqa: E402
 from rig.core.errors import MotionStopped  # noqa: E402
 from rig.devices.servo import ServoState  # noqa: E402
-from rig.safety.state_machine import TableState  # noqa: E402
+from rig.safety.supervisor import TableState  # noqa: E402
 from rig.search.model import load_model  # noqa: E402
 from tests.rig.plans.test_fly import flying  # noqa: E402
 

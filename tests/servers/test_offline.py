@@ -26,7 +26,7 @@ from rig.core.errors import CatalogDamaged, CatalogError, CatalogUnavailable, Ob
 from rig.core.next_steps import Do
 from rig.events.events import NoteCode
 from rig.plans.tray import TrayItem, left_to_enroll
-from rig.search.current_model import CurrentModel
+from rig.search.model import CurrentModel
 from tests.programs import Program
 from tests.rig.catalog.catalog_samples import PROVENANCE, die_at, fill, image, new_result, record
 from tests.servers.postgres import PostgresServer, place_in

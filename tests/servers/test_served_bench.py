@@ -17,7 +17,7 @@ from rig.catalog.verify import verify
 from rig.config.catalog_place import CatalogPlace
 from rig.core.clock import SystemClock
 from rig.events.events import NoteCode
-from rig.search.current_model import CurrentModel
+from rig.search.model import CurrentModel
 from tests.rig.catalog.catalog_samples import fill
 from tests.rig.web.conftest import Served, serve  # noqa: F401 - a fixture
 from tests.servers.postgres import PostgresServer, place_in

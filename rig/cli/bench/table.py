@@ -67,7 +67,7 @@ def status(settings: Settings) -> None:
     Example: rig status --bench sim --json
     """
     from rig.cli.bench.bench_report import report_lines, report_of, report_of_server, report_without_servo
-    from rig.safety.bench_lock import server_address
+    from rig.safety.saved_state import server_address
 
     if server := server_address(settings.load().state_path(settings.bench_name)):
         report = report_of_server(server)

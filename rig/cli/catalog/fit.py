@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from hbr import FittedRule
     from hbr.core.arrays import FloatArray
-    from hbr.dense.leave_one_out import Task
+    from hbr.dense.fitting import Task
     from rig.catalog.unfinished import UnfinishedJob
 
 _SEVERAL_PROCESSES: Final = 20_000
@@ -110,7 +110,7 @@ def _continued(
     """Yield the searches for all objects: first those that are stored, then the others, which are stored, too."""
     import numpy as np
 
-    from hbr.dense.leave_one_out import NUMBERS_OF_VIEW
+    from hbr.dense.fitting import NUMBERS_OF_VIEW
 
     left = []
     for task in tasks:

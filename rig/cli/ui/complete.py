@@ -56,6 +56,5 @@ def config_keys(incomplete: str) -> list[str]:
 
 def strategy_names(incomplete: str) -> list[str]:
     """Return the names of the search strategies."""
-    plugged = [point.name for point in entry_points(group="rig.strategies")]
-    names = ["dense", "arc", "ahbr", "hbr", "sweep", "random", *plugged]
+    names = ["dense", "arc", "ahbr", "hbr", "sweep", "random"]
     return [name for name in names if name.startswith(incomplete)]

@@ -34,7 +34,7 @@ from rig.events.events import (
 )
 from rig.events.lines import line
 from rig.events.wording import decision_words, move_words, ranking_words, share_words, similar_objects_words
-from rig.motion.motion_model import MotionModel
+from rig.motion.move import MotionModel
 from rig.plans.estimate import TimeLeft
 from rig.views.capture import ViewEvidence, rejection_text
 

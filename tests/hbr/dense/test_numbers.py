@@ -5,7 +5,7 @@ import pytest
 
 import hbr
 from hbr.dense.arc import ArcSession, fit_arc_confidence
-from hbr.dense.pose import pose
+from hbr.dense.filter import pose
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from hbr import DenseIndex, Views
 from hbr.core.angles import wrap180
-from hbr.dense.pose import LARGEST_SIGMA_DEG, pose, pose_of
+from hbr.dense.filter import LARGEST_SIGMA_DEG, pose, pose_of
 from tests.hbr.dense.searches import belief_after
 
 AZIMUTHS_DEG = np.arange(72) * 5.0

@@ -9,8 +9,8 @@ import pytest
 import hbr
 from hbr import Outcome, StopReason
 from hbr.dense.arc import ArcSession
-from hbr.dense.last_steps import NeedEnrolledViews, Verification, answered, compare_leaders
 from hbr.dense.local_difference import LocalView
+from hbr.dense.session import NeedEnrolledViews, Verification, answered, compare_leaders
 from tests.hbr.dense.test_local_difference import shown
 from tests.hbr.dense.test_stopping import catalog
 

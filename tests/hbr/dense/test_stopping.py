@@ -15,8 +15,7 @@ from hbr.dense.fitting import (
     min_confidence_for,
     rule_from_searches,
 )
-from hbr.dense.open_set import Leaders, usual_scores
-from hbr.dense.stopping import LimitationCode, StoppingRule
+from hbr.dense.stopping import Leaders, LimitationCode, StoppingRule, usual_scores
 from tests.fuzzing import examples
 
 BETA = 60.0

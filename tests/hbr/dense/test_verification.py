@@ -9,7 +9,8 @@ import pytest
 
 from hbr import Belief, DenseIndex, DenseSession, Outcome, StopDecision, StopReason, Views, update_belief
 from hbr.dense.fitting import fit_stopping_rule
-from hbr.dense.last_steps import (
+from hbr.dense.local_difference import LocalView, Pixels, fit
+from hbr.dense.session import (
     FOUND_FROM,
     FOUND_FROM_SAME_BENCH,
     UNKNOWN_BELOW,
@@ -18,10 +19,7 @@ from hbr.dense.last_steps import (
     is_doubtful,
     verify,
 )
-from hbr.dense.local_difference import LocalView
-from hbr.dense.open_set import fitted_before
-from hbr.dense.pixel_fit import Pixels, fit
-from hbr.dense.stopping import StoppingRule
+from hbr.dense.stopping import StoppingRule, fitted_before
 from tests.hbr.dense.test_stopping import catalog
 
 KIND = "edges+colours"

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from hbr import cedd, describe
 from hbr.descriptors.cedd import (
+    VOTE_BINS,
     _areas,
     _colour_outputs,
     _covered_size,
@@ -22,7 +23,6 @@ from hbr.descriptors.cedd import (
     _row_sums,
     _texture_votes,
 )
-from hbr.descriptors.cedd_tables import VOTE_BINS
 from tests.fuzzing import examples
 from tests.hbr.descriptors.cedd_reference import area, cedd_reference, colours, hsv, texture_classes
 

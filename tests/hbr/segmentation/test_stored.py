@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import hbr
-from hbr.segmentation.learned import LearnedBackground
-from hbr.segmentation.stored import evidence_together, mask_from, mask_text, stored_segmentation
+from hbr.descriptors.together import LearnedBackground
+from hbr.segmentation.segment import evidence_together, mask_from, mask_text, stored_segmentation
 from tests.fuzzing import examples
 from tests.hbr.segmentation.test_views_together import frames
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import hbr
-from hbr.dense.leave_one_out import can_shift
-from hbr.dense.whitening import Whitening
-from hbr.descriptors.shift import Shift
+from hbr.dense.fitting import can_shift
+from hbr.dense.index import Whitening
+from hbr.descriptors.base import Shift
 from hbr.descriptors.together import like_enrollment
 from hbr.evaluation.changed_bench import HARD, Bench, Visit
 from hbr.segmentation import Method

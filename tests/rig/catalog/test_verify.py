@@ -8,7 +8,7 @@ import pytest
 
 import hbr
 from hbr.descriptors import descriptor, registry
-from hbr.descriptors.plain_cedd import Cedd
+from hbr.descriptors.cedd import Cedd
 from rig.catalog import Catalog, derived
 from rig.catalog.jobs import JobProgress
 from rig.catalog.upkeep import statistics

@@ -16,7 +16,7 @@ import pytest
 from rig.catalog import Action, Catalog
 from rig.cli.ui.settings import Settings
 from rig.core.clock import SystemClock
-from rig.safety.bench_lock import BenchLock
+from rig.safety.saved_state import BenchLock
 from tests.programs import Program, stopping_after_view
 
 SMALL = (

@@ -14,9 +14,8 @@ from rig.core.next_steps import Do
 from rig.doctor.computer import RULES_FILES, udev_rules
 from rig.doctor.finding import FindingCode, Severity, finding_words
 from rig.doctor.single_servo import single_servo
-from rig.safety.bench_lock import BenchLock, holder
+from rig.safety.saved_state import BenchLock, FileStore, LatchedFault, holder
 from rig.safety.saved_state import BenchState as State
-from rig.safety.saved_state import FileStore, LatchedFault
 from sim.clock import VirtualClock
 from tests.rig.doctor.doctor_parts import unopened
 

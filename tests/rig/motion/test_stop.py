@@ -13,8 +13,7 @@ from rig.core.clock import seconds_between
 from rig.core.errors import BenchBusy, DeviceSilent, TorqueStaysOn, UsageError
 from rig.motion.stop_request import stop
 from rig.motion.turntable import Turntable
-from rig.safety.bench_lock import BenchLock
-from rig.safety.saved_state import Holder
+from rig.safety.saved_state import BenchLock, Holder
 from rig.safety.stop_channel import listen
 from rig.safety.supervisor import TableState
 from sim.world import World

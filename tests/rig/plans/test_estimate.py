@@ -12,7 +12,7 @@ from rig.config import load_config
 from rig.core.errors import LimitExceeded
 from rig.core.next_steps import Do
 from rig.events.events import Accepted, Enrolled, Moved, Started
-from rig.motion.motion_model import MotionModel
+from rig.motion.move import MotionModel
 from rig.motion.turntable import Turntable
 from rig.plans.enroll import enroll
 from rig.plans.estimate import TimeLeft, dry_run, even_azimuths, table_angles

@@ -27,8 +27,7 @@ from rig.core.next_steps import Do
 from rig.devices.servo import ServoCondition, ServoIdentity, ServoLimits, ServoState
 from rig.safety.angle_reference import AngleFinding
 from rig.safety.saved_state import BenchState, FileStore, LatchedFault, MemoryStore, StateStore
-from rig.safety.state_machine import TRANSITIONS, StateEvent
-from rig.safety.supervisor import Safety, TableState
+from rig.safety.supervisor import TRANSITIONS, Safety, StateEvent, TableState
 from sim.clock import VirtualClock
 from tests.fuzzing import fuzz_settings
 

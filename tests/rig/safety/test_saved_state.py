@@ -16,18 +16,20 @@ from rig.config import load_config
 from rig.core.clock import SystemClock
 from rig.core.errors import BenchBusy, Stalled, StateNotStored
 from rig.core.next_steps import Do
-from rig.safety.bench_lock import BenchLock, busy, holder
 from rig.safety.saved_state import (
     LATCH_BYTES,
     SERVER_FILE,
     SERVER_FOLDER,
     SESSION,
+    BenchLock,
     BenchState,
     FileStore,
     Holder,
     LatchedFault,
     SavedTable,
     ServerAddress,
+    busy,
+    holder,
 )
 from sim import disk
 from tests.fuzzing import fuzz_settings
@@ -36,7 +38,7 @@ HOLD = """
 import sys, time
 from pathlib import Path
 from rig.core.clock import SystemClock
-from rig.safety.bench_lock import BenchLock
+from rig.safety.saved_state import BenchLock
 lock = BenchLock(Path(sys.argv[1]), SystemClock())
 print("held", flush=True)
 time.sleep(60)

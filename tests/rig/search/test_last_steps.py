@@ -12,8 +12,8 @@ import pytest
 
 import hbr
 from benchmarks.twins import kind_of, searches
-from hbr.dense.last_steps import FOUND_FROM_SAME_BENCH
-from hbr.dense.open_set import fitted_before
+from hbr.dense.session import FOUND_FROM_SAME_BENCH
+from hbr.dense.stopping import fitted_before
 from rig.bench import Bench
 from rig.catalog import Catalog
 from rig.config import load_config

@@ -9,8 +9,7 @@ import pytest
 from sqlalchemy import delete
 
 import hbr
-from hbr.dense.fitting import UNFITTED_MIN_CONFIDENCE
-from hbr.dense.leave_one_out import leave_one_out
+from hbr.dense.fitting import UNFITTED_MIN_CONFIDENCE, leave_one_out
 from hbr.dense.stopping import LimitationCode
 from rig.catalog import Catalog
 from rig.catalog.facts import Derived

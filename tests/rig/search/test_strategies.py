@@ -1,6 +1,4 @@
-"""Strategies of a search: their rotations, their ends, and plug-ins."""
-
-from importlib.metadata import EntryPoint
+"""Strategies of a search: their rotations, and their ends."""
 
 import numpy as np
 import pytest
@@ -13,10 +11,9 @@ from hbr.core.angles import wrap180
 from rig.config import IdentifyConfig, RigConfig
 from rig.core.errors import CatalogError, UsageError
 from rig.events.events import RotationReason
-from rig.search import strategies
 from rig.search.model import begin_search, model_of
 from rig.search.session import Search
-from rig.search.strategies import Finish, Rotate, SearchState, Strategy, end_by_margin, strategy
+from rig.search.strategies import Finish, Rotate, Strategy, strategy
 from tests.fuzzing import examples
 from tests.rig.search.views import seen
 
@@ -110,24 +107,3 @@ def test_empty_catalog_and_an_unknown_strategy_are_rejected():
     with pytest.raises(UsageError) as caught:
         strategy("swep")
     assert "sweep" in caught.value.next_step
-
-
-class Once:
-    """A plug-in: one view is enough."""
-
-    name = "once"
-
-    def next(self, state: SearchState) -> Rotate | Finish:
-        return end_by_margin(state) or Finish(note=f"one view of {state.ranking.names[0]} at {state.table_deg:g}")
-
-
-def test_strategies_plug_in_by_an_entry_point(monkeypatch):
-    broken = EntryPoint("broken", "no.such.module:Thing", strategies.GROUP)
-    mine = EntryPoint("once", f"{__name__}:Once", strategies.GROUP)
-    monkeypatch.setattr(strategies, "entry_points", lambda **_: [broken, mine])
-    assert strategies.names() == ["dense", "arc", "ahbr", "hbr", "sweep", "random", "broken", "once"]
-    rotations, end, _ = run("once")
-    assert rotations == []
-    assert end.note.startswith("one view of")
-    with pytest.raises(UsageError, match="cannot be loaded"):
-        strategy("broken")

@@ -41,7 +41,7 @@ from rig.devices.dynamixel.opening import open_servo
 from rig.devices.dynamixel.port import open_serial
 from rig.devices.imu import ImuIdentity, ImuSamples
 from rig.safety.saved_state import FileStore
-from rig.safety.bench_lock import BenchLock
+from rig.safety.saved_state import BenchLock
 from rig.motion.turntable import Turntable
 
 CLOCK = SystemClock()

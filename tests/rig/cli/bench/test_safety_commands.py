@@ -12,8 +12,7 @@ from rig.config import load_config
 from rig.core.clock import SystemClock
 from rig.core.errors import Stalled
 from rig.motion.stop_request import stop
-from rig.safety.bench_lock import holder
-from rig.safety.saved_state import FileStore, LatchedFault
+from rig.safety.saved_state import FileStore, LatchedFault, holder
 from tests.programs import Program
 
 SMALL = ("--set", "camera.width=320", "--set", "camera.height=240", "--set", "view.roi=[40, 0, 240, 240]")
@@ -183,7 +182,7 @@ def test_stop_signals_a_program_outside_its_control_loop(tmp_path, monkeypatch, 
 import signal, sys, time
 from pathlib import Path
 from rig.core.clock import SystemClock
-from rig.safety.bench_lock import BenchLock
+from rig.safety.saved_state import BenchLock
 def unwind(number, frame):
     raise SystemExit(128 + number)
 if {handler!r}:
@@ -211,7 +210,7 @@ def test_stop_reports_how_to_end_a_program_that_does_not_react(tmp_path, monkeyp
 import signal, time
 from pathlib import Path
 from rig.core.clock import SystemClock
-from rig.safety.bench_lock import BenchLock
+from rig.safety.saved_state import BenchLock
 signal.signal(signal.SIGINT, signal.SIG_IGN)
 lock = BenchLock(Path({str(tmp_path / "sim")!r}), SystemClock())
 print("held", flush=True)

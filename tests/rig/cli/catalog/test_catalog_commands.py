@@ -19,7 +19,7 @@ from click.testing import Result
 from typer.testing import CliRunner
 
 from hbr.descriptors import registry
-from hbr.descriptors.plain_cedd import Cedd
+from hbr.descriptors.cedd import Cedd
 from rig.catalog import Catalog
 from rig.catalog.exchange.photographs import read_folder
 from rig.catalog.jobs import finished

@@ -19,7 +19,7 @@ from rig.catalog.images import FolderImages
 from rig.cli.main import app
 from rig.cli.ui.exit_codes import EXIT_AMBIGUOUS, EXIT_QUALITY, EXIT_UNKNOWN
 from rig.core.clock import SystemClock
-from rig.search.current_model import CurrentModel
+from rig.search.model import CurrentModel
 from rig.views.object_presence import TableWatcher
 from sim.bench import ShelfOperator
 from sim.objects.shelf import shelf
