@@ -84,7 +84,7 @@ def test_page_of_events_has_its_tables_on_the_site():
 
 def test_links_out_of_docs_are_rewritten_for_the_site():
     text, copied = generate.with_site_links(
-        "[a](../README.md#use) [b](../examples/tray.csv) [c](../tests)", "docs/page.md"
+        "[a](../README.md#use) [b](../examples/tray.csv) [c](../tests)", "docs/results.md"
     )
     assert text == "[a](index.md#use) [b](files/examples/tray.csv) c"
     assert copied == {"examples/tray.csv"}
