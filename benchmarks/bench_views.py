@@ -4,14 +4,13 @@ First one view as it is enrolled, with all of its steps: the object is found, cu
 descriptors are computed. Peer: OpenCV's resize of the same frame to 80 x 80. With the empty-table image, and without it
 by a guess.
 
-Then a view of a search, 320 x 240, compared with a view that is guessed by OpenCV's GrabCut and described. Without an
+Then a view of a search, 320 x 240, compared with a view that is guessed and described. Without an
 empty-table image each view of a search also improves the earlier ones, which are segmented again.
 """
 
 from collections.abc import Callable
 from dataclasses import replace
 from time import process_time, thread_time
-from unittest.mock import patch
 
 import cv2
 import numpy as np
@@ -20,7 +19,7 @@ from benchmarks.record import record
 from hbr import Background, Segmentation, ViewsTogether, descriptor, segment
 from hbr.core.arrays import ImageArray
 from hbr.evaluation.changed_bench import HARD, Bench, Visit
-from hbr.segmentation import Method, guess
+from hbr.segmentation import Method
 from hbr.segmentation.background import shrunk
 from hbr.segmentation.guess import guess_object
 from hbr.segmentation.network import shares
@@ -30,7 +29,7 @@ DESCRIPTOR = "edges+colours"
 BENCHES = 6
 VIEWS = 4
 REPEATS = 3
-PEER = "a guess by OpenCV's GrabCut"
+PEER = "a guess"
 
 
 def printed_box(visit: Visit, side: int) -> ImageArray:
@@ -59,12 +58,6 @@ def fastest(work: Callable[[], object], repeats: int) -> float:
     return 1e3 * min(took)
 
 
-def guess_by_opencv(work: Callable[[], object]) -> object:
-    """Segment a frame by a guess with OpenCV's GrabCut."""
-    with patch.object(guess, "grab_cut", return_value=None):
-        return work()
-
-
 def one_view(size: tuple[int, int]) -> None:
     """Measure one view of this width and height, and its parts."""
     images, empty = frames(0)
@@ -88,7 +81,6 @@ def one_view(size: tuple[int, int]) -> None:
         "- describe, cedd and edges+colours": (lambda: described(replace(found)), 200),
         "whole view, guessed": (lambda: described(segment(image)), 30),
         "- guess": (lambda: guess_object(small), 30),
-        "- the same by OpenCV's GrabCut": (lambda: guess_by_opencv(lambda: guess_object(small)), 30),
         "network": (lambda: shares(small), 30),
     }
     for name, (work, repeats) in parts.items():
@@ -109,11 +101,8 @@ def main() -> None:
         images, empty = frames(seed)
         for image in images:
             start = process_time()
-            guess_by_opencv(lambda image=image: kind.describe(segment(image)))
-            timed(PEER, start)
-            start = process_time()
             kind.describe(segment(image))
-            timed("a guess", start)
+            timed(PEER, start)
         table = Background(empty)
         for name, views, revise in (
             ("with the empty-table image", ViewsTogether(DESCRIPTOR, empty_table=table), True),

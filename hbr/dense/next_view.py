@@ -15,7 +15,6 @@ from hbr.core.arrays import FloatArray, IndexArray
 from hbr.dense.filter import BETA, Belief
 from hbr.dense.index import BINS
 from hbr.descriptors import Packed
-from hbr.kernels import calls
 
 #: λ: how reliably a view separates two objects that look different.
 SHARPNESS: Final = 100.0
@@ -202,9 +201,6 @@ def strongest(posterior: FloatArray) -> tuple[FloatArray, IndexArray, IndexArray
 
 
 def _peak_weights(posterior: FloatArray) -> FloatArray:
-    compiled = calls.peak_weights(posterior)
-    if compiled is not None:
-        return compiled
     around = np.concatenate([posterior[:, -1:], posterior, posterior[:, :1]], axis=1)
     peaks = posterior * ((posterior >= around[:, :-2]) & (posterior >= around[:, 2:]))
     mass, total = posterior.sum(axis=1), peaks.sum(axis=1)

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from hbr.core.arrays import FloatArray, ImageArray, IndexArray, LevelArray
 from hbr.descriptors.base import CompiledDescriptor, Shift
-from hbr.kernels import images
 from hbr.kernels.calls import Measure
 from hbr.segmentation import CROP_PX, Segmentation, segment
 
@@ -140,8 +139,7 @@ def _coefficients(crop: ImageArray, mask: NDArray[np.uint8]) -> FloatArray:
     # in two steps, because OpenCV averages fast when it halves the size
     half = cv2.resize(crop, (_PIXELS, _PIXELS), interpolation=cv2.INTER_AREA).astype(np.uint8, copy=False)
     weight = cv2.resize(mask, (_PIXELS, _PIXELS), interpolation=cv2.INTER_AREA).astype(np.float32) * np.float32(1 / 255)
-    by_kernel = images.cell_means(half, weight, _CELLS)
-    totals, covered = (_means(half * weight[:, :, None]), _means(weight)) if by_kernel is None else by_kernel
+    totals, covered = _means(half * weight[:, :, None]), _means(weight)
     share = np.where(covered > _MIN_COVERED, covered, 0.0)
     colour = totals / np.maximum(covered, 1e-3)[:, :, None]
     channels = np.log(colour + _FLOOR) @ _OPPONENT

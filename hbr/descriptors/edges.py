@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from hbr.core.arrays import FloatArray, ImageArray, LevelArray
 from hbr.descriptors.base import CompiledDescriptor, Shift
 from hbr.descriptors.cosine import WholeCosine
-from hbr.kernels import images
 from hbr.kernels.calls import Measure
 from hbr.segmentation import CROP_PX, Segmentation, segment
 
@@ -110,9 +109,6 @@ def _histogram(image: ImageArray) -> NDArray[np.float32]:
 
 def _strongest(x: cv2.typing.MatLike, y: cv2.typing.MatLike) -> tuple[Floats, Floats]:
     """Return at every pixel the gradient of the channel with the strongest edge."""
-    found = images.strongest(x, y)
-    if found is not None:
-        return found
     strength = x * x + y * y
     channel = strength.argmax(axis=2)[:, :, None]
     own = [np.take_along_axis(part, channel, axis=2)[:, :, 0] for part in (x, y)]
@@ -122,9 +118,6 @@ def _strongest(x: cv2.typing.MatLike, y: cv2.typing.MatLike) -> tuple[Floats, Fl
 def _votes(magnitude: cv2.typing.MatLike, angle: cv2.typing.MatLike) -> Floats:
     """Return the votes of the pixels for the eight directions, float32 (8, h, w)."""
     scale = np.float32(_DIRECTIONS / np.pi)
-    found = images.votes(magnitude, angle, scale)
-    if found is not None:
-        return found
     place = angle * scale
     away = np.abs(place - np.arange(2 * _DIRECTIONS + 1, dtype=np.float32)[:, None, None])
     votes = np.maximum(1 - away, 0, out=away)

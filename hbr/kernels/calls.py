@@ -2,7 +2,9 @@
 
 import ctypes
 import threading
+from functools import lru_cache
 from itertools import pairwise
+from math import ceil, floor
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -14,6 +16,8 @@ from hbr.kernels.library import address, library, run
 
 _ROWS_OF_A_THREAD: Final = 100_000
 """Smallest number of rows for a thread: fewer take less time than its start."""
+_MOST_ROWS: Final = 257
+"""Largest number of bytes whose sum fits into 16 bits."""
 
 
 class Addresses:
@@ -54,6 +58,63 @@ def cedd(image: ImageArray, grid: tuple[int, int, int, int], tables: Addresses) 
     if not run("hbr_cedd", image, image.strides[0], *size, tables.address, address + 144, address):
         return None
     return work.array[:18].view(np.uint8).copy()
+
+
+def shrink(image: ImageArray, size: tuple[int, int]) -> ImageArray | None:
+    """Return an image averaged to (width, height), as cv2.INTER_AREA does, if one whole number above 2 divides it."""
+    width, height = size
+    factor = image.shape[1] // width
+    if not 2 < factor <= _MOST_ROWS or image.shape[:2] != (height * factor, width * factor):
+        return None
+    if image.strides[1:] != (3, 1):
+        image = np.ascontiguousarray(image)
+    sums, small = np.empty(3 * image.shape[1] + 1, np.uint16), np.empty((height, width, 3), np.uint8)
+    return small if run("hbr_shrink", image, image.strides[0], height, width, factor, sums, small) else None
+
+
+class _Taps:
+    """The pixels, and their weights, of which each pixel of a shrunk row is the average."""
+
+    def __init__(self, size: int, side: int) -> None:
+        scale = size / side
+        rows: list[tuple[int, list[float]]] = []
+        for x in range(side):
+            begin, end = x * scale, x * scale + scale
+            width = min(scale, size - begin)
+            last = min(floor(end), size - 1)
+            whole = min(ceil(begin), last)
+            weights = [1 / width] * (last - whole)
+            first = whole
+            if whole - begin > 1e-3:
+                weights.insert(0, (whole - begin) / width)
+                first -= 1
+            if end - last > 1e-3:
+                weights.append(min(min(end - last, 1.0), width) / width)
+            rows.append((first, weights))
+        self.most = max(len(weights) for _, weights in rows)
+        self.first = np.array([min(first, size - self.most) for first, _ in rows], np.int64)
+        self.weights = np.zeros((side, self.most), np.float32)
+        for row, at, (first, weights) in zip(self.weights, self.first, rows, strict=True):
+            row[first - at : first - at + len(weights)] = weights
+
+
+_taps = lru_cache(maxsize=512)(_Taps)
+
+
+def average(image: ImageArray, side: int) -> ImageArray | None:
+    """Return a square image of more than ``side`` pixels averaged to ``side``, as cv2.INTER_AREA does."""
+    size = image.shape[0]
+    if image.shape[1] != size or not size > side or not size % side:
+        return None
+    if image.strides[1:] != (3, 1):
+        image = np.ascontiguousarray(image)
+    taps = _taps(size, side)
+    floats, out = np.zeros(8 * side + 3 * size + 1, np.float32), np.empty((side, side, 3), np.uint8)
+    is_done = run(
+        "hbr_average", image, image.strides[0], size, side, taps.first, taps.weights, taps.most,
+        floats[8 * side :], floats, floats[4 * side :], out,
+    )  # fmt: skip
+    return out if is_done else None
 
 
 class _Measure(ctypes.Structure):
@@ -301,13 +362,6 @@ def support(
     return added if is_done else None
 
 
-def peak_weights(posterior: FloatArray) -> FloatArray | None:
-    """Return the weight of each hypothesis of a posterior, (k, 72); see `hbr.dense.next_view.strongest`."""
-    posterior = np.ascontiguousarray(posterior)
-    weights = np.empty(posterior.shape)
-    return weights if run("hbr_peak_weights", posterior, len(posterior), weights) else None
-
-
 def nearest_view(
     segments: Segments, azimuth_deg: FloatArray, places: IndexArray, at_deg: FloatArray
 ) -> tuple[IndexArray, FloatArray] | None:
@@ -317,20 +371,6 @@ def nearest_view(
     asked = places, len(places), at_deg, len(at_deg)
     is_done = run("hbr_nearest_view", *segments[:3], azimuth_deg, *asked, rows, away_deg)
     return (rows, away_deg) if is_done else None
-
-
-def rotated(
-    anchors: IndexArray,
-    rotation_deg: FloatArray,
-    object_index: IndexArray,
-    by_object: tuple[IndexArray, IndexArray],
-    azimuth_deg: FloatArray,
-) -> IndexArray | None:
-    """Return for each view the view of its object that is nearest to its azimuth plus ``rotation_deg``."""
-    given = _whole(anchors), np.ascontiguousarray(rotation_deg), len(anchors)
-    enrolled = *map(_whole, (object_index, *by_object)), np.ascontiguousarray(azimuth_deg)
-    views = np.empty(len(anchors), np.int64)
-    return views if run("hbr_rotated", *given, *enrolled, views) else None
 
 
 def paths(

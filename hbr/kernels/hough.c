@@ -9,25 +9,6 @@ PART double revolutions(double difference_deg) {
     return __builtin_fabs(difference_deg - 360.0 * ((quotient + large) - large)) / 360.0;
 }
 
-/* For each view of `anchors`, store the view of its object whose azimuth is closest to the anchor's plus `rotation_deg`.
-
-   Object j has the views `order[start[j]]` to `order[start[j + 1] - 1]`; of equally close ones, the first is stored. */
-EXPORT void hbr_rotated(const int64_t *anchors, const double *rotation_deg, int64_t count, const int64_t *object_index,
-                        const int64_t *order, const int64_t *start, const double *azimuth_deg, int64_t *rotated) {
-    for (int64_t i = 0; i < count; i++) {
-        const int64_t j = object_index[anchors[i]];
-        const double from_deg = azimuth_deg[anchors[i]], by_deg = rotation_deg[i];
-        double least = __builtin_inf();
-        for (int64_t k = start[j]; k < start[j + 1]; k++) {
-            const double away = revolutions((azimuth_deg[order[k]] - from_deg) - by_deg);
-            if (away < least) {
-                least = away;
-                rotated[i] = order[k];
-            }
-        }
-    }
-}
-
 PART int is_before(const int64_t *object_index, int64_t a, int64_t b) {
     return object_index[a] < object_index[b] || (object_index[a] == object_index[b] && a < b);
 }

@@ -1,36 +1,6 @@
 /* Parts of the choice of the next view, with the same bits as hbr/dense/next_view.py and hbr/dense/index.py. */
 #include "kernels.h"
 
-#define BINS 72
-#define LANES 8
-
-/* Add up a row in the order in which NumPy does. */
-PART double sum_of_row(const double *row) {
-    double part[LANES];
-    for (int i = 0; i < LANES; i++) part[i] = row[i];
-    for (int b = LANES; b < BINS; b += LANES)
-        for (int i = 0; i < LANES; i++) part[i] += row[b + i];
-    return ((part[0] + part[1]) + (part[2] + part[3])) + ((part[4] + part[5]) + (part[6] + part[7]));
-}
-
-/* Store the weight of each hypothesis of a posterior, (objects, 72). A hypothesis that is a peak of its object gets
-   the weight of the slopes beside it; the others have the weight 0. */
-FOR_EVERY_PROCESSOR
-EXPORT void hbr_peak_weights(const double *posterior, int64_t objects, double *weights) {
-    for (int64_t j = 0; j < objects; j++, posterior += BINS, weights += BINS) {
-        double around[BINS + 2], peaks[BINS];
-        around[0] = posterior[BINS - 1];
-        for (int b = 0; b < BINS; b++) around[b + 1] = posterior[b];
-        around[BINS + 1] = posterior[0];
-        for (int b = 0; b < BINS; b++) {
-            const double here = around[b + 1];
-            peaks[b] = here >= around[b] && here >= around[b + 2] ? here : 0.0;
-        }
-        const double total = sum_of_row(peaks), share = total > 0 ? sum_of_row(posterior) / total : 0.0;
-        for (int b = 0; b < BINS; b++) weights[b] = peaks[b] * share;
-    }
-}
-
 /* Return the nearest whole number; halves are rounded to even. For values below 2^51. */
 PART double nearest_whole(double value) { return (value + 6755399441055744.0) - 6755399441055744.0; }
 

@@ -200,9 +200,6 @@ def _rotated(anchors: IndexArray, rotation_deg: FloatArray, views: Views) -> Ind
     """Return for each view the view of its object whose azimuth is closest to rotation_deg further on (ρ)."""
     if not len(anchors):
         return anchors
-    compiled = calls.rotated(anchors, rotation_deg, views.object_index, views.by_object, views.azimuth_deg)
-    if compiled is not None:
-        return compiled
     rows, begin = views.of_each(views.object_index[anchors])
     count = lengths(begin, len(rows))
     rotated_deg = views.azimuth_deg[rows] - np.repeat(views.azimuth_deg[anchors], count)

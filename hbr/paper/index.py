@@ -2,10 +2,9 @@
 
 from copy import copy
 from functools import cached_property
-from typing import Final, Literal, Protocol, Self, TypeVar, get_args
+from typing import Final, Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hbr.core.arrays import FloatArray, IndexArray, LevelArray
 from hbr.descriptors.cedd import BINS
@@ -14,19 +13,12 @@ from hbr.kernels import library
 from hbr.kernels.calls import ByteRows
 from hbr.model.views import Views
 
-Method = Literal["auto", "flat", "bound", "kdtree"]
-_T = TypeVar("_T", np.float32, np.float64)
+Method = Literal["flat", "kdtree"]
 
-#: Below this number of views, one product over all 144 levels is as fast as the bound.
-_SMALL: Final = 10_000
-#: Principal components in the bound: more of them need more memory traffic, fewer leave more views to compare fully.
-_COMPONENTS: Final = 15
 #: Rows that share one maximum in the search for the first candidates.
 _GROUP: Final = 64
 #: Number of searches whose results are cached; then the cache is cleared.
 _REMEMBERED: Final = 64
-#: Rows that are converted to float at once.
-_CHUNK: Final = 4_096
 
 
 class ViewIndex:
@@ -36,16 +28,13 @@ class ViewIndex:
     ----------
     views : Views
         The model set; it is not copied.
-    method : {"auto", "flat", "bound", "kdtree"}
-        ``flat`` compares with every view. ``bound`` compares a few principal components with every view: with an
-        orthonormal projection P, q·c <= Pq·Pc + |q - PᵀPq| |c - PᵀPc|, which bounds the similarity from above, and only
-        views whose bound reaches the k-th best similarity found so far are compared in full. ``kdtree`` finds the k
-        nearest views by Euclidean distance in a KD-tree, then all views in the ball that contains every view as similar
-        as those. It needs SciPy and eight times the memory of the descriptors. ``auto`` uses ``flat`` for small sets
-        and ``bound`` for others. All methods return the same result.
+    method : {"flat", "kdtree"}
+        ``flat`` compares with every view. ``kdtree``, the paper's index, finds the k nearest views by Euclidean
+        distance in a KD-tree, then all views in the ball that contains every view as similar as those. It needs eight
+        times the memory of the descriptors, and is slower. Both return the same result.
     """
 
-    def __init__(self, views: Views, method: Method = "auto") -> None:
+    def __init__(self, views: Views, method: Method = "flat") -> None:
         if method not in get_args(Method):
             raise ValueError(f"method {method!r} is unknown; use one of {', '.join(get_args(Method))}")
         if views.descriptors.shape[1] != BINS:
@@ -60,13 +49,13 @@ class ViewIndex:
         return len(self.views)
 
     @cached_property
-    def _searcher(self) -> "_Searcher":
-        return _searcher(self.views.descriptors, self._method)
+    def _searcher(self) -> "_Flat | _Tree":
+        return _Tree(self.views.descriptors) if self._method == "kdtree" else _Flat(self.views.descriptors)
 
     def extended(self, more: Views) -> "ViewIndex":
         """Return an index of these views followed by more; this index does not change.
 
-        The new index reuses what was computed for these views, except with ``kdtree`` or if their number has doubled.
+        The new index reuses what was computed for these views, except with ``kdtree``.
 
         Parameters
         ----------
@@ -76,7 +65,8 @@ class ViewIndex:
         views = Views.concatenate([self.views, more])
         grown = copy(self)
         grown.views = views
-        grown._searcher = _searcher(views.descriptors, self._method, self._searcher)
+        known = self._searcher
+        grown._searcher = _Tree(views.descriptors) if isinstance(known, _Tree) else _Flat(views.descriptors, known)
         grown._remembered = {}
         return grown
 
@@ -147,112 +137,25 @@ def check_queries(queries: LevelArray) -> None:
         raise ValueError(f"the query has a level of {queries.max()}; CEDD levels are 0..7, unpack packed bytes first")
 
 
-class _Searcher(Protocol):
-    def extended(self, descriptors: LevelArray, /) -> Self | None:
-        """Return a searcher of these rows, which start with its own; None if a new one is better."""
-
-    def top(self, query: LevelArray, k: int) -> tuple[IndexArray, FloatArray]: ...
-
-
-def _searcher(descriptors: LevelArray, method: Method, known: _Searcher | None = None) -> _Searcher:
-    if method == "auto":
-        method = "flat" if len(descriptors) < _SMALL else "bound"
-    flat = _Flat if library() is None else _Compiled
-    kinds: dict[str, type[_Compiled | _Flat | _Bound | _Tree]] = {"flat": flat, "bound": _Bound, "kdtree": _Tree}
-    kind = kinds[method]
-    return (known.extended(descriptors) if isinstance(known, kind) else None) or kind(descriptors)
-
-
-class _Compiled:
-    """The compiled kernel: compares with every view without a copy; only the squared lengths are stored."""
-
-    def __init__(self, descriptors: LevelArray, known: NDArray[np.int32] | None = None) -> None:
-        self._rows = ByteRows(descriptors, known)
-
-    def extended(self, descriptors: LevelArray, /) -> "_Compiled":
-        return _Compiled(descriptors, self._rows.squares)
-
-    def top(self, query: LevelArray, k: int) -> tuple[IndexArray, FloatArray]:
-        return self._rows.top(query, k)
-
-
 class _Flat:
-    """Products with every view. They are exact in float32 (below 144 * 49)."""
+    """Compares with every view: by the kernel, without a copy, or by products, exact in float32 (below 144 * 49)."""
 
-    def __init__(self, descriptors: LevelArray) -> None:
-        self._rows = descriptors.astype(np.float32)
-        self._squares = squares(self._rows)
-
-    def extended(self, descriptors: LevelArray, /) -> "_Flat":
-        more = _Flat(descriptors[len(self._rows) :])
-        more._rows = np.concatenate([self._rows, more._rows])
-        more._squares = np.concatenate([self._squares, more._squares])
-        return more
+    def __init__(self, descriptors: LevelArray, known: "_Flat | None" = None) -> None:
+        self._compiled = self._rows = None
+        if library() is not None:
+            known_squares = None if known is None or known._compiled is None else known._compiled.squares
+            self._compiled = ByteRows(descriptors, known_squares)
+        else:
+            self._rows = descriptors.astype(np.float32)
+            self._squares = squares(self._rows)
 
     def top(self, query: LevelArray, k: int) -> tuple[IndexArray, FloatArray]:
+        if self._compiled is not None:
+            return self._compiled.top(query, k)
+        assert self._rows is not None
         q = query.astype(np.float32)
         dots = (self._rows @ q).astype(np.float64)
         return largest(tanimoto_of_dots(dots, squares(q[None]), self._squares), k)
-
-
-class _Bound:
-    """Bounds for every view, and products only for the views that can be among the best."""
-
-    def __init__(self, descriptors: LevelArray) -> None:
-        moments = np.zeros((BINS, BINS))
-        for start in range(0, len(descriptors), _CHUNK):
-            rows = descriptors[start : start + _CHUNK].astype(np.float32)
-            moments += rows.T @ rows
-        # eigh sorts ascending: the last components contain most of the length
-        self._axes = np.ascontiguousarray(np.linalg.eigh(moments)[1][:, -_COMPONENTS:])
-        self._fitted = len(descriptors)
-        self._columns, self._squares = np.empty((_COMPONENTS + 1, 0), np.float32), np.empty(0, np.float32)
-        self._add(descriptors)
-
-    def extended(self, descriptors: LevelArray, /) -> "_Bound | None":
-        if len(descriptors) > 2 * self._fitted:
-            return None  # the axes may not fit the majority of the views any more
-        grown = copy(self)
-        grown._add(descriptors)
-        return grown
-
-    def _add(self, descriptors: LevelArray) -> None:
-        """Project the new rows; the arrays are copied, because another index may share the old ones."""
-        self._descriptors = descriptors
-        known = len(self._squares)
-        columns, lengths = self._columns, self._squares
-        self._columns = np.empty((len(columns), len(descriptors)), np.float32)
-        self._squares = np.empty(len(descriptors), np.float32)
-        self._columns[:, :known], self._squares[:known] = columns, lengths
-        for start in range(known, len(descriptors), _CHUNK):
-            chunk = slice(start, start + _CHUNK)
-            projected, self._squares[chunk] = self._project(descriptors[chunk])
-            self._columns[:, chunk] = projected.T
-
-    def _project(self, rows: LevelArray) -> tuple[FloatArray, FloatArray]:
-        """Return components and length of the residual, (n, components + 1), and squared length of each row."""
-        x = rows.astype(np.float64)
-        inside = x @ self._axes
-        residual = np.linalg.norm(x - inside @ self._axes.T, axis=1)
-        return np.column_stack([inside, residual]), squares(x)
-
-    def top(self, query: LevelArray, k: int) -> tuple[IndexArray, FloatArray]:
-        columns, own_squares = self._project(query[None])
-        own = float(own_squares[0])
-        if own == 0:
-            return np.arange(k), np.zeros(k)
-        # the error of float32 is less than (components + 3) * 2**-24 of |q| |c|, and |c| <= 84
-        dots = columns[0].astype(np.float32) @ self._columns + np.float32(1e-5 * 84 * own**0.5)
-        bounds = dots / (self._squares + np.float32(own) - dots)
-        promising = _promising(bounds, k)
-        reached = np.sort(self._similarities(query, promising))[-k]
-        rows = np.flatnonzero(bounds >= np.float32(reached * (1 - 1e-5)))
-        best, similarities = largest(self._similarities(query, rows), k)
-        return rows[best], similarities
-
-    def _similarities(self, query: LevelArray, rows: IndexArray) -> FloatArray:
-        parts = (rows[start : start + _CHUNK] for start in range(0, len(rows), _CHUNK))
-        return np.concatenate([tanimoto(query, self._descriptors[part])[0] for part in parts])
 
 
 class _Tree:
@@ -266,9 +169,6 @@ class _Tree:
 
         self._descriptors = descriptors
         self._tree = cKDTree(descriptors.astype(np.float64)) if len(descriptors) else None
-
-    def extended(self, _descriptors: LevelArray, /) -> None:
-        return None
 
     def top(self, query: LevelArray, k: int) -> tuple[IndexArray, FloatArray]:
         assert self._tree is not None
@@ -297,20 +197,8 @@ def largest(values: FloatArray, k: int) -> tuple[IndexArray, FloatArray]:
     return chosen, values[chosen]
 
 
-def _promising(values: NDArray[np.float32], k: int) -> IndexArray:
-    """Return at least `k` indices of large values."""
-    wanted = 4 * k
-    if len(values) < wanted * _GROUP:
-        return np.arange(len(values))
-    maxima = _group_maxima(values)
-    groups = np.argpartition(maxima, -wanted)[-wanted:]
-    in_group = groups + len(maxima) * np.arange(_GROUP)[:, None]
-    rows: IndexArray = in_group[values[in_group].argmax(axis=0), np.arange(wanted)]
-    return rows
-
-
-def _group_maxima(values: NDArray[_T]) -> NDArray[_T]:
+def _group_maxima(values: FloatArray) -> FloatArray:
     """Return maxima over groups of every n-th value, so that views of one object are in different groups."""
     whole = len(values) // _GROUP * _GROUP
-    maxima: NDArray[_T] = values[:whole].reshape(_GROUP, -1).max(axis=0)
+    maxima: FloatArray = values[:whole].reshape(_GROUP, -1).max(axis=0)
     return maxima

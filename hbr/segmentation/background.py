@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from hbr.core.arrays import FloatArray, ImageArray
 from hbr.core.validation import check_frame
-from hbr.kernels import images
+from hbr.kernels import calls
 
 Mask = NDArray[np.bool_]
 Floats = NDArray[np.float32]
@@ -129,15 +129,12 @@ class Illumination:
 
     def over(self, height: int, width: int) -> Floats:
         """Return the logarithms of the factors for every pixel, float32 (H, W, 3)."""
-        along, down = self.sides(height, width)
+        x, y = _places(width), _places(height)
+        along = (self.slopes[0] + x * self.slopes[1]).astype(np.float32)
+        down = (y * self.slopes[2]).astype(np.float32)
         # in long rows: NumPy adds up short ones slowly
         planes: Floats = along.reshape(1, -1) + np.tile(down, (1, width))
         return planes.reshape(height, width, 3)
-
-    def sides(self, height: int, width: int) -> tuple[Floats, Floats]:
-        """Return two parts of `over`, whose sum it is: of each column, float32 (W, 3), and of each row, (H, 3)."""
-        x, y = _places(width), _places(height)
-        return (self.slopes[0] + x * self.slopes[1]).astype(np.float32), (y * self.slopes[2]).astype(np.float32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -243,11 +240,6 @@ class Background:
 
     def _planes(self, small: ImageArray, illumination: Illumination) -> tuple[Floats, Floats, Mask, Mask, Mask]:
         """Return the planes of a `Difference`, without the grain, and where the frame agrees with this image."""
-        sides = illumination.sides(*small.shape[:2])
-        found = images.compare(small, self._grey_levels, _LOG, self._log, sides, _NOISE, _AGREES)
-        if found is not None:
-            evenly, coloured, certain, possible, agrees = found
-            return evenly, coloured, certain.view(np.bool_), possible.view(np.bool_), agrees.view(np.bool_)
         residual = cv2.split(_logarithm(small) - self._log - illumination.over(*small.shape[:2]))
         evenly = (residual[0] + residual[1] + residual[2]) * np.float32(1 / 3)
         coloured = np.asarray(_largest([cv2.absdiff(part, evenly) for part in residual]), np.float32)
@@ -306,7 +298,7 @@ def shrunk(image_bgr: ImageArray) -> ImageArray:
     scale = SIDE_PX / max(image_bgr.shape[:2])
     if scale < 1:
         size = max(1, round(image_bgr.shape[1] * scale)), max(1, round(image_bgr.shape[0] * scale))
-        by_kernel = images.shrink(image_bgr, size)
+        by_kernel = calls.shrink(image_bgr, size)
         if by_kernel is None:
             by_kernel = cv2.resize(image_bgr, size, interpolation=cv2.INTER_AREA).astype(np.uint8, copy=False)
         image_bgr = by_kernel
@@ -368,38 +360,23 @@ def _medians(rows: FloatArray) -> FloatArray:
 
 def _fit(small: ImageArray, useful: Mask, table_log: Floats) -> FloatArray:
     """Fit a plane to each channel of the difference of logarithms by least squares, repeated without the outliers."""
-    samples = images.samples(small, useful, _LOG, table_log, _plane(*useful.shape))
-    basis, values, middle = _samples(small, useful, table_log) if samples is None else samples
-    if len(basis) < 12:
-        return np.zeros((3, 3))
-    slopes = np.zeros((3, 3))
-    slopes[0] = middle
-    quarter = len(values) // 4
-    for tolerance in (0.35, 0.2, 0.12, 0.12):
-        fitted = basis @ slopes
-        inliers = images.inliers(values, fitted, basis, tolerance, quarter)
-        own, own_values = _inliers(values, fitted, basis, tolerance, quarter) if inliers is None else inliers
-        gram = own.T @ own + _RIDGE
-        slopes = np.linalg.solve(gram, own.T @ own_values).astype(np.float64, copy=False)
-    return slopes
-
-
-def _samples(small: ImageArray, useful: Mask, table_log: Floats) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return what `hbr.kernels.images.samples` returns."""
     few = np.s_[2::_EVERY, 2::_EVERY]
     keep = useful[few] & _useful(small[few])
     basis = _plane(*useful.shape)[keep]
     values = (_logarithm(small[few]) - table_log[few])[keep].astype(np.float64)
-    return basis, values, _medians(np.ascontiguousarray(values.T)) if len(values) else np.zeros(3)
-
-
-def _inliers(
-    values: FloatArray, fitted: FloatArray, basis: FloatArray, tolerance: float, quarter: int
-) -> tuple[FloatArray, FloatArray]:
-    """Return what `hbr.kernels.images.inliers` returns."""
-    away = np.maximum.reduce(np.abs(values - fitted).T)
-    inlier = np.flatnonzero(away <= max(tolerance, float(np.partition(away, quarter)[quarter])))
-    return basis.take(inlier, axis=0), values.take(inlier, axis=0)
+    if len(basis) < 12:
+        return np.zeros((3, 3))
+    slopes = np.zeros((3, 3))
+    slopes[0] = _medians(np.ascontiguousarray(values.T))
+    quarter = len(values) // 4
+    for tolerance in (0.35, 0.2, 0.12, 0.12):
+        fitted = basis @ slopes
+        away = np.maximum.reduce(np.abs(values - fitted).T)
+        inlier = np.flatnonzero(away <= max(tolerance, float(np.partition(away, quarter)[quarter])))
+        own, own_values = basis.take(inlier, axis=0), values.take(inlier, axis=0)
+        gram = own.T @ own + _RIDGE
+        slopes = np.linalg.solve(gram, own.T @ own_values).astype(np.float64, copy=False)
+    return slopes
 
 
 #: A pixel differs from the background by at least this many grey levels, and by this share of the object's contrast.

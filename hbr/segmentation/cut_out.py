@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hbr.core.arrays import ImageArray
-from hbr.kernels import images
+from hbr.kernels import calls
 from hbr.segmentation.background import Illumination, Issue, Method
 
 #: Side of the square crop around an object.
@@ -86,9 +86,6 @@ class Segmentation:
         """The crop with an even grey instead of the background, half as bright as the object, uint8 (160, 160, 3)."""
         if self.box is None:
             return self.crop
-        by_kernel = images.surround(self.crop, self.mask, _SURROUND)
-        if by_kernel is not None:
-            return by_kernel
         level = _SURROUND * float(np.mean(cv2.mean(self.crop, mask=(self.mask > 127).astype(np.uint8))[:3]))
         share = cv2.GaussianBlur(self.mask, (0, 0), 2.5)
         ground = np.full_like(self.crop, round(level))
@@ -176,7 +173,7 @@ def _square(
         part = image[max(0, y) : y + size, max(0, x) : x + size]
         if any(out):
             part = cv2.copyMakeBorder(part, out[1], out[3], out[0], out[2], border).astype(np.uint8, copy=False)
-        by_kernel = images.average(part, CROP_PX) if part.ndim == 3 else None
+        by_kernel = calls.average(part, CROP_PX) if part.ndim == 3 else None
         if by_kernel is not None:
             return by_kernel
         return cv2.resize(part, (CROP_PX, CROP_PX), interpolation=cv2.INTER_AREA).astype(np.uint8, copy=False)

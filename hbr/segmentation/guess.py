@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hbr.core.arrays import ImageArray
-from hbr.kernels.images import grab_cut, likely_parts
 from hbr.segmentation.background import Mask
 
 #: Part of the frame that an object may be in: left, top, right, bottom.
@@ -59,9 +58,6 @@ def guess_object(small: ImageArray) -> Mask | None:
 def _cut(image: ImageArray, start: Mask) -> Binary:
     height, width = start.shape
     left, top, right, bottom = (int(part * (width, height)[i % 2]) for i, part in enumerate(_WITHIN))
-    done = grab_cut(image, start, (left, top, right, bottom))
-    if done is not None:
-        return done
     labels = np.full((height, width), cv2.GC_BGD, np.uint8)
     inner = start[top:bottom, left:right]
     labels[top:bottom, left:right] = np.where(inner, cv2.GC_PR_FGD, cv2.GC_PR_BGD)
@@ -75,19 +71,9 @@ def _main_part(cut: Binary, prior: NDArray[np.float32]) -> Binary | None:
     radius = max(1, round(_BRIDGE * max(cut.shape)))
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
     opened = cv2.morphologyEx(cut, cv2.MORPH_OPEN, disc).astype(np.uint8, copy=False)
-    part = likely_parts(opened, prior, _NEAR_PX, _PART, _PART_WEIGHT)
-    if part is None:
-        part = _parts(opened, prior)
-    if not part.size:
-        return None
-    return cv2.dilate(part, np.ones((3, 3), np.uint8)).astype(np.uint8) & cut
-
-
-def _parts(opened: Binary, prior: NDArray[np.float32]) -> Binary:
-    """Return what `hbr.kernels.images.likely_parts` returns."""
     count, labels, stats, _ = cv2.connectedComponentsWithStats(opened)
     if count < 2:
-        return np.empty(0, np.uint8)
+        return None
     weight = np.bincount(labels.ravel(), prior.ravel(), count)[1:]
     x, y, w, h, area = stats[1:].T
     main = int(weight.argmax())
@@ -95,7 +81,8 @@ def _parts(opened: Binary, prior: NDArray[np.float32]) -> Binary:
     near &= (y < y[main] + h[main] + _NEAR_PX) & (y[main] < y + h + _NEAR_PX)
     keep = near & (area > _PART * area[main]) & (weight > _PART_WEIGHT * area)
     keep[main] = True
-    return np.isin(labels, 1 + np.flatnonzero(keep)).astype(np.uint8)
+    part = np.isin(labels, 1 + np.flatnonzero(keep)).astype(np.uint8)
+    return cv2.dilate(part, np.ones((3, 3), np.uint8)).astype(np.uint8) & cut
 
 
 @lru_cache

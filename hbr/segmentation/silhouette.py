@@ -7,7 +7,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hbr.kernels import images
 from hbr.segmentation.background import Mask
 
 Binary = NDArray[np.uint8]
@@ -55,9 +54,6 @@ def silhouette(certain: Mask, possible: Mask | None = None, *, framed: bool) -> 
 
 def _cleaned(mask: Binary) -> Binary:
     """Remove single pixels, and join what is separated by a few."""
-    by_kernel = images.cleaned(mask, _reach(1), _reach(3))
-    if by_kernel is not None:
-        return by_kernel
     opened = cv2.morphologyEx(mask, cv2.MORPH_OPEN, _disc(1))
     return cv2.morphologyEx(opened, cv2.MORPH_CLOSE, _disc(3)).astype(np.uint8, copy=False)
 
@@ -76,9 +72,6 @@ def _opened(mask: Binary, radius: int) -> Binary:
 
 def _main_parts(mask: Binary, *, framed: bool) -> Binary | None:
     """Return the largest part and those close to it; None if a part that touches the border is much larger."""
-    by_kernel = images.largest_parts(mask, framed, _NEAR_PX, _LEAST * mask.size, _OF_BORDER, _PART)
-    if by_kernel is not None:
-        return by_kernel if by_kernel.size else None
     count, labels, stats, _ = cv2.connectedComponentsWithStats(mask)
     if count < 2:
         return None
@@ -97,9 +90,6 @@ def _main_parts(mask: Binary, *, framed: bool) -> Binary | None:
 
 
 def _filled(mask: Binary) -> Mask:
-    by_kernel = images.filled(mask, _reach(8))
-    if by_kernel is not None:
-        return by_kernel.view(np.bool_)
     margin = 12  # so that closing does not see the frame's border as background
     height, width = mask.shape
     wide = cv2.copyMakeBorder(mask, margin, margin, margin, margin, cv2.BORDER_CONSTANT)
@@ -113,9 +103,3 @@ def _filled(mask: Binary) -> Mask:
 @lru_cache
 def _disc(radius: int) -> Binary:
     return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1)).astype(np.uint8)
-
-
-@lru_cache
-def _reach(radius: int) -> images.Disc:
-    """Return the disc in the form that the kernels need."""
-    return images.Disc(radius, (_disc(radius).sum(axis=1, dtype=np.int64) - 1) // 2)

@@ -18,16 +18,11 @@ void hbr_support(const int64_t *, const int64_t *, const int64_t *, int64_t, con
                  double, int64_t, double *, int64_t, float *);
 void hbr_pairs(const struct measure *, const uint8_t *, int64_t, const double *, const int64_t *, int64_t, int64_t,
                const int64_t *, const int64_t *, int64_t, double *);
-void hbr_peak_weights(const double *, int64_t, double *);
 void hbr_nearest_view(const int64_t *, const int64_t *, const int64_t *, const double *, const int64_t *, int64_t,
                       const double *, int64_t, int64_t *, double *);
-void hbr_rotated(const int64_t *, const double *, int64_t, const int64_t *, const int64_t *, const int64_t *,
-                 const double *, int64_t *);
 void hbr_paths(const uint8_t *, int64_t, int64_t, int64_t, const uint8_t *, int64_t, const int64_t *, const double *,
                const double *, double, const int64_t *, int64_t *, double *, int64_t *, double *, int64_t *,
                int64_t *);
-void hbr_grab_cut(const uint8_t *, int64_t, int64_t, const int64_t *, const uint8_t *, double (*)(double),
-                  double (*)(double), double *, uint8_t *, int64_t *);
 void hbr_cedd(const uint8_t *, int64_t, int64_t, int64_t, int64_t, int64_t, const void *, double *, uint8_t *);
 
 static uint64_t state = 88172645463325252ULL, sum = 1469598103934665603ULL;
@@ -76,9 +71,8 @@ static void support(void) {
 }
 
 static void next_view(void) {
-    static double posterior[10 * 72], weights[10 * 72], azimuth_deg[300], at_deg[60], away_deg[60];
+    static double azimuth_deg[300], at_deg[60], away_deg[60];
     static int64_t order[300], begin[10], count[10], places[6], rows[60];
-    for (int i = 0; i < 10 * 72; i++) posterior[i] = (double)(random_bits() % 50) * .013;
     for (int i = 0; i < 300; i++) {
         order[i] = i;
         azimuth_deg[i] = (i % 30) * 12 + (double)(random_bits() % 1000) * .01;
@@ -93,34 +87,25 @@ static void next_view(void) {
     static const int64_t second[5] = {1, 3, 2, 0, 3};
     hbr_pairs(&measure, packed, 160, squares, groups[0], 2, 4, first, second, 5, similar);
     add(similar, 10 * sizeof *similar);
-    hbr_peak_weights(posterior, 10, weights);
     hbr_nearest_view(order, begin, count, azimuth_deg, places, 6, at_deg, 10, rows, away_deg);
-    add(weights, sizeof weights);
     add(rows, sizeof rows);
     add(away_deg, sizeof away_deg);
 }
 
 static void paths(void) {
     static uint8_t levels[300 * 144];
-    static int64_t object[300], order[300], start[11], anchors[300], rows[5 * 300], begin[6], before[5 * 300];
-    static int64_t rotated[300], taken[10 * 5], objects;
-    static double azimuth_deg[300], rotation_deg[300], value[5 * 300], scores[10];
+    static int64_t object[300], rows[5 * 300], begin[6], before[5 * 300], taken[10 * 5], objects;
+    static double azimuth_deg[300], value[5 * 300], scores[10];
     static const double orientation_deg[5] = {0, 90.3, -170, 1000, 7.125};
     for (size_t i = 0; i < sizeof levels; i++) levels[i] = random_bits() % 3 ? 0 : random_bits() % 8;
     for (int i = 0; i < 300; i++) {
-        order[i] = i;
         object[i] = i / 30;
-        anchors[i] = random_bits() % 300;
         azimuth_deg[i] = (double)(random_bits() % 36000) * .01;
-        rotation_deg[i] = (double)(random_bits() % 72000) * .01 - 360;
     }
-    for (int j = 0; j <= 10; j++) start[j] = 30 * j;
     for (int q = 0; q <= 5; q++) begin[q] = 300 * q;
     for (int i = 0; i < 5 * 300; i++) rows[i] = 299 - i % 300;
-    hbr_rotated(anchors, rotation_deg, 300, object, order, start, azimuth_deg, rotated);
     hbr_paths(levels, 144, 5, 144, levels, 144, object, azimuth_deg, orientation_deg, .5, begin, rows, value, before,
               scores, taken, &objects);
-    add(rotated, sizeof rotated);
     add(scores, sizeof scores);
     add(taken, sizeof taken);
 }
@@ -151,28 +136,6 @@ static void cedd(void) {
     }
 }
 
-/* Instead of exp and log, which differ in their last bits from one C library to another. */
-static double falling(double x) { return 1 / (1 - x + x * x); }
-static double rising(double x) { return (x - 1) / (x + 1); }
-
-static void grab_cut(void) {
-    static uint8_t image[96 * 128 * 3], start[96 * 128], mask[96 * 128];
-    static double work[18 * 96 * 128];
-    static const int64_t inner[4] = {25, 11, 102, 86};
-    int64_t done;
-    for (int mode = 0; mode < 3; mode++) { /* smooth colours, noise, few colours */
-        for (int i = 0; i < 96 * 128 * 3; i++) {
-            const int x = i / 3 % 128, y = i / 384, near = (x - 64) * (x - 64) + (y - 50) * (y - 50) < 900;
-            const int smooth = x + y / 2 + (near ? 70 * (i % 3) : 0) + (int)(random_bits() % 16);
-            image[i] = (uint8_t)(mode == 0 ? (uint64_t)smooth : mode == 1 ? random_bits() >> 9 : (random_bits() % 3) * 90);
-            start[i / 3] = abs(x - 60) < 20 && abs(y - 50) < 20;
-        }
-        hbr_grab_cut(image, 96, 128, inner, start, falling, rising, work, mask, &done);
-        add(mask, sizeof mask);
-        add(&done, sizeof done);
-    }
-}
-
 int main(void) {
     similarity();
     printf("similarity %016llx\n", (unsigned long long)sum);
@@ -184,7 +147,5 @@ int main(void) {
     printf("paths %016llx\n", (unsigned long long)sum);
     next_view();
     printf("next_view %016llx\n", (unsigned long long)sum);
-    grab_cut();
-    printf("grab_cut %016llx\n", (unsigned long long)sum);
     return 0;
 }

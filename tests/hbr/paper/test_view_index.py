@@ -6,11 +6,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hbr import ViewIndex, Views, tanimoto
-from hbr.paper.index import Method, _Bound, _promising, largest
+from hbr.paper.index import Method, largest
 from tests.fuzzing import examples
 
 METHODS = get_args(Method)
-EXACT: tuple[Method, ...] = ("flat", "bound", "kdtree")
 
 
 def views_of(descriptors: np.ndarray) -> Views:
@@ -40,23 +39,10 @@ def test_equals_brute_force(seed: int, count: int, k: int) -> None:
     query = descriptors[rng.integers(count)] if rng.random() < 0.5 else adversarial(rng, 1)[0]
     similarities = tanimoto(query, descriptors)[0]
     expected = np.lexsort((np.arange(count), -similarities))[:k]
-    for method in EXACT:
+    for method in METHODS:
         rows, values = ViewIndex(views_of(descriptors), method).search(query, k)
         assert rows.tolist() == expected.tolist(), method
         assert values.tolist() == similarities[expected].tolist(), method
-
-
-def test_bound_compares_few_views_and_equals_brute_force_on_a_large_set() -> None:
-    """Sparse clustered rows, like views, above the size at which the bound is the default."""
-    rng = np.random.default_rng(5)
-    centres = rng.integers(0, 8, (400, 144)) * (rng.random((400, 144)) < 0.15)
-    rows = np.repeat(centres, 50, axis=0) + rng.integers(-1, 2, (20_000, 144)) * (rng.random((20_000, 144)) < 0.1)
-    descriptors = np.clip(rows, 0, 7).astype(np.uint8)
-    flat, bound = ViewIndex(views_of(descriptors), "flat"), ViewIndex(views_of(descriptors))
-    for query in descriptors[::1999]:
-        expected, found = flat.search(query, 10), bound.search(query, 10)
-        assert found[0].tolist() == expected[0].tolist()
-        assert found[1].tolist() == expected[1].tolist()
 
 
 @examples(6)
@@ -73,25 +59,6 @@ def test_extended_index_equals_a_new_one(seed: int, sizes: list[int], method: Me
     query = adversarial(rng, 1)[0]
     for found, expected in zip(grown.search(query, 12), whole.search(query, 12), strict=True):
         assert found.tolist() == expected.tolist()
-
-
-def test_extension_projects_only_the_new_views(monkeypatch: pytest.MonkeyPatch) -> None:
-    rows = adversarial(np.random.default_rng(0), 3000)
-    index = ViewIndex(views_of(rows[:2000]), "bound")
-    index.search(rows[0], 1)  # prepares it
-    projected = []
-    project = _Bound._project
-
-    def counted(self: _Bound, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        projected.append(len(rows))
-        return project(self, rows)
-
-    monkeypatch.setattr(_Bound, "_project", counted)
-    grown = index.extended(views_of(rows[2000:]))
-    assert projected == [1000]
-    assert index.search(rows[0], 5)[0].max() < 2000  # projects the query
-    grown.extended(views_of(rows[:1001]))  # twice the views the axes were fitted to: all again
-    assert projected[2:] == [4001]
 
 
 def test_results_are_cached_and_returned_as_copies(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -127,13 +94,6 @@ def test_best_of_equal_values_has_the_lower_index(values: list[int], k: int) -> 
     assert best.tolist() == [values[i] for i in expected]
 
 
-@given(st.integers(1, 5), st.integers(1, 2000))
-def test_promising_rows_are_distinct_and_enough(k: int, count: int) -> None:
-    values = np.random.default_rng(count).random(count, np.float32)
-    rows = _promising(values, k)
-    assert len(set(rows.tolist())) == len(rows) >= min(k, count)
-
-
 @pytest.mark.parametrize("method", METHODS)
 def test_large_k_returns_all_views_and_an_empty_index_none(method: Method) -> None:
     index = ViewIndex(views_of(np.eye(3, 144, dtype=np.uint8)), method)
@@ -143,7 +103,7 @@ def test_large_k_returns_all_views_and_an_empty_index_none(method: Method) -> No
     empty = ViewIndex(Views.empty(), method)
     rows, similarities = empty.search(np.ones(144, np.uint8), 10)
     assert len(empty) == len(rows) == len(similarities) == 0
-    with pytest.raises(ValueError, match="auto, flat, bound, kdtree"):
+    with pytest.raises(ValueError, match="flat, kdtree"):
         ViewIndex(Views.empty(), "hash")  # type: ignore[arg-type]
 
 
