@@ -21,8 +21,8 @@ from hbr.core.arrays import ImageArray
 from hbr.evaluation.changed_bench import HARD, Bench, Visit
 from hbr.segmentation import Method
 from hbr.segmentation.background import shrunk
-from hbr.segmentation.guess import guess_object
 from hbr.segmentation.network import shares
+from hbr.segmentation.silhouette import guess_object
 
 DESCRIPTORS = ("cedd", "edges+colours")
 DESCRIPTOR = "edges+colours"

@@ -182,13 +182,6 @@ def next_arc(belief: Belief, *, beta: float, rotations_deg: FloatArray, seconds:
 
     All frames on the way count: the exponents of `hbr.dense.next_view.next_best_view` are added up from the last view
     to the end of the arc, each with the weight of its frames.
-
-    Parameters
-    ----------
-    rotations_deg
-        Ends of the possible arcs, multiples of `STEP_DEG` to both sides, float64 (a,); the nearest ones included.
-    seconds
-        Time to each. It is the cost: one second costs 1.
     """
     here_deg = float(belief.orientation_deg[-1])
     apart_deg = size_deg(here_deg + rotations_deg[:, None] - belief.orientation_deg).min(axis=1)

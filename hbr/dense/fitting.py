@@ -250,11 +250,6 @@ def shifted_searches(index: DenseIndex, *, views: int, searches: int) -> Shifted
     """Search for the objects of an index in turn, each time with the same number of views.
 
     Objects with fewer views are left out. Every object is searched for under each strength before one is repeated.
-
-    Raises
-    ------
-    ValueError
-        No object has enough views.
     """
     rng = np.random.default_rng(_SEED)
     places = np.flatnonzero(index.view_counts >= max(2, views)).tolist()

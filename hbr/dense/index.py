@@ -37,13 +37,7 @@ _MOST_REMEMBERED: Final = 4096
 
 
 class Whitening:
-    """Whitening of the descriptions of a catalog; computed when it is first used.
-
-    Parameters
-    ----------
-    views : Views
-        The enrolled views.
-    """
+    """Whitening of the descriptions of a catalog; computed when it is first used."""
 
     def __init__(self, views: Views) -> None:
         self._views = views

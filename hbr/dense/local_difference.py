@@ -189,25 +189,7 @@ def compare_objects(
     *,
     max_error: float = 0.01,
 ) -> LocalDecision:
-    """Decide which of two objects the views of a search show.
-
-    Parameters
-    ----------
-    queries
-        Views of the search, at least one.
-    objects
-        Enrolled views of the first and of the second object; those within two views of the poses are enough.
-    rotations_deg
-        For each object, the angles that are added to the azimuth of a query to get that of the enrolled views; several
-        if the pose is not certain. The one that fits the views best counts.
-    max_error
-        Largest `LocalDecision.error_bound` of a decision.
-
-    Raises
-    ------
-    ValueError
-        There are no views of the search, or an object has fewer than two enrolled views.
-    """
+    """Decide which of two objects the views of a search show."""
     if not queries or min(map(len, objects)) < NEAREST:
         raise ValueError("the comparison needs a view of the search and two enrolled views of each object")
     fits = [_best_pose(queries, views, rotations) for views, rotations in zip(objects, rotations_deg, strict=True)]

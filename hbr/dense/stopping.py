@@ -175,15 +175,7 @@ class OpenSetModel:
 
     @classmethod
     def fitted(cls, known: FloatArray, correct: NDArray[np.bool_], unknown: FloatArray) -> "OpenSetModel":
-        """Fit the weights by logistic regression.
-
-        Parameters
-        ----------
-        known, unknown : float64 arrays (searches, views, 7)
-            Numbers of searches for enrolled objects, and for the same objects as if they were not enrolled.
-        correct : bool array (searches, views)
-            Whether the leading candidate of `known` is right.
-        """
+        """Fit the weights by logistic regression."""
         fits = []
         for n in range(known.shape[1]):
             numbers = np.concatenate([known[:, n], unknown[:, n]])

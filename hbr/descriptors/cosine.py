@@ -26,13 +26,6 @@ class Cosine:
     A matrix product adds up float32 in one accumulator for each result. Levels take few values, so that equal products
     are rounded in the same direction many times: over 512 columns the error is up to 5e-6. Therefore the rows are
     stored in blocks of columns, float32 (blocks, n, 64), whose products are added up separately.
-
-    Parameters
-    ----------
-    to_unit : callable
-        Returns levels as rows of unit length, float32 (n, length).
-    blocks : float32 array (blocks, n, 64)
-        The rows.
     """
 
     def __init__(self, to_unit: Callable[[LevelArray], Rows], blocks: Rows) -> None:
@@ -74,15 +67,6 @@ class WholeCosine:
 
     The products are added up in float32, in blocks of columns whose sums are below 2**24. For that, the values of a
     query are split into two parts, of 64 and of 1.
-
-    Parameters
-    ----------
-    values : int32 array (levels,)
-        Value of each level, at most 4095.
-    blocks : float32 array (blocks, n, 64)
-        Values of the rows.
-    squares : float64 array (n,)
-        Squared lengths of the rows.
     """
 
     def __init__(self, values: NDArray[np.int32], blocks: Rows, squares: FloatArray) -> None:

@@ -33,17 +33,6 @@ class Embedding(Descriptor):
 
     The model takes one image, float (1, 3, 224, 224) in R, G, B, normalised by ImageNet's mean and deviation, and
     returns one vector: the embedding before the classifier.
-
-    Parameters
-    ----------
-    path : Path
-        The model file.
-
-    Raises
-    ------
-    ValueError
-        The file is missing, is not a regular one or is too large, OpenCV cannot run the model, or it does not return
-        one vector.
     """
 
     def __init__(self, path: Path) -> None:
@@ -81,13 +70,7 @@ class Embedding(Descriptor):
 
 
 def read_model(path: Path) -> bytes:
-    """Return the content of a model file.
-
-    Raises
-    ------
-    ValueError
-        The file is missing, is not a regular one or is too large.
-    """
+    """Return the content of a model file."""
     try:
         if path.exists() and not path.is_file():  # reading a pipe waits, and a device can have no end
             raise ValueError(f"the model {path} is not a regular file; check the path")

@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 from hbr.core.arrays import ImageArray
 from hbr.segmentation.background import Background, Difference, Frame, Illumination, Issue, IssueCode, Mask, Method
 from hbr.segmentation.cut_out import Box, Found, Segmentation
-from hbr.segmentation.guess import guess_object
 from hbr.segmentation.network import shares
-from hbr.segmentation.silhouette import silhouette
+from hbr.segmentation.silhouette import guess_object, silhouette
 
 #: Probabilities above which a pixel belongs to the object: of the first segmentation, and of further ones.
 _LEVELS: Final = (0.5, 0.2, 0.8)
@@ -287,13 +286,7 @@ def mask_text(found: Mask) -> str:
 
 
 def mask_from(text: str, shape: tuple[int, int]) -> Mask:
-    """Return the silhouette of this height and width from its text.
-
-    Raises
-    ------
-    ValueError
-        The text is damaged, or the silhouette has another size.
-    """
+    """Return the silhouette of this height and width from its text."""
     pixels = shape[0] * shape[1]
     try:
         packed = zlib.decompressobj().decompress(b64decode(text, validate=True), pixels)

@@ -109,17 +109,6 @@ def _design(at_s: Floats, t: Floats, time_s: Floats, rate: Floats, integral: Flo
 class TrajectoryRecorder:
     """Collects encoder readings and gyro samples of a motion.
 
-    Parameters
-    ----------
-    resolution_deg
-        Angle of one encoder count.
-    backlash_deg
-        Largest backlash between shaft and platter.
-    scale_sigma
-        Standard uncertainty of the gyro's scale.
-    arw
-        Angle random walk of the gyro in °/√s.
-
     Attributes
     ----------
     readings

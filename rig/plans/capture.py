@@ -54,13 +54,7 @@ def announced(
 
 
 def check_camera(bench: Bench, settings: Collection[Mapping[str, Any]]) -> None:
-    """Check that the camera has one of these settings (`rig.devices.camera.CameraLocks`), which earlier views had.
-
-    Raises
-    ------
-    CameraSettingsDiffer
-        All of them are other settings, for example another gain.
-    """
+    """Check that the camera has one of these settings (`rig.devices.camera.CameraLocks`), which earlier views had."""
     now = asdict(bench.camera.read_locks())
     differing = [
         {key: value for key, value in before.items() if None not in (value, now.get(key)) and value != now[key]}
@@ -79,13 +73,7 @@ def check_camera(bench: Bench, settings: Collection[Mapping[str, Any]]) -> None:
 
 
 def check_object(bench: Bench, image_bgr: NDArray[np.uint8], empty_table: NDArray[np.uint8] | None) -> None:
-    """Check that the first view shows more than the empty table; without an empty-table image, more than one colour.
-
-    Raises
-    ------
-    NoObject
-        It shows the empty table.
-    """
+    """Check that the first view shows more than the empty table; without an empty-table image, more than one colour."""
     if is_empty_table(image_bgr, empty_table, bench.config.view):
         raise NoObject(
             "No object is on the table: nothing in the image differs from the background.",

@@ -26,16 +26,6 @@ def even_azimuths(views: int, limits_deg: tuple[float, float], sign: int = -1) -
 
     The first azimuth is 0 if the cable budget allows a revolution upwards from the table angle 0; otherwise the table
     starts further back. If the limits allow less than a revolution, only the azimuths within them are returned.
-
-    Parameters
-    ----------
-    views
-        Number of views in a whole revolution.
-    limits_deg
-        Lowest and highest table angle.
-    sign
-        Sense of the azimuth: -1 if the table rotates the object, +1 if it moves the camera around the object
-        (`TableConfig.orientation_sign`).
     """
     step_deg = 360.0 / views
     low, high = limits_deg

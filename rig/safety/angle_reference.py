@@ -217,17 +217,7 @@ def check_saved_angle(
 
 
 class TableRecord:
-    """The stored state of a table: compared with its servo, and updated.
-
-    Parameters
-    ----------
-    servo
-        Only read.
-    config
-        Direction, zero and encoder calibration of the table.
-    store
-        Store in which the state survives the process.
-    """
+    """The stored state of a table: compared with its servo, and updated."""
 
     def __init__(self, servo: Servo, config: TableConfig, store: StateStore) -> None:
         self._servo = servo

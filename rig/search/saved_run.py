@@ -62,24 +62,7 @@ _WORDS: Final = {
 
 
 class RunWriter:
-    """Stores one search while it runs: after an interruption the folder contains all events so far.
-
-    Parameters
-    ----------
-    folder
-        A new or empty folder; missing folders above it are created.
-    bench
-        The bench of the search.
-    model
-        The enrolled views.
-    config
-        The settings of the search, if they are not those of the bench.
-
-    Raises
-    ------
-    UsageError
-        The folder is not empty, or cannot be written to.
-    """
+    """Stores one search while it runs: after an interruption the folder contains all events so far."""
 
     def __init__(self, folder: Path, bench: Bench, model: Model, config: RigConfig | None = None) -> None:
         self._folder = folder
@@ -230,13 +213,7 @@ class SavedRun:
 
     @property
     def started(self) -> Started:
-        """The first event.
-
-        Raises
-        ------
-        UsageError
-            The first event has another kind.
-        """
+        """The first event."""
         first = next(self.events(), None)
         if not isinstance(first, Started):
             raise _damaged(self.folder, "events.jsonl does not begin with the event started")

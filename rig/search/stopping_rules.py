@@ -203,13 +203,7 @@ def write_stopping_rule(path: Path, rule: hbr.StoppingRule, index: hbr.DenseInde
 
 
 def read_stopping_rule(folder: Path) -> StoredRule | None:
-    """Read the stopping rule in a folder; None if there is none.
-
-    Raises
-    ------
-    CatalogError
-        The file is damaged, of another version of the program, or cannot be read.
-    """
+    """Read the stopping rule in a folder; None if there is none."""
     path = folder / FILE
     try:
         values = json_values(read(path, max_bytes=MAX_FILE_BYTES))

@@ -40,17 +40,7 @@ State = TypeVar("State", contravariant=True)
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class _AnyState:
-    """What the state of each search has.
-
-    Attributes
-    ----------
-    table_deg
-        The table angle, unwrapped.
-    config
-        The settings of a search.
-    rng
-        For strategies that draw random numbers: seeded, so that a saved run can be computed again.
-    """
+    """What the state of each search has."""
 
     table_deg: float
     config: IdentifyConfig
