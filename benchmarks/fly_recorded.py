@@ -32,7 +32,7 @@ from rig.motion.flight_views import FlightFrames
 from rig.motion.move import MotionModel, equivalent_within
 from rig.motion.turntable import Turntable
 from rig.plans.capture import capture
-from rig.search.model import DenseModel, Model, begin_search
+from rig.search.model import Model, begin_search
 from rig.search.strategies import Finish
 from rig.views.capture import Viewer
 from rig.views.description import BENCH_DESCRIPTOR, DescribedView, ViewDescriber
@@ -174,7 +174,7 @@ def main() -> None:
         objects, angles, levels = zip(*seen, strict=True)
         azimuths = config.table.orientation_sign * np.array(angles) % 360
         index = hbr.DenseIndex(hbr.Views(np.array(levels), azimuths, np.array(objects), tuple(known), BENCH_DESCRIPTOR))
-        model = DenseModel(index, hbr.fit_stopping_rule(index).rule)
+        model = Model(index, hbr.fit_stopping_rule(index).rule)
         for trial in range(given.trials // CATALOGS):
             name = str(rng.choice(unknown if trial % UNKNOWN_EVERY == UNKNOWN_EVERY - 1 else known))
             shown = changed(recorded[name], rng, given.strength) if given.strength else recorded[name]

@@ -5,12 +5,10 @@
 Decision: docs/decisions/0030.
 """
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
-from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
@@ -26,8 +24,8 @@ from rig.config import RigConfig
 from rig.core.errors import CatalogError, CatalogUnavailable, RigError, UsageError
 from rig.core.next_steps import Do
 from rig.events.events import Note, NoteCode
-from rig.search.session import SHOWN, ArcSearch, DenseSearch, EnrolledViews, HoughSearch, Search
-from rig.search.stopping_rules import FILE, stopping_rule_of, write_stopping_rule
+from rig.search.session import SHOWN, DenseSearch, EnrolledViews, HoughSearch, Search
+from rig.search.stopping_rules import FILE, stopping_rule_of
 from rig.search.strategies import AnyStrategy, descriptor_for, is_in_motion, strategy_for
 from rig.search.strategies import strategy as strategy_named
 from rig.views.description import BENCH_DESCRIPTOR
@@ -35,17 +33,18 @@ from rig.views.empty_table import empty_table_status
 
 
 @dataclass(frozen=True, eq=False)
-class Model(ABC):
-    """Enrolled views, prepared for searches: a `PaperModel` or a `DenseModel`.
+class Model:
+    """Enrolled views, prepared for searches: the paper's, or with a stopping rule the dense ones.
 
     Attributes
     ----------
     index : hbr.ViewIndex or hbr.DenseIndex
         Index for the paper's searches, or for the dense search.
     rule : hbr.StoppingRule, optional
-        The rule that ends the dense search and decides which objects are unknown; None for the paper's.
+        Ends the dense search and decides which objects are unknown; `hbr.fit_stopping_rule` makes it. None for the
+        paper's.
     notes
-        Notes for the operator about an answer by this model.
+        For the operator about an answer by this model.
     with_empty_table
         Whether most objects were enrolled with an empty-table image; None if that is not known.
     camera
@@ -78,74 +77,21 @@ class Model(ABC):
         """The descriptor of the enrolled views, and of queries."""
         return self.views.descriptor
 
-    @abstractmethod
-    def search(self, config: RigConfig, strategy: AnyStrategy, *, seed: int, top: int) -> Search:
-        """Begin a search with a strategy for this descriptor; `begin_search` checks that."""
-
-    @abstractmethod
-    def write_rule(self, path: Path, *, made_utc: str) -> None:
-        """Store the stopping rule in a file if there is one; errors as for `write_stopping_rule`."""
-
-
-@dataclass(frozen=True, eq=False)
-class PaperModel(Model):
-    """A model for the paper's searches."""
-
-    index: hbr.ViewIndex
-
-    def search(self, config: RigConfig, strategy: AnyStrategy, *, seed: int, top: int) -> Search:
-        return HoughSearch(self.index, config, strategy, seed=seed, top=top)
-
-    def write_rule(self, path: Path, *, made_utc: str) -> None:
-        """Store nothing: there is no rule."""
-
-
-@dataclass(frozen=True, eq=False)
-class DenseModel(Model):
-    """A model for the dense search; `hbr.fit_stopping_rule` makes the rule of an index."""
-
-    index: hbr.DenseIndex
-    rule: hbr.StoppingRule
-
-    def search(self, config: RigConfig, strategy: AnyStrategy, *, seed: int, top: int) -> Search:
-        if is_in_motion(strategy):
-            moving = ArcSession(self.index, self.rule, _arc_confidence(self.index, self.rule))
-            return ArcSearch(moving, self.views, config, strategy, seed=seed, top=top)
-        session = hbr.DenseSession(self.index, self.rule, max_views=config.identify.max_views)
-        return DenseSearch(session, self.views, config, strategy, seed=seed, top=top)
-
-    def write_rule(self, path: Path, *, made_utc: str) -> None:
-        write_stopping_rule(path, self.rule, self.index, made_utc=made_utc)
-
-
-@lru_cache(maxsize=4)
-def _arc_confidence(index: hbr.DenseIndex, rule: hbr.StoppingRule) -> float:
-    """Return the confidence that ends searches in motion; it is fitted once for each model."""
-    return fit_arc_confidence(index, rule)
-
 
 def model_of(views: hbr.Views, *, rule: hbr.StoppingRule | None = None) -> Model:
     """Return a model of views: for the dense search if there is a stopping rule, else for the paper's."""
-    return PaperModel(hbr.ViewIndex(views)) if rule is None else DenseModel(hbr.DenseIndex(views), rule)
+    return Model(hbr.ViewIndex(views) if rule is None else hbr.DenseIndex(views), rule)
+
+
+_arc_confidence = lru_cache(maxsize=4)(fit_arc_confidence)  # fitted once for each model
 
 
 def begin_search(
     model: Model, config: RigConfig, strategy: AnyStrategy | str | None = None, *, seed: int = 0, top: int = SHOWN
 ) -> Search:
-    """Begin a search, and return it.
+    """Begin a search by a strategy: its name or an object, by default the one that the model is for.
 
-    Parameters
-    ----------
-    model
-        What is enrolled.
-    config
-        Of the bench.
-    strategy
-        Its name, or a strategy object. The default is ``dense`` if the model is for it, else ``ahbr``.
-    seed
-        For strategies that draw random numbers.
-    top
-        The number of candidates that events name.
+    ``seed`` is for strategies that draw random numbers; events name the ``top`` candidates.
 
     Raises
     ------
@@ -166,7 +112,14 @@ def begin_search(
             next_step=f"Load it with rig.search.model.load_model(catalog, descriptor={wanted!r}), or use another "
             "strategy.",
         )
-    return model.search(config, chosen, seed=seed, top=top)
+    if isinstance(model.index, hbr.ViewIndex):
+        return HoughSearch(model.index, config, chosen, seed=seed, top=top)
+    assert model.rule is not None
+    if is_in_motion(chosen):
+        session: hbr.DenseSession = ArcSession(model.index, model.rule, _arc_confidence(model.index, model.rule))
+    else:
+        session = hbr.DenseSession(model.index, model.rule, max_views=config.identify.max_views)
+    return DenseSearch(session, model.views, config, chosen, seed=seed, top=top)
 
 
 def load_model(
@@ -177,14 +130,8 @@ def load_model(
     The stopping rule of the dense search is the one that `rig catalog fit` stored, if it is of this catalog.
     Otherwise a quick fit makes one (`rig.search.stopping_rules.stopping_rule_of`).
 
-    Parameters
-    ----------
-    catalog
-        An open one.
-    descriptor
-        Another descriptor, for a strategy of the paper.
-    progress
-        Called while the program describes views that have no description by it.
+    ``descriptor`` is another one, for a strategy of the paper. ``progress`` is called while the program describes views
+    that have no description by it.
 
     Raises
     ------
@@ -194,20 +141,18 @@ def load_model(
         The catalog cannot be read, or a view cannot be described.
     """
     views = derived.views(catalog, descriptor or BENCH_DESCRIPTOR, progress)
-    model = _loaded(catalog, views)
-    if catalog.copied_utc is None:
-        return model
-    note = Note(NoteCode.LOCAL_COPY, {"copied_utc": f"{catalog.copied_utc:%Y-%m-%d %H:%M:%S} UTC"})
-    return replace(model, notes=(note, *model.notes))
-
-
-def _loaded(catalog: Catalog, views: hbr.Views) -> Model:
+    copied = catalog.copied_utc
+    notes: tuple[Note, ...] = ()
+    if copied is not None:
+        notes = (Note(NoteCode.LOCAL_COPY, {"copied_utc": f"{copied:%Y-%m-%d %H:%M:%S} UTC"}),)
     camera = tuple(derived.camera_settings(catalog))
     if not len(views) or views.descriptor != BENCH_DESCRIPTOR:
         # without views, any search may say that the catalog is empty
-        return PaperModel(hbr.ViewIndex(views if len(views) else hbr.Views.empty()), camera=camera)
+        return Model(hbr.ViewIndex(views if len(views) else hbr.Views.empty()), notes=notes, camera=camera)
     index = hbr.DenseIndex(views)
-    rule, notes = stopping_rule_of(catalog.path, index)
+    rule, about_rule = stopping_rule_of(catalog.path, index)
+    notes += about_rule
+    # Were the objects enrolled with an empty-table image, and what does their bench look like?
     before = derived.empty_tables(catalog)
     with_image = len(before.with_image) >= len(before.without_image)
     others = before.without_image if with_image else before.with_image
@@ -219,8 +164,7 @@ def _loaded(catalog: Catalog, views: hbr.Views) -> Model:
             table = bench_image = catalog.read_image(before.newest)
         elif (view := derived.newest_view(catalog)) is not None:
             bench_image = catalog.read_image(view)
-    nearest = partial(derived.local_views, catalog)
-    return DenseModel(index, rule, notes, with_image, camera, table, bench_image, nearest)
+    return Model(index, rule, notes, with_image, camera, table, bench_image, partial(derived.local_views, catalog))
 
 
 def empty_table_for(bench: Bench, model: Model) -> tuple[NDArray[np.uint8] | None, tuple[Note, ...]]:

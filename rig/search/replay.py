@@ -21,7 +21,7 @@ from rig.events.events import (
 from rig.search.model import begin_search
 from rig.search.saved_run import SavedRun
 from rig.search.session import Search, saved_enrolled_views
-from rig.search.strategies import AnyStrategy, Rotate
+from rig.search.strategies import AnyStrategy, Finish
 from rig.views.description import SearchDescriber
 
 TOLERANCE: Final = 1e-9
@@ -131,7 +131,7 @@ def check(run: SavedRun, *, by: AnyStrategy | None = None) -> Check:
 
 def _decided(search: Search, saved: Decided) -> Decided | dict[str, Any]:
     """Return the event of the computed step; the target angle is the turntable's, not the search's."""
-    if not isinstance(search.step, Rotate):
+    if isinstance(search.step, Finish):
         return {"reason": plain(search.step.reason)}
     computed = search.decided(saved.index, saved.target_deg)
     return replace(computed, candidates=computed.candidates[: len(saved.candidates)])

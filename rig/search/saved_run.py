@@ -34,7 +34,7 @@ from rig.events.compared import Compared
 from rig.events.events import Accepted, Event, Failed, Identified, Started, event_dict, event_of
 from rig.search.model import Model, empty_table_for, model_of
 from rig.search.stopping_rules import FILE as STOPPING_RULE
-from rig.search.stopping_rules import read_stopping_rule
+from rig.search.stopping_rules import read_stopping_rule, write_stopping_rule
 from rig.views import image_files as images
 
 FORMAT: Final = "hbr-rig run"
@@ -74,7 +74,8 @@ class RunWriter:
             if len(list(folder.iterdir())) > 1:
                 raise UsageError(f"The folder {folder} is not empty.", next_step="Give a new folder for each run.")
             write(folder / "model.jsonl", "".join(_model_lines(views)).encode())
-            model.write_rule(folder / STOPPING_RULE, made_utc=started_utc)
+            if model.rule is not None and isinstance(model.index, hbr.DenseIndex):
+                write_stopping_rule(folder / STOPPING_RULE, model.rule, model.index, made_utc=started_utc)
             empty_table, _ = empty_table_for(bench, model)
             if empty_table is not None:
                 write(folder / EMPTY_TABLE, images.encode(empty_table))

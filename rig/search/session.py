@@ -11,7 +11,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from math import isfinite
-from typing import Any, ClassVar, Final
+from typing import Any, Final
 
 import cv2
 import numpy as np
@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 import hbr
 from hbr.core.angles import wrap360
 from hbr.core.arrays import IndexArray
+from hbr.dense.arc import ArcSession
 from hbr.dense.filter import pose
 from hbr.dense.local_difference import LocalView, ViewDifference
 from hbr.dense.session import UNKNOWN_BELOW, Asking, LeaderComparison, Queries, Verification
@@ -70,7 +71,7 @@ def compared_event(index: int, comparison: LeaderComparison, names: tuple[str, .
 def saved_enrolled_views(
     event: Compared, names: Sequence[str]
 ) -> Callable[[int, Sequence[float]], Sequence[LocalView]]:
-    """Return a function that returns the enrolled views of a saved comparison, by the index of the object's name."""
+    """Return what brings the enrolled views of a saved comparison, by the index of the object's name."""
 
     def views(object_index: int, _: Sequence[float]) -> list[LocalView]:
         side = event.names.index(names[object_index])
@@ -132,28 +133,18 @@ Hypotheses = Sequence[Sequence[hbr.Segmentation]]
 class Search(ABC):
     """One search for an object; `rig.search.model.begin_search` makes it.
 
-    Views can be added after its end, too: a replay adds all views of a run.
-
-    Attributes
-    ----------
-    descriptor
-        The descriptor that its queries need.
-    names
-        Names of the enrolled objects.
-    strategy
-        Chooses after each view.
-    in_motion
-        Whether the frames of a rotation are its views.
-    ranked, step
-        The candidates after the last view, and the strategy's decision.
-    is_new_decision
-        Whether the last view led to a decision; between the decisions of a search in motion the last one stays.
+    Views can be added after its end, too: a replay adds all views of a run. Queries need its ``descriptor``; ``names``
+    are those of the enrolled objects.
     """
 
-    in_motion: ClassVar[bool] = False
+    in_motion = False
+    """Whether the frames of a rotation are its views."""
     ranked: Ranked
-    step: Rotate | Finish
+    """The candidates after the last view."""
+    step: Rotate | Finish | None = None
+    """The strategy's last decision."""
     is_new_decision = True
+    """Whether the last view led to a decision; between the decisions of a search in motion the last one stays."""
 
     def __init__(self, views: hbr.Views, config: RigConfig, strategy: Strategy[Any], *, seed: int, top: int) -> None:
         self.descriptor = views.descriptor
@@ -165,21 +156,16 @@ class Search(ABC):
         self._orientations: list[float] = []
 
     def add(self, view: DescribedView, azimuth_deg: float, *, table_deg: float) -> tuple[Ranked, Rotate | Finish]:
-        """Add the next view; return the candidates, and the strategy's decision.
+        """Add the next view, described by the search's descriptor; return the candidates and the strategy's decision.
 
-        Parameters
-        ----------
-        view
-            The view by the search's descriptor.
-        azimuth_deg
-            Orientation of the camera around the object, from any zero that all views share, in [0, 360).
-        table_deg
-            The table angle, unwrapped.
+        The azimuth is the orientation of the camera around the object, from any zero that all views share, in [0, 360).
+        The table angle is unwrapped.
         """
         self._orientations.append(azimuth_deg)
         self.ranked = self._rank(view)
         if self.is_new_decision:
             self.step = self.strategy.next(self._state(table_deg))
+        assert self.step is not None
         return self.ranked, self.step
 
     @abstractmethod
@@ -207,7 +193,7 @@ class Search(ABC):
 
     def frame_used(self, number: int, azimuth_deg: float, seconds: float, rejected: int) -> FrameUsed:
         """Return the event of the last frame of a search in motion; ``number`` counts the views from 0."""
-        raise NotImplementedError("only the dense search takes frames in motion")
+        raise NotImplementedError
 
     def last_steps(self, hypotheses: Hypotheses) -> tuple[Asking[Verified | None], Asking[Compared | None]]:
         """Return the steps before the answer: a doubtful leader is verified, then the two leaders are compared."""
@@ -215,13 +201,11 @@ class Search(ABC):
 
     def verify(self, hypotheses: Hypotheses, measured: Verification | None = None) -> Asking[Verified | None]:  # noqa: ARG002
         """Verify a doubtful leader, as `hbr.DenseSession.verify`; the answer depends on it."""
-        yield from ()
-        return None
+        return _no_step()
 
     def compare(self, hypotheses: Hypotheses) -> Asking[Compared | None]:  # noqa: ARG002
         """Compare the two leaders, as `hbr.DenseSession.compare`; the answer depends on it."""
-        yield from ()
-        return None
+        return _no_step()
 
     def answer(self, *, travelled_deg: float = 0.0, seconds: float = 0.0) -> Identified:
         """Return the answer after the last view and the last steps that were taken."""
@@ -243,6 +227,10 @@ class Search(ABC):
             possible=(best.name,),
             note=end.note,
         )
+
+
+def _no_step() -> Asking[None]:
+    yield from ()
 
 
 class HoughSearch(Search):
@@ -319,7 +307,10 @@ class HoughSearch(Search):
 
 
 class DenseSearch(Search):
-    """The bench's own search: a probability for every object at every azimuth (`hbr.DenseSession`)."""
+    """The bench's own search: a probability for every object at every azimuth (`hbr.DenseSession`).
+
+    In motion (`hbr.dense.arc`), each frame has a weight for its share of new evidence.
+    """
 
     def __init__(
         self,
@@ -333,6 +324,7 @@ class DenseSearch(Search):
     ) -> None:
         super().__init__(views, config, strategy, seed=seed, top=top)
         self._session = session
+        self.in_motion = isinstance(session, ArcSession)
 
     def _rank(self, view: DescribedView) -> Ranked:
         decision = self._session.add(
@@ -368,7 +360,11 @@ class DenseSearch(Search):
         return FrameUsed(number, azimuth_deg, seconds, rejected, name, present.probability, present.outcome)
 
     def _state(self, table_deg: float) -> DenseSearchState:
-        rotations_deg, seconds = self._reachable(table_deg)
+        if self.in_motion:
+            way = float(np.sign(self.step.rotation_deg)) if isinstance(self.step, Rotate) else 0.0
+            rotations_deg, seconds = reachable_arcs(self._config, table_deg, way)
+        else:
+            rotations_deg, seconds = reachable_rotations(self._config, table_deg)
         return DenseSearchState(
             session=self._session,
             decision=self._session.decision,
@@ -378,10 +374,6 @@ class DenseSearch(Search):
             config=self._config.identify,
             rng=self._rng,
         )
-
-    def _reachable(self, table_deg: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the rotations of the camera that the cable allows, and the time of each."""
-        return reachable_rotations(self._config, table_deg)
 
     def verify(self, hypotheses: Hypotheses, measured: Verification | None = None) -> Asking[Verified | None]:
         found = yield from self._session.verify(self._queries(hypotheses), measured)
@@ -445,14 +437,3 @@ class DenseSearch(Search):
         if decision.outcome is hbr.Outcome.AMBIGUOUS:
             count += int((np.cumsum(probability[order]) < decision.min_confidence).sum())
         return tuple(self.names[j] for j in self._session.belief.index.object_index[order[:count]].tolist())
-
-
-class ArcSearch(DenseSearch):
-    """The bench's own search in motion (`hbr.dense.arc`): each frame has a weight for its share of new evidence."""
-
-    in_motion = True
-
-    def _reachable(self, table_deg: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        before = getattr(self, "step", None)  # there is no step before the first view
-        way = float(np.sign(before.rotation_deg)) if isinstance(before, Rotate) else 0.0
-        return reachable_arcs(self._config, table_deg, way)

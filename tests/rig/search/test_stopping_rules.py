@@ -18,7 +18,7 @@ from rig.core.errors import CatalogError, UsageError
 from rig.core.next_steps import Do
 from rig.events.events import NoteCode
 from rig.plans.enroll import enroll
-from rig.search.model import DenseModel, begin_search, load_model, model_of
+from rig.search.model import Model, begin_search, load_model, model_of
 from rig.search.stopping_rules import (
     FILE,
     digest,
@@ -58,7 +58,7 @@ def search_for(
 ) -> tuple[str | None, int]:
     """Search with the nearest views of ``other``; return the name that was found, and the number of views."""
     config = RigConfig.model_validate({"identify": {"max_views": max_views}})
-    search = begin_search(DenseModel(index, rule), config)
+    search = begin_search(Model(index, rule), config)
     here_deg, taken = 0.0, 0
     while True:
         nearest = np.abs((other.azimuth_deg - here_deg + 180) % 360 - 180).argmin()
@@ -263,7 +263,7 @@ class Around:
 
 def test_custom_strategy_decides_on_the_dense_search():
     index = shelf(12, 12, 12)
-    model = DenseModel(index, hbr.fit_stopping_rule(index).rule)
+    model = Model(index, hbr.fit_stopping_rule(index).rule)
     search = begin_search(model, RigConfig(), Around())
     assert search.strategy.name == "around"
     for number in range(3):
@@ -276,7 +276,7 @@ def test_custom_strategy_decides_on_the_dense_search():
 def test_strategy_that_does_not_fit_the_model_is_rejected():
     index = shelf(8, 8)
     dense, papers = (
-        DenseModel(index, hbr.fit_stopping_rule(index).rule),
+        Model(index, hbr.fit_stopping_rule(index).rule),
         model_of(hbr.Views.of_object("a", *_cedd())),
     )
     for model, name in ((dense, "ahbr"), (papers, "dense"), (papers, Around())):
@@ -296,7 +296,7 @@ def _cedd() -> tuple[np.ndarray, np.ndarray]:
 def test_search_ends_if_the_cable_allows_no_rotation():
     index = shelf(8, 8, 8)
     config = RigConfig.model_validate({"table": {"mode": "pan", "limits_deg": [-1, 1]}})
-    search = begin_search(DenseModel(index, hbr.fit_stopping_rule(index).rule), config)
+    search = begin_search(Model(index, hbr.fit_stopping_rule(index).rule), config)
     unknown = views_of("unknown", 8, seed=5)
     _, step = search.add(seen(unknown.descriptors[0]), 0.0, table_deg=0.0)
     assert step == Finish(hbr.StopReason.NO_ROTATION_LEFT)
