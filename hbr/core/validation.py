@@ -11,10 +11,7 @@ MIN_SIDE_PX: Final = 16
 def check_image(image: object) -> None:
     """Check that an image is a uint8 array of shape (H, W, 3) and not empty.
 
-    Raises
-    ------
-    TypeError, ValueError
-        The image has another type or shape. The message names them, and the next step.
+    Raises `TypeError`, `ValueError`: the image has another type or shape. The message names them, and the next step.
     """
     if not isinstance(image, np.ndarray):
         raise TypeError(
@@ -35,10 +32,7 @@ def check_image(image: object) -> None:
 def check_frame(image: object) -> None:
     """Check an image like `check_image`, and that it is large enough for a segmentation.
 
-    Raises
-    ------
-    TypeError, ValueError
-        As `check_image`, or a side is shorter than 16 pixels.
+    Raises `TypeError`, `ValueError`: as `check_image`, or a side is shorter than 16 pixels.
     """
     check_image(image)
     assert isinstance(image, np.ndarray)

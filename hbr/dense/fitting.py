@@ -342,10 +342,7 @@ def conformal_threshold(scores: ArrayLike, false_reject: float) -> float:
 
     Source: V. Vovk, A. Gammerman and G. Shafer, "Algorithmic Learning in a Random World", Springer 2005.
 
-    Raises
-    ------
-    ValueError
-        The share is not between 0 and 1, or a score is not finite.
+    Raises `ValueError`: the share is not between 0 and 1, or a score is not finite.
     """
     ordered = np.sort(np.asarray(scores, np.float64).ravel())
     if not 0 < false_reject < 1:

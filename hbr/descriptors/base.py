@@ -171,19 +171,13 @@ class Descriptor(Protocol):
     def prepared(self, rows: LevelArray, /) -> Comparison:
         """Prepare rows, uint8 (m, length), for comparison with many queries.
 
-        Raises
-        ------
-        TypeError, ValueError
-            The rows are no levels of this descriptor.
+        Raises `TypeError`, `ValueError`: the rows are no levels of this descriptor.
         """
 
     def opened(self, packed: LevelArray, /) -> Comparison:
         """Prepare packed rows, uint8 (m, size_bytes), for comparison with many queries.
 
-        Raises
-        ------
-        ValueError
-            The rows have another size.
+        Raises `ValueError`: the rows have another size.
         """
         return self.prepared(self.unpack_rows(packed.tobytes()))
 
@@ -195,10 +189,7 @@ class Descriptor(Protocol):
         float64 array (n, m)
             0..1; 1 for equal rows that are not empty, to 1e-6.
 
-        Raises
-        ------
-        ValueError
-            The rows are not of this descriptor's length.
+        Raises `ValueError`: the rows are not of this descriptor's length.
         """
         self.check_rows(a)
         return self.prepared(b).similarity(a)
@@ -217,10 +208,7 @@ class Descriptor(Protocol):
     def pack_rows(self, rows: LevelArray) -> LevelArray:
         """Return the packed levels of many views, (n, length), as rows of bytes, uint8 (n, size_bytes).
 
-        Raises
-        ------
-        ValueError
-            A level is too large.
+        Raises `ValueError`: a level is too large.
         """
         self.check_levels(rows)
         return rows
@@ -251,10 +239,7 @@ class Descriptor(Protocol):
     def packed_rows(self, packed: bytes) -> LevelArray:
         """Return packed views as rows of bytes, uint8 (n, size_bytes).
 
-        Raises
-        ------
-        ValueError
-            The number of bytes is not a multiple of `size_bytes`.
+        Raises `ValueError`: the number of bytes is not a multiple of `size_bytes`.
         """
         if len(packed) % self.size_bytes:
             raise ValueError(f"{len(packed)} bytes are no multiple of {self.size_bytes}, check how they were stored")
@@ -263,10 +248,7 @@ class Descriptor(Protocol):
     def check_rows(self, *rows: LevelArray) -> None:
         """Check the type and the length of arrays (..., length) of levels.
 
-        Raises
-        ------
-        TypeError, ValueError
-            An array is not of uint8, or its last axis has another length.
+        Raises `TypeError`, `ValueError`: an array is not of uint8, or its last axis has another length.
         """
         for levels in rows:
             if levels.dtype != np.uint8:
@@ -279,10 +261,7 @@ class Descriptor(Protocol):
     def check_levels(self, rows: LevelArray) -> None:
         """Check that no level is above `max_level`.
 
-        Raises
-        ------
-        ValueError
-            A level is above it, often because the descriptors are still packed.
+        Raises `ValueError`: a level is above it, often because the descriptors are still packed.
         """
         if rows.size and rows.max() > self.max_level:
             raise ValueError(

@@ -86,10 +86,7 @@ def read_model(path: Path) -> bytes:
 def opened(path: Path, content: bytes) -> cv2.dnn.Net:
     """Return the network of an ONNX file after a first run.
 
-    Raises
-    ------
-    ValueError
-        OpenCV cannot run it.
+    Raises `ValueError`: openCV cannot run it.
     """
     try:
         net = cv2.dnn.readNetFromONNX(np.frombuffer(content, np.uint8))

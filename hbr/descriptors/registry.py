@@ -149,10 +149,7 @@ def descriptor(name: str) -> Descriptor:
 def register(added: Descriptor) -> None:
     """Make a descriptor known by its name in this process.
 
-    Raises
-    ------
-    ValueError
-        The name belongs to another descriptor, or to networks.
+    Raises `ValueError`: the name belongs to another descriptor, or to networks.
     """
     if added.name.startswith(PREFIX) or _KNOWN.setdefault(added.name, added) != added:
         raise ValueError(f"the name {added.name!r} is taken; choose another one")
@@ -161,10 +158,7 @@ def register(added: Descriptor) -> None:
 def load_descriptor(given: str) -> Descriptor:
     """Return the descriptor that the user names: ``onnx:FILE`` loads a model, other names are those of `descriptor`.
 
-    Raises
-    ------
-    ValueError
-        The name is unknown, or the model file cannot be used.
+    Raises `ValueError`: the name is unknown, or the model file cannot be used.
     """
     if given.startswith(PREFIX) and not MODEL_NAME.fullmatch(given):
         return load_model(Path(given.removeprefix(PREFIX)))

@@ -37,10 +37,7 @@ class LearnedBackground:
     def add(self, image_bgr: ImageArray, small: ImageArray | None = None) -> None:
         """Add a view, uint8 (H, W, 3); ``small`` is what `shrunk` returns for it, if that is known.
 
-        Raises
-        ------
-        ValueError
-            The view has another size than the others.
+        Raises `ValueError`: the view has another size than the others.
         """
         height, width = image_bgr.shape[:2]
         if self._shape is not None and self._shape != (height, width):
@@ -147,10 +144,7 @@ class ViewsTogether:
         If many views are not revised, the object is guessed only in the first one. If the image is not stored, `revise`
         does not change the view's segmentations, and a long search needs less memory.
 
-        Raises
-        ------
-        TypeError, ValueError
-            As for `hbr.segment`, or the view has another size than the others.
+        Raises `TypeError`, `ValueError`: as for `hbr.segment`, or the view has another size than the others.
         """
         self.learn(image_bgr)
         if revise:

@@ -92,10 +92,7 @@ class Views:
     def concatenate(cls, parts: Sequence["Views"]) -> "Views":
         """Return all views of the parts in their order; objects of the same name are merged.
 
-        Raises
-        ------
-        ValueError
-            The parts have different descriptors.
+        Raises `ValueError`: the parts have different descriptors.
         """
         kinds = dict.fromkeys(part.descriptor for part in parts) or {"cedd": None}
         if len(kinds) > 1:

@@ -453,10 +453,7 @@ def _smooth(corners: list[tuple[slice, slice]], away: cv2.typing.MatLike, noise:
 class Frame:
     """A frame, uint8 (H, W, 3), and its small image.
 
-    Raises
-    ------
-    TypeError, ValueError
-        The array is no such image.
+    Raises `TypeError`, `ValueError`: the array is no such image.
     """
 
     def __init__(self, image_bgr: ImageArray) -> None:

@@ -262,10 +262,7 @@ def stored_segmentation(
     evidence
         As it is stored with the view (`evidence_together` or `Segmentation.evidence`).
 
-    Raises
-    ------
-    TypeError, ValueError
-        As for `hbr.segment`, or the evidence is damaged.
+    Raises `TypeError`, `ValueError`: as for `hbr.segment`, or the evidence is damaged.
     """
     if evidence is None or TOGETHER not in evidence:
         return segment(image_bgr, empty_table=empty_table)

@@ -153,10 +153,8 @@ class Arrival:
     def rest_deg(self, state: ServoState, angle_deg: float) -> float | None:
         """Return the table's angle at rest; None if it is not at rest yet, by this reading of the servo.
 
-        Raises
-        ------
-        MotionTimeout, DeviceFault
-            The time is over: the table has not arrived, it shakes, or the gyro fails.
+        Raises `MotionTimeout`, `DeviceFault`: the time is over: the table has not arrived, it shakes, or the gyro
+        fails.
         """
         readings = self._readings
         arrived = not state.moving and abs(angle_deg - self.goal_deg) <= self.config.tolerance_deg

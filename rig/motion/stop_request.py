@@ -39,14 +39,9 @@ class StopReport:
 def stop(name: str, config: RigConfig, clock: Clock, *, seed: int | None = None) -> StopReport:
     """Stop the table of the bench ``name`` and switch its torque off, even if another program moves it.
 
-    Raises
-    ------
-    BenchBusy
-        The program that uses the bench does not react.
-    DeviceNotFound, DeviceMismatch, DeviceSilent
-        The servo cannot be reached, or does not answer the program that uses the bench.
-    TorqueStaysOn
-        The servo does not switch its torque off; the fault is latched.
+    Raises `BenchBusy`: the program that uses the bench does not react. `DeviceNotFound`, `DeviceMismatch`,
+    `DeviceSilent`: the servo cannot be reached, or does not answer the program that uses the bench. `TorqueStaysOn`:
+    the servo does not switch its torque off; the fault is latched.
     """
     path = config.state_path(name)
     server = holder(path / SERVER_FOLDER)

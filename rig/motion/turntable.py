@@ -190,20 +190,13 @@ class Turntable(AbstractContextManager["Turntable"]):
     def goto(self, target_deg: float) -> Move:
         """Rotate to ``target_deg`` (table, unwrapped) and return when the table is at rest there.
 
-        Raises
-        ------
-        LimitExceeded
-            The target is outside the cable budget; nothing moved.
-        Stalled, Overloaded, FollowingError, NoProgress, Overheated, SupplyOutOfRange, RotationDisagreement
-            See `rig.safety.motion_checks`; the table was stopped, and the fault is latched.
-        MotionTimeout, DeviceFault
-            It did not come to rest within the computed time, or the servo reported a hardware error; latched as well.
-        WatchdogTripped, SupplyLost, DeviceSilent
-            The computer was too slow, or the servo lost its supply or its cable; its own watchdog stops it.
-        MotionStopped
-            The operator requested a stop.
-        FaultLatched, NotReady
-            An earlier motion was interrupted.
+        Raises `LimitExceeded`: the target is outside the cable budget; nothing moved. `Stalled`, `Overloaded`,
+        `FollowingError`, `NoProgress`, `Overheated`, `SupplyOutOfRange`, `RotationDisagreement`: see
+        `rig.safety.motion_checks`; the table was stopped, and the fault is latched. `MotionTimeout`, `DeviceFault`: it
+        did not come to rest within the computed time, or the servo reported a hardware error; latched as well.
+        `WatchdogTripped`, `SupplyLost`, `DeviceSilent`: the computer was too slow, or the servo lost its supply or its
+        cable; its own watchdog stops it. `MotionStopped`: the operator requested a stop. `FaultLatched`, `NotReady`: an
+        earlier motion was interrupted.
         """
         self.check_target(target_deg)
         waypoints = self._waypoints(target_deg)

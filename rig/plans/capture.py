@@ -43,10 +43,7 @@ def announced(
 
     No event is yielded if ``asked_deg`` is the same angle, because the long way was asked for.
 
-    Raises
-    ------
-    LimitExceeded, MotionTimeout, DeviceFault, DeviceSilent
-        See `Turntable.goto`.
+    Raises `LimitExceeded`, `MotionTimeout`, `DeviceFault`, `DeviceSilent`: see `Turntable.goto`.
     """
     if target_deg != asked_deg and (rotations := table.unwound_revolutions(target_deg)):
         yield Unwinding(index, table.rest_deg, target_deg, rotations, table.limits_deg)
@@ -102,10 +99,7 @@ def accepted(index: int, azimuth_deg: float, attempt: Attempt, described: Descri
 def capture(index: int, viewer: Viewer, table: Turntable, settled_ns: int) -> Generator[Event, None, Attempt]:
     """Yield an event for each rejected frame and return the accepted frame.
 
-    Raises
-    ------
-    ViewRejected
-        All frames were rejected. The evidence is that of the last one.
+    Raises `ViewRejected`: all frames were rejected. The evidence is that of the last one.
     """
     attempts = viewer.attempts(settled_ns, table.check_still, table.collect_gyro)
     for attempt in attempts:

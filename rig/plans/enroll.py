@@ -78,16 +78,10 @@ class EnrollmentViews:
     def take(self, angles_deg: Mapping[int, float], *, in_motion: bool) -> Generator[Event, None, None]:
         """Take and store the views at these table angles; check that the object was not moved; return to 0.
 
-        Raises
-        ------
-        LimitExceeded
-            The cable budget does not allow a revolution.
-        NoObject
-            The table is empty.
-        RotationDisagreement
-            Encoder and gyro disagree: no view is stored at an uncertain angle, and none of a revolution.
-        ObjectMoved
-            The object was moved between any two views, so all views of this session are abandoned.
+        Raises `LimitExceeded`: the cable budget does not allow a revolution. `NoObject`: the table is empty.
+        `RotationDisagreement`: encoder and gyro disagree: no view is stored at an uncertain angle, and none of a
+        revolution. `ObjectMoved`: the object was moved between any two views, so all views of this session are
+        abandoned.
         """
         left = dict(angles_deg)
         if in_motion:

@@ -43,10 +43,7 @@ def table_angles(azimuth_deg: Sequence[float], limits_deg: tuple[float, float], 
 
     The table always rotates upwards, so that the backlash stays on one side.
 
-    Raises
-    ------
-    LimitExceeded
-        The cable budget does not allow this number of views in one direction.
+    Raises `LimitExceeded`: the cable budget does not allow this number of views in one direction.
     """
     if not azimuth_deg:
         return ()
@@ -129,12 +126,7 @@ def dry_run(
     views, resume, replace, fly
         As for `enroll`.
 
-    Raises
-    ------
-    UsageError
-        A name cannot be used.
-    LimitExceeded
-        The cable budget does not allow the missing views.
+    Raises `UsageError`: a name cannot be used. `LimitExceeded`: the cable budget does not allow the missing views.
     """
     known = {} if catalog is None else {summary.name: summary for summary in catalog.known_objects()}
     table_deg = Turntable(bench).angle_deg()

@@ -37,12 +37,8 @@ def jog(bench: Bench, keys: Iterable[JogKey | None], *, step_deg: float = 5.0) -
     step_deg
         The first step.
 
-    Raises
-    ------
-    UsageError
-        The step is not positive.
-    FaultLatched, Unreferenced, MotionStopped, Stalled, MotionTimeout, DeviceFault, DeviceSilent
-        See `Turntable.goto`.
+    Raises `UsageError`: the step is not positive. `FaultLatched`, `Unreferenced`, `MotionStopped`, `Stalled`,
+    `MotionTimeout`, `DeviceFault`, `DeviceSilent`: see `Turntable.goto`.
     """
     if not 0 < step_deg <= 360:
         raise UsageError(f"A step of {step_deg:g}° is not possible.", next_step="Give a step above 0° and up to 360°.")

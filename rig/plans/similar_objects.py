@@ -13,10 +13,7 @@ SHOWN = 3
 def similar_objects(views: Views, name: str) -> SimilarObjects:
     """Measure how similar an enrolled object is to itself from other sides, and to the other objects.
 
-    Raises
-    ------
-    ObjectNotFound
-        The object has no views.
+    Raises `ObjectNotFound`: the object has no views.
     """
     if name not in views.object_names:
         raise ObjectNotFound(

@@ -50,10 +50,7 @@ class TrayItem:
 def read_tray(path: Path) -> tuple[TrayItem, ...]:
     """Read a list of objects: CSV in UTF-8 with a header line, separated by commas or semicolons.
 
-    Raises
-    ------
-    UsageError
-        The file cannot be read, or it has mistakes; the evidence lists all of them with their lines.
+    Raises `UsageError`: the file cannot be read, or it has mistakes; the evidence lists all of them with their lines.
     """
     step = "Choose a CSV file."
     with os_errors_as(UsageError, f"The list {path} cannot be read.", next_step=step):

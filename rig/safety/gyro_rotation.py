@@ -119,10 +119,7 @@ def compare(
     The encoder is on the shaft and does not measure the gears' backlash: a difference of up to ``backlash_deg`` plus
     ``k`` standard deviations agrees.
 
-    Raises
-    ------
-    UsageError
-        The gyro's rotation is not valid.
+    Raises `UsageError`: the gyro's rotation is not valid.
     """
     if not gyro.valid:
         raise UsageError(
@@ -192,14 +189,9 @@ class GyroRotationMeter:
         A slow and steady rotation looks like a bias, so the caller must know from the encoder that the table stands
         still. A rotation that was begun and not ended (its move was interrupted) is dropped.
 
-        Raises
-        ------
-        NotReady
-            The table moves or shakes. The bias in use stays as it was, and the rest begins again.
-        DeviceSilent
-            The sensor delivers too few samples.
-        UsageError
-            ``duration_s`` is not above 0, or above half of `MEMORY_S`.
+        Raises `NotReady`: the table moves or shakes. The bias in use stays as it was, and the rest begins again.
+        `DeviceSilent`: the sensor delivers too few samples. `UsageError`: ``duration_s`` is not above 0, or above half
+        of `MEMORY_S`.
         """
         if not 0 < duration_s <= MEMORY_S / 2:
             raise UsageError(
@@ -228,10 +220,7 @@ class GyroRotationMeter:
     def begin(self) -> None:
         """Start to measure a rotation, before the table moves.
 
-        Raises
-        ------
-        NotReady
-            The bias is not known yet.
+        Raises `NotReady`: the bias is not known yet.
         """
         if self.bias is None:
             raise NotReady("The gyro's bias is not known.", next_step="Measure it at rest first.")
@@ -253,10 +242,7 @@ class GyroRotationMeter:
     def end(self) -> Rotation:
         """Return the rotation since the last `end` (or first `rest`); the table stands still again.
 
-        Raises
-        ------
-        NotReady
-            No rotation was begun.
+        Raises `NotReady`: no rotation was begun.
         """
         if not self._moving or self.bias is None:
             raise NotReady("No rotation was begun.", next_step="Call `begin` before the move.")
@@ -275,10 +261,7 @@ class GyroRotationMeter:
     def since_rest(self, until_ns: int | None = None) -> Rotation:
         """Return the rotation since the last `end`, from the samples collected so far (those until ``until_ns``).
 
-        Raises
-        ------
-        NotReady
-            The bias is not known yet.
+        Raises `NotReady`: the bias is not known yet.
         """
         if self.bias is None:
             raise NotReady("The gyro's bias is not known.", next_step="Measure it at rest first.")

@@ -141,10 +141,8 @@ class MotionMonitor:
         lag_deg
             Angle by which the table is behind the servo's profile; None if that is not known.
 
-        Raises
-        ------
-        DeviceFault, Overheated, SupplyOutOfRange, Stalled, Overloaded, FollowingError, NoProgress
-            The motion must be stopped.
+        Raises `DeviceFault`, `Overheated`, `SupplyOutOfRange`, `Stalled`, `Overloaded`, `FollowingError`, `NoProgress`:
+        the motion must be stopped.
         """
         config = self._config
         self._check_servo(state)

@@ -428,12 +428,8 @@ LOCK_ATTEMPTS = 3
 class BenchLock:
     """Reserves a bench for this process until it is closed; the kernel releases it when the process dies.
 
-    Raises
-    ------
-    BenchBusy
-        Another process uses the bench; the message says which.
-    StateNotStored
-        The folder cannot be created.
+    Raises `BenchBusy`: another process uses the bench; the message says which. `StateNotStored`: the folder cannot be
+    created.
     """
 
     def __init__(self, path: Path, clock: Clock) -> None:

@@ -131,10 +131,7 @@ def listen(folder: Path) -> StopListener:
 
     A server and the bench that it opens share one listener.
 
-    Raises
-    ------
-    StateNotStored
-        The socket cannot be made in the folder.
+    Raises `StateNotStored`: the socket cannot be made in the folder.
     """
     folder = folder.absolute()
     with _registry_lock:

@@ -201,10 +201,7 @@ class Safety:
     def connect(self) -> TableState:
         """Read the condition of the servo, and check the table's angle; nothing moves.
 
-        Raises
-        ------
-        DeviceSilent
-            The servo does not answer.
+        Raises `DeviceSilent`: the servo does not answer.
         """
         self._store.listen()
         condition = self._servo.read_condition()
@@ -223,18 +220,10 @@ class Safety:
     def prepare(self) -> None:
         """Make sure that the table may move now; call it before the torque is switched on.
 
-        Raises
-        ------
-        FaultLatched
-            A fault waits to be acknowledged.
-        Unreferenced
-            It is not known how far the cable is wound up.
-        DeviceFault, Overheated, SupplyOutOfRange
-            The servo must not work in its condition; the fault is latched.
-        MotionStopped
-            The operator requested a stop.
-        DeviceMismatch, DeviceSilent
-            After a lost connection, another servo answers, or none.
+        Raises `FaultLatched`: a fault waits to be acknowledged. `Unreferenced`: it is not known how far the cable is
+        wound up. `DeviceFault`, `Overheated`, `SupplyOutOfRange`: the servo must not work in its condition; the fault
+        is latched. `MotionStopped`: the operator requested a stop. `DeviceMismatch`, `DeviceSilent`: after a lost
+        connection, another servo answers, or none.
         """
         if self._store.stop_requested():
             self._store.clear_stop()
@@ -276,14 +265,9 @@ class Safety:
         stop. The state is then STOPPED or DISCONNECTED, or a FAULT is latched. The path is on the disk before anything
         moves.
 
-        Raises
-        ------
-        NotReady
-            The table may not move in this state.
-        MotionStopped
-            The operator requested a stop before this motion, for example while the plan paused; nothing moved.
-        StateNotStored
-            The path cannot be stored; nothing moved.
+        Raises `NotReady`: the table may not move in this state. `MotionStopped`: the operator requested a stop before
+        this motion, for example while the plan paused; nothing moved. `StateNotStored`: the path cannot be stored;
+        nothing moved.
         """
         self.require_ready()
         self.check_stop_request()
@@ -383,10 +367,8 @@ class Safety:
         TableState
             READY, or UNREFERENCED if the table's angle is uncertain.
 
-        Raises
-        ------
-        DeviceFault, Overheated, SupplyOutOfRange, DeviceMismatch, DeviceSilent
-            The cause is still there; the fault stays.
+        Raises `DeviceFault`, `Overheated`, `SupplyOutOfRange`, `DeviceMismatch`, `DeviceSilent`: the cause is still
+        there; the fault stays.
         """
         for restore in self.restore_actions:
             restore()
@@ -412,12 +394,8 @@ class Safety:
     def set_angle(self, table_deg: float) -> None:
         """Set the table's present angle to ``table_deg``, after the operator looked at the cable.
 
-        Raises
-        ------
-        NotReady
-            The servo is not connected, or a fault is latched.
-        UsageError
-            The angle is beyond the table's limits; nothing is stored.
+        Raises `NotReady`: the servo is not connected, or a fault is latched. `UsageError`: the angle is beyond the
+        table's limits; nothing is stored.
         """
         if self._record.beyond_limits(table_deg):
             raise UsageError(
@@ -433,13 +411,8 @@ class Safety:
     def set_revolutions(self, revolutions: int) -> None:
         """Set the number of revolutions by which the cable is wound up, as the operator sees it; home does not change.
 
-        Raises
-        ------
-        NotReady
-            As in `set_angle`; or a gear hides the table's angle within its revolution from the servo; or the settings
-            of the table were changed.
-        UsageError
-            As in `set_angle`.
+        Raises `NotReady`: as in `set_angle`; or a gear hides the table's angle within its revolution from the servo; or
+        the settings of the table were changed. `UsageError`: as in `set_angle`.
         """
         if self.doubt and self.doubt.finding is AngleFinding.SETTINGS_CHANGED:
             raise self._not_ready()

@@ -93,12 +93,7 @@ def begin_search(
 
     ``seed`` is for strategies that draw random numbers; events name the ``top`` candidates.
 
-    Raises
-    ------
-    CatalogError
-        Nothing is enrolled.
-    UsageError
-        There is no such strategy, or the model is not for it.
+    Raises `CatalogError`: nothing is enrolled. `UsageError`: there is no such strategy, or the model is not for it.
     """
     chosen = strategy_for(model.descriptor) if strategy is None else strategy
     if isinstance(chosen, str):

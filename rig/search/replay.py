@@ -73,10 +73,7 @@ def check(run: SavedRun, *, by: AnyStrategy | None = None) -> Check:
     by
         The strategy, if its name is not known to this program.
 
-    Raises
-    ------
-    UsageError
-        The run cannot be read, or its strategy is not known.
+    Raises `UsageError`: the run cannot be read, or its strategy is not known.
     """
     started = run.started
     found = Check(is_complete=run.error is not None and not run.is_cut)

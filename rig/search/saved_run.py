@@ -107,10 +107,7 @@ class RunWriter:
     def add(self, event: Event) -> None:
         """Store the next event; a frame is in the folder before its event.
 
-        Raises
-        ------
-        UsageError
-            The disk is full or fails.
+        Raises `UsageError`: the disk is full or fails.
         """
         with _writing(self._folder):
             for name, image in _images_of(event):
@@ -184,10 +181,7 @@ class SavedRun:
     def events(self) -> Iterator[Event]:
         """Yield the events in their order, frames included.
 
-        Raises
-        ------
-        UsageError
-            An event is not known to this program, or a frame is missing.
+        Raises `UsageError`: an event is not known to this program, or a frame is missing.
         """
         for number, line in enumerate(self._lines, 1):
             try:
@@ -202,10 +196,7 @@ class SavedRun:
 
         Values with the right types may still not fit together, for example an empty list of candidates.
 
-        Raises
-        ------
-        UsageError
-            The values do not fit together.
+        Raises `UsageError`: the values do not fit together.
         """
         try:
             yield
@@ -243,11 +234,8 @@ class SavedRun:
 def load_run(folder: Path) -> SavedRun:
     """Read a saved run; a last event that was cut off while it was written is left out.
 
-    Raises
-    ------
-    UsageError
-        The folder contains no run, a damaged run, or one of another version of the program; or the run needs a model
-        that is not loaded (`hbr.descriptors.load_model`).
+    Raises `UsageError`: the folder contains no run, a damaged run, or one of another version of the program; or the run
+    needs a model that is not loaded (`hbr.descriptors.load_model`).
     """
     try:
         about = _object(_bytes(folder, "run.json"), "run.json")

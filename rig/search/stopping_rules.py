@@ -190,10 +190,7 @@ def stopping_rule_values(rule: hbr.StoppingRule, index: hbr.DenseIndex, *, made_
 def write_stopping_rule(path: Path, rule: hbr.StoppingRule, index: hbr.DenseIndex, *, made_utc: str) -> None:
     """Store a stopping rule in a file, whole or not at all.
 
-    Raises
-    ------
-    CatalogError
-        The disk is full, or the folder may not be written to.
+    Raises `CatalogError`: the disk is full, or the folder may not be written to.
     """
     values = stopping_rule_values(rule, index, made_utc=made_utc)
     text = json.dumps(values, ensure_ascii=False, indent=1, allow_nan=False)

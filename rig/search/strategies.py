@@ -315,10 +315,7 @@ BUILT_IN: Final = {strategy.name: strategy for strategy in _OWN}
 def strategy(name: str) -> AnyStrategy:
     """Return the strategy of that name.
 
-    Raises
-    ------
-    UsageError
-        There is none.
+    Raises `UsageError`: there is none.
     """
     if name in BUILT_IN:
         return BUILT_IN[name]
