@@ -415,55 +415,29 @@ def pack(levels: LevelArray) -> bytes:
         raise ValueError(
             f"the levels span {levels.min()}..{levels.max()}, not 0..7; pass a descriptor, not a histogram"
         )
-    return pack_rows(levels.astype(np.uint8)[None]).tobytes()
-
-
-def pack_rows(levels: LevelArray) -> LevelArray:
-    """Return packed descriptors, uint8 (n, 54), of levels 0..7, uint8 (n, 144)."""
-    bits = np.unpackbits(levels.reshape(len(levels), BINS, 1), axis=2)[:, :, -BITS:]
-    return np.packbits(bits.reshape(len(levels), BITS * BINS), axis=1)
+    return _CEDD.pack(levels.astype(np.uint8))
 
 
 def unpack(packed: bytes) -> LevelArray:
-    """Return the levels of one packed descriptor; the inverse of `pack`.
-
-    Returns
-    -------
-    uint8 array (144,)
-        Levels 0..7.
+    """Return the levels of one packed descriptor, uint8 (144,); the inverse of `pack`.
 
     Raises
     ------
     ValueError
         There are not exactly 54 bytes.
     """
-    if len(packed) != PACKED_BYTES:
-        raise ValueError(f"{len(packed)} bytes; a packed descriptor has {PACKED_BYTES}, check how it was stored")
-    levels: LevelArray = unpack_rows(packed)[0]
-    return levels
+    return _CEDD.unpack(packed)
 
 
 def unpack_rows(packed: bytes) -> LevelArray:
-    """Return the levels of many packed descriptors, joined.
-
-    Returns
-    -------
-    uint8 array (n, 144)
-        Levels 0..7.
+    """Return the levels of many packed descriptors, joined, uint8 (n, 144).
 
     Raises
     ------
     ValueError
         The number of bytes is not a multiple of 54.
     """
-    if len(packed) % PACKED_BYTES:
-        raise ValueError(f"{len(packed)} bytes are no multiple of {PACKED_BYTES}, check how they were stored")
-    threes = np.frombuffer(packed, np.uint8).reshape(-1, BINS // 8, BITS).astype(np.uint32)  # 3 bytes are 8 levels
-    bits = threes[..., 0] << 16 | threes[..., 1] << 8 | threes[..., 2]
-    levels = np.empty((*bits.shape, 8), np.uint8)
-    for place in range(8):
-        levels[..., place] = bits >> (21 - BITS * place) & 7
-    return levels.reshape(-1, BINS)
+    return _CEDD.unpack_rows(packed)
 
 
 #: Blocks of CEDD's grid along each side of an image.
@@ -505,15 +479,21 @@ class Cedd(Descriptor):
     def similarity(self, a: LevelArray, b: LevelArray) -> FloatArray:
         return tanimoto(a, b)
 
-    def pack(self, levels: LevelArray) -> bytes:
-        return pack(levels)
-
     def pack_rows(self, rows: LevelArray) -> LevelArray:
         self.check_levels(rows)
-        return pack_rows(rows)
+        bits = np.unpackbits(rows.reshape(len(rows), BINS, 1), axis=2)[:, :, -BITS:]
+        return np.packbits(bits.reshape(len(rows), BITS * BINS), axis=1)
 
     def unpack_rows(self, packed: bytes) -> LevelArray:
-        return unpack_rows(packed)
+        threes = self.packed_rows(packed).reshape(-1, BINS // 8, BITS).astype(np.uint32)  # 3 bytes are 8 levels
+        bits = threes[..., 0] << 16 | threes[..., 1] << 8 | threes[..., 2]
+        levels = np.empty((*bits.shape, 8), np.uint8)
+        for place in range(8):
+            levels[..., place] = bits >> (21 - BITS * place) & 7
+        return levels.reshape(-1, BINS)
+
+
+_CEDD: Final = Cedd()
 
 
 class _Tanimoto:

@@ -1,5 +1,7 @@
 """The objects that an enrolled object can be confused with."""
 
+from dataclasses import asdict
+
 from hbr.model import symmetry
 from hbr.model.views import Views
 from rig.core.errors import ObjectNotFound
@@ -30,11 +32,7 @@ def similar_objects(views: Views, name: str) -> SimilarObjects:
         objects=tuple(
             SimilarObject(
                 name=views.object_names[one.object_index],
-                arcs_deg=one.arcs_deg,
-                differs_deg=one.differs_deg,
-                other_differs_deg=one.other_differs_deg,
-                share=one.share,
-                similarity=one.similarity,
+                **{key: value for key, value in asdict(one).items() if key != "object_index"},
             )
             for one in symmetry.similar_objects(views, number, SHOWN)
         ),

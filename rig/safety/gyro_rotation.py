@@ -222,17 +222,20 @@ class GyroRotationMeter:
 
         Raises `NotReady`: the bias is not known yet.
         """
-        if self.bias is None:
-            raise NotReady("The gyro's bias is not known.", next_step="Measure it at rest first.")
+        self._known_bias()
         self._drain()
         self._moving = True
 
     @property
     def bias_of_table(self) -> tuple[float, float]:
         """The bias about the table's axis and its standard uncertainty in °/s, in the unit of `taps`."""
+        bias = self._known_bias()
+        return self._to_table * bias.rate_dps, abs(self._to_table) * bias.sigma_dps
+
+    def _known_bias(self) -> Bias:
         if self.bias is None:
             raise NotReady("The gyro's bias is not known.", next_step="Measure it at rest first.")
-        return self._to_table * self.bias.rate_dps, abs(self._to_table) * self.bias.sigma_dps
+        return self.bias
 
     def update(self, *, now: bool = False) -> None:
         """Collect the sensor's new samples, unless it was done very recently and ``now`` is false."""
@@ -263,8 +266,7 @@ class GyroRotationMeter:
 
         Raises `NotReady`: the bias is not known yet.
         """
-        if self.bias is None:
-            raise NotReady("The gyro's bias is not known.", next_step="Measure it at rest first.")
+        bias = self._known_bias()
         count, sum_dps = self._count, self._sum_dps
         if until_ns is not None:
             # The memory also has samples from before the rest, which are not in the sum.
@@ -272,8 +274,8 @@ class GyroRotationMeter:
             later = self._rate_dps[first:]
             count, sum_dps = count - later.size, sum_dps - float(later.sum())
         duration_s = count / self._imu.rate_hz
-        angle_deg = self._to_table * (sum_dps / self._imu.rate_hz - self.bias.rate_dps * duration_s)
-        drift_deg = abs(self._to_table) * hypot(self.arw * sqrt(duration_s), self.bias.sigma_dps * duration_s)
+        angle_deg = self._to_table * (sum_dps / self._imu.rate_hz - bias.rate_dps * duration_s)
+        drift_deg = abs(self._to_table) * hypot(self.arw * sqrt(duration_s), bias.sigma_dps * duration_s)
         sigma_deg = hypot(drift_deg, self._scale_sigma * angle_deg)
         return Rotation(angle_deg, sigma_deg, duration_s, self._issue, self._issue_limit)
 

@@ -93,21 +93,6 @@ TRANSITIONS: Mapping[TableState, Mapping[StateEvent, TableState]] = MappingProxy
 )
 
 
-class StateMachine:
-    """The state of one table."""
-
-    def __init__(self, *, faulty: bool) -> None:
-        self.state = TableState.FAULT if faulty else TableState.DISCONNECTED
-
-    def accepts(self, event: StateEvent) -> bool:
-        """Return whether ``event`` is possible in this state."""
-        return event in TRANSITIONS[self.state]
-
-    def apply(self, event: StateEvent) -> None:
-        """Change the state by ``event``; raises KeyError if the event is not possible in this state."""
-        self.state = TRANSITIONS[self.state][event]
-
-
 _CHECK_CABLE: Final[NextSteps] = (
     "Look at the cable. If it hangs free,",
     Do.SET_REVOLUTIONS(revolutions=0),
@@ -156,7 +141,7 @@ class Safety:
         self._clock = clock
         self._store: StateStore = store or MemoryStore()
         self._record = TableRecord(servo, config.table, self._store)
-        self._machine = StateMachine(faulty=self._record.fault is not None)
+        self._state = TableState.DISCONNECTED if self._record.fault is None else TableState.FAULT
         self.acknowledge_checks: list[Callable[[], object]] = []
         """Called before a fault is acknowledged; each raises a `RigError` if its device has a problem."""
         self.monitors: list[Callable[[], object]] = []
@@ -170,7 +155,7 @@ class Safety:
 
     @property
     def state(self) -> TableState:
-        return self._machine.state
+        return self._state
 
     @property
     def angle_reference(self) -> AngleReference:
@@ -403,7 +388,7 @@ class Safety:
                 f"{angle_range(self._config.table.limits_deg)}.",
                 next_step=("Check the revolutions that you gave.", *_SET_HOME),
             )
-        if not self._machine.accepts(StateEvent.REFER):
+        if StateEvent.REFER not in TRANSITIONS[self._state]:
             raise self._not_ready()
         self._record.set_angle(table_deg)
         self._apply(StateEvent.REFER)
@@ -445,9 +430,9 @@ class Safety:
         return symptom
 
     def _apply(self, event: StateEvent) -> None:
-        if not self._machine.accepts(event):
+        if event not in TRANSITIONS[self._state]:
             raise self._not_ready()
-        self._machine.apply(event)
+        self._state = TRANSITIONS[self._state][event]
 
     def _check_angle(self) -> None:
         """Check the table's angle and change the state accordingly; a fault stays."""

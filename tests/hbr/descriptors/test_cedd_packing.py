@@ -44,7 +44,7 @@ def test_invalid_descriptors_are_rejected(levels: np.ndarray, error: type[Except
 
 @pytest.mark.parametrize("count", [0, 53, 55])
 def test_wrong_number_of_bytes_is_rejected(count: int) -> None:
-    with pytest.raises(ValueError, match=f"{count} bytes; a packed descriptor has 54"):
+    with pytest.raises(ValueError, match=f"{count} bytes; cedd has 54"):
         unpack(bytes(count))
     with pytest.raises(ValueError, match="109 bytes are no multiple of 54"):
         unpack_rows(bytes(109))
