@@ -43,7 +43,7 @@ def test_enrolled_object_is_shown(rig):
     assert max(map(len, shown.stdout.splitlines())) < 200
     assert "simulated camera" in shown.stdout
     assert "placement_mm" not in shown.stdout
-    assert "placement_mm" in rig("catalog", "show", "mug-dots", "--full").stdout
+    assert "placement_mm" in rig("catalog", "show", "mug-dots", "--json").stdout
     assert Path("catalog/images").is_dir()
 
 

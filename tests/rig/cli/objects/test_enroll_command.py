@@ -44,7 +44,7 @@ def test_training_set_is_exported_and_imported(rig, tmp_path):
     assert rig(*words).exit_code == 7
     imported = json.loads(rig("import", target, "--json", "--set", f"catalog.path={tmp_path / 'new'}").stdout)
     assert (imported["objects"], imported["views"], imported["rejected"]) == (1, 6, [])
-    for wrong in (["--split", "colour"], ["--fractions", "a,b"], ["--fractions", "0.1,0.1"]):
+    for wrong in (["--split", "colour"], ["--fractions", "a,b"], ["--fractions", "0,0"]):
         assert rig("export", f"{target}-2", "--format", "yolo", *wrong).exit_code == 2
 
 

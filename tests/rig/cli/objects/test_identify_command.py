@@ -46,7 +46,7 @@ def test_identification_is_recorded_corrected_and_exported(rig, tmp_path):
     assert "label read" in rig("results", "show", "1").stdout
     assert "dice *" in rig("results", "list", "--sample", "S-1").stdout
     assert rig("results", "list", "--sample", "S-2").stdout == "No results match.\n"
-    log = rig("log", "--object", "dice").stdout
+    log = rig("log").stdout
     assert "identified" in log
     assert "result corrected" in log
     assert rig("results", "export", str(tmp_path / "a.csv"), "--object", "dice").exit_code == 0
