@@ -26,7 +26,7 @@ REPOSITORY_PAGES = {
     "README.md": "index.md",
     "CHANGELOG.md": "changelog.md",
     "CONTRIBUTING.md": "contributing.md",
-    "SECURITY.md": "security.md",
+    "SECURITY.md": "explanation/security.md",
     "examples/README.md": "how-to/examples.md",
     "firmware/README.md": "how-to/rig-head.md",
     "firmware/PROTOCOL.md": "reference/head-protocol.md",
@@ -39,7 +39,7 @@ CODES = {
     "StopReason": "reasons-of-ends",
     "NoteCode": "codes-of-notes",
 }
-"""Headings of `docs/events.md` over the meanings of codes, by the type of the codes."""
+"""Headings of `docs/reference/events.md` over the meanings of codes, by the type of the codes."""
 
 NOTE = "*This page is generated from the code.*\n\n"
 
@@ -225,7 +225,7 @@ def exit_codes_page() -> str:
 
 
 def events_page() -> str:
-    """Return `docs/events.md` with a table of each event, and of each part of events, from their JSON schema."""
+    """Return `docs/reference/events.md` with a table of each event and of each of its parts, from their JSON schema."""
     from pydantic import TypeAdapter
 
     from rig.events.events import DESCRIBED, JsonEvent
@@ -235,7 +235,7 @@ def events_page() -> str:
     events = [objects.pop(_definition(one["$ref"])) for one in schema["oneOf"]]
     kinds = {one["properties"]["event"]["const"]: one for one in events}
     parts = {_snake_case(name): found for name, found in objects.items()}
-    text = (ROOT / "docs" / "events.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs" / "reference" / "events.md").read_text(encoding="utf-8")
     for found, level, before in ((kinds, "##", "## Parts\n"), (parts, "###", "## Codes\n")):
         headings = {f"{level} {name}": one for name, one in found.items()}
         tables = [
@@ -365,7 +365,7 @@ def with_site_links(markdown: str, page: str) -> tuple[str, set[str]]:
     markdown
         The text of the page.
     page
-        Its path in the repository, such as ``docs/searching.md``.
+        Its path in the repository, such as ``docs/explanation/searching.md``.
 
     Returns
     -------
@@ -445,7 +445,7 @@ def on_page_markdown(markdown: str, page: Any, **_others: Any) -> str:
     """Put what is generated into the pages of `docs`, and rewrite the links that lead out of it."""
     if page.file.generated_by:
         return markdown
-    if page.file.src_uri == "events.md":
+    if page.file.src_uri == "reference/events.md":
         markdown = events_page()
     shown = with_site_links(markdown, f"docs/{page.file.src_uri}")[0]
     for source, site in REPOSITORY_PAGES.items():

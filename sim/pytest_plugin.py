@@ -1,6 +1,7 @@
 """Fixtures for the tests of programs that use the rig: a simulated bench, its world, and a catalog.
 
-Installed with the package; nothing heavy is imported until a test asks for a fixture. See docs/testing.md.
+Installed with the package; nothing heavy is imported until a test asks for a fixture.
+Guide: docs/how-to/test-without-hardware.md.
 """
 
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""The commands, outputs and files that the README shows are those of the program."""
+"""The commands, outputs and files that the README and the first guides show are those of the program."""
 
 import re
 from pathlib import Path
@@ -12,6 +12,10 @@ from tests.programs import Program
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
+GUIDES = {
+    name: (ROOT / "docs" / "how-to" / f"{name}.md").read_text(encoding="utf-8")
+    for name in ("install", "enroll-and-identify", "troubleshoot", "call-the-rig", "first-light")
+}
 COMMANDS = (
     "enroll mug-white --bench sim --views 12",
     "enroll mug-star --bench sim --views 12",
@@ -22,8 +26,8 @@ LEFT_OUT = re.compile(
 )
 
 
-def blocks(language: str) -> list[str]:
-    return re.findall(rf"```{language}\n(.*?)```", README, re.DOTALL)
+def blocks(language: str, page: str = README) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", page, re.DOTALL)
 
 
 def own_folders(folder: Path, patch: pytest.MonkeyPatch) -> None:
@@ -62,7 +66,8 @@ def test_library_example_finds_the_object(tmp_path):
 
 
 def test_every_command_and_option_exists():
-    shown = re.findall(r"^ {4}rig ([^#\n]+)|`rig ([^`\n]+)`|^\$ rig ([^\n]+)", README, re.MULTILINE)
+    pages = "\n".join([README, *GUIDES.values()])
+    shown = re.findall(r"^ {4}rig ([^#\n]+)|`rig ([^`\n]+)`|^\$ rig ([^\n]+)", pages, re.MULTILINE)
     assert len(shown) >= 20
     helps: dict[tuple[str, ...], str] = {}
     for found in shown:
@@ -78,9 +83,9 @@ def test_every_command_and_option_exists():
 
 
 def test_tables_list_the_common_options_and_the_exit_codes():
-    options = re.findall(r"^\| `(--[a-z-]+)", README, re.MULTILINE)
+    options = re.findall(r"^\| `(--[a-z-]+)", GUIDES["call-the-rig"], re.MULTILINE)
     assert sorted(options) == sorted(["--bench", "--config", "--set", "--seed", "--json", "--no-color"])
-    codes = re.findall(r"^\| ([\d, ]+) \|", README, re.MULTILINE)
+    codes = re.findall(r"^\| ([\d, ]+) \|", GUIDES["call-the-rig"], re.MULTILINE)
     assert set(EXIT_CODES) <= {int(code) for cell in codes for code in cell.split(",")}
 
 
@@ -92,15 +97,15 @@ def test_every_linked_file_exists():
 def test_toml_example_is_a_valid_configuration(tmp_path):
     from rig.config import load_config
 
-    (toml,) = blocks("toml")
-    (tmp_path / "rig.toml").write_text(re.sub(r"(?m)^   ", "", toml), encoding="utf-8")
+    (toml,) = blocks("toml", GUIDES["first-light"])
+    (tmp_path / "rig.toml").write_text(toml, encoding="utf-8")
     assert load_config(tmp_path / "rig.toml").servo.port == "/dev/ttyUSB0"
 
 
 def test_sample_tray_can_be_read(tmp_path):
     from rig.plans.tray import read_tray
 
-    (tray,) = blocks("csv")
+    (tray,) = blocks("csv", GUIDES["enroll-and-identify"])
     (tmp_path / "tray.csv").write_text(tray, encoding="utf-8")
     assert [item.name for item in read_tray(tmp_path / "tray.csv")] == ["lamp", "toy-car", "dice"]
 
@@ -114,7 +119,7 @@ def test_folders_of_the_data_are_those_of_the_configuration(monkeypatch):
     monkeypatch.setattr(platformdirs, "user_state_dir", lambda app: f"~/.local/state/{app}")
     config = RigConfig()
     for path in (config.catalog_path("BENCH"), config.calibration_path("BENCH"), config.state_path("BENCH")):
-        assert f"`{path}/`" in README
+        assert f"`{path}/`" in GUIDES["install"]
 
 
 if __name__ == "__main__":

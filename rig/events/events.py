@@ -22,7 +22,7 @@ from rig.motion.scan_speed import SpeedLimit
 from rig.views.capture import ViewEvidence
 
 SCHEMA = 1
-"""Version of the JSON form (docs/events.md): it rises when a field is removed or changes its meaning."""
+"""Version of the JSON form (docs/reference/events.md): it rises when a field is removed or changes its meaning."""
 
 
 class NoteCode(StrEnum):

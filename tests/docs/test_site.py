@@ -75,8 +75,8 @@ def test_links_between_pages_exist():
 
 
 def test_page_of_events_has_its_tables_on_the_site():
-    page = SimpleNamespace(file=SimpleNamespace(generated_by=None, src_uri="events.md"))
-    text = generate.on_page_markdown((DOCS / "events.md").read_text(encoding="utf-8"), page)
+    page = SimpleNamespace(file=SimpleNamespace(generated_by=None, src_uri="reference/events.md"))
+    text = generate.on_page_markdown((DOCS / "reference/events.md").read_text(encoding="utf-8"), page)
     for heading in ("## started", "## frame_used", "### view_evidence", "### stop_decision", "## Codes"):
         assert text.count(f"\n{heading}\n") == 1
     assert "| `rotation_imu_deg` | number or null | The same rotation by the gyro; null" in text
@@ -84,7 +84,7 @@ def test_page_of_events_has_its_tables_on_the_site():
 
 def test_links_out_of_docs_are_rewritten_for_the_site():
     text, copied = generate.with_site_links(
-        "[a](../README.md#use) [b](../examples/tray.csv) [c](../tests)", "docs/style.md"
+        "[a](../README.md#use) [b](../examples/tray.csv) [c](../tests)", "docs/results.md"
     )
     assert text == "[a](index.md#use) [b](files/examples/tray.csv) c"
     assert copied == {"examples/tray.csv"}
@@ -121,7 +121,7 @@ def test_architecture_picture_shows_every_room():
 
 
 def test_commands_of_the_attacks_select_tests():
-    commands = re.findall(r"`(tests/[^`]+)`", (DOCS / "security.md").read_text(encoding="utf-8"))
+    commands = re.findall(r"`(tests/[^`]+)`", (DOCS / "explanation/security.md").read_text(encoding="utf-8"))
     assert len(commands) > 30
     for command in commands:
         words = shlex.split(command)

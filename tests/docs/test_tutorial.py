@@ -1,4 +1,4 @@
-"""docs/tutorial.md: every command runs and ends as the page says."""
+"""docs/tutorial/first-search.md: every command runs and ends as the page says."""
 
 import re
 import shlex
@@ -14,7 +14,7 @@ EXIT_CODES = {"identify --set bench.sim.object=camera": 8, "goto 90": 5}
 
 @pytest.mark.parametrize("whole_frames", [False, pytest.param(True, marks=pytest.mark.nightly)])
 def test_commands_of_the_tutorial_end_as_it_says(tmp_path, monkeypatch, whole_frames):
-    page = (DOCS / "tutorial.md").read_text(encoding="utf-8")
+    page = (DOCS / "tutorial/first-search.md").read_text(encoding="utf-8")
     (toml,) = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
     small = "[camera]\nwidth = 320\nheight = 240\n[view]\nroi = [40, 0, 240, 240]\n"  # takes less computing
     (tmp_path / "rig.toml").write_text(toml + ("" if whole_frames else small), encoding="utf-8")

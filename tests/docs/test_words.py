@@ -1,4 +1,4 @@
-"""One term for each concept: no file uses a term that docs/glossary.md replaces, nor translated English."""
+"""One term for each concept: no file uses a term that docs/reference/glossary.md replaces, nor translated English."""
 
 import ast
 import re
@@ -82,8 +82,8 @@ NAMES = {
 }
 """Expressions that find the names in files of other languages, by suffix."""
 EXCEPTIONS: dict[str, tuple[str, ...]] = {
-    "docs/glossary.md": RETIRED,  # it lists them
-    "docs/style.md": (r"anew", r"anyhow"),  # examples of what not to write
+    "docs/reference/glossary.md": RETIRED,  # it lists them
+    "docs/reference/style.md": (r"anew", r"anyhow"),  # examples of what not to write
     "tests/docs/test_words.py": RETIRED,
     "hbr/evaluation/unknown_objects.py": (r"strangers?",),  # the name of a random stream: another draws other objects
     "tests/rig/catalog/test_upkeep.py": (r"somebody|nobody|anybody",),  # a user of the operating system
@@ -186,4 +186,4 @@ def test_names_are_found_in_files_of_other_languages(suffix, content, names):
 
 def test_no_retired_term_is_used():
     found = retired_terms()
-    assert not found, "\n".join([f"{len(found)} retired terms; docs/glossary.md has the ones to use:", *found])
+    assert not found, "\n".join([f"{len(found)} retired terms; use those of docs/reference/glossary.md:", *found])

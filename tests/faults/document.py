@@ -1,4 +1,4 @@
-"""Write `docs/faults.md` from measurements; a test compares the page with new measurements.
+"""Write `docs/reference/faults.md` from measurements; a test compares the page with new measurements.
 
     python tests/faults/document.py [FAULT ...]
 
@@ -15,7 +15,7 @@ from sim.faults import fault_kinds
 from tests.faults.fault_runs import LATE, SHORT, VIEWS, Outcome, answer, enrollment, identification, new_rig
 from tests.faults.scenarios import SCENARIOS, Scenario
 
-PAGE = Path(__file__).parents[2] / "docs" / "faults.md"
+PAGE = Path(__file__).parents[2] / "docs" / "reference" / "faults.md"
 SLACK_S = 0.1
 """Measured times are rounded up to a multiple of this; the test allows once more of it."""
 COLUMNS = (

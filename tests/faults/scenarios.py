@@ -1,6 +1,6 @@
 """The expected outcome of an enrollment and of an identification under each simulated fault.
 
-``found`` and ``then`` are texts of `docs/faults.md`; its other columns are measured.
+``found`` and ``then`` are texts of `docs/reference/faults.md`; its other columns are measured.
 """
 
 from dataclasses import dataclass

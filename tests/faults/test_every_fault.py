@@ -35,7 +35,7 @@ from tests.faults.scenarios import BOOT_S, FOUND, SCENARIOS, After, Scenario, St
 
 TOLERANCE_DEG = 0.5
 """Half the backlash, the encoder's noise, and a slip smaller than the gyro's error over 5°."""
-UPDATE = "docs/faults.md is out of date: check the difference, then run python tests/faults/document.py"
+UPDATE = "docs/reference/faults.md is out of date: check the difference, then run python tests/faults/document.py"
 RESUMED_VIEWS = 1
 LATE_MOVE = 20
 KINDS_OF_RECOVERY = {(one.step, one.after, one.late, one.torque): name for name, one in reversed(SCENARIOS.items())}

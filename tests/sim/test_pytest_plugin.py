@@ -8,7 +8,7 @@ from pathlib import Path
 
 from tests.programs import Program
 
-DOCUMENT = Path(__file__).parents[2] / "docs" / "testing.md"
+DOCUMENT = Path(__file__).parents[2] / "docs" / "how-to" / "test-without-hardware.md"
 
 
 def project(folder: Path, code: str) -> list[str]:

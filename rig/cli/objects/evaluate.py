@@ -48,7 +48,7 @@ def evaluate(
     descriptor: Annotated[
         str,
         typer.Option(
-            metavar="NAME", help="Descriptor of the views: cedd, edges+colours, ...; see docs/descriptors.md."
+            metavar="NAME", help="Descriptor of the views: cedd, edges+colours; see docs/explanation/descriptors.md"
         ),
     ] = "cedd",
     perturb: Annotated[

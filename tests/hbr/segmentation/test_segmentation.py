@@ -240,7 +240,7 @@ def test_bench_descriptor_is_robust_to_illumination_and_background() -> None:
 
 
 def test_code_of_the_descriptors_page_runs(monkeypatch: pytest.MonkeyPatch) -> None:
-    text = (Path(__file__).parents[3] / "docs/descriptors.md").read_text(encoding="utf-8")
+    text = (Path(__file__).parents[3] / "docs/explanation/descriptors.md").read_text(encoding="utf-8")
     empty = table(0)
     monkeypatch.setattr(cv2, "imread", lambda _path: empty)
     parts = []
