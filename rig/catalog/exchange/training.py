@@ -6,7 +6,7 @@ Decision: docs/decisions/0038.
 """
 
 import json
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import lru_cache, partial
@@ -38,8 +38,6 @@ from rig.views.description import BENCH_DESCRIPTOR, ViewDescriber, within
 from rig.views.image_files import IMAGE_FOLDER
 
 PARTS: Final = ("train", "val", "test")
-Intrinsics = Callable[[Session], Mapping[str, float] | None]
-"""Returns the calibrated camera of a session: fx, fy, cx, cy in pixels, k1, k2, p1, p2; None if it is not known."""
 
 
 class Split(StrEnum):
@@ -97,9 +95,8 @@ def write_training(
     form: Annotations,
     *,
     split: Split | None = None,
-    fractions: Sequence[float] = (0.8, 0.1, 0.1),
+    fractions: Sequence[float] = (8, 1, 1),
     seed: int = 0,
-    intrinsics: Intrinsics = lambda _: None,
     jobs: Jobs | None = None,
 ) -> Generator[JobProgress, None, TrainingExport]:
     """Write the views that searches use as a training set into a new folder, all or nothing.
@@ -157,7 +154,7 @@ def write_training(
         parts = _divided(annotated, split, np.asarray(fractions) / sum(fractions), np.random.default_rng(seed))
         items = [item for item, *_ in objects]
         if form is Annotations.COCO:
-            _write_coco(made, items, parts, intrinsics)
+            _write_coco(made, items, parts)
         else:
             _write_yolo(made, items, parts)
     without = sum(mask.box is None for mask in masks.values())
@@ -238,7 +235,7 @@ def _outline(mask: NDArray[np.bool_]) -> list[list[int]]:
 # Files
 
 
-def _write_coco(folder: Path, items: Sequence[Item], parts: _Parts, intrinsics: Intrinsics) -> None:
+def _write_coco(folder: Path, items: Sequence[Item], parts: _Parts) -> None:
     about = {
         "info": {
             "description": "Views of objects on a turntable. The masks were computed from the images. If no object was "
@@ -261,7 +258,6 @@ def _write_coco(folder: Path, items: Sequence[Item], parts: _Parts, intrinsics: 
                 "height": mask.height,
                 "date_captured": picture.view.captured_utc and picture.view.captured_utc.isoformat(),
                 "azimuth_deg": picture.view.azimuth_deg,
-                "intrinsics": intrinsics(picture.session),
             }
             for picture, mask in own
         ]

@@ -11,7 +11,7 @@ from rig.cli.ui.options import YesOption
 from rig.cli.ui.prompts import confirm
 from rig.cli.ui.settings import Settings
 from rig.core.errors import UsageError
-from rig.core.phrases import counted, number
+from rig.core.phrases import angle_words, counted
 
 if TYPE_CHECKING:
     from rig.catalog import ObjectDetails
@@ -141,9 +141,7 @@ def _print_object(details: "ObjectDetails", described: "Described") -> None:
         )
         for session in enrollment.sessions:
             by = session.provenance
-            devices = [f"{part} {_model(identity)}" for part, identity in by.devices.items()]
-            source = ", ".join([f"bench {by.bench}", f"software {by.software}", *devices])
-            print(f"  {session.started_utc:%Y-%m-%d %H:%M} UTC: {source}")
+            print(f"  {session.started_utc:%Y-%m-%d %H:%M} UTC: bench {by.bench or '–'}, software {by.software}")
     if details.views:
         if words := SegmentationSummary.of(described.segmentation).text:
             print(words)
@@ -151,23 +149,13 @@ def _print_object(details: "ObjectDetails", described: "Described") -> None:
             (
                 str(view.index),
                 f"{view.azimuth_deg:.2f}°",
-                *(f"{_number(angle, 2)}°" for angle in (view.encoder_deg, view.imu_deg)),
-                _number(view.evidence.get("sharpness"), 1),
+                *("–" if angle is None else angle_words(angle, 2) for angle in (view.encoder_deg, view.imu_deg)),
+                f"{view.evidence.get('sharpness', float('nan')):.1f}",
             )
             for view in details.views
         ]
         titles = ("view", "azimuth", "encoder", "IMU", "sharpness")
         print_table(titles, rows, right=titles)
-
-
-def _number(value: Any, digits: int) -> str:
-    return number(value, f".{digits}f") if isinstance(value, int | float) else "–"
-
-
-def _model(identity: Any) -> Any:
-    """Return the short name of a device."""
-    named = identity if isinstance(identity, dict) else {}
-    return next((named[key] for key in ("model", "device", "name") if named.get(key)), identity)
 
 
 @app.command("rename")

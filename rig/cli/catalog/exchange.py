@@ -3,7 +3,6 @@
 import sys
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
-from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, Literal
 
@@ -20,34 +19,20 @@ from rig.core.next_steps import Do
 from rig.core.phrases import counted
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Iterator
 
-    from rig.catalog import Session
-    from rig.catalog.transfer import CatalogSource, Source
+    from rig.catalog.transfer import Source
 
 SHOWN: Final = 20
 """Number of rejected files and of objects that are listed. With --json all of them are."""
 
 
-class Format(StrEnum):
-    """Format of an export."""
-
-    BUNDLE = "bundle"
-    FOLDER = "folder"
-    CSV = "csv"
-    JSON = "json"
-    PARQUET = "parquet"
-    HTML = "html"
-    COCO = "coco"
-    YOLO = "yolo"
-
-
 _FORMAT_OF: Final = {
-    "": Format.FOLDER,
-    ".zip": Format.BUNDLE,
-    ".csv": Format.CSV,
-    ".json": Format.JSON,
-    ".parquet": Format.PARQUET,
+    "": "folder",
+    ".zip": "bundle",
+    ".csv": "csv",
+    ".json": "json",
+    ".parquet": "parquet",
 }
 """The format that the suffix of a target names."""
 
@@ -167,7 +152,7 @@ def export(
         typer.Argument(metavar="[NAME]...", help="Names of the objects (default: all).", autocompletion=object_names),
     ] = None,
     format_: Annotated[
-        Format | None,
+        Literal["bundle", "folder", "csv", "json", "parquet", "html", "coco", "yolo"] | None,
         typer.Option("--format", help="Format (default: by the suffix of the target, folder without one)."),
     ] = None,
     label: Annotated[str | None, typer.Option(help="Only objects with this label.")] = None,
@@ -177,7 +162,7 @@ def export(
     ] = None,
     fractions: Annotated[
         str, typer.Option(metavar="TRAIN,VAL,TEST", help="For a training set: shares of its parts.")
-    ] = "0.8,0.1,0.1",
+    ] = "8,1,1",
 ) -> None:
     """Export objects in an open format.
 
@@ -191,10 +176,23 @@ def export(
     """
     from rig.catalog.exchange.bundle import write_bundle
     from rig.catalog.exchange.tables import TableFormat, write_folder, write_views
+    from rig.catalog.exchange.training import Annotations, Split, write_training
     from rig.catalog.transfer import CatalogSource
+    from rig.core.json_form import plain
     from rig.report.catalog_page import write_catalog_page
 
-    form = format_ or _format(target)
+    form = format_ or _FORMAT_OF.get(target.suffix.lower())
+    if form is None:
+        suffixes = ", ".join(f"{suffix or 'no suffix'} ({form})" for suffix, form in _FORMAT_OF.items())
+        raise UsageError(
+            f"The suffix of {target} does not name a format.",
+            next_step=f"Use one of these suffixes: {suffixes}. Or give --format.",
+        )
+    try:
+        shares = [float(part) for part in fractions.split(",")]
+    except ValueError as error:
+        raise UsageError(f"--fractions {fractions} are no numbers.", next_step="Give shares: 8,1,1.") from error
+    words, values = "", {}
     with settings.open_catalog(read_only=True) as catalog:
         wanted = list(names or [])
         if label is not None:
@@ -204,71 +202,28 @@ def export(
                 raise ExportFailed(f"No object has the label {label!r}.", next_step=Do.LIST_OBJECTS())
         source = CatalogSource(catalog, wanted)
         match form:
-            case Format.COCO | Format.YOLO:
-                _export_training(settings, target, source, form, split, fractions)
-                return
-            case Format.BUNDLE:
+            case "coco" | "yolo":
+                job = write_training(
+                    *(target, source, Annotations(form)),
+                    split=Split(split) if split else None,
+                    fractions=shares,
+                    seed=settings.seed or 0,
+                )
+                done = run_job("exporting", job, interrupted="Interrupted; nothing was exported.")
+                count, values = done.objects, plain(done)
+                words = f" Views: {', '.join(f'{part} {views}' for part, views in done.views.items())}."
+                if done.without_mask:
+                    what = "marked as a region to ignore" if form == "coco" else "left out"
+                    words += f" No object was found in {counted(done.without_mask, 'view')}, {what}."
+            case "bundle":
                 count = write_bundle(target, source)
-            case Format.FOLDER:
+            case "folder":
                 count = write_folder(target, source)
-            case Format.HTML:
+            case "html":
                 count = write_catalog_page(target, source)
             case _:
                 count = write_views(target, source, TableFormat(form))
     settings.say(
-        f"Exported {counted(count, 'object')} to {target} ({form}).",
-        {"target": str(target), "format": form, "objects": count},
+        f"Exported {counted(count, 'object')} to {target} ({form}).{words}",
+        {"target": str(target), "format": form, "objects": count, **values},
     )
-
-
-def _format(target: Path) -> Format:
-    form = _FORMAT_OF.get(target.suffix.lower())
-    if form is None:
-        suffixes = ", ".join(f"{suffix or 'no suffix'} ({form})" for suffix, form in _FORMAT_OF.items())
-        raise UsageError(
-            f"The suffix of {target} does not name a format.",
-            next_step=f"Use one of these suffixes: {suffixes}. Or give --format.",
-        )
-    return form
-
-
-def _export_training(
-    settings: Settings, target: Path, source: "CatalogSource", form: Format, split: str | None, fractions: str
-) -> None:
-    from rig.catalog.exchange.training import Annotations, Split, write_training
-    from rig.core.json_form import plain
-
-    try:
-        shares = [float(part) for part in fractions.split(",")]
-    except ValueError as error:
-        raise UsageError(f"--fractions {fractions} are no numbers.", next_step="Give shares: 0.8,0.1,0.1.") from error
-    job = write_training(
-        *(target, source, Annotations(form.value)),
-        split=None if split is None else Split(split),
-        fractions=shares,
-        seed=settings.seed or 0,
-        intrinsics=_intrinsics(settings),
-    )
-    done = run_job("exporting", job, interrupted="Interrupted; nothing was exported.")
-    parts = ", ".join(f"{name} {views}" for name, views in done.views.items())
-    text = f"Exported {counted(done.objects, 'object')} to {target} ({form}). Views: {parts}."
-    if done.without_mask:
-        what = "marked as a region to ignore" if form is Format.COCO else "left out"
-        text += f" No object was found in {counted(done.without_mask, 'view')}, {what}."
-    settings.say(text, {"target": str(target), "format": form, **plain(done)})
-
-
-def _intrinsics(settings: Settings) -> "Callable[[Session], dict[str, float] | None]":
-    """Return a function that finds the calibrated camera of a session of this bench; None if it is not known."""
-    from rig.calibrations import CalibrationStore
-    from rig.calibrations.store import CALIBRATIONS
-
-    results = CalibrationStore(settings.load().calibration_path(settings.bench_name)).history("camera.intrinsics")
-    known = {one.id: {name: estimate.value for name, estimate in one.estimates.items()} for one in results}
-
-    def of_session(session: "Session") -> dict[str, float] | None:
-        by = session.provenance
-        used = by.conditions.get(CALIBRATIONS) if by.bench == settings.bench_name else None
-        return next((known[one] for one in used if one in known), None) if isinstance(used, list) else None
-
-    return of_session

@@ -80,46 +80,23 @@ def show(settings: Settings, result: ResultArgument) -> None:
 
     Example: rig results show 12 --bench sim
     """
+    from rig.catalog.exchange.tables import plain_row
     from rig.catalog.results import find_result
     from rig.core.json_form import plain
-    from rig.events.events import Identified, event_of
-    from rig.events.wording import result_words
 
     with settings.open_catalog(read_only=True) as catalog:
         found = find_result(catalog, result)
-        image = "–" if found.image is None else catalog.database.images.where(found.image)
-    if settings.json:
-        shown = plain(found) | {"answered": found.answered._asdict(), "current": found.current._asdict()}
-        shown |= {"image": found.image_path, "image_sha256": found.image_sha256}
-        shown["time_utc"] = found.time_utc.isoformat()
-        for correction, one in zip(shown["corrections"], found.corrections, strict=True):
-            correction |= {"time_utc": one.time_utc.isoformat(), "corrected": one.corrected._asdict()}
-        settings.print_json(shown)
-        return
-    try:
-        answer = event_of(found.details)
-    except ValueError:  # another version of the program recorded it
-        answer = None
-    identified = answer if isinstance(answer, Identified) else None
-    said = _words(found.answered) if identified is None else result_words(identified)
-    corrected = f"corrected to {_words(found.current)}; the answer was: " if found.corrections else ""
-    print(f"Result {found.id}: {corrected}{said}")
-    lines = {
-        "sample": found.answered.sample or "–",
-        "time": f"{found.time_utc:%Y-%m-%d %H:%M:%S} UTC",
-        "operator": f"{found.operator} (account {found.user} on {found.host})",
-        "candidates": ", ".join(f"{one.name} {one.score:.3f}" for one in identified.candidates) if identified else "–",
-        "views": f"{len(found.azimuths_deg)}",
-        "bench": f"{found.provenance.bench}, {found.provenance.software}",
-        "catalog": f"version {found.catalog_version[:12]}",
-        "image": image,
-    }
-    for name, text in lines.items():
-        print(f"  {name:10} {text}")
-    for one in found.corrections:
+    shown = plain(found) | {"answered": found.answered._asdict(), "current": found.current._asdict()}
+    shown |= {"image": found.image_path, "image_sha256": found.image_sha256}
+    shown["time_utc"] = found.time_utc.isoformat()
+    for correction, one in zip(shown["corrections"], found.corrections, strict=True):
+        correction |= {"time_utc": one.time_utc.isoformat(), "corrected": one.corrected._asdict()}
+    lines = {name: value for name, value in plain_row(found.as_row()).items() if value is not None}
+    lines["candidates"] = ", ".join(f"{one['name']} {one['score']:.3f}" for one in found.details.get("candidates", ()))
+    for number, one in enumerate(found.corrections, 1):
         sample = f", sample {one.corrected.sample}" if one.corrected.sample else ""
-        print(f"Corrected {one.time_utc:%Y-%m-%d %H:%M:%S} UTC by {one.operator}: {_words(one.corrected)}{sample}")
-        print(f"  reason     {one.reason}")
+        lines[f"correction {number}"] = f"{_words(one.corrected)}{sample}, by {one.operator}: {one.reason}"
+    settings.say("\n".join(f"{name:18} {value}" for name, value in lines.items()), shown)
 
 
 @app.command("export")

@@ -3,7 +3,6 @@
 import json
 import shutil
 from collections.abc import Callable, Iterator
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,6 @@ import yaml
 from numpy.typing import NDArray
 from typer.testing import CliRunner, Result
 
-from rig.calibrations import CalibrationResult, CalibrationStore, Estimate
 from rig.catalog import Catalog, Provenance, View
 from rig.catalog.derived import described
 from rig.catalog.exchange.training import Annotations, Split, write_training
@@ -81,7 +79,7 @@ def parts_of(folder: Path) -> dict[str, Any]:
 
 
 def test_coco_has_the_stored_boxes_and_azimuths(catalog: Catalog, tmp_path: Path) -> None:
-    done = export(catalog, tmp_path / "out", intrinsics=lambda _: {"fx": 700.0})
+    done = export(catalog, tmp_path / "out")
     assert (done.objects, done.views, done.without_mask) == (2, {"train": 2 * VIEWS}, 1)
     (content,) = parts_of(tmp_path / "out").values()
     assert [(one["name"], one["supercategory"]) for one in content["categories"]] == [
@@ -96,7 +94,7 @@ def test_coco_has_the_stored_boxes_and_azimuths(catalog: Catalog, tmp_path: Path
     for (view, evidence), picture, annotation in zip(views, content["images"], content["annotations"], strict=True):
         assert (tmp_path / "out" / picture["file_name"]).read_bytes() == catalog.image_path(view.image).read_bytes()
         assert picture["azimuth_deg"] == annotation["azimuth_deg"] == view.azimuth_deg
-        assert (picture["width"], picture["height"], picture["intrinsics"]) == (192, 144, {"fx": 700.0})
+        assert (picture["width"], picture["height"]) == (192, 144)
         stored = evidence["box_px"]
         x0, y0, *_ = view.region or (0, 0)
         expected = [0, 0, 192, 144] if stored is None else [stored[0] + x0, stored[1] + y0, *stored[2:]]
@@ -121,33 +119,6 @@ def test_pycocotools_reads_the_masks(catalog: Catalog, tmp_path: Path) -> None:
         assert not mask[:y, :].any()
         assert mask[y : y + height, x : x + width].sum() == mask.sum() == annotation["area"]
     assert len(read.getAnnIds(iscrowd=True)) == 1
-
-
-def test_intrinsics_are_those_of_the_calibration_in_force(tmp_path: Path) -> None:
-    result = CalibrationResult(
-        name="camera.intrinsics",
-        estimates={"fx": Estimate(701.5, 0.4, "px"), "k1": Estimate(-0.1, 0.01, "")},
-        residual=None,
-        limit=None,
-        residual_unit="px",
-        rejections=(),
-        when_utc=datetime(2026, 3, 1, tzinfo=UTC),
-        device={},
-        evidence={},
-    )
-    CalibrationStore(tmp_path / "calibration" / "sim").add(result)
-    with Catalog.open(tmp_path / "catalog", clock=VirtualClock()) as catalog:
-        enroll(catalog, "before", [scene(1)], provenance=Provenance("sim", {}))
-        conditions = {"calibrations": ["imu.scale@1", result.id]}
-        enroll(catalog, "after", [scene(2)], provenance=Provenance("sim", {}, conditions))
-        enroll(catalog, "elsewhere", [scene(3)], provenance=Provenance("../sim", {}, {"calibrations": [result.id]}))
-    folders = {"catalog.path": "catalog", "calibration_dir": "calibration"}
-    places = [word for key, name in folders.items() for word in ("--set", f"{key}={tmp_path / name}")]
-    target = str(tmp_path / "out")
-    done = CliRunner().invoke(app, ["export", target, "--format", "coco", "--bench", "sim", *places])
-    assert done.exit_code == 0, done.output
-    (content,) = parts_of(tmp_path / "out").values()
-    assert [one["intrinsics"] for one in content["images"]] == [None, {"fx": 701.5, "k1": -0.1}, None]
 
 
 def contents(catalog: Catalog) -> list[object]:

@@ -36,7 +36,8 @@ def test_identification_is_recorded_corrected_and_exported(rig, tmp_path):
         assert first["catalog_version"] == catalog.version()
     assert Path("catalog", first["image"]).is_file()
     shown = rig("results", "show", "1").stdout
-    assert "dice, rotated" in shown
+    assert re.search("^object +dice$", shown, re.MULTILINE)
+    assert re.search("^candidates +dice 0[.]", shown, re.MULTILINE)
     wrong = rig("results", "correct", "1", "--object", "dise", "--reason", "label")
     assert wrong.exit_code == 7
     assert "Did you mean 'dice'?" in wrong.stderr
