@@ -28,7 +28,6 @@ DEFAULT_PATTERN: Final = "{object}__{angle}"
 _SUFFIXES: Final = {".png", ".jpg", ".jpeg"}
 _PARTS: Final = {"{object}": r"(?P<object>[^/]+?)", "{angle}": r"(?P<angle>[-+]?[0-9]+(?:\.[0-9]+)?)", "*": r"[^/]*?"}
 _NEEDED: Final = ("object", "azimuth_deg", "image")
-_MAX_TABLE_BYTES: Final = 1_000_000_000
 
 _Row = Mapping[str, str]
 
@@ -56,9 +55,7 @@ class Photographs:
     folder: Path
     now: datetime
     rejected: list[RejectedFile] = field(default_factory=list)
-    _software: str = field(default_factory=this_software)
     _found: dict[str, dict[float, tuple[View, _Row]]] = field(default_factory=dict)
-    _inside: dict[Path, bool] = field(default_factory=dict)
 
     def add(self, row: _Row, view: View) -> None:
         """Add a view of the object of a row, if its name and texts can be stored, and no view has its azimuth."""
@@ -81,11 +78,7 @@ class Photographs:
 
     def contains(self, path: Path) -> bool:
         """Return whether a file is really within the folder, where links lead."""
-        if path.is_symlink():
-            return path.resolve().is_relative_to(self.folder)
-        if path.parent not in self._inside:
-            self._inside[path.parent] = path.parent.resolve().is_relative_to(self.folder)
-        return self._inside[path.parent]
+        return path.resolve().is_relative_to(self.folder)
 
     def nothing(self, what: str, *fix: str | NextStep) -> ImportRejected:
         """Return the error that nothing can be used."""
@@ -99,6 +92,7 @@ class Photographs:
 
     def items(self) -> Iterator[Item]:
         """Yield the objects in the order of the folder or the table."""
+        software = this_software()
         for name, found in self._found.items():
             enrollment = Enrollment(  # the transfer replaces the key by a digest of the images
                 key=name, object_id=0, started_utc=self.now, planned_azimuth_deg=tuple(sorted(found))
@@ -106,7 +100,7 @@ class Photographs:
             sessions: dict[tuple[str, str], Session] = {}
             texts = {"label": "", "note": ""}
             for index, (_, (view, row)) in enumerate(sorted(found.items(), key=itemgetter(0))):
-                by = (row.get("bench", ""), row.get("software") or self._software)
+                by = (row.get("bench", ""), row.get("software") or software)
                 if by not in sessions:
                     provenance = Provenance(by[0], {}, {"imported_from": self.origin}, by[1])
                     sessions[by] = Session(number=len(sessions), started_utc=self.now, provenance=provenance)
@@ -195,8 +189,6 @@ def read_table(path: Path, *, now: datetime) -> Photographs:
 def _rows(path: Path) -> Iterator[tuple[int, _Row]]:
     """Yield the rows of a CSV file with their line numbers, without empty cells."""
     try:
-        if path.stat().st_size > _MAX_TABLE_BYTES:
-            raise ImportRejected(f"{path} is larger than {_MAX_TABLE_BYTES} bytes.", next_step="Split it.")
         with path.open(encoding="utf-8-sig", newline="") as file:
             rows = csv.DictReader(file, strict=True)
             if missing := [name for name in _NEEDED if name not in (rows.fieldnames or ())]:

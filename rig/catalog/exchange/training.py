@@ -10,8 +10,6 @@ from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import lru_cache, partial
-from itertools import groupby
-from math import inf
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -31,20 +29,15 @@ from rig.catalog.records import Region, this_software
 from rig.catalog.transfer import CatalogSource, Item, transfer
 from rig.config import ViewConfig
 from rig.config.catalog_place import DATABASE_NAME
-from rig.core.errors import ExportFailed, UsageError
+from rig.core.errors import ExportFailed
 from rig.core.next_steps import Do
 from rig.core.processes import Jobs, map_in_processes
 from rig.views.description import BENCH_DESCRIPTOR, ViewDescriber, within
 from rig.views.image_files import IMAGE_FOLDER
 
 PARTS: Final = ("train", "val", "test")
-
-
-class Split(StrEnum):
-    """The unit that is divided among the parts: whole objects, or the views of each object."""
-
-    OBJECT = "object"
-    VIEW = "view"
+_PART_OF: Final = {4: "val", 9: "test"}
+"""By the last digit of the index of a view: neighbouring views are similar, so the parts are spread over the object."""
 
 
 class Annotations(StrEnum):
@@ -94,39 +87,20 @@ def write_training(
     source: CatalogSource,
     form: Annotations,
     *,
-    split: Split | None = None,
-    fractions: Sequence[float] = (8, 1, 1),
-    seed: int = 0,
     jobs: Jobs | None = None,
 ) -> Generator[JobProgress, None, TrainingExport]:
     """Write the views that searches use as a training set into a new folder, all or nothing.
 
-    Masks are the silhouettes of the descriptors. An image that several views share is annotated once.
-
-    Parameters
-    ----------
-    split
-        None puts all views into the first part.
-    fractions
-        Shares of at most three parts, train, val and test: any numbers, of which only the ratios count.
-    seed
-        The same seed gives the same parts.
+    Masks are the silhouettes of the descriptors. An image that several views share is annotated once. Of ten views of
+    an object in a row, one is for validation and one for the test.
 
     Raises
     ------
-    UsageError
-        The fractions are not valid.
     ExportFailed
         The folder is not empty or cannot be written, or there are no views.
     CatalogError
         An image is not the stored one.
     """
-    if not (1 <= len(fractions) <= len(PARTS) and all(0 <= one < inf for one in fractions) and sum(fractions) > 0):
-        shown = ",".join(f"{one:g}" for one in fractions)
-        raise UsageError(
-            f"{shown or 'Nothing'} cannot be shares of the parts.",
-            next_step="Give the shares of train, val, test: 8,1,1.",
-        )
     objects = list(enrolled(source))
     if not objects:
         raise ExportFailed("There are no complete enrollments to export.", next_step=Do.ENROLL())
@@ -150,8 +124,9 @@ def write_training(
             masks.update(zip((picture.id for picture in portion), of_these, strict=True))
             yield JobProgress(len(masks), len(pictures))
         # Write the annotations, in the order of the catalog.
-        annotated = [(picture, masks[picture.id]) for picture in pictures.values()]
-        parts = _divided(annotated, split, np.asarray(fractions) / sum(fractions), np.random.default_rng(seed))
+        parts: dict[str, list[_Annotated]] = {part: [] for part in PARTS}
+        for picture in pictures.values():
+            parts[_PART_OF.get(picture.view.index % 10, "train")].append((picture, masks[picture.id]))
         items = [item for item, *_ in objects]
         if form is Annotations.COCO:
             _write_coco(made, items, parts)
@@ -159,29 +134,6 @@ def write_training(
             _write_yolo(made, items, parts)
     without = sum(mask.box is None for mask in masks.values())
     return TrainingExport(len(objects), {part: len(own) for part, own in parts.items()}, without)
-
-
-def _divided(
-    annotated: Sequence[_Annotated], split: Split | None, shares: NDArray[np.float64], rng: np.random.Generator
-) -> _Parts:
-    """Return the views of each part, in their order."""
-
-    def drawn(count: int) -> NDArray[np.intp]:
-        """Return the number of a part for each of several things, as close to the shares as whole numbers can be."""
-        ends = np.rint(np.cumsum(shares) * count).astype(int)
-        return rng.permutation(np.searchsorted(ends, np.arange(count), side="right").clip(max=len(shares) - 1))
-
-    if split is None:
-        return {PARTS[0]: annotated}
-    of_objects = [list(own) for _, own in groupby(annotated, lambda one: one[0].number)]
-    if split is Split.OBJECT:
-        part_of = np.repeat(drawn(len(of_objects)), list(map(len, of_objects)))
-    else:
-        part_of = np.concatenate([drawn(len(own)) for own in of_objects])
-    return {
-        part: [one for one, own in zip(annotated, part_of, strict=True) if own == number]
-        for number, part in enumerate(PARTS[: len(shares)])
-    }
 
 
 # Masks
@@ -294,7 +246,8 @@ def _write_yolo(folder: Path, items: Sequence[Item], parts: _Parts) -> None:
             listed += f"./{image}\n"
         (folder / f"{part}.txt").write_text(listed, encoding="utf-8")
     # YAML reads JSON strings; names can contain any character.
-    lines = [f"{part}: {part}.txt" for part in parts]
-    lines += ["val: train.txt"] if "val" not in parts else []  # trainers need one
+    lines = [
+        f"{part}: {part if own else 'train'}.txt" for part, own in parts.items()
+    ]  # trainers need a file with views
     lines += ["names:", *(f"  {number}: {json.dumps(item.name)}" for number, item in enumerate(items))]
     (folder / "data.yaml").write_text("\n".join([*lines, ""]), encoding="utf-8")

@@ -156,27 +156,20 @@ def export(
         typer.Option("--format", help="Format (default: by the suffix of the target, folder without one)."),
     ] = None,
     label: Annotated[str | None, typer.Option(help="Only objects with this label.")] = None,
-    split: Annotated[
-        Literal["object", "view"] | None,
-        typer.Option(help="For a training set: divide the objects, or the views of each object."),
-    ] = None,
-    fractions: Annotated[
-        str, typer.Option(metavar="TRAIN,VAL,TEST", help="For a training set: shares of its parts.")
-    ] = "8,1,1",
 ) -> None:
     """Export objects in an open format.
 
     Formats: bundle (everything, for rig import), folder (images named as in COIL-100, with a table views.csv), csv,
     json and parquet (table without images), html (folder with a page and contact sheets), coco and yolo (training sets
-    with boxes and masks; --seed chooses the parts).
+    with boxes and masks, divided into train, val and test).
 
     Example: rig export tray.rigcat.zip --label kitchen --bench sim
 
-    Example: rig export training --format coco --split view --bench sim
+    Example: rig export training --format coco --bench sim
     """
     from rig.catalog.exchange.bundle import write_bundle
     from rig.catalog.exchange.tables import TableFormat, write_folder, write_views
-    from rig.catalog.exchange.training import Annotations, Split, write_training
+    from rig.catalog.exchange.training import Annotations, write_training
     from rig.catalog.transfer import CatalogSource
     from rig.core.json_form import plain
     from rig.report.catalog_page import write_catalog_page
@@ -188,10 +181,6 @@ def export(
             f"The suffix of {target} does not name a format.",
             next_step=f"Use one of these suffixes: {suffixes}. Or give --format.",
         )
-    try:
-        shares = [float(part) for part in fractions.split(",")]
-    except ValueError as error:
-        raise UsageError(f"--fractions {fractions} are no numbers.", next_step="Give shares: 8,1,1.") from error
     words, values = "", {}
     with settings.open_catalog(read_only=True) as catalog:
         wanted = list(names or [])
@@ -203,12 +192,7 @@ def export(
         source = CatalogSource(catalog, wanted)
         match form:
             case "coco" | "yolo":
-                job = write_training(
-                    *(target, source, Annotations(form)),
-                    split=Split(split) if split else None,
-                    fractions=shares,
-                    seed=settings.seed or 0,
-                )
+                job = write_training(target, source, Annotations(form))
                 done = run_job("exporting", job, interrupted="Interrupted; nothing was exported.")
                 count, values = done.objects, plain(done)
                 words = f" Views: {', '.join(f'{part} {views}' for part, views in done.views.items())}."
