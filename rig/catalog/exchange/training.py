@@ -246,8 +246,7 @@ def _write_yolo(folder: Path, items: Sequence[Item], parts: _Parts) -> None:
             listed += f"./{image}\n"
         (folder / f"{part}.txt").write_text(listed, encoding="utf-8")
     # YAML reads JSON strings; names can contain any character.
-    lines = [
-        f"{part}: {part if own else 'train'}.txt" for part, own in parts.items()
-    ]  # trainers need a file with views
+    used = [part for part, own in parts.items() if own or part == "val"]  # trainers need a file of this name with views
+    lines = [f"{part}: {part if parts[part] else 'train'}.txt" for part in used]
     lines += ["names:", *(f"  {number}: {json.dumps(item.name)}" for number, item in enumerate(items))]
     (folder / "data.yaml").write_text("\n".join([*lines, ""]), encoding="utf-8")

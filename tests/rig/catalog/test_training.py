@@ -169,7 +169,7 @@ def test_yolo_has_outlines_and_leaves_out_views_without_an_object(catalog: Catal
     done = export(catalog, tmp_path / "out", Annotations.YOLO)
     assert done.without_mask == 1
     about = yaml.safe_load((tmp_path / "out" / "data.yaml").read_text())
-    assert about == {"train": "train.txt", "val": "train.txt", "test": "train.txt", "names": {0: "mug", 1: 'tin: "7"'}}
+    assert about == {"train": "train.txt", "val": "train.txt", "names": {0: "mug", 1: 'tin: "7"'}}
     names = (tmp_path / "out" / "train.txt").read_text().split()
     assert len(names) == 2 * VIEWS - 1
     first = {view.image for view in catalog.object("mug").views}
