@@ -122,7 +122,7 @@ def imports(folder: Path, photographs: Path) -> None:
     bare, whole = len(files) / bare_s, done.views / import_s
     print(f"\n{'photographs into a catalog':<64} {'wall s':>7} {'CPU s':>6} {'images/s':>9} {'ratio':>6}")
     print(f"{'decode and CEDD alone, one process':<64} {bare_s:7.1f} {bare_cpu_s:6.1f} {bare:9.0f} {1:6.2f}")
-    label = f"import of {done.views}, {len(done.gaps)} gaps, durable, {os.cpu_count()} processes"
+    label = f"import of {done.views}, durable, {os.cpu_count()} processes"
     print(f"{label:<64} {import_s:7.1f} {import_cpu_s:6.1f} {whole:9.0f} {whole / bare:6.2f}")
 
 

@@ -3,7 +3,7 @@
 Decision: docs/decisions/0052.
 """
 
-from rig.bluesky.devices import BenchDevices, CameraDevice, FlyScan, ImuDevice, TableDevice
+from rig.bluesky.devices import BenchDevices, CameraDevice, ImuDevice, TableDevice
 from rig.bluesky.plans import enroll, identify
 
-__all__ = ["BenchDevices", "CameraDevice", "FlyScan", "ImuDevice", "TableDevice", "enroll", "identify"]
+__all__ = ["BenchDevices", "CameraDevice", "ImuDevice", "TableDevice", "enroll", "identify"]

@@ -1,10 +1,10 @@
-"""Table, camera, IMU and fly scan with the protocols of bluesky (`bluesky.protocols`).
+"""Table, camera and IMU with the protocols of bluesky (`bluesky.protocols`).
 
 Only one thread may use a bench. All devices of a bench share a thread of their own; a status is done when its work is
 done.
 """
 
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, ExitStack
 from typing import Any, Self
@@ -12,10 +12,8 @@ from typing import Any, Self
 import numpy as np
 
 from rig.bench import Bench
-from rig.catalog import Catalog
 from rig.events.events import Accepted, Event
 from rig.motion.turntable import Turntable
-from rig.plans.enroll import enroll as enroll_steps
 from rig.views.capture import Viewer
 
 
@@ -239,61 +237,3 @@ def view_values(event: Accepted) -> dict[str, Any]:
         "azimuth_deg": float(event.azimuth_deg),
         "sharpness": float(event.evidence.sharpness),
     }
-
-
-class FlyScan:
-    """The fly scan as a Flyer: it enrolls an object in one revolution without a stop (`rig.plans.enroll`).
-
-    Parameters
-    ----------
-    devices
-        The devices of the bench, with ``hold=False``, because the scan prepares the table itself.
-    catalog
-        The catalog that stores the views.
-    object_name
-        The object.
-    views
-        Number of views; None for `enroll.views`.
-    """
-
-    parent = None
-
-    def __init__(self, devices: BenchDevices, catalog: Catalog, object_name: str, *, views: int | None = None) -> None:
-        self.name = "fly"
-        self._devices = devices
-        self._events = enroll_steps(devices.bench, catalog, object_name, views=views, fly=True)
-        self._views: list[dict[str, Any]] = []
-        self._status: WorkStatus | None = None
-
-    def kickoff(self) -> WorkStatus:
-        self._status = self._devices.start(self._scan)
-        return _Started()
-
-    def _scan(self) -> None:
-        for event in self._events:
-            if isinstance(event, Accepted):
-                data = {f"fly_{key}": value for key, value in view_values(event).items()}
-                now = self._devices.now_s()
-                self._views.append({"data": data, "timestamps": dict.fromkeys(data, now), "time": now})
-
-    def complete(self) -> WorkStatus:
-        """Return the status of the scan: done when all views are in the catalog."""
-        assert self._status is not None, "kickoff first"
-        return self._status
-
-    def describe_collect(self) -> dict[str, Any]:
-        example = {"fly_index": 0, "fly_azimuth_deg": 0.0, "fly_sharpness": 0.0}
-        return {"views": {key: data_key("fly", value) for key, value in example.items()}}
-
-    def collect(self) -> Iterator[dict[str, Any]]:
-        views, self._views = self._views, []
-        yield from views
-
-
-class _Started(WorkStatus):
-    """The status of work that has started, and is done at once."""
-
-    def __init__(self) -> None:
-        future: Future[None] = Future()
-        future.set_result(None)
-        super().__init__(future)

@@ -42,11 +42,3 @@ class RejectedFile:
         """Return the file with the code and the text of the reason."""
         code = self.reason.code.name.lower()
         return {"path": self.path, "code": code, "values": self.reason.values, "reason": str(self.reason)}
-
-
-@dataclass(frozen=True, slots=True)
-class Gap:
-    """A view that is missing in the even spacing of the others."""
-
-    object_name: str
-    azimuth_deg: float

@@ -36,7 +36,7 @@ from rig.catalog.facts import (
 from rig.catalog.incoming import ReadImages, Reading, read_images
 from rig.catalog.jobs import JobProgress
 from rig.catalog.records import EnrollmentStatus, check_text, checked_texts, clean_name
-from rig.catalog.rejected import Gap, RejectedFile
+from rig.catalog.rejected import RejectedFile
 from rig.catalog.state import Ended, EnrollmentState, Named
 from rig.core.errors import CatalogDamaged, ImportRejected, ObjectExists, RigError, UsageError
 from rig.core.next_steps import Do
@@ -91,10 +91,6 @@ class Source(Protocol):
         """What cannot be transferred."""
 
     @property
-    def gaps(self) -> Sequence[Gap]:
-        """What is missing."""
-
-    @property
     def content(self) -> Callable[[str], bytes]:
         """Function that returns the bytes of an image. It can be sent to other processes."""
 
@@ -116,7 +112,6 @@ class CatalogSource:
     """
 
     rejected: Sequence[RejectedFile] = ()
-    gaps: Sequence[Gap] = ()
 
     def __init__(
         self, catalog: Catalog, names: Sequence[str] = (), *, used_only: bool = False, own: bool = True
@@ -187,7 +182,7 @@ def _check(item: Item) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Transferred:
-    """What was transferred, left out and replaced, and which views are missing."""
+    """What was transferred, left out and replaced."""
 
     objects: int
     views: int
@@ -195,7 +190,6 @@ class Transferred:
     skipped: tuple[str, ...]
     replaced: tuple[str, ...]
     rejected: tuple[RejectedFile, ...]
-    gaps: tuple[Gap, ...]
 
 
 def transfer(
@@ -304,7 +298,7 @@ def transfer(
                 )
                 describing.add(transaction, _computed(source, new, found.contents, copied=once))
     counts = (len(plan.wanted), plan.views, plan.bytes)
-    return Transferred(*counts, plan.skipped, plan.replaced, rejected, tuple(source.gaps))
+    return Transferred(*counts, plan.skipped, plan.replaced, rejected)
 
 
 def _rejection(source: Source, rejected: Sequence[RejectedFile]) -> RigError:

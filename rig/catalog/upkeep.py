@@ -3,7 +3,6 @@
 Decision: docs/decisions/0016.
 """
 
-from collections import Counter
 from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any, Final
@@ -44,10 +43,7 @@ class DescriptorStatistics:
 
 @dataclass(frozen=True, slots=True)
 class Statistics:
-    """Numbers and sizes in bytes; `free_disk_bytes` is None for an object store.
-
-    `collect_garbage` frees `deleted_image_bytes`, and with ``old`` `old_image_bytes`.
-    """
+    """Numbers and sizes in bytes; `free_disk_bytes` is None for an object store."""
 
     schema_version: int
     objects: int
@@ -57,14 +53,10 @@ class Statistics:
     image_bytes: int
     database_bytes: int
     free_disk_bytes: int | None
-    labels: dict[str, int]
-    benches: dict[str, int]
     descriptors: tuple[DescriptorStatistics, ...]
     log_entries: int
     results: int
     result_image_bytes: int
-    deleted_image_bytes: int
-    old_image_bytes: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,51 +72,26 @@ class GarbageReport:
 
 def statistics(catalog: Catalog) -> Statistics:
     """Return the statistics of a catalog."""
-    bench, image = Session.__table__.c.bench, Entry.record["image_bytes"].as_integer()
+    count = (Ended.status, func.count(Enrollment.id.distinct()), func.count(View.id), func.sum(View.image_bytes))
+    deleted = _states(func.count(Enrollment.object_id.distinct())).where(Named.deleted == true())
+    answers = select(func.count(), func.sum(Entry.record["image_bytes"].as_integer()))
     with catalog.database.read() as transaction:
-        # Count enrollments and views by their status.
-        counted = (func.count(Enrollment.id.distinct()), func.count(View.id), func.sum(View.image_bytes))
-        sizes = transaction.execute(
-            _states(Ended.status, Named.deleted, *counted)
-            .outerjoin(View, View.enrollment_id == Enrollment.id)
-            .group_by(Ended.status, Named.deleted)
-        ).all()
-        deleted = _states(func.count(Enrollment.object_id.distinct())).where(Named.deleted == true())
-        # Group objects by label, and views by bench.
-        labels = transaction.execute(
-            select(Named.label, func.count()).where(state.IN_USE).group_by(Named.label).order_by(Named.label)
-        )
-        by_label = {label or "": count for label, count in labels}
-        benches = transaction.execute(
-            select(bench, func.count(View.id))
-            .join(View, (View.enrollment_id == Session.enrollment_id) & (View.session == Session.number))
-            .group_by(bench)
-            .order_by(bench)
-        )
-        answers = select(func.count(), func.sum(image)).where(Entry.action == Action.IDENTIFIED)
-        recorded, recorded_bytes = transaction.execute(answers).one()
-        enrollments = Counter[str]()
-        for status, _, count, _, _ in sizes:
-            enrollments[str(status)] += count
+        views = _states(*count).outerjoin(View, View.enrollment_id == Enrollment.id).group_by(Ended.status)
+        found = transaction.execute(views).all()
+        results, result_bytes = transaction.execute(answers.where(Entry.action == Action.IDENTIFIED)).one()
         return Statistics(
             schema_version=SCHEMA_VERSION,
-            objects=sum(by_label.values()),
+            objects=transaction.scalar(select(func.count()).where(state.IN_USE)) or 0,
             deleted_objects=transaction.scalar(deleted) or 0,
-            enrollments=dict(enrollments),
-            views=sum(count for *_, count, _ in sizes),
-            image_bytes=sum(size or 0 for *_, size in sizes),
+            enrollments={str(status): number for status, number, _, _ in found},
+            views=sum(number for _, _, number, _ in found),
+            image_bytes=sum(size or 0 for *_, size in found),
             database_bytes=catalog.database.size_bytes(transaction),
             free_disk_bytes=catalog.database.images.free_bytes(),
-            labels=by_label,
-            benches=dict(benches.all()),
             descriptors=tuple(DescriptorStatistics(*one) for one in derived.counts(transaction)),
             log_entries=log.head(transaction)[0],
-            results=recorded,
-            result_image_bytes=recorded_bytes or 0,
-            deleted_image_bytes=sum(size or 0 for _, is_deleted, *_, size in sizes if is_deleted),
-            old_image_bytes=sum(
-                size or 0 for status, is_deleted, *_, size in sizes if not is_deleted and status in _OLD
-            ),
+            results=results,
+            result_image_bytes=result_bytes or 0,
         )
 
 

@@ -3,10 +3,13 @@
 Decision: docs/decisions/0034.
 """
 
+import threading
 from collections.abc import Callable, Collection, Generator, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import partial
+from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from sqlalchemy import and_, func, select
@@ -19,7 +22,10 @@ from rig.catalog.images import Images, path_of
 from rig.catalog.jobs import JobProgress, portions, processes
 from rig.catalog.state import Ended, Named
 from rig.catalog.upkeep import COLLECTED, NAMED_IMAGES
-from rig.core.errors import CatalogDamaged
+from rig.config.catalog_place import CatalogPlace
+from rig.core.clock import Clock, seconds_between
+from rig.core.errors import CatalogDamaged, RigError
+from rig.core.next_steps import Do
 from rig.core.processes import Jobs, map_in_processes
 from rig.views import image_files as files
 
@@ -31,22 +37,33 @@ _STATUS: Final = and_(Ended.enrollment_id == Enrollment.id, state.IS_STATUS)
 
 
 class Problem(StrEnum):
-    """Kind of a problem, with the keys of `Finding.details`."""
+    """Kind of a problem."""
 
     DAMAGED_DATABASE = "database damaged"
-    """``message`` of the database, or of the program that cannot read a row."""
     LOG_CHANGED = "log changed"
-    """Entry ``entry_id`` of the log is not the one that was written, or entries before it are missing."""
     ENROLLMENT_CHANGED = "enrollment changed"
-    """A value or a view of ``enrollment_id`` is not the stored one, or the log does not know the enrollment."""
     MISSING_ENROLLMENT = "enrollment missing"
-    """``enrollment_id`` is in the log, and was not removed by this program."""
     MISSING_IMAGE = "image missing"
-    """``reason`` of the system."""
     CHANGED_IMAGE = "image changed"
-    """``bytes`` found and ``stored_bytes``."""
     DESCRIPTION_DAMAGED = "description damaged"
-    """The stored ``descriptor`` is not used, because its digest is wrong. It is computed again when it is needed."""
+
+
+_BACKUP: Final = "restore it from a backup"
+_IMAGE_BACKUP: Final = f"{_BACKUP}, or enroll the object again"
+_ENROLLMENT_BACKUP: Final = "restore the catalog from a backup, or delete the object and enroll it again"
+_WORDS: Final = {
+    Problem.DAMAGED_DATABASE: ("{message}", _BACKUP),
+    Problem.LOG_CHANGED: ("entry {entry_id} is not the one that was written, or one before is missing", _BACKUP),
+    Problem.ENROLLMENT_CHANGED: ("something in enrollment {enrollment_id} changed", _ENROLLMENT_BACKUP),
+    Problem.MISSING_ENROLLMENT: ("this program did not remove enrollment {enrollment_id}", _ENROLLMENT_BACKUP),
+    Problem.MISSING_IMAGE: ("{reason}", _IMAGE_BACKUP),
+    Problem.CHANGED_IMAGE: ("{bytes} bytes now, {stored_bytes} when it was stored", _IMAGE_BACKUP),
+    Problem.DESCRIPTION_DAMAGED: (
+        "the stored {descriptor} is not the one that was computed",
+        "it is computed again when it is needed",
+    ),
+}
+"""The evidence, with the keys of `Finding.details`, and what to do."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +75,13 @@ class Finding:
     view_id: int | None = None
     path: str | None = None
     details: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def text(self) -> str:
+        """The finding in one line: the problem, the object and the file, the evidence, and what to do."""
+        place = ": ".join(filter(None, (self.object_name and repr(self.object_name), self.path)))
+        evidence, fix = _WORDS[self.problem]
+        return "; ".join((": ".join(filter(None, (self.problem, place))), evidence.format_map(self.details), fix))
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,3 +222,66 @@ def _check_images(store: Images, portion: Sequence[_Image]) -> list[Finding]:
                 sizes = {"bytes": len(content), "stored_bytes": stored_bytes}
                 findings.append(found(Problem.CHANGED_IMAGE, details=sizes))
     return findings
+
+
+SHARE: Final = 0.05
+"""Largest share of a processor core that a background check uses, after the first `BURST_S` of work."""
+BURST_S: Final = 0.1
+"""Small catalogs are compared at once."""
+
+
+class BackgroundCheck(AbstractContextManager["BackgroundCheck"]):
+    """A thread that compares the digests of the catalog at ``place`` until all are compared or a ``with`` block ends.
+
+    Searches and exports compare the digests of what they load. This compares the others: of deleted objects, unfinished
+    and earlier enrollments, the log and the results; not the images. A portion is one transaction, so that a change of
+    the catalog in the meantime is no damage. ``report`` gets the first damage; it is called in the thread.
+    """
+
+    def __init__(self, place: CatalogPlace | Path, clock: Clock, report: Callable[[RigError], None]) -> None:
+        self._place = place
+        self._clock = clock
+        self._report = report
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="catalog check", daemon=True)
+        self._thread.start()
+
+    def __exit__(self, *_: object) -> None:
+        self._ended.set()
+        self._thread.join()
+
+    def wait(self, timeout_s: float | None = None) -> None:
+        """Wait until all digests are compared, or damage is reported."""
+        self._thread.join(timeout_s)
+
+    def _run(self) -> None:
+        start_ns = begun_ns = self._clock.now_ns()
+        spent_s = 0.0
+        try:
+            with Catalog.open(self._place, clock=self._clock, create=False, read_only=True) as catalog:
+                with catalog.database.read() as transaction:
+                    checks = list(row_checks(transaction))
+                for check in checks:
+                    with catalog.database.read() as transaction:
+                        for finding in check(transaction):
+                            raise _error(finding)
+                    now_ns = self._clock.now_ns()
+                    spent_s += seconds_between(begun_ns, now_ns)
+                    if self._ended.wait((spent_s - BURST_S) / SHARE - seconds_between(start_ns, now_ns)):
+                        return
+                    begun_ns = self._clock.now_ns()
+        except CatalogDamaged as damage:
+            self._report(damage)
+        except RigError:
+            pass  # the catalog was moved or is locked: the work itself reports it
+
+
+def _error(finding: Finding) -> CatalogDamaged:
+    if finding.problem is not Problem.LOG_CHANGED:
+        return state.changed([str(finding.object_name)])
+    line = finding.details["entry_id"]
+    return CatalogDamaged(
+        f"Entry {line} of the log of the catalog is not the one that was written, or entries are missing.",
+        next_step=(Do.VERIFY_CATALOG(), "Then use a backup."),
+        evidence={"log_entry": line},
+    )

@@ -14,8 +14,7 @@ import typer
 from typer.core import TyperGroup
 
 from rig.cli.bench import config, doctor, find, head, jog, serve, servo, setup, snapshot, table
-from rig.cli.catalog import catalog, exchange, results, upkeep
-from rig.cli.catalog import fit as rules
+from rig.cli.catalog import catalog, exchange, results, upkeep  # noqa: F401 - upkeep adds its commands
 from rig.cli.objects import enroll, evaluate, identify, runs
 from rig.cli.ui.command import show_error, without_color
 from rig.cli.ui.exit_codes import EXIT_CODES
@@ -131,9 +130,7 @@ app.command("find", rich_help_panel=BENCH)(find.find)
 app.command("setup", rich_help_panel=BENCH)(setup.setup)
 app.command("import", rich_help_panel=OBJECTS)(exchange.import_)
 app.command("export", rich_help_panel=OBJECTS)(exchange.export)
-app.command("log", rich_help_panel=OBJECTS)(upkeep.log)
-catalog.app.command("fit")(rules.fit)
-catalog.app.command("calibrate", hidden=True)(rules.fit)  # the word that technicians try first
+app.command("log", rich_help_panel=OBJECTS)(results.log)
 app.add_typer(results.app, name="results", rich_help_panel=OBJECTS)
 app.add_typer(catalog.app, name="catalog", rich_help_panel=OBJECTS)
 app.add_typer(config.app, name="config", rich_help_panel=BENCH)

@@ -96,7 +96,7 @@ class Do(StrEnum):
     VERIFY_CATALOG = "verify-catalog", "check the catalog", "rig catalog verify"
     REDESCRIBE = "redescribe", "describe the stored images again", "rig catalog redescribe"
     FIT_STOPPING_RULE = "fit-stopping-rule", "fit the stopping rule again", "rig catalog fit"
-    MERGE = "merge", "add the objects to a catalog", "rig catalog merge {source}"
+    MERGE = "merge", "add the objects to a catalog", "rig import {source}"
     DELIVER_RENAMED = (
         "deliver-renamed",
         "deliver the object with another name",

@@ -6,12 +6,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from statistics import median
 from typing import Any, Final, NamedTuple
-from urllib.parse import quote
 
 import cv2
 import numpy as np
 
-from rig.catalog.exchange.new_files import new_document, new_folder
+from rig.catalog.exchange.new_files import new_folder
 from rig.catalog.exchange.tables import enrolled
 from rig.catalog.facts import Enrollment, Session
 from rig.catalog.transfer import CatalogSource, Item
@@ -37,8 +36,8 @@ class _Shown(NamedTuple):
     items_: list[tuple[str, str]]
 
 
-def write_sheets(folder: Path, source: CatalogSource) -> int:
-    """Write a contact sheet of every object, ``0001-mug-white.jpg``, and return their number.
+def write_catalog_page(folder: Path, source: CatalogSource) -> int:
+    """Write a folder with an HTML page ``index.html`` and a contact sheet of every object; return their number.
 
     Raises
     ------
@@ -48,22 +47,9 @@ def write_sheets(folder: Path, source: CatalogSource) -> int:
         An image is not the one that was stored.
     """
     with new_folder(folder) as made:
-        return sum(1 for _ in _shown(made, None, source))
-
-
-def write_catalog_page(target: Path, source: CatalogSource) -> int:
-    """Write an HTML page with the contact sheets, and return the number of objects.
-
-    ``target`` is the file (suffix ``.html``; the sheets are in a folder beside it), or a folder for ``index.html``.
-
-    Raises
-    ------
-    ExportFailed
-        As `write_sheets`.
-    """
-    with new_document(target, "index.html", SHEETS) as (file, sheets, link):
-        shown = list(_shown(sheets, link, source))
-        file.write(_page(shown))
+        (made / SHEETS).mkdir()
+        shown = list(_shown(made / SHEETS, source))
+        (made / "index.html").write_bytes(_page(shown))
     return len(shown)
 
 
@@ -73,8 +59,8 @@ def _page(shown: list[_Shown]) -> bytes:
     return template.render(objects=shown, views=sum(one.views for one in shown), labels=labels).encode()
 
 
-def _shown(folder: Path, link: str | None, source: CatalogSource) -> Iterator[_Shown]:
-    """Write the sheets into ``folder``; ``link`` is its path from the page, None without a page."""
+def _shown(folder: Path, source: CatalogSource) -> Iterator[_Shown]:
+    """Write the sheets into a folder beside the page."""
     for number, (item, enrollment, regions) in enumerate(enrolled(source), start=1):
         pictures = [
             thumbnail(decode(source.content(view.image)), TILE, region)
@@ -83,12 +69,11 @@ def _shown(folder: Path, link: str | None, source: CatalogSource) -> Iterator[_S
         stem = f"{number:04d}-{_slug(item.name)}".rstrip("-")
         sheet, stamp = f"{stem}.jpg", f"{stem}-small.jpg"
         _write(folder / sheet, contact_sheet(pictures, [view.azimuth_deg for view in enrollment.views], tile=TILE))
-        if link is not None:
-            _write(folder / stamp, thumbnail(pictures[0], _STAMP))
+        _write(folder / stamp, thumbnail(pictures[0], _STAMP))
         finished_utc = next(one.finished_utc for one in item.enrollments if one.enrollment is enrollment)
         when = f"{finished_utc:%Y-%m-%d %H:%M} UTC" if finished_utc else "–"
         items = list(_items(item, enrollment))
-        yield _Shown(item, quote(f"{link}/{sheet}"), quote(f"{link}/{stamp}"), len(enrollment.views), when, items)
+        yield _Shown(item, f"{SHEETS}/{sheet}", f"{SHEETS}/{stamp}", len(enrollment.views), when, items)
 
 
 def _slug(name: str) -> str:

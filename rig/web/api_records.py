@@ -77,7 +77,7 @@ def add_records(routes: Routes, server: Server) -> None:
         """List the recorded answers, the newest first. Filters use the corrected values."""
         with server.catalog.open_to_read() as catalog:
             found = find_results(catalog, ResultFilter(sample, object_name, outcome))
-        rows = [{**plain_row(one), "id": str(one.id)} for one in found]
+        rows = [{**plain_row(one.as_row()), "id": str(one.id)} for one in found]
         return page.of(rows[::-1], "id")
 
     @routes.operate.post("/results/{result_id}/correct", tags=["results"])
@@ -95,7 +95,7 @@ def add_records(routes: Routes, server: Server) -> None:
                 sample=body.sample,
                 operator=person.name,
             )
-            return plain_row(find_result(catalog, result_id))
+            return plain_row(find_result(catalog, result_id).as_row())
 
     @routes.watch.get("/calibrations", tags=["bench"])
     def calibration_list() -> dict[str, Any]:

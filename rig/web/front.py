@@ -18,7 +18,7 @@ from typing import Any, Final
 import uvicorn
 from anyio import to_thread
 
-from rig.catalog.background import BackgroundCheck
+from rig.catalog.verify import BackgroundCheck
 from rig.core.clock import SystemClock
 from rig.core.errors import RigError
 from rig.safety.saved_state import SERVER_FOLDER

@@ -25,7 +25,7 @@ def rig(rig, monkeypatch):
 def region(rig, name: str) -> list[int]:
     """Return the region that the object's first view is described within."""
     reported = json.loads(rig("catalog", "show", name, "--json").stdout)
-    return reported["views"][0]["record"]["region"]
+    return reported["views"][0]["region"]
 
 
 @pytest.mark.parametrize("in_depth", [False, pytest.param(True, marks=pytest.mark.nightly)])

@@ -18,13 +18,13 @@ from tests.faults.kills import killed_child, points
 COMMANDS = {
     "import": ("import", "third.rigcat.zip", "--on-conflict", "skip", "--jobs", "1"),
     "export": ("export", "all.rigcat.zip"),
-    "merge": ("catalog", "merge", "other", "--on-conflict", "skip", "--jobs", "1"),
+    "merge": ("import", "other", "--on-conflict", "skip", "--jobs", "1"),
     "rename": ("catalog", "rename", "lamp", "lantern"),
     "delete": ("catalog", "delete", "lamp", "--yes"),
     "gc": ("catalog", "gc", "--yes"),
     "redescribe": ("catalog", "redescribe", "--descriptor", "edges", "--jobs", "1"),
     "calibrate": ("catalog", "fit"),
-    "verify": ("catalog", "verify", "--jobs", "1"),
+    "verify": ("catalog", "verify"),
     "configuration": ("config", "set", "identify.max_views", "5"),
     "search": ("identify", "--save-run", "run", "--set", "bench.sim.object=dice"),
 }

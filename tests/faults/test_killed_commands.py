@@ -87,10 +87,10 @@ def test_killed_command_loses_nothing_and_completes(folder: Path, rig: Rig, comm
         home = folder / command / str(number)
         found = state(rig, home)
         assert found in (before, complete), "a command takes effect as a whole or not at all"
-        rig(home, "catalog", "verify", "--jobs", "1")
+        rig(home, "catalog", "verify")
         if command == "search":
             shutil.rmtree(home / "run", ignore_errors=True)  # a run is never continued
         if found == before:
             rig(home, *COMMANDS[command], codes=(0, 8))  # a search may end with "unknown object"
         assert state(rig, home) == complete
-        rig(home, "catalog", "verify", "--jobs", "1")
+        rig(home, "catalog", "verify")

@@ -88,7 +88,7 @@ ARGUMENTS = st.one_of(
 COMMANDS = [
     *("config get", "config set", "config path", "config check", "catalog list", "catalog show", "catalog rename"),
     *("catalog label", "catalog delete", "catalog verify", "catalog gc", "catalog stats", "log", "status", "goto"),
-    *("home", "stop", "acknowledge", "replay", "report", "export", "import", "servo", "catalog merge", "eval"),
+    *("home", "stop", "acknowledge", "replay", "report", "export", "import", "servo", "catalog copy", "eval"),
 ]
 OPTIONS = [
     "--json",

@@ -19,7 +19,7 @@ from bluesky import RunEngine, plan_stubs, plans, protocols  # noqa: E402
 from bluesky.utils import FailedStatus, RunEngineInterrupted  # noqa: E402
 
 from rig.bench import open_bench  # noqa: E402
-from rig.bluesky import BenchDevices, FlyScan, enroll, identify  # noqa: E402
+from rig.bluesky import BenchDevices, enroll, identify  # noqa: E402
 from rig.catalog import Catalog  # noqa: E402
 from rig.config import load_config  # noqa: E402
 from rig.core.errors import MotionStopped  # noqa: E402
@@ -157,14 +157,12 @@ def test_plans_enroll_and_identify_and_tiled_reads_them_back(devices: BenchDevic
         client.context.http_client.close()
 
 
-def test_flyer_enrolls_in_one_revolution(tmp_path: Path) -> None:
+def test_plan_enrolls_in_one_revolution(tmp_path: Path) -> None:
     documents: Documents = []
     with flying(tmp_path) as (bench, catalog, _), BenchDevices(bench, hold=False) as devices:
-        flyer = FlyScan(devices, catalog, "block", views=12)
-        assert isinstance(flyer, protocols.Flyable)
         engine = RunEngine({}, context_managers=[])
         engine.subscribe(lambda name, document: documents.append((name, document)))
-        engine(plans.fly([flyer], md=devices.provenance()))
+        engine(enroll(devices, catalog, "block", views=12, fly=True))
         assert catalog.object("block").summary.views == 12
     validated(documents)
     assert sum(len(d["seq_num"]) if n == "event_page" else n == "event" for n, d in documents) == 12

@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from functools import lru_cache, partial
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
-from typing import Final, NoReturn
+from typing import Final
 from zipfile import ZIP_DEFLATED, ZIP_STORED, BadZipFile, ZipFile, ZipInfo
 
 from sqlalchemy import select
@@ -112,15 +112,11 @@ def read_bundle(path: Path, clock: Clock) -> Iterator[CatalogSource]:
                     shutil.copyfileobj(packed, file)  # not more than the size that was checked
         except (BadZipFile, OSError, EOFError, NotImplementedError, ValueError, RuntimeError, zlib.error) as error:
             raise _rejected(path, f"it cannot be read: {error}") from error
-        try:
+        with _rejecting(path, folder):
             catalog = Catalog.open(folder, clock=clock, create=False, read_only=True)
-        except RigError as error:
-            _raise_rejected(path, folder, error)
         with catalog:
-            try:
+            with _rejecting(path, folder):
                 _check_images(path, catalog, {name: info.file_size for name, info in members.items()})
-            except RigError as error:
-                _raise_rejected(path, folder, error)
             yield _Bundled(path, folder, catalog)
 
 
@@ -135,10 +131,8 @@ class _Bundled(CatalogSource):
         self._path, self._folder = path, folder
 
     def items(self) -> Iterator[Item]:
-        try:
+        with _rejecting(self._path, self._folder):
             yield from super().items()
-        except RigError as error:
-            _raise_rejected(self._path, self._folder, error)
 
 
 def _read_member(path: str, inode: int, changed_ns: int, name: str) -> bytes:
@@ -158,12 +152,16 @@ def _rejected(path: Path, why: str) -> ImportRejected:
     )
 
 
-def _raise_rejected(path: Path, folder: str, error: RigError) -> NoReturn:
+@contextmanager
+def _rejecting(path: Path, folder: str) -> Iterator[None]:
     """Raise an error of the unpacked catalog as one of the bundle."""
-    if isinstance(error, ImportRejected):
-        raise error
-    why = error.what.replace(folder, str(path)).rstrip(".")
-    raise _rejected(path, why[0].lower() + why[1:]) from error
+    try:
+        yield
+    except ImportRejected:
+        raise
+    except RigError as error:
+        why = error.what.replace(folder, str(path)).rstrip(".")
+        raise _rejected(path, why[0].lower() + why[1:]) from error
 
 
 def _member(name: str) -> ZipInfo:

@@ -1,54 +1,47 @@
-"""Tables of views and of results, and folders of photographs, for other programs.
+"""Tables of views and of results for other programs, as CSV, JSON or Parquet, and folders of photographs.
 
-All formats contain the views that searches use: those of the complete enrollments.
+All exports contain the views that searches use: those of the complete enrollments.
 """
 
 import csv
 import json
 import re
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
 from datetime import datetime
 from enum import StrEnum
 from io import TextIOWrapper
+from itertools import islice
 from pathlib import Path
-from typing import IO, Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
 from hbr.descriptors import descriptor
 from rig.catalog.derived import described, regions_of
-from rig.catalog.exchange.new_files import new_document, new_file, new_folder
+from rig.catalog.exchange.new_files import new_file, new_folder
 from rig.catalog.facts import Enrollment, View
 from rig.catalog.images import path_of
 from rig.catalog.records import EnrollmentStatus, Region
-from rig.catalog.results import Result
 from rig.catalog.transfer import CatalogSource, Item
-from rig.core.errors import ExportFailed
+from rig.core.errors import ExportFailed, UsageError
 from rig.core.next_steps import Do
 from rig.views.description import PAPER_DESCRIPTOR
-from rig.views.image_files import IMAGE_FOLDER
 
 TABLE: Final = "views.csv"
-NAMES: Final = "objects.csv"
-"""File with the names of obj1, obj2, ..., beside the photographs of an export."""
+"""The table beside the photographs of an export."""
 
 ANGLES: Final = ("commanded_deg", "encoder_deg", "imu_deg", "imu_sigma_deg")
 """Columns that a photograph of another program does not have."""
-_CSV: Final = (
-    *("object", "label", "note", "azimuth_deg", "image", *ANGLES, "captured_utc", "bench", "software"),
-    *("image_sha256", "region", "descriptor", "descriptor_version", "packed"),
-)
-_PARQUET: Final[Mapping[str, type]] = {
+VIEWS: Final[Mapping[str, type]] = {
     **dict.fromkeys(("object", "label", "note"), str),
     **dict.fromkeys(("azimuth_deg", *ANGLES), float),
     "captured_utc": datetime,
-    **dict.fromkeys(("bench", "software", "devices", "conditions", "evidence", "image", "image_sha256"), str),
-    "descriptor": str,
-    "descriptor_version": np.int32,
-    "levels": np.ndarray,
+    **dict.fromkeys(("bench", "software", "devices", "conditions", "evidence"), str),
+    **dict.fromkeys(("image", "image_sha256", "region", "descriptor"), str),
+    "descriptor_version": int,
+    "levels": list,
 }
-"""Columns of the table of views in each format; with types where the format has some."""
+"""Columns of a table of views and their types."""
 
 RESULTS: Final[Mapping[str, type]] = {
     "result": int,
@@ -64,13 +57,25 @@ RESULTS: Final[Mapping[str, type]] = {
 }
 """Columns of `Result.as_row` and their types."""
 
+_ROW_GROUP: Final = 10_000
+"""Rows of a Parquet table that are in memory at once."""
+
 
 class TableFormat(StrEnum):
-    """Format of a table of results; its suffix is the same."""
+    """Format of a table; its suffix is the same."""
 
     CSV = "csv"
     JSON = "json"
     PARQUET = "parquet"
+
+    @classmethod
+    def of(cls, path: Path) -> "TableFormat":
+        """Return the format that the suffix of a file names; a `UsageError` if there is none."""
+        try:
+            return cls(path.suffix.lower().removeprefix("."))
+        except ValueError as error:
+            known = ", ".join(f".{one}" for one in cls)
+            raise UsageError(f"The format of {path} is unknown.", next_step=f"Give a file with {known}.") from error
 
 
 class Enrolled(NamedTuple):
@@ -90,9 +95,7 @@ def enrolled(source: CatalogSource) -> Iterator[Enrolled]:
 
 
 def write_folder(folder: Path, source: CatalogSource) -> int:
-    """Write the views as ``obj{N}__{azimuth}.png``, and the names of the objects in ``objects.csv``.
-
-    The files are copies of the stored ones, and the azimuths are exact.
+    """Write copies of the images as ``obj{N}__{azimuth}.png``, as in COIL-100, with a table `TABLE`.
 
     Returns
     -------
@@ -105,132 +108,58 @@ def write_folder(folder: Path, source: CatalogSource) -> int:
     CatalogError
         An image is not the stored one.
     """
-    count = 0
-    with (
-        new_folder(folder) as made,
-        (made / NAMES).open("wb") as file,
-        _csv(file, ("object", "name", "label", "note", "region")) as rows,
-    ):
-        for count, (item, enrollment, regions) in enumerate(enrolled(source), 1):
-            about = {"name": item.name, "label": item.label, "note": item.note, "region": region_text(regions[0])}
-            rows.writerow({"object": f"obj{count}", **about})
-            for view in enrollment.views:
+    objects = list(enrolled(source))
+
+    def placed() -> Iterator[dict[str, Any]]:
+        for number, one in enumerate(objects, 1):
+            for row, view in _rows(source, one):
                 angle = np.format_float_positional(view.azimuth_deg, trim="-")
-                target = made / f"obj{count}__{angle}{Path(view.image).suffix}"
+                target = made / f"obj{number}__{angle}{Path(view.image).suffix}"
                 if target.exists():
                     raise ExportFailed(
-                        f"{item.name!r} has two views from {angle}°.", next_step="Export a bundle instead."
+                        f"{one.item.name!r} has two views from {angle}°.", next_step="Export a bundle instead."
                     )
                 target.write_bytes(source.content(view.image))
-    return count
+                yield {**row, "image": target.name}
+
+    with new_folder(folder) as made:
+        write_rows(made / TABLE, TableFormat.CSV, VIEWS, placed())
+    return len(objects)
 
 
-def write_table(target: Path, source: CatalogSource) -> int:
-    """Write the views as a CSV file, with copies of their images.
-
-    ``target`` is the file (suffix ``.csv``; the images are in a folder beside it), or a folder for ``views.csv`` and
-    the images. Errors are those of `write_folder`.
-    """
-    count = 0
-    with new_document(target, TABLE, IMAGE_FOLDER) as (file, images, link), _csv(file, _CSV) as table:
-        for rows in _rows(source):
-            count += 1
-            for row, view in rows:
-                within = Path(row["image"]).relative_to(IMAGE_FOLDER)
-                (images / within).parent.mkdir(exist_ok=True)
-                (images / within).write_bytes(source.content(view.image))
-                table.writerow({**row, "image": Path(link, within).as_posix()})
-    return count
-
-
-def write_parquet(path: Path, source: CatalogSource) -> int:
-    """Write the views as a Parquet table, with their CEDD levels, without their images.
+def write_views(path: Path, source: CatalogSource, form: TableFormat) -> int:
+    """Write the views as a table with their CEDD levels, without their images, and return the number of objects.
 
     Raises
     ------
     ExportFailed
         The file exists already or cannot be written, or pyarrow is not installed.
     """
-    return _write_parquet(path, _PARQUET, ([row for row, _ in rows] for rows in _rows(source)))
+    objects = list(enrolled(source))
+    write_rows(path, form, VIEWS, (row for one in objects for row, _ in _rows(source, one)))
+    return len(objects)
 
 
-def write_results(path: Path, results: Iterable[Result], form: TableFormat) -> None:
-    """Write results as one table into a new file; errors as for `write_parquet`."""
+def write_rows(path: Path, form: TableFormat, columns: Mapping[str, type], rows: Iterable[dict[str, Any]]) -> None:
+    """Write rows into a new file; errors as for `write_views`."""
     if form is TableFormat.PARQUET:
-        _write_parquet(path, RESULTS, [[result.as_row() for result in results]])
+        _write_parquet(path, columns, iter(rows))
         return
-    plain = [plain_row(result) for result in results]
     with new_file(path) as file:
+        text = TextIOWrapper(file, encoding="utf-8", newline="")
         if form is TableFormat.JSON:
-            file.write((json.dumps(plain, ensure_ascii=False, indent=1, allow_nan=False) + "\n").encode())
-            return
-        with _csv(file, RESULTS) as rows:
-            rows.writerows(plain)
+            text.write(json.dumps([plain_row(row) for row in rows], ensure_ascii=False, indent=1, allow_nan=False))
+            text.write("\n")
+        else:
+            table = csv.DictWriter(text, list(columns), lineterminator="\n")
+            table.writeheader()
+            for row in rows:
+                cells = plain_row(row)
+                table.writerow({k: " ".join(map(str, v)) if isinstance(v, list) else v for k, v in cells.items()})
+        text.detach()  # flushes
 
 
-def region_text(region: Region | None) -> str:
-    """Return a region as text for a table: x y width height; empty for the whole image."""
-    return "" if region is None else " ".join(map(str, region))
-
-
-def parse_region(text: str) -> Region | None:
-    """Parse the text of `region_text`. ValueError if it is not a region."""
-    if not text.strip():
-        return None
-    numbers = re.split(r"[ ,]+", text.strip())
-    if len(numbers) != 4 or not all(re.fullmatch("[0-9]{1,6}", number) for number in numbers):
-        raise ValueError(f"the region {text!r} is not of the form x y width height, in pixels")
-    x, y, width, height = map(int, numbers)
-    return x, y, width, height
-
-
-def plain_row(result: Result) -> dict[str, Any]:
-    """Return a result as a row of JSON values."""
-    return {k: v.isoformat() if isinstance(v, datetime) else v for k, v in result.as_row().items()}
-
-
-def _rows(source: CatalogSource) -> Iterator[list[tuple[dict[str, Any], View]]]:
-    """Yield the rows of each object, with all columns of both formats, and their views."""
-    kind = descriptor(PAPER_DESCRIPTOR)
-    for item, enrollment, regions in enrolled(source):
-        levels_of = described(source.catalog, enrollment, item.name, kind.name).levels[kind.name]
-        rows = []
-        for view, region, levels in zip(enrollment.views, regions, levels_of, strict=True):
-            by = enrollment.sessions[view.session].provenance
-            row = {
-                "object": item.name,
-                "label": item.label,
-                "note": item.note,
-                **{name: getattr(view, name) for name in ("azimuth_deg", *ANGLES, "captured_utc")},
-                "image": path_of(view.image),
-                "image_sha256": Path(view.image).stem,
-                "bench": by.bench,
-                "software": by.software,
-                "devices": json.dumps(by.devices, ensure_ascii=False),
-                "conditions": json.dumps(by.conditions, ensure_ascii=False),
-                "evidence": json.dumps(view.evidence, ensure_ascii=False),
-                "region": region_text(region),
-                "descriptor": kind.name,
-                "descriptor_version": kind.version,
-                "packed": kind.pack(levels).hex(),
-                "levels": levels,
-            }
-            rows.append((row, view))
-        yield rows
-
-
-@contextmanager
-def _csv(file: IO[bytes], columns: Iterable[str]) -> Iterator["csv.DictWriter[str]"]:
-    """Yield a writer of the rows of a CSV table with these columns; a row may have others."""
-    text = TextIOWrapper(file, encoding="utf-8", newline="")
-    rows = csv.DictWriter(text, list(columns), lineterminator="\n", extrasaction="ignore")
-    rows.writeheader()
-    yield rows
-    text.detach()  # flushes; the caller closes the file
-
-
-def _write_parquet(path: Path, columns: Mapping[str, type], portions: Iterable[list[dict[str, Any]]]) -> int:
-    """Write rows as a Parquet table in portions, and return the number of portions; a row may have other columns."""
+def _write_parquet(path: Path, columns: Mapping[str, type], rows: Iterator[dict[str, Any]]) -> None:
     try:
         import pyarrow as pa
         import pyarrow.parquet as pq
@@ -240,16 +169,55 @@ def _write_parquet(path: Path, columns: Mapping[str, type], portions: Iterable[l
         ) from error
     kinds = {
         int: pa.int64(),
-        np.int32: pa.int32(),
         float: pa.float64(),
         str: pa.string(),
         datetime: pa.timestamp("us", "UTC"),
-        np.ndarray: pa.list_(pa.uint8()),
+        list: pa.list_(pa.uint8()),
     }
     schema = pa.schema([(name, kinds[kind]) for name, kind in columns.items()])
-    count = 0
     with new_file(path) as file, pq.ParquetWriter(file, schema) as writer:
-        for rows in portions:
-            count += 1
-            writer.write_table(pa.Table.from_pylist(rows, schema))
-    return count
+        while part := list(islice(rows, _ROW_GROUP)):
+            writer.write_table(pa.Table.from_pylist(part, schema))
+
+
+def plain_row(row: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a row as JSON values."""
+    return {key: value.isoformat() if isinstance(value, datetime) else value for key, value in row.items()}
+
+
+def parse_region(text: str) -> Region | None:
+    """Parse a region of a table: x y width height, empty for the whole image. ValueError if it is none."""
+    if not text.strip():
+        return None
+    numbers = re.split(r"[ ,]+", text.strip())
+    if len(numbers) != 4 or not all(re.fullmatch("[0-9]{1,6}", number) for number in numbers):
+        raise ValueError(f"the region {text!r} is not of the form x y width height, in pixels")
+    x, y, width, height = map(int, numbers)
+    return x, y, width, height
+
+
+def _rows(source: CatalogSource, one: Enrolled) -> Iterator[tuple[dict[str, Any], View]]:
+    """Yield the views of an object, each with its row: the columns `VIEWS`."""
+    kind = descriptor(PAPER_DESCRIPTOR)
+    item, enrollment, regions = one
+    levels_of = described(source.catalog, enrollment, item.name, kind.name).levels[kind.name]
+    for view, region, levels in zip(enrollment.views, regions, levels_of, strict=True):
+        by = enrollment.sessions[view.session].provenance
+        row = {
+            "object": item.name,
+            "label": item.label,
+            "note": item.note,
+            **{name: getattr(view, name) for name in ("azimuth_deg", *ANGLES, "captured_utc")},
+            "bench": by.bench,
+            "software": by.software,
+            "devices": json.dumps(by.devices, ensure_ascii=False),
+            "conditions": json.dumps(by.conditions, ensure_ascii=False),
+            "evidence": json.dumps(view.evidence, ensure_ascii=False),
+            "image": path_of(view.image),
+            "image_sha256": Path(view.image).stem,
+            "region": "" if region is None else " ".join(map(str, region)),
+            "descriptor": kind.name,
+            "descriptor_version": kind.version,
+            "levels": levels.tolist(),
+        }
+        yield row, view

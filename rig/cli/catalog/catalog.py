@@ -1,7 +1,6 @@
 """`rig catalog ...`: the objects of a catalog, one by one."""
 
-from fnmatch import fnmatchcase
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -12,10 +11,10 @@ from rig.cli.ui.options import YesOption
 from rig.cli.ui.prompts import confirm
 from rig.cli.ui.settings import Settings
 from rig.core.errors import UsageError
-from rig.core.phrases import counted, number
+from rig.core.phrases import angle_words, counted
 
 if TYPE_CHECKING:
-    from rig.catalog import ObjectDetails, ObjectSummary, Session, View
+    from rig.catalog import ObjectDetails
     from rig.catalog.describing import Described
 
 app = typer.Typer(help="Manage the enrolled objects.", no_args_is_help=True)
@@ -27,11 +26,7 @@ NameArgument = Annotated[str, typer.Argument(metavar="NAME", help="Name of the o
 @command
 def list_(
     settings: Settings,
-    match: Annotated[
-        str | None, typer.Argument(metavar="[PATTERN]", help="Only names that match, e.g. 'mug-*'.")
-    ] = None,
     label: Annotated[str | None, typer.Option(help="Only objects with this label.")] = None,
-    unfinished: Annotated[bool, typer.Option("--unfinished", help="Only unfinished enrollments.")] = False,
     deleted: Annotated[bool, typer.Option("--deleted", help="List deleted objects instead.")] = False,
 ) -> None:
     """List the enrolled objects. Exit code 7 if the catalog is damaged.
@@ -39,54 +34,40 @@ def list_(
     Columns: name of the object, its label, its number of views (in brackets those of an unfinished enrollment), and the
     time when its enrollment was complete.
 
-    Example: rig catalog list 'mug-*' --label kitchen --bench sim
+    Example: rig catalog list --label kitchen --bench sim
     """
+    from rig.cli.ui.present import print_table
+
     with settings.open_catalog(read_only=True) as catalog:
-        found = catalog.objects(deleted=deleted)
-        objects = [
-            item
-            for item in found
-            if (match is None or fnmatchcase(item.name, match))
-            and (label is None or item.label == label)
-            and (not unfinished or item.unfinished_views is not None)
-        ]
+        objects = [one for one in catalog.objects(deleted=deleted) if label in (None, one.label)]
         if settings.json:
             settings.print_json({"catalog": str(catalog.place), "objects": objects})
-        elif objects:
-            _print_objects(objects)
+        elif not objects:
+            print("No such objects." if deleted or label else "No objects yet. Enroll one: rig enroll NAME")
         else:
-            empty = "No deleted objects." if deleted else "No objects yet. Enroll one: rig enroll NAME"
-            print(f"None of the {len(found)} objects matches." if found else empty)
+            rows = [
+                (
+                    one.name,
+                    one.label,
+                    f"{one.views}"
+                    + (f" (+{one.unfinished_views} unfinished)" if one.unfinished_views is not None else ""),
+                    f"{one.enrolled_utc:%Y-%m-%d %H:%M}" if one.enrolled_utc else "not yet",
+                )
+                for one in objects
+            ]
+            print_table(("object", "label", "views", "enrolled (UTC)"), rows)
         damage = catalog.damage()  # seconds for a large catalog, so the table is shown before
     if damage is not None:
         raise damage
 
 
-def _print_objects(objects: "list[ObjectSummary]") -> None:
-    from rig.cli.ui.present import print_table
-
-    rows = []
-    for item in objects:
-        views = str(item.views)
-        if item.unfinished_views is not None:
-            views += f" (+{item.unfinished_views} unfinished)"
-        enrolled = f"{item.enrolled_utc:%Y-%m-%d %H:%M}" if item.enrolled_utc else "not yet"
-        rows.append((item.name, item.label, views, enrolled))
-    print_table(("object", "label", "views", "enrolled (UTC)"), rows)
-
-
 @app.command("show")
 @command
-def show(
-    settings: Settings,
-    name: NameArgument,
-    full: Annotated[
-        bool, typer.Option("--full", help="Also show all settings of the devices and conditions of each session.")
-    ] = False,
-) -> None:
+def show(settings: Settings, name: NameArgument) -> None:
     """Show an object: its enrollments with their sessions, and the angles of its views. Exit code 7 if it is damaged.
 
     Columns: index of the view, azimuth of the camera, table angle by the servo's encoder and by the IMU, and sharpness.
+    With --json all settings of the devices and conditions of each session are shown, too.
 
     Example: rig catalog show mug-white --bench sim
     """
@@ -97,7 +78,6 @@ def show(
     found, problem = Described({}, ()), None
     with settings.open_catalog(read_only=True) as catalog:
         details = catalog.object(name)
-        folder = catalog.database.images.where("")
         try:
             if details.complete is not None:
                 found = described(catalog, details.complete, details.summary.name)
@@ -106,76 +86,51 @@ def show(
     if settings.json:
         settings.print_json(_as_json(details, found))
     else:
-        _print_object(details, found, folder, full=full)
+        _print_object(details, found)
     if problem is not None:
         raise problem
 
 
 def _as_json(details: "ObjectDetails", described: "Described") -> dict[str, Any]:
-    """Return an object with its views and their descriptions as JSON values."""
+    """Return an object with its views and their descriptions as JSON values: every column by its name."""
     from rig.catalog.images import path_of
     from rig.core.json_form import plain
     from rig.views.segmentation_evidence import SegmentationSummary
 
-    def session(one: "Session") -> dict[str, Any]:
-        return {
-            "id": one.number,
-            "started_utc": one.started_utc,
-            "provenance": one.provenance,
-            "empty_table_image": one.empty_table and path_of(one.empty_table),
-        }
+    def columns(row: Any) -> dict[str, Any]:
+        names = [column.key for column in type(row).__mapper__.column_attrs]
+        return {name: getattr(row, name) for name in names if name not in ("key", "digest", "object_id")}
 
-    def view(place: int, one: "View") -> dict[str, Any]:
-        record = {key: getattr(one, key) for key in _OF_A_RECORD}
-        record["descriptors"] = {name: levels[place].tolist() for name, levels in described.levels.items()}
-        record["segmentation"] = described.segmentation[place] if described.segmentation else None
-        return {
-            "id": one.id,
-            "object_name": details.summary.name,
-            "enrollment_id": one.enrollment_id,
-            "session": session(sessions[one.session]),
-            "record": record,
-            "captured_utc": one.captured_utc,
-            "image": path_of(one.image),
-            "image_sha256": one.image.partition(".")[0],
-            "image_bytes": one.image_bytes,
-        }
-
-    sessions = () if details.complete is None else details.complete.sessions
     enrollments = [
         {
-            "id": one.enrollment.id,
+            **columns(one.enrollment),
             "status": one.status,
-            "started_utc": one.enrollment.started_utc,
             "finished_utc": one.finished_utc,
-            "planned_azimuth_deg": one.enrollment.planned_azimuth_deg,
-            "present": one.enrollment.present,
-            "sessions": [session(part) for part in one.enrollment.sessions],
+            "sessions": [columns(part) for part in one.enrollment.sessions],
         }
         for one in details.enrollments
     ]
-    shown: dict[str, Any] = plain(
+    views = [
         {
-            "summary": details.summary,
-            "enrollments": enrollments,
-            "views": [view(place, one) for place, one in enumerate(details.views)],
-            "segmentation": SegmentationSummary.of(described.segmentation),
+            **columns(view),
+            "image": path_of(view.image),
+            "image_sha256": view.image.partition(".")[0],
+            "descriptors": {name: levels[place].tolist() for name, levels in described.levels.items()},
+            "segmentation": described.segmentation[place] if described.segmentation else None,
         }
-    )
-    return shown
+        for place, view in enumerate(details.views)
+    ]
+    segmentation = SegmentationSummary.of(described.segmentation)
+    shown = {"summary": details.summary, "enrollments": enrollments, "views": views, "segmentation": segmentation}
+    return dict(plain(shown))
 
 
-_OF_A_RECORD: Final = (
-    *("index", "commanded_deg", "encoder_deg", "azimuth_deg", "captured_ns", "imu_deg", "imu_sigma_deg"),
-    *("evidence", "region"),
-)
-
-
-def _print_object(details: "ObjectDetails", described: "Described", folder: str, *, full: bool) -> None:
+def _print_object(details: "ObjectDetails", described: "Described") -> None:
+    from rig.cli.ui.present import print_table
     from rig.views.segmentation_evidence import SegmentationSummary
 
     summary = details.summary
-    print("  ".join(text for text in (summary.name, summary.label) if text))
+    print("  ".join(filter(None, (summary.name, summary.label))))
     if summary.note:
         print(summary.note)
     for one in details.enrollments:
@@ -185,25 +140,22 @@ def _print_object(details: "ObjectDetails", described: "Described", folder: str,
             f"{len(enrollment.planned_azimuth_deg)} views, started {enrollment.started_utc:%Y-%m-%d %H:%M} UTC"
         )
         for session in enrollment.sessions:
-            provenance = session.provenance
-            devices = {part: value if full else _model(value) for part, value in provenance.devices.items()}
-            source = {"bench": provenance.bench, "software": provenance.software, **devices}
-            print(f"  {session.started_utc:%Y-%m-%d %H:%M} UTC: {_in_one_line(source)}")
-            if full:
-                print(*(f"    {key}: {_in_one_line(value)}" for key, value in provenance.conditions.items()), sep="\n")
-            elif provenance.conditions:
-                print(f"    {counted(_count(provenance.conditions), 'setting')}: --full")
-    if not details.views:
-        return
-    if segmentation := SegmentationSummary.of(described.segmentation).text:
-        print(segmentation)
-    print(f"images in {folder}")
-    print("view  azimuth   encoder       IMU  sharpness")
-    for view in details.views:
-        print(
-            f"{view.index:4d}  {view.azimuth_deg:6.2f}°  {_number(view.encoder_deg, 7, 2)}°  "
-            f"{_number(view.imu_deg, 7, 2)}°  {_number(view.evidence.get('sharpness'), 9, 1)}"
-        )
+            by = session.provenance
+            print(f"  {session.started_utc:%Y-%m-%d %H:%M} UTC: bench {by.bench or '–'}, software {by.software}")
+    if details.views:
+        if words := SegmentationSummary.of(described.segmentation).text:
+            print(words)
+        rows = [
+            (
+                str(view.index),
+                f"{view.azimuth_deg:.2f}°",
+                *("–" if angle is None else angle_words(angle, 2) for angle in (view.encoder_deg, view.imu_deg)),
+                f"{view.evidence.get('sharpness', float('nan')):.1f}",
+            )
+            for view in details.views
+        ]
+        titles = ("view", "azimuth", "encoder", "IMU", "sharpness")
+        print_table(titles, rows, right=titles)
 
 
 @app.command("rename")
@@ -260,14 +212,10 @@ def delete_(
     """
     with settings.open_catalog() as catalog:
         found = [catalog.summary(name) for name in dict.fromkeys(names)]
-        views = sum(item.views for item in found)
-        confirm(
-            f"Delete {', '.join(item.name for item in found)} with {counted(views, 'view')}?",
-            yes=yes,
-            settings=settings,
-        )
+        deleted = [one.name for one in found]
+        views = counted(sum(one.views for one in found), "view")
+        confirm(f"Delete {', '.join(deleted)} with {views}?", yes=yes, settings=settings)
         catalog.delete(*names)
-    deleted = [item.name for item in found]
     settings.say(f"Deleted {', '.join(deleted)}. To restore: rig catalog undelete NAME", {"deleted": deleted})
 
 
@@ -297,60 +245,21 @@ def stats(settings: Settings) -> None:
     from rig.core.json_form import plain
 
     with settings.open_catalog(read_only=True) as catalog:
-        found = statistics(catalog)
-        path = catalog.place
-    if settings.json:
-        settings.print_json({"catalog": str(path), **plain(found)})
-        return
-    print(f"catalog      {path}, schema version {found.schema_version}")
-    print(f"objects      {found.objects}" + (f" (+{found.deleted_objects} deleted)" if found.deleted_objects else ""))
-    print("enrollments  " + (", ".join(f"{count} {status}" for status, count in found.enrollments.items()) or "none"))
-    print(f"views        {found.views}")
-    print(f"images       {size_words(found.image_bytes)}")
-    room = found.free_disk_bytes
-    free = "" if room is None else f"; {size_words(room)} free on the disk of the images"
-    print(f"database     {size_words(found.database_bytes)}{free}")
-    if found.labels.keys() - {""}:
-        print("labels       " + ", ".join(f"{label or '(none)'} {count}" for label, count in found.labels.items()))
-    print(
-        "benches      "
-        + (", ".join(f"{bench or '(imported)'} {count}" for bench, count in found.benches.items()) or "none")
-    )
-    for kind in found.descriptors:
-        state = "" if kind.current else ", by another version of the program: they are computed again"
-        print(f"descriptor   {kind.name} {kind.version}: {kind.views} views{state}")
-    print(f"log          {found.log_entries} entries")
-    print(f"results      {found.results}, {size_words(found.result_image_bytes)} of images")
-    if found.deleted_image_bytes or found.old_image_bytes:
-        print(
-            f"removable    {size_words(found.deleted_image_bytes)} of deleted objects (rig catalog gc), "
-            f"{size_words(found.old_image_bytes)} of earlier enrollments (rig catalog gc --old)"
-        )
-
-
-def _number(value: Any, width: int, digits: int) -> str:
-    return (number(value, f".{digits}f") if isinstance(value, int | float) else "–").rjust(width)
-
-
-def _model(identity: Any) -> Any:
-    """Return the short name of a device."""
-    named = identity if isinstance(identity, dict) else {}
-    return next((named[key] for key in ("model", "device", "name") if named.get(key)), identity)
-
-
-def _count(values: Any) -> int:
-    """Return the number of single values in nested ones."""
-    return sum(map(_count, values.values())) if isinstance(values, dict) else 1
-
-
-def _in_one_line(values: Any) -> str:
-    """Return nested values in one line: servo (model xl430, id 1), ..."""
-    if isinstance(values, dict):
-        return ", ".join(
-            f"{key} ({_in_one_line(value)})" if isinstance(value, dict) else f"{key} {_in_one_line(value)}"
-            for key, value in values.items()
-            if value not in (None, "", [], {})
-        )
-    if isinstance(values, list):
-        return "[" + " ".join(_in_one_line(value) for value in values) + "]"
-    return f"{values:g}" if isinstance(values, float) else str(values)
+        found, place = statistics(catalog), catalog.place
+    lines = {
+        "catalog": f"{place}, schema version {found.schema_version}",
+        "objects": f"{found.objects}" + (f" (+{found.deleted_objects} deleted)" if found.deleted_objects else ""),
+        "enrollments": ", ".join(f"{count} {status}" for status, count in found.enrollments.items()) or "none",
+        "views": found.views,
+        "images": size_words(found.image_bytes),
+        "database": size_words(found.database_bytes),
+        "free": "–" if found.free_disk_bytes is None else size_words(found.free_disk_bytes),
+        **{
+            f"{kind.name} {kind.version}": f"{kind.views} views" + ("" if kind.current else ", to be computed again")
+            for kind in found.descriptors
+        },
+        "log": f"{found.log_entries} entries",
+        "results": f"{found.results}, {size_words(found.result_image_bytes)} of images",
+    }
+    words = "\n".join(f"{name:16} {text}" for name, text in lines.items())
+    settings.say(words, {"catalog": str(place), **plain(found)})

@@ -1,22 +1,29 @@
-"""`rig results ...`: the recorded answers of identifications."""
+"""`rig results ...` and `rig log`: the recorded answers of identifications, and who did what."""
 
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, TypedDict, Unpack
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypedDict, Unpack
 
 import typer
 
-from rig.cli.catalog.upkeep import parse_time
 from rig.cli.ui.command import command
 from rig.cli.ui.complete import object_names
 from rig.cli.ui.settings import Settings
+from rig.core.clock import SystemClock
 from rig.core.errors import UsageError
-from rig.core.phrases import counted
+from rig.core.phrases import angle_words, counted, short
 
 if TYPE_CHECKING:
     from rig.catalog.results import Answer, Result
-    from rig.events.events import Identified
 
 app = typer.Typer(help="Show, export and correct the recorded answers of identifications.", no_args_is_help=True)
+
+_LONGEST_DETAIL: Final = 60
+"""Letters of a detail of the log in a table; --json has all."""
+
+_WHEN: Final = "2026-01-31, 2026-01-31T14:00 (UTC), or a time ago: 30m, 12h, 7d, 4w."
+SinceOption = Annotated[str | None, typer.Option(metavar="WHEN", help=f"Only those since this time: {_WHEN}")]
+ResultArgument = Annotated[int, typer.Argument(metavar="RESULT", min=1, help="Number of the result.")]
 
 
 class Filters(TypedDict):
@@ -26,20 +33,9 @@ class Filters(TypedDict):
     name: Annotated[
         str | None, typer.Option("--object", metavar="NAME", help="Only this object.", autocompletion=object_names)
     ]
-    outcome: Annotated[str | None, typer.Option(metavar="found|ambiguous|unknown", help="Only this outcome.")]
-    taken_on: Annotated[str | None, typer.Option(metavar="BENCH", help="Only answers of this bench.")]
-    since: Annotated[
-        str | None,
-        typer.Option(
-            metavar="WHEN",
-            help="Only answers since this time: 2026-01-31, 2026-01-31T14:00 (UTC), or a time ago: 30m, 12h, 7d, 4w.",
-        ),
-    ]
-    before: Annotated[str | None, typer.Option(metavar="WHEN", help="Only answers before this time.")]
-    corrected: Annotated[bool, typer.Option("--corrected", help="Only corrected results.")]
-
-
-ResultArgument = Annotated[int, typer.Argument(metavar="RESULT", min=1, help="Number of the result.")]
+    outcome: Annotated[Literal["found", "ambiguous", "unknown"] | None, typer.Option(help="Only this outcome.")]
+    since: SinceOption
+    before: Annotated[str | None, typer.Option(metavar="WHEN", help="Only those before this time.")]
 
 
 @app.command("list")
@@ -57,7 +53,7 @@ def list_(settings: Settings, **filters: Unpack[Filters]) -> None:
     found = _find(settings, filters)
     if settings.json:
         for result in found:
-            settings.print_json(plain_row(result))
+            settings.print_json(plain_row(result.as_row()))
         return
     if not found:
         print("No results match.")
@@ -84,40 +80,23 @@ def show(settings: Settings, result: ResultArgument) -> None:
 
     Example: rig results show 12 --bench sim
     """
+    from rig.catalog.exchange.tables import plain_row
     from rig.catalog.results import find_result
     from rig.core.json_form import plain
-    from rig.events.wording import result_words
 
     with settings.open_catalog(read_only=True) as catalog:
         found = find_result(catalog, result)
-        image = "–" if found.image is None else catalog.database.images.where(found.image)
-    if settings.json:
-        shown = plain(found) | {"answered": found.answered._asdict(), "current": found.current._asdict()}
-        shown |= {"image": found.image_path, "image_sha256": found.image_sha256}
-        shown["time_utc"] = found.time_utc.isoformat()
-        for correction, one in zip(shown["corrections"], found.corrections, strict=True):
-            correction |= {"time_utc": one.time_utc.isoformat(), "corrected": one.corrected._asdict()}
-        settings.print_json(shown)
-        return
-    corrected = f"corrected to {_words(found.current)}; the answer was: " if found.corrections else ""
-    answer = _event(found)
-    print(f"Result {found.id}: {corrected}{_words(found.answered) if answer is None else result_words(answer)}")
-    lines = {
-        "sample": found.answered.sample or "–",
-        "time": f"{found.time_utc:%Y-%m-%d %H:%M:%S} UTC",
-        "operator": f"{found.operator} (account {found.user} on {found.host})",
-        "candidates": ", ".join(f"{one.name} {one.score:.3f}" for one in answer.candidates) if answer else "–",
-        "views": f"{len(found.azimuths_deg)}",
-        "bench": f"{found.provenance.bench}, {found.provenance.software}",
-        "catalog": f"version {found.catalog_version[:12]}",
-        "image": image,
-    }
-    for name, text in lines.items():
-        print(f"  {name:10} {text}")
-    for one in found.corrections:
+    shown = plain(found) | {"answered": found.answered._asdict(), "current": found.current._asdict()}
+    shown |= {"image": found.image_path, "image_sha256": found.image_sha256}
+    shown["time_utc"] = found.time_utc.isoformat()
+    for correction, one in zip(shown["corrections"], found.corrections, strict=True):
+        correction |= {"time_utc": one.time_utc.isoformat(), "corrected": one.corrected._asdict()}
+    lines = {name: value for name, value in plain_row(found.as_row()).items() if value is not None}
+    lines["candidates"] = ", ".join(f"{one['name']} {one['score']:.3f}" for one in found.details.get("candidates", ()))
+    for number, one in enumerate(found.corrections, 1):
         sample = f", sample {one.corrected.sample}" if one.corrected.sample else ""
-        print(f"Corrected {one.time_utc:%Y-%m-%d %H:%M:%S} UTC by {one.operator}: {_words(one.corrected)}{sample}")
-        print(f"  reason     {one.reason}")
+        lines[f"correction {number}"] = f"{_words(one.corrected)}{sample}, by {one.operator}: {one.reason}"
+    settings.say("\n".join(f"{name:18} {value}" for name, value in lines.items()), shown)
 
 
 @app.command("export")
@@ -131,15 +110,10 @@ def export(
 
     Example: rig results export june.csv --since 2026-06-01 --before 2026-07-01 --bench sim
     """
-    from rig.catalog.exchange.tables import TableFormat, write_results
+    from rig.catalog.exchange.tables import RESULTS, TableFormat, write_rows
 
-    try:
-        form = TableFormat(target.suffix.lower().removeprefix("."))
-    except ValueError as error:
-        known = ", ".join(f".{one}" for one in TableFormat)
-        raise UsageError(f"The format of {target} is unknown.", next_step=f"Give a file with {known}.") from error
-    found = _find(settings, filters)
-    write_results(target, found, form)
+    form, found = TableFormat.of(target), _find(settings, filters)
+    write_rows(target, form, RESULTS, (result.as_row() for result in found))
     settings.say(
         f"Exported {counted(len(found), 'result')} to {target}.",
         {"target": str(target), "format": form, "results": len(found)},
@@ -175,47 +149,83 @@ def correct(
     settings.say(text, {"result": result, **now._asdict()})
 
 
+@command
+def log(settings: Settings, since: SinceOption = None) -> None:
+    """Show who did what with the catalog and the table, oldest first.
+
+    Columns: time, user, action, object, details.
+
+    Example: rig log --since 7d --bench sim
+    """
+    from rig.catalog.log import shown
+    from rig.cli.ui.present import print_table
+
+    begin = _time(since, "--since")
+    with settings.open_catalog(read_only=True) as catalog:
+        entries = catalog.log(since=begin)
+    if settings.json:
+        for entry in entries:
+            settings.print_json(shown(entry) | {"time_utc": entry.time_utc.isoformat()})
+        return
+    if not entries:
+        print("No entries since then." if since else "No entries yet.")
+        return
+    rows = [
+        (
+            f"{entry.time_utc:%Y-%m-%d %H:%M:%S}",
+            entry.user,
+            entry.action,
+            entry.object_name or "",
+            ", ".join(filter(None, (_detail(key, value) for key, value in entry.details.items()))),
+        )
+        for entry in entries
+    ]
+    print_table(("time (UTC)", "user", "action", "object", "details"), rows)
+
+
+def _detail(key: str, value: Any) -> str:
+    """Return a detail of the log in words: "enrollment 3", "to 90.0°", "replace"; empty if there is nothing to say."""
+    name = key.removesuffix("_deg").removesuffix("_id").replace("_", " ")
+    if value is None or isinstance(value, bool):
+        return name if value else ""
+    if key.endswith("_deg") and isinstance(value, int | float):
+        return f"{name} {angle_words(value)}"
+    return f"{name} {short(', '.join(map(str, value)) if isinstance(value, list) else str(value), _LONGEST_DETAIL)}"
+
+
 def _find(settings: Settings, filters: Filters) -> "list[Result]":
     from rig.catalog.records import Outcome
     from rig.catalog.results import ResultFilter, find_results
 
-    given = filters["outcome"]
-    try:
-        outcome = None if given is None else Outcome(given)
-    except ValueError as error:
-        raise UsageError(f"--outcome {given!r} is unknown.", next_step=f"Give {', '.join(Outcome)}.") from error
     wanted = ResultFilter(
-        filters["sample"],
-        filters["name"],
-        outcome,
-        filters["taken_on"],
-        parse_time(filters["since"], "--since"),
-        parse_time(filters["before"], "--before"),
-        filters["corrected"],
+        sample=filters["sample"],
+        object_name=filters["name"],
+        outcome=Outcome(filters["outcome"]) if filters["outcome"] else None,
+        since=_time(filters["since"], "--since"),
+        before=_time(filters["before"], "--before"),
     )
     with settings.open_catalog(read_only=True) as catalog:
         return find_results(catalog, wanted)
 
 
-def _words(answer: "Answer") -> str:
-    """Return an answer for a table: "mug-white", "mug-white? (ambiguous)", "unknown"."""
-    from rig.catalog.records import Outcome
-
-    match answer.outcome:
-        case Outcome.FOUND:
-            return answer.object_name or "–"
-        case Outcome.AMBIGUOUS:
-            return f"ambiguous ({answer.object_name}?)"
-        case Outcome.UNKNOWN:
-            return "unknown"
-
-
-def _event(result: "Result") -> "Identified | None":
-    """Return the recorded event; None if another version of the program recorded it."""
-    from rig.events.events import Identified, event_of
-
-    try:
-        answer = event_of(result.details)
-    except ValueError:
+def _time(text: str | None, option: str) -> datetime | None:
+    """Return the time that an option gives: a date, a time in UTC, or how long ago."""
+    if text is None:
         return None
-    return answer if isinstance(answer, Identified) else None
+    units = {"m": "minutes", "h": "hours", "d": "days", "w": "weeks"}
+    try:
+        if text[-1:] in units and text[:-1].isdecimal():
+            return SystemClock().utc() - timedelta(**{units[text[-1]]: int(text[:-1])})
+        when = datetime.fromisoformat(text)
+    except (ValueError, OverflowError) as error:
+        raise UsageError(
+            f"{option} {text!r} is not a time.", next_step="Give a date such as 2026-01-31, or 12h for 12 hours ago."
+        ) from error
+    return when.replace(tzinfo=UTC) if when.tzinfo is None else when
+
+
+def _words(answer: "Answer") -> str:
+    """Return an answer for a table: "mug-white", "ambiguous (mug-white?)", "unknown"."""
+    if answer.outcome == "ambiguous":
+        return f"ambiguous ({answer.object_name}?)"
+    return answer.object_name or ("–" if answer.outcome == "found" else "unknown")

@@ -1,57 +1,60 @@
-"""`rig catalog verify`, `redescribe`, `gc`, `copy`, `merge` and `deliver`, and `rig log`."""
+"""`rig catalog verify`, `redescribe`, `gc`, `copy`, `deliver` and `fit`: the catalog as a whole.
 
+Decision: docs/decisions/0061.
+"""
+
+import os
 import sys
-from datetime import UTC, datetime, timedelta
+from math import isfinite
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
 from rig.cli.catalog.catalog import app
 from rig.cli.ui.command import command
-from rig.cli.ui.complete import object_names
 from rig.cli.ui.exit_codes import EXIT_CATALOG
-from rig.cli.ui.jobs import run_job, size_words
-from rig.cli.ui.options import ClusterOption, DryImportOption, JobsOption, YesOption, descriptor_name, jobs_of
+from rig.cli.ui.jobs import interruptible, run_job, size_words
+from rig.cli.ui.options import ClusterOption, JobsOption, YesOption, descriptor_name, jobs_of
 from rig.cli.ui.prompts import confirm
 from rig.cli.ui.settings import Settings
 from rig.core.clock import SystemClock
-from rig.core.errors import UsageError
-from rig.core.phrases import angle_words, counted
+from rig.core.errors import CatalogError, UsageError
+from rig.core.next_steps import Do
+from rig.core.phrases import counted, percent, percent_words, sentence
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+
+    from hbr import FittedRule
+    from hbr.core.arrays import FloatArray
+    from hbr.dense.fitting import Task
+
+_SEVERAL_PROCESSES: Final = 20_000
+"""Views from which the searches of a fit take longer than the start of further processes."""
+_SHOWN: Final = 20
+"""Failed objects that are listed; --json has all."""
 
 
 @app.command("verify")
 @command
-def verify(
-    settings: Settings,
-    jobs: JobsOption = None,
-    cluster: ClusterOption = None,
-) -> None:
+def verify(settings: Settings) -> None:
     """Check whether everything is as it was stored. The exit code is 7 if it is not. Nothing is changed.
 
     Example: rig catalog verify --bench sim
     """
     from rig.catalog.verify import verify as job
-    from rig.cli.catalog.findings import finding_text
 
     with settings.open_catalog(read_only=True) as catalog:
-        found = run_job(
-            "verifying",
-            job(catalog, jobs=jobs_of(jobs, cluster)),
-            interrupted="Interrupted; nothing was changed.",
-        )
-    if settings.json:
-        settings.print_json(found)
-    else:
-        for finding in found.findings:
-            print(finding_text(finding))
-        problems = counted(len(found.findings), "problem")
-        outcome = problems if found.findings else "everything is as it was stored"
-        checked = ", ".join(
-            counted(number, noun)
-            for number, noun in ((found.objects, "object"), (found.views, "view"), (found.results, "result"))
-        )
-        print(f"{checked}, {size_words(found.image_bytes)} of images: {outcome}")
+        found = run_job("verifying", job(catalog), interrupted="Interrupted; nothing was changed.")
+    checked = ", ".join(
+        counted(number, noun)
+        for number, noun in ((found.objects, "object"), (found.views, "view"), (found.results, "result"))
+    )
+    problems = counted(len(found.findings), "problem")
+    outcome = problems if found.findings else "everything is as it was stored"
+    summary = f"{checked}, {size_words(found.image_bytes)} of images: {outcome}"
+    settings.say("\n".join([*(finding.text for finding in found.findings), summary]), found)
     if found.findings:
         raise typer.Exit(EXIT_CATALOG)
 
@@ -62,45 +65,46 @@ def redescribe(
     settings: Settings,
     descriptor: Annotated[str, typer.Option(help="Name of the descriptor.")] = "cedd",
     region: Annotated[
-        str,
+        str | None,
         typer.Option(
-            help="Region of the images: stored (unchanged), config (view.roi), whole, or X,Y,WIDTH,HEIGHT in pixels."
+            metavar="X,Y,WIDTH,HEIGHT|whole",
+            help="From now on, describe this part of the images, in pixels, or the whole.",
         ),
-    ] = "stored",
-    again: Annotated[bool, typer.Option("--again", help="Also describe views that are described already.")] = False,
+    ] = None,
     jobs: JobsOption = None,
     cluster: ClusterOption = None,
 ) -> None:
     """Describe the enrolled views now: those that no search has described since the program or the region changed.
 
-    A search does this, too. After an interruption, the command continues if it is given without --again.
+    A search does this, too. After an interruption, the same command continues.
 
-    Example: rig catalog redescribe --region config --bench sim
+    Example: rig catalog redescribe --region 40,0,240,240 --bench sim
 
     Example: rig catalog redescribe --descriptor edges+colours --bench sim
     """
     from rig.catalog.derived import choose_region
     from rig.catalog.derived import redescribe as job
+    from rig.catalog.exchange.tables import parse_region
 
     name = descriptor_name(descriptor)
+    try:
+        part = None if region in (None, "whole") else parse_region(region)
+    except ValueError as error:
+        raise UsageError(f"--region: {error}.", next_step="Give X,Y,WIDTH,HEIGHT, or whole.") from error
     with settings.open_catalog() as catalog:
-        if region != "stored":
-            choose_region(catalog, _region(settings, region))
-        done = run_job(
-            "describing",
-            job(catalog, name, again=again, jobs=jobs_of(jobs, cluster)),
-            interrupted="Interrupted; the results so far are stored. "
-            f"To continue: rig catalog redescribe --descriptor {name}",
+        if region is not None:
+            choose_region(catalog, part)
+        interrupted = (
+            f"Interrupted; the results so far are stored. To continue: rig catalog redescribe --descriptor {name}"
         )
-    if settings.json:
-        settings.print_json(done)
-    else:
-        print(
-            f"{done.descriptor} {done.version}: {counted(done.described, 'view')} described, "
-            f"{done.unchanged} unchanged, {len(done.failed)} failed"
-        )
-        for path, reason in done.failed[:20]:
-            print(f"  {path}: {reason}", file=sys.stderr)
+        done = run_job("describing", job(catalog, name, jobs=jobs_of(jobs, cluster)), interrupted=interrupted)
+    settings.say(
+        f"{done.descriptor} {done.version}: {counted(done.described, 'view')} described, "
+        f"{done.unchanged} unchanged, {len(done.failed)} failed",
+        done,
+    )
+    for path, reason in done.failed[:_SHOWN]:
+        print(f"  {path}: {reason}", file=sys.stderr)
     if done.failed:
         raise typer.Exit(EXIT_CATALOG)
 
@@ -117,24 +121,22 @@ def gc(
 
     Example: rig catalog gc --dry-run --bench sim
     """
-    from rig.catalog.upkeep import GarbageReport, collect_garbage
+    from rig.catalog.upkeep import collect_garbage
     from rig.core.json_form import plain
 
-    def words(found: GarbageReport) -> str:
+    with settings.open_catalog() as catalog:
+        found = collect_garbage(catalog, old=old, dry_run=True)
         names = ", ".join(found.objects[:10]) + (" and others" if len(found.objects) > 10 else "")
-        return (
+        words = (
             f"{counted(len(found.objects), 'deleted object')}{f' ({names})' if names else ''}, "
             f"{counted(found.enrollments, 'enrollment')}, {counted(found.views, 'view')} and "
             f"{counted(found.files, 'file')}, {size_words(found.bytes)}"
         )
-
-    with settings.open_catalog() as catalog:
-        found = collect_garbage(catalog, old=old, dry_run=True)
-        nothing = found == GarbageReport((), 0, 0, 0, 0)
+        nothing = not (found.enrollments or found.files)
         if not dry_run and not nothing:
-            confirm(f"Remove {words(found)} permanently?", yes=yes, settings=settings)
+            confirm(f"Remove {words} permanently?", yes=yes, settings=settings)
             found = collect_garbage(catalog, old=old)
-    text = f"{'Would remove' if dry_run else 'Removed'} {words(found)}."
+    text = f"{'Would remove' if dry_run else 'Removed'} {words}."
     settings.say("There is nothing to remove." if nothing else text, {"dry_run": dry_run, **plain(found)})
 
 
@@ -144,14 +146,12 @@ def copy(
     settings: Settings,
     source: Annotated[str, typer.Argument(metavar="FROM", help="Folder or database URL of the catalog.")],
     target: Annotated[str, typer.Argument(metavar="TO", help="Folder or database URL of a new or empty catalog.")],
-    images: Annotated[
-        str | None,
-        typer.Option(metavar="PLACE", help="Folder or store of the images of a database (default: catalog.images)."),
-    ] = None,
 ) -> None:
     """Copy a whole catalog, for example from this computer to a server, and compare all digests.
 
-    Example: rig catalog copy ~/catalog postgresql+psycopg://rig@server/rig --images s3://rig/catalog
+    The images of a database are in the store that the setting catalog.images names.
+
+    Example: rig catalog copy ~/catalog postgresql+psycopg://rig@server/rig --set catalog.images=s3://rig/catalog
     """
     from rig.catalog import Catalog
     from rig.catalog.copying import copy_catalog
@@ -161,7 +161,7 @@ def copy(
         if "://" not in text:
             return CatalogPlace(Path(text))
         config = settings.load()
-        return CatalogPlace(config.catalog_path(settings.bench_name), text, images or config.catalog.images)
+        return CatalogPlace(config.catalog_path(settings.bench_name), text, config.catalog.images)
 
     clock = SystemClock()
     with (
@@ -176,124 +176,6 @@ def copy(
             f"{after.place}. All digests are equal."
         )
     settings.say(words, done._asdict())
-
-
-@command
-def log(
-    settings: Settings,
-    since: Annotated[
-        str | None,
-        typer.Option(
-            metavar="WHEN",
-            help="Only entries since this time: 2026-01-31, 2026-01-31T14:00 (UTC), or a time ago: 30m, 12h, 7d, 4w.",
-        ),
-    ] = None,
-    name: Annotated[
-        str | None, typer.Option("--object", metavar="NAME", help="Only this object.", autocompletion=object_names)
-    ] = None,
-) -> None:
-    """Show who did what with the catalog and the table, oldest first.
-
-    Columns: time, user, action, object, details.
-
-    Example: rig log --since 7d --bench sim
-    """
-    from rig.catalog.log import shown
-    from rig.cli.ui.present import print_table
-
-    begin = parse_time(since, "--since")
-    with settings.open_catalog(read_only=True) as catalog:
-        entries = catalog.log(since=begin, object_name=name)
-    if settings.json:
-        for entry in entries:
-            settings.print_json(shown(entry) | {"time_utc": entry.time_utc.isoformat()})
-        return
-    if not entries:
-        print("No entries since then." if since else "No entries yet.")
-        return
-    rows = [
-        (
-            f"{entry.time_utc:%Y-%m-%d %H:%M:%S}",
-            entry.user,
-            entry.action,
-            entry.object_name or "",
-            ", ".join(filter(None, (_detail(key, value) for key, value in entry.details.items()))),
-        )
-        for entry in entries
-    ]
-    print_table(("time (UTC)", "user", "action", "object", "details"), rows)
-
-
-def _detail(key: str, value: Any) -> str:
-    """Return a detail of the log in words: "enrollment 3", "to 90.0°", "replace"; empty if there is nothing to say."""
-    name = key.removesuffix("_deg").removesuffix("_id").replace("_", " ")
-    if value is None or isinstance(value, bool):
-        return name if value else ""
-    if key.endswith("_deg") and isinstance(value, int | float):
-        return f"{name} {angle_words(value)}"
-    text = ", ".join(map(str, value)) if isinstance(value, list) else str(value)
-    return f"{name} {text if len(text) <= 60 else f'{text[:59]}…'}"
-
-
-def _region(settings: Settings, text: str) -> Any:
-    from rig.catalog.exchange.tables import parse_region
-
-    match text:
-        case "config":
-            return settings.load().view.roi
-        case "whole":
-            return None
-    try:
-        return parse_region(text)
-    except ValueError as error:
-        raise UsageError(str(error), next_step="Give stored, config, whole, or X,Y,WIDTH,HEIGHT.") from error
-
-
-def parse_time(text: str | None, option: str) -> datetime | None:
-    """Return the time that an option gives: a date, a time in UTC, or how long ago."""
-    if text is None:
-        return None
-    units = {"m": "minutes", "h": "hours", "d": "days", "w": "weeks"}
-    try:
-        if text[-1:] in units and text[:-1].isdecimal():
-            return SystemClock().utc() - timedelta(**{units[text[-1]]: int(text[:-1])})
-        when = datetime.fromisoformat(text)
-    except (ValueError, OverflowError) as error:
-        raise UsageError(
-            f"{option} {text!r} is not a time.", next_step="Give a date such as 2026-01-31, or 12h for 12 hours ago."
-        ) from error
-    return when.replace(tzinfo=UTC) if when.tzinfo is None else when
-
-
-@app.command("merge")
-@command
-def merge(
-    settings: Settings,
-    other: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of the other catalog. It is not changed.")],
-    on_conflict: Annotated[
-        str, typer.Option(metavar="reject|skip|replace", help="What to do with objects that are in both.")
-    ] = "reject",
-    dry_run: DryImportOption = False,
-    jobs: JobsOption = None,
-) -> None:
-    """Import the objects of another catalog with all their enrollments; all or nothing.
-
-    Example: rig catalog merge /media/stick/catalog --on-conflict skip --bench sim
-    """
-    from rig.catalog import Catalog
-    from rig.catalog.transfer import CatalogSource
-    from rig.cli.catalog.exchange import run_import
-
-    with Catalog.open(other, clock=SystemClock(), create=False, read_only=True) as source:
-        run_import(
-            settings,
-            CatalogSource(source, own=False),
-            on_conflict=on_conflict,
-            label=None,
-            strict=True,
-            dry_run=dry_run,
-            jobs=jobs,
-        )
 
 
 @app.command("deliver")
@@ -346,3 +228,92 @@ def deliver(
         print("No object was delivered.")
     if conflicts:
         raise typer.Exit(EXIT_CATALOG)
+
+
+@app.command("fit")
+@app.command("calibrate", hidden=True)  # the word that technicians try first
+@command
+def fit(
+    settings: Settings,
+    error_rate: Annotated[
+        float, typer.Option(min=0.0001, max=0.5, help="Largest share of wrong objects among those named.")
+    ] = 0.01,
+    false_reject: Annotated[
+        float, typer.Option(min=0.0001, max=0.5, help="Largest share of enrolled objects called unknown.")
+    ] = 0.02,
+    cluster: ClusterOption = None,
+) -> None:
+    """Fit the stopping rule, which decides when rig identify ends a search, to the catalog.
+
+    The command searches for each enrolled object with its own views, as if the camera had been a little to the side.
+    Then it leaves the object out and searches again, as for an unknown object. In a catalog of more than 1000 objects,
+    it searches for 1000 of them among all. It reports what the rule cannot guarantee, and how much more data is needed.
+    Repeat the command when rig identify reports that the catalog has changed.
+
+    Example: rig catalog fit --bench sim --error-rate 0.005
+    """
+    from hbr import DenseIndex, fit_stopping_rule
+    from rig.catalog.derived import views as enrolled_views
+    from rig.catalog.jobs import JobProgress
+    from rig.cli.ui.present import Progress
+    from rig.core.json_form import plain
+    from rig.core.processes import map_in_processes
+    from rig.search.stopping_rules import FILE, stopping_rule_values, write_stopping_rule
+    from rig.views.description import BENCH_DESCRIPTOR
+
+    clock = SystemClock()
+    with settings.open_catalog(read_only=True) as catalog:
+        with Progress("Describing the enrolled views") as progress:
+            views = enrolled_views(catalog, BENCH_DESCRIPTOR, progress)
+        if not len(views):
+            raise CatalogError("The catalog is empty.", next_step=Do.ENROLL())
+        path = catalog.path / FILE
+    print(f"Searching for {len(views.object_names)} objects among each other ...", file=sys.stderr)
+    index = DenseIndex(views)
+    where = jobs_of(None, cluster) or ((os.cpu_count() or 1) if len(views) >= _SEVERAL_PROCESSES else 1)
+    with interruptible("Interrupted; nothing changed."), Progress("Searching") as progress:
+
+        def searched(
+            work: "Callable[[Task], FloatArray]", tasks: "Sequence[Task]"
+        ) -> "Iterator[tuple[Task, FloatArray]]":
+            for done, one in enumerate(map_in_processes(work, tasks, where)):
+                progress(JobProgress(done, len(tasks)))
+                yield one
+
+        found = fit_stopping_rule(index, error_rate=error_rate, false_reject=false_reject, tasks=searched)
+    made_utc = f"{clock.utc():%Y-%m-%dT%H:%M:%SZ}"
+    write_stopping_rule(path, found.rule, index, made_utc=made_utc)
+    outcome = {key: value for key, value in plain(found).items() if key != "rule"}
+    values = stopping_rule_values(found.rule, index, made_utc=made_utc)
+    words = "\n".join([*_fit_lines(found, len(views.object_names)), f"Stored: {path}"])
+    settings.say(words, {"file": str(path), "fit": outcome, **values})
+
+
+def _fit_lines(found: "FittedRule", objects: int) -> list[str]:
+    from rig.events.note_wording import limitation_words
+
+    rule = found.rule
+    searched = (f"{found.searched} of " if 0 < found.searched < objects else "") + counted(objects, "object")
+    lines = [f"{rule.searches} leave-one-out searches of {counted(found.views, 'view')} for {searched}"]
+    if found.ended:
+        lines.append(
+            f"  answers  {found.ended} searches ended at a confidence of {percent_words(rule.min_confidence)}, after "
+            f"{found.mean_views:.2f} views on average, {found.wrong} of them with a wrong object "
+            f"({percent(found.wrong / found.ended)})"
+        )
+    if isfinite(rule.open_set_thresholds[-1]):
+        thresholds = ", ".join(f"{one:.3f}" for one in rule.open_set_thresholds)
+        share = f": {found.rejected} of {rule.searches} searches for enrolled objects" if found.ended else ""
+        lines.append(f"  unknown  below an open-set score of {thresholds} after 1, 2, ... views{share}")
+    if found.accepted is not None:
+        pairs = ", ".join(f"{one} for {other}" for one, other in found.confused[:3])
+        lines.append(
+            f"  left out  {found.accepted} of {rule.searches} left-out objects were taken for another object "
+            f"({percent(found.accepted / rule.searches)}){f': {pairs}' if pairs else ''}"
+        )
+    if not rule.limitations:
+        lines.append(
+            f"Guaranteed for searches like these: at most {percent(rule.error_rate)} wrong answers, and "
+            f"{percent(rule.false_reject)} of the enrolled objects called unknown."
+        )
+    return [*lines, *(f"Not guaranteed: {sentence(limitation_words(one))}" for one in rule.limitations)]

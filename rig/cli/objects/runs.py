@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 RunArgument = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a saved run.")]
 SHOWN: Final = 3
-"""Differences that an error lists without --all."""
+"""Differences that an error lists without --json."""
 
 
 @command
@@ -25,9 +25,6 @@ def replay(
     run: RunArgument,
     check: Annotated[
         bool, typer.Option("--check", help="Compute every decision again from the images; exit code 6 if one differs.")
-    ] = False,
-    every: Annotated[
-        bool, typer.Option("--all", help="With --check: list all differences in full, not only the first three.")
     ] = False,
     model: ModelOption = None,
 ) -> None:
@@ -40,7 +37,7 @@ def replay(
     load_model_file(model)
     saved = load_run(run)
     if check:
-        _check(settings, saved, every=every or settings.json)
+        _check(settings, saved)
         return
     from rig.cli.ui.live import IdentifyView
     from rig.cli.ui.present import console
@@ -85,7 +82,7 @@ def report(
     settings.say(f"Report: {path}", {"report": str(path)})
 
 
-def _check(settings: Settings, saved: "SavedRun", *, every: bool) -> None:
+def _check(settings: Settings, saved: "SavedRun") -> None:
     from rig.core.json_form import plain
     from rig.search.replay import check
 
@@ -93,13 +90,17 @@ def _check(settings: Settings, saved: "SavedRun", *, every: bool) -> None:
         found = check(saved)
     done = f"Computed again: {counted(found.views, 'descriptor')} and {counted(found.decisions, 'decision')}."
     if found.differences:
-        more = 0 if every else len(found.differences) - SHOWN
-        listed = [str(one) if every else one.summary() for one in found.differences[: None if every else SHOWN]]
+        more = 0 if settings.json else len(found.differences) - SHOWN
+        listed = (
+            [str(one) for one in found.differences]
+            if settings.json
+            else [one.summary() for one in found.differences[:SHOWN]]
+        )
         raise ReplayMismatch(
             f"{counted(len(found.differences), 'number')} in the saved run differ from the computed ones. {done}",
             next_step="Check whether the files of the run were changed. If not, this version of the program decides "
             f"differently from {saved.about['software']}, which saved the run.",
-            evidence={"differences": [*listed, f"and {more} more: --all"] if more > 0 else listed},
+            evidence={"differences": [*listed, f"and {more} more: --json"] if more > 0 else listed},
         )
     if not found.is_complete:
         raise RunIncomplete(

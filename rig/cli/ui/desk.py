@@ -7,9 +7,9 @@ from contextlib import AbstractContextManager, nullcontext, suppress
 from rig.bench import Bench
 from rig.bench.bench import DEVICES
 from rig.catalog import Catalog
-from rig.catalog.background import BackgroundCheck
 from rig.catalog.jobs import JobProgress
 from rig.catalog.shared import BackgroundDelivery, open_or_copy, waiting
+from rig.catalog.verify import BackgroundCheck
 from rig.cli.ui import prompts
 from rig.cli.ui.present import Progress as ProgressBar
 from rig.cli.ui.settings import Settings

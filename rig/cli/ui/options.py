@@ -54,7 +54,6 @@ class CommonOptions(TypedDict):
 
 
 YesOption = Annotated[bool, typer.Option("--yes", "-y", help="Do not ask for confirmation.")]
-DryImportOption = Annotated[bool, typer.Option("--dry-run", help="Only report what would be imported.")]
 JobsOption = Annotated[int | None, typer.Option(min=1, help="Number of processes (default: one per core).")]
 ClusterOption = Annotated[
     str | None,

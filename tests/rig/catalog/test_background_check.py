@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from rig.catalog import Action, Catalog, derived, log
-from rig.catalog.background import BackgroundCheck
 from rig.catalog.images import name_of
+from rig.catalog.verify import BackgroundCheck
 from rig.core.clock import SystemClock
 from rig.core.errors import CatalogDamaged, RigError
 from rig.views.image_files import encode
@@ -127,7 +127,7 @@ def test_watch_reports_a_flipped_byte_of_an_object_that_it_does_not_load(rig, ro
     assert "'gone' in the catalog changed after they were stored" in done.stderr
 
 
-@pytest.mark.parametrize("words", [("list",), ("list", "tin"), ("list", "--deleted")])
+@pytest.mark.parametrize("words", [("list",), ("list", "--label", ""), ("list", "--deleted")])
 def test_listing_reports_a_flipped_byte_of_a_view_and_is_printed(rig, root: Path, words: tuple[str, ...]) -> None:
     intact = rig("catalog", *words)
     assert intact.exit_code == 0, intact.output

@@ -251,9 +251,9 @@ def rollback_journal(database: Path, *, names: Path | None) -> bytes:
 
 
 COMMANDS = (
-    *("catalog gc --yes", "catalog verify --jobs 1", "catalog delete mug --yes", "catalog rename mug cup"),
-    *("catalog redescribe --again --jobs 1", "catalog label mug lab", "import photographs --jobs 1"),
-    *("enroll cup --views 4", "catalog merge other --jobs 1", "export a.zip", "catalog list", "identify"),
+    *("catalog gc --yes", "catalog verify", "catalog delete mug --yes", "catalog rename mug cup"),
+    *("catalog redescribe --jobs 1", "catalog label mug lab", "import photographs --jobs 1"),
+    *("enroll cup --views 4", "import other --jobs 1", "export a.zip", "catalog list", "identify"),
 )
 
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from rig.catalog import Catalog
-from rig.catalog.exchange.tables import RESULTS, TableFormat, write_results
+from rig.catalog.exchange.tables import RESULTS, TableFormat, write_rows
 from rig.catalog.records import Outcome
 from rig.catalog.results import ResultFilter, correct, find_result, find_results, record
 from rig.catalog.transfer import CatalogSource, transfer
@@ -193,9 +193,9 @@ def test_table_has_a_row_for_each_result(catalog: Catalog, tmp_path: Path) -> No
     results = find_results(catalog)
     assert list(results[0].as_row()) == list(RESULTS)
     for form in TableFormat:
-        write_results(tmp_path / f"a.{form}", results, form)
+        write_rows(tmp_path / f"a.{form}", form, RESULTS, [one.as_row() for one in results])
     with pytest.raises(ExportFailed, match="exists already"):
-        write_results(tmp_path / "a.csv", results, TableFormat.CSV)
+        write_rows(tmp_path / "a.csv", TableFormat.CSV, RESULTS, [one.as_row() for one in results])
     with (tmp_path / "a.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     loaded = json.loads((tmp_path / "a.json").read_text())

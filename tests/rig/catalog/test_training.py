@@ -3,7 +3,6 @@
 import json
 import shutil
 from collections.abc import Callable, Iterator
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -14,14 +13,13 @@ import yaml
 from numpy.typing import NDArray
 from typer.testing import CliRunner, Result
 
-from rig.calibrations import CalibrationResult, CalibrationStore, Estimate
 from rig.catalog import Catalog, Provenance, View
 from rig.catalog.derived import described
-from rig.catalog.exchange.training import Annotations, Split, write_training
+from rig.catalog.exchange.training import Annotations, write_training
 from rig.catalog.transfer import CatalogSource
 from rig.catalog.verify import verify
 from rig.cli.main import app
-from rig.core.errors import ExportFailed, UsageError
+from rig.core.errors import ExportFailed
 from sim.clock import VirtualClock
 from tests.rig.catalog.catalog_samples import PROVENANCE, finished, plan, sql, without_waiting
 
@@ -81,9 +79,9 @@ def parts_of(folder: Path) -> dict[str, Any]:
 
 
 def test_coco_has_the_stored_boxes_and_azimuths(catalog: Catalog, tmp_path: Path) -> None:
-    done = export(catalog, tmp_path / "out", intrinsics=lambda _: {"fx": 700.0})
-    assert (done.objects, done.views, done.without_mask) == (2, {"train": 2 * VIEWS}, 1)
-    (content,) = parts_of(tmp_path / "out").values()
+    done = export(catalog, tmp_path / "out")
+    assert (done.objects, done.views, done.without_mask) == (2, {"train": 2 * VIEWS, "val": 0, "test": 0}, 1)
+    content = parts_of(tmp_path / "out")["train"]
     assert [(one["name"], one["supercategory"]) for one in content["categories"]] == [
         ("mug", "toys"),
         ('tin: "7"', "toys"),
@@ -96,7 +94,7 @@ def test_coco_has_the_stored_boxes_and_azimuths(catalog: Catalog, tmp_path: Path
     for (view, evidence), picture, annotation in zip(views, content["images"], content["annotations"], strict=True):
         assert (tmp_path / "out" / picture["file_name"]).read_bytes() == catalog.image_path(view.image).read_bytes()
         assert picture["azimuth_deg"] == annotation["azimuth_deg"] == view.azimuth_deg
-        assert (picture["width"], picture["height"], picture["intrinsics"]) == (192, 144, {"fx": 700.0})
+        assert (picture["width"], picture["height"]) == (192, 144)
         stored = evidence["box_px"]
         x0, y0, *_ = view.region or (0, 0)
         expected = [0, 0, 192, 144] if stored is None else [stored[0] + x0, stored[1] + y0, *stored[2:]]
@@ -123,33 +121,6 @@ def test_pycocotools_reads_the_masks(catalog: Catalog, tmp_path: Path) -> None:
     assert len(read.getAnnIds(iscrowd=True)) == 1
 
 
-def test_intrinsics_are_those_of_the_calibration_in_force(tmp_path: Path) -> None:
-    result = CalibrationResult(
-        name="camera.intrinsics",
-        estimates={"fx": Estimate(701.5, 0.4, "px"), "k1": Estimate(-0.1, 0.01, "")},
-        residual=None,
-        limit=None,
-        residual_unit="px",
-        rejections=(),
-        when_utc=datetime(2026, 3, 1, tzinfo=UTC),
-        device={},
-        evidence={},
-    )
-    CalibrationStore(tmp_path / "calibration" / "sim").add(result)
-    with Catalog.open(tmp_path / "catalog", clock=VirtualClock()) as catalog:
-        enroll(catalog, "before", [scene(1)], provenance=Provenance("sim", {}))
-        conditions = {"calibrations": ["imu.scale@1", result.id]}
-        enroll(catalog, "after", [scene(2)], provenance=Provenance("sim", {}, conditions))
-        enroll(catalog, "elsewhere", [scene(3)], provenance=Provenance("../sim", {}, {"calibrations": [result.id]}))
-    folders = {"catalog.path": "catalog", "calibration_dir": "calibration"}
-    places = [word for key, name in folders.items() for word in ("--set", f"{key}={tmp_path / name}")]
-    target = str(tmp_path / "out")
-    done = CliRunner().invoke(app, ["export", target, "--format", "coco", "--jobs", "1", "--bench", "sim", *places])
-    assert done.exit_code == 0, done.output
-    (content,) = parts_of(tmp_path / "out").values()
-    assert [one["intrinsics"] for one in content["images"]] == [None, {"fx": 701.5, "k1": -0.1}, None]
-
-
 def contents(catalog: Catalog) -> list[object]:
     found = [catalog.object(item.name) for item in catalog.objects()]
     return [
@@ -163,7 +134,7 @@ def import_(folder: Path, catalog: Path) -> Result:
 
 @pytest.mark.parametrize("form", Annotations)
 def test_import_restores_everything(catalog: Catalog, tmp_path: Path, form: Annotations) -> None:
-    export(catalog, tmp_path / "out", form, split=Split.VIEW)
+    export(catalog, tmp_path / "out", form)
     done = import_(tmp_path / "out", tmp_path / "new")
     assert done.exit_code == 0, done.output
     with Catalog.open(tmp_path / "new", clock=VirtualClock()) as new:
@@ -175,33 +146,23 @@ def test_image_that_two_objects_share_is_annotated_once(tmp_path: Path) -> None:
     with Catalog.open(tmp_path / "catalog", clock=VirtualClock()) as shared:
         enroll(shared, "mug", [scene(i) for i in range(VIEWS)])
         enroll(shared, "cup", [scene(i) for i in range(1, VIEWS + 1)])
-        done = export(shared, tmp_path / "out", split=Split.VIEW)
+        done = export(shared, tmp_path / "out")
     assert (done.objects, sum(done.views.values())) == (2, VIEWS + 1)
     names = [one["file_name"] for content in parts_of(tmp_path / "out").values() for one in content["images"]]
     assert len(names) == len(set(names)) == VIEWS + 1
 
 
-def test_split_by_view_divides_the_views_of_each_object(catalog: Catalog, tmp_path: Path) -> None:
-    def split(name: str, seed: int) -> dict[str, list[tuple[int, int]]]:
-        export(catalog, tmp_path / name, split=Split.VIEW, fractions=(0.5, 0.25, 0.25), seed=seed)
-        return {
-            part: [(one["category_id"], one["image_id"]) for one in content["annotations"]]
-            for part, content in parts_of(tmp_path / name).items()
-        }
-
-    first = split("a", 1)
-    for part, count in (("train", 2), ("val", 1), ("test", 1)):
-        assert [sum(category == key for category, _ in first[part]) for key in (1, 2)] == [count, count]
-    assert split("b", 1) == first
-    assert split("c", 2) != first
-
-
-def test_split_by_object_keeps_the_views_of_an_object_together(catalog: Catalog, tmp_path: Path) -> None:
-    done = export(catalog, tmp_path / "out", split=Split.OBJECT, fractions=(0.5, 0.5))
-    assert done.views == {"train": VIEWS, "val": VIEWS}
-    for content in parts_of(tmp_path / "out").values():
-        assert len({one["category_id"] for one in content["annotations"]}) == 1
-        assert len(content["categories"]) == 2
+def test_views_of_each_object_are_divided(tmp_path: Path) -> None:
+    with Catalog.open(tmp_path / "catalog", clock=VirtualClock()) as catalog:
+        enroll(catalog, "mug", [scene(i) for i in range(20)])
+        enroll(catalog, "tin", [scene(i, (200, 90, 30)) for i in range(5)])
+        done = export(catalog, tmp_path / "out")
+    assert done.views == {"train": 20, "val": 3, "test": 2}
+    places = {
+        part: [one["azimuth_deg"] for one in content["images"]] for part, content in parts_of(tmp_path / "out").items()
+    }
+    assert places["val"] == [plan(20)[4], plan(20)[14], plan(5)[4]]
+    assert places["test"] == [plan(20)[9], plan(20)[19]]
 
 
 def test_yolo_has_outlines_and_leaves_out_views_without_an_object(catalog: Catalog, tmp_path: Path) -> None:
@@ -218,13 +179,6 @@ def test_yolo_has_outlines_and_leaves_out_views_without_an_object(catalog: Catal
         corners = np.array(label[1:], float).reshape(-1, 2) * (192, 144)
         assert label[0] == ("0" if Path(name).name in first else "1")
         assert cv2.contourArea(corners.astype(np.float32)) == pytest.approx(AREA, rel=0.15)
-
-
-@pytest.mark.parametrize("fractions", [(0.5, 0.6), (1.2, -0.2), (0.25,) * 4, (float("nan"), 1.0), ()])
-def test_impossible_fractions_are_rejected(catalog: Catalog, tmp_path: Path, fractions: tuple[float, ...]) -> None:
-    with pytest.raises(UsageError):
-        export(catalog, tmp_path / "out", split=Split.VIEW, fractions=fractions)
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_interrupted_or_failed_export_leaves_nothing(catalog: Catalog, tmp_path: Path) -> None:

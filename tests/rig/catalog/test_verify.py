@@ -13,7 +13,6 @@ from rig.catalog import Catalog, derived
 from rig.catalog.jobs import JobProgress
 from rig.catalog.upkeep import statistics
 from rig.catalog.verify import Finding, Problem, Verification, verify
-from rig.cli.catalog.findings import finding_text
 from rig.core.errors import CatalogError, UsageError
 from rig.views.description import BENCH_DESCRIPTOR
 from sim.clock import VirtualClock
@@ -60,9 +59,9 @@ class TestVerify:
         (finding,) = alone.findings
         assert (finding.problem, finding.object_name) == (Problem.MISSING_IMAGE, "mug")
         assert finding.path == lost.relative_to(catalog.path).as_posix()
-        assert finding_text(finding) == (
+        assert finding.text == (
             f"image missing: 'mug': {finding.path}; No such file or directory; "
-            "restore it from a backup, or enroll the object again: rig enroll --replace"
+            "restore it from a backup, or enroll the object again"
         )
 
     def test_swapped_images_and_links_are_found(self, catalog: Catalog, tmp_path: Path) -> None:
@@ -143,7 +142,7 @@ class TestVerify:
         sql(catalog, "UPDATE derived SET content = zeroblob(length(content)) WHERE what != 'cedd'")
         found = finished(verify(catalog, jobs=1))
         assert concerned(found) == [(Problem.DESCRIPTION_DAMAGED, name) for name in ("mug", "mug", "tin", "tin")]
-        assert finding_text(found.findings[0]) == (
+        assert found.findings[0].text == (
             f"description damaged: 'mug'; the stored {BENCH_DESCRIPTOR} is not the one that was computed; "
             "it is computed again when it is needed"
         )
@@ -170,7 +169,7 @@ def test_every_problem_has_words_and_a_next_step(problem: Problem) -> None:
     keys = ("message", "entry_id", "enrollment_id", "reason", "bytes", "stored_bytes", "descriptor")
     details = dict.fromkeys(keys, 1)
     for name in (None, "mug"):
-        words = finding_text(Finding(problem, name, None, None, details))
+        words = Finding(problem, name, None, None, details).text
         assert words.startswith(f"{problem}")
         assert words.count("; ") == 2
 

@@ -46,7 +46,7 @@ def test_enrollment_takes_the_image_once_a_day(rig: Callable[..., Any]) -> None:
     assert "object found in 4 of 4 views, illumination corrected in 4" in shown.stdout
     reported = json.loads(rig("catalog", "show", "lamp", "--json").stdout)
     assert reported["segmentation"]["found"] == 4
-    assert reported["views"][0]["record"]["segmentation"]["agreement"] > 0.65
+    assert reported["views"][0]["segmentation"]["agreement"] > 0.65
 
 
 def test_name_is_checked_before_the_table_is_cleared(rig: Callable[..., Any]) -> None:

@@ -3,7 +3,6 @@
 import os
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from rig.catalog.derived import views
@@ -70,29 +69,6 @@ class TestFolders:
         (item,) = read_folder(tmp_path, table_angles=True, now=NOW).items()
         shown = {Path(view.image).stem: view.azimuth_deg for view in item.enrollments[0].enrollment.views}
         assert shown == {"obj1__0": 0.0, "obj1__5": 355.0, "obj1__355": 5.0}
-
-    def test_gaps_in_the_even_spacing_are_reported(self, tmp_path: Path) -> None:
-        for name, lacking in (("a", ()), ("b", (90, 270)), ("c", (0,))):
-            for angle in range(0, 360, 30):
-                if angle not in lacking:
-                    photograph(tmp_path / f"{name}__{angle}.png", angle)
-        rng = np.random.default_rng(0)
-        for angle in range(0, 360, 30):  # scatter is not a gap
-            photograph(tmp_path / f"d__{(angle + rng.uniform(-2, 2)) % 360:.4f}.png", angle)
-        gaps = read_folder(tmp_path, now=NOW).gaps
-        assert [(gap.object_name, gap.azimuth_deg) for gap in gaps] == [("b", 90.0), ("b", 270.0), ("c", 0.0)]
-
-    def test_each_object_has_its_own_step(self, tmp_path: Path) -> None:
-        for name, angles in (
-            ("many", range(0, 360, 10)),
-            ("few", range(0, 360, 60)),
-            ("lacks-one", range(0, 320, 40)),
-            ("front-only", range(0, 90, 10)),
-        ):
-            for angle in angles:
-                photograph(tmp_path / f"{name}__{angle}.png", angle)
-        gaps = read_folder(tmp_path, now=NOW).gaps
-        assert [(gap.object_name, gap.azimuth_deg) for gap in gaps] == [("lacks-one", 320.0)]
 
     def test_unusable_files_are_rejected_one_by_one(self, tmp_path: Path, open_catalog: OpenCatalog) -> None:
         folder = tmp_path / "in"

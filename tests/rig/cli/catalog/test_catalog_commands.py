@@ -42,20 +42,18 @@ def names(rig: Rig, *options: str) -> list[str]:
     return [item["name"] for item in result(rig("catalog", "list", "--json", *options))["objects"]]
 
 
-def test_list_filters_by_name_label_and_state(two: Rig) -> None:
+def test_list_filters_by_label(two: Rig) -> None:
     assert names(two) == ["mug", "tin"]
-    assert names(two, "m*") == ["mug"]
     assert names(two, "--label", "kitchen") == ["mug", "tin"]
     assert names(two, "--label", "lab") == []
-    assert names(two, "--unfinished") == []
-    assert "None of the 2 objects matches" in two("catalog", "list", "x*").stdout
+    assert "No such objects" in two("catalog", "list", "--label", "lab").stdout
     assert two("catalog", "list").stdout.splitlines()[1].split()[:3] == ["mug", "kitchen", "4"]
 
 
 def test_list_in_a_pipe_is_complete_and_without_markup(rig: Rig, tmp_path: Path) -> None:
     name = f"[red]{'long ' * 18}name"
     folder = photographs(tmp_path / "in", "x")
-    (folder / "objects.csv").write_text(f"object,name\nx,{name}\n")
+    (folder / "views.csv").write_text(f"object,azimuth_deg,image\n{name},0,x__0.png\n")
     assert rig("import", "in").exit_code == 0
     assert name in rig("catalog", "list").stdout
 
@@ -83,7 +81,7 @@ def test_catalog_is_edited_and_every_change_is_logged(two: Rig) -> None:
     assert "nothing to remove" in two("catalog", "gc").stdout
     stats = result(two("catalog", "stats", "--json"))
     assert (stats["objects"], stats["views"], stats["deleted_objects"]) == (1, 4, 0)
-    assert "descriptor   cedd 1: 4 views" in two("catalog", "stats").stdout
+    assert "cedd 1           4 views" in two("catalog", "stats").stdout
     log = [json.loads(line) for line in two("log", "--json").stdout.splitlines()]
     changes = [entry["action"] for entry in log]
     assert changes[0] == "imported"
@@ -137,7 +135,6 @@ def test_search_computes_a_new_descriptor_by_itself(two: Rig, monkeypatch: pytes
     monkeypatch.setitem(registry._KNOWN, "cedd", Cedd(version=2))
     assert two("identify", "--strategy", "ahbr", "--max-views", "2").exit_code in (0, 8)
     assert result(two("catalog", "redescribe", "--json"))["unchanged"] == 8
-    assert result(two("catalog", "redescribe", "--again", "--json"))["described"] == 8
     assert two("catalog", "redescribe", "--descriptor", "sift").exit_code == 2
     assert two("catalog", "redescribe", "--region", "1,2,3").exit_code == 2
 
@@ -146,7 +143,7 @@ def test_identify_reports_another_region(rig: Rig) -> None:
     assert rig("enroll", "dice", "--views", "4").exit_code == 0
     moved = ("--set", "view.roi=[45, 0, 230, 240]", "--set", "bench.sim.object=dice", "--max-views", "2")
     assert "now it is [45, 0, 230, 240]" in rig("identify", *moved).stderr
-    assert rig("catalog", "redescribe", "--region", "config", *moved[:2]).exit_code == 0
+    assert rig("catalog", "redescribe", "--region", "45,0,230,240").exit_code == 0
     assert "view.roi" not in rig("identify", *moved).stderr
 
 
@@ -160,31 +157,24 @@ def test_dry_run_writes_nothing(rig: Rig, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("target", "options"),
-    [
-        ("out.rigcat.zip", ()),
-        ("out", ()),
-        ("out.csv", ()),
-        ("out", ("--format", "csv")),
-        ("out", ("--format", "coil")),
-    ],
+    [("out.rigcat.zip", ()), ("out", ()), ("out.images", ("--format", "folder"))],
 )
 def test_export_can_be_imported(two: Rig, target: str, options: tuple[str, ...]) -> None:
     assert result(two("export", target, "--json", *options))["objects"] == 2
-    source = f"{target}/views.csv" if "csv" in options else target
     other = ("--set", "catalog.path=other")
-    assert two("import", source, *other).exit_code == 0
+    assert two("import", target, *other).exit_code == 0
     assert two("catalog", "verify", *other).exit_code == 0
     shown = [result(two("catalog", "show", "tin", "--json", *where))["views"] for where in ((), other)]
     assert next([v["image_sha256"] for v in views] for views in shown) == [v["image_sha256"] for v in shown[1]]
-    assert [v["record"]["descriptors"] for v in shown[0]] == [v["record"]["descriptors"] for v in shown[1]]
-    again = two("import", source, *other)
-    if source.endswith(".zip"):  # these enrollments are in the catalog already
+    assert [v["descriptors"] for v in shown[0]] == [v["descriptors"] for v in shown[1]]
+    again = two("import", target, *other)
+    if target.endswith(".zip"):  # these enrollments are in the catalog already
         assert again.exit_code == 0
         assert "Skipped, already in the catalog: mug, tin" in again.output
     else:
         assert again.exit_code == 7
         assert "--on-conflict skip" in again.stderr
-    assert result(two("import", source, "--on-conflict", "skip", "--json", *other))["skipped"] == ["mug", "tin"]
+    assert result(two("import", target, "--on-conflict", "skip", "--json", *other))["skipped"] == ["mug", "tin"]
     assert two("export", target, *options).exit_code == 7  # it exists already
 
 
@@ -195,28 +185,24 @@ def test_some_objects_and_pages_are_exported(two: Rig) -> None:
     unknown = two("export", "out.tar")
     assert unknown.exit_code == 2
     assert ".csv (csv)" in unknown.stderr
-    assert two("export", "sheets", "--format", "sheets").exit_code == 0
-    assert sorted(path.name for path in Path("sheets").iterdir()) == ["0001-mug.jpg", "0002-tin.jpg"]
-    assert cv2.imread("sheets/0001-mug.jpg").shape[1] > 12 * 96
     assert two("catalog", "label", "mug", "<script>alert(1)</script>").exit_code == 0
     assert two("export", "page", "--format", "html").exit_code == 0
     page = Path("page/index.html").read_text(encoding="utf-8")
     assert "<script>" not in page
-    assert all((Path("page") / f"sheets/{name}").is_file() for name in ("0001-mug.jpg", "0001-mug-small.jpg"))
-    assert two("export", "all mugs.html").exit_code == 0
-    assert 'src="all%20mugs-sheets/0001-mug.jpg"' in Path("all mugs.html").read_text(encoding="utf-8")
-    assert Path("all mugs-sheets/0001-mug.jpg").is_file()
+    assert 'src="sheets/0001-mug.jpg"' in page
+    sheets = ["0001-mug-small.jpg", "0001-mug.jpg", "0002-tin-small.jpg", "0002-tin.jpg"]
+    assert sorted(path.name for path in Path("page/sheets").iterdir()) == sheets
+    assert cv2.imread("page/sheets/0001-mug.jpg").shape[1] > 12 * 96
 
 
 def test_merge_is_all_or_nothing(two: Rig) -> None:
     other = ("--set", "catalog.path=other")
     assert two("import", "photographs", "--table-angles", *other).exit_code == 0
     assert two("catalog", "rename", "tin", "jar", *other).exit_code == 0
-    assert two("catalog", "merge", "other").exit_code == 7
+    assert two("import", "other").exit_code == 7
     assert names(two) == ["mug", "tin"]
-    assert two("import", "other").exit_code == 7  # the folder of a catalog is an unpacked bundle
-    assert two("catalog", "merge", "catalog").exit_code == 0  # with what it has already
-    assert result(two("catalog", "merge", "other", "--on-conflict", "skip", "--json"))["objects"] == 1
+    assert two("import", "catalog").exit_code == 0  # with what it has already
+    assert result(two("import", "other", "--on-conflict", "skip", "--json"))["objects"] == 1
     assert names(two) == ["mug", "tin", "jar"]
 
 
@@ -235,7 +221,7 @@ def test_import_rejects_bad_source(rig: Rig) -> None:
         assert done.exit_code == 7, source
         assert words in done.stderr
     assert rig("import", "empty", "--pattern", "{angle}").exit_code == 2
-    assert rig("import", "empty", "--on-conflict", "merge").exit_code in (2, 7)
+    assert rig("import", "empty", "--on-conflict", "merge").exit_code == 2
 
 
 def test_busy_catalog_is_reported_after_the_timeout(two: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -283,10 +269,8 @@ def test_interrupted_import_leaves_images_only(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(not COIL.is_dir(), reason="no COIL-100 at ../shared/data nor where RIG_TEST_DATA points")
-def test_coil_100_is_read_with_its_gaps() -> None:
+def test_coil_100_is_read() -> None:
     batch = read_folder(COIL, now=datetime(2026, 1, 1, tzinfo=UTC))
     items = list(batch.items())
     views = sum(len(state.enrollment.views) for item in items for state in item.enrollments)
     assert (len(items), views, list(batch.rejected)) == (100, 7178, [])
-    missing = (COIL / "MISSING.txt").read_text().split()
-    assert [f"{gap.object_name}__{gap.azimuth_deg:g}.png" for gap in batch.gaps] == missing

@@ -52,8 +52,8 @@ def test_replay_check_sums_differences_up(rig, tmp_path):
     short = rig("replay", run, "--check").stderr
     assert f"{count} numbers in the saved run differ" in short
     assert short.count("    view ") == 3
-    assert f"and {count - 3} more: --all" in short
-    assert rig("replay", run, "--check", "--all").stderr.count("    view ") == count
+    assert f"and {count - 3} more: --json" in short
+    assert rig("replay", run, "--check", "--json").stderr.count("    view ") == count
 
 
 def test_difference_of_long_values_is_cut():
