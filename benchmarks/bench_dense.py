@@ -29,7 +29,7 @@ from hbr import (
 from hbr.core.arrays import ImageArray, IndexArray
 from hbr.dense.filter import Belief
 from hbr.descriptors import names
-from hbr.evaluation.scenes import plain_bench
+from hbr.evaluation.perturb import plain_bench
 
 #: The views of a search, as positions on an object's ring of 72.
 SEEN = (0, 18, 30, 45, 60, 66, 9, 51)

@@ -3,7 +3,6 @@
 import argparse
 import statistics
 import timeit
-import tracemalloc
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -96,26 +95,6 @@ def bench_search(views: Views, methods: Sequence[Method], repeats: int) -> None:
         )
 
 
-def bench_memory(views: Views) -> None:
-    """Measure the peak of NumPy's allocations while the default index is built and searched, with the descriptors."""
-    own = views.descriptors.nbytes
-    tracemalloc.start()
-    index = ViewIndex(views)
-    index.search(views.descriptors[0], K)
-    peak = own + tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    print(f"{len(views):>9} {'peak memory, multiple of the descriptors':<44} {peak / 1e6:6.0f} MB {peak / own:6.2f}")
-
-
-def bench_adding(views: Views) -> None:
-    """Measure the addition of one object, compared with the construction of the index."""
-    more = Views.of_object("new", views.descriptors[:72], views.azimuth_deg[:72])
-    index = built(views)
-    build = milliseconds(lambda _: built(views), 1)
-    added = milliseconds(lambda _: index.extended(more), 3)
-    print(f"{len(views):>9} {'add 72 views, against building (= 1)':<44} {added:9.1f} {added / build:6.2f}")
-
-
 def step_ms(views: Views, index: ViewIndex, repeats: int) -> tuple[float, float]:
     """Return the median time of a step with 8 queries: after the 7 steps before it, and without known lists."""
     rng = np.random.default_rng(3)
@@ -143,30 +122,6 @@ def bench_step(views: Views, repeats: int) -> None:
         print(f"{len(views):>9} {f'retrieve, next_view: {name} (product = 1)':<44} {took:9.3f} {took / alone:6.2f}")
 
 
-def growth(sizes: Sequence[int], times_ms: Sequence[float]) -> float:
-    """Return the exponent b of time = a * views**b, by least squares of the logarithms."""
-    return float(np.polyfit(np.log(sizes), np.log(times_ms), 1)[0])
-
-
-def bench_growth(objects: Sequence[int]) -> None:
-    """Measure the time against the number of views, and the order of growth over the larger half."""
-    print(f"\n{'views':>9} {'search ms':>10} {'step ms':>10}")
-    sizes, searches, steps = [], [], []
-    for count in objects:
-        views = model(count)
-        index = ViewIndex(views)
-        queries = queries_of(views, np.random.default_rng(1).integers(len(views), size=61), 2)
-        searches.append(milliseconds(lambda i, index=index, queries=queries: index.search(queries[i + 1], K), 60))  # type: ignore[misc]
-        steps.append(step_ms(views, index, 30)[0])
-        sizes.append(len(views))
-        print(f"{sizes[-1]:>9} {searches[-1]:10.3f} {steps[-1]:10.3f}", flush=True)
-    half = len(sizes) // 2
-    print(
-        f"time grows as views to the power of {growth(sizes[half:], searches[half:]):.2f} (search), "
-        f"{growth(sizes[half:], steps[half:]):.2f} (step), from {sizes[half]} views on"
-    )
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument(
@@ -175,13 +130,10 @@ def main() -> None:
     tree = parser.parse_args().tree
     print(f"{'views':>9} {'call':<44} {'median ms':>9} {'ratio':>6}")
     every: tuple[Method, ...] = ("flat", "kdtree")
-    for objects, repeats in ((100, 200), (1_389, 60), (10_000, 30), (13_889, 30)):
+    for objects, repeats in ((100, 200), (1_389, 60), (10_000, 30)):
         views = model(objects)
         bench_search(views, every if objects < 10_000 or tree else every[:1], repeats)
-        bench_memory(views)
-        bench_adding(views)
         bench_step(views, repeats)
-    bench_growth([100, 200, 400, 800, 1_600, 3_200, 6_400, 12_800])
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ import numpy as np
 from benchmarks.record import record
 from hbr import Background, Segmentation, ViewsTogether, descriptor, segment
 from hbr.core.arrays import ImageArray
-from hbr.evaluation.changed_bench import HARD, Bench, Visit
+from hbr.drawing.bench import HARD, Bench, Visit
 from hbr.segmentation import Method
 from hbr.segmentation.background import shrunk
 from hbr.segmentation.network import shares

@@ -20,9 +20,11 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.fly_enrollment import calibrated
+from calibration.procedures import CameraTime
 from hbr.evaluation.statistics import wilson
 from rig import Catalog, enroll, identify, load_model
+from rig.calibrations import CalibrationResult, apply_results
+from rig.config import load_config
 from rig.events.events import Identified
 from sim.bench import ShelfOperator, open_sim_bench
 from sim.noise import NoiseModel
@@ -48,12 +50,22 @@ def main() -> None:
         given.json.write_text(json.dumps({"summary": summary(rows), "rows": rows}, indent=1) + "\n")
 
 
+def calibrated(operator: ShelfOperator, thing: str) -> Any:
+    """Return the configuration with the camera's time, which is calibrated before."""
+    config = load_config(None, ())
+    with open_sim_bench(config, operator) as bench:
+        *_, result = CameraTime(thing).live(bench)
+        assert isinstance(result, CalibrationResult)
+        assert result.passed, result.rejections
+        return apply_results(config, [result])[0]
+
+
 def searches(given: argparse.Namespace) -> list[dict[str, Any]]:
     """Enroll, and search; return a row for each search in each mode."""
     things = twins()
     world = World(seed=given.seed, noise=NoiseModel())
     operator = ShelfOperator(world, things)
-    config, _ = calibrated(ShelfOperator(world, things), "mug-star")
+    config = calibrated(ShelfOperator(world, things), "mug-star")
     rng = np.random.default_rng(given.seed)
     known = [pair[0] for pair in PAIRS] if given.alone else list(things)
     rows: list[dict[str, Any]] = []

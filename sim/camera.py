@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hbr.evaluation.changed_bench import Visit
+from hbr.drawing.bench import Visit
 from rig.devices import v4l2
 from sim.calibration_board import BoardOnPlatter
 from sim.camera_controls import BUFFERS_RANGE, EXPOSURE_RANGE, KELVIN_RANGE, NOMINAL_EXPOSURE, SHARP_AT, Controls

@@ -8,8 +8,8 @@ from typing import Self
 import cv2
 import numpy as np
 
-from hbr.evaluation.changed_bench import HARD, Bench, Visit
-from hbr.evaluation.changed_bench import Change as HardChange
+from hbr.drawing.bench import HARD, Bench, Visit
+from hbr.drawing.bench import Change as HardChange
 from rig.core.errors import UsageError
 from sim.devices import SimDevices
 from sim.objects.projection import CENTRE_PX, HEIGHT, PX_PER_MM, SIN, WIDTH, Image
@@ -37,7 +37,7 @@ class Change:
     background: float = 0.0
     """Weight of another bench's table and wall with patterns: 0 for none, 1 for only these."""
     hard: float = 0.0
-    """Strength of what `rig eval --bench-change hard` changes (`hbr.evaluation.changed_bench.HARD`): another bench with
+    """Strength of what `rig eval hard-change` changes (`hbr.drawing.bench.HARD`): another bench with
     patterns and clutter, a holder in front, cast shadows, highlights, coloured light with a gradient, gamma, placement,
     scale, elevation and defocus. The light, the camera and the placement change for each object."""
 
@@ -103,7 +103,7 @@ CHANGES: Mapping[str, Change] = MappingProxyType(
     }
 )
 """By name: light, exposure and white balance; placement; both together with another table and wall; all that
-`rig eval --bench-change hard` changes."""
+`rig eval hard-change` changes."""
 
 
 def another_bench(rng: np.random.Generator) -> Image:

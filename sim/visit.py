@@ -5,7 +5,7 @@ from typing import Protocol
 import cv2
 import numpy as np
 
-from hbr.evaluation.changed_bench import Visit
+from hbr.drawing.bench import Visit
 from sim.objects.projection import CENTRE_PX, HEIGHT, WIDTH, Image
 
 _GROUNDS = (24, 232)

@@ -26,9 +26,3 @@ def output(name: str, folder: Path) -> str:
 )
 def test_short_benchmarks_run_to_their_end(name: str, last: str, tmp_path: Path) -> None:
     assert last in output(name, tmp_path).splitlines()[-1]
-
-
-@pytest.mark.nightly
-@pytest.mark.parametrize("name", ["bench_segmentation", "bench_sift"])
-def test_benchmarks_without_photographs_name_the_missing_folder(name: str, tmp_path: Path) -> None:
-    assert "../shared/data/coil-100 does not exist" in output(name, tmp_path)

@@ -6,7 +6,7 @@ changed. An absolute similarity means little after a change of the bench: it fal
 Therefore `OpenSetModel.score`, a log-odds, weighs several numbers (`evidence`), each of which compares the leading
 candidate with the other candidates under the same conditions. Half of them come from whitened descriptions: properties
 that all enrolled views share count little there, and properties that distinguish them count much. The weights for the
-rig's own descriptor come from searches on drawn benches (`hbr.evaluation.changed_bench`); for other descriptors they
+rig's own descriptor come from searches on drawn benches (`hbr.drawing.bench`); for other descriptors they
 are fitted on leave-one-out searches of the catalog, under changes of the bench of several strengths
 (`hbr.descriptors.base.Shift`). The thresholds always come from the catalog.
 

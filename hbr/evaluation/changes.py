@@ -1,69 +1,39 @@
 """Searches by image after a change of the bench: rates of right decisions and of accepted unknown objects.
 
 Objects are enrolled on one drawn bench. Each search is a visit to the same bench (mild change), or to one of twelve
-other benches (hard change), with four views, 90° apart. Some objects are never enrolled.
+other benches (hard change), with four views, 90° apart. Every ninth object is never enrolled.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from functools import cache
-from typing import Final, Literal
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import cache, lru_cache, partial
+from typing import Any, Final
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from hbr.core.angles import wrap180
 from hbr.core.arrays import ImageArray, LevelArray
+from hbr.dense.fitting import fit_stopping_rule
 from hbr.dense.index import DenseIndex
 from hbr.dense.local_difference import LocalView
 from hbr.dense.session import DenseSession, answered, near
 from hbr.dense.stopping import Outcome, StoppingRule
 from hbr.descriptors.together import ViewsTogether
-from hbr.evaluation.changed_bench import ENROLLMENT, HARD, MILD, Bench, Visit
-from hbr.evaluation.condition import object_mask
-from hbr.evaluation.datasets import Dataset, PhotographedObject, read_photograph
-from hbr.evaluation.draws import generator
+from hbr.drawing.bench import ENROLLMENT, HARD, MILD, Bench, Visit
+from hbr.evaluation.experiment import Experiment, Kind
+from hbr.evaluation.photographs import Dataset, PhotographedObject, object_mask, read_photograph, without_specks
+from hbr.evaluation.protocol import generator
+from hbr.model.views import Views
 from hbr.segmentation import Background
 
-Kind = Literal["mild", "hard"]
 #: Largest number of views of a search, and the step between them.
 VIEWS: Final = 4
 _STEP_DEG: Final = 90.0
 _BENCHES: Final = 12
-DESCRIPTOR: Final = "edges+colours"
-
-
-@dataclass(frozen=True)
-class Changes:
-    """The settings of searches after a change of the bench.
-
-    Attributes
-    ----------
-    kind : {"mild", "hard"}
-        The change of the bench.
-    picture : bool
-        Whether enrollment and searches use a picture of their empty table.
-    enrolled : int
-        Enrolled views of each object.
-    trials : int
-        Searches for each object.
-    every : int
-        One of this many objects is never enrolled.
-    seed : int
-        Seed of all random values.
-    """
-
-    kind: Kind = "hard"
-    picture: bool = True
-    enrolled: int = 36
-    trials: int = 4
-    every: int = 9
-    seed: int = 0
-
-    def is_enrolled(self, place: int) -> bool:
-        """Return whether the object at this place of the data set is enrolled."""
-        return (place + 1) % self.every != 0
+_NEVER_ENROLLED: Final = 9
+#: Objects whose enrolled views each process remembers for the last steps of searches, 4 MB each with 36 views.
+_REMEMBERED: Final = 128
 
 
 @dataclass(frozen=True)
@@ -116,7 +86,7 @@ class EnrolledViews:
     cut_outs: tuple[LocalView, ...]
 
 
-def enroll_changed(item: PhotographedObject, changes: Changes) -> EnrolledViews:
+def enroll_changed(item: PhotographedObject, experiment: Experiment) -> EnrolledViews:
     """Return an object's enrolled views.
 
     Raises
@@ -125,8 +95,10 @@ def enroll_changed(item: PhotographedObject, changes: Changes) -> EnrolledViews:
         A photograph cannot be used.
     """
     visit = _enrollment_visit()
-    places = _places(item, np.arange(changes.enrolled) * 360 / changes.enrolled)
-    views = ViewsTogether(DESCRIPTOR, empty_table=visit.empty() if changes.picture else None, several=False)
+    count = experiment.protocol.enrolled or 0
+    places = _places(item, np.arange(count) * 360 / count)
+    kind, picture = experiment.condition.descriptor, _has_picture(experiment)
+    views = ViewsTogether(kind, empty_table=visit.empty() if picture else None, several=False)
     for place in places:
         azimuth_deg = item.photographs[place].azimuth_deg
         views.learn(visit.photograph(*_cut_out(item, place), azimuth_deg).image)
@@ -142,7 +114,7 @@ def enroll_changed(item: PhotographedObject, changes: Changes) -> EnrolledViews:
 
 def search_changed(
     item: PhotographedObject,
-    changes: Changes,
+    experiment: Experiment,
     index: DenseIndex,
     rule: StoppingRule,
     example: PhotographedObject,
@@ -161,15 +133,17 @@ def search_changed(
         A photograph cannot be used.
     """
     results = []
-    before = _bench_image(None if changes.picture else example)
+    picture, protocol = _has_picture(experiment), experiment.protocol
+    before = _bench_image(None if picture else example)
     left_out = _without(index, item.name)
-    for trial in range(changes.trials):
-        rng = generator(changes.seed, item.name, "trial", trial)
-        hard = changes.kind == "hard"
+    for trial in range(protocol.trials):
+        rng = generator(protocol.seed, item.name, "trial", trial)
+        hard = experiment.change == "hard"
         bench = _benches()[int(rng.integers(_BENCHES))] if hard else _enrollment_bench()
         visit = Visit(bench, HARD if hard else MILD, rng)
         first_deg = rng.uniform(0, 360)
-        views = ViewsTogether(DESCRIPTOR, empty_table=visit.empty() if changes.picture else None)
+        kind = experiment.condition.descriptor
+        views = ViewsTogether(kind, empty_table=visit.empty() if picture else None)
         search = _Search(index, rule, enrolled)
         without = None if left_out is None else _Search(left_out, rule, enrolled)
         same_bench: bool | None = None
@@ -277,16 +251,19 @@ def summary(known: dict[str, list[SearchResult]], unknown: dict[str, list[Search
     }
 
 
-def enrolled_names(dataset: Dataset, changes: Changes) -> list[str]:
-    """Return the names of the objects that are enrolled."""
-    return [item.name for place, item in enumerate(dataset.objects) if changes.is_enrolled(place)]
+def is_enrolled(place: int) -> bool:
+    """Return whether the object at this place of the data set is enrolled."""
+    return (place + 1) % _NEVER_ENROLLED != 0
+
+
+def _has_picture(experiment: Experiment) -> bool:
+    """Return whether enrollment and searches use a picture of their empty table."""
+    return experiment.condition.reference != "none"
 
 
 def _cut_out(item: PhotographedObject, place: int) -> tuple[ImageArray, NDArray[np.bool_]]:
     image = read_photograph(item.photographs[place].path)
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(object_mask(image).astype(np.uint8))
-    area = stats[1:, cv2.CC_STAT_AREA]
-    return image, np.isin(labels, 1 + np.flatnonzero(area >= 0.05 * area.max(initial=0)))
+    return image, without_specks(object_mask(image))
 
 
 def _places(item: PhotographedObject, azimuth_deg: NDArray[np.float64]) -> list[int]:
@@ -313,3 +290,66 @@ def _enrollment_bench() -> Bench:
 @cache
 def _benches() -> tuple[Bench, ...]:
     return tuple(Bench.drawn(np.random.default_rng(1000 + k)) for k in range(_BENCHES))
+
+
+def _enroll(experiment: Experiment, dataset: Dataset, j: int) -> tuple[LevelArray, NDArray[np.float64]] | None:
+    if not is_enrolled(j):
+        return None
+    found = _enrolled(experiment, dataset, dataset.objects[j].name)
+    return found.levels, found.azimuth_deg
+
+
+@lru_cache(maxsize=_REMEMBERED)
+def _enrolled(experiment: Experiment, dataset: Dataset, name: str) -> EnrolledViews:
+    return enroll_changed(next(item for item in dataset.objects if item.name == name), experiment)
+
+
+def _model(
+    experiment: Experiment, dataset: Dataset, enrolled: list[tuple[LevelArray, NDArray[np.float64]] | None]
+) -> tuple[Views, StoppingRule]:
+    kind, found = experiment.condition.descriptor, zip(dataset.objects, enrolled, strict=True)
+    parts = [Views.of_object(item.name, *own, kind) for item, own in found if own is not None]
+    if len(parts) < 2:
+        raise ValueError(f"{len(parts)} object is enrolled; at least two are needed")
+    index = DenseIndex(Views.concatenate(parts))
+    return index.views, fit_stopping_rule(index).rule
+
+
+def _search(
+    experiment: Experiment,
+    dataset: Dataset,
+    model: tuple[Views, StoppingRule],
+    _now_ns: Callable[[], int],
+    j: int,
+) -> list[SearchResult]:
+    enrolled = partial(_enrolled, experiment, dataset)
+    views, rule = model
+    return search_changed(dataset.objects[j], experiment, DenseIndex(views), rule, dataset.objects[0], enrolled)
+
+
+def _results(
+    experiment: Experiment, dataset: Dataset, model: tuple[Views, StoppingRule], found: list[list[SearchResult]]
+) -> dict[str, Any]:
+    views, rule = model
+    searched = {item.name: results for item, results in zip(dataset.objects, found, strict=True)}
+    words = f"{experiment.change}, {'picture' if _has_picture(experiment) else 'no picture'}"
+
+    def row(objects: str, of: Collection[str]) -> dict[str, Any]:
+        some = {name: results for name, results in searched.items() if name in of}
+        known = {name: results for name, results in some.items() if name in views.object_names}
+        others = {name: results for name, results in some.items() if name not in known}
+        return {"change": words, "objects": objects, **summary(known, others)}
+
+    rows = [row("all", searched)]
+    if experiment.report is not None:
+        first, last = experiment.report
+        rows.append(row(f"{first}-{last}", [item.name for item in dataset.subset(first, last).objects]))
+    return {
+        "settings": experiment.settings(dataset),
+        "rows": rows,
+        "fitted": [asdict(one) for one in rule.rates],
+        "searches": {name: [asdict(one) for one in results] for name, results in searched.items()},
+    }
+
+
+BENCH_CHANGE: Final = Kind(_enroll, _model, _search, _results)

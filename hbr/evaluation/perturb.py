@@ -1,4 +1,4 @@
-"""Perturbations of a query: placement, illumination, occlusion and background.
+"""Perturbations of a query: placement, illumination, occlusion and background; drawn benches for them.
 
 Every perturbation has three strengths. The second one can also occur when a technician works carefully.
 """
@@ -12,8 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hbr.core.arrays import ImageArray
-from hbr.evaluation.scenes import FOOT_PX, HEIGHT, SIDE_PX, WIDTH, Picture
+from hbr.drawing.bench import FOOT_PX, HEIGHT, SIDE_PX, WIDTH, Picture, draw_highlights, missing_light
+from hbr.evaluation.photographs import without_specks
 
+#: Half axes of the platter in pixels, and the grain of the surfaces.
+_PLATTER_PX: Final = (105, 27)
+_GRAINS: Final = (3, 6, 12, 24, 48)
 #: Magnitudes at the strengths 1, 2 and 3.
 STRENGTHS: Final[Mapping[str, tuple[float, float, float]]] = {
     "shift": (0.03, 0.06, 0.09),  # largest shift, relative to the photograph's side
@@ -105,9 +109,9 @@ class Perturbations:
         seen, cover = self._placed(image_bgr, mask, rng, on_bench=bench is not None)
         ground = seen if bench is None else bench.copy()
         if bench is not None:
-            ground *= (1 - self._shadows(cover, rng))[:, :, None]
+            ground *= (1 - self._shade(cover, rng))[:, :, None]
         picture = ground * (1 - cover[:, :, None]) + seen * cover[:, :, None]
-        self._highlights(picture, cover, rng)
+        draw_highlights(picture, cover, self.of("specular"), rng)
         pictures = [picture] if bench is None else [picture, bench.copy()]
         self._bar(pictures, cover, rng)
         images = self._illuminated(pictures, rng)
@@ -124,7 +128,7 @@ class Perturbations:
         upright = scale * np.cos(np.radians(15 + tilt_deg)) / np.cos(np.radians(15))
         shift = rng.uniform(-1, 1, 2) * self.of("shift")
         if on_bench:
-            mask = _whole(mask)
+            mask = without_specks(mask)
             scale, upright = scale * SIDE_PX / max(height, width), upright * SIDE_PX / max(height, width)
             rows, columns = np.nonzero(mask)
             x, y = (columns.min() + columns.max()) / 2, float(rows.max())
@@ -142,34 +146,10 @@ class Perturbations:
         seen = cv2.warpAffine(image, move, size, borderMode=cv2.BORDER_REPLICATE)
         return seen.astype(np.float32), np.asarray(cv2.warpAffine(edge, move, size), np.float32)
 
-    def _shadows(self, cover: Picture, rng: np.random.Generator) -> Picture:
-        """Return the share of the light that is missing on the ground: around the foot, and in a cast shadow."""
-        left, top, width, height = cv2.boundingRect((cover > 0.5).astype(np.uint8))
-        foot = np.zeros_like(cover)
-        cv2.ellipse(foot, (left + width // 2, top + height - 3), (int(0.55 * width) + 3, 8), 0, 0, 360, 1, -1)
-        shade = 0.35 * cv2.GaussianBlur(foot, (0, 0), 3)
+    def _shade(self, cover: Picture, rng: np.random.Generator) -> Picture:
         lean, length = rng.uniform(-0.8, 0.8), rng.uniform(0.25, 0.5)
         strength = rng.uniform(0.5, 1) * self.of("shadow")
-        if strength:
-            bottom = top + height
-            fallen = np.array([[1, lean, -lean * bottom], [0, length, bottom * (1 - length)]])
-            cast = cv2.warpAffine(cover, fallen, (cover.shape[1], cover.shape[0]))
-            shade = 1 - (1 - shade) * (1 - strength * cv2.GaussianBlur(cast, (0, 0), rng.uniform(2, 5)))
-        return np.asarray(shade, np.float32)
-
-    def _highlights(self, picture: Picture, cover: Picture, rng: np.random.Generator) -> None:
-        strength = self.of("specular")
-        rows, columns = np.nonzero(cover > 0.5)
-        if not strength or not len(rows):
-            return
-        for _ in range(int(rng.integers(1, 4))):
-            i = int(rng.integers(len(rows)))
-            axes = int(rng.integers(2, 9)), int(rng.integers(2, 9))
-            spot = np.zeros_like(cover)
-            centre = int(columns[i]), int(rows[i])
-            cv2.ellipse(spot, centre, axes, float(rng.uniform(0, 180)), 0, 360, 1, -1)
-            spot = np.asarray(cv2.GaussianBlur(spot, (0, 0), 2), np.float32) * cover
-            picture += spot[:, :, None] * np.float32(rng.uniform(0.4, 1) * strength)
+        return missing_light(cover, strength, lean, length, rng.uniform(2, 5) if strength else 0.0)
 
     def _bar(self, pictures: list[Picture], cover: Picture, rng: np.random.Generator) -> None:
         """Draw a bar in front of the object, from below; half of the bars are on the empty-table image, too."""
@@ -206,9 +186,68 @@ class Perturbations:
         return images
 
 
-def _whole(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return the mask without small regions."""
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
-    area = stats[1:, cv2.CC_STAT_AREA]
-    whole: NDArray[np.bool_] = np.isin(labels, 1 + np.flatnonzero(area >= 0.05 * area.max(initial=0)))
-    return whole
+def plain_bench(rng: np.random.Generator) -> Picture:
+    """Return a wall and a table of similar greys, and a dark platter."""
+    wall = rng.uniform(90, 170)
+    picture = np.full((HEIGHT, WIDTH, 3), wall, np.float32) + rng.normal(0, 6, 3).astype(np.float32)
+    picture *= np.linspace(1.04, 0.94, HEIGHT, dtype=np.float32)[:, None, None]
+    horizon = int(rng.integers(150, 175))
+    picture[horizon:] = wall * rng.uniform(0.7, 0.95) + rng.normal(0, 8, 3)
+    picture = np.asarray(cv2.GaussianBlur(picture, (0, 0), 2.5), np.float32)
+    _platter(picture, np.full(3, rng.uniform(60, 110)))
+    return picture
+
+
+def other_bench(rng: np.random.Generator) -> Picture:
+    """Return another wall and table, with a pattern and clutter, and a platter of any brightness."""
+    horizon = int(rng.integers(120, 170))
+    picture = _pattern(rng, rng.uniform(50, 200) + rng.normal(0, 25, 3))
+    if rng.random() < 0.5:  # tiles
+        step, relief = int(rng.integers(18, 40)), rng.uniform(-30, 30)
+        picture[::step] += relief
+        picture[:, ::step] += relief
+    table = _pattern(rng, rng.uniform(50, 190) + rng.normal(0, 30, 3))
+    if rng.random() < 0.7:  # wood
+        grain = np.repeat(rng.normal(0, 18, (1, WIDTH // 3)).astype(np.float32), WIDTH, axis=0)
+        along = cv2.resize(grain, (WIDTH, WIDTH))
+        table += (along if rng.random() < 0.5 else along.T)[:HEIGHT, :, None]
+    picture[horizon:] = table[horizon:]
+    picture = np.asarray(cv2.GaussianBlur(picture, (0, 0), rng.uniform(0.5, 1.2)), np.float32)
+    for _ in range(int(rng.integers(3, 7))):
+        _clutter(picture, rng)
+    _platter(picture, rng.uniform(40, 190) + rng.normal(0, 8, 3))
+    return picture
+
+
+def _pattern(rng: np.random.Generator, colour: NDArray[np.float64]) -> Picture:
+    """Return mostly grey noise around a colour, with several grain sizes; the coarse ones are the strongest."""
+    picture = np.broadcast_to(colour, (HEIGHT, WIDTH, 3)).astype(np.float32)
+    for cells in _GRAINS:
+        strength = 26 / np.sqrt(cells / _GRAINS[0])
+        shape = max(2, cells * HEIGHT // WIDTH), cells
+        grain = rng.normal(0, strength, (*shape, 1)) + rng.normal(0, 0.35 * strength, (*shape, 3))
+        picture += cv2.resize(grain.astype(np.float32), (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC)
+    return picture
+
+
+def _clutter(picture: Picture, rng: np.random.Generator) -> None:
+    """Draw a thing next to or behind the platter."""
+    colour = rng.uniform(20, 235, 3).tolist()
+    half = int(rng.integers(10, 38)), int(rng.integers(10, 45))
+    if rng.random() < 0.75:
+        x, y = int(rng.choice([rng.integers(0, 90), rng.integers(230, WIDTH)])), int(rng.integers(60, 220))
+    else:
+        x, y = int(rng.integers(90, 230)), int(rng.integers(30, 110))
+    if rng.random() < 0.5:
+        cv2.rectangle(picture, (x - half[0], y - half[1]), (x + half[0], y + half[1]), colour, -1)
+    else:
+        cv2.ellipse(picture, (x, y), half, float(rng.uniform(0, 180)), 0, 360, colour, -1)
+    if rng.random() < 0.5:
+        stripe = rng.uniform(0, 255, 3).tolist()
+        cv2.line(picture, (x - half[0], y), (x + half[0], y + half[1] // 2), stripe, 3)
+
+
+def _platter(picture: Picture, colour: NDArray[np.float64]) -> None:
+    x, y = FOOT_PX
+    for down, share in ((6, 0.8), (10, 1.0)):
+        cv2.ellipse(picture, (x, y - down), _PLATTER_PX, 0, 0, 360, (share * colour).tolist(), -1)

@@ -1,15 +1,15 @@
 """Results of runs: hit rates by the number of views, decisions, pose errors, and comparisons of methods."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hbr.core.arrays import FloatArray
 from hbr.dense.stopping import Outcome
-from hbr.evaluation.methods import Method
-from hbr.evaluation.protocol import COMPARED, OUTCOMES, Runs
+from hbr.evaluation.protocol import COMPARED, OUTCOMES, Method, Runs
 from hbr.evaluation.statistics import bootstrap_difference, mcnemar_exact, wilson
 
 _BEST: int = 10
@@ -261,3 +261,31 @@ def _median(errors_deg: FloatArray) -> float | None:
 
 def _rms(errors_deg: FloatArray) -> float | None:
     return float(np.sqrt(np.mean(errors_deg**2))) if errors_deg.size else None
+
+
+def results_of(
+    runs: Runs, methods: Sequence[Method], margin: float, min_views: int, rng: np.random.Generator
+) -> dict[str, Any]:
+    """Return all results as JSON values, units in the keys; equal runs give equal values except ``wall_clock``.
+
+    Arguments as for `method_results` and `contests`.
+    """
+    return {
+        "methods": [
+            {
+                "name": result.method.name,
+                "label": result.method.label,
+                "curve": [asdict(point) for point in result.curve],
+                "stopping": asdict(result.stopping),
+                "pose_rmse_deg_by_object": _plain(pose_rmse_by_object(runs, m, similar=False)),
+                "alike_rmse_deg_by_object": _plain(pose_rmse_by_object(runs, m, similar=True)),
+            }
+            for m, result in enumerate(method_results(runs, methods, margin, min_views))
+        ],
+        "contests": [asdict(contest) for contest in contests(runs, methods, rng)],
+        "wall_clock": {"step_median_ms": {method.name: step_median_ms(runs, m) for m, method in enumerate(methods)}},
+    }
+
+
+def _plain(values: FloatArray) -> list[float | None]:
+    return [None if np.isnan(value) else round(float(value), 3) for value in values]

@@ -6,30 +6,32 @@ for all methods.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from hbr.core.angles import wrap180
 from hbr.core.arrays import FloatArray, IndexArray, LevelArray
-from hbr.dense.filter import Belief, update_belief
+from hbr.dense.filter import BETA, Belief, update_belief
 from hbr.dense.fitting import fit_stopping_rule
-from hbr.dense.index import DenseIndex
+from hbr.dense.index import POWER, DenseIndex
 from hbr.dense.local_difference import LocalView
-from hbr.dense.session import DenseSession, answered
+from hbr.dense.next_view import ALL_ROTATIONS_DEG, expected_views, strongest
+from hbr.dense.session import DenseSession, answered, near
 from hbr.dense.stopping import Outcome, StoppingRule
 from hbr.descriptors import descriptor
-from hbr.evaluation.draws import generator
-from hbr.evaluation.methods import Method
-from hbr.evaluation.mutual_information import most_informative_rotation
-from hbr.evaluation.near_twins import LocalPhotographs
-from hbr.evaluation.protocol import COMPARED, OUTCOMES, Protocol, Runs, views_of_trial
+from hbr.evaluation.condition import Condition, EvaluationImage, enrolled_levels, query_levels
+from hbr.evaluation.experiment import Experiment, Kind
+from hbr.evaluation.photographs import Dataset
+from hbr.evaluation.protocol import COMPARED, OUTCOMES, Method, Protocol, Runs, generator, views_of_trial
+from hbr.evaluation.results import results_of
 from hbr.model.symmetry import symmetry
 from hbr.model.views import Views
 from hbr.paper.hough import Ranking, retrieve
 from hbr.paper.index import ViewIndex, largest
 from hbr.paper.next_view import Side, next_view
+from hbr.segmentation import segment
 
 _STEP_DEG: Final = {"sweep-45": 45.0, "sweep-90": 90.0, "ahbr-90": 90.0}
 
@@ -56,6 +58,50 @@ class _Model(NamedTuple):
         """Return the places of these views, indices among all, in the selection."""
         place: IndexArray = rows - np.searchsorted(self.gone, rows)
         return place
+
+
+class LocalPhotographs:
+    """The photographs of a data set, cut out when a comparison of two leaders asks for them (`hbr.dense.session`).
+
+    ``seed`` is that of the queries, as for `hbr.evaluation.condition.query_levels`.
+    """
+
+    def __init__(self, dataset: Dataset, condition: Condition, seed: int) -> None:
+        self._dataset, self._condition, self._seed = dataset, condition, seed
+        self._known: dict[tuple[int, int], LocalView] = {}
+
+    @property
+    def possible(self) -> bool:
+        """Whether the descriptor describes an object that is cut out, as on the bench."""
+        return not descriptor(self._condition.descriptor).whole_image
+
+    def query(self, object_index: int, number: int, azimuth_deg: float) -> LocalView:
+        """Return a photograph of an object, counted from 0, as a view of a search at this orientation."""
+        name = self._dataset.objects[object_index].name
+        rng = generator(self._seed, name, "photograph", number)
+        image = self._dataset.image(object_index, number)
+        return _local_view(self._condition.query(image, rng), azimuth_deg)
+
+    def enrolled(self, object_index: int, numbers: IndexArray, azimuths_deg: Sequence[float]) -> list[LocalView]:
+        """Return the enrolled views nearest to each azimuth, of the photographs with these numbers, by azimuth.
+
+        There is one more than `NEAREST` for each azimuth, because a comparison leaves one out.
+        """
+        own_deg = self._dataset.objects[object_index].azimuth_deg[numbers]
+        return [self._enrolled(object_index, number) for number in numbers[near(own_deg, azimuths_deg)].tolist()]
+
+    def _enrolled(self, object_index: int, number: int) -> LocalView:
+        if (object_index, number) not in self._known:
+            item = self._dataset.objects[object_index]
+            image = self._dataset.image(object_index, number)
+            shown = self._condition.enrolled(image, generator(0, item.name, "enrolled", number))
+            self._known[object_index, number] = _local_view(shown, item.photographs[number].azimuth_deg)
+        return self._known[object_index, number]
+
+
+def _local_view(shown: EvaluationImage, azimuth_deg: float) -> LocalView:
+    cut = segment(shown.image, empty_table=shown.empty)
+    return LocalView(cut.crop, cut.mask, azimuth_deg)
 
 
 def run_object(
@@ -93,7 +139,7 @@ def run_object(
     same_bench : bool, optional
         Whether a search of the dense filter knows that the bench is that of the enrollment; None: it does not know.
     segmented_by : sequence of str, optional
-        How each query was segmented (`hbr.evaluation.descriptors.segmented_queries`).
+        How each query was segmented (`hbr.evaluation.condition.segmented_queries`).
     now_ns : callable
         Monotonic time, for `Runs.step_ns`.
 
@@ -390,3 +436,81 @@ def _similar_views(similar: FloatArray, ring: IndexArray) -> NDArray[np.bool_]:
     found: NDArray[np.bool_] = similar >= np.minimum(similar[rows, before], similar[rows, after])[:, None]
     found[rows, rows] = True  # a view without texture and colour has similarity 0 to itself
     return found
+
+
+def most_informative_rotation(belief: Belief, *, beta: float = BETA, rotations_deg: ArrayLike | None = None) -> float:
+    """Choose the rotation whose view is expected to leave the least entropy: a baseline for `hbr.next_best_view`.
+
+    If hypothesis h is true, the view after a rotation is the one that was enrolled there. The likelihood of hypothesis
+    h' is then exp(β T(view_h, view_h')^p). Arguments as for `hbr.next_best_view`.
+    """
+    angles_deg = ALL_ROTATIONS_DEG if rotations_deg is None else np.asarray(rotations_deg, np.float64)
+    probability, place, bin_of = strongest(belief.posterior(beta))
+    rows, _ = expected_views(belief, place, bin_of, angles_deg)
+    similar = belief.index.compared.among(rows)
+    weights = probability * np.exp(beta / np.sqrt(belief.queries + 1) * (np.maximum(similar, 0) ** POWER - 1))
+    weights /= weights.sum(axis=2, keepdims=True)
+    objects = (place[:, None] == np.unique(place)).astype(np.float64)
+    shares = weights @ objects
+    entropy = -(shares * np.log(np.maximum(shares, 1e-300))).sum(axis=2)
+    return float(angles_deg[int((entropy @ probability).argmin())])
+
+
+def enroll(experiment: Experiment, dataset: Dataset, j: int) -> LevelArray:
+    """Describe all photographs of object `j` as enrolled views."""
+    return enrolled_levels(dataset, j, experiment.condition)
+
+
+def all_views(experiment: Experiment, dataset: Dataset, enrolled: list[LevelArray]) -> Views:
+    """Return the enrolled views of all objects."""
+    kind = experiment.condition.descriptor
+    objects = zip(dataset.objects, enrolled, strict=True)
+    return Views.concatenate([Views.of_object(item.name, own, item.azimuth_deg, kind) for item, own in objects])
+
+
+def _with_rule(
+    experiment: Experiment, dataset: Dataset, enrolled: list[LevelArray]
+) -> tuple[Views, StoppingRule | None]:
+    views = all_views(experiment, dataset, enrolled)
+    is_dense = any(method.dense for method in experiment.methods)
+    return views, rule_of_trial(views, experiment.protocol) if is_dense else None
+
+
+def _search(
+    experiment: Experiment,
+    dataset: Dataset,
+    model: tuple[Views, StoppingRule | None],
+    now_ns: Callable[[], int],
+    j: int,
+) -> Runs:
+    condition, protocol, (views, rule) = experiment.condition, experiment.protocol, model
+    queries = query_levels(dataset, j, condition, protocol.seed)
+    photographs = LocalPhotographs(dataset, condition, protocol.seed)
+    return run_object(
+        j,
+        queries.levels,
+        views,
+        experiment.methods,
+        protocol,
+        rule=rule,
+        photographs=photographs if photographs.possible else None,
+        same_bench=condition.same_bench,
+        segmented_by=queries.methods,
+        now_ns=now_ns,
+    )
+
+
+def _results(experiment: Experiment, dataset: Dataset, _model: object, found: list[Runs]) -> dict[str, Any]:
+    runs, report = Runs.concatenate(found), experiment.report
+    if report is not None:
+        runs = runs.of(slice(report[0] - 1, report[1]))
+    rng = generator(experiment.protocol.seed, dataset.name, "bootstrap", 0)
+    return {
+        "settings": experiment.settings(dataset),
+        "reported": None if report is None else list(report),
+        "bytes_per_view": descriptor(experiment.condition.descriptor).size_bytes,
+        **results_of(runs, experiment.methods, experiment.margin, experiment.min_views, rng),
+    }
+
+
+TRIALS: Final = Kind(enroll, _with_rule, _search, _results)

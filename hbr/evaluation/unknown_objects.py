@@ -1,15 +1,26 @@
 """Error rates for unknown objects: shares of accepted unknown objects and of rejected enrolled objects."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
 from hbr.core.arrays import BoolArray
-from hbr.dense.fitting import conformal_threshold
+from hbr.dense.fitting import LeaveOneOut, conformal_threshold, fitting_searches, rule_from_searches
+from hbr.dense.index import DenseIndex
 from hbr.dense.stopping import Leaders, StoppingRule, usual_scores
-from hbr.evaluation.draws import generator
-from hbr.evaluation.protocol import Protocol, Runs
+from hbr.evaluation.condition import query_levels
+from hbr.evaluation.experiment import Experiment, Kind
+from hbr.evaluation.photographs import Dataset
+from hbr.evaluation.protocol import METHODS, Protocol, Runs, generator, views_of_trial
+from hbr.evaluation.statistics import wilson
+from hbr.evaluation.trials import all_views, enroll, run_object
+from hbr.model.views import Views
+
+#: Nominal shares of enrolled objects that may be called unknown, and draws of left-out objects.
+_NOMINAL: Final = (0.005, 0.01, 0.02, 0.05)
+_DRAWS: Final = 5
 
 
 @dataclass(frozen=True)
@@ -92,3 +103,51 @@ def _leaders(runs: Runs, objects: BoolArray, trials: slice) -> Leaders:
     """Return the leaders of these objects' trials, (objects * trials, views)."""
     parts = (part[0, objects][:, trials] for part in (runs.best, runs.score, runs.margin))
     return Leaders(*(part.reshape(-1, part.shape[-1]) for part in parts))
+
+
+class _Model(NamedTuple):
+    """All views, and for each draw its protocol, and the fitted rules by nominal rate."""
+
+    views: Views
+    protocols: tuple[Protocol, ...]
+    rules: dict[float, list[StoppingRule]]
+
+
+def _model(experiment: Experiment, dataset: Dataset, enrolled: list[Any]) -> _Model:
+    views = all_views(experiment, dataset, enrolled)
+    protocols = left_out(experiment.protocol, views.object_names, experiment.left_out, _DRAWS)
+    searches = [_searches(views, protocol) for protocol in protocols]
+    rules = {rate: [rule_from_searches(one, false_reject=rate) for one in searches] for rate in _NOMINAL}
+    return _Model(views, protocols, rules)
+
+
+def _searches(views: Views, protocol: Protocol) -> LeaveOneOut:
+    searches = fitting_searches(DenseIndex(views.select(views_of_trial(views, protocol))))
+    if searches is None:
+        raise ValueError(
+            "objects with a single enrolled view are too few for a stopping rule; enroll more views of each"
+        )
+    return searches
+
+
+def _search(experiment: Experiment, dataset: Dataset, model: _Model, _now_ns: Callable[[], int], j: int) -> list[Runs]:
+    queries = query_levels(dataset, j, experiment.condition, experiment.protocol.seed).levels
+    draws = zip(model.protocols, model.rules[_NOMINAL[0]], strict=True)
+    return [run_object(j, queries, model.views, (METHODS["dense"],), one, rule=rule) for one, rule in draws]
+
+
+def _results(experiment: Experiment, dataset: Dataset, model: _Model, found: list[list[Runs]]) -> dict[str, Any]:
+    names = np.array(model.views.object_names)
+    parts = [
+        (Runs.concatenate([runs[draw] for runs in found]), np.isin(names, protocol.absent))
+        for draw, protocol in enumerate(model.protocols)
+    ]
+    rows = []
+    for rate in _NOMINAL:
+        for row in (*unknown_objects(parts, rate), *unknown_objects(parts, rate, model.rules[rate])):
+            low, high = wilson(row.false_accepts, row.unknown_trials)
+            rows.append({**asdict(row), "false_accepts_low": low, "false_accepts_high": high})
+    return {"settings": experiment.settings(dataset), "rows": rows}
+
+
+UNKNOWN_OBJECTS: Final = Kind(enroll, _model, _search, _results)

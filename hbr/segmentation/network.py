@@ -2,7 +2,7 @@
 
 The network sees a small frame and, where the background is known, the frame's difference from it. The background is
 known from the empty-table image, or was learned while the table rotated. Its weights are in the wheel, and
-`benchmarks/train_segmentation.py` makes them. Model card: docs/explanation/segmentation-network.md.
+How they were made says the model card: docs/explanation/segmentation-network.md.
 
 Decision: docs/decisions/0048.
 """

@@ -1,1 +1,1 @@
-"""The evaluations of `rig eval`: in several processes, resumable, with results as page, table, figures and JSON."""
+"""The experiments of `rig eval`: shipped ones and files, run in several processes; results as tables, figures, JSON."""

@@ -1,85 +1,98 @@
-"""Run a plan, with several objects in parallel processes."""
+"""Runs an experiment, with several objects in parallel processes, and writes its results."""
 
-from collections.abc import Callable
+import csv
+import io
+import json
+import re
+from collections.abc import Callable, Mapping
 from functools import partial
+from hashlib import sha256
+from pathlib import Path
+from typing import Any, Final, TypeVar
 
-from hbr.core.arrays import LevelArray
-from hbr.dense.stopping import StoppingRule
-from hbr.evaluation.descriptors import enrolled_levels, segmented_queries
-from hbr.evaluation.near_twins import LocalPhotographs
-from hbr.evaluation.protocol import Runs
-from hbr.evaluation.trials import rule_of_trial, run_object
-from hbr.model.views import Views
+from hbr.evaluation.changes import BENCH_CHANGE
+from hbr.evaluation.experiment import Experiment, Kind
+from hbr.evaluation.matrix import MATRIX
+from hbr.evaluation.photographs import Dataset
+from hbr.evaluation.trials import TRIALS
+from hbr.evaluation.unknown_objects import UNKNOWN_OBJECTS
+from rig.charts.evaluation_figures import figures
 from rig.core.clock import SystemClock
+from rig.core.errors import UsageError, os_errors_as
+from rig.core.files import write
+from rig.core.next_steps import Do
 from rig.core.processes import Jobs, map_in_processes
-from rig.evaluation.plan import Plan
-from rig.evaluation.store import Store
+from rig.evaluation.tables import rows_of
+
+FOLDER: Final = Path("rig-eval")
+"""The folder of all results without a folder of their own choice."""
+_KINDS: Final[Mapping[str, Kind]] = {
+    "trials": TRIALS,
+    "matrix": MATRIX,
+    "unknown-objects": UNKNOWN_OBJECTS,
+    "bench-change": BENCH_CHANGE,
+}
+_MAX_NAME: Final = 60
+_T = TypeVar("_T")
 
 
-def enrolled_views(plan: Plan, jobs: Jobs, advance: Callable[[str], None]) -> Views:
-    """Return the descriptors of all photographs as enrolled views; `advance` is called with each object's name.
+def run_experiment(
+    experiment: Experiment, dataset: Dataset, jobs: Jobs, advance: Callable[[str, str], None]
+) -> dict[str, Any]:
+    """Return the results as JSON values; they do not depend on `jobs`.
 
-    Raises
-    ------
-    DatasetError
-        A photograph cannot be used.
-    """
-    objects = plan.dataset.objects
-    levels: dict[int, LevelArray] = {}
-    for j, found in map_in_processes(partial(_enroll, plan), range(len(objects)), jobs):
-        levels[j] = found
-        advance(objects[j].name)
-    return Views.concatenate(
-        [
-            Views.of_object(item.name, levels[j], item.azimuth_deg, plan.condition.descriptor)
-            for j, item in enumerate(objects)
-        ]
-    )
-
-
-def run_plan(plan: Plan, views: Views, store: Store, jobs: Jobs, advance: Callable[[str], None]) -> Runs:
-    """Search for every object that has no stored runs, and return the runs of all objects.
-
-    The results do not depend on `jobs`. `advance` is called with the name of each object. If the call is interrupted,
-    the runs of the completed objects are in the store.
+    `advance` is called with "described" and "searched" and the name of each object.
 
     Raises
     ------
     DatasetError, ValueError
-        A photograph cannot be used, or an object has too few views for the protocol.
+        A photograph cannot be used, or there are too few objects or views for the experiment.
     """
-    names = [item.name for item in plan.dataset.objects]
-    done: dict[int, Runs] = {}
-    for j, name in enumerate(names):
-        if (runs := store.load(name)) is not None:
-            done[j] = runs
-            advance(name)
-    missing = [j for j in range(len(names)) if j not in done]
-    dense = any(method.dense for method in plan.methods)
-    rule = rule_of_trial(views, plan.protocol) if missing and dense else None
-    for j, runs in map_in_processes(partial(_search, plan, views, rule), missing, jobs):
-        store.save(names[j], runs)
-        done[j] = runs
-        advance(names[j])
-    return Runs.concatenate([done[j] for j in range(len(names))])
+    kind = _KINDS[experiment.kind]
+
+    def of_each(work: Callable[[int], _T], done: str) -> list[_T]:
+        found: dict[int, _T] = {}
+        for j, one in map_in_processes(work, range(len(dataset.objects)), jobs):
+            found[j] = one
+            advance(done, dataset.objects[j].name)
+        return [found[j] for j in range(len(dataset.objects))]
+
+    model = kind.model(experiment, dataset, of_each(partial(kind.enroll, experiment, dataset), "described"))
+    # the clock measures the steps of a search; hbr has none
+    search = partial(kind.search, experiment, dataset, model, SystemClock().now_ns)
+    return kind.results(experiment, dataset, model, of_each(search, "searched"))
 
 
-def _enroll(plan: Plan, j: int) -> LevelArray:
-    return enrolled_levels(plan.dataset, j, plan.condition, plan.size)
+def own_folder(experiment: Experiment, dataset: Dataset) -> Path:
+    """Return the folder of these results: the same for equal experiments on equal data sets, and another for others."""
+    reported = {"report": experiment.report}
+    digest = sha256(json.dumps(experiment.settings(dataset) | reported, sort_keys=True).encode()).hexdigest()[:8]
+    name = f"{dataset.name}-{experiment.name}-{experiment.condition.noise}"
+    words = re.sub(r"[^\w.+-]+", "-", name).strip("-.")[-_MAX_NAME:]
+    return FOLDER / f"{words}-{digest}"
 
 
-def _search(plan: Plan, views: Views, rule: StoppingRule | None, j: int) -> Runs:
-    queries, methods = segmented_queries(plan.dataset, j, plan.condition, plan.size, plan.protocol.seed)
-    photographs = LocalPhotographs(plan.dataset, plan.condition, plan.size, plan.protocol.seed)
-    return run_object(
-        j,
-        queries,
-        views,
-        plan.methods,
-        plan.protocol,
-        rule=rule,
-        photographs=photographs if photographs.possible else None,
-        same_bench=plan.condition.same_bench,
-        segmented_by=methods,
-        now_ns=SystemClock().now_ns,
-    )
+def write_results(results: Mapping[str, Any], folder: Path) -> None:
+    """Write results.json, results.csv and the figures; a missing folder is created.
+
+    Raises
+    ------
+    UsageError
+        The folder cannot be written.
+    """
+    text = io.StringIO()
+    rows = rows_of(results)
+    writer = csv.DictWriter(text, rows[0].keys(), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    files = {
+        "results.json": json.dumps(results, ensure_ascii=False, allow_nan=False, indent=1).encode() + b"\n",
+        "results.csv": text.getvalue().encode(),
+    }
+    if "methods" in results:
+        files |= {f"{name}.svg": figure.svg().encode() for name, figure in figures(dict(results)).items()}
+    step = Do.RUN_AGAIN(out="FOLDER")
+    with os_errors_as(UsageError, f"The results cannot be written to {folder}.", next_step=step):
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, data in files.items():
+            write(folder / name, data)

@@ -37,7 +37,7 @@ def demo(
             "--change",
             metavar="NAME",
             help="Change the bench between enrollment and search: light (with exposure and white balance), placement, "
-            "bench (both, with another table and wall), or hard (all that rig eval --bench-change hard changes). "
+            "bench (both, with another table and wall), or hard (all that rig eval hard-change changes). "
             "Repeatable.",
         ),
     ] = None,

@@ -21,7 +21,7 @@ def main() -> None:
     import cv2
 
     import rig.catalog.exchange.bundle
-    import rig.evaluation.plan
+    import rig.evaluation.run
     import rig.plans.identify
     import rig.report
     import rig.search.replay

@@ -9,7 +9,7 @@ from hbr import DenseIndex, Views, next_best_view
 from hbr.dense.filter import update_belief
 from hbr.dense.index import BINS
 from hbr.dense.next_view import SHARPNESS, strongest
-from hbr.evaluation.mutual_information import most_informative_rotation
+from hbr.evaluation.trials import most_informative_rotation
 from tests.fuzzing import examples
 
 STEP = 15

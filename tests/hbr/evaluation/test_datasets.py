@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from hbr.evaluation.datasets import DatasetError, load_coil, read_photograph
+from hbr.evaluation.photographs import DatasetError, load_coil, read_photograph
 
 
 def picture(path: Path, size: int = 8) -> Path:

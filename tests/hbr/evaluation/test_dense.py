@@ -8,8 +8,7 @@ import pytest
 from hbr import DenseIndex, Outcome, next_best_view, update_belief
 from hbr.core.angles import wrap180
 from hbr.dense.stopping import NUMBERS, OpenSetModel
-from hbr.evaluation.methods import METHODS, choose_methods
-from hbr.evaluation.protocol import COMPARED, OUTCOMES, Protocol, Runs
+from hbr.evaluation.protocol import COMPARED, METHODS, OUTCOMES, Protocol, Runs, choose_methods
 from hbr.evaluation.results import contests, method_results
 from hbr.evaluation.trials import _Trials, rule_of_trial, run_object
 from tests.hbr.dense.searches import belief_after

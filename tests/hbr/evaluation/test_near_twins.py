@@ -9,13 +9,10 @@ import numpy as np
 import pytest
 
 from hbr import Outcome
-from hbr.evaluation.condition import Condition
-from hbr.evaluation.datasets import load_coil
-from hbr.evaluation.descriptors import enrolled_levels, query_levels, segmented_queries
-from hbr.evaluation.methods import METHODS
-from hbr.evaluation.near_twins import LocalPhotographs
-from hbr.evaluation.protocol import COMPARED, OUTCOMES, Protocol
-from hbr.evaluation.trials import rule_of_trial, run_object
+from hbr.evaluation.condition import Condition, enrolled_levels, query_levels
+from hbr.evaluation.photographs import load_coil
+from hbr.evaluation.protocol import COMPARED, METHODS, OUTCOMES, Protocol
+from hbr.evaluation.trials import LocalPhotographs, rule_of_trial, run_object
 from hbr.model.views import Views
 
 SIZE = (96, 96)
@@ -45,7 +42,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_searches_for_near_twins_compare_the_two_leaders(folder: Path) -> None:
     dataset, condition = load_coil(folder), Condition(descriptor="edges+colours")
-    levels = [enrolled_levels(dataset, j, condition, SIZE) for j in range(3)]
+    levels = [enrolled_levels(dataset, j, condition) for j in range(3)]
     views = Views.concatenate(
         [
             Views.of_object(item.name, own, item.azimuth_deg, condition.descriptor)
@@ -53,14 +50,12 @@ def test_searches_for_near_twins_compare_the_two_leaders(folder: Path) -> None:
         ]
     )
     protocol = Protocol(trials=1, max_views=2, removal="queries", sigma_deg=0.5, enrolled=12)
-    photographs = LocalPhotographs(dataset, condition, SIZE, protocol.seed)
+    photographs = LocalPhotographs(dataset, condition, protocol.seed)
     assert photographs.possible
-    assert not LocalPhotographs(dataset, Condition(), SIZE, 0).possible  # plain CEDD cuts nothing out
-    queries = query_levels(dataset, 1, condition, SIZE, protocol.seed)
-    segmented = segmented_queries(dataset, 1, condition, SIZE, protocol.seed)
-    np.testing.assert_array_equal(segmented.levels, queries)
-    assert set(segmented.methods) == {"plain-background"}
-    assert set(segmented_queries(dataset, 1, Condition(), SIZE, protocol.seed).methods) == {""}
+    assert not LocalPhotographs(dataset, Condition(), 0).possible  # plain CEDD cuts nothing out
+    queries, methods = query_levels(dataset, 1, condition, protocol.seed)
+    assert set(methods) == {"plain-background"}
+    assert set(query_levels(dataset, 1, Condition(), protocol.seed).methods) == {""}
     # no search is confident, and no object is unknown: each ends as ambiguous
     rule = replace(rule_of_trial(views, protocol), min_confidence=2.0, open_set_thresholds=(-inf, -inf))
     without, with_images = (

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hbr.evaluation.condition import Condition, object_mask
-from hbr.evaluation.noise import Noise, gaussian, motion_kernel
+from hbr.evaluation.condition import Condition, Noise, gaussian, motion_kernel
+from hbr.evaluation.photographs import object_mask
 from tests.fuzzing import examples
 
 

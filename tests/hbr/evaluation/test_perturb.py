@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from hbr import describe, descriptor
-from hbr.evaluation.condition import Condition, object_mask
-from hbr.evaluation.noise import Noise
-from hbr.evaluation.perturb import STRENGTHS, Perturbations
-from hbr.evaluation.scenes import HEIGHT, WIDTH, other_bench, plain_bench
+from hbr.drawing.bench import HEIGHT, WIDTH
+from hbr.evaluation.condition import Condition, Noise
+from hbr.evaluation.perturb import STRENGTHS, Perturbations, other_bench, plain_bench
+from hbr.evaluation.photographs import object_mask
 
 
 def ball() -> np.ndarray:

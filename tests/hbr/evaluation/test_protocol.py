@@ -7,8 +7,7 @@ from hypothesis import strategies as st
 
 import hbr
 from hbr import ViewIndex, Views
-from hbr.evaluation.methods import METHODS, Method, choose_methods
-from hbr.evaluation.protocol import Protocol, Removal, Runs
+from hbr.evaluation.protocol import METHODS, Method, Protocol, Removal, Runs, choose_methods
 from hbr.evaluation.trials import _Trials, run_object
 from tests.fuzzing import examples
 

@@ -1,8 +1,7 @@
 import numpy as np
 import pytest
 
-from hbr.evaluation.methods import METHODS
-from hbr.evaluation.protocol import Runs
+from hbr.evaluation.protocol import METHODS, Runs
 from hbr.evaluation.results import contests, method_results, pose_rmse_by_object, step_median_ms
 
 PAIR = (METHODS["ahbr"], METHODS["hbr"])

@@ -11,7 +11,7 @@ import pytest
 
 import hbr
 from hbr import Background, segment
-from hbr.evaluation.scenes import other_bench, plain_bench
+from hbr.evaluation.perturb import other_bench, plain_bench
 from hbr.segmentation import CROP_PX, Issue, IssueCode, Method
 
 BOX = (130, 70, 60, 110)

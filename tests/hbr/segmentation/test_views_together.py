@@ -10,7 +10,7 @@ from hbr.dense.fitting import can_shift
 from hbr.dense.index import Whitening
 from hbr.descriptors.base import Shift
 from hbr.descriptors.together import like_enrollment
-from hbr.evaluation.changed_bench import HARD, Bench, Visit
+from hbr.drawing.bench import HARD, Bench, Visit
 from hbr.segmentation import Method
 
 NAMES = tuple("abcdefghij")

@@ -8,7 +8,7 @@ import pytest
 from click.testing import Result
 
 from hbr.descriptors import registry
-from hbr.descriptors.plain_cedd import Cedd
+from hbr.descriptors.cedd import Cedd
 
 Rig = Callable[..., Result]
 

@@ -13,8 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hbr.core.arrays import ImageArray
-from hbr.evaluation.scenes import FOOT_PX, HEIGHT, SIDE_PX, WIDTH, Picture
 
+Picture = NDArray[np.float32]
+"""BGR, not clipped, so that the illumination can be changed later."""
+
+WIDTH: Final = 320
+HEIGHT: Final = 240
+#: Position of the middle of an object's foot, and side of an object's photograph, in pixels.
+FOOT_PX: Final = (160, 196)
+SIDE_PX: Final = 150
 #: Half axes of the platter in pixels.
 _PLATTER_PX: Final = (96.0, 27.0)
 _GRAINS: Final = (3, 6, 12, 24, 48, 96)
@@ -199,9 +206,10 @@ class Visit:
         """
         side = SIDE_PX / max(image_bgr.shape[:2]) if px_per_px is None else px_per_px
         seen, cover = self._placed(image_bgr, mask, table_deg, side, foot_px)
-        ground = self._bench.seen(table_deg) * (1 - self._shadow(cover))[:, :, None]
+        shade = missing_light(cover, self._shade, self._lean, self._length, self._soft_px)
+        ground = self._bench.seen(table_deg) * (1 - shade)[:, :, None]
         picture = ground * (1 - cover[:, :, None]) + seen * cover[:, :, None]
-        self._highlights(picture, cover)
+        draw_highlights(picture, cover, self._change.specular, self._rng)
         image, hidden = self._photographed(picture, False)
         return Frame(image, (cover > 0.5) & ~hidden)
 
@@ -228,29 +236,6 @@ class Visit:
         seen = cv2.warpAffine(image, move, (WIDTH, HEIGHT), borderMode=cv2.BORDER_REPLICATE).astype(np.float32)
         return seen, np.asarray(cv2.warpAffine(edge.astype(np.float32), move, (WIDTH, HEIGHT)), np.float32)
 
-    def _shadow(self, cover: Picture) -> Picture:
-        left, top, width, height = cv2.boundingRect((cover > 0.5).astype(np.uint8))
-        foot = np.zeros_like(cover)
-        cv2.ellipse(foot, (left + width // 2, top + height - 3), (int(0.55 * width) + 3, 8), 0, 0, 360, 1, -1)
-        bottom = top + height
-        fallen = np.array([[1, self._lean, -self._lean * bottom], [0, self._length, bottom * (1 - self._length)]])
-        cast = cv2.GaussianBlur(cv2.warpAffine(cover, fallen, (WIDTH, HEIGHT)), (0, 0), self._soft_px)
-        shade = 1 - (1 - 0.35 * cv2.GaussianBlur(foot, (0, 0), 3)) * (1 - self._shade * cast)
-        return np.asarray(shade, np.float32)
-
-    def _highlights(self, picture: Picture, cover: Picture) -> None:
-        rows, columns = np.nonzero(cover > 0.5)
-        if not self._change.specular or not len(rows):
-            return
-        for _ in range(int(self._rng.integers(1, 4))):
-            i = int(self._rng.integers(len(rows)))
-            axes = int(self._rng.integers(2, 9)), int(self._rng.integers(2, 9))
-            spot = np.zeros_like(cover)
-            centre = int(columns[i]), int(rows[i])
-            cv2.ellipse(spot, centre, axes, float(self._rng.uniform(0, 180)), 0, 360, 1, -1)
-            spot = np.asarray(cv2.GaussianBlur(spot, (0, 0), 2), np.float32) * cover
-            picture += spot[:, :, None] * np.float32(self._rng.uniform(0.4, 1) * self._change.specular)
-
     def _photographed(self, picture: Picture, without_holder: bool) -> tuple[ImageArray, NDArray[np.bool_]]:
         """Return the picture as the camera sees it, and the pixels of the holder."""
         hidden = np.zeros((HEIGHT, WIDTH), np.float32)
@@ -265,6 +250,37 @@ class Visit:
             picture = np.asarray(cv2.GaussianBlur(picture, (0, 0), self._blur_px), np.float32)
         noisy = picture + self._rng.normal(0, 1, picture.shape).astype(np.float32) * self._change.noise
         return np.clip(np.rint(noisy), 0, 255).astype(np.uint8), hidden > 0.5
+
+
+def missing_light(cover: Picture, strength: float, lean: float, length: float, soft_px: float) -> Picture:
+    """Return the share of the light that is missing on the ground, (H, W): at the object's foot, and in its shadow.
+
+    ``cover`` (H, W) is the share of the object in each pixel; the shadow falls ``lean`` to the side per ``length``.
+    """
+    left, top, width, height = cv2.boundingRect((cover > 0.5).astype(np.uint8))
+    foot = np.zeros_like(cover)
+    cv2.ellipse(foot, (left + width // 2, top + height - 3), (int(0.55 * width) + 3, 8), 0, 0, 360, 1, -1)
+    shade = 0.35 * cv2.GaussianBlur(foot, (0, 0), 3)
+    if strength:
+        bottom = top + height
+        fallen = np.array([[1, lean, -lean * bottom], [0, length, bottom * (1 - length)]])
+        cast = cv2.GaussianBlur(cv2.warpAffine(cover, fallen, (cover.shape[1], cover.shape[0])), (0, 0), soft_px)
+        shade = 1 - (1 - shade) * (1 - strength * cast)
+    return np.asarray(shade, np.float32)
+
+
+def draw_highlights(picture: Picture, cover: Picture, strength: float, rng: np.random.Generator) -> None:
+    """Draw one to three highlights of this many grey levels on the object."""
+    rows, columns = np.nonzero(cover > 0.5)
+    if not strength or not len(rows):
+        return
+    for _ in range(int(rng.integers(1, 4))):
+        i = int(rng.integers(len(rows)))
+        axes = int(rng.integers(2, 9)), int(rng.integers(2, 9))
+        spot = np.zeros_like(cover)
+        cv2.ellipse(spot, (int(columns[i]), int(rows[i])), axes, float(rng.uniform(0, 180)), 0, 360, 1, -1)
+        spot = np.asarray(cv2.GaussianBlur(spot, (0, 0), 2), np.float32) * cover
+        picture += spot[:, :, None] * np.float32(rng.uniform(0.4, 1) * strength)
 
 
 def _holder(rng: np.random.Generator) -> tuple[tuple[int, int], tuple[int, int], int, NDArray[np.float32]]:

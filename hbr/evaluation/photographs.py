@@ -1,18 +1,22 @@
-"""Data sets: files of photographs of objects from known angles."""
+"""Data sets: photographs of objects from known angles."""
 
 import re
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Final
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from hbr.core.angles import wrap360
 from hbr.core.arrays import FloatArray, ImageArray
 
 _SUFFIXES: Final = {".png", ".jpg", ".jpeg"}
 _COIL_NAME: Final = re.compile(r"obj(?P<number>\d+)__(?P<angle>\d+(?:\.\d+)?)")
+#: Largest level of COIL's black background, with sensor noise and glow.
+_DARK: Final = 45
 #: The last bytes of a complete file. OpenCV does not reject a file that was cut off.
 _ENDS: Final = {".png": b"IEND\xaeB`\x82", ".jpg": b"\xff\xd9", ".jpeg": b"\xff\xd9"}
 
@@ -89,6 +93,26 @@ class Dataset:
         whole = round(360 / self.spacing_deg)
         return sum(max(0, whole - len(item.photographs)) for item in self.objects)
 
+    @cached_property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the first photograph, which all must have."""
+        height, width = read_photograph(self.objects[0].photographs[0].path).shape[:2]
+        return width, height
+
+    def image(self, j: int, i: int) -> ImageArray:
+        """Return the described part of photograph `i` of object `j`, uint8 (H, W, 3), BGR.
+
+        Raises
+        ------
+        DatasetError
+            The photograph cannot be used, or has another size than the first one.
+        """
+        image = read_photograph(self.objects[j].photographs[i].path, self.size)
+        if self.region is not None:
+            x, y, width, height = self.region
+            image = image[y : y + height, x : x + width]
+        return image
+
     def subset(self, first: int, last: int) -> "Dataset":
         """Return the data set with the objects at positions `first` to `last`, counted from 1, both included."""
         if not 1 <= first <= last <= len(self.objects):
@@ -134,19 +158,7 @@ def load_coil(folder: Path) -> Dataset:
 
 
 def read_photograph(path: Path, size: tuple[int, int] | None = None) -> ImageArray:
-    """Read an image.
-
-    Parameters
-    ----------
-    path : Path
-        PNG or JPEG.
-    size : (int, int), optional
-        Required width and height.
-
-    Returns
-    -------
-    uint8 array (H, W, 3)
-        BGR.
+    """Read a PNG or JPEG file, uint8 (H, W, 3), BGR; ``size`` is the required width and height.
 
     Raises
     ------
@@ -170,3 +182,20 @@ def read_photograph(path: Path, size: tuple[int, int] | None = None) -> ImageArr
             "views of one data set must have one size"
         )
     return image.astype(np.uint8, copy=False)
+
+
+def object_mask(image_bgr: ImageArray) -> NDArray[np.bool_]:
+    """Return the pixels of the object, (H, W): all except the dark region that is connected with the image's border."""
+    dark = (image_bgr.max(axis=2) <= _DARK).astype(np.uint8)
+    # a frame of dark pixels joins all regions that touch the border
+    labels = cv2.connectedComponents(cv2.copyMakeBorder(dark, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=1))[1]
+    outside: NDArray[np.bool_] = labels[1:-1, 1:-1] == labels[0, 0]
+    return ~outside
+
+
+def without_specks(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return the mask without small regions."""
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
+    area = stats[1:, cv2.CC_STAT_AREA]
+    whole: NDArray[np.bool_] = np.isin(labels, 1 + np.flatnonzero(area >= 0.05 * area.max(initial=0)))
+    return whole

@@ -1,0 +1,110 @@
+"""An experiment: everything that decides its results besides the photographs."""
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from typing import Any, Final, Literal, NamedTuple, get_args
+
+from hbr.descriptors import descriptor
+from hbr.evaluation.condition import Condition
+from hbr.evaluation.photographs import Dataset
+from hbr.evaluation.protocol import Method, Protocol
+
+KindName = Literal["trials", "matrix", "unknown-objects", "bench-change"]
+Change = Literal["mild", "hard"]
+#: Increased if the same settings give other numbers.
+FORMAT: Final = 7
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """An experiment; equal ones give equal results on equal photographs.
+
+    Attributes
+    ----------
+    name : str
+        Name in files and reports.
+    kind : {"trials", "matrix", "unknown-objects", "bench-change"}
+        ``trials`` compares methods; ``matrix`` measures one perturbation at a time; ``unknown-objects`` leaves objects
+        out, and searches for them, too; ``bench-change`` searches after a change of a whole drawn bench.
+    condition : Condition
+        How the images of queries differ from those of enrolled views.
+    protocol : Protocol
+        The settings of the trials.
+    methods : tuple of Method
+        The methods of ``trials``.
+    objects, report : (int, int) or None
+        First and last object of the data set that takes part, and that is reported, counted from 1; None: all.
+    left_out : int
+        Objects that ``unknown-objects`` leaves out, five times.
+    change : {"mild", "hard"}
+        The change of ``bench-change``.
+    margin, min_views
+        Lead per view, and number of views, that end a search of the paper.
+    """
+
+    name: str
+    kind: KindName = "trials"
+    condition: Condition = field(default_factory=Condition)
+    protocol: Protocol = field(default_factory=Protocol)
+    methods: tuple[Method, ...] = ()
+    objects: tuple[int, int] | None = None
+    report: tuple[int, int] | None = None
+    left_out: int = 20
+    change: Change = "hard"
+    margin: float = 0.02
+    min_views: int = 2
+
+    def __post_init__(self) -> None:
+        if self.kind not in get_args(KindName):
+            raise ValueError(f"kind {self.kind!r} is unknown; use one of {', '.join(get_args(KindName))}")
+        if self.change not in get_args(Change):
+            raise ValueError(f"change {self.change!r} is unknown; use mild or hard")
+        if self.kind in ("matrix", "bench-change") and self.protocol.enrolled is None:
+            raise ValueError(f"{self.kind} needs the number of enrolled views; give enrolled = 18")
+
+    def settings(self, dataset: Dataset) -> dict[str, Any]:
+        """Return everything that determines the results, as JSON values with units in the keys."""
+        condition, (width, height) = self.condition, dataset.size
+        return {
+            "format": FORMAT,
+            "kind": self.kind,
+            "dataset": {
+                "name": dataset.name,
+                "objects": [item.name for item in dataset.objects],
+                "views": dataset.views,
+                "missing_views": dataset.missing,
+                "spacing_deg": dataset.spacing_deg,
+                "width_px": width,
+                "height_px": height,
+            },
+            "condition": {
+                **{name: getattr(condition, name) for name in condition.__dataclass_fields__},
+                **{name: str(getattr(condition, name)) for name in ("noise", "enrolled_noise", "perturbations")},
+                "descriptor_version": descriptor(condition.descriptor).version,
+            },
+            "protocol": asdict(self.protocol),
+            "methods": [asdict(method) for method in self.methods],
+            "change": self.change if self.kind == "bench-change" else None,
+            "left_out": self.left_out if self.kind == "unknown-objects" else None,
+        }
+
+
+class Kind(NamedTuple):
+    """The steps of a kind of experiment; objects are numbered from 0, each can be worked on in a process of its own.
+
+    Attributes
+    ----------
+    enroll
+        Describes the enrolled views of one object: experiment, data set, object.
+    model
+        Makes the model of all objects: experiment, data set, what `enroll` returned for each.
+    search
+        Searches for one object: experiment, data set, model, monotonic time in ns, object.
+    results
+        The results as JSON values: experiment, data set, model, what `search` returned for each object.
+    """
+
+    enroll: Callable[[Experiment, Dataset, int], Any]
+    model: Callable[[Experiment, Dataset, list[Any]], Any]
+    search: Callable[[Experiment, Dataset, Any, Callable[[], int], int], Any]
+    results: Callable[[Experiment, Dataset, Any, list[Any]], dict[str, Any]]

@@ -1,0 +1,175 @@
+"""Results of an experiment as tables of texts: each is made of the rows that ``results.csv`` has."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+from rich.table import Table
+
+from hbr.evaluation.results import Contest
+from rig.core.phrases import percent, signed
+
+Row = dict[str, Any]
+
+
+class Rows(NamedTuple):
+    """A table of texts: headings and rows; the first column contains names."""
+
+    columns: list[str]
+    rows: list[list[str]]
+
+    def terminal(self) -> Table:
+        table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0))
+        for i, heading in enumerate(self.columns):
+            table.add_column(heading, justify="right" if i else "left", no_wrap=True)
+        for row in self.rows:
+            table.add_row(*row)
+        return table
+
+
+def rows_of(results: Mapping[str, Any]) -> list[Row]:
+    """Return the results in long form; of trials, one row for each method and number of views."""
+    if "methods" not in results:
+        rows: list[Row] = results["rows"]
+        return rows
+    took = results["wall_clock"]["step_median_ms"]
+    return [
+        {"method": method["name"], **point, "step_median_ms": step_ms}
+        for method in results["methods"]
+        for point, step_ms in zip(method["curve"], took[method["name"]], strict=True)
+    ]
+
+
+def tables(results: Mapping[str, Any]) -> list[Rows]:
+    """Return the tables that the terminal shows."""
+    rows = rows_of(results)
+    match results["settings"]["kind"]:
+        case "trials":
+            return [_curves(results, rows), _decisions(results)]
+        case "matrix":
+            return [_matrix(rows)]
+        case "unknown-objects":
+            return [_unknown_objects(rows)]
+        case _:
+            return [_changes(rows)]
+
+
+def _pivot(
+    heading: str, rows: Sequence[Row], name: Callable[[Row], str], across: str, cell: Callable[[Row], str]
+) -> Rows:
+    """Return a table with a line for each name, and a column for each value of the key ``across``."""
+    values = sorted({row[across] for row in rows})
+    lines: dict[str, dict[Any, str]] = {}
+    for row in rows:
+        lines.setdefault(name(row), {})[row[across]] = cell(row)
+    return Rows([heading, *map(str, values)], [[key, *(own.get(v, "") for v in values)] for key, own in lines.items()])
+
+
+def _curves(results: Mapping[str, Any], rows: Sequence[Row]) -> Rows:
+    labels = {method["name"]: method["label"] for method in results["methods"]}
+    found = _pivot(
+        "hit rate, %, at N =", rows, lambda row: row["method"], "views", lambda row: _percent(row["hit_rate"])
+    )
+    best10 = {row["method"]: _percent(row["best10_rate"]) for row in rows}  # after the last view
+    return Rows([*found.columns, "best 10"], [[labels[name], *cells, best10[name]] for name, *cells in found.rows])
+
+
+def _decisions(results: Mapping[str, Any]) -> Rows:
+    """Return the cost of a decision, and the error of the pose after all views, by method."""
+    rows = []
+    for method in results["methods"]:
+        last, stopping = method["curve"][-1], method["stopping"]
+        poses = [last[f"{kind}_error_{measure}_deg"] for kind in ("pose", "alike") for measure in ("median", "rmse")]
+        poses.append(last["asymmetric_error_median_deg"])
+        rates = ("hit", "ambiguous", "unknown", "wrong", "compared", "compared_right")
+        rows.append(
+            [
+                method["label"],
+                f"{stopping['views_mean']:.2f}",
+                f"{stopping['views_p95']:.0f}",
+                *(f"{100 * stopping[f'{rate}_rate']:.2f}" for rate in rates),
+                f"{stopping['travelled_mean_deg']:.0f}",
+                *("–" if error is None else f"{error:.1f}" for error in poses),
+                f"{results['wall_clock']['step_median_ms'][method['name']][-1]:.1f}",
+            ]
+        )
+    heads = "decision|views|p95|hits %|ambiguous %|unknown %|wrong %|compared %|right by it %|rotated°|pose°|RMSE°"
+    return Rows([*heads.split("|"), "similar°", "RMSE°", "asym.°", "ms"], rows)
+
+
+def _matrix(rows: Sequence[Row]) -> Rows:
+    """Return perturbations by strengths, with the hit rates in percent after one view and after all."""
+    last = max(row["views"] for row in rows)
+    first = {(row["kind"], row["strength"]): _percent(row["hit_rate"]) for row in rows if row["views"] == 1}
+    return _pivot(
+        f"hit rate, %, N = 1 / {last}; strength",
+        [row for row in rows if row["views"] == last],
+        lambda row: row["kind"],
+        "strength",
+        lambda row: f"{first[row['kind'], row['strength']]} / {_percent(row['hit_rate'])}",
+    )
+
+
+def _unknown_objects(rows: Sequence[Row]) -> Rows:
+    """Return nominal rates by views, with the measured false rejects and false accepts in percent."""
+
+    def cell(row: Row) -> str:
+        rejected, accepted = row["false_rejects"] / row["known_trials"], row["false_accepts"] / row["unknown_trials"]
+        return f"{100 * rejected:.2f} / {100 * accepted:.2f}"
+
+    return _pivot(
+        "false rejects / accepts, %, at N =",
+        sorted(rows, key=lambda row: (row["fitted"], row["nominal"])),
+        lambda row: f"nominal {100 * row['nominal']:g}{', fitted' if row['fitted'] else ''}",
+        "views",
+        cell,
+    )
+
+
+def _changes(rows: Sequence[Row]) -> Rows:
+    """Return the shares in percent: of all objects, and of those that are reported alone."""
+    heads = "change, %|objects|ranking, N = 1 / 2 / 4|decided right|wrong|ambiguous|called unknown|leader verified"
+    heads += "|leaders compared|right / wrong by it|unknown accepted|left out in turn: accepted"
+    shares = ("decided_wrong", "ambiguous", "called_unknown", "verified", "compared")
+    return Rows(
+        heads.split("|"),
+        [
+            [
+                row["change"],
+                row["objects"],
+                f"{' / '.join(_percent(row[f'hit_rate_{n}']) for n in (1, 2, 4))} of {row['searches']}",
+                f"{_percent(row['decided_right'])} in {row['mean_views']:.2f} views",
+                *(_percent(row[share]) for share in shares),
+                f"{_percent(row['right_by_comparison'])} / {_percent(row['wrong_by_comparison'])}",
+                f"{_percent(row['unknown_accepted'])} of {row['unknown_searches']}",
+                f"{_percent(row['left_out_accepted'])} of {row['left_out_searches']}",
+            ]
+            for row in rows
+        ],
+    )
+
+
+def contest_sentences(results: Mapping[str, Any]) -> list[str]:
+    """Return each comparison of two methods in words, with its interval and p-value."""
+    labels = {method["name"]: method["label"] for method in results.get("methods", ())}
+    return [_sentence(Contest(**contest), labels) for contest in results.get("contests", ())]
+
+
+def _sentence(contest: Contest, labels: dict[str, str]) -> str:
+    first = f"{labels[contest.first]} at N = {contest.first_views}"
+    second = f"{labels[contest.second]} at N = {contest.second_views}"
+    if contest.difference_low > 0 and contest.p_value < 0.05:
+        result = "better"
+    elif contest.difference_high < 0 and contest.p_value < 0.05:
+        result = "worse"
+    else:
+        result = "no difference shown"
+    return (
+        f"{first} ({percent(contest.first_rate)}) against {second} ({percent(contest.second_rate)}): "
+        f"{signed(100 * contest.difference, 1)} points "
+        f"[{signed(100 * contest.difference_low, 1)}, {signed(100 * contest.difference_high, 1)}], "
+        f"McNemar p = {contest.p_value:.2g} ({contest.only_first} trials to {contest.only_second}); {result}"
+    )
+
+
+def _percent(rate: float) -> str:
+    return f"{100 * rate:.1f}"
