@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from functools import cache
-from typing import Final, Literal, NamedTuple, Self, TypeVar, get_args
+from typing import Any, Final, Literal, NamedTuple, Self, TypeVar, get_args
 
 import cv2
 import numpy as np
@@ -186,6 +186,10 @@ class Condition:
         such image for queries and enrolled views.
     enrolled_noise : Noise
         Noise of the enrolled views.
+    enrolled_background : {"same", "uniform", "textured"}
+        Background of the enrolled views instead of the dark surroundings; each view has its own.
+    cut_out : bool
+        Whether the object is cut out of every image as on the rig, and described before an even grey.
     """
 
     size_px: int | None = None
@@ -197,6 +201,8 @@ class Condition:
     descriptor: str = "cedd"
     reference: Reference = "own"
     enrolled_noise: Noise = field(default_factory=Noise)
+    enrolled_background: Literal["same", "uniform", "textured"] = "same"
+    cut_out: bool = False
 
     def __post_init__(self) -> None:
         if self.size_px is not None and self.size_px < 2:
@@ -209,6 +215,14 @@ class Condition:
             raise ValueError(f"background {self.background!r} is unknown; use one of {', '.join(get_args(Background))}")
         if self.reference not in get_args(Reference):
             raise ValueError(f"reference {self.reference!r} is unknown; use one of {', '.join(get_args(Reference))}")
+        if self.enrolled_background not in ("same", "uniform", "textured"):
+            raise ValueError(
+                f"enrolled_background {self.enrolled_background!r} is unknown; use same, uniform or textured"
+            )
+        if self.on_bench and self.enrolled_background != "same":
+            raise ValueError("on a bench, enrolled views have its background; leave enrolled_background out")
+        if self.cut_out and not descriptor(self.descriptor).whole_image:
+            raise ValueError(f"{self.descriptor} cuts the object out itself; leave cut_out out")
         if (self.on_bench or self.perturbations) and (self.rotation_deg or self.background in ("uniform", "textured")):
             raise ValueError(
                 "a rotation in the plane, and a uniform or textured background, cannot be combined with perturbations "
@@ -234,6 +248,8 @@ class Condition:
             image, empty = Perturbations().photograph(
                 image, object_mask(image), np.random.default_rng(0), _benches()[0]
             )
+        if self.enrolled_background != "same":
+            image = _before(image, object_mask(image), self.enrolled_background, rng or np.random.default_rng(0))
         noisy = self.enrolled_noise.apply(image, rng or np.random.default_rng(0))
         return EvaluationImage(self._prefiltered(noisy), None if self.reference == "none" else empty)
 
@@ -253,9 +269,7 @@ class Condition:
                 angle_deg = rng.uniform(-self.rotation_deg, self.rotation_deg)
                 image, mask = _rotated(image, angle_deg), _rotated(mask, angle_deg)
             if self.background != "same":
-                behind = _uniform(image, rng) if self.background == "uniform" else _textured(image, rng)
-                share = mask[:, :, None]
-                image = np.rint(share * image + (1 - share) * behind).astype(np.uint8)
+                image = _before(image, mask, self.background, rng)
         return EvaluationImage(self._prefiltered(self.noise.apply(image, rng)))
 
     def _sized(self, image_bgr: ImageArray) -> ImageArray:
@@ -291,6 +305,13 @@ def _rotated(image: NDArray[_T], angle_deg: float) -> NDArray[_T]:
     height, width = image.shape[:2]
     matrix = cv2.getRotationMatrix2D(((width - 1) / 2, (height - 1) / 2), angle_deg, 1.0)
     return cv2.warpAffine(image, matrix, (width, height), flags=cv2.INTER_LINEAR).astype(image.dtype, copy=False)
+
+
+def _before(image: ImageArray, share: NDArray[Any], background: Background, rng: np.random.Generator) -> ImageArray:
+    """Return the object before a random background; ``share`` (H, W) is the object's share of each pixel."""
+    behind = _uniform(image, rng) if background == "uniform" else _textured(image, rng)
+    own = share.astype(np.float32)[:, :, None]
+    return np.rint(own * image + (1 - own) * behind).astype(np.uint8)
 
 
 def _uniform(image: ImageArray, rng: np.random.Generator) -> ImageArray:
@@ -345,4 +366,7 @@ def _queries(dataset: Dataset, j: int, condition: Condition, seed: int) -> Itera
 
 
 def _levels(images: Iterable[EvaluationImage], condition: Condition) -> LevelArray:
+    if condition.cut_out:
+        cut = (segment(image, empty_table=empty).alone for image, empty in images)
+        return np.stack([describe(one, descriptor=condition.descriptor) for one in cut])
     return np.stack([describe(image, descriptor=condition.descriptor, empty_table=empty) for image, empty in images])

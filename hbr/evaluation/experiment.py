@@ -12,7 +12,7 @@ from hbr.evaluation.protocol import Method, Protocol
 KindName = Literal["trials", "matrix", "unknown-objects", "bench-change"]
 Change = Literal["mild", "hard"]
 #: Increased if the same settings give other numbers.
-FORMAT: Final = 7
+FORMAT: Final = 8
 
 
 @dataclass(frozen=True)
@@ -34,6 +34,8 @@ class Experiment:
         The methods of ``trials``.
     objects, report : (int, int) or None
         First and last object of the data set that takes part, and that is reported, counted from 1; None: all.
+    every : int
+        Step between the photographs of an object that are used: with 2, every second one.
     left_out : int
         Objects that ``unknown-objects`` leaves out, five times.
     change : {"mild", "hard"}
@@ -49,6 +51,7 @@ class Experiment:
     methods: tuple[Method, ...] = ()
     objects: tuple[int, int] | None = None
     report: tuple[int, int] | None = None
+    every: int = 1
     left_out: int = 20
     change: Change = "hard"
     margin: float = 0.02
@@ -59,6 +62,8 @@ class Experiment:
             raise ValueError(f"kind {self.kind!r} is unknown; use one of {', '.join(get_args(KindName))}")
         if self.change not in get_args(Change):
             raise ValueError(f"change {self.change!r} is unknown; use mild or hard")
+        if self.every < 1:
+            raise ValueError(f"every is {self.every}; at least 1 is needed")
         if self.kind in ("matrix", "bench-change") and self.protocol.enrolled is None:
             raise ValueError(f"{self.kind} needs the number of enrolled views; give enrolled = 18")
 
@@ -84,6 +89,7 @@ class Experiment:
             },
             "protocol": asdict(self.protocol),
             "methods": [asdict(method) for method in self.methods],
+            "every": self.every,
             "change": self.change if self.kind == "bench-change" else None,
             "left_out": self.left_out if self.kind == "unknown-objects" else None,
         }

@@ -113,6 +113,11 @@ class Dataset:
             image = image[y : y + height, x : x + width]
         return image
 
+    def every(self, step: int) -> "Dataset":
+        """Return the data set with every ``step``-th photograph of each object."""
+        objects = tuple(replace(item, photographs=item.photographs[::step]) for item in self.objects)
+        return replace(self, objects=objects)
+
     def subset(self, first: int, last: int) -> "Dataset":
         """Return the data set with the objects at positions `first` to `last`, counted from 1, both included."""
         if not 1 <= first <= last <= len(self.objects):

@@ -57,6 +57,8 @@ class Method:
         Largest number of views of this method; None: that of the protocol.
     dense : bool
         Whether the dense filter ranks the objects, instead of the paper's voting.
+    sectors : int
+        Number of average views of an object (N~M of Eq. 5) that AHBR plans with.
     """
 
     name: str
@@ -67,6 +69,7 @@ class Method:
     extension: Extension = "orient_all"
     views: int | None = None
     dense: bool = False
+    sectors: int = 4
 
     @property
     def active(self) -> bool:
@@ -98,16 +101,22 @@ _DENSE: Final = (
     Method("dense-oracle", "dense filter, oracle", "oracle", _OMEGA, dense=True),
 )
 _OMEGAS: Final = (0.0, 0.125, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
-_LENGTHS: Final = (1, 2, 5, 10, 20, 50, 100)
+_LENGTHS: Final = (1, 2, 4, 5, 6, 8, 10, 20, 50, 100)
+_SECTORS: Final = (2, 3, 4, 6, 8, 12, 18)
 _OMEGA_SWEEP: Final = tuple(Method(f"omega-{omega:g}", f"HBR ω = {omega:g}", omega=omega) for omega in _OMEGAS)
 _LIST_SWEEP: Final = tuple(Method(f"list-{n}", f"HBR lists of {n}", list_length=n) for n in _LENGTHS)
 
-METHODS: Final = {method.name: method for method in (*_LISTED, *_DENSE, *_OMEGA_SWEEP, *_LIST_SWEEP)}
+_SECTOR_SWEEP: Final = tuple(
+    Method(f"sectors-{n}", f"AHBR with {n} average views", "ahbr", sectors=n) for n in _SECTORS
+)
+
+METHODS: Final = {method.name: method for method in (*_LISTED, *_DENSE, *_OMEGA_SWEEP, *_LIST_SWEEP, *_SECTOR_SWEEP)}
 GROUPS: Final[dict[str, tuple[Method, ...]]] = {
     "all": _LISTED,
     "beyond": _DENSE[:-1],  # the oracle tries every view, which is slow
     "omega-sweep": _OMEGA_SWEEP,
     "list-sweep": _LIST_SWEEP,
+    "sector-sweep": _SECTOR_SWEEP,
 }
 
 
@@ -153,6 +162,9 @@ class Protocol:
         Standard deviation of the error of each measured orientation.
     drift_deg : float
         Drift of the measured orientation with each view.
+    rotation_errors_deg : tuple of float
+        Measured errors of rotations. If there are any, each rotation between two views has one of them at random, and
+        they add up, as those of a gyro do; `sigma_deg` and `drift_deg` then have no effect.
     seed : int
         Seed of all random values.
     enrolled : int or None
@@ -168,6 +180,7 @@ class Protocol:
     near_deg: float = 10.0
     sigma_deg: float = 2.0
     drift_deg: float = 0.0
+    rotation_errors_deg: tuple[float, ...] = ()
     seed: int = 0
     enrolled: int | None = None
     absent: tuple[str, ...] = ()
@@ -182,6 +195,8 @@ class Protocol:
                 f"near_deg is {self.near_deg}, sigma_deg {self.sigma_deg}, drift_deg {self.drift_deg}; needed are a "
                 "value above 0 and up to 180, one of at least 0, and a finite one"
             )
+        if not np.isfinite(self.rotation_errors_deg).all():
+            raise ValueError("an error of a rotation is not a finite number; correct the file of the errors")
         if self.seed < 0:
             raise ValueError(f"seed is {self.seed}; a whole number of at least 0 is needed")
         if self.enrolled is not None and self.enrolled < 1:

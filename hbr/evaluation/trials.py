@@ -207,12 +207,13 @@ class _Trials:
 
     def draw(self, trial: int) -> _Draws:
         rng = generator(self._protocol.seed, self._views.object_names[self._object], "trial", trial)
-        count = self._protocol.max_views
-        return _Draws(
-            order=rng.permutation(self._free)[:count],
-            error_deg=rng.normal(0, self._protocol.sigma_deg, count) + self._protocol.drift_deg * np.arange(count),
-            coins=rng.random(count) < 0.5,
-        )
+        count, measured_deg = self._protocol.max_views, self._protocol.rotation_errors_deg
+        order = rng.permutation(self._free)[:count]
+        error_deg = rng.normal(0, self._protocol.sigma_deg, count) + self._protocol.drift_deg * np.arange(count)
+        coins = rng.random(count) < 0.5
+        if measured_deg:  # drawn last, so that the other values do not depend on it
+            error_deg = np.cumsum(rng.choice(measured_deg, count))
+        return _Draws(order, error_deg, coins)
 
     def run(
         self, method: Method, draws: _Draws, models: dict[bytes, _Model], runs: Runs, at: tuple[int, int, int]
@@ -385,7 +386,8 @@ class _Trials:
         """Return the next query: a photograph that was not a query yet."""
         if method.active and len(seen) > 1:
             coin: Side = "left" if draws.coins[len(seen)] else "right"
-            rotation_deg = next_view(ranking, side=coin if method.strategy == "coin" else None).rotation_deg
+            side = coin if method.strategy == "coin" else None
+            rotation_deg = next_view(ranking, side=side, sectors=method.sectors).rotation_deg
         elif method.strategy in _STEP_DEG:
             rotation_deg = _STEP_DEG[method.strategy]
         else:

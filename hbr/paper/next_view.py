@@ -17,8 +17,8 @@ from hbr.paper.hough import Ranking
 
 Side = Literal["left", "right"]
 
-_SECTOR_DEG: Final = 90.0
-_CENTRES_DEG: Final = np.arange(4) * _SECTOR_DEG + _SECTOR_DEG / 2
+SECTORS: Final = 4
+"""Average views of an object, N~M of Eq. 5: the paper's number."""
 _BEST: Final = 10
 
 
@@ -53,13 +53,18 @@ class Decision:
 
 
 def next_view(
-    ranking: Ranking, *, visited_deg: ArrayLike | None = None, revisit_deg: float = 10.0, side: Side | None = None
+    ranking: Ranking,
+    *,
+    visited_deg: ArrayLike | None = None,
+    revisit_deg: float = 10.0,
+    side: Side | None = None,
+    sectors: int = SECTORS,
 ) -> Decision:
     """Choose the side on which the candidates differ most, and the rotation to the next sector centre there.
 
-    The views of an object are divided into four sectors of 90 degrees, each represented by an average view (Eq. 5).
-    The sector centre is that of the best candidate. The candidates are the objects on the last retrieval list; if there
-    are fewer than two, the ten best ones of the ranking.
+    The views of an object are divided into equal sectors, each represented by an average view (Eq. 5). The sector
+    centre is that of the best candidate. The candidates are the objects on the last retrieval list; if there are fewer
+    than two, the ten best ones of the ranking.
 
     Parameters
     ----------
@@ -68,10 +73,12 @@ def next_view(
     visited_deg : array, optional
         Orientations to avoid; by default those of the ranking's queries. That of the last query is always avoided.
     revisit_deg : float
-        A rotation that ends this close to a visited orientation, or closer, is extended by 90 degrees, repeatedly until
-        it is clear of all. If all four ends are visited, the first one is used.
+        A rotation that ends this close to a visited orientation, or closer, is extended by a sector, repeatedly until it
+        is clear of all. If all ends are visited, the first one is used.
     side : {"left", "right"}, optional
         Rotate to this side by the same step, independently of the similarities: a control for measurements.
+    sectors : int
+        Number of sectors (N~M), at least 2.
 
     Returns
     -------
@@ -81,16 +88,18 @@ def next_view(
     Raises
     ------
     ValueError
-        The ranking has only one query, `revisit_deg` is out of range, a visited orientation is not finite, or `side`
-        is unknown.
+        The ranking has only one query, `revisit_deg` or `sectors` is out of range, a visited orientation is not finite,
+        or `side` is unknown.
     """
     if len(ranking.orientation_deg) < 2:
         raise ValueError("a decision needs two queries; rotate to the second view by a fixed step such as +90 degrees")
     visited = np.asarray(ranking.orientation_deg if visited_deg is None else visited_deg, np.float64).ravel()
     if not np.isfinite(visited).all():
         raise ValueError(f"visited_deg is {visited}; leave unknown orientations out")
-    if not 0 <= revisit_deg < _SECTOR_DEG / 2:
-        raise ValueError(f"revisit_deg is {revisit_deg}; at least 0 and less than {_SECTOR_DEG / 2} is needed")
+    if sectors < 2:
+        raise ValueError(f"sectors is {sectors}; at least 2 are needed, {SECTORS} by default")
+    if not 0 <= revisit_deg < 180 / sectors:
+        raise ValueError(f"revisit_deg is {revisit_deg}; at least 0 and less than {180 / sectors} is needed")
     if side not in (None, *get_args(Side)):
         raise ValueError(f"side {side!r} is unknown; use left or right, or None to decide by the candidates")
 
@@ -99,46 +108,51 @@ def next_view(
         candidates = np.sort(ranking.object_index[:_BEST])
     pose_of = dict(zip(ranking.object_index.tolist(), ranking.pose_deg.tolist(), strict=True))
     poses = np.array([pose_of[j] for j in candidates.tolist()])
-    s_left = _side_similarity(ranking.views, candidates, _next_sector(poses, +1)[0])
-    s_right = _side_similarity(ranking.views, candidates, _next_sector(poses, -1)[0])
+    centres_deg = (np.arange(sectors) + 0.5) * 360 / sectors
+    s_left = _side_similarity(ranking.views, candidates, _next_sector(poses, +1, centres_deg)[0], centres_deg)
+    s_right = _side_similarity(ranking.views, candidates, _next_sector(poses, -1, centres_deg)[0], centres_deg)
 
     if side is None:
         side = "left" if s_left <= s_right else "right"
     sign = 1 if side == "left" else -1
-    step = float(_next_sector(ranking.pose_deg[:1], sign)[1][0])
+    step = float(_next_sector(ranking.pose_deg[:1], sign, centres_deg)[1][0])
     here = float(ranking.orientation_deg[-1])
-    detour = _detour(here + sign * step, sign, np.append(visited, here), revisit_deg)
+    detour = _detour(here + sign * step, sign * 360 / sectors, np.append(visited, here), revisit_deg)
     rotation = sign * (step + detour)
     return Decision(side, rotation, s_left, s_right, tuple(candidates.tolist()), wrap360(here + rotation), detour)
 
 
-def _next_sector(pose_deg: FloatArray, sign: int) -> tuple[IndexArray, FloatArray]:
-    """Return the sector whose centre is next on the left (+1) or right (-1), and the rotation to it, in (0, 90]."""
-    gap_deg = wrap360(sign * (_CENTRES_DEG - pose_deg[:, None]))
+def _next_sector(pose_deg: FloatArray, sign: int, centres_deg: FloatArray) -> tuple[IndexArray, FloatArray]:
+    """Return the sector whose centre is next on the left (+1) or right (-1), and the rotation to it, above 0."""
+    gap_deg = wrap360(sign * (centres_deg - pose_deg[:, None]))
     gap_deg[gap_deg == 0] = 360.0
     return gap_deg.argmin(axis=1), gap_deg.min(axis=1)
 
 
-def _side_similarity(views: Views, candidates: IndexArray, sectors: IndexArray) -> float:
-    """Return the sum of the similarities of all pairs of candidates, each in its sector (Eq. 6)."""
-    averages = np.stack([_average_view(views, int(j), int(s)) for j, s in zip(candidates, sectors, strict=True)])
+def _side_similarity(views: Views, candidates: IndexArray, places: IndexArray, centres_deg: FloatArray) -> float:
+    """Return the sum of the similarities of all pairs of candidates, each in the sector at its place (Eq. 6)."""
+    half_deg = 180 / len(centres_deg)
+    centres = centres_deg[places].tolist()
+    averages = np.stack(
+        [_average_view(views, j, centre, half_deg) for j, centre in zip(candidates.tolist(), centres, strict=True)]
+    )
     return float(np.triu(tanimoto(averages, averages), k=1).sum())
 
 
-def _average_view(views: Views, object_index: int, sector: int) -> FloatArray:
+def _average_view(views: Views, object_index: int, centre_deg: float, half_deg: float) -> FloatArray:
     """Return the mean descriptor of an object's views in a sector (Eq. 5), or the nearest view if it is empty."""
     rows = views.of(object_index)
-    offset_deg = wrap180(views.azimuth_deg[rows] - _CENTRES_DEG[sector])
-    half = _SECTOR_DEG / 2
-    inside = rows[(offset_deg >= -half) & (offset_deg < half)]
+    offset_deg = wrap180(views.azimuth_deg[rows] - centre_deg)
+    inside = rows[(offset_deg >= -half_deg) & (offset_deg < half_deg)]
     if not len(inside):
         inside = rows[[np.abs(offset_deg).argmin()]]
     mean: FloatArray = views.levels(inside).mean(axis=0)
     return mean
 
 
-def _detour(landing_deg: float, sign: int, visited_deg: FloatArray, revisit_deg: float) -> float:
-    for detour_deg in np.arange(4) * _SECTOR_DEG:
-        if np.all(np.abs(wrap180(landing_deg + sign * detour_deg - visited_deg)) > revisit_deg):
-            return float(detour_deg)
+def _detour(landing_deg: float, sector_deg: float, visited_deg: FloatArray, revisit_deg: float) -> float:
+    """Return the multiple of a sector, without sign, that leads to an orientation away from those visited."""
+    for count in range(round(360 / abs(sector_deg))):
+        if np.all(np.abs(wrap180(landing_deg + count * sector_deg - visited_deg)) > revisit_deg):
+            return count * abs(sector_deg)
     return 0.0

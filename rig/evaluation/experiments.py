@@ -30,7 +30,7 @@ def load_experiment(name: str, **changed: Any) -> Experiment:
     """Return a shipped experiment, or that of a TOML file, with some keys changed; None changes nothing.
 
     A key is an attribute of `Experiment`, `Condition` or `Protocol`. The key ``base`` names a shipped experiment whose
-    keys hold, too.
+    keys hold, too. The key ``orientation_errors`` names a file for `rotation_errors`.
 
     Raises
     ------
@@ -64,11 +64,43 @@ def _filled(name: str, keys: dict[str, Any]) -> Experiment:
     of = descriptor(keys.get("descriptor", "cedd"))
     chosen = keys.pop("methods", None) or ("all" if of.whole_image else "beyond")
     own: dict[str, Any] = {"name": name, "methods": choose_methods(str(chosen).split(","))}
+    if (errors := keys.pop("orientation_errors", None)) is not None:
+        keys["rotation_errors_deg"] = rotation_errors(str(errors))
     for attribute, kind in (("condition", Condition), ("protocol", Protocol)):
         mine = [item.name for item in fields(kind)]
         own[attribute] = _checked(kind, {key: keys.pop(key) for key in mine if key in keys})
     experiment: Experiment = _checked(Experiment, own | keys)
     return experiment
+
+
+def rotation_errors(name: str) -> tuple[float, ...]:
+    """Return measured errors of rotations in degrees.
+
+    They come from a stored result of ``rig calibrate imu`` (the gyro's rotation minus the encoder's, of each move), or
+    from a JSON file with ``rotation_errors_deg``; "mpu6050" names the shipped one.
+
+    Raises
+    ------
+    ValueError
+        The file cannot be read, or it has no such errors.
+    """
+    path = files("rig.evaluation").joinpath("mpu6050.json") if name == "mpu6050" else Path(name)
+    try:
+        values = own_files.json_values(path.read_bytes()[:_MAX_BYTES])
+        if "rotation_errors_deg" in values:
+            found = [float(value) for value in values["rotation_errors_deg"]]
+        else:
+            legs = [move["leg"] for move in values["evidence"]["moves"]]
+            # a gyro that is mounted upside down counts the other way
+            found = [abs(leg["gyro_deg"]) - abs(leg["encoder_deg"]) for leg in legs if not leg["invalid"]]
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise ValueError(
+            f"the orientation errors {name} cannot be read: {error!r}; name the file imu.rotation of "
+            "rig calibrate imu, or a JSON file with rotation_errors_deg"
+        ) from error
+    if not found:
+        raise ValueError(f"{name} has no errors of rotations; run rig calibrate imu again")
+    return tuple(found)
 
 
 def _checked(kind: type[Any], values: dict[str, Any]) -> Any:

@@ -48,7 +48,7 @@ def run_experiment(
     DatasetError, ValueError
         A photograph cannot be used, or there are too few objects or views for the experiment.
     """
-    kind = _KINDS[experiment.kind]
+    kind, dataset = _KINDS[experiment.kind], dataset.every(experiment.every)
 
     def of_each(work: Callable[[int], _T], done: str) -> list[_T]:
         found: dict[int, _T] = {}

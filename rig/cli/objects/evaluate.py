@@ -48,6 +48,10 @@ def evaluate(
     descriptor: Annotated[
         str | None, typer.Option(metavar="NAME", help="Descriptor of the views: cedd, edges+colours, ...")
     ] = None,
+    orientation_errors: Annotated[
+        str | None,
+        typer.Option(metavar="FILE", help="Errors of the orientation: a result imu.rotation of rig calibrate imu."),
+    ] = None,
     jobs: JobsOption = None,
     cluster: ClusterOption = None,
     out: Annotated[
@@ -75,6 +79,7 @@ def evaluate(
             noise=noise,
             methods=methods,
             descriptor=None if descriptor is None else descriptor_name(descriptor),
+            orientation_errors=orientation_errors,
             seed=settings.seed,
         )
         asked = replace(asked, margin=rule.margin, min_views=rule.min_views)
