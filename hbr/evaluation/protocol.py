@@ -102,7 +102,7 @@ _DENSE: Final = (
 )
 _OMEGAS: Final = (0.0, 0.125, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 _LENGTHS: Final = (1, 2, 4, 5, 6, 8, 10, 20, 50, 100)
-_SECTORS: Final = (2, 3, 4, 6, 8, 12, 18)
+_SECTORS: Final = (2, 3, 4, 6, 8, 12, 16)
 _OMEGA_SWEEP: Final = tuple(Method(f"omega-{omega:g}", f"HBR ω = {omega:g}", omega=omega) for omega in _OMEGAS)
 _LIST_SWEEP: Final = tuple(Method(f"list-{n}", f"HBR lists of {n}", list_length=n) for n in _LENGTHS)
 

@@ -73,8 +73,8 @@ def next_view(
     visited_deg : array, optional
         Orientations to avoid; by default those of the ranking's queries. That of the last query is always avoided.
     revisit_deg : float
-        A rotation that ends this close to a visited orientation, or closer, is extended by a sector, repeatedly until it
-        is clear of all. If all ends are visited, the first one is used.
+        A rotation that ends this close to a visited orientation, or closer, is extended by a sector, repeatedly until
+        it is clear of all. If all ends are visited, the first one is used.
     side : {"left", "right"}, optional
         Rotate to this side by the same step, independently of the similarities: a control for measurements.
     sectors : int

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
 from rich.table import Table
 
 from hbr.evaluation.results import Contest
@@ -44,7 +45,7 @@ def tables(results: Mapping[str, Any]) -> list[Rows]:
     rows = rows_of(results)
     match results["settings"]["kind"]:
         case "trials":
-            return [_curves(results, rows), _decisions(results)]
+            return [_curves(results, rows), _decisions(results), _poses(results)]
         case "matrix":
             return [_matrix(rows)]
         case "unknown-objects":
@@ -94,6 +95,17 @@ def _decisions(results: Mapping[str, Any]) -> Rows:
         )
     heads = "decision|views|p95|hits %|ambiguous %|unknown %|wrong %|compared %|right by it %|rotated°|pose°|RMSE°"
     return Rows([*heads.split("|"), "similar°", "RMSE°", "asym.°", "ms"], rows)
+
+
+def _poses(results: Mapping[str, Any]) -> Rows:
+    """Return how the RMS error of the orientation after all views is distributed over the objects (Fig. 5)."""
+    rows = []
+    for method in results["methods"]:
+        found = [error for error in method["pose_rmse_deg_by_object"] if error is not None]
+        cells = [f"{value:.1f}" for value in np.quantile(found, [0, 0.25, 0.5, 0.75, 1])] if found else ["–"] * 5
+        rows.append([method["label"], str(len(found)), *cells])
+    heads = "RMSE of the pose by object, °|objects|least|25 %|median|75 %|largest"
+    return Rows(heads.split("|"), rows)
 
 
 def _matrix(rows: Sequence[Row]) -> Rows:
