@@ -14,14 +14,14 @@ from prometheus_client.registry import Collector
 from starlette.exceptions import HTTPException
 
 from rig.core.errors import RigError
-from rig.web.api_access import add_access
-from rig.web.api_bench import add_bench, add_jobs
-from rig.web.api_catalog import add_catalog
+from rig.web.answers import Problem
+from rig.web.api_bench import add_access, add_bench, add_jobs
+from rig.web.api_catalog import add_bundles, add_objects, add_results
 from rig.web.api_records import add_records
 from rig.web.pages import pages
 from rig.web.problems import MEDIA_TYPE, problem, problem_body, status_of
 from rig.web.requests import JobState
-from rig.web.server import API, Problem, Routes, Server, Watcher
+from rig.web.server import API, Routes, Server, Watcher
 
 QUANTILES: Final = (0.5, 0.99, 0.999)
 _ERRORS: Final[dict[int | str, dict[str, Any]]] = {
@@ -51,14 +51,15 @@ def create_app(server: Server) -> FastAPI:
         docs_url=None,
         redoc_url=None,
         openapi_url=f"{API}/openapi.json",
+        generate_unique_id_function=lambda route: route.name,
     )
     app.state.server = server
     routes = Routes()
-    for add in (add_access, add_bench, add_jobs, add_catalog, add_records):
+    for add in (add_access, add_bench, add_jobs, add_objects, add_results, add_bundles, add_records):
         add(routes, server)
     for router in (routes.public, routes.watch, routes.operate):
         app.include_router(router, prefix=API, responses=_ERRORS)
-    app.include_router(pages(server))
+    app.include_router(pages(server.setup.bench))
     app.mount("/static", StaticFiles(packages=[("rig.web", "static")]), name="static")
 
     @app.get("/metrics", include_in_schema=False)

@@ -11,12 +11,11 @@ from rig.bench import Bench, open_bench
 from rig.core.clock import SystemClock
 from rig.core.errors import JobNotFound
 from rig.safety.stop_channel import StopListener, listen
-from rig.web.bench_catalog import BenchCatalog
 from rig.web.jobs import JobQueue
 from rig.web.link import Functions, Link
 from rig.web.picture import LivePicture
 from rig.web.requests import Job
-from rig.web.setup import Setup
+from rig.web.setup import BenchCatalog, Setup
 from rig.web.work import ServedDesk
 from rig.web.worker import BenchWorker
 
@@ -47,8 +46,7 @@ class BenchSide:
         self.stops: StopListener = listen(setup.state_folder)
         self.picture = LivePicture(clock)
         self.queue = JobQueue(folder, clock, lambda job: self.publish("job", job), setup.arguments, self.stops.count)
-        place = setup.config.catalog_place(setup.bench)
-        catalog = BenchCatalog(place, clock, lambda state: self.publish("catalog", state), report)
+        catalog = BenchCatalog(setup.catalog_place, clock, lambda state: self.publish("catalog", state), report)
         self.worker = BenchWorker(opened, self.queue, self.publish, self.picture, run, self.stops, clock)
         asked = ("jobs", "job", "submit", "cancel", "pause", "resume", "answer")
         self._functions: Functions = {

@@ -8,9 +8,9 @@ from typing import Any, Final
 
 from rig.core.clock import Clock, seconds_between
 from rig.safety.stop_channel import StopAnswer, StopRequest, stop_answer
+from rig.web.answers import BOUNDARY
 from rig.web.link import Link
 
-BOUNDARY: Final = "frame"
 PICTURE_S: Final = 0.08
 """Shortest time between two pictures that are fetched from the bench, for all viewers together."""
 VIEWER_GONE_S: Final = 30.0

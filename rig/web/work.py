@@ -30,14 +30,9 @@ from rig.plans.estimate import TimeLeft
 from rig.plans.operator import Choice, Operator, Question
 from rig.plans.tray import TrayItem
 from rig.web import requests
-from rig.web.bench_catalog import BenchCatalog
 from rig.web.picture import Outliner, jpeg
-from rig.web.requests import (
-    Job,
-    JobState,
-    TrayObject,
-)
-from rig.web.setup import Setup
+from rig.web.requests import Job, JobState, TrayObject
+from rig.web.setup import BenchCatalog, Setup
 from rig.web.worker import BenchWorker
 
 VIEW_PX: Final = 480
@@ -204,9 +199,9 @@ def _enroll(desk: ServedDesk, **parameters: Any) -> Steps[None]:
     return enroll(desk, **parameters, ask=False)
 
 
-def _tray(desk: ServedDesk, objects: list[TrayObject], views: int | None) -> Steps[None]:
+def _tray(desk: ServedDesk, objects: list[TrayObject], **parameters: Any) -> Steps[None]:
     items = [TrayItem(number, one.name, one.label, one.note, one.views) for number, one in enumerate(objects, 1)]
-    return enroll_list(desk, items, views=views, ask=False)
+    return enroll_list(desk, items, **parameters, ask=False)
 
 
 def _dry_run(desk: ServedDesk, objects: list[TrayObject], **parameters: Any) -> Steps[None]:

@@ -89,7 +89,7 @@ def starting(folder: Path) -> Iterator[Callable[..., Served]]:
         listening = Listening(host="127.0.0.1", port=0, needs_login=needs_login, max_upload_bytes=2_000_000)
         setup = Setup(bench="sim", config=config, seed=1, arguments=("--bench", "sim"), listening=listening)
         side, server, disconnect = connected(setup)
-        client = TestClient(guarded(server, listening), base_url="http://127.0.0.1", client=("127.0.0.1", 50000))
+        client = TestClient(guarded(server), base_url="http://127.0.0.1", client=("127.0.0.1", 50000))
         thread = threading.Thread(target=side.worker.run, daemon=True)
         thread.start()
 

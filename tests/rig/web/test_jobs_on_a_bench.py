@@ -106,7 +106,7 @@ def test_listeners_learn_when_a_job_ends_after_the_answer_to_a_stop(serve, halte
     job = served.client.post("/api/v1/jobs", json={"kind": "goto", "angle_deg": 350}).json()
     assert halted.reached.wait(60.0)
     with halted.lock:
-        request = StopRequest(served.server.config.state_path("sim"))
+        request = StopRequest(served.server.setup.config.state_path("sim"))
         assert request.answer() is None
     assert served.wait(job["id"])["state"] == "cancelled"
     assert request.answer() is StopAnswer.TORQUE_OFF
