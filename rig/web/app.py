@@ -6,7 +6,6 @@ from typing import Any, Final
 
 from fastapi import FastAPI, Request, Response
 from fastapi.exceptions import RequestValidationError
-from fastapi.responses import JSONResponse
 from fastapi.staticfiles import StaticFiles
 from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
@@ -19,26 +18,14 @@ from rig.web.api_bench import add_access, add_bench, add_jobs
 from rig.web.api_catalog import add_bundles, add_objects, add_results
 from rig.web.api_records import add_records
 from rig.web.pages import pages
-from rig.web.problems import MEDIA_TYPE, problem, problem_body, status_of
+from rig.web.problems import ProblemResponse
 from rig.web.requests import JobState
 from rig.web.server import API, Routes, Server, Watcher
 
 QUANTILES: Final = (0.5, 0.99, 0.999)
 _ERRORS: Final[dict[int | str, dict[str, Any]]] = {
-    code: {"model": Problem, "description": text}
-    for code, text in (
-        (400, "Bad request"),
-        (401, "Login required"),
-        (403, "Forbidden"),
-        (404, "Not found"),
-        (409, "Conflict"),
-        (413, "Too large"),
-        (415, "Not JSON"),
-        (421, "Wrong host name"),
-        (422, "Not valid"),
-        (423, "Another operator has the lease"),
-        (503, "The bench or the catalog is not available"),
-    )
+    "4XX": {"model": Problem, "description": "The request cannot be carried out; `code` and `next_step` say why"},
+    "5XX": {"model": Problem, "description": "The bench or the catalog is not available"},
 }
 
 
@@ -67,20 +54,19 @@ def create_app(server: Server) -> FastAPI:
         return Response(metrics_text(server), media_type="text/plain; version=0.0.4")
 
     @app.exception_handler(RigError)
-    async def rig_error(_request: Request, error: RigError) -> JSONResponse:
-        return JSONResponse(problem(error), status_of(error), media_type=MEDIA_TYPE)
+    async def rig_error(_request: Request, error: RigError) -> Response:
+        return ProblemResponse.of(error)
 
     @app.exception_handler(RequestValidationError)
     async def not_valid(_request: Request, error: RequestValidationError) -> Response:
         mistakes = [f"{'.'.join(map(str, one['loc']))}: {one['msg']}" for one in error.errors()]
-        body = problem_body(422, "The request is not valid.", "Correct these values.", evidence={"mistakes": mistakes})
-        return Response(body, 422, media_type=MEDIA_TYPE)
+        what, step = "The request is not valid.", "Correct these values."
+        return ProblemResponse.of_request(422, what, step, evidence={"mistakes": mistakes})
 
     @app.exception_handler(HTTPException)
     async def http_error(_request: Request, error: HTTPException) -> Response:
         step = f"See {API}/openapi.json."
-        body = problem_body(error.status_code, str(error.detail), step)
-        return Response(body, error.status_code, headers=error.headers, media_type=MEDIA_TYPE)
+        return ProblemResponse.of_request(error.status_code, str(error.detail), step, error.headers)
 
     return app
 

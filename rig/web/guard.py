@@ -11,13 +11,12 @@ from weakref import WeakKeyDictionary
 
 from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
-from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol, RequestResponseCycle
 
 from rig.core.next_steps import Do, SomeSteps
 from rig.core.phrases import whole
-from rig.web.problems import MEDIA_TYPE, problem_body
+from rig.web.problems import ProblemResponse
 
 MAX_BODY_BYTES: Final = 1_000_000
 """Largest size of a request, except an upload."""
@@ -108,8 +107,7 @@ class Guard:
         if rejection is None:
             await self._app(scope, limited, guarded)
         else:
-            body, status = problem_body(*rejection), rejection[0]
-            await Response(body, status, media_type=MEDIA_TYPE)(scope, receive, guarded)
+            await ProblemResponse.of_request(*rejection)(scope, receive, guarded)
 
     def _rejection(self, method: str, path: str, headers: Headers) -> tuple[int, str, SomeSteps] | None:
         host = headers.get("host", "")

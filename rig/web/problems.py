@@ -1,7 +1,10 @@
 """Errors as RFC 9457 problem details."""
 
-import json
-from typing import Any, Final
+from collections.abc import Mapping
+from typing import Any, Final, Self
+
+from fastapi.responses import JSONResponse
+from pydantic_core import to_jsonable_python
 
 from rig.core.errors import (
     BenchBusy,
@@ -17,9 +20,7 @@ from rig.core.errors import (
     RigError,
     TooManyListeners,
 )
-from rig.core.next_steps import SomeSteps, as_steps, in_words, steps_as_json
-
-MEDIA_TYPE: Final = "application/problem+json"
+from rig.core.next_steps import NextSteps, SomeSteps, as_steps, in_words, steps_as_json
 
 _STATUS: Final[dict[type[RigError], int]] = {
     LoginRequired: 401,
@@ -47,22 +48,28 @@ def status_of(error: RigError) -> int:
 
 def problem(error: RigError) -> dict[str, Any]:
     """Return an error as problem details: ``code``, ``next_step``, ``steps`` and ``evidence`` are extensions."""
-    values = error.as_dict()
-    return {
-        "type": f"urn:hbr-rig:error:{error.code}",
-        "title": error.title,
-        "status": status_of(error),
-        "detail": error.what,
-        "code": error.code,
-        "next_step": error.next_step,
-        "steps": values["steps"],
-        "evidence": json.loads(json.dumps(values["evidence"], default=str)),
-    }
+    more = {"code": error.code, "evidence": to_jsonable_python(error.evidence, fallback=str)}
+    return _problem(f"urn:hbr-rig:error:{error.code}", error.title, status_of(error), error.what, error.steps) | more
 
 
-def problem_body(status: int, what: str, next_step: SomeSteps, **more: Any) -> bytes:
-    """Return the JSON text of a problem that is not one of our errors."""
-    steps = as_steps(next_step)
-    values = {"type": "about:blank", "title": "request", "status": status, "detail": what}
-    values |= {"next_step": in_words(steps), "steps": steps_as_json(steps)}
-    return json.dumps({**values, **more}, ensure_ascii=False).encode()
+class ProblemResponse(JSONResponse):
+    """An answer that is an error."""
+
+    media_type = "application/problem+json"
+
+    @classmethod
+    def of(cls, error: RigError) -> Self:
+        return cls(problem(error), status_of(error))
+
+    @classmethod
+    def of_request(
+        cls, status: int, what: str, next_step: SomeSteps, headers: Mapping[str, str] | None = None, **more: Any
+    ) -> Self:
+        """Return the answer to a request that HTTP itself does not allow."""
+        values = _problem("about:blank", "request", status, what, as_steps(next_step))
+        return cls({**values, **more}, status, headers)
+
+
+def _problem(kind: str, title: str, status: int, what: str, steps: NextSteps) -> dict[str, Any]:
+    values = {"type": kind, "title": title, "status": status, "detail": what}
+    return {**values, "next_step": in_words(steps), "steps": steps_as_json(steps)}

@@ -34,7 +34,7 @@ class RemoteBench:
     Attributes
     ----------
     link
-        Calls the functions of `rig.web.bench_side`, after `connect`.
+        Calls the functions of `rig.web.run`, after `connect`.
     """
 
     link: Link
@@ -63,7 +63,7 @@ class RemoteBench:
         self._received(kind, data)
 
     def ask(self, function: str, **values: Any) -> Any:
-        """Return the result of a function of `rig.web.bench_side`. Raises its errors, and `BenchBusy`."""
+        """Return the result of a function of `rig.web.run`. Raises its errors, and `BenchBusy`."""
         return self.link.call(function, **values)[0]
 
     # -- STOP: it asks no queue, no thread and no disk ----------------------------------------------------------------

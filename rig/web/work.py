@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager, closing, nullcontext
-from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, Final, Protocol
 
@@ -15,6 +14,7 @@ from rig.core.errors import UsageError
 from rig.core.json_form import plain
 from rig.core.next_steps import NextSteps, as_steps, steps_as_json
 from rig.core.phrases import counted, duration_words
+from rig.core.plugins import plugins
 from rig.doctor.context import open_context
 from rig.doctor.finding import Finding, finding_words
 from rig.events.events import Accepted, Decided, Enrolled, Event, Identified, Started, event_dict
@@ -51,7 +51,7 @@ class Calibration(Protocol):
 
 def calibrations() -> dict[str, Calibration]:
     """Return the installed calibrations by name."""
-    return {point.name: point.load() for point in sorted(entry_points(group=CALIBRATIONS), key=lambda p: p.name)}
+    return dict(sorted(plugins(CALIBRATIONS)))
 
 
 class ServedDesk(Desk):

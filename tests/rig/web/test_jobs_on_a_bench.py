@@ -51,7 +51,7 @@ def halted(monkeypatch) -> Halted:
         bench.safety.observers.append(observe)
         return bench
 
-    monkeypatch.setattr("rig.web.bench_side.open_bench", opened)
+    monkeypatch.setattr("rig.web.run.open_bench", opened)
     return halt
 
 
@@ -76,6 +76,12 @@ def test_enrolled_object_is_identified_and_its_run_is_saved(serve):
     fixed = {"object": "lamp", "reason": "read the label"}
     assert served.client.post(f"/api/v1/results/{answer['id']}/correct", json=fixed).json()["object"] == "lamp"
     assert served.client.get("/api/v1/results?object=mug-white").json()["total"] == 0
+    assert served.client.get(f"/api/v1/results/{answer['id']}").json()["object"] == "lamp"
+    image = served.client.get(f"/api/v1/results/{answer['id']}/image")
+    assert image.headers["content-type"] == "image/jpeg"
+    assert image.content.startswith(b"\xff\xd8")
+    for path in ("results/999", "results/999/image"):
+        assert served.client.get(f"/api/v1/{path}").status_code == 404
 
 
 def test_sample_is_not_accepted_for_several_objects(serve):
@@ -247,7 +253,7 @@ def test_doctor_examines_a_bench_that_cannot_be_opened(serve, monkeypatch):
     def missing(*_arguments: Any, **_options: Any) -> Bench:
         raise DeviceNotFound("The camera is missing.", next_step="Connect it.")
 
-    monkeypatch.setattr("rig.web.bench_side.open_bench", missing)
+    monkeypatch.setattr("rig.web.run.open_bench", missing)
     served = serve()
     assert served.run(kind="home")["error"]["what"] == "The camera is missing."
     assert served.run(kind="doctor")["state"] == "done"

@@ -53,7 +53,7 @@ def motion(monkeypatch: pytest.MonkeyPatch) -> Motion:
         motion.watch(bench)
         return bench
 
-    monkeypatch.setattr("rig.web.bench_side.open_bench", opened)
+    monkeypatch.setattr("rig.web.run.open_bench", opened)
     return motion
 
 
