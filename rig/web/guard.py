@@ -46,14 +46,8 @@ _HEADERS: Final = [
 class Guard:
     """A layer before the application: rejects foreign and too large requests, and adds headers to responses.
 
-    Parameters
-    ----------
-    app
-        The application.
-    hosts
-        Names and addresses by which browsers may call the server (against DNS rebinding).
-    upload_path, max_upload_bytes
-        The path whose requests may be larger, and their largest size.
+    ``hosts`` are the names and addresses by which browsers may call the server (against DNS rebinding). Requests to
+    ``upload_path`` may be larger than others.
     """
 
     def __init__(self, app: ASGIApp, *, hosts: set[str], upload_path: str, max_upload_bytes: int) -> None:

@@ -33,18 +33,8 @@ MAX_BYTES: Final = 20_000_000
 class JobQueue:
     """The jobs of one bench; all methods may be called from any thread.
 
-    Parameters
-    ----------
-    folder
-        Folder of the stored jobs.
-    clock
-        Clock for the times of the jobs.
-    changed
-        Called with each job that has changed.
-    rig_arguments
-        Arguments that let a command of the terminal use the same bench.
-    stops
-        Returns the number of stops so far. A job that was submitted before a stop never starts.
+    ``changed`` gets each job that has changed. ``rig_arguments`` let a command of the terminal use the same bench.
+    ``stops`` returns the number of stops so far: a job that was submitted before a stop never starts.
     """
 
     def __init__(

@@ -22,19 +22,7 @@ CONFIRM_S: Final = 3.0
 class RemoteBench:
     """The bench of another process.
 
-    Parameters
-    ----------
-    state_folder
-        The bench's state folder, where the stop channel is.
-    clock
-        The computer's clock.
-    received
-        Called with the kind and the values of each event.
-
-    Attributes
-    ----------
-    link
-        Calls the functions of `rig.web.run`, after `connect`.
+    ``received`` gets the kind and the values of each event. ``link`` calls the functions of `rig.web.run.BenchSide`.
     """
 
     link: Link

@@ -8,7 +8,6 @@ Decision: docs/decisions/0062.
 """
 
 import os
-import secrets
 import socket
 import ssl
 import subprocess
@@ -23,7 +22,6 @@ from typing import Any, Final
 from pydantic import validate_call
 
 from rig.bench import Bench, open_bench
-from rig.config import RigConfig
 from rig.core.clock import SystemClock, seconds_between
 from rig.core.errors import JobNotFound, RigError, UsageError, WebEnded, os_errors_as
 from rig.core.files import write
@@ -55,18 +53,10 @@ STARTS_WITHIN_S: Final = 60.0
 """After `MAX_STARTS` web processes within this time, the server ends."""
 
 
-def run_server(
-    bench: str,
-    config: RigConfig,
-    seed: int | None,
-    arguments: tuple[str, ...],
-    listening: Listening,
-    ready: Callable[[str], None],
-) -> None:
+def run_server(setup: Setup, ready: Callable[[str], None]) -> None:
     """Serve a bench until a signal ends the program; the torque is off on return.
 
-    ``arguments`` are those of `rig` that select the same bench. ``ready`` gets the address of the page when the server
-    answers.
+    ``ready`` gets the address of the page when the server answers.
 
     Raises
     ------
@@ -77,12 +67,8 @@ def run_server(
     WebEnded
         The web process ends again and again.
     """
-    clock = SystemClock()
+    clock, listening = SystemClock(), setup.listening
     _check_certificate(listening)
-    token = secrets.token_urlsafe(32)
-    setup = Setup(
-        bench=bench, config=config, seed=seed, arguments=arguments, listening=listening, local_token=f"rig_{token}"
-    )
     folder = setup.state_folder / SERVER_FOLDER
     lock = BenchLock(folder, clock)  # one server for each bench
     set_priority(BENCH_NICE)

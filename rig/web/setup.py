@@ -8,13 +8,14 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, Field
 
 from rig.catalog import Catalog
 from rig.catalog.shared import Attempts, BackgroundDelivery, JournalState, open_or_copy
 from rig.config import RigConfig
 from rig.config.catalog_place import CatalogPlace
 from rig.core.clock import Clock
+from rig.web.access import new_token
 
 BENCH_NICE: Final = -10
 """The process that owns the bench. Without root, a priority is raised only if the system permits it (`LimitNICE=`)."""
@@ -49,7 +50,7 @@ class Setup(BaseModel):
     seed: int | None = None
     arguments: tuple[str, ...] = ()
     listening: Listening
-    local_token: str = ""
+    local_token: str = Field(default_factory=new_token)
 
     @property
     def state_folder(self) -> Path:

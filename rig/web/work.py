@@ -55,19 +55,7 @@ def calibrations() -> dict[str, Calibration]:
 
 
 class ServedDesk(Desk):
-    """The desk of a job of the server, and its operator: the bench is open, and the pages ask.
-
-    Parameters
-    ----------
-    worker
-        Owns the bench.
-    job
-        The running job.
-    setup
-        The served bench.
-    catalog
-        Opens the bench's catalog.
-    """
+    """The desk of a job of the server, and its operator: the bench is open, and the pages ask."""
 
     is_there = True
     log_waits_for_server = False  # which may be away: that would delay the answer to a STOP
