@@ -1,5 +1,6 @@
 """The web application: the REST API of version 1, its events, the pages, and the numbers for Prometheus."""
 
+from collections import Counter
 from collections.abc import Iterator
 from importlib.metadata import version
 from typing import Any, Final
@@ -51,7 +52,9 @@ def create_app(server: Server) -> FastAPI:
 
     @app.get("/metrics", include_in_schema=False)
     def metrics(_person: Watcher) -> Response:
-        return Response(metrics_text(server), media_type="text/plain; version=0.0.4")
+        registry = CollectorRegistry()
+        registry.register(_Numbers(server))
+        return Response(generate_latest(registry), media_type="text/plain; version=0.0.4")
 
     @app.exception_handler(RigError)
     async def rig_error(_request: Request, error: RigError) -> Response:
@@ -80,37 +83,31 @@ class _Numbers(Collector):
 
     def collect(self) -> Iterator[Metric]:
         server, status, numbers = self._server, self._server.remote.status, self._server.remote.ask("numbers")
-        yield GaugeMetricFamily("rig_bench_open", "Whether the bench is open.", float(bool(status.get("open"))))
-        yield GaugeMetricFamily("rig_fault_latched", "Whether a fault is latched.", float(bool(status.get("fault"))))
-        if (angle_deg := status.get("table_deg")) is not None:
-            yield GaugeMetricFamily("rig_table_degrees", "Angle of the table.", angle_deg)
-        if servo := status.get("servo"):
-            yield GaugeMetricFamily("rig_servo_temperature_celsius", "Temperature.", servo["temperature_c"])
-            yield GaugeMetricFamily("rig_servo_volts", "Supply voltage.", servo["voltage_v"])
-        yield GaugeMetricFamily("rig_viewers", "Open live pictures.", server.remote.viewers)
-        yield GaugeMetricFamily("rig_event_listeners", "Open streams of events.", server.hub.listeners)
-        jobs = server.remote.ask("jobs")
-        waiting = GaugeMetricFamily("rig_jobs", "Jobs by state.", labels=["state"])
+        servo = status.get("servo") or {}
+        for name, text, value in (
+            ("bench_open", "Whether the bench is open.", float(bool(status.get("open")))),
+            ("fault_latched", "Whether a fault is latched.", float(bool(status.get("fault")))),
+            ("table_degrees", "Angle of the table.", status.get("table_deg")),
+            ("servo_temperature_celsius", "Temperature.", servo.get("temperature_c")),
+            ("servo_volts", "Supply voltage.", servo.get("voltage_v")),
+            ("viewers", "Open live pictures.", server.remote.viewers),
+            ("event_listeners", "Open streams of events.", server.hub.listeners),
+        ):
+            if value is not None:
+                yield GaugeMetricFamily(f"rig_{name}", text, value)
+        jobs = GaugeMetricFamily("rig_jobs", "Jobs by state.", labels=["state"])
+        states = Counter(job["state"] for job in server.remote.ask("jobs"))
         for state in JobState:
-            waiting.add_metric([state.value], sum(job["state"] == state for job in jobs))
-        yield waiting
+            jobs.add_metric([state.value], states[state])
+        yield jobs
         ended = CounterMetricFamily("rig_jobs_ended", "Jobs ended since the server started.", labels=["state"])
         for name, number in numbers["jobs_ended"].items():
             ended.add_metric([name], number)
         yield ended
         yield CounterMetricFamily("rig_stops", "Presses of STOP since the server started.", numbers["stops"])
-        intervals = sorted(numbers["intervals_s"])
-        if intervals:
-            polls = GaugeMetricFamily(
-                "rig_servo_poll_seconds", "Time between two readings of the servo in motion.", labels=["quantile"]
-            )
+        if intervals := sorted(numbers["intervals_s"]):
+            text = "Time between two readings of the servo in motion."
+            polls = GaugeMetricFamily("rig_servo_poll_seconds", text, labels=["quantile"])
             for quantile in QUANTILES:
                 polls.add_metric([str(quantile)], intervals[min(int(quantile * len(intervals)), len(intervals) - 1)])
             yield polls
-
-
-def metrics_text(server: Server) -> bytes:
-    """Return the numbers of a server."""
-    registry = CollectorRegistry()
-    registry.register(_Numbers(server))
-    return generate_latest(registry)

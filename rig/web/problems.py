@@ -6,50 +6,31 @@ from typing import Any, Final, Self
 from fastapi.responses import JSONResponse
 from pydantic_core import to_jsonable_python
 
-from rig.core.errors import (
-    BenchBusy,
-    CatalogBusy,
-    ConfigError,
-    Forbidden,
-    JobNotFound,
-    JobRejected,
-    LeaseHeld,
-    LoginRequired,
-    ObjectExists,
-    ObjectNotFound,
-    RigError,
-    TooManyListeners,
-)
+from rig.core import errors
+from rig.core.errors import RigError
 from rig.core.next_steps import NextSteps, SomeSteps, as_steps, in_words, steps_as_json
 
-_STATUS: Final[dict[type[RigError], int]] = {
-    LoginRequired: 401,
-    Forbidden: 403,
-    TooManyListeners: 503,
-    LeaseHeld: 423,
-    JobNotFound: 404,
-    JobRejected: 409,
-    ObjectNotFound: 404,
-    ObjectExists: 409,
-    BenchBusy: 409,
-    CatalogBusy: 503,
-    ConfigError: 503,
+_STATUS: Final = {
+    errors.LoginRequired.code: 401,
+    errors.Forbidden.code: 403,
+    errors.JobNotFound.code: 404,
+    errors.ObjectNotFound.code: 404,
+    errors.LeaseHeld.code: 423,
+    errors.CatalogBusy.code: 503,
+    errors.TooManyListeners.code: 503,
 }
-_BY_HUNDRED: Final = {1: 500, 2: 422, 3: 500, 4: 503, 5: 409, 6: 422, 7: 409, 8: 404, 9: 409}
+_BY_HUNDRED: Final = {1: 500, 2: 422, 3: 503, 4: 503, 5: 409, 6: 422, 7: 409, 8: 404, 9: 409}
+"""Of the other errors, by the hundreds of their codes."""
 
 
-def status_of(error: RigError) -> int:
-    """Return the HTTP status of an error."""
-    for kind, status in _STATUS.items():
-        if isinstance(error, kind):
-            return status
-    return _BY_HUNDRED.get(error.code // 100, 500)
+def _status(error: RigError) -> int:
+    return _STATUS.get(error.code) or _BY_HUNDRED[error.code // 100]
 
 
 def problem(error: RigError) -> dict[str, Any]:
     """Return an error as problem details: ``code``, ``next_step``, ``steps`` and ``evidence`` are extensions."""
     more = {"code": error.code, "evidence": to_jsonable_python(error.evidence, fallback=str)}
-    return _problem(f"urn:hbr-rig:error:{error.code}", error.title, status_of(error), error.what, error.steps) | more
+    return _problem(f"urn:hbr-rig:error:{error.code}", error.title, _status(error), error.what, error.steps) | more
 
 
 class ProblemResponse(JSONResponse):
@@ -59,7 +40,7 @@ class ProblemResponse(JSONResponse):
 
     @classmethod
     def of(cls, error: RigError) -> Self:
-        return cls(problem(error), status_of(error))
+        return cls(problem(error), _status(error))
 
     @classmethod
     def of_request(

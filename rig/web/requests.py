@@ -185,8 +185,7 @@ class Job(BaseModel):
     """A job of the bench.
 
     ``error`` has the fields of an error as ``rig --json`` prints them. ``resume`` is the request that continues the
-    job's work, and ``command`` the same for a terminal; both are None if there is nothing to continue. ``result`` is
-    the last important event of the plan.
+    job's work; None if there is nothing to continue. ``result`` is the last important event of the plan.
     """
 
     model_config = ConfigDict(extra="forbid")
@@ -204,7 +203,6 @@ class Job(BaseModel):
     result_text: str = ""
     error: dict[str, Any] | None = None
     resume: JobRequest | None = None
-    command: str | None = None
     run: str | None = Field(None, description="saved run of an identification, for GET /api/v1/runs/{run}")
     views: int = Field(0, description="number of pictures at GET /api/v1/jobs/{id}/views/{n}")
 

@@ -114,7 +114,7 @@ class BenchSide:
         self.link: Link | None = None
         self.stops: StopListener = listen(setup.state_folder)
         self.picture = LivePicture(clock)
-        self.queue = JobQueue(folder, clock, lambda job: self.publish("job", job), setup.arguments, self.stops.count)
+        self.queue = JobQueue(folder, clock, lambda job: self.publish("job", job), self.stops.count)
         catalog = BenchCatalog(setup.catalog_place, clock, lambda state: self.publish("catalog", state), report)
         self.worker = BenchWorker(opened, self.queue, self.publish, self.picture, run, self.stops, clock)
         asked = ("jobs", "job", "submit", "cancel", "pause", "resume", "answer")
