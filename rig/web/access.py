@@ -5,7 +5,6 @@ Decision: docs/decisions/0039.
 
 import hashlib
 import hmac
-import json
 import secrets
 import threading
 from collections.abc import Callable
@@ -160,7 +159,7 @@ class Tokens:
             )
 
     def _store(self, tokens: list[StoredToken]) -> None:
-        content = json.dumps([token.model_dump(mode="json") for token in tokens], indent=1).encode()
+        content = _STORED.dump_json(tokens, indent=1)
         step = (Do.FREE_DISK(), "Or set state_dir to a folder that you may write to.")
         with os_errors_as(StateNotStored, f"The tokens cannot be stored in {self._file}.", next_step=step):
             self._file.parent.mkdir(parents=True, exist_ok=True, mode=0o700)

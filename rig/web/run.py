@@ -32,20 +32,13 @@ from rig.web.jobs import JobQueue
 from rig.web.link import Functions, Link
 from rig.web.picture import LivePicture
 from rig.web.requests import Job
-from rig.web.setup import (
-    BENCH_NICE,
-    BenchCatalog,
-    Listening,
-    Setup,
-    print_note,
-    set_priority,
-    shorten_pauses,
-)
+from rig.web.setup import BENCH_NICE, BenchCatalog, Listening, Setup, print_note, set_priority, shorten_pauses
 from rig.web.work import ServedDesk
 from rig.web.worker import BenchWorker
 
 START_S: Final = 30.0
 END_S: Final = 6.0
+"""Longer than `rig.web.front.END_S`, after which a web process ends itself."""
 SILENT_S: Final = 30.0
 """Time without a sign of life after which a web process counts as hanging, and is ended."""
 MAX_STARTS: Final = 3

@@ -131,38 +131,33 @@ class Routes:
         self.operate = APIRouter(dependencies=[Depends(operator), *_SCHEMES])
 
 
+@dataclass(frozen=True, slots=True)
 class PageOfList:
     """The page of a list that a request asks for."""
 
-    def __init__(
-        self,
-        request: Request,
-        limit: Annotated[int, Query(ge=1, le=MAX_PAGE)] = 100,
-        after: Annotated[str | None, Query(max_length=100)] = None,
-    ) -> None:
-        self._request = request
-        self._limit = limit
-        self._after = after
+    request: Request
+    limit: Annotated[int, Query(ge=1, le=MAX_PAGE)] = 100
+    after: Annotated[str | None, Query(max_length=100)] = None
 
     def of(self, rows: Sequence[dict[str, Any]], key: str) -> Response:
         """Return the page with an ETag, and a link to the next one; ``key`` names the entries."""
         start = 0
-        if self._after is not None:
-            places = [number for number, row in enumerate(rows) if row[key] == self._after]
+        if self.after is not None:
+            places = [number for number, row in enumerate(rows) if row[key] == self.after]
             if not places:
                 raise UsageError(
                     "The list has changed: the entry after which to continue is gone.", next_step="Start again."
                 )
             start = places[0] + 1
-        shown = rows[start : start + self._limit]
-        more = shown[-1][key] if start + self._limit < len(rows) else None
+        shown = rows[start : start + self.limit]
+        more = shown[-1][key] if start + self.limit < len(rows) else None
         values = {"items": shown, "total": len(rows), "next": more}
         body = json.dumps(values, ensure_ascii=False, default=str).encode()
         headers = {"Cache-Control": "private, no-cache"}
         if more is not None:
-            headers["Link"] = f'<{self._request.url.include_query_params(after=more)}>; rel="next"'
+            headers["Link"] = f'<{self.request.url.include_query_params(after=more)}>; rel="next"'
         digest = hashlib.sha256(body).hexdigest()[:32]
-        return cached(self._request, digest, lambda: Response(body, media_type="application/json"), headers)
+        return cached(self.request, digest, lambda: Response(body, media_type="application/json"), headers)
 
 
 Page = Annotated[PageOfList, Depends()]
