@@ -21,8 +21,8 @@ from rig.core.masking import masked
 from rig.core.phrases import angle_range
 from rig.devices.camera import Camera
 from rig.devices.dynamixel.guardian import Guardian
-from rig.devices.dynamixel.opening import open_servo
 from rig.devices.dynamixel.port import SerialConnection
+from rig.devices.dynamixel.servo import open_servo
 from rig.devices.head.head import RigHead
 from rig.devices.head.opening import open_head, powered, switch_on
 from rig.devices.head.protocol import BAUD
