@@ -7,7 +7,7 @@ import json
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
-from typing import Any, cast
+from typing import Any
 
 from pydantic import BaseModel
 
@@ -23,11 +23,9 @@ from rig.devices.camera import Camera
 from rig.devices.dynamixel.guardian import Guardian
 from rig.devices.dynamixel.port import SerialConnection
 from rig.devices.dynamixel.servo import open_servo
-from rig.devices.head.head import RigHead
-from rig.devices.head.opening import open_head, powered, switch_on
+from rig.devices.head.head import RigHead, open_head, powered
 from rig.devices.head.protocol import BAUD
 from rig.devices.imu import Imu
-from rig.devices.on_demand import OnDemand
 from rig.devices.open_imu import open_imu
 from rig.devices.opencv_camera import CameraSettings, OpenCvCamera
 from rig.devices.opencv_capture import Capture
@@ -134,7 +132,7 @@ def assemble(
         if config.imu.connection == "head" and head_port is not None:
             head = open_head(config, head_port, clock)
             opened.callback(head.close)
-            fault = switch_on(head, config.head, clock)  # first, because the servo's supply may go through it
+            fault = head.switch_on(config.head)  # first, because the servo's supply may go through it
         servo = open_servo(connection, config.servo, clock, config.table.mode, reopen_serial, guardian)
         findings = servo.prepare(write=config.servo.write_settings)
         findings += tuple(f"servo: {one}" for one in servo.remarks)
@@ -142,7 +140,10 @@ def assemble(
         if head is None and (note := imu_kind(config.imu.model).note):
             findings += (f"imu: {note}",)
 
-        # Prepare the camera and the IMU, which are opened at their first use.
+        # IMU and camera are opened at their first use, unless the head is the IMU.
+        def open_sensor() -> Imu:
+            return open_imu(config.imu, i2c_bus, clock) if head is None else head
+
         def open_camera() -> Camera:
             with ExitStack() as failed:
                 source = capture()
@@ -166,18 +167,17 @@ def assemble(
             )
             return camera
 
-        imu = cast(Imu, head or OnDemand(lambda: open_imu(config.imu, i2c_bus, clock)))
-        camera = cast(Camera, OnDemand(open_camera))
         # Connect the safety layer with the devices.
-        bench = Bench(name, config, clock, servo, imu, camera, findings=findings, state=state, head=head)
+        bench = Bench(name, config, clock, servo, open_sensor, open_camera, findings=findings, state=state, head=head)
         bench.safety.connect()
         if head is not None:
             watched = head
+            bench.open_devices(("imu",))
             bench.safety.monitors.append(watched.check)
-            bench.safety.restore_actions.append(lambda: switch_on(watched, config.head, clock))
+            bench.safety.restore_actions.append(lambda: watched.switch_on(config.head))
         if fault is not None:
             bench.safety.latch(fault)
-        bench.safety.acknowledge_checks.append(lambda: imu.read_samples())
+        bench.safety.acknowledge_checks.append(lambda: bench.imu.read_samples())
         bench.findings += bench.safety.findings
         opened.pop_all()
     return bench

@@ -18,6 +18,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from rig.core.clock import Clock, seconds_between
 from rig.core.errors import DeviceFault, DeviceMismatch, DeviceNotFound, DeviceSilent
@@ -107,6 +108,7 @@ class OpenCvCamera:
         self._settings = settings or CameraSettings()
         self._missing = capture.get(_UNKNOWN_PROPERTY)
         self.modes = modes_of(capture)
+        self.observers: list[Callable[[NDArray[np.uint8]], object]] = []
         self.returns = 0
         self._clock = clock
         self._timeout_s = timeout_s
@@ -150,7 +152,10 @@ class OpenCvCamera:
                 self._clock.sleep(seconds_between(self._clock.now_ns(), after_ns))
             exposed_ns = self._grab(meanwhile)
             if exposed_ns is not None and exposed_ns >= after_ns:
-                return Frame(self._retrieve(), exposed_ns, self.time_base is TimeBase.STAMPED)
+                image_bgr = self._retrieve()
+                for observer in self.observers:
+                    observer(image_bgr)
+                return Frame(image_bgr, exposed_ns, self.time_base is TimeBase.STAMPED)
             dropped += 1
             if self._clock.now_ns() > deadline_ns:
                 raise DeviceSilent(

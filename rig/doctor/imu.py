@@ -9,7 +9,7 @@ import numpy as np
 from rig.config import ImuConfig
 from rig.core.next_steps import Do, SomeSteps
 from rig.devices.bno055 import SLOW_BUS
-from rig.devices.head.opening import open_head
+from rig.devices.head.head import open_head
 from rig.devices.head.protocol import BAUD
 from rig.devices.imu import Imu, ImuSamples
 from rig.devices.open_imu import open_imu

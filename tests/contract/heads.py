@@ -14,7 +14,7 @@ from rig.core.clock import Clock, SystemClock
 from rig.devices.dynamixel.port import SerialConnection
 from rig.devices.head.head import RigHead
 from rig.devices.head.protocol import BAUD, Counters, ReadCounters
-from rig.devices.head.sensors import HeadSensor, head_sensor
+from rig.devices.head.samples import HeadSensor, head_sensor
 from sim.head.board import SimHead
 from sim.head.build import missing
 from sim.head.serial_port import HeadSerial

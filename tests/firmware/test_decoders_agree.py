@@ -18,7 +18,7 @@ NIGHTLY_LINES, LINES = 1_000_000, 4_000
 
 PROGRAM = """
 import ctypes, random, sys
-from rig.devices.head.framing import CrcError, Frame, FrameError, LONGEST, decode, encode
+from rig.devices.head.link import CrcError, Frame, FrameError, LONGEST, decode, encode
 
 library, count, seed = ctypes.CDLL(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3])
 library.frame_decode.restype = ctypes.c_int8

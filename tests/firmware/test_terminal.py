@@ -18,7 +18,7 @@ from rig.core.clock import SystemClock
 from rig.devices.head import link
 from rig.devices.head.head import RigHead
 from rig.devices.head.protocol import BAUD
-from rig.devices.head.sensors import head_sensor
+from rig.devices.head.samples import head_sensor
 
 link.REPLY_S = 2.0  # the head is a program that may have to wait for a processor
 clock = SystemClock()

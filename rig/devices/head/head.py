@@ -15,10 +15,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rig.config import HeadConfig, RigConfig
 from rig.core.clock import Clock, seconds_between
-from rig.core.errors import ConfigError, DeviceSilent, RequestRejected, RigError
+from rig.core.errors import ConfigError, DeviceSilent, EmergencyStop, RequestRejected, RigError
 from rig.devices.dynamixel.port import SerialConnection
-from rig.devices.head.connection import HEARTBEATS_PER_DEADMAN, HeadConnection, version
+from rig.devices.head.link import HeadLink, version
 from rig.devices.head.protocol import (
     DEADMAN_MAX_MS,
     DEADMAN_MIN_MS,
@@ -39,11 +40,11 @@ from rig.devices.head.protocol import (
     Trigger,
     Triggered,
 )
-from rig.devices.head.sensors import HeadSensor
+from rig.devices.head.samples import HeadClock, HeadSensor, SampleStream, head_sensor
 from rig.devices.head.status import HeadIdentity, HeadStatus, head_fault, sensor_error
-from rig.devices.head.stream import HeadStatistics, SampleStream
 from rig.devices.imu import ImuSamples
 
+HEARTBEATS_PER_DEADMAN = 4
 FIRST_HEARTBEATS = 8
 """Heartbeats that compare the clocks before the first sample is dated."""
 RECOVERY_S = 0.5
@@ -103,15 +104,14 @@ class RigHead:
         self._status = HeadStatus()
         self._restart: Reset | None = None
         self._set_up = self._down = self._closed = False
-        self.statistics = HeadStatistics()
-        self._connection = HeadConnection(
-            connection, clock, self._on_event, deadman_ms=self._deadman_ms, name=name, reopen=reopen
-        )
-        self._link, self._timing = self._connection.link, self._connection.timing
+        self._link = HeadLink(connection, clock, self._on_event, name, reopen)
+        self.statistics = self._link.statistics
+        self._timing = HeadClock(2 * self._link.frame_ns(HeartbeatReply.LAYOUT.size))
         self._stream = SampleStream(sensor, clock, self._timing, self.statistics)
+        self._heartbeat_ns = clock.now_ns()
         self._cancel: Callable[[], None] = lambda: None
         try:
-            self._connection.greet()
+            self._link.greet()
             self._begin()
             self._wait_until_running()
         except BaseException:
@@ -123,7 +123,7 @@ class RigHead:
 
     @property
     def identity(self) -> HeadIdentity:
-        head, sensor, boards = self._connection.identity, self._sensor, {b.value: b.name.lower() for b in Board}
+        head, sensor, boards = self._link.identity, self._sensor, {b.value: b.name.lower() for b in Board}
         return HeadIdentity(
             model=sensor.kind.name,
             bus_address=sensor.setup.address,
@@ -191,6 +191,32 @@ class RigHead:
         with self._in_use():
             self._link.request(Relay(int(on)), Done)
 
+    def switch_on(self, config: HeadConfig) -> RigError | None:
+        """Switch on the servo's power and the ring light if they are connected; return the fault that was latched.
+
+        A fault of an earlier program is cleared on the head and returned. The caller latches it, so that the operator
+        must acknowledge it before anything moves.
+
+        Raises
+        ------
+        EmergencyStop
+            The e-stop is pressed, and the servo's supply goes through it.
+        """
+        fault = self.fault
+        if fault is not None:
+            try:
+                self.acknowledge()
+            except EmergencyStop:
+                if config.power:
+                    raise
+                return fault
+        if config.power:
+            self.set_power(True)
+            self._clock.sleep(config.power_up_s)
+        if config.light is not None:
+            self.set_light(config.light)
+        return fault
+
     def trigger(self, width_s: float = 0.001) -> int:
         """Send one pulse to the camera; return when it begins, on the bench's clock (ns)."""
         with self._in_use():
@@ -210,9 +236,9 @@ class RigHead:
         """The reason why the head switched its outputs off; None if it did not."""
         return head_fault(
             self._status,
-            port=self._connection.name,
+            port=self._link.name,
             restart=self._restart,
-            start=Reset(self._connection.identity.reset_cause),
+            start=Reset(self._link.identity.reset_cause),
             deadman_ms=self._deadman_ms,
         )
 
@@ -261,7 +287,6 @@ class RigHead:
     def health(self) -> dict[str, float]:
         """Return statistics of connection, clock and samples, with units in the names."""
         return {
-            **self._link.counts(),
             **asdict(self.statistics),
             "drift_ppm": round(self._timing.drift_ppm, 1),
             "time_uncertainty_us": round(self._timing.uncertainty_ns / 1000, 1),
@@ -276,10 +301,9 @@ class RigHead:
             if self._down:
                 if self._closed:
                     raise DeviceSilent(
-                        f"The rig head at {self._connection.name} is closed.", next_step="Open the bench again."
+                        f"The rig head at {self._link.name} is closed.", next_step="Open the bench again."
                     )
-                self._connection.reconnect()
-                self.statistics.reconnects += 1
+                self._link.reconnect()
                 self._begin()
                 self._down = False
             self._poll()
@@ -300,7 +324,6 @@ class RigHead:
         """Compare the clocks, set the sensor up and start the stream."""
         self._stream.restart()
         self._timing.restart()
-        self._link.restarted()
         for _ in range(FIRST_HEARTBEATS):
             self._heartbeat()
         self._link.request(self._sensor.setup, Done)
@@ -312,19 +335,22 @@ class RigHead:
         try:
             self._link.poll()
             if self._restart is not None and not self._set_up:
-                self._connection.identify()
-                self._restart = Reset(self._connection.identity.reset_cause)
+                self._link.identify()
+                self._restart = Reset(self._link.identity.reset_cause)
                 self._begin()
-            if self._connection.heartbeat_due:
+            elapsed_s = seconds_between(self._heartbeat_ns, self._clock.now_ns())
+            if elapsed_s * HEARTBEATS_PER_DEADMAN * 1000 >= self._deadman_ms:
                 self._heartbeat()
         except DeviceSilent:
             self._down = True
             raise
 
     def _heartbeat(self) -> None:
-        reply = self._connection.heartbeat()
+        reply = self._link.heartbeat(self._deadman_ms)
+        self._heartbeat_ns = self._link.heard_ns
         if not self._take_status(reply):
-            self._connection.compare_clocks(reply)
+            received_us, answered_us = self._timing.unwrap(reply.received_us), self._timing.unwrap(reply.sent_us)
+            self._timing.add(self._link.sent_ns, received_us, answered_us, self._link.heard_ns)
 
     def _on_event(self, event: Sample | StatusChanged) -> None:
         if isinstance(event, StatusChanged):
@@ -368,7 +394,7 @@ class RigHead:
             raise self._sensor_error()
 
     def _sensor_error(self) -> RigError:
-        return sensor_error(self._status, self._sensor, self._connection.name)
+        return sensor_error(self._status, self._sensor, self._link.name)
 
     def _fresh_sample(self) -> Sample:
         """Return a sample that is at most a tenth of a second and a few periods old."""
@@ -383,3 +409,48 @@ class RigHead:
                 if seconds_between(start_ns, now_ns) > RECOVERY_S:
                     raise self._sensor_error()
             self._clock.sleep(0.005)
+
+
+def open_head(config: RigConfig, open_port: Callable[[], SerialConnection], clock: Clock) -> RigHead:
+    """Open the head at ``config.head.port``; its outputs stay off.
+
+    ``open_port`` opens its port, also again after the cable was unplugged.
+
+    Raises ConfigError, DeviceNotFound, FirmwareMismatch, DeviceMismatch, DeviceSilent: see `RigHead`.
+    """
+    imu = config.imu
+    sensor = head_sensor(
+        imu.model, address=imu.address, range_dps=imu.range_dps, rate_hz=imu.rate_hz, bandwidth_hz=imu.bandwidth_hz
+    )
+    connection = open_port()
+    try:
+        return RigHead(
+            connection, clock, sensor, deadman_s=config.head.deadman_s, name=config.head.port, reopen=open_port
+        )
+    except BaseException:
+        connection.close()
+        raise
+
+
+@contextmanager
+def powered(config: RigConfig, open_port: Callable[[], SerialConnection], clock: Clock) -> Iterator[None]:
+    """Power the servo for the duration of a ``with`` block if its supply goes through a rig head.
+
+    Raises
+    ------
+    EmergencyStop, HeartbeatLost, HeadRestarted
+        The head keeps the supply off until the fault is acknowledged.
+    DeviceNotFound, FirmwareMismatch, DeviceMismatch, DeviceSilent
+        See `RigHead`.
+    """
+    if not (config.imu.connection == "head" and config.head.power):
+        yield
+        return
+    head = open_head(config, open_port, clock)
+    try:
+        head.check()
+        head.set_power(True)
+        clock.sleep(config.head.power_up_s)
+        yield
+    finally:
+        head.close()

@@ -15,7 +15,7 @@ from rig.core.errors import (
 )
 from rig.core.next_steps import Do
 from rig.devices.head.protocol import HeadFault, HeadState, HeartbeatReply, ImuStatus, Input, Reset, StatusChanged
-from rig.devices.head.sensors import HeadSensor
+from rig.devices.head.samples import HeadSensor
 from rig.devices.imu import ImuIdentity
 
 _RESTARTS = {

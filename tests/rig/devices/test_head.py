@@ -177,7 +177,7 @@ def test_deadman_has_the_configured_duration(deadman_s):
     with opened_head(noise=NoiseModel.none(), deadman_s=deadman_s) as h:
         h.imu.set_power(True)
         h.imu._cancel()
-        last_ns = h.imu._connection._heartbeat_ns
+        last_ns = h.imu._heartbeat_ns
         h.clock.sleep(3.0)
         silent_s = (h.head.pulses("relay")[-1][0] - last_ns) * 1e-9
         assert deadman_s * 0.99 - 0.002 <= silent_s <= deadman_s * 1.01 + 0.001

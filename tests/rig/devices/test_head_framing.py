@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rig.devices.head import protocol
-from rig.devices.head.framing import LONGEST, CrcError, Deframer, Frame, FrameError, decode, encode
+from rig.devices.head.link import LONGEST, CrcError, Deframer, Frame, FrameError, HeadStatistics, decode, encode
 from tests.fuzzing import fuzz_settings
 
 BYTE = st.integers(0, 255)
@@ -34,9 +34,9 @@ def test_flipped_bit_is_always_detected(frame, data):
     line = bytearray(encode(frame)[:-1])
     bit = data.draw(st.integers(0, 8 * len(line) - 1))
     line[bit // 8] ^= 1 << bit % 8
-    deframer = Deframer()
-    assert list(deframer.feed(bytes(line) + b"\0")) == []
-    assert deframer.crc_errors + deframer.malformed >= 1
+    found = HeadStatistics()
+    assert list(Deframer(found).feed(bytes(line) + b"\0")) == []
+    assert found.crc_errors + found.malformed >= 1
 
 
 @fuzz_settings()
@@ -60,7 +60,7 @@ def test_frames_are_found_however_the_stream_is_split(parts, data):
         else:
             stream += part.replace(b"\0", b"\1") + b"\0"  # noise that ends before the next frame
     cuts = sorted(data.draw(st.lists(st.integers(0, len(stream)), max_size=8)))
-    deframer = Deframer()
+    deframer = Deframer(HeadStatistics())
     got = [f for a, b in zip([0, *cuts], [*cuts, len(stream)], strict=True) for f in deframer.feed(stream[a:b])]
     assert [f for f in got if f in expected] == expected
     for frame in got:  # noise that is a valid frame by chance has a right checksum
@@ -69,7 +69,7 @@ def test_frames_are_found_however_the_stream_is_split(parts, data):
 
 
 def test_endless_frame_uses_bounded_memory():
-    deframer = Deframer()
+    deframer = Deframer(HeadStatistics())
     for _ in range(1000):
         assert list(deframer.feed(b"\xff" * 4096)) == []
     assert len(deframer._line) <= LONGEST

@@ -68,7 +68,7 @@ def go(settings: Settings) -> None:
         guardian = Guardian(port.port, port.baud, port.model, port.id)
     servo = open_servo(bus, port, CLOCK, guardian=guardian)
     servo.prepare(write=True)
-    bench = Bench("hardware", config, CLOCK, servo, StillImu(), None, state=FileStore(config.state_path("hardware")))
+    bench = Bench("hardware", config, CLOCK, servo, StillImu, None, state=FileStore(config.state_path("hardware")))
     bench.safety.connect()
     if bench.safety.doubt:
         bench.safety.set_angle(0.0)
