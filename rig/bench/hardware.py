@@ -25,8 +25,7 @@ from rig.devices.dynamixel.port import SerialConnection
 from rig.devices.dynamixel.servo import open_servo
 from rig.devices.head.head import RigHead, open_head, powered
 from rig.devices.head.protocol import BAUD
-from rig.devices.imu import Imu
-from rig.devices.open_imu import open_imu
+from rig.devices.imu import Imu, open_imu
 from rig.devices.opencv_camera import CameraSettings, OpenCvCamera
 from rig.devices.opencv_capture import Capture
 from rig.devices.servo import Servo

@@ -49,22 +49,12 @@ SLOW_BUS = (
 
 
 @dataclass(frozen=True, slots=True)
-class Bno055Calibration:
-    """The sensor's calibration status: 0 not at all, 3 fully. Without magnetometer only ``gyro`` matters."""
-
-    system: int
-    gyro: int
-    accelerometer: int
-    magnetometer: int
-
-
-@dataclass(frozen=True, slots=True)
 class _Reading:
-    """The registers from the gyro to the power mode, read in one transfer."""
+    """The registers from the gyro to the power mode, read in one transfer; ``calibrated`` says that of the gyro."""
 
     gyro_dps: Floats
     orientation: Floats
-    calibration: Bno055Calibration
+    calibrated: bool
 
 
 class Bno055:
@@ -156,10 +146,6 @@ class Bno055:
         self._read()
         return float(int.from_bytes(self._registers.read(_TEMP, 1), "little", signed=True))
 
-    def calibration(self) -> Bno055Calibration:
-        """Return the calibration status; the gyro's reaches 3 after a few seconds at rest."""
-        return self._read().calibration
-
     # -- setting up ---------------------------------------------------------------------------------------------------
 
     def _identify(self) -> ImuIdentity:
@@ -201,7 +187,7 @@ class Bno055:
                     raise
             else:
                 # Without calibration the orientation drifts. On a moving table, calibration never completes.
-                if reading.calibration.gyro == 3 or waited_s > _LEARN_S:
+                if reading.calibrated or waited_s > _LEARN_S:
                     break
         self._start_over(reading, self._clock.now_ns())
 
@@ -222,9 +208,8 @@ class Bno055:
             mode = status[4] & 0x0F  # the upper bits are reserved
             good = (status[0], status[2], mode, status[5] & 3) == (_FUSION_RUNNING, 0, _IMU_MODE, 0)
             if good and abs(float(orientation @ orientation) - 1) < 0.01:
-                stat = block[0x21]
-                calibration = Bno055Calibration(stat >> 6, stat >> 4 & 3, stat >> 2 & 3, stat & 3)
-                return _Reading(np.frombuffer(block[:6], "<i2") / LSB_PER_DPS, orientation, calibration)
+                calibrated = block[0x21] >> 4 & 3 == 3  # CALIB_STAT: 0 not at all, 3 fully, after some seconds at rest
+                return _Reading(np.frombuffer(block[:6], "<i2") / LSB_PER_DPS, orientation, calibrated)
             self.statistics.corrupt += 1
         reset = mode == _CONFIG_MODE
         raise DeviceFault(

@@ -6,7 +6,7 @@ whole reply with its length, which the SDK's own read functions ignore.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Protocol
+from typing import ClassVar
 
 from dynamixel_sdk import COMM_SUCCESS, Protocol1PacketHandler, Protocol2PacketHandler
 
@@ -35,32 +35,18 @@ class Reply:
     size: int
 
 
-class Packets(Protocol):
-    """One of the two protocols."""
-
-    rejections: ClassVar[dict[int, str]]
-    """Meaning of the error of a `Reply`."""
-    corrupted: ClassVar[int]
-    """The error of a `Reply` by which the device reports that the instruction arrived damaged."""
-
-    start: ClassVar[bytes]
-    """The first bytes of a packet."""
-
-    def send(self, port: ClockedPort, bus_id: int, instruction: int, parameters: bytes) -> int:
-        """Drop unread bytes and send an instruction; return the SDK's result."""
-
-    def receive(self, port: ClockedPort) -> tuple[Reply | None, int]:
-        """Wait for the next intact status packet; return it, or None and the SDK's result."""
-
-    def reply_size(self, size: int) -> int:
-        """Return the length of a status packet with ``size`` parameters, in bytes."""
-
-    def read_parameters(self, address: int, size: int) -> bytes: ...
-    def write_parameters(self, address: int, data: bytes) -> bytes: ...
-
-
 class Packets2(Protocol2PacketHandler):  # type: ignore[misc]
-    """Protocol 2.0."""
+    """Protocol 2.0.
+
+    Attributes
+    ----------
+    rejections
+        Meaning of the error of a `Reply`.
+    corrupted
+        The error of a `Reply` by which the device reports that the instruction arrived damaged.
+    start
+        The first bytes of a packet.
+    """
 
     rejections: ClassVar[dict[int, str]] = {
         1: "result fail",
@@ -75,11 +61,13 @@ class Packets2(Protocol2PacketHandler):  # type: ignore[misc]
     start: ClassVar[bytes] = _HEADER
 
     def send(self, port: ClockedPort, bus_id: int, instruction: int, parameters: bytes) -> int:
+        """Drop unread bytes and send an instruction; return the SDK's result."""
         length = len(parameters) + 3
         packet = [0, 0, 0, 0, bus_id, length & 0xFF, length >> 8, instruction, *parameters, 0, 0]
         return int(self.txPacket(port, packet))
 
     def receive(self, port: ClockedPort) -> tuple[Reply | None, int]:
+        """Wait for the next intact status packet; return it, or None and the SDK's result."""
         packet, result = self.rxPacket(port, False)
         if result != COMM_SUCCESS:
             return None, result
@@ -90,6 +78,7 @@ class Packets2(Protocol2PacketHandler):  # type: ignore[misc]
         return Reply(packet[4], body[0] & 0x7F, body[0] & 0x80, bytes(body[1:]), size), result
 
     def reply_size(self, size: int) -> int:
+        """Return the length of a status packet with ``size`` parameters, in bytes."""
         return 11 + size
 
     def read_parameters(self, address: int, size: int) -> bytes:
@@ -149,6 +138,9 @@ class Packets1(Protocol1PacketHandler):  # type: ignore[misc]
 
     def write_parameters(self, address: int, data: bytes) -> bytes:
         return bytes((address,)) + data
+
+
+Packets = Packets1 | Packets2
 
 
 def _restuff(packet: list[int], body: Sequence[int] | bytes) -> list[int]:
