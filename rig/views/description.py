@@ -1,9 +1,10 @@
-"""Description of views: the levels of several descriptors, and the evidence of the segmentation.
+"""Description of views: the levels of several descriptors, and the evidence of the segmentation with its summary.
 
 Decision: docs/decisions/0029.
 """
 
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 
 import hbr
 from hbr.descriptors.together import LearnedBackground
-from hbr.segmentation import MIN_AGREEMENT, Issue, IssueCode
+from hbr.segmentation import MIN_AGREEMENT, Issue, IssueCode, Method
 from hbr.segmentation.background import Frame
 from hbr.segmentation.segment import evidence_together, stored_segmentation
 from rig.config import ViewConfig
@@ -27,6 +28,19 @@ DESCRIPTORS: Final = (PAPER_DESCRIPTOR, BENCH_DESCRIPTOR)
 """The descriptors of every enrolled view."""
 IN_A_ROW: Final = 3
 """Number of successive frames that must differ from the empty-table image: one or two can show the operator's arm."""
+
+_TEXT: Final = {
+    IssueCode.TABLE_SIZE: "the empty-table image has another size than the frames",
+    IssueCode.TABLE_DIFFERS: "the surroundings do not look like the empty-table image",
+    IssueCode.BACKDROP_EXPOSURE: "the backdrop is too dark or overexposed to measure its colour",
+    IssueCode.BACKDROP_COLOURS: "the backdrop has several colours, so none can be taken for grey",
+    IssueCode.BACKDROP_COLOURFUL: "the backdrop is not grey",
+    IssueCode.BACKDROP_LEVEL: "the backdrop is too dark or too bright to correct the exposure",
+    IssueCode.BACKGROUND_NOT_PLAIN: "the background is not plain",
+    IssueCode.NO_GUESS: "no part of the frame stands out",
+    IssueCode.NO_OBJECT: "no object was found while the table rotated",
+    IssueCode.NO_DIFFERENCE: "nothing differs from the background",
+}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -267,3 +281,73 @@ class SearchDescriber(ViewDescriber):
         return DescribedView(
             {self._name: levels}, found.evidence(), problem, revised, self._views.reliable, self._same_bench
         )
+
+
+@dataclass(frozen=True, slots=True)
+class SegmentationSummary:
+    """Summary of the segmentation of several views.
+
+    Attributes
+    ----------
+    views
+        Number of views with segmentation evidence.
+    found, guessed
+        Numbers of views in which the object was found reliably, and in which it was guessed.
+    corrected
+        Number of views whose illumination was corrected.
+    issues
+        Number of views for each `hbr.segmentation.IssueCode`, the most frequent first.
+    """
+
+    views: int
+    found: int
+    guessed: int
+    corrected: int
+    issues: Mapping[str, int]
+
+    @classmethod
+    def of(cls, evidence: Iterable[Mapping[str, Any] | None]) -> "SegmentationSummary":
+        """Summarise the stored evidence of views; None is a view without segmentation."""
+        views = [one for one in evidence if one is not None]
+        boxes = [one for one in views if one.get("box_px") is not None]
+        guessed = sum(one.get("method") == Method.GUESS for one in boxes)
+        codes = Counter(code for one in views for code in {issue["code"]: None for issue in one.get("issues", ())})
+        return cls(
+            views=len(views),
+            found=len(boxes) - guessed,
+            guessed=guessed,
+            corrected=sum(one.get("gains_bgr") is not None for one in views),
+            issues=dict(codes.most_common()),
+        )
+
+    @property
+    def text(self) -> str:
+        """The summary in one line; empty if no view has segmentation evidence."""
+        if not self.views:
+            return ""
+        guessed = f", guessed in {self.guessed}" if self.guessed else ""
+        known = set(IssueCode)
+        issues = "".join(
+            f"; {_TEXT[IssueCode(code)] if code in known else code} ({count})" for code, count in self.issues.items()
+        )
+        return (
+            f"object found in {self.found} of {self.views} views{guessed}, illumination corrected in {self.corrected}"
+            f"{issues}"
+        )
+
+
+def check_evidence(evidence: object) -> None:
+    """Raise TypeError if a JSON value is not segmentation evidence, on which a reader would fail."""
+    if not isinstance(evidence, Mapping) or not isinstance(evidence.get("issues", []), list):
+        raise TypeError("the evidence of a segmentation that is not one")
+    for issue in evidence.get("issues", []):
+        if not isinstance(issue, Mapping) or not isinstance(issue.get("code"), str):
+            raise TypeError("the evidence of a segmentation with an issue without a code")
+    for name, length in (("box_px", 4), ("gains_bgr", 3)):
+        numbers = evidence.get(name)
+        if numbers is not None and not (
+            isinstance(numbers, list | tuple)
+            and len(numbers) == length
+            and all(isinstance(number, int | float) for number in numbers)
+        ):
+            raise TypeError(f"the evidence of a segmentation whose {name} is not {length} numbers")
