@@ -161,10 +161,8 @@ class Bench(AbstractContextManager["Bench"]):
     def open_devices(self, parts: Collection[str]) -> None:
         """Open ``imu`` and ``camera`` now, not at their first use.
 
-        Raises
-        ------
-        DeviceNotFound, DeviceMismatch, DeviceSilent
-            A device is missing, is another one, or does not answer.
+        Raises `DeviceNotFound`, `DeviceMismatch`, `DeviceSilent`: a device is missing, is another one, or does not
+        answer.
         """
         for part in parts:
             getattr(self, part)
@@ -234,14 +232,9 @@ def open_bench(
     devices
         Devices to open now; the others are opened when they are first used. The servo is always opened.
 
-    Raises
-    ------
-    ConfigError
-        The bench does not exist, or its options have mistakes.
-    DeviceNotFound, DeviceMismatch, DeviceSilent
-        A device is missing, is another one, or does not answer.
-    BenchBusy
-        Another program uses the bench.
+    Raises `ConfigError`: the bench does not exist, or its options have mistakes. `DeviceNotFound`, `DeviceMismatch`,
+    `DeviceSilent`: a device is missing, is another one, or does not answer. `BenchBusy`: another program uses the
+    bench.
     """
     config = config or RigConfig()
     kind, options = _kind(name or config.default_bench, config)
@@ -276,10 +269,7 @@ def calibrate(bench: Bench, store: CalibrationStore) -> None:
 
     A second call also applies new calibrations.
 
-    Raises
-    ------
-    ConfigError
-        A calibration sets a value that the configuration does not allow.
+    Raises `ConfigError`: a calibration sets a value that the configuration does not allow.
     """
     bench._as_opened = bench._as_opened or (bench.config, bench.findings)
     config, findings = bench._as_opened
@@ -315,10 +305,7 @@ def _kind(name: str, config: RigConfig) -> tuple[BenchKind, BaseModel]:
 def bench_kind(name: str) -> BenchKind:
     """Return the plug-in of that name.
 
-    Raises
-    ------
-    ConfigError
-        The bench does not exist.
+    Raises `ConfigError`: the bench does not exist.
     """
     if name in _plugins():
         kind: BenchKind = _plugins()[name].load()
@@ -334,10 +321,7 @@ def bench_kind(name: str) -> BenchKind:
 def check_config(read: Values) -> tuple[RigConfig, dict[str, BaseModel]]:
     """Return the configuration and the options of every bench that is installed.
 
-    Raises
-    ------
-    ConfigError
-        The evidence lists all mistakes, including those in the benches' own sections.
+    Raises `ConfigError`: the evidence lists all mistakes, including those in the benches' own sections.
     """
     found: list[str] = []
     config, options = RigConfig(), {}

@@ -117,12 +117,9 @@ def assemble(
 
     Nothing moves, and the torque stays as it is. `Bench.safety` then knows whether the table may move.
 
-    Raises
-    ------
-    DeviceNotFound, DeviceMismatch, DeviceSilent
-        A device is missing, is another one, or does not answer. The caller closes the connections.
-    ConfigError
-        The servo does not support the configuration, or does not reach the table's limits.
+    Raises `DeviceNotFound`, `DeviceMismatch`, `DeviceSilent`: a device is missing, is another one, or does not answer.
+    The caller closes the connections. `ConfigError`: the servo does not support the configuration, or does not reach
+    the table's limits.
     """
     with ExitStack() as opened:
         # Open the rig head and the servo.

@@ -71,14 +71,9 @@ class Bno055:
     address
         0x28, or 0x29 with ADR high.
 
-    Raises
-    ------
-    DeviceNotFound
-        The bus cannot be opened, or no device acknowledges the address, even a second after power-up.
-    DeviceMismatch
-        Another device answers there.
-    DeviceFault
-        Its fusion does not run, or it does not keep its settings.
+    Raises `DeviceNotFound`: the bus cannot be opened, or no device acknowledges the address, even a second after
+    power-up. `DeviceMismatch`: another device answers there. `DeviceFault`: its fusion does not run, or it does not
+    keep its settings.
     """
 
     rate_hz = RATE_HZ
@@ -108,12 +103,8 @@ class Bno055:
     def read_samples(self) -> ImuSamples:
         """Return samples for the time since the last call.
 
-        Raises
-        ------
-        DeviceSilent
-            The sensor does not answer, even after retries.
-        DeviceFault
-            The sensor was reset, its fusion stopped, or its data are impossible.
+        Raises `DeviceSilent`: the sensor does not answer, even after retries. `DeviceFault`: the sensor was reset, its
+        fusion stopped, or its data are impossible.
         """
         now_ns = self._clock.now_ns()
         reading = self._read()

@@ -112,10 +112,7 @@ class ImuDriver(Protocol):
 def identified(kind: ImuKind, got: int, address: int, bus: str, gyro_noise_dps_rthz: float) -> ImuIdentity:
     """Return the identity of a sensor whose identity register has the value ``got``.
 
-    Raises
-    ------
-    DeviceMismatch
-        It is another sensor than ``kind``.
+    Raises `DeviceMismatch`: it is another sensor than ``kind``.
     """
     if got not in kind.identities:
         other = recognised(address, kind.register, got)
@@ -134,10 +131,8 @@ def identified(kind: ImuKind, got: int, address: int, bus: str, gyro_noise_dps_r
 def open_imu(config: ImuConfig, bus: int | str, clock: Clock) -> Imu:
     """Open the sensor at ``config.address`` of ``bus`` (a number, or the path of a device file).
 
-    Raises
-    ------
-    ConfigError, DeviceNotFound, DeviceMismatch, DeviceFault, DeviceSilent
-        The driver of a plug-in cannot be loaded; otherwise see the driver of the model.
+    Raises `ConfigError`, `DeviceNotFound`, `DeviceMismatch`, `DeviceFault`, `DeviceSilent`: the driver of a plug-in
+    cannot be loaded; otherwise see the driver of the model.
     """
     kind = imu_kind(config.model)
     try:

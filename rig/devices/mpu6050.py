@@ -60,16 +60,9 @@ class Mpu6050:
     bandwidth_hz
         Bandwidth of the gyro's low-pass: 188, 98, 42, 20, 10 or 5 Hz; below half of ``rate_hz`` to avoid aliasing.
 
-    Raises
-    ------
-    ConfigError
-        The sensor does not have a setting.
-    DeviceNotFound
-        The bus cannot be opened, or no device acknowledges the address.
-    DeviceMismatch
-        Another device answers there.
-    DeviceFault
-        The sensor does not keep its settings.
+    Raises `ConfigError`: the sensor does not have a setting. `DeviceNotFound`: the bus cannot be opened, or no device
+    acknowledges the address. `DeviceMismatch`: another device answers there. `DeviceFault`: the sensor does not keep
+    its settings.
     """
 
     KIND: ClassVar[ImuKind] = imu_kind("mpu6050")
@@ -119,12 +112,8 @@ class Mpu6050:
     def read_samples(self) -> ImuSamples:
         """Return the samples in the FIFO; `FifoTimes` dates them.
 
-        Raises
-        ------
-        DeviceSilent
-            The sensor does not answer, even after retries.
-        DeviceFault
-            The sensor fell asleep or lost its settings (a brown-out).
+        Raises `DeviceSilent`: the sensor does not answer, even after retries. `DeviceFault`: the sensor fell asleep or
+        lost its settings (a brown-out).
         """
         before_ns = self._clock.now_ns()
         count = self._fifo_count()
@@ -255,11 +244,8 @@ class Mpu6050Clone(Mpu6050):
     The driver assumes the worst values of the family: the smallest FIFO and the largest noise. The temperature has the
     MPU-6050's scale.
 
-    Raises
-    ------
-    DeviceMismatch
-        Its samples come at another rate, are all equal or wild, gravity is not 1 g, or its gyro does not respond to its
-        self-test.
+    Raises `DeviceMismatch`: its samples come at another rate, are all equal or wild, gravity is not 1 g, or its gyro
+    does not respond to its self-test.
     """
 
     KIND = imu_kind("mpu6050_clone")

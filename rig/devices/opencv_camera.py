@@ -135,10 +135,7 @@ class OpenCvCamera:
     modes
         The modes that the camera offers; empty if they are not known.
 
-    Raises
-    ------
-    DeviceSilent
-        The camera delivers no frames.
+    Raises `DeviceSilent`: the camera delivers no frames.
     """
 
     def __init__(
@@ -191,12 +188,8 @@ class OpenCvCamera:
         ``meanwhile`` is called several times per second while the method waits for a slow or an unplugged camera. If it
         raises an error, the wait ends, and the next call waits again.
 
-        Raises
-        ------
-        DeviceSilent
-            No such frame arrived within the time-out, or the camera stopped delivering frames.
-        DeviceMismatch
-            After it was unplugged, another camera answers, or the camera has another mode.
+        Raises `DeviceSilent`: no such frame arrived within the time-out, or the camera stopped delivering frames.
+        `DeviceMismatch`: after it was unplugged, another camera answers, or the camera has another mode.
         """
         deadline_ns = max(self._clock.now_ns(), after_ns) + round(max(self._timeout_s, 3 * max(self._waits_s)) * 1e9)
         dropped = 0
@@ -350,10 +343,7 @@ class OpenCvCamera:
 
         If the source does not report this, wait until shortly before the next frame, estimated from the last ones.
 
-        Raises
-        ------
-        DeviceSilent
-            The stream hangs.
+        Raises `DeviceSilent`: the stream hangs.
         """
         if wait := waiter_of(self._capture):
             limit_s, begun_ns = max(self._timeout_s, 3 * max(self._waits_s)), self._clock.now_ns()

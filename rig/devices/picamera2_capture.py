@@ -83,10 +83,8 @@ class Picamera2Capture:
     number
         The number of the camera (`rpicam-hello --list-cameras`).
 
-    Raises
-    ------
-    DeviceNotFound
-        picamera2 is not installed or cannot be imported, there is no such camera, or another program uses it.
+    Raises `DeviceNotFound`: picamera2 is not installed or cannot be imported, there is no such camera, or another
+    program uses it.
     """
 
     def __init__(self, number: int) -> None:

@@ -74,10 +74,7 @@ class DescribedView:
 def within(image_bgr: NDArray[np.uint8], region: tuple[int, int, int, int] | None) -> NDArray[np.uint8]:
     """Return a region of an image, uint8 (h, w, 3); the whole image if the region is None.
 
-    Raises
-    ------
-    UsageError
-        The region does not lie within the image.
+    Raises `UsageError`: the region does not lie within the image.
     """
     if region is None:
         return image_bgr
@@ -104,10 +101,7 @@ class ViewDescriber:
     empty_table : uint8 array (H, W, 3), optional
         The bench's empty-table image: a whole frame of the same size as the views.
 
-    Raises
-    ------
-    ValueError
-        A descriptor is unknown.
+    Raises `ValueError`: a descriptor is unknown.
     """
 
     def __init__(
@@ -124,12 +118,8 @@ class ViewDescriber:
     def __call__(self, image_bgr: NDArray[np.uint8]) -> DescribedView:
         """Describe a frame, uint8 (H, W, 3).
 
-        Raises
-        ------
-        UsageError
-            The region does not lie within the frame.
-        ValueError
-            The region is too small for a segmentation.
+        Raises `UsageError`: the region does not lie within the frame. `ValueError`: the region is too small for a
+        segmentation.
         """
         if not self._segments:
             return DescribedView(self._levels(within(image_bgr, self.region), None), None)
@@ -142,10 +132,7 @@ class ViewDescriber:
 
         ``stored`` is the evidence of an enrolled view, which keeps its silhouette (`hbr.segmentation.segment`).
 
-        Raises
-        ------
-        UsageError, ValueError
-            As for a call, or the stored evidence is damaged.
+        Raises `UsageError`, `ValueError`: as for a call, or the stored evidence is damaged.
         """
         background, issues = self._prepared_table(image_bgr)
         found = stored_segmentation(within(image_bgr, self.region), stored, empty_table=background)
@@ -195,10 +182,7 @@ class EnrollmentDescriber(ViewDescriber):
     def learn(self, image_bgr: NDArray[np.uint8]) -> int:
         """Learn the background from the next view, uint8 (H, W, 3); return the number of the view.
 
-        Raises
-        ------
-        UsageError, ValueError
-            As for `ViewDescriber`, or the view has another size than the others.
+        Raises `UsageError`, `ValueError`: as for `ViewDescriber`, or the view has another size than the others.
         """
         self._learned.add(within(image_bgr, self.region))
         return len(self._learned) - 1
@@ -231,10 +215,7 @@ class SearchDescriber(ViewDescriber):
     bench_image : uint8 array (H, W, 3), optional
         Shows the bench of the enrollment; the first frame is compared with it.
 
-    Raises
-    ------
-    ValueError
-        The descriptor is unknown.
+    Raises `ValueError`: the descriptor is unknown.
     """
 
     def __init__(

@@ -116,10 +116,7 @@ def empty_table_status(bench: Bench) -> EmptyTableStatus:
 def store_empty_table(bench: Bench, table: EmptyTable) -> None:
     """Store an image instead of the previous one, which stays until the new one is completely on the disk.
 
-    Raises
-    ------
-    StateNotStored
-        The disk is full or not writable.
+    Raises `StateNotStored`: the disk is full or not writable.
     """
     png = images.encode(table.image_bgr)
     stored = table.model_copy(update={"image": f"empty-table-{images.digest(png)}.png"})

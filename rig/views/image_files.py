@@ -49,10 +49,7 @@ PNG_SETTINGS: Final = [
 def encode(image_bgr: NDArray[np.uint8]) -> bytes:
     """Encode an image, uint8 (H, W, 3) BGR, as PNG, without loss.
 
-    Raises
-    ------
-    UsageError
-        The array has another type or shape, or is empty.
+    Raises `UsageError`: the array has another type or shape, or is empty.
     """
     if image_bgr.dtype != np.uint8 or image_bgr.ndim != 3 or image_bgr.shape[2] != 3 or not image_bgr.size:
         raise UsageError(
@@ -88,10 +85,7 @@ def decode(content: bytes, *, max_pixels: int = MAX_PIXELS) -> NDArray[np.uint8]
 
     The size in the file's header is checked before memory is allocated.
 
-    Raises
-    ------
-    BadImage
-        The file has another type, is truncated, damaged or too large.
+    Raises `BadImage`: the file has another type, is truncated, damaged or too large.
     """
     if len(content) > MAX_FILE_BYTES:
         raise BadImage(f"{len(content)} bytes, more than {MAX_FILE_BYTES}")

@@ -56,10 +56,7 @@ class TableWatcher:
     def place(self, name: str | None) -> None:
         """Wait until the next object is on the table. An object to be enrolled (``name``) is there already.
 
-        Raises
-        ------
-        DeviceSilent
-            The camera gives no frame.
+        Raises `DeviceSilent`: the camera gives no frame.
         """
         if name is not None:
             return
@@ -79,10 +76,7 @@ class TableWatcher:
     def wait_until_still(self) -> None:
         """Wait until nothing moves before the camera, for example after the operator has scanned a barcode.
 
-        Raises
-        ------
-        DeviceSilent
-            The camera gives no frame.
+        Raises `DeviceSilent`: the camera gives no frame.
         """
         for _, still_s in self._frames():
             if still_s >= self._still_s:

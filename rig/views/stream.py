@@ -60,10 +60,7 @@ class FrameStream:
         newest
             Drop frames that have waited for two periods.
 
-        Raises
-        ------
-        DeviceSilent
-            The camera has failed.
+        Raises `DeviceSilent`: the camera has failed.
         """
         after_ns = self._after_ns
         if newest and self._last is not None:

@@ -179,10 +179,7 @@ class DynamixelBus:
     def reboot(self, device_id: int) -> None:
         """Restart a device, which is then silent for some tenths of a second.
 
-        Raises
-        ------
-        UsageError
-            Protocol 1.0 does not have this instruction.
+        Raises `UsageError`: Protocol 1.0 does not have this instruction.
         """
         if self.protocol == 1:
             raise UsageError(

@@ -53,10 +53,8 @@ def open_serial(path: str, baud: int, device: str = "servo", clock: Clock | None
 
     With a ``clock``, wait while the guardian of a killed program uses the port.
 
-    Raises
-    ------
-    DeviceNotFound
-        The next step names the likely reason: no such port, no permission, or another program uses it.
+    Raises `DeviceNotFound`: the next step names the likely reason: no such port, no permission, or another program uses
+    it.
     """
     begun_ns = clock.now_ns() if clock else 0
     was_guarded = True  # a guardian may close the port between the attempt to open it and the check of its users
@@ -171,10 +169,7 @@ class ClockedPort(PortHandler):  # type: ignore[misc]
     def reconnect(self) -> bool:
         """Open a lost connection again; return whether there was one.
 
-        Raises
-        ------
-        DeviceNotFound
-            The adapter is not connected yet.
+        Raises `DeviceNotFound`: the adapter is not connected yet.
         """
         if not self.lost or self._reopen is None:
             return False
@@ -187,10 +182,7 @@ class ClockedPort(PortHandler):  # type: ignore[misc]
     def setBaudRate(self, baudrate: int) -> bool:  # noqa: N802 - the SDK's names
         """Set any baud rate that the adapter supports: the SDK's own list lacks 250,000 and 4,500,000.
 
-        Raises
-        ------
-        serial.SerialException, OSError, ValueError
-            The adapter does not support it.
+        Raises `serial.SerialException`, `OSError`, `ValueError`: the adapter does not support it.
         """
         self.ser.baudrate = baudrate
         self.baudrate = baudrate

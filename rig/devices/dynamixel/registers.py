@@ -165,10 +165,7 @@ def model_numbers() -> Mapping[int, str]:
 def servo_plugin(model: str) -> Any:
     """Return the object that a package names ``model`` in the group `GROUP`; None for other models.
 
-    Raises
-    ------
-    ConfigError
-        A package cannot be loaded.
+    Raises `ConfigError`: a package cannot be loaded.
     """
     if model in model_numbers().values():
         return None
@@ -221,10 +218,7 @@ def _row(model: str) -> DynamixelModel | None:
 def control_table(model: str, firmware: int | None = None) -> ControlTable:
     """Return the control table of ``model`` (e.g. ``"xl430_w250"``), which may change with firmware 52.
 
-    Raises
-    ------
-    ConfigError
-        The model does not exist, or the driver does not fit it.
+    Raises `ConfigError`: the model does not exist, or the driver does not fit it.
     """
     if (row := _row(model)) is not None:
         signed = _SIGNED if row.protocol == 2 else frozenset()

@@ -137,14 +137,8 @@ class DynamixelServo:
     guardian
         Switches the torque off if this program is killed; None if the servo is simulated in this program.
 
-    Raises
-    ------
-    ConfigError
-        The mode is turntable, but the servo does not count revolutions.
-    DeviceNotFound
-        No servo answers at ``bus_id``.
-    DeviceMismatch
-        Another model answers. The rig may be unable to drive it.
+    Raises `ConfigError`: the mode is turntable, but the servo does not count revolutions. `DeviceNotFound`: no servo
+    answers at ``bus_id``. `DeviceMismatch`: another model answers. The rig may be unable to drive it.
     """
 
     def __init__(
@@ -456,12 +450,8 @@ def open_servo(
     ``reopen`` opens the connection again after its adapter was unplugged. ``guardian`` switches the torque off if this
     program is killed.
 
-    Raises
-    ------
-    ConfigError
-        The model does not exist, or does not support the mode.
-    DeviceNotFound, DeviceMismatch, DeviceSilent
-        No servo answers, another model answers, or the servo stops answering.
+    Raises `ConfigError`: the model does not exist, or does not support the mode. `DeviceNotFound`, `DeviceMismatch`,
+    `DeviceSilent`: no servo answers, another model answers, or the servo stops answering.
     """
     driver = servo_plugin(config.model)
     if driver is not None and not isinstance(driver, DynamixelModel):

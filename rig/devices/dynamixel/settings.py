@@ -84,12 +84,8 @@ def compare(bus: DynamixelBus, bus_id: int, table: ControlTable, mode: Mode = "t
 def write(bus: DynamixelBus, bus_id: int, table: ControlTable, differences: Sequence[SettingDifference]) -> None:
     """Write settings with the torque off (a servo rejects them otherwise), and read each back.
 
-    Raises
-    ------
-    RequestRejected
-        The servo's torque stays on, or it rejects or loses a value.
-    DeviceSilent
-        The servo stops answering; the values written so far stay, and `compare` returns the others.
+    Raises `RequestRejected`: the servo's torque stays on, or it rejects or loses a value. `DeviceSilent`: the servo
+    stops answering; the values written so far stay, and `compare` returns the others.
     """
     # A servo that does not answer writes would count as silent, so the setting that makes it answer comes first.
     ordered = sorted(differences, key=lambda difference: difference.register != "Status Return Level")

@@ -69,16 +69,9 @@ class RigHead:
     reopen
         Opens the port again after the cable was unplugged.
 
-    Raises
-    ------
-    DeviceNotFound
-        Nothing answers that uses the protocol.
-    FirmwareMismatch
-        The head uses another version; the message says which side to update.
-    DeviceSilent, DeviceMismatch
-        The sensor on the head does not answer, or is another one.
-    ConfigError
-        The head does not support ``deadman_s``.
+    Raises `DeviceNotFound`: nothing answers that uses the protocol. `FirmwareMismatch`: the head uses another version;
+    the message says which side to update. `DeviceSilent`, `DeviceMismatch`: the sensor on the head does not answer, or
+    is another one. `ConfigError`: the head does not support ``deadman_s``.
     """
 
     def __init__(
@@ -146,12 +139,8 @@ class RigHead:
     def read_samples(self) -> ImuSamples:
         """Return the samples that arrived since the last call, at most those of `stream.MEMORY_S`.
 
-        Raises
-        ------
-        DeviceSilent
-            The head does not answer and cannot be reconnected, or it lost its sensor.
-        DeviceMismatch
-            Another head or another sensor answers than the one that was opened.
+        Raises `DeviceSilent`: the head does not answer and cannot be reconnected, or it lost its sensor.
+        `DeviceMismatch`: another head or another sensor answers than the one that was opened.
         """
         with self._in_use():
             self._check_sensor()
@@ -197,10 +186,7 @@ class RigHead:
         A fault of an earlier program is cleared on the head and returned. The caller latches it, so that the operator
         must acknowledge it before anything moves.
 
-        Raises
-        ------
-        EmergencyStop
-            The e-stop is pressed, and the servo's supply goes through it.
+        Raises `EmergencyStop`: the e-stop is pressed, and the servo's supply goes through it.
         """
         fault = self.fault
         if fault is not None:
@@ -255,12 +241,7 @@ class RigHead:
     def acknowledge(self) -> None:
         """Clear the latched faults after the operator looked at their causes; the outputs stay off.
 
-        Raises
-        ------
-        EmergencyStop
-            The e-stop is still pressed.
-        DeviceSilent
-            The head does not answer.
+        Raises `EmergencyStop`: the e-stop is still pressed. `DeviceSilent`: the head does not answer.
         """
         with self._in_use():
             try:
@@ -436,12 +417,8 @@ def open_head(config: RigConfig, open_port: Callable[[], SerialConnection], cloc
 def powered(config: RigConfig, open_port: Callable[[], SerialConnection], clock: Clock) -> Iterator[None]:
     """Power the servo for the duration of a ``with`` block if its supply goes through a rig head.
 
-    Raises
-    ------
-    EmergencyStop, HeartbeatLost, HeadRestarted
-        The head keeps the supply off until the fault is acknowledged.
-    DeviceNotFound, FirmwareMismatch, DeviceMismatch, DeviceSilent
-        See `RigHead`.
+    Raises `EmergencyStop`, `HeartbeatLost`, `HeadRestarted`: the head keeps the supply off until the fault is
+    acknowledged. `DeviceNotFound`, `FirmwareMismatch`, `DeviceMismatch`, `DeviceSilent`: see `RigHead`.
     """
     if not (config.imu.connection == "head" and config.head.power):
         yield

@@ -94,12 +94,7 @@ def encode(frame: Frame) -> bytes:
 def decode(line: bytes) -> Frame:
     """Return the frame in ``line``, the bytes between two zeros.
 
-    Raises
-    ------
-    CrcError
-        The checksum is wrong.
-    FrameError
-        The bytes are not COBS, too few or too many.
+    Raises `CrcError`: the checksum is wrong. `FrameError`: the bytes are not COBS, too few or too many.
     """
     if len(line) >= LONGEST:
         raise FrameError(f"{len(line)} bytes, longer than any frame")
@@ -216,12 +211,8 @@ class HeadLink:
     def greet(self) -> None:
         """Wait until the head answers, and check that it uses this program's protocol.
 
-        Raises
-        ------
-        DeviceNotFound
-            Nothing answers that uses the protocol.
-        FirmwareMismatch
-            The head uses another version; the message says which side to update.
+        Raises `DeviceNotFound`: nothing answers that uses the protocol. `FirmwareMismatch`: the head uses another
+        version; the message says which side to update.
         """
         self.identity = self._greet()
 
@@ -233,12 +224,7 @@ class HeadLink:
     def reconnect(self) -> None:
         """Open the port again, and continue only with the same head.
 
-        Raises
-        ------
-        DeviceSilent
-            The port is still gone, or nothing answers.
-        DeviceMismatch
-            Another head answers.
+        Raises `DeviceSilent`: the port is still gone, or nothing answers. `DeviceMismatch`: another head answers.
         """
         if self._reopen is None:
             raise DeviceSilent(
@@ -267,12 +253,8 @@ class HeadLink:
     def store_serial(self, serial: int) -> None:
         """Store a serial number, 0 to 2³² − 2, in the head, and read it back.
 
-        Raises
-        ------
-        RequestRejected
-            A program uses the head, or its firmware is older than 1.1.
-        DeviceFault
-            The head reports another number afterwards.
+        Raises `RequestRejected`: a program uses the head, or its firmware is older than 1.1. `DeviceFault`: the head
+        reports another number afterwards.
         """
         self.request(SetSerial(serial), Done)
         self.identify()
@@ -327,14 +309,8 @@ class HeadLink:
 
         A repetition has the same sequence number: the head replies again, but does nothing twice.
 
-        Raises
-        ------
-        DeviceSilent
-            The head did not reply to any of the ``attempts``.
-        DeviceUnplugged
-            The port is gone.
-        RequestRejected
-            The head rejected the request; the error says why.
+        Raises `DeviceSilent`: the head did not reply to any of the ``attempts``. `DeviceUnplugged`: the port is gone.
+        `RequestRejected`: the head rejected the request; the error says why.
         """
         self._sequence = (self._sequence + 1) % 256
         frame = encode(Frame(message.ID, self._sequence, message.LAYOUT.pack(*astuple(message))))

@@ -59,10 +59,7 @@ class HeadSensor:
 def head_sensor(kind: str, *, address: int, range_dps: int, rate_hz: float, bandwidth_hz: int) -> HeadSensor:
     """Return the sensor ``kind`` (``mpu6050`` or ``bno055``) with these settings; a BNO055 has its own rate and range.
 
-    Raises
-    ------
-    ConfigError
-        The sensor or the setting does not exist.
+    Raises `ConfigError`: the sensor or the setting does not exist.
     """
     if kind == "bno055":
         return HeadSensor(
