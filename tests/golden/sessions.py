@@ -203,6 +203,7 @@ def _normal(value: Any, folder: str) -> Any:
             return "DISK"
         case dict():
             left_out = {"seconds"} if "dry_run" in value else set()  # an import takes real time
+            left_out |= {"database_bytes"}  # SQLite keeps or removes its write-ahead log
             left_out |= {key for key in value if _is_time(key)}
             return {key: _normal(one, folder) for key, one in value.items() if key not in left_out}
         case list() if len(value) > LONGEST and all(isinstance(one, int | float) for one in value):
