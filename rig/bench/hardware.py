@@ -37,13 +37,7 @@ class NoOptions(Section):
 
 
 class HardwareBench:
-    """Opens the devices in the configuration.
-
-    Attributes
-    ----------
-    name
-        The bench's name. Its state, calibrations and catalog belong to it.
-    """
+    """Opens the devices in the configuration. State, calibrations and catalog belong to its name."""
 
     name = "hardware"
     options: type[BaseModel] = NoOptions
@@ -182,10 +176,7 @@ def assemble(
 class CameraPlug:
     """The camera of a source. It keeps its identity when it is plugged in again, and may get another number.
 
-    Attributes
-    ----------
-    device
-        Identifies the camera (`Computer.camera_device`), once it was opened.
+    ``device`` identifies the camera (`Computer.camera_device`), once it was opened.
     """
 
     def __init__(self, computer: Computer, source: int | str) -> None:

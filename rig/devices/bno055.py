@@ -64,13 +64,6 @@ class Bno055:
     are further apart than the gyro's period, they are interpolated. Therefore the rates are only correct if the sensor
     is read while the table moves, as the control loop does.
 
-    Parameters
-    ----------
-    bus
-        Number of the I2C bus, or the path of its device file.
-    address
-        0x28, or 0x29 with ADR high.
-
     Raises `DeviceNotFound`: the bus cannot be opened, or no device acknowledges the address, even a second after
     power-up. `DeviceMismatch`: another device answers there. `DeviceFault`: its fusion does not run, or it does not
     keep its settings.

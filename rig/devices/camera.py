@@ -72,15 +72,10 @@ class Frame:
 
 
 class Camera(Protocol):
-    """A source of frames.
-
-    Attributes
-    ----------
-    observers
-        Called with each image that `capture` returns: for displays.
-    """
+    """A source of frames."""
 
     observers: list[Callable[[NDArray[np.uint8]], object]]
+    """Called with each image that `capture` returns: for displays."""
 
     @property
     def identity(self) -> CameraIdentity: ...

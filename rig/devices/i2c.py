@@ -39,14 +39,7 @@ class I2cStatistics:
 
 
 class I2cRegisters:
-    """Registers of the device at ``address``.
-
-    Parameters
-    ----------
-    bus
-        Number of the I2C bus, or the path of its device file.
-    address
-        The device's address, 7 bits.
+    """Registers of the device at ``address`` (7 bits) of ``bus``: its number, or the path of its device file.
 
     Raises `DeviceNotFound`: the bus cannot be opened.
     """

@@ -49,10 +49,6 @@ class Mpu6050:
 
     Parameters
     ----------
-    bus
-        Number of the I2C bus, or the path of its device file.
-    address
-        0x68, or 0x69 with AD0 high.
     range_dps
         Full scale of the gyro: 250, 500, 1000 or 2000 °/s.
     rate_hz

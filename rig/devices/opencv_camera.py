@@ -115,10 +115,8 @@ class OpenCvCamera:
         An open source, for example from `open_capture`. The camera closes it.
     settings
         Requested settings. `rejected_settings` lists those that the camera did not accept.
-    name
-        The camera's name in records.
-    device
-        Identity of the camera itself, at any port; None if it is not known.
+    name, device
+        See `CameraIdentity`.
     timeout_s
         How long `capture` waits for a new frame.
     latency_s
@@ -129,11 +127,6 @@ class OpenCvCamera:
     node
         Returns what identifies the device file now, None if it is missing. Another value than at the opening means that
         the camera was unplugged: `cv2.VideoCapture.isOpened` stays True on V4L2.
-
-    Attributes
-    ----------
-    modes
-        The modes that the camera offers; empty if they are not known.
 
     Raises `DeviceSilent`: the camera delivers no frames.
     """
@@ -234,10 +227,8 @@ class OpenCvCamera:
     def change_exposure(self, exposure_us: float) -> int:
         """Change the locked exposure time until the camera is opened again.
 
-        Returns
-        -------
-        int
-            Time in ns from which `capture` returns frames of this exposure time: the camera takes some frames for it.
+        Return the time in ns from which `capture` returns frames of this exposure time: it takes the camera some
+        frames.
         """
         self._capture.set(cv2.CAP_PROP_EXPOSURE, round(exposure_us / _EXPOSURE_UNIT_US))
         return self._clock.now_ns() + round(_EXPOSURE_CHANGE_FRAMES * max(self._period_s, *self._waits_s) * 1e9)

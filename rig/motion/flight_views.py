@@ -26,21 +26,9 @@ FEWEST_STAMPS: Final = 4
 
 @dataclass(eq=False)
 class FlightFrames:
-    """The frames of one flight, or of several flights with one trajectory.
+    """The frames of one flight, or of several flights with one trajectory; the table must have torque on.
 
-    Parameters
-    ----------
-    bench, table
-        An open bench, and its table with torque on.
-    newest
-        Whether frames are dropped for which the program is too slow.
-
-    Attributes
-    ----------
-    recorder
-        The recorder of the trajectory.
-    stream
-        The frames of the camera.
+    With ``newest`` those frames are dropped for which the program is too slow.
     """
 
     bench: Bench
@@ -104,12 +92,8 @@ class FlightFrames:
     ) -> Attempt:
         """Return a frame of this flight as an attempt at a view: its evidence, and the reasons to reject it.
 
-        Parameters
-        ----------
-        locks, locks_hold
-            The camera's settings before the flight, and whether they have not changed.
-        stamps
-            The number of the last time stamps that the frame's is compared with; 0 for all of this flight.
+        ``locks`` are the camera's settings before the flight. The frame's time stamp is compared with the last
+        ``stamps`` ones; 0 for all of this flight.
         """
         config = self.bench.config
         middle = middle_ns(frame.exposed_ns, config.camera_time)

@@ -54,19 +54,13 @@ class Motion:
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """The platter's angle as a function of time; `TrajectoryRecorder.fit` makes it.
-
-    Attributes
-    ----------
-    residual_deg
-        The largest mean deviation of `SLIP_READINGS` encoder readings in a row.
-    start_ns, end_ns
-        Times of the first and the last gyro sample.
-    """
+    """The platter's angle as a function of time; `TrajectoryRecorder.fit` makes it."""
 
     residual_deg: float
+    """The largest mean deviation of `SLIP_READINGS` encoder readings in a row."""
     start_ns: int
     end_ns: int
+    """Times of the first and the last gyro sample."""
     _values: Floats
     _covariance: Floats
     _time_s: Floats
@@ -107,13 +101,7 @@ def _design(at_s: Floats, t: Floats, time_s: Floats, rate: Floats, integral: Flo
 
 @dataclass(eq=False)
 class TrajectoryRecorder:
-    """Collects encoder readings and gyro samples of a motion.
-
-    Attributes
-    ----------
-    readings
-        The encoder readings so far: times and table angles.
-    """
+    """Collects encoder readings (times and table angles) and gyro samples of a motion."""
 
     resolution_deg: float
     backlash_deg: float

@@ -72,8 +72,6 @@ class Turntable(AbstractContextManager["Turntable"]):
 
     Parameters
     ----------
-    bench
-        An open bench.
     trust_gyro
         Whether a motion is stopped if the gyro contradicts the encoder. Calibrations of the gyro set it to False.
     first_rest_s

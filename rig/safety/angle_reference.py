@@ -77,22 +77,9 @@ _TEXTS: Final[Mapping[AngleFinding, str]] = {
 
 @dataclass(frozen=True, slots=True)
 class SavedAngleCheck:
-    """Result of `check_saved_angle`.
+    """Result of `check_saved_angle`: the finding, and the numbers of its text.
 
-    Attributes
-    ----------
-    finding
-        Result of the comparison.
-    shift_deg
-        Angle that must be added to the servo's positions.
-    position_deg, saved_position_deg
-        The servo's position now and when it was stored.
-    firmware, saved_firmware
-        The servo's firmware now and when it was stored.
-    lost_revolutions
-        Revolutions that the servo no longer counts.
-    table_deg
-        The table's angle, if it is beyond the limits.
+    ``shift_deg`` must be added to the servo's positions. ``table_deg`` is the table's angle if it is beyond the limits.
     """
 
     finding: AngleFinding

@@ -123,16 +123,8 @@ class Motion:
 class Safety:
     """State, latched fault and angle reference of one bench's table.
 
-    Parameters
-    ----------
-    servo
-        The servo. It is only read, except by `acknowledge` with a reboot.
-    config
-        The bench's configuration.
-    clock
-        Clock for the times of the faults.
-    store
-        Store in which the state survives the process; None holds it in memory.
+    The servo is only read, except by `set_goal`, and by `acknowledge` with a reboot. The state survives the process in
+    ``store``; None holds it in memory.
     """
 
     def __init__(self, servo: Servo, config: RigConfig, clock: Clock, store: StateStore | None = None) -> None:
@@ -340,17 +332,9 @@ class Safety:
     def acknowledge(self, *, reboot: bool = False) -> TableState:
         """Acknowledge the latched fault after its cause is gone: servo, settings, supply and angle are checked.
 
-        Problems that do not show at rest (a jam, a loose platter) show in the next motion.
-
-        Parameters
-        ----------
-        reboot
-            Restart the servo first: nothing else clears its hardware errors.
-
-        Returns
-        -------
-        TableState
-            READY, or UNREFERENCED if the table's angle is uncertain.
+        Problems that do not show at rest (a jam, a loose platter) show in the next motion. With ``reboot`` the servo
+        restarts first: nothing else clears its hardware errors. The new state is READY, or UNREFERENCED if the table's
+        angle is uncertain.
 
         Raises `DeviceFault`, `Overheated`, `SupplyOutOfRange`, `DeviceMismatch`, `DeviceSilent`: the cause is still
         there; the fault stays.

@@ -90,16 +90,9 @@ def within(image_bgr: NDArray[np.uint8], region: tuple[int, int, int, int] | Non
 class ViewDescriber:
     """Segments views of one bench, and describes them by several descriptors.
 
-    The paper's descriptors describe the whole region of interest. All others describe only the object.
-
-    Parameters
-    ----------
-    config
-        Configuration with the region of interest to describe.
-    names
-        The descriptors. Without any, each view is only segmented; with the paper's alone, it is not.
-    empty_table : uint8 array (H, W, 3), optional
-        The bench's empty-table image: a whole frame of the same size as the views.
+    The paper's descriptors describe the whole region of interest. All others describe only the object. Without any
+    descriptor, each view is only segmented; with the paper's alone, it is not. The empty-table image is a whole frame
+    of the same size as the views.
 
     Raises `ValueError`: a descriptor is unknown.
     """
@@ -204,18 +197,8 @@ class SearchDescriber(ViewDescriber):
     The background is learned from all views of the search, so that each view also improves the earlier ones
     (`hbr.ViewsTogether`). The levels have a row for each segmentation.
 
-    Parameters
-    ----------
-    config, empty_table
-        As for `ViewDescriber`.
-    name
-        The descriptor.
-    revise
-        Whether earlier views are segmented again with each new one; not in a search in motion, which has many views.
-    bench_image : uint8 array (H, W, 3), optional
-        Shows the bench of the enrollment; the first frame is compared with it.
-
-    Raises `ValueError`: the descriptor is unknown.
+    With ``revise`` earlier views are segmented again with each new one; not in a search in motion, which has many
+    views. The first frame is compared with ``bench_image``, uint8 (H, W, 3), which shows the bench of the enrollment.
     """
 
     def __init__(
@@ -266,25 +249,17 @@ class SearchDescriber(ViewDescriber):
 
 @dataclass(frozen=True, slots=True)
 class SegmentationSummary:
-    """Summary of the segmentation of several views.
-
-    Attributes
-    ----------
-    views
-        Number of views with segmentation evidence.
-    found, guessed
-        Numbers of views in which the object was found reliably, and in which it was guessed.
-    corrected
-        Number of views whose illumination was corrected.
-    issues
-        Number of views for each `hbr.segmentation.IssueCode`, the most frequent first.
-    """
+    """Summary of the segmentation of several views: numbers of views."""
 
     views: int
+    """Views with segmentation evidence."""
     found: int
+    """Views in which the object was found reliably, and not only guessed."""
     guessed: int
     corrected: int
+    """Views whose illumination was corrected."""
     issues: Mapping[str, int]
+    """Views with each `hbr.segmentation.IssueCode`, the most frequent first."""
 
     @classmethod
     def of(cls, evidence: Iterable[Mapping[str, Any] | None]) -> "SegmentationSummary":

@@ -64,20 +64,9 @@ class DynamixelBus:
     write is read back, and each reading is confirmed. In Protocol 1.0 no reading contains its age, so all readings are
     confirmed.
 
-    Parameters
-    ----------
-    port
-        An open port.
-    retries
-        Largest number of repetitions of a transaction before the device counts as silent. All instructions used here
-        are absolute (a read, or a write of a value), so a repetition is harmless.
-    protocol
-        2 (X series, and MX series with firmware for it), or 1 (AX-12A).
-
-    Attributes
-    ----------
-    sampled_ns
-        Time at which the device began to send the last block that was read; it had sampled its registers just before.
+    After ``retries`` repetitions of a transaction the device counts as silent. All instructions used here are absolute
+    (a read, or a write of a value), so a repetition is harmless. ``protocol`` is 2 (X series, and MX series with
+    firmware for it), or 1 (AX-12A).
     """
 
     def __init__(self, port: ClockedPort, retries: int = 3, protocol: int = 2) -> None:
@@ -85,6 +74,7 @@ class DynamixelBus:
         self.statistics = BusStatistics()
         self.protocol = protocol
         self.sampled_ns = 0
+        """When the device began to send the last block that was read; it had sampled its registers just before."""
         self._packets: Packets = Packets1() if protocol == 1 else Packets2()
         self._retries = retries
         self._lock = RLock()

@@ -38,14 +38,8 @@ class Reply:
 class Packets2(Protocol2PacketHandler):  # type: ignore[misc]
     """Protocol 2.0.
 
-    Attributes
-    ----------
-    rejections
-        Meaning of the error of a `Reply`.
-    corrupted
-        The error of a `Reply` by which the device reports that the instruction arrived damaged.
-    start
-        The first bytes of a packet.
+    ``rejections`` are the meanings of the error of a `Reply`, and ``corrupted`` is the error by which the device
+    reports that the instruction arrived damaged. ``start`` are the first bytes of a packet.
     """
 
     rejections: ClassVar[dict[int, str]] = {

@@ -42,16 +42,8 @@ GROUP = "rig.servos"
 class DynamixelModel:
     """A model that has no `.model` file in the SDK.
 
-    Attributes
-    ----------
-    name, number : str, int
-        Value of ``servo.model``, and Model Number.
-    protocol : int
-        1 or 2.
-    registers : tuple of (int, int, str)
-        Address, size and e-manual name of each register.
-    ram_start : int
-        First address of the RAM area.
+    ``name`` is the value of ``servo.model``, ``number`` its Model Number. ``registers`` are address, size and e-manual
+    name of each register; the RAM area begins at ``ram_start``.
     """
 
     name: str

@@ -125,12 +125,8 @@ class DynamixelServo:
 
     Parameters
     ----------
-    bus
-        The servo's bus.
-    bus_id, model
-        The servo's id, and its model as in `model_of`.
-    mode
-        How the servo is used.
+    model
+        As in `model_of`.
     gear_ratio
         Revolutions of the servo for one revolution of the table. All angles and rates of this class are on the table's
         side of the gear. If the gears reverse the direction, set `table.direction`.

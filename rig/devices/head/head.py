@@ -58,20 +58,15 @@ class RigHead:
 
     Parameters
     ----------
-    connection
-        The open port, at `protocol.BAUD`.
+    connection, name, reopen
+        As for `HeadLink`; at `protocol.BAUD`.
     sensor
         The sensor on the head's I2C bus, with its settings.
     deadman_s
         The silence after which the head switches its outputs off.
-    name
-        The port's name, for messages.
-    reopen
-        Opens the port again after the cable was unplugged.
 
-    Raises `DeviceNotFound`: nothing answers that uses the protocol. `FirmwareMismatch`: the head uses another version;
-    the message says which side to update. `DeviceSilent`, `DeviceMismatch`: the sensor on the head does not answer, or
-    is another one. `ConfigError`: the head does not support ``deadman_s``.
+    Raises `DeviceNotFound`, `FirmwareMismatch`: as `HeadLink.greet`. `DeviceSilent`, `DeviceMismatch`: the sensor on
+    the head does not answer, or is another one. `ConfigError`: the head does not support ``deadman_s``.
     """
 
     def __init__(

@@ -95,10 +95,8 @@ def head_sensor(kind: str, *, address: int, range_dps: int, rate_hz: float, band
 class HeadClock:
     """Converts times of the head (µs, wrapping at 2³²) to times of the bench (ns).
 
-    Parameters
-    ----------
-    transmission_ns
-        Time that the two frames take at the baud rate; equal in both directions, so it adds no uncertainty.
+    ``transmission_ns`` is the time that the two frames take at the baud rate. It is equal in both directions, so it
+    adds no uncertainty.
     """
 
     def __init__(self, transmission_ns: float) -> None:
