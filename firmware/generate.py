@@ -122,6 +122,22 @@ def sentence(text: str) -> str:
     return f"{text[0].upper()}{text[1:]}."
 
 
+MESSAGE = (
+    "",
+    "",
+    "class Message:",
+    '    """A message: its id, and the layout of its body."""',
+    "",
+    "    __slots__ = ()",
+    "    ID: ClassVar[int]",
+    "    LAYOUT: ClassVar[Struct]",
+    "",
+    '    def __init_subclass__(cls, number: int | None = None, layout: str = "") -> None:',
+    "        if number is not None:  # a dataclass with slots makes its class twice, the second time without arguments",
+    "            cls.ID, cls.LAYOUT = number, Struct(layout)",
+)
+
+
 def module(table: Table) -> str:
     major, minor, patch = table["firmware"]
     lines = [
@@ -147,12 +163,13 @@ def module(table: Table) -> str:
         lines += ["", "", f"class {camel(enum['name'])}({'IntFlag' if flags else 'IntEnum'}):"]
         lines += [f'    """{enum["doc"]}"""', ""]
         lines += [f"    {n.upper()} = {v}" for n, v in enum["values"]]
+    lines += MESSAGE
     for message in table["message"]:
         fields = message["fields"]
-        lines += ["", "", "@dataclass(frozen=True, slots=True)", f"class {camel(message['name'])}:"]
         layout = "<" + "".join(PY_FORMATS[kind] for _, kind, _ in fields)
-        lines += [f'    """{message["doc"]}"""', "", f"    ID: ClassVar[int] = 0x{message['id']:02X}"]
-        lines += [f'    LAYOUT: ClassVar[Struct] = Struct("{layout}")']
+        kind = f'Message, number=0x{message["id"]:02X}, layout="{layout}"'
+        lines += ["", "", "@dataclass(frozen=True, slots=True)", f"class {camel(message['name'])}({kind}):"]
+        lines += [f'    """{message["doc"]}"""', *([""] if fields else [])]
         for name, _, doc in fields:
             field = f"    {name}: int" + " = 0" * name.startswith("pad_")
             comment = f"  # {sentence(doc)}" if doc and doc != "0" else ""

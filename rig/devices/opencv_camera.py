@@ -14,7 +14,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import Enum
 from math import floor
-from typing import Any
+from typing import Any, Final
 
 import cv2
 import numpy as np
@@ -41,6 +41,21 @@ _UNKNOWN_PROPERTY = cv2.CAP_PROP_XI_AEAG  # V4L2 answers -1, other sources 0
 _EXPOSURE_CHANGE_FRAMES = 4  # a sensor applies a new exposure time up to this number of frames later
 _FOCUS_STILL_S, _FOCUS_LIMIT_S = 1.0, 8.0
 _FOCUS_CHANGE = 0.1  # share of the sharpness that changes while the lens moves
+
+_LOCKS: Final[dict[str, tuple[int, Callable[[float], Any]]]] = {
+    "exposure_us": (cv2.CAP_PROP_EXPOSURE, lambda value: value * _EXPOSURE_UNIT_US),
+    "gain": (cv2.CAP_PROP_GAIN, float),
+    "white_balance_k": (cv2.CAP_PROP_WB_TEMPERATURE, float),
+    "auto_exposure": (cv2.CAP_PROP_AUTO_EXPOSURE, lambda value: value in _V4L2_EXPOSURE_AUTO),
+    "auto_white_balance": (cv2.CAP_PROP_AUTO_WB, bool),
+    "focus": (cv2.CAP_PROP_FOCUS, float),
+    "autofocus": (cv2.CAP_PROP_AUTOFOCUS, bool),
+    "sharpness": (cv2.CAP_PROP_SHARPNESS, float),
+    "backlight_compensation": (cv2.CAP_PROP_BACKLIGHT, float),
+    "power_line_frequency": (v4l2.POWER_LINE_FREQUENCY, float),
+    "dynamic_frame_rate": (v4l2.EXPOSURE_DYNAMIC_FRAMERATE, bool),
+}
+"""Property of each field of `CameraLocks`, and the conversion to the field's unit."""
 
 
 class TimeBase(Enum):
@@ -205,23 +220,9 @@ class OpenCvCamera:
                 )
 
     def read_locks(self) -> CameraLocks:
-        exposure = self._known(cv2.CAP_PROP_EXPOSURE)
-        auto_exposure = self._known(cv2.CAP_PROP_AUTO_EXPOSURE)
-        auto_white_balance = self._known(cv2.CAP_PROP_AUTO_WB)
-        autofocus = self._known(cv2.CAP_PROP_AUTOFOCUS)
-        dynamic = self._known(v4l2.EXPOSURE_DYNAMIC_FRAMERATE)
+        reported = {name: (self._known(prop), convert) for name, (prop, convert) in _LOCKS.items()}
         return CameraLocks(
-            exposure_us=None if exposure is None else exposure * _EXPOSURE_UNIT_US,
-            gain=self._known(cv2.CAP_PROP_GAIN),
-            white_balance_k=self._known(cv2.CAP_PROP_WB_TEMPERATURE),
-            auto_exposure=None if auto_exposure is None else auto_exposure in _V4L2_EXPOSURE_AUTO,
-            auto_white_balance=None if auto_white_balance is None else auto_white_balance != 0,
-            focus=self._known(cv2.CAP_PROP_FOCUS),
-            autofocus=None if autofocus is None else autofocus != 0,
-            sharpness=self._known(cv2.CAP_PROP_SHARPNESS),
-            backlight_compensation=self._known(cv2.CAP_PROP_BACKLIGHT),
-            power_line_frequency=self._known(v4l2.POWER_LINE_FREQUENCY),
-            dynamic_frame_rate=None if dynamic is None else dynamic != 0,
+            **{name: None if value is None else convert(value) for name, (value, convert) in reported.items()}
         )
 
     def change_exposure(self, exposure_us: float) -> int:

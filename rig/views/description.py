@@ -218,11 +218,6 @@ class SearchDescriber(ViewDescriber):
         self._views: hbr.ViewsTogether | None = None
 
     @property
-    def segmentations(self) -> list[hbr.Segmentation]:
-        """The likeliest segmentation of each view so far; empty if the descriptor needs none."""
-        return [] if self._views is None else [several[0] for several in self._views.segmentations]
-
-    @property
     def hypotheses(self) -> list[tuple[hbr.Segmentation, ...]]:
         """All segmentations of each view so far, in the order of its levels; empty if the descriptor needs none."""
         return [] if self._views is None else self._views.segmentations
