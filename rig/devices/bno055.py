@@ -108,9 +108,12 @@ class Bno055:
             self.statistics.overflows += 1
             self._start_over(reading, now_ns)
             return ImuSamples(np.empty(0, np.int64), np.empty((0, 3)), int(count))
+        # Interpolate the gyro between this reading and the last one, one sample for each of its periods.
         share = np.arange(1, count + 1) / count
         time_ns = self._newest_ns + np.rint((now_ns - self._newest_ns) * share).astype(np.int64)
         gyro = self._last.gyro_dps + (reading.gyro_dps - self._last.gyro_dps) * (share - 0.5 / count)[:, None]
+        # Correct the samples so that they add up to the rotation that the chip integrated itself. A small difference is
+        # carried to the next reading: it is the orientation's resolution and age.
         owed_deg = self._owed_deg + _rotation_deg(self._last.orientation, reading.orientation) - gyro.sum(0) / RATE_HZ
         fastest = max(float(np.linalg.norm(self._last.gyro_dps)), float(np.linalg.norm(reading.gyro_dps)))
         carried = (_CARRIED_DEG + _ORIENTATION_AGE_S * fastest) / max(float(np.linalg.norm(owed_deg)), 1e-9)
@@ -142,6 +145,7 @@ class Bno055:
                 if self._clock.now_ns() > deadline_ns:
                     raise self._registers.not_found(silent, "ADR pin (low 0x28, high 0x29)") from silent
                 self._clock.sleep(_POLL_S)
+        # A wrong identity that changes, or is one bit late, comes from the bus, and not from another chip.
         if got not in KIND.identities:
             again = {self._registers.read(KIND.register, 1)[0] for _ in range(_IDENTITY_READS)}
             if again & {*KIND.identities, *(_late_by_one_bit(one) for one in KIND.identities)} or len(again) > 1:

@@ -111,6 +111,7 @@ class Mpu6050:
         Raises `DeviceSilent`: the sensor does not answer, even after retries. `DeviceFault`: the sensor fell asleep or
         lost its settings (a brown-out).
         """
+        # How many bytes are there? Two times bound the moment at which the sensor counted them.
         before_ns = self._clock.now_ns()
         count = self._fifo_count()
         after_ns = self._clock.now_ns()
@@ -118,11 +119,13 @@ class Mpu6050:
             self._implausible(count, after_ns) and self._implausible(count := self._fifo_count(), after_ns)
         ):
             return self._start_over()  # incomplete twice, so it is not a frame that is being written
+        # How many samples should be there? Another program may have emptied the FIFO, or the sensor was reset.
         samples, missing = count // _FRAME, 0
         due = self._times.due(before_ns)
         if samples < 0.9 * due - 2:  # the sensor's clock is off by at most 5 % (PS 6.6): samples are missing
             self._check_settings()
             missing = round(due) - samples
+        # A FIFO that overflows while it is read shifts its frames.
         full_ns = before_ns + round((self.FIFO_BYTES - count) // _FRAME * self._times.period_ns)
         data = self._pop(count, full_ns) if count else b""
         if data is None:

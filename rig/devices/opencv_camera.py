@@ -199,6 +199,7 @@ class OpenCvCamera:
         Raises `DeviceSilent`: no such frame arrived within the time-out, or the camera stopped delivering frames.
         `DeviceMismatch`: after it was unplugged, another camera answers, or the camera has another mode.
         """
+        # A camera that is slower than its mode says gets the time of three of its frames.
         deadline_ns = max(self._clock.now_ns(), after_ns) + round(max(self._timeout_s, 3 * max(self._waits_s)) * 1e9)
         dropped = 0
         while True:
@@ -310,6 +311,7 @@ class OpenCvCamera:
     def _hold(self) -> None:
         """Request the camera's own values of the manual controls, too, when it was plugged in again."""
         locks = self.read_locks()
+        # These are not requested by default, and a camera forgets them without power.
         names = ("focus", "sharpness", "backlight_compensation", "power_line_frequency")
         own: dict[str, Any] = {name: getattr(locks, name) for name in names if getattr(self._settings, name) is None}
         if locks.autofocus:

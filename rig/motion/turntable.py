@@ -196,6 +196,7 @@ class Turntable(AbstractContextManager["Turntable"]):
         cable; its own watchdog stops it. `MotionStopped`: the operator requested a stop. `FaultLatched`, `NotReady`: an
         earlier motion was interrupted.
         """
+        # All stops are known before anything moves, so that the whole path can be stored and monitored.
         self.check_target(target_deg)
         waypoints = self._waypoints(target_deg)
         rotation = self._begin(*waypoints)

@@ -234,6 +234,7 @@ class TableRecord:
             self._state.table, self._servo.identity, state.position_deg, condition, self._servo.revolution_deg
         )
         self.angle_reference.shift_deg = check.shift_deg
+        # With other settings, the stored positions mean other angles.
         if check.finding is not AngleFinding.NEVER_REFERENCED and self._settings_changed():
             check = replace(check, finding=AngleFinding.SETTINGS_CHANGED)
         elif check.certain and self.beyond_limits(table_deg := self.angle_reference.to_table(state.position_deg)):

@@ -298,7 +298,7 @@ class GyroRotationMeter:
         rate = new.gyro_dps[:, self._column]
         for tap in self.taps:
             tap(new.time_ns, self._to_table * rate)
-        if new.lost:
+        if new.lost:  # an integral across missing samples is not valid
             self._time_ns, self._rate_dps = self._time_ns[:0], self._rate_dps[:0]
         self._time_ns = np.concatenate([self._time_ns, new.time_ns])
         self._rate_dps = np.concatenate([self._rate_dps, rate])

@@ -181,6 +181,7 @@ class Safety:
         Raises `DeviceSilent`: the servo does not answer.
         """
         self._store.listen()
+        # What the last program left: it may have been killed, with the torque on.
         condition = self._servo.read_condition()
         findings = [f"the bench's stored state is lost: {self._record.damage}"] if self._record.damage else []
         if condition.torque:
@@ -250,6 +251,7 @@ class Safety:
         self.check_stop_request()
         motion = Motion()
         path = [self.angle_reference.to_servo(angle) for angle in ends_deg]
+        # If the program is killed, the next one knows where the servo may be.
         self._record.save_position(path_deg=(min(path), max(path)))
         try:
             self._apply(StateEvent.START)
@@ -339,12 +341,13 @@ class Safety:
         Raises `DeviceFault`, `Overheated`, `SupplyOutOfRange`, `DeviceMismatch`, `DeviceSilent`: the cause is still
         there; the fault stays.
         """
+        # First the supply: without it the servo could not answer.
         for restore in self.restore_actions:
             restore()
         if self.state in (TableState.DISCONNECTED, TableState.STOPPED):
             self.prepare()
         if reboot:
-            if self._record.check_angle():
+            if self._record.check_angle():  # the servo forgets its revolutions, the stored angle gives them back
                 self._record.save_position()
             self._servo.reboot()
         else:

@@ -295,6 +295,7 @@ class Viewer:
             yield attempt
             if attempt.accepted:
                 return
+            # A camera on a busy bus repeats frames; that is no failed attempt.
             if attempt.reasons == (RejectReason.REPEATED_FRAME,) and repeated < MOST_REPEATED:
                 repeated += 1
             after_ns = frame.exposed_ns + 1

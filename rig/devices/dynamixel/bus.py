@@ -143,6 +143,7 @@ class DynamixelBus:
             return self._ask(device_id, READ, self._packets.read_parameters(start, asked), asked)
 
         reply = self._transact(f"read of {size} bytes at {address}", (device_id,), attempt)[device_id]
+        # The reply ended just now, and took its length at the baud rate.
         sent_ns = reply.size * _BITS * 1_000_000_000 // self.port.baudrate
         return reply.data[skipped : skipped + size], self.port.clock.now_ns() - sent_ns
 
@@ -184,24 +185,24 @@ class DynamixelBus:
 
     def _transact(self, what: str, device_ids: Sequence[int], attempt: Callable[[], Answers]) -> dict[int, Reply]:
         """Repeat attempts until all devices have answered or no retries remain; return their replies."""
-        with self._lock:
+        with self._lock:  # the SDK would report to a second thread that the port is busy, or mix up their packets
             for number in range(self._retries + 1):
                 self.statistics.transactions += 1
                 self.statistics.retries += number > 0
                 try:
-                    if self._unanswered:
+                    if self._unanswered:  # the reply to it may be on its way
                         self.port.drain()
                     self._unanswered = True
                     replies, result = attempt()
                 except (serial.SerialException, OSError) as unplugged:
-                    self.port.lost = True
+                    self.port.lost = True  # `reconnect` opens it again
                     step = "Check the adapter's USB plug, then start again."
                     raise self._silent(what, device_ids, f"the port failed: {unplugged}", step) from unplugged
                 except (BusBabble, IndexError):
                     # From some noise the SDK builds a packet that is too short for its own parser.
                     replies, result = {}, COMM_RX_CORRUPT
                 finally:
-                    self.port.is_using = False
+                    self.port.is_using = False  # the SDK leaves it set after an error
                 if result == COMM_SUCCESS:
                     self._unanswered = False
                     self._alerts |= {reply.bus_id: reply.alert for reply in replies.values()}

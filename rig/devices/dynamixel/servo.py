@@ -245,6 +245,7 @@ class DynamixelServo:
         time_ns, values = self._read_fresh() if "Realtime Tick" in self._table else self._read_block(*series.state)
         position, trajectory = values["Present Position"], values.get("Position Trajectory")
         moving = bool(values["Moving"])
+        # A model without Moving Status, trajectory or current has other registers for the same.
         if (status := values.get("Moving Status")) is not None:
             in_position = bool(status & 1)
         else:
@@ -321,7 +322,7 @@ class DynamixelServo:
 
     def torque_on(self) -> None:
         if self._guardian:
-            self._guardian.arm()
+            self._guardian.arm()  # here, so that no command can forget it
         errors = self._hardware_errors()
         if errors:
             raise DeviceFault(
@@ -337,7 +338,7 @@ class DynamixelServo:
         self._write("Torque Enable", 1)
 
     def torque_off(self) -> None:
-        for _ in range(TORQUE_OFF_ATTEMPTS):
+        for _ in range(TORQUE_OFF_ATTEMPTS):  # read back, because the reply to an earlier write may hide a lost one
             self._write("Torque Enable", 0)
             if not self._read("Torque Enable"):
                 if self._guardian:

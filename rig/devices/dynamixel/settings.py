@@ -40,6 +40,7 @@ def wanted(found: Mapping[str, int], mode: Mode) -> dict[str, tuple[int, str]]:
 
     ``found`` has the registers of the model only.
     """
+    # An AX-12A has no Operating Mode: two limits of 0 make it rotate endlessly.
     shutdown, why = _SHUTDOWN if "Operating Mode" in found else _AX_SHUTDOWN
     wheel_mode = found.get("CW Angle Limit") == found.get("CCW Angle Limit") == 0
     needs = {

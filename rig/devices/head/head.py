@@ -105,6 +105,7 @@ class RigHead:
         except BaseException:
             self.close()
             raise
+        # Beside the work, not in its control loop: a slow disk or the operator takes longer than a deadman.
         self._cancel = clock.every(deadman_s / HEARTBEATS_PER_DEADMAN, self._in_background)
 
     # -- IMU --------------------------------------------------------------------------------------------------------
@@ -310,6 +311,7 @@ class RigHead:
     def _poll(self) -> None:
         try:
             self._link.poll()
+            # A head that restarted has lost its sensor's settings, and its clock began again.
             if self._restart is not None and not self._set_up:
                 self._link.identify()
                 self._restart = Reset(self._link.identity.reset_cause)

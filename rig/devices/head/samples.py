@@ -194,6 +194,7 @@ class SampleStream:
     def add(self, sample: Sample) -> None:
         """Add a sample that arrived, and count those that are missing before it."""
         time_us = self._timing.unwrap(sample.time_us)
+        # The index counts the sensor's samples, so that every lost one appears as a gap.
         if self._next_index is not None:
             self._miss((sample.index - self._next_index) % (1 << 16))
         elif self.newest is not None:  # the first sample after a restart of the head or of the connection
@@ -215,7 +216,7 @@ class SampleStream:
         time_ns, sigma_ns = self._timing.to_host(np.array([time_us for time_us, _ in taken], np.int64))
         gyro = np.array([(s.gyro_x, s.gyro_y, s.gyro_z) for _, s in taken], float).reshape(-1, 3)
         if not all(s.flags & SampleFlag.EDGE for _, s in taken):
-            # The head polled the sensor: the sample may be from any time within a period.
+            # Without the data-ready edge the head polled the sensor: the sample may be from any time within a period.
             sigma_ns = hypot(sigma_ns, 1e9 / self._sensor.rate_hz / sqrt(12))
         return ImuSamples(time_ns, gyro / self._sensor.lsb_per_dps, lost, round(sigma_ns))
 
