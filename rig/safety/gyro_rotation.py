@@ -10,7 +10,6 @@ time t is
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from enum import StrEnum
 from math import hypot, inf, isfinite, sqrt
 from typing import Literal
 
@@ -20,7 +19,7 @@ from numpy.typing import NDArray
 from rig.core.clock import Clock
 from rig.core.errors import ConfigError, DeviceFault, DeviceSilent, NotReady, UsageError
 from rig.core.json_form import NumberOrNull
-from rig.core.phrases import signed
+from rig.core.phrases import Worded, filled, signed
 from rig.devices.imu import Imu
 
 Axis = Literal["x", "y", "z"]
@@ -50,11 +49,11 @@ class Bias:
     samples: int
 
 
-class GyroIssue(StrEnum):
+class GyroIssue(Worded):
     """The reasons why a rotation by the gyro is not valid."""
 
-    LOST_SAMPLES = "lost-samples"
-    OUT_OF_RANGE = "out-of-range"
+    LOST_SAMPLES = "lost-samples", "the sensor lost {limit:.0f} samples"
+    OUT_OF_RANGE = "out-of-range", "the rate exceeded the gyro's range of {limit:g} °/s"
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,12 +76,7 @@ class Rotation:
     @property
     def reason(self) -> str:
         """The issue in words; empty if there is none."""
-        match self.issue:
-            case GyroIssue.LOST_SAMPLES:
-                return f"the sensor lost {self.limit:.0f} samples"
-            case GyroIssue.OUT_OF_RANGE:
-                return f"the rate exceeded the gyro's range of {self.limit:g} °/s"
-        return ""
+        return "" if self.issue is None else filled(self.issue.words, limit=self.limit)
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,9 +1,8 @@
 """Captures frames for views and checks them: image quality, camera settings, and whether the table stood still."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from enum import StrEnum
 from math import isfinite
 
 import cv2
@@ -11,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.config import RigConfig, ViewConfig
-from rig.core.phrases import filled
+from rig.core.phrases import Worded, filled
 from rig.devices.camera import Camera, CameraLocks, Frame
 from rig.safety.gyro_rotation import Stillness
 from rig.views.description import within
@@ -32,21 +31,28 @@ SIMILARITY_PX = 4
 """Side of the squares that `image_similarity` averages over."""
 
 
-class RejectReason(StrEnum):
-    """The reasons to reject a frame. `rejection_text` has their texts."""
+class RejectReason(Worded):
+    """The reasons to reject a frame; the texts contain numbers of its `ViewEvidence`."""
 
-    EXPOSED_EARLY = "exposed-early"
-    GYRO_INCOMPLETE = "gyro-incomplete"
-    TABLE_MOVED = "table-moved"
-    REPEATED_FRAME = "repeated-frame"
-    LOCKS_CHANGED = "locks-changed"
-    TOO_DARK = "too-dark"
-    OVEREXPOSED = "overexposed"
-    BLURRED = "blurred"
-    NOISE = "noise"
-    SMEARED = "smeared"
-    ANGLE_UNCERTAIN = "angle-uncertain"
-    TIME_UNCERTAIN = "time-uncertain"
+    EXPOSED_EARLY = "exposed-early", "exposed before the table stood still"
+    GYRO_INCOMPLETE = (
+        "gyro-incomplete",
+        "the gyro's samples are incomplete: it is unknown whether the table stood still",
+    )
+    TABLE_MOVED = (
+        "table-moved",
+        "the table moved ({0.stillness.peak_rate_dps:.2f} °/s, shaft {0.stillness.encoder_change_deg:.2f}°, "
+        "platter {0.stillness.platter_change_deg:+.2f}°)",
+    )
+    REPEATED_FRAME = "repeated-frame", "the camera repeated its last frame"
+    LOCKS_CHANGED = "locks-changed", "a setting of the camera has changed"
+    TOO_DARK = "too-dark", "too dark (mean level {0.mean_level:.1f}, {0.dark_share:.0%} black)"
+    OVEREXPOSED = "overexposed", "overexposed ({0.saturated_share:.0%} saturated)"
+    BLURRED = "blurred", "blurred (sharpness {0.sharpness:.1f})"
+    NOISE = "noise", "noise instead of an image"
+    SMEARED = "smeared", "smeared by {0.motion.smear_px:.1f} px at {0.motion.speed_dps:.0f} °/s"
+    ANGLE_UNCERTAIN = "angle-uncertain", "the angle is uncertain by {0.motion.angle_sigma_deg:.2f}°"
+    TIME_UNCERTAIN = "time-uncertain", "the time stamp does not fit the camera's rhythm"
 
 
 @dataclass(frozen=True, slots=True)
@@ -301,23 +307,7 @@ class Viewer:
             after_ns = frame.exposed_ns + 1
 
 
-_TEXTS: Mapping[str, str] = {
-    RejectReason.EXPOSED_EARLY: "exposed before the table stood still",
-    RejectReason.GYRO_INCOMPLETE: "the gyro's samples are incomplete: it is unknown whether the table stood still",
-    RejectReason.TABLE_MOVED: "the table moved ({0.stillness.peak_rate_dps:.2f} °/s, "
-    "shaft {0.stillness.encoder_change_deg:.2f}°, platter {0.stillness.platter_change_deg:+.2f}°)",
-    RejectReason.REPEATED_FRAME: "the camera repeated its last frame",
-    RejectReason.LOCKS_CHANGED: "a setting of the camera has changed",
-    RejectReason.TOO_DARK: "too dark (mean level {0.mean_level:.1f}, {0.dark_share:.0%} black)",
-    RejectReason.OVEREXPOSED: "overexposed ({0.saturated_share:.0%} saturated)",
-    RejectReason.BLURRED: "blurred (sharpness {0.sharpness:.1f})",
-    RejectReason.NOISE: "noise instead of an image",
-    RejectReason.SMEARED: "smeared by {0.motion.smear_px:.1f} px at {0.motion.speed_dps:.0f} °/s",
-    RejectReason.ANGLE_UNCERTAIN: "the angle is uncertain by {0.motion.angle_sigma_deg:.2f}°",
-    RejectReason.TIME_UNCERTAIN: "the time stamp does not fit the camera's rhythm",
-}
-
-
 def rejection_text(reason: str, evidence: ViewEvidence | ImageQuality) -> str:
     """Return the text of a `RejectReason`, with the numbers of the evidence; an unknown one is returned as it is."""
-    return filled(_TEXTS[reason], evidence) if reason in _TEXTS else str(reason)
+    known = set(RejectReason)
+    return filled(RejectReason(reason).words, evidence) if reason in known else str(reason)
