@@ -6,14 +6,13 @@ Decision: docs/decisions/0001.
 import json
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import replace
 from typing import Any
 
 from pydantic import BaseModel
 
 from rig.bench import Bench, BenchKind
 from rig.bench.computer import Computer
-from rig.config import RigConfig, Section
+from rig.config import CameraConfig, RigConfig, Section
 from rig.config.imus import imu_kind
 from rig.core.clock import Clock, SystemClock
 from rig.core.errors import ConfigError, DeviceMismatch, RigError, StateNotStored
@@ -26,7 +25,7 @@ from rig.devices.dynamixel.servo import open_servo
 from rig.devices.head.head import RigHead, open_head, powered
 from rig.devices.head.protocol import BAUD
 from rig.devices.imu import Imu, open_imu
-from rig.devices.opencv_camera import CameraSettings, OpenCvCamera
+from rig.devices.opencv_camera import OpenCvCamera
 from rig.devices.opencv_capture import Capture
 from rig.devices.servo import Servo
 from rig.safety.saved_state import BenchLock, FileStore, StateStore
@@ -152,7 +151,7 @@ def assemble(
             if config.camera.focus is None:
                 store_focus(state, device, camera.read_locks().focus)
             bench.findings += tuple(
-                f"camera: {n.setting} was set to {n.asked_text}, but the camera reports {n.reported_text}"
+                f"camera: {n.setting} was set to {n.asked}, but the camera reports {n.reported}"
                 for n in camera.rejected_settings
             )
             return camera
@@ -218,9 +217,9 @@ class CameraPlug:
 _FOCUS_FILE = "camera-focus.json"
 
 
-def camera_settings(config: RigConfig, state: StateStore, device: str | None) -> CameraSettings:
+def camera_settings(config: RigConfig, state: StateStore, device: str | None) -> CameraConfig:
     """Return the camera's settings: the configured ones, and the focus that an earlier program has found."""
-    settings = CameraSettings(**config.camera.model_dump(exclude={"source"}))
+    settings = config.camera
     if settings.focus is not None:
         return settings
     try:
@@ -228,7 +227,7 @@ def camera_settings(config: RigConfig, state: StateStore, device: str | None) ->
         focus = float(stored["focus"]) if stored["device"] == device else None
     except (StateNotStored, ValueError, KeyError, TypeError):  # none yet, or damaged: the autofocus settles again
         return settings
-    return replace(settings, focus=focus)
+    return settings.model_copy(update={"focus": focus})
 
 
 def store_focus(state: StateStore, device: str | None, focus: float | None) -> None:

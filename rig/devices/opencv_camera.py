@@ -11,7 +11,7 @@ known in one of three ways (`TimeBase`), which is determined when the camera is 
 
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import Enum
 from math import floor
 from typing import Any, Final
@@ -20,6 +20,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from rig.config import CameraConfig
 from rig.core.clock import Clock, seconds_between
 from rig.core.errors import DeviceFault, DeviceMismatch, DeviceNotFound, DeviceSilent
 from rig.devices import v4l2
@@ -67,51 +68,12 @@ class TimeBase(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class CameraSettings:
-    """Requested settings; None leaves a setting to the camera, except the focus, which is locked after the autofocus.
-
-    Without ``fourcc``, the pixel format is chosen from those of the camera (`rig.devices.v4l2.choose_mode`).
-    ``gain``, ``focus``, ``sharpness`` and ``backlight_compensation`` are in the camera's own units, as `v4l2-ctl
-    --list-ctrls` shows them; ``power_line_frequency`` is the number in its menu.
-    """
-
-    width: int | None = 640
-    height: int | None = 480
-    fps: float | None = 30.0
-    exposure_us: float | None = 10_000.0
-    gain: float | None = 0.0
-    white_balance_k: float | None = 5000.0
-    focus: float | None = None
-    sharpness: float | None = None
-    backlight_compensation: float | None = None
-    power_line_frequency: float | None = None
-    dynamic_frame_rate: bool | None = False
-    fourcc: str | None = None
-
-    def __post_init__(self) -> None:
-        for name in ("width", "height", "fps", "exposure_us", "white_balance_k"):
-            value = getattr(self, name)
-            if value is not None and not 0 < value < float("inf"):
-                raise ValueError(f"{name} = {value!r}: give a positive number, or None to leave it to the camera")
-
-
-@dataclass(frozen=True, slots=True)
 class RejectedSetting:
-    """A setting that the camera did not accept: the requested and the reported value."""
+    """A setting that the camera did not accept: the requested and the reported value, as text."""
 
     setting: str
-    asked: float
-    reported: float
-
-    @property
-    def asked_text(self) -> str:
-        """The requested value as text."""
-        return _value_text(self.setting, self.asked)
-
-    @property
-    def reported_text(self) -> str:
-        """The reported value as text."""
-        return _value_text(self.setting, self.reported)
+    asked: str
+    reported: str
 
 
 def _value_text(setting: str, value: float) -> str:
@@ -129,7 +91,8 @@ class OpenCvCamera:
     capture
         An open source, for example from `open_capture`. The camera closes it.
     settings
-        Requested settings. `rejected_settings` lists those that the camera did not accept.
+        Requested settings; None leaves one to the camera, except the focus, which is locked after the autofocus.
+        `rejected_settings` lists those that the camera did not accept.
     name, device
         See `CameraIdentity`.
     timeout_s
@@ -151,7 +114,7 @@ class OpenCvCamera:
         capture: Capture,
         *,
         clock: Clock,
-        settings: CameraSettings | None = None,
+        settings: CameraConfig | None = None,
         name: str = "camera",
         device: str | None = None,
         timeout_s: float = 3.0,
@@ -163,7 +126,7 @@ class OpenCvCamera:
         self._reopen = reopen
         self._node = node
         self._node_opened = node()
-        self._settings = settings or CameraSettings()
+        self._settings = settings or CameraConfig()
         self._missing = capture.get(_UNKNOWN_PROPERTY)
         self.modes = modes_of(capture)
         self.observers: list[Callable[[NDArray[np.uint8]], object]] = []
@@ -240,7 +203,7 @@ class OpenCvCamera:
 
     # -- settings -----------------------------------------------------------------------------------------------------
 
-    def _configure(self, settings: CameraSettings) -> tuple[RejectedSetting, ...]:
+    def _configure(self, settings: CameraConfig) -> tuple[RejectedSetting, ...]:
         """Request all settings; UVC requires that an automatic is switched off before its value is set."""
         asked: list[tuple[str, int, float]] = []
 
@@ -259,7 +222,7 @@ class OpenCvCamera:
         if settings.exposure_us is not None:
             ask("auto_exposure", cv2.CAP_PROP_AUTO_EXPOSURE, V4L2_EXPOSURE_MANUAL)
             ask("exposure_100us", cv2.CAP_PROP_EXPOSURE, round(settings.exposure_us / _EXPOSURE_UNIT_US))
-            ask("dynamic_frame_rate", v4l2.EXPOSURE_DYNAMIC_FRAMERATE, settings.dynamic_frame_rate)
+            ask("dynamic_frame_rate", v4l2.EXPOSURE_DYNAMIC_FRAMERATE, 0)
         ask("gain", cv2.CAP_PROP_GAIN, settings.gain)
         ask("sharpness", cv2.CAP_PROP_SHARPNESS, settings.sharpness)
         ask("backlight_compensation", cv2.CAP_PROP_BACKLIGHT, settings.backlight_compensation)
@@ -272,16 +235,16 @@ class OpenCvCamera:
         ask("focus", cv2.CAP_PROP_FOCUS, settings.focus)
         read_back = [(name, prop, value, self._capture.get(prop)) for name, prop, value in asked]
         return tuple(
-            RejectedSetting(name, value, reported)
+            RejectedSetting(name, _value_text(name, value), _value_text(name, reported))
             for name, prop, value, reported in read_back
             if prop not in self._supported or abs(reported - value) > (0.01 * abs(value) if name != "fourcc" else 0)
         )
 
-    def _pixel_format(self, settings: CameraSettings) -> str | None:
+    def _pixel_format(self, settings: CameraConfig) -> str | None:
         """Return the pixel format to request; None leaves it to the camera."""
-        if settings.fourcc is not None or settings.width is None or settings.height is None:
+        if settings.fourcc is not None:
             return settings.fourcc
-        mode = choose_mode(self.modes, settings.width, settings.height, settings.fps or 0.0)
+        mode = choose_mode(self.modes, settings.width, settings.height, settings.fps)
         return None if mode is None else mode.fourcc
 
     def _known(self, prop: int) -> float | None:
@@ -306,7 +269,7 @@ class OpenCvCamera:
                 break
         self._capture.set(cv2.CAP_PROP_AUTOFOCUS, 0)
         if (reported := self._capture.get(cv2.CAP_PROP_AUTOFOCUS)) != 0:
-            self.rejected_settings += (RejectedSetting("autofocus", 0, reported),)
+            self.rejected_settings += (RejectedSetting("autofocus", "0", f"{reported:g}"),)
 
     def _hold(self) -> None:
         """Request the camera's own values of the manual controls, too, when it was plugged in again."""
@@ -316,7 +279,7 @@ class OpenCvCamera:
         own: dict[str, Any] = {name: getattr(locks, name) for name in names if getattr(self._settings, name) is None}
         if locks.autofocus:
             del own["focus"]
-        self._settings = replace(self._settings, **own)
+        self._settings = self._settings.model_copy(update=own)
 
     # -- frames -------------------------------------------------------------------------------------------------------
 
