@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import pytest
 import serial
 
+from rig.config import ImuConfig
 from rig.core.clock import Clock, SystemClock
 from rig.devices.dynamixel.port import SerialConnection
 from rig.devices.head.head import RigHead
@@ -47,11 +48,11 @@ def needs(kind: str) -> None:
 
 
 def mpu6050() -> HeadSensor:
-    return head_sensor("mpu6050", address=0x68, range_dps=250, rate_hz=200.0, bandwidth_hz=42)
+    return head_sensor(ImuConfig())
 
 
 def bno055() -> HeadSensor:
-    return head_sensor("bno055", address=0x28, range_dps=2000, rate_hz=100.0, bandwidth_hz=42)
+    return head_sensor(ImuConfig(model="bno055"))
 
 
 @contextmanager

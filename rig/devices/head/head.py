@@ -17,12 +17,10 @@ from numpy.typing import NDArray
 
 from rig.config import HeadConfig, RigConfig
 from rig.core.clock import Clock, seconds_between
-from rig.core.errors import ConfigError, DeviceSilent, EmergencyStop, RequestRejected, RigError
+from rig.core.errors import DeviceSilent, EmergencyStop, RequestRejected, RigError
 from rig.devices.dynamixel.port import SerialConnection
 from rig.devices.head.link import HeadLink, version
 from rig.devices.head.protocol import (
-    DEADMAN_MAX_MS,
-    DEADMAN_MIN_MS,
     SERIAL_UNSET,
     Acknowledge,
     Board,
@@ -66,7 +64,7 @@ class RigHead:
         The silence after which the head switches its outputs off.
 
     Raises `DeviceNotFound`, `FirmwareMismatch`: as `HeadLink.greet`. `DeviceSilent`, `DeviceMismatch`: the sensor on
-    the head does not answer, or is another one. `ConfigError`: the head does not support ``deadman_s``.
+    the head does not answer, or is another one.
     """
 
     def __init__(
@@ -80,11 +78,6 @@ class RigHead:
         reopen: Callable[[], SerialConnection] | None = None,
     ) -> None:
         self._deadman_ms = round(1000 * deadman_s)
-        if not DEADMAN_MIN_MS <= self._deadman_ms <= DEADMAN_MAX_MS:
-            raise ConfigError(
-                f"A deadman of {deadman_s:g} s is not possible.",
-                next_step=f"Set head.deadman_s to {DEADMAN_MIN_MS / 1000:g} to {DEADMAN_MAX_MS / 1000:g}.",
-            )
         self._clock = clock
         self._sensor = sensor
         self._lock = Lock()
@@ -396,18 +389,8 @@ def open_head(config: RigConfig, open_port: Callable[[], SerialConnection], cloc
 
     Raises ConfigError, DeviceNotFound, FirmwareMismatch, DeviceMismatch, DeviceSilent: see `RigHead`.
     """
-    imu = config.imu
-    sensor = head_sensor(
-        imu.model, address=imu.address, range_dps=imu.range_dps, rate_hz=imu.rate_hz, bandwidth_hz=imu.bandwidth_hz
-    )
-    connection = open_port()
-    try:
-        return RigHead(
-            connection, clock, sensor, deadman_s=config.head.deadman_s, name=config.head.port, reopen=open_port
-        )
-    except BaseException:
-        connection.close()
-        raise
+    sensor, head = head_sensor(config.imu), config.head
+    return RigHead(open_port(), clock, sensor, deadman_s=head.deadman_s, name=head.port, reopen=open_port)
 
 
 @contextmanager

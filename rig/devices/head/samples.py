@@ -17,6 +17,7 @@ from math import hypot, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
+from rig.config import ImuConfig
 from rig.config.imus import ImuKind
 from rig.core.clock import Clock, seconds_between
 from rig.core.errors import ConfigError
@@ -56,15 +57,15 @@ class HeadSensor:
     start_s: float
 
 
-def head_sensor(kind: str, *, address: int, range_dps: int, rate_hz: float, bandwidth_hz: int) -> HeadSensor:
-    """Return the sensor ``kind`` (``mpu6050`` or ``bno055``) with these settings; a BNO055 has its own rate and range.
+def head_sensor(config: ImuConfig) -> HeadSensor:
+    """Return the configured sensor; a BNO055 has its own rate and range.
 
-    Raises `ConfigError`: the sensor or the setting does not exist.
+    Raises `ConfigError`: a head does not support the sensor, or the sensor a setting.
     """
-    if kind == "bno055":
+    if config.model == "bno055":
         return HeadSensor(
             kind=bno055.KIND,
-            setup=Imu(ImuModel.BNO055, address, divider=0, filter=1, range=0),
+            setup=Imu(ImuModel.BNO055, config.address, divider=0, filter=1, range=0),
             rate_hz=bno055.RATE_HZ,
             range_dps=bno055.RANGE_DPS,
             noise_dps_rthz=bno055.NOISE_DPS_RTHZ,
@@ -73,19 +74,21 @@ def head_sensor(kind: str, *, address: int, range_dps: int, rate_hz: float, band
             temperature_c=float,
             start_s=6.0,
         )
-    if kind != "mpu6050":
+    if config.model != "mpu6050":
         raise ConfigError(
-            f"A rig head does not support the sensor {kind!r}.",
+            f"A rig head does not support the sensor {config.model!r}.",
             next_step="Set imu.model to mpu6050 or bno055, or connect the sensor to the computer's own I2C bus.",
         )
-    divider, dlpf, full_scale, _ = mpu6050.settings(range_dps, rate_hz, bandwidth_hz)[mpu6050.SMPLRT_DIV]
+    registers = mpu6050.settings(config.range_dps, config.rate_hz, config.bandwidth_hz)
+    divider, dlpf, full_scale, _ = registers[mpu6050.SMPLRT_DIV]
+    lsb_per_dps = mpu6050.LSB_PER_DPS[config.range_dps]
     return HeadSensor(
         kind=mpu6050.Mpu6050.KIND,
-        setup=Imu(ImuModel.MPU6050, address, divider=divider, filter=dlpf, range=full_scale >> 3),
+        setup=Imu(ImuModel.MPU6050, config.address, divider=divider, filter=dlpf, range=full_scale >> 3),
         rate_hz=1000.0 / (divider + 1),
-        range_dps=32767 / mpu6050.LSB_PER_DPS[range_dps],
+        range_dps=32767 / lsb_per_dps,
         noise_dps_rthz=mpu6050.NOISE_DPS_RTHZ,
-        lsb_per_dps=mpu6050.LSB_PER_DPS[range_dps],
+        lsb_per_dps=lsb_per_dps,
         lsb_per_g=mpu6050.LSB_PER_G,
         temperature_c=lambda raw: raw / 340 + 36.53,
         start_s=0.6,

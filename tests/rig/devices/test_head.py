@@ -3,7 +3,6 @@
 import pytest
 
 from rig.core.errors import (
-    ConfigError,
     DeviceMismatch,
     DeviceNotFound,
     DeviceSilent,
@@ -104,11 +103,6 @@ def test_missing_or_wrong_sensor_is_reported():
         head.attach(0x68, SimMpu6050(head.world_at_board_time, who_am_i=0x70))
         with pytest.raises(DeviceMismatch, match=r"0x70, expected 0x68.*MPU-6500"):
             RigHead(HeadSerial(head), world.clock, mpu6050())
-
-
-def test_impossible_deadman_is_rejected(opened):
-    with pytest.raises(ConfigError, match="deadman"):
-        RigHead(HeadSerial(opened.head), opened.clock, mpu6050(), deadman_s=3.0)
 
 
 # -- outputs -----------------------------------------------------------------------------------------------------
