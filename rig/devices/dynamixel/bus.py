@@ -28,12 +28,6 @@ CONFIRM_ATTEMPTS = 16
 """Largest number of repetitions of a reading until only its reply arrives."""
 
 _BITS = 10  # a byte with its start and stop bit
-_ECHO_SIZE = 2  # in Protocol 1.0, an echoed instruction that reads this number of bytes is a valid reply to itself
-
-READ_LENGTHS = {1: 16, 2: 4}
-"""Reads in a row have this number of different lengths, by protocol: a repeated answer to an earlier one does not fit.
-In Protocol 2.0 the servo's clock shows the age of a reading, too."""
-
 Answers = tuple[dict[int, Reply], int]
 """Replies by id, and the SDK's result for missing ones."""
 
@@ -81,9 +75,8 @@ class DynamixelBus:
         self._alerts: dict[int, int] = {}
         self._reads = 0
         self._unanswered = False  # the last request, also if Ctrl+C interrupted it: its reply may still arrive
-        self._outstanding: list[
-            tuple[int, int]
-        ] = []  # replies that may still arrive: number of parameters, time of the request
+        # Replies that may still arrive: number of parameters, and time of the request.
+        self._outstanding: list[tuple[int, int]] = []
         self._foreign_ns: int | None = None  # when the last reply arrived that belongs to no request
 
     def alert(self, device_id: int) -> int:
@@ -92,7 +85,7 @@ class DynamixelBus:
 
     def ping(self, device_id: int) -> int:
         """Return the model number of the device."""
-        if self.protocol == 1 or self._is_outstanding(3):  # an echoed ping of Protocol 1.0 is a valid reply to itself
+        if self._packets.echo_sizes or self._is_outstanding(3):  # an echoed ping is a valid reply to itself
             return int.from_bytes(self.read_block(device_id, 0, 3)[:2], "little")
         answer = self._transact("ping", (device_id,), lambda: self._ask(device_id, PING, b"", 3))[device_id]
         return int.from_bytes(answer.data[:2], "little")
@@ -107,7 +100,7 @@ class DynamixelBus:
         already or arrives before the reply to the second reading; then both are discarded.
         """
         data, self.sampled_ns = self._read_once(device_id, address, size)
-        if dated or not (self.protocol == 1 or self._repeats_replies()):
+        if dated or not (self._packets.undated or self._repeats_replies()):
             return data
         counts = self.statistics
         for _ in range(CONFIRM_ATTEMPTS):
@@ -172,7 +165,7 @@ class DynamixelBus:
 
         Raises `UsageError`: Protocol 1.0 does not have this instruction.
         """
-        if self.protocol == 1:
+        if not self._packets.reboots:
             raise UsageError(
                 "A servo with Protocol 1.0 cannot be restarted over its bus.", next_step="Switch its supply off and on."
             )
@@ -253,7 +246,7 @@ class DynamixelBus:
                 self.statistics.foreign += 1
             elif reply.error and not reply.data and ambiguous:
                 doubtful[reply.bus_id] = reply
-            elif self.protocol == 1 and reply.data == parameters and len(parameters) not in (0, size):
+            elif self._packets.echo_sizes and reply.data == parameters and len(parameters) not in (0, size):
                 pass  # the adapter's echo of the instruction
             elif len(reply.data) != size and not (reply.error and not reply.data):
                 self.statistics.late += 1
@@ -273,9 +266,9 @@ class DynamixelBus:
 
     def _unambiguous(self, address: int, size: int) -> tuple[int, int]:
         """Return start and size of a read that includes ``size`` bytes at ``address`` and has an unambiguous reply."""
-        asked = size + min(self._reads % READ_LENGTHS[self.protocol], address)
+        asked = size + min(self._reads % self._packets.read_lengths, address)
         self._reads += 1
-        while self._is_outstanding(asked) or (self.protocol == 1 and asked == _ECHO_SIZE):
+        while self._is_outstanding(asked) or asked in self._packets.echo_sizes:
             asked += 1
         return max(address - (asked - size), 0), asked
 

@@ -39,9 +39,16 @@ class Packets2(Protocol2PacketHandler):  # type: ignore[misc]
     """Protocol 2.0.
 
     ``rejections`` are the meanings of the error of a `Reply`, and ``corrupted`` is the error by which the device
-    reports that the instruction arrived damaged. ``start`` are the first bytes of a packet.
+    reports that the instruction arrived damaged. ``start`` are the first bytes of a packet. Reads in a row have
+    ``read_lengths`` different lengths, so that a repeated answer to an earlier one does not fit. An echoed instruction
+    that reads one of ``echo_sizes`` bytes is a valid reply to itself. The readings are ``undated`` if no servo of the
+    protocol has a clock that shows their age. ``reboots`` is whether there is an instruction to restart.
     """
 
+    read_lengths: ClassVar[int] = 4
+    echo_sizes: ClassVar[tuple[int, ...]] = ()
+    undated: ClassVar[bool] = False
+    reboots: ClassVar[bool] = True
     rejections: ClassVar[dict[int, str]] = {
         1: "result fail",
         2: "instruction error",
@@ -102,6 +109,10 @@ class Packets1(Protocol1PacketHandler):  # type: ignore[misc]
     two bytes returns as a valid status packet; `DynamixelBus` never sends one.
     """
 
+    read_lengths: ClassVar[int] = 16
+    echo_sizes: ClassVar[tuple[int, ...]] = (2,)
+    undated: ClassVar[bool] = True
+    reboots: ClassVar[bool] = False
     rejections: ClassVar[dict[int, str]] = {
         0x10: "checksum error",
         0x02: "outside the angle limits",
