@@ -125,7 +125,7 @@ def sentence(text: str) -> str:
 MESSAGE = (
     "",
     "",
-    "class Message:",
+    "class HeadMessage:",
     '    """A message: its id, and the layout of its body."""',
     "",
     "    __slots__ = ()",
@@ -167,7 +167,7 @@ def module(table: Table) -> str:
     for message in table["message"]:
         fields = message["fields"]
         layout = "<" + "".join(PY_FORMATS[kind] for _, kind, _ in fields)
-        kind = f'Message, number=0x{message["id"]:02X}, layout="{layout}"'
+        kind = f'HeadMessage, number=0x{message["id"]:02X}, layout="{layout}"'
         lines += ["", "", "@dataclass(frozen=True, slots=True)", f"class {camel(message['name'])}({kind}):"]
         lines += [f'    """{message["doc"]}"""', *([""] if fields else [])]
         for name, _, doc in fields:

@@ -1,6 +1,6 @@
 """A Dynamixel servo: of the X series, of the MX series (2.0), or an AX-12A.
 
-One class drives all of them. What differs is a row (`Series`), or follows from the registers that a model has or lacks.
+One class drives all of them. What differs is a row (`ServoSeries`), or follows from the registers that a model lacks.
 
 Decision: docs/decisions/0011.
 """
@@ -59,7 +59,7 @@ def _by_direction_bit(value: int) -> int:
 
 
 @dataclass(frozen=True, slots=True)
-class Series:
+class ServoSeries:
     """What differs between two series of servos: units at the servo's own shaft, and names of registers.
 
     ``state`` and ``condition`` are the first and the last register of the blocks that `DynamixelServo.read_state` and
@@ -83,7 +83,7 @@ class Series:
 
 
 SERIES: Final = {
-    2: Series(
+    2: ServoSeries(
         deg_per_count=DEG_PER_COUNT,
         dps_per_unit=DPS_PER_UNIT,
         dps2_per_unit=214.577 * 6.0 / 60.0,  # Profile Acceleration: 214.577 rev/min²
@@ -96,7 +96,7 @@ SERIES: Final = {
         profile_velocity="Profile Velocity",
         volatile="Profile Acceleration",
     ),
-    1: Series(
+    1: ServoSeries(
         deg_per_count=300.0 / 1023,
         dps_per_unit=0.111 * 6.0,
         dps2_per_unit=2000.0,  # its fastest acceleration, estimated from its 354 °/s, because no document states it

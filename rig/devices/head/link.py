@@ -76,7 +76,7 @@ class CrcError(FrameError):
 
 
 @dataclass(frozen=True, slots=True)
-class Frame:
+class HeadFrame:
     """The content of a frame."""
 
     id: int
@@ -84,14 +84,14 @@ class Frame:
     body: bytes
 
 
-def encode(frame: Frame) -> bytes:
+def encode(frame: HeadFrame) -> bytes:
     """Return the frame's bytes on the wire, including the zero that ends them."""
     content = bytes([frame.id, frame.sequence]) + frame.body
     encoded: bytes = cobs.encode(content + crc_hqx(content, 0xFFFF).to_bytes(CRC, "big"))
     return encoded + b"\0"
 
 
-def decode(line: bytes) -> Frame:
+def decode(line: bytes) -> HeadFrame:
     """Return the frame in ``line``, the bytes between two zeros.
 
     Raises `CrcError`: the checksum is wrong. `FrameError`: the bytes are not COBS, too few or too many.
@@ -106,7 +106,7 @@ def decode(line: bytes) -> Frame:
         raise FrameError(f"{len(content)} bytes, shorter than any frame")
     if crc_hqx(content, 0xFFFF):  # over data and its CRC the remainder is 0
         raise CrcError(f"wrong checksum in {line.hex()}")
-    return Frame(content[0], content[1], content[HEADER:-CRC])
+    return HeadFrame(content[0], content[1], content[HEADER:-CRC])
 
 
 @dataclass(slots=True)
@@ -136,7 +136,7 @@ class Deframer:
         self._statistics = statistics
         self._line = bytearray()
 
-    def feed(self, data: bytes) -> Iterator[Frame]:
+    def feed(self, data: bytes) -> Iterator[HeadFrame]:
         """Add bytes and yield the frames that they complete."""
         *lines, rest = (bytes(self._line) + data).split(b"\0")
         # A frame that is too long is invalid: keep only enough of it to detect that.
@@ -197,7 +197,7 @@ class HeadLink:
         self._deframer = Deframer(self.statistics)
         self._sequence = 0
         self._event_sequence: int | None = None
-        self._reply: Frame | None = None
+        self._reply: HeadFrame | None = None
 
     def frame_ns(self, body_bytes: int) -> float:
         """Return the time that a frame with such a body takes on the wire."""
@@ -313,7 +313,7 @@ class HeadLink:
         `RequestRejected`: the head rejected the request; the error says why.
         """
         self._sequence = (self._sequence + 1) % 256
-        frame = encode(Frame(message.ID, self._sequence, message.LAYOUT.pack(*astuple(message))))
+        frame = encode(HeadFrame(message.ID, self._sequence, message.LAYOUT.pack(*astuple(message))))
         reply_bytes = protocol.REPLIES.get(type(message), Done).LAYOUT.size + OVERHEAD
         for attempt in range(attempts):
             self.statistics.retries += bool(attempt)
@@ -390,7 +390,7 @@ class HeadLink:
             else:
                 self.statistics.late += 1
 
-    def _event(self, frame: Frame) -> None:
+    def _event(self, frame: HeadFrame) -> None:
         event = _parse(frame)
         if isinstance(event, Sample | StatusChanged):
             if self._event_sequence is not None:
@@ -414,7 +414,7 @@ def version(identity: Identity) -> str:
     return f"{identity.major}.{identity.minor}.{identity.patch}"
 
 
-def _parse(frame: Frame) -> Answer | None:
+def _parse(frame: HeadFrame) -> Answer | None:
     """Return the frame as a message; None if it is no message of this protocol."""
     kind = protocol.MESSAGES.get(frame.id)
     if kind is None or kind.LAYOUT.size != len(frame.body):

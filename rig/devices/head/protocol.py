@@ -110,7 +110,7 @@ class SampleFlag(IntFlag):
     EDGE = 1
 
 
-class Message:
+class HeadMessage:
     """A message: its id, and the layout of its body."""
 
     __slots__ = ()
@@ -123,14 +123,14 @@ class Message:
 
 
 @dataclass(frozen=True, slots=True)
-class Hello(Message, number=0x01, layout="<B"):
+class Hello(HeadMessage, number=0x01, layout="<B"):
     """Ask for the head's identity; the head answers any protocol version."""
 
     protocol: int  # Protocol version of the host.
 
 
 @dataclass(frozen=True, slots=True)
-class Heartbeat(Message, number=0x02, layout="<HIII"):
+class Heartbeat(HeadMessage, number=0x02, layout="<HIII"):
     """Heartbeat of the host. It has as many bytes as its reply, so that both take the same time on the wire."""
 
     deadman_ms: int  # Longest silence until the next heartbeat.
@@ -140,40 +140,40 @@ class Heartbeat(Message, number=0x02, layout="<HIII"):
 
 
 @dataclass(frozen=True, slots=True)
-class Shutdown(Message, number=0x03, layout="<"):
+class Shutdown(HeadMessage, number=0x03, layout="<"):
     """Switch the outputs and the deadman off, and end the stream."""
 
 
 @dataclass(frozen=True, slots=True)
-class Acknowledge(Message, number=0x04, layout="<B"):
+class Acknowledge(HeadMessage, number=0x04, layout="<B"):
     """Clear latched faults whose cause is gone."""
 
     faults: int  # The faults that the operator has seen; others stay.
 
 
 @dataclass(frozen=True, slots=True)
-class Light(Message, number=0x05, layout="<B"):
+class Light(HeadMessage, number=0x05, layout="<B"):
     """Set the ring light."""
 
     level: int  # Duty in 1/255; 0 is off.
 
 
 @dataclass(frozen=True, slots=True)
-class Relay(Message, number=0x06, layout="<B"):
+class Relay(HeadMessage, number=0x06, layout="<B"):
     """Close or open the servo-power relay."""
 
     closed: int  # 0 or 1.
 
 
 @dataclass(frozen=True, slots=True)
-class Trigger(Message, number=0x07, layout="<H"):
+class Trigger(HeadMessage, number=0x07, layout="<H"):
     """Send one pulse to the camera."""
 
     width_us: int  # Length of the pulse.
 
 
 @dataclass(frozen=True, slots=True)
-class Imu(Message, number=0x08, layout="<BBBBB"):
+class Imu(HeadMessage, number=0x08, layout="<BBBBB"):
     """Set up the sensor; `status_changed` and each `heartbeat_reply` report the result."""
 
     model: int  # Imu_model.
@@ -184,26 +184,26 @@ class Imu(Message, number=0x08, layout="<BBBBB"):
 
 
 @dataclass(frozen=True, slots=True)
-class Stream(Message, number=0x09, layout="<B"):
+class Stream(HeadMessage, number=0x09, layout="<B"):
     """Start or stop sending samples."""
 
     on: int  # 0 or 1.
 
 
 @dataclass(frozen=True, slots=True)
-class ReadCounters(Message, number=0x0A, layout="<"):
+class ReadCounters(HeadMessage, number=0x0A, layout="<"):
     """Ask for the counters of errors since the start."""
 
 
 @dataclass(frozen=True, slots=True)
-class SetSerial(Message, number=0x0B, layout="<I"):
+class SetSerial(HeadMessage, number=0x0B, layout="<I"):
     """Store the serial number in permanent memory, but not while the head is active. Since firmware 1.1."""
 
     serial: int  # Serial number; serial_unset removes it.
 
 
 @dataclass(frozen=True, slots=True)
-class Done(Message, number=0x80, layout="<BB"):
+class Done(HeadMessage, number=0x80, layout="<BB"):
     """The request was carried out or rejected; also the reply to unknown requests."""
 
     request: int  # Message id of the request.
@@ -211,7 +211,7 @@ class Done(Message, number=0x80, layout="<BB"):
 
 
 @dataclass(frozen=True, slots=True)
-class Identity(Message, number=0x81, layout="<BBBBBBBII"):
+class Identity(HeadMessage, number=0x81, layout="<BBBBBBBII"):
     """Identity of the head."""
 
     protocol: int  # Protocol version of the head.
@@ -226,7 +226,7 @@ class Identity(Message, number=0x81, layout="<BBBBBBBII"):
 
 
 @dataclass(frozen=True, slots=True)
-class HeartbeatReply(Message, number=0x82, layout="<IIBBBBBB"):
+class HeartbeatReply(HeadMessage, number=0x82, layout="<IIBBBBBB"):
     """Two times of the head's clock, and its status."""
 
     received_us: int  # When the heartbeat's last byte arrived.
@@ -240,7 +240,7 @@ class HeartbeatReply(Message, number=0x82, layout="<IIBBBBBB"):
 
 
 @dataclass(frozen=True, slots=True)
-class Triggered(Message, number=0x87, layout="<IH"):
+class Triggered(HeadMessage, number=0x87, layout="<IH"):
     """The pulse started."""
 
     time_us: int  # Its leading edge.
@@ -248,7 +248,7 @@ class Triggered(Message, number=0x87, layout="<IH"):
 
 
 @dataclass(frozen=True, slots=True)
-class Counters(Message, number=0x8A, layout="<HHHHHHHHHH"):
+class Counters(HeadMessage, number=0x8A, layout="<HHHHHHHHHH"):
     """Counters since the start; they stop at 65535."""
 
     frames: int  # Whole frames received.
@@ -264,7 +264,7 @@ class Counters(Message, number=0x8A, layout="<HHHHHHHHHH"):
 
 
 @dataclass(frozen=True, slots=True)
-class Sample(Message, number=0xC0, layout="<HIBBhhhhhhh"):
+class Sample(HeadMessage, number=0xC0, layout="<HIBBhhhhhhh"):
     """One sample of the sensor."""
 
     index: int  # Count of the sensor's samples, including lost ones.
@@ -281,7 +281,7 @@ class Sample(Message, number=0xC0, layout="<HIBBhhhhhhh"):
 
 
 @dataclass(frozen=True, slots=True)
-class StatusChanged(Message, number=0xC1, layout="<IBBBBBB"):
+class StatusChanged(HeadMessage, number=0xC1, layout="<IBBBBBB"):
     """The state, a fault, the e-stop or the sensor changed; also the first message after a start."""
 
     time_us: int  # When.

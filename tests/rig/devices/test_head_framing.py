@@ -8,15 +8,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rig.devices.head import protocol
-from rig.devices.head.link import LONGEST, CrcError, Deframer, Frame, FrameError, HeadStatistics, decode, encode
+from rig.devices.head.link import LONGEST, CrcError, Deframer, FrameError, HeadFrame, HeadStatistics, decode, encode
 from tests.fuzzing import fuzz_settings
 
 BYTE = st.integers(0, 255)
-FRAMES = st.builds(Frame, BYTE, BYTE, st.binary(max_size=protocol.MAX_BODY))
+FRAMES = st.builds(HeadFrame, BYTE, BYTE, st.binary(max_size=protocol.MAX_BODY))
 
 
 def test_checksum_is_crc_16_ccitt_false():
-    line = encode(Frame(0x31, 0x32, b"3456789"))
+    line = encode(HeadFrame(0x31, 0x32, b"3456789"))
     assert cobs.decode(line[:-1]) == b"123456789" + (0x29B1).to_bytes(2, "big")
 
 
@@ -54,7 +54,7 @@ def test_random_bytes_raise_only_frame_errors(line):
 def test_frames_are_found_however_the_stream_is_split(parts, data):
     stream, expected = b"\0", []
     for part in parts:
-        if isinstance(part, Frame):
+        if isinstance(part, HeadFrame):
             stream += encode(part)
             expected.append(part)
         else:
@@ -73,11 +73,11 @@ def test_endless_frame_uses_bounded_memory():
     for _ in range(1000):
         assert list(deframer.feed(b"\xff" * 4096)) == []
     assert len(deframer._line) <= LONGEST
-    assert list(deframer.feed(b"\0" + encode(Frame(1, 2, b"3")))) == [Frame(1, 2, b"3")]
+    assert list(deframer.feed(b"\0" + encode(HeadFrame(1, 2, b"3")))) == [HeadFrame(1, 2, b"3")]
 
 
 def test_wrong_checksum_and_garbage_are_distinguished():
-    line = bytearray(encode(Frame(1, 2, b"abc"))[:-1])
+    line = bytearray(encode(HeadFrame(1, 2, b"abc"))[:-1])
     line[3] ^= 0x10
     with pytest.raises(CrcError):
         decode(bytes(line))
