@@ -5,7 +5,7 @@ known in one of three ways (`TimeBase`), which is determined when the camera is 
 
 - stamped: ``CAP_PROP_POS_MSEC`` is the bench's monotonic clock in milliseconds, as in V4L2. Each frame has its time.
 - paced: a live source with other stamps. A frame for which `grab` had to wait is new, and its exposure began at most
-  ``latency_s`` before it arrived. The frames before it empty the buffer.
+  `LATENCY_FRAMES` before it arrived. The frames before it empty the buffer.
 - recorded: a source with a known number of frames, such as a video file. A frame counts as exposed when it is read.
 """
 
@@ -32,6 +32,10 @@ V4L2_EXPOSURE_MANUAL = 1
 _V4L2_EXPOSURE_AUTO = (0, 3)  # fully automatic, and aperture priority: the camera sets the time
 _EXPOSURE_UNIT_US = 100.0  # V4L2_CID_EXPOSURE_ABSOLUTE
 
+TIMEOUT_S = 3.0
+"""How long `OpenCvCamera.capture` waits for a new frame, and for a camera that was unplugged."""
+LATENCY_FRAMES = 3
+"""For a paced source: longest time from the start of the exposure until `grab` returns, in periods."""
 _PROBES = 16  # frames to examine when opened: more than a driver buffers
 _RETRIES = 5  # attempts to grab a frame
 _FRESH_S = 1.0  # largest age of a frame that the camera just delivered
@@ -95,13 +99,9 @@ class OpenCvCamera:
         `rejected_settings` lists those that the camera did not accept.
     name, device
         See `CameraIdentity`.
-    timeout_s
-        How long `capture` waits for a new frame.
-    latency_s
-        For a paced source: longest time from the start of the exposure until `grab` returns; None: three frames.
     reopen
         Opens the source again (raises DeviceNotFound while it is missing). A camera that was unplugged for less than
-        ``timeout_s`` gets its settings again and continues.
+        `TIMEOUT_S` gets its settings again and continues.
     node
         Returns what identifies the device file now, None if it is missing. Another value than at the opening means that
         the camera was unplugged: `cv2.VideoCapture.isOpened` stays True on V4L2.
@@ -117,8 +117,6 @@ class OpenCvCamera:
         settings: CameraConfig | None = None,
         name: str = "camera",
         device: str | None = None,
-        timeout_s: float = 3.0,
-        latency_s: float | None = None,
         reopen: Callable[[], Capture] | None = None,
         node: Callable[[], object] = lambda: None,
     ) -> None:
@@ -132,7 +130,6 @@ class OpenCvCamera:
         self.observers: list[Callable[[NDArray[np.uint8]], object]] = []
         self.returns = 0
         self._clock = clock
-        self._timeout_s = timeout_s
         self._supported: set[int] = set()
         self.rejected_settings: tuple[RejectedSetting, ...] = self._configure(self._settings)
         self.identity = CameraIdentity(
@@ -143,7 +140,7 @@ class OpenCvCamera:
             device,
         )
         self._period_s = 1 / self.identity.fps if 1 <= self.identity.fps <= 1000 else 1 / 30
-        self._latency_ns = round((3 * self._period_s if latency_s is None else latency_s) * 1e9)
+        self._latency_ns = round(LATENCY_FRAMES * self._period_s * 1e9)
         self._last_stamp_ns = -1
         self._arrived_ns = clock.now_ns()
         self._waits_s: deque[float] = deque([self._period_s], maxlen=4)
@@ -163,7 +160,7 @@ class OpenCvCamera:
         `DeviceMismatch`: after it was unplugged, another camera answers, or the camera has another mode.
         """
         # A camera that is slower than its mode says gets the time of three of its frames.
-        deadline_ns = max(self._clock.now_ns(), after_ns) + round(max(self._timeout_s, 3 * max(self._waits_s)) * 1e9)
+        deadline_ns = max(self._clock.now_ns(), after_ns) + round(max(TIMEOUT_S, 3 * max(self._waits_s)) * 1e9)
         dropped = 0
         while True:
             if self.time_base is TimeBase.RECORDED:
@@ -177,7 +174,7 @@ class OpenCvCamera:
             dropped += 1
             if self._clock.now_ns() > deadline_ns:
                 raise DeviceSilent(
-                    f"{self.identity.name} delivered no new frame in {self._timeout_s:g} s.",
+                    f"{self.identity.name} delivered no new frame in {TIMEOUT_S:g} s.",
                     next_step="Check the camera's cable. If the exposure is long or the USB bus is busy, give a longer "
                     "time-out.",
                     evidence={"dropped_frames": dropped, "time_base": self.time_base.value, "after_ns": after_ns},
@@ -303,7 +300,7 @@ class OpenCvCamera:
         Raises `DeviceSilent`: the stream hangs.
         """
         if wait := waiter_of(self._capture):
-            limit_s, begun_ns = max(self._timeout_s, 3 * max(self._waits_s)), self._clock.now_ns()
+            limit_s, begun_ns = max(TIMEOUT_S, 3 * max(self._waits_s)), self._clock.now_ns()
             while not wait(_SLICE_S):
                 if seconds_between(begun_ns, self._clock.now_ns()) > limit_s:
                     raise self._no_frames(1, limit_s)
@@ -333,7 +330,7 @@ class OpenCvCamera:
         """Wait until the camera is connected again, and set it up as before."""
         self._capture.release()
         meanwhile()
-        end_ns = self._clock.now_ns() + round(self._timeout_s * 1e9)
+        end_ns = self._clock.now_ns() + round(TIMEOUT_S * 1e9)
         while True:
             try:
                 self._capture = reopen()
@@ -342,7 +339,7 @@ class OpenCvCamera:
             except DeviceNotFound as missing:
                 if self._clock.now_ns() > end_ns:
                     raise DeviceSilent(
-                        f"{self.identity.name} was disconnected for more than {self._timeout_s:g} s.",
+                        f"{self.identity.name} was disconnected for more than {TIMEOUT_S:g} s.",
                         next_step=missing.steps,
                         evidence=missing.evidence,
                     ) from missing
@@ -371,7 +368,7 @@ class OpenCvCamera:
     def _grab_now(self, meanwhile: Callable[[], object] | None) -> int | None:
         first_ns = self._clock.now_ns()
         attempts, waited_s = 0, 0.0
-        while attempts < _RETRIES and waited_s <= self._timeout_s:  # V4L2 itself waits long for a hanging stream
+        while attempts < _RETRIES and waited_s <= TIMEOUT_S:  # V4L2 itself waits long for a hanging stream
             if attempts:
                 self._clock.sleep(self._period_s)
             asked_ns = self._clock.now_ns()

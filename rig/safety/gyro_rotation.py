@@ -35,6 +35,8 @@ FINE_DPS = 550.0
 """Up to this range, a sensor's steps are small enough to show its noise."""
 REST_PEAK_DPS = 0.5
 """Largest deviation from the mean rate at rest: eight sigma of the sensor's noise, a ringing of 0.01°."""
+AGREED_SIGMAS = 4.0
+"""Largest difference of encoder and gyro that agrees, in standard deviations, apart from the backlash."""
 MAX_BIAS_DPS = 25.0
 """Largest bias of a gyro: ±20 °/s (PS-MPU-6000A, 6.1), and a margin for temperature."""
 
@@ -105,13 +107,11 @@ class Stillness:
     """Whether these values count as rest."""
 
 
-def compare(
-    encoder_deg: float, gyro: Rotation, *, encoder_sigma_deg: float, backlash_deg: float = 0.0, k: float = 4.0
-) -> Agreement:
+def compare(encoder_deg: float, gyro: Rotation, *, encoder_sigma_deg: float, backlash_deg: float = 0.0) -> Agreement:
     """Compare a rotation by the encoder with the gyro's.
 
     The encoder is on the shaft and does not measure the gears' backlash: a difference of up to ``backlash_deg`` plus
-    ``k`` standard deviations agrees.
+    `AGREED_SIGMAS` standard deviations agrees.
 
     Raises `UsageError`: the gyro's rotation is not valid.
     """
@@ -119,7 +119,9 @@ def compare(
         raise UsageError(
             f"The gyro's rotation is not valid: {gyro.reason}.", next_step="Check `valid` before comparing."
         )
-    return Agreement(encoder_deg - gyro.angle_deg, k * hypot(gyro.sigma_deg, encoder_sigma_deg) + backlash_deg)
+    return Agreement(
+        encoder_deg - gyro.angle_deg, AGREED_SIGMAS * hypot(gyro.sigma_deg, encoder_sigma_deg) + backlash_deg
+    )
 
 
 def finite(value: float) -> float | None:

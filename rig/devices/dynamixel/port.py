@@ -23,6 +23,9 @@ READ_SLICE_S = 0.005
 BABBLE_GRACE_MS = 50.0
 """How long a packet may exceed its timeout while bytes keep arriving; the SDK itself has no limit."""
 
+QUIET_S, DRAIN_S = 0.005, 0.25
+"""How long a bus must be quiet before the next request, and how long to wait for that."""
+
 
 class SerialConnection(Protocol):
     """The part of `serial.Serial` that the port uses."""
@@ -211,13 +214,13 @@ class ClockedPort(PortHandler):  # type: ignore[misc]
             raise BusBabble
         return data
 
-    def drain(self, quiet_s: float = 0.005, limit_s: float = 0.25) -> None:
-        """Drop what arrives until the bus has been quiet for ``quiet_s``.
+    def drain(self) -> None:
+        """Drop what arrives until the bus has been quiet for `QUIET_S`.
 
         Otherwise a reply after its timeout would be accepted as the reply to the next request, because Protocol 2.0 has
         no sequence numbers.
         """
         start_ns = last_ns = self.clock.now_ns()
-        while (now_ns := self.clock.now_ns()) - last_ns < quiet_s * 1e9 and now_ns - start_ns < limit_s * 1e9:
+        while (now_ns := self.clock.now_ns()) - last_ns < QUIET_S * 1e9 and now_ns - start_ns < DRAIN_S * 1e9:
             if self.ser.read(256):
                 last_ns = self.clock.now_ns()
