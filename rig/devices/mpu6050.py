@@ -253,6 +253,7 @@ class Mpu6050Clone(Mpu6050):
 
     def _set_up(self) -> None:
         super()._set_up()
+        # Its samples and gravity at rest.
         due = min(float(_TESTED_SAMPLES), _TESTED_S * self.rate_hz)
         self._clock.sleep(due / self.rate_hz)
         samples, gravity_g = self.read_samples(), float(np.linalg.norm(self.read_gravity_g()))
@@ -267,6 +268,7 @@ class Mpu6050Clone(Mpu6050):
             problems.append(f"its rates scatter by {noise_dps:.0f} °/s")
         if not 0.8 < gravity_g < 1.2:
             problems.append(f"gravity is {gravity_g:.2f} g")
+        # Its self-test, only if the samples can be trusted.
         response_dps = np.zeros(3) if problems else self._self_test(rates.mean(axis=0))
         low_dps, high_dps = _SELF_TEST_DPS
         if not problems and not all(low_dps <= abs(one) <= high_dps for one in response_dps):

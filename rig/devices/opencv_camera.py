@@ -130,6 +130,7 @@ class OpenCvCamera:
         self.observers: list[Callable[[NDArray[np.uint8]], object]] = []
         self.returns = 0
         self._clock = clock
+        # Lock the settings, then read back what the camera made of them.
         self._supported: set[int] = set()
         self.rejected_settings: tuple[RejectedSetting, ...] = self._configure(self._settings)
         self.identity = CameraIdentity(
@@ -144,6 +145,7 @@ class OpenCvCamera:
         self._last_stamp_ns = -1
         self._arrived_ns = clock.now_ns()
         self._waits_s: deque[float] = deque([self._period_s], maxlen=4)
+        # Only frames show how their time is known, and where the autofocus stops.
         self.time_base: TimeBase = TimeBase.STAMPED
         self.time_base = self._find_time_base()
         if self._settings.focus is None and self.time_base is not TimeBase.RECORDED:
@@ -328,6 +330,7 @@ class OpenCvCamera:
 
     def _reconnect(self, reopen: Callable[[], Capture], meanwhile: Callable[[], object]) -> None:
         """Wait until the camera is connected again, and set it up as before."""
+        # Wait for it.
         self._capture.release()
         meanwhile()
         end_ns = self._clock.now_ns() + round(TIMEOUT_S * 1e9)
@@ -345,6 +348,7 @@ class OpenCvCamera:
                     ) from missing
                 self._clock.sleep(_REPLUG_PAUSE_S)
                 meanwhile()
+        # Set it up as before, and accept no other camera.
         meanwhile()
         self._last_stamp_ns = -1
         rejected_settings, mode = self._configure(self._settings), (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)

@@ -401,6 +401,7 @@ class Turntable(AbstractContextManager["Turntable"]):
         arrival = self._arrival_at(goal_deg, quiet_s, self._allowed_s(goal_deg - self._rest_deg))
         rest_deg = None
         while rest_deg is None:
+            # The next frame may change the goal.
             asked_deg = flight.each()
             next_deg = goal_deg if asked_deg is None else min(max(asked_deg, low_deg), high_deg)
             state, angle_deg = self._read(gyro_now=True)

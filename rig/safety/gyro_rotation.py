@@ -157,6 +157,7 @@ class GyroRotationMeter:
                 f"uncertainty {scale_sigma}.",
                 next_step="Set axis x, y or z, sign 1 or -1, a positive scale, and an uncertainty of at least 0.",
             )
+        # The sensor's axes and scale, and the uncertainty of its samples.
         self._imu = imu
         self._clock = clock
         self._column = "xyz".index(axis)
@@ -165,6 +166,7 @@ class GyroRotationMeter:
         self.arw = imu.identity.gyro_noise_dps_rthz / sqrt(2)
         """The angle random walk by the datasheet, in °/√s."""
         self._saturated_dps = imu.range_dps
+        # The memory of the last samples, and the integral since the last rest.
         self._time_ns: NDArray[np.int64] = np.empty(0, np.int64)
         self._rate_dps: NDArray[np.float64] = np.empty(0)
         self._drain_s = min(DRAIN_S, DRAIN_SAMPLES / imu.rate_hz)

@@ -236,6 +236,7 @@ class FileStore:
         file may have contained one.
         """
         state, fault, damage = BenchState(), None, ""
+        # The state: its checksum finds a byte that the disk changed.
         try:
             state = BenchState.model_validate_json(self._file.read_bytes())
             if state.version != VERSION:
@@ -250,6 +251,7 @@ class FileStore:
             damage = f"{self._file} cannot be read: {error.strerror}"
         except ValidationError as error:
             damage = f"{self._file} is damaged: {error.errors(include_url=False)[0]['msg']}"
+        # The latch is newer than the state if the disk was full.
         try:
             text = self._latch.read_bytes()
             if len(text) != LATCH_BYTES:

@@ -230,6 +230,7 @@ def checked(
         stillness=stillness,
         motion=motion,
     )
+    # Each limit of a view, apart from those of its image.
     unknown = stillness is not None and not isfinite(stillness.peak_rate_dps)
     exceeded = {
         RejectReason.EXPOSED_EARLY: early,

@@ -207,6 +207,7 @@ class DynamixelBus:
                         raise self._rejected(what, rejected)
                     result, replies = COMM_RX_CORRUPT, {}  # the instruction was damaged on its way: send it again
                 self._count(result)
+            # No attempt succeeded: say what the operator can check.
             missing = [device_id for device_id in device_ids if device_id not in replies]
             advice: SomeSteps = (
                 (
@@ -227,6 +228,7 @@ class DynamixelBus:
         A reply of another length does not belong to this request. A rejection has no parameters: while a reply without
         parameters is missing, a rejection is accepted only if no longer reply arrives.
         """
+        # Send, after old bytes were dropped; from now on a reply of this length is owed.
         answering = (target,) if answering is None else answering
         self._drop_foreign()
         ambiguous = size > 0 and self._is_outstanding(0)
@@ -235,6 +237,7 @@ class DynamixelBus:
         if result != COMM_SUCCESS:
             return {}, result
         self.port.setPacketTimeout(self._packets.reply_size(size) * len(answering))
+        # Collect the replies, and leave out what belongs to no request of ours.
         replies: dict[int, Reply] = {}
         doubtful: dict[int, Reply] = {}
         while len(replies) < len(answering):
