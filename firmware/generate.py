@@ -18,7 +18,7 @@ BEGIN, END = "<!-- generated from protocol.toml -->", "<!-- end of generated par
 
 Table = dict[str, Any]
 
-FIRMWARE_ONLY = {"tick_us", "estop_ticks", "deadman_default_ms", "trigger_min_us", "trigger_max_us"}
+FIRMWARE_ONLY = {"tick_us", "estop_ticks", "deadman_default_ms", "trigger_min_us", "trigger_max_us", "capability"}
 
 
 def size(message: Table) -> int:
@@ -159,6 +159,8 @@ def module(table: Table) -> str:
         shown = f"0x{value:08X}" if value > 1 << 31 else f"{value:_}" if value > 99_999 else str(value)
         lines += [f"{name.upper()} = {shown}", f'"""{sentence(doc)}"""']
     for enum in table["enum"]:
+        if enum["name"] in FIRMWARE_ONLY:
+            continue
         flags = "bits" in enum["doc"].lower()
         lines += ["", "", f"class {camel(enum['name'])}({'IntFlag' if flags else 'IntEnum'}):"]
         lines += [f'    """{enum["doc"]}"""', ""]

@@ -26,16 +26,6 @@ class Board(IntEnum):
     ATMEGA328P = 2
 
 
-class Capability(IntFlag):
-    """Bits of `identity.capabilities`."""
-
-    IMU = 1
-    LIGHT = 2
-    TRIGGER = 4
-    ESTOP = 8
-    RELAY = 16
-
-
 class Reset(IntEnum):
     """Why the head started."""
 
