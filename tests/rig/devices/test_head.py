@@ -2,7 +2,9 @@
 
 import pytest
 
+from rig.config import load_config
 from rig.core.errors import (
+    ConfigError,
     DeviceMismatch,
     DeviceNotFound,
     DeviceSilent,
@@ -16,6 +18,8 @@ from rig.core.next_steps import Do
 from rig.devices.head.head import RigHead
 from rig.devices.head.protocol import (
     BAUD,
+    DEADMAN_MAX_MS,
+    DEADMAN_MIN_MS,
     PROTOCOL_VERSION,
     HeadFault,
     HeadState,
@@ -103,6 +107,15 @@ def test_missing_or_wrong_sensor_is_reported():
         head.attach(0x68, SimMpu6050(head.world_at_board_time, who_am_i=0x70))
         with pytest.raises(DeviceMismatch, match=r"0x70, expected 0x68.*MPU-6500"):
             RigHead(HeadSerial(head), world.clock, mpu6050())
+
+
+def test_only_deadmen_of_the_head_can_be_configured():
+    shortest_s, longest_s = DEADMAN_MIN_MS / 1000, DEADMAN_MAX_MS / 1000
+    for seconds in (shortest_s, longest_s):
+        assert load_config(None, [f"head.deadman_s={seconds}"]).head.deadman_s == seconds
+    for seconds in (0.99 * shortest_s, 1.01 * longest_s):
+        with pytest.raises(ConfigError):
+            load_config(None, [f"head.deadman_s={seconds}"])
 
 
 # -- outputs -----------------------------------------------------------------------------------------------------
