@@ -38,7 +38,9 @@ class BenchSide:
 
     def __init__(self, setup: Setup, folder: Path, clock: SystemClock, report: Callable[[str], None]) -> None:
         def opened() -> Bench:
-            return open_bench(setup.bench, setup.config, seed=setup.seed, show_frame=self.picture.show)
+            bench = open_bench(setup.bench, setup.config, seed=setup.seed)
+            bench.camera.observers.append(self.picture.show)
+            return bench
 
         def run(worker: BenchWorker, job: Job) -> None:
             ServedDesk(worker, job, setup, catalog).run()

@@ -25,7 +25,7 @@ from rig.jobs.enroll import enroll, enroll_list, plan
 from rig.jobs.identify import identify
 from rig.jobs.table import acknowledge, goto, home, refer
 from rig.jobs.table_image import take_table_image
-from rig.motion.move import MotionModel
+from rig.motion.move import MotionTimes
 from rig.plans.estimate import TimeLeft
 from rig.plans.operator import Choice, Operator, Question
 from rig.plans.tray import TrayItem
@@ -163,7 +163,7 @@ class ServedDesk(Desk):
             bench = self._worker.bench()
             job.progress = requests.Progress(done=0, total=event.views)
             self._outline = Outliner(bench)
-            left = TimeLeft(MotionModel(bench.config), event.angles_deg, in_motion=event.in_motion)
+            left = TimeLeft(MotionTimes(bench.config), event.angles_deg, in_motion=event.in_motion)
             self._left = left if event.angles_deg else None
         if self._left is not None:
             self._left.add(event)
