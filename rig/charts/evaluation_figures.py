@@ -5,32 +5,32 @@ from dataclasses import replace
 from math import ceil
 from typing import Any, Final
 
-from rig.charts.xy import INK, Axis, Chart, Series
+from rig.charts.xy import Axis, Chart, Series
 
-#: Colour and dashes of each method, the same in every figure (Okabe and Ito's palette, for all kinds of colour vision).
+#: Colour and dashes of each method, the same in every figure.
 _STYLES: Final = {
-    "single": ("#8a8f96", True),
-    "hbr-visual": ("#56b4e9", False),
-    "hbr-0": ("#009e73", False),
-    "hbr-0-orient": ("#009e73", True),
-    "hbr": ("#0072b2", False),
-    "hbr-orient": ("#0072b2", True),
-    "ahbr": ("#d55e00", False),
-    "ahbr-orient": ("#d55e00", True),
-    "ahbr-90": ("#8c2d04", False),
-    "coin": ("#cc79a7", False),
-    "sweep-45": (INK, False),
-    "sweep-90": (INK, True),
-    "dense": ("#6a3d9a", False),
-    "dense-coin": ("#cc79a7", False),
-    "dense-random": ("#0072b2", False),
-    "dense-45": (INK, False),
-    "dense-90": (INK, True),
-    "dense-mutual": ("#009e73", False),
-    "dense-oracle": ("#b08900", True),
+    "single": ("soft", True),
+    "hbr-visual": ("c5", False),
+    "hbr-0": ("c2", False),
+    "hbr-0-orient": ("c2", True),
+    "hbr": ("c0", False),
+    "hbr-orient": ("c0", True),
+    "ahbr": ("c1", False),
+    "ahbr-orient": ("c1", True),
+    "ahbr-90": ("c7", False),
+    "coin": ("c3", False),
+    "sweep-45": ("ink", False),
+    "sweep-90": ("ink", True),
+    "dense": ("c6", False),
+    "dense-coin": ("c3", False),
+    "dense-random": ("c0", False),
+    "dense-45": ("ink", False),
+    "dense-90": ("ink", True),
+    "dense-mutual": ("c2", False),
+    "dense-oracle": ("c4", True),
 }
-_OTHERS: Final = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", INK, "#8a8f96", "#b08900")
-_BEST_10: Final = ("#b08900", False)
+_OTHERS: Final = ("c0", "c1", "c2", "c3", "c5", "ink", "soft", "c4")
+_BEST_10: Final = ("c4", False)
 _HIT_RATE: Final = Axis("hit rate, %")
 #: More bands than these hide each other; the tables have all intervals.
 _BANDS: Final = ("hbr", "ahbr", "dense")

@@ -5,35 +5,21 @@ import unicodedata
 from collections.abc import Iterator
 from pathlib import Path
 from statistics import median
-from typing import Any, Final, NamedTuple
-
-import cv2
-import numpy as np
+from typing import Any, Final
 
 from rig.catalog.exchange.new_files import new_folder
 from rig.catalog.exchange.tables import enrolled
 from rig.catalog.facts import Enrollment, Session
 from rig.catalog.transfer import CatalogSource, Item
-from rig.core.errors import ExportFailed
 from rig.core.phrases import counted
-from rig.core.templates import environment
-from rig.report.contact_sheet import Image, contact_sheet, thumbnail
-from rig.report.page import JPEG_QUALITY
+from rig.report.contact_sheet import contact_sheet, thumbnail
+from rig.report.page import FEW, STAMP, Meta, ShownObject, jpeg, render_page
 from rig.report.records import TILE
+from rig.report.summary import SummaryItem
 from rig.views.image_files import decode
 
 SHEETS: Final = "sheets"
 MAX_SLUG_LENGTH: Final = 40
-_STAMP: Final = (56, 56)
-
-
-class _Shown(NamedTuple):
-    item: Item
-    sheet: str
-    stamp: str
-    views: int
-    enrolled: str
-    items_: list[tuple[str, str]]
 
 
 def write_catalog_page(folder: Path, source: CatalogSource) -> int:
@@ -48,47 +34,44 @@ def write_catalog_page(folder: Path, source: CatalogSource) -> int:
     """
     with new_folder(folder) as made:
         (made / SHEETS).mkdir()
-        shown = list(_shown(made / SHEETS, source))
-        (made / "index.html").write_bytes(_page(shown))
-    return len(shown)
+        shown = list(_objects(made / SHEETS, source))
+        objects = [one for one, _ in shown]
+        labels = sorted({one.note for one in objects} - {""})
+        items = [
+            SummaryItem("objects", f"{len(objects)}"),
+            SummaryItem("views", f"{sum(views for _, views in shown)}"),
+            *([SummaryItem("labels", f"{len(labels)}", ", ".join(labels))] if labels else []),
+        ]
+        (made / "index.html").write_bytes(render_page("Catalog", objects, items, meta=Meta()).encode())
+    return len(objects)
 
 
-def _page(shown: list[_Shown]) -> bytes:
-    template = environment("rig.report").get_template("catalog.html.j2")
-    labels = sorted({one.item.label for one in shown} - {""})
-    return template.render(objects=shown, views=sum(one.views for one in shown), labels=labels).encode()
-
-
-def _shown(folder: Path, source: CatalogSource) -> Iterator[_Shown]:
+def _objects(folder: Path, source: CatalogSource) -> Iterator[tuple[ShownObject, int]]:
     """Write the sheets into a folder beside the page."""
     for number, (item, enrollment, regions) in enumerate(enrolled(source), start=1):
+        views = enrollment.views
         pictures = [
             thumbnail(decode(source.content(view.image)), TILE, region)
-            for view, region in zip(enrollment.views, regions, strict=True)
+            for view, region in zip(views, regions, strict=True)
         ]
         stem = f"{number:04d}-{_slug(item.name)}".rstrip("-")
         sheet, stamp = f"{stem}.jpg", f"{stem}-small.jpg"
-        _write(folder / sheet, contact_sheet(pictures, [view.azimuth_deg for view in enrollment.views], tile=TILE))
-        _write(folder / stamp, thumbnail(pictures[0], _STAMP))
+        (folder / sheet).write_bytes(jpeg(contact_sheet(pictures, [view.azimuth_deg for view in views], tile=TILE)))
+        (folder / stamp).write_bytes(jpeg(thumbnail(pictures[0], STAMP)))
         finished_utc = next(one.finished_utc for one in item.enrollments if one.enrollment is enrollment)
         when = f"{finished_utc:%Y-%m-%d %H:%M} UTC" if finished_utc else "–"
-        items = list(_items(item, enrollment))
-        yield _Shown(item, f"{SHEETS}/{sheet}", f"{SHEETS}/{stamp}", len(enrollment.views), when, items)
+        line = f"{counted(len(views), 'view')}, enrolled {when}"
+        rows = [SummaryItem(*words) for words in _items(item, enrollment)]
+        addresses = f"{SHEETS}/{stamp}", f"{SHEETS}/{sheet}"
+        unfold = number <= FEW
+        shown = ShownObject(number, addresses[0], item.name, line, addresses[1], rows, unfold, note=item.label)
+        yield shown, len(views)
 
 
 def _slug(name: str) -> str:
     """Return a name for a file; it may be empty."""
     plain = unicodedata.normalize("NFKD", name).encode("ascii", "ignore").decode().lower()
     return re.sub(r"[^a-z0-9]+", "-", plain)[:MAX_SLUG_LENGTH].strip("-")
-
-
-def _write(path: Path, image: Image) -> None:
-    encoded, jpeg = cv2.imencode(".jpg", np.ascontiguousarray(image), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-    if not encoded:
-        raise ExportFailed(
-            f"The picture {path.name} cannot be encoded.", next_step="Export an object with fewer views."
-        )
-    path.write_bytes(jpeg.tobytes())
 
 
 def _items(item: Item, enrollment: Enrollment) -> Iterator[tuple[str, str]]:

@@ -12,17 +12,16 @@ import cv2
 from jinja2 import Template
 from markupsafe import Markup
 
+from hbr import Outcome
 from hbr.core.angles import wrap360
-from rig.charts.azimuth_ring import RingView, azimuth_ring
-from rig.charts.decision_chart import decision_chart
-from rig.charts.polar_path import polar_path
-from rig.charts.score_chart import score_chart
-from rig.core.errors import UsageError, os_errors_as
+from rig.charts.candidates import Style, Styles, candidates_chart
+from rig.charts.compass import RingView, azimuth_ring, decision_chart, polar_path
+from rig.core.errors import ExportFailed, UsageError, os_errors_as
 from rig.core.files import write
 from rig.core.next_steps import Do, in_words
 from rig.core.phrases import azimuth_words, counted, listed, sentence, signed
 from rig.core.templates import environment
-from rig.events.events import Candidate, Ranked
+from rig.events.events import Decided
 from rig.events.note_wording import note_steps, note_words
 from rig.events.wording import (
     answer_words,
@@ -34,17 +33,18 @@ from rig.events.wording import (
     share_words,
     verification_words,
 )
-from rig.report.arc_figure import ArcFigure, arc_figure
 from rig.report.contact_sheet import Image, contact_sheet, thumbnail
-from rig.report.records import TILE, Correctness, EnrollmentRecord, IdentificationRecord
+from rig.report.records import TILE, Correctness, EnrollmentRecord, IdentificationRecord, ReportView
 from rig.report.summary import SummaryItem, enrollment_items, totals
+from rig.search.saved_run import SavedRun
 
 JPEG_QUALITY: Final = 84
-COLUMNS: Final = 12
-_STAMP: Final = (56, 56)
-_FEW: Final = 3
+STAMP: Final = (56, 56)
+_COLUMNS: Final = 12
+_LEADING: Final = 3
+"""Candidates in the table of a view."""
+FEW: Final = 3
 """Up to this number of searches or objects are all expanded; of more, only the first and the wrong ones."""
-
 
 _HEADS: Final = (
     ("#", "number of the search; it leads to its details", "n"),
@@ -75,6 +75,21 @@ class Meta:
     date: datetime | None = None
 
 
+class ShownObject(NamedTuple):
+    """An enrolled object on a page: ``stamp`` and ``sheet`` are addresses of its pictures, ``rows`` its numbers."""
+
+    number: int
+    stamp: str
+    name: str
+    line: str
+    sheet: str
+    rows: Sequence[SummaryItem]
+    unfold: bool
+    note: str = ""
+    ring: Markup = Markup()
+    retakes: int = 0
+
+
 def render_report(
     title: str,
     summary: str,
@@ -94,25 +109,70 @@ def render_report(
     meta
         Conditions and wall-clock times.
     """
-    with_truth = any(record.truth is not None for record in identifications)
+    styles = Styles()
+    return render_page(
+        title,
+        [
+            _object(number, record, unfold=number == 1 or len(enrollments) <= FEW)
+            for number, record in enumerate(enrollments, 1)
+        ],
+        totals(enrollments, identifications),
+        summary=summary,
+        retrievals=[
+            _retrieval(number, record, styles, unfold=number == 1 or len(identifications) <= FEW)
+            for number, record in enumerate(identifications, 1)
+        ],
+        with_truth=any(record.truth is not None for record in identifications),
+        meta=meta,
+    )
+
+
+def render_page(
+    title: str,
+    objects: Sequence[ShownObject],
+    items: Sequence[SummaryItem],
+    *,
+    summary: str = "",
+    retrievals: Sequence["_Retrieval"] = (),
+    with_truth: bool = False,
+    meta: Meta,
+) -> str:
+    """Return a page of objects and searches; ``items`` are the numbers at its top."""
     return _template().render(
         title=title,
         date="" if meta.date is None else f"{meta.date.astimezone(UTC):%Y-%m-%d %H:%M} UTC",
         summary=summary,
-        totals=totals(enrollments, identifications),
-        retrievals=[
-            _retrieval(number, record, unfold=number == 1 or len(identifications) <= _FEW)
-            for number, record in enumerate(identifications, 1)
-        ],
-        objects=[
-            _object(number, record, unfold=number == 1 or len(enrollments) <= _FEW)
-            for number, record in enumerate(enrollments, 1)
-        ],
+        totals=items,
+        retrievals=retrievals,
+        objects=objects,
         with_truth=with_truth,
         heads=[head for head in _HEADS if with_truth or head[0] not in _WITH_TRUTH],
         conditions=_groups(meta.conditions),
         wall_clock=_groups(meta.wall_clock),
     )
+
+
+def run_report(saved: SavedRun) -> str:
+    """Return the page about a saved run: the answer, the camera's path, the candidates and the decisions.
+
+    Raises
+    ------
+    UsageError
+        The run is damaged.
+    """
+    record = IdentificationRecord(region=saved.config.view.roi)
+    about = saved.about
+    with saved.damage():
+        for event in saved.events():
+            record.add(event)
+        answer = record.answer
+        found = "no answer" if answer is None else outcome_words(answer)
+        meta = Meta(
+            conditions={"bench": about["bench"], **record.conditions, "devices": about["devices"]},
+            wall_clock={"software": about["software"]},
+            date=datetime.fromisoformat(about["started_utc"]),
+        )
+        return render_report(f"Search: {found}", _answer(record), [], [record], meta=meta)
 
 
 def write_report(path: Path, html: str) -> None:
@@ -131,19 +191,29 @@ def write_report(path: Path, html: str) -> None:
 
 @cache
 def _template() -> Template:
-    return environment("rig.report").get_template("page.html.j2")
+    return environment("rig.report", "rig.charts").get_template("page.html.j2")
+
+
+class _Leading(NamedTuple):
+    name: str
+    style: Style
+    score: str
+    share: str
 
 
 class _Frame(NamedTuple):
+    """A view, and what the search decided after it. The chart of a decision has the same words as its card."""
+
     number: int
     picture: str
     where: str
     rejected: str
-    leading: list[tuple[str, str, str]]
+    leading: list[_Leading]
     margin: str
     decided: str
     moved: str
     decision: str
+    chart: Markup
 
 
 class _Retrieval(NamedTuple):
@@ -159,52 +229,40 @@ class _Retrieval(NamedTuple):
     margin: str
     words: str
     path: Markup
-    compared: bool
-    scores: Markup
-    arc: ArcFigure
+    path_words: str
+    candidates: Markup
+    motion: str
     notes: list[str]
-    decisions: list[Markup]
     differs: str
-    verification: str
-    comparison: str
     frames: list[_Frame]
+    hidden: int
     unfold: bool
 
 
-class _Object(NamedTuple):
-    number: int
-    stamp: str
-    name: str
-    line: str
-    retakes: int
-    sheet: str
-    ring: Markup
-    items_: list[SummaryItem]
-    unfold: bool
-
-
-def _retrieval(number: int, record: IdentificationRecord, *, unfold: bool) -> _Retrieval:
+def _retrieval(number: int, record: IdentificationRecord, styles: Styles, *, unfold: bool) -> _Retrieval:
     answer, views, compared = record.answer, record.views, record.compared
     error_deg = record.pose_error_deg
-    path = scores = Markup()
+    shown = record.shown
+    path = candidates = Markup()
     if views:
         start_deg = _report_azimuth_deg(record, views[0].azimuth_deg)
-        scale = "azimuth on the table" if record.yaw_deg is None else "azimuth as enrolled"
-        path = Markup(polar_path(start_deg, record.steps, scale=scale))
+        path = Markup(polar_path(start_deg, record.steps, named={view.index + 1 for view in shown}))
     if record.ranked:
-        rounds = [{c.name: c.score for c in ranked.candidates} for ranked in record.ranked]
-        truth = record.truth.name if record.truth else None
-        scores = Markup(
-            score_chart(
-                rounds,
-                winner=answer.name if answer else None,
-                truth=truth,
-                min_score=answer.min_score if answer else None,
-            )
+        rotated_deg = record.rotated_deg if record.in_motion else None
+        known = [event for event in record.ranked if rotated_deg is None or event.index in rotated_deg]
+        enough = record.enough if known else None
+        chart = candidates_chart(
+            known or record.ranked[-1:],
+            styles,
+            answer=answer.name if answer is not None and answer.outcome is Outcome.FOUND else None,
+            min_score=answer.min_score if answer else None,
+            rotated_deg=rotated_deg if known else None,
+            enough_deg=rotated_deg.get(enough.index) if rotated_deg and enough else None,
         )
+        candidates = Markup(chart.svg())
     return _Retrieval(
         number=number,
-        stamp=_data_uri(thumbnail(views[0].picture_bgr, _STAMP)) if views else "",
+        stamp=_data_uri(thumbnail(views[0].picture_bgr, STAMP)) if views else "",
         truth=_truth(record),
         answer=outcome_words(answer) if answer else "no answer",
         correctness=record.correctness,
@@ -213,19 +271,21 @@ def _retrieval(number: int, record: IdentificationRecord, *, unfold: bool) -> _R
         pose_error="–" if error_deg is None else f"{error_deg:.1f}°",
         score=f"{answer.score:.3f}" if answer else "–",
         margin=signed(answer.margin, 3) if answer else "–",
-        words=answer_words(answer) if answer else "The search ended without an answer.",
+        words=_answer(record),
         path=path,
-        compared=any(event.s_left is not None for event in record.decided),
-        scores=scores,
-        arc=arc_figure(record),
+        path_words="on the table" if record.yaw_deg is None else "as enrolled",
+        candidates=candidates,
+        motion=_motion_words(record),
         notes=[f"{sentence(note_words(note))} {in_words(note_steps(note))}" for note in record.notes],
-        decisions=_decisions(record),
         differs="" if compared is None or compared.picture_bgr is None else _data_uri(compared.picture_bgr),
-        verification="" if record.verified is None else sentence(verification_words(record.verified)),
-        comparison="" if compared is None else sentence(comparison_words(compared)),
-        frames=_frames(record),
+        frames=[_frame(record, view, styles) for view in shown],
+        hidden=len(views) - len(shown),
         unfold=unfold or record.correctness is Correctness.WRONG,
     )
+
+
+def _answer(record: IdentificationRecord) -> str:
+    return answer_words(record.answer) if record.answer else "The search ended without an answer."
 
 
 def _truth(record: IdentificationRecord) -> str:
@@ -241,79 +301,95 @@ def _report_azimuth_deg(record: IdentificationRecord, azimuth_deg: float) -> flo
     return wrap360(azimuth_deg - (record.yaw_deg or 0.0))
 
 
-def _leading(one: Candidate, ranked: Ranked) -> tuple[str, str, str]:
-    return one.name, f"{one.score:.3f}", share_words(one, ranked.decision)
+def _motion_words(record: IdentificationRecord) -> str:
+    """Return which frames of a search in motion were used; empty for runs that do not contain this."""
+    rotated_deg, enough = record.rotated_deg, record.enough
+    frames = [used for used in record.used if used.index in rotated_deg]
+    if not frames:
+        return ""
+    last = frames[-1]
+    used = f"{counted(len(frames), 'frame')} of the rotation used (views {frames[0].index + 1} to {last.index + 1})"
+    used += f", {last.rejected} rejected."
+    if enough is None or enough.index not in rotated_deg:
+        return f"{used} Their evidence was not enough for an answer before the search ended."
+    when = f"{enough.seconds:.1f} s after the start"
+    where = f"azimuth {azimuth_words(enough.azimuth_deg)}°, after {rotated_deg[enough.index]:.0f}° of rotation"
+    return (
+        f"{used} The evidence was enough for an answer from view {enough.index + 1} on: {when}, at {where}. "
+        f"The last frame came after {last.seconds:.1f} s."
+    )
 
 
-def _decisions(record: IdentificationRecord) -> list[Markup]:
-    """Return a chart for each decision that compared all possible rotations."""
-    seen_deg = {view.index: _report_azimuth_deg(record, view.azimuth_deg) for view in record.views}
-    return [
-        Markup(
-            decision_chart(
-                seen_deg[event.index],
-                event.weighed,
-                event.rotation_deg,
-                reason=event.reason,
-                candidates=event.candidates,
-                seen_deg=[azimuth_deg for index, azimuth_deg in seen_deg.items() if index <= event.index],
-                number=event.index + 1,
-            )
-        )
-        for event in record.decided
-        if event.weighed is not None and event.weighed.rotations_deg and event.index in seen_deg
-    ]
+def _frame(record: IdentificationRecord, view: ReportView, styles: Styles) -> _Frame:
+    thought = next((event for event in record.ranked if event.index == view.index), None)
+    decided = next((event for event in record.decided if event.index == view.index), None)
+    leading = []
+    if thought:
+        leading = [
+            _Leading(one.name, styles[one.name], f"{one.score:.3f}", share_words(one, thought.decision))
+            for one in thought.candidates[:_LEADING]
+        ]
+    # What a search decides at its end follows from all of these, so the last card says all of them.
+    words = [ranking_words(thought)]
+    if view is record.views[-1]:
+        words += [verification_words(record.verified)] if record.verified else []
+        words += [comparison_words(record.compared)] if record.compared else []
+    return _Frame(
+        number=view.index + 1,
+        picture=_data_uri(view.picture_bgr),
+        where=f"{azimuth_words(_report_azimuth_deg(record, view.azimuth_deg))}°",
+        rejected=listed(view.rejected),
+        leading=leading,
+        margin=signed(thought.margin, 3) if thought else "",
+        decided=" ".join(sentence(one) for one in words if one),
+        moved=sentence(move_words(view.move)) if view.move and view.index else "",
+        decision=decision_words(decided) if decided else "",
+        chart=_decision(record, view, decided) if decided else Markup(),
+    )
 
 
-def _frames(record: IdentificationRecord) -> list[_Frame]:
-    ranked = {event.index: event for event in record.ranked}
-    decided = {event.index: event for event in record.decided}
-    frames = []
-    for view in record.views:
-        thought = ranked.get(view.index)
-        decision = decided.get(view.index)
-        frames.append(
-            _Frame(
-                number=view.index + 1,
-                picture=_data_uri(view.picture_bgr),
-                where=f"{azimuth_words(_report_azimuth_deg(record, view.azimuth_deg))}°",
-                rejected=listed(view.rejected),
-                leading=[_leading(c, thought) for c in thought.candidates[:3]] if thought else [],
-                decided=sentence(words) if (words := ranking_words(thought)) else "",
-                margin=signed(thought.margin, 3) if thought else "",
-                moved=sentence(move_words(view.move)) if view.move and view.index else "",
-                decision=decision_words(decision) if decision else "",
-            )
-        )
-    return frames
+def _decision(record: IdentificationRecord, view: ReportView, decided: Decided) -> Markup:
+    """Return the chart of a decision; empty if the search did not compare all possible rotations."""
+    if decided.weighed is None or not decided.weighed.rotations_deg:
+        return Markup()
+    seen_deg = [_report_azimuth_deg(record, one.azimuth_deg) for one in record.views if one.index < view.index]
+    here_deg = _report_azimuth_deg(record, view.azimuth_deg)
+    words = f"Decision after view {view.index + 1}: {decision_words(decided)}"
+    return Markup(decision_chart(here_deg, decided.weighed, decided.rotation_deg, words, seen_deg=seen_deg))
 
 
-def _object(number: int, record: EnrollmentRecord, *, unfold: bool) -> _Object:
+def _object(number: int, record: EnrollmentRecord, *, unfold: bool) -> ShownObject:
     views = record.views
     sheet = stamp = ""
     ring = Markup()
     if views:
         pictures = [view.picture_bgr for view in views]
-        sheet = _data_uri(
-            contact_sheet(
-                pictures, [view.azimuth_deg for view in views], columns=min(COLUMNS, len(pictures)), tile=TILE
-            )
-        )
-        stamp = _data_uri(thumbnail(pictures[0], _STAMP))
+        columns = min(_COLUMNS, len(pictures))
+        sheet = _data_uri(contact_sheet(pictures, [view.azimuth_deg for view in views], columns=columns, tile=TILE))
+        stamp = _data_uri(thumbnail(pictures[0], STAMP))
         ring = Markup(azimuth_ring([RingView(v.azimuth_deg, v.evidence.sharpness, len(v.rejected)) for v in views]))
-    retakes = record.retakes
     line = counted(len(views), "view")
     if record.result is None:
         line += f" of {record.planned}: not finished"
-    if retakes:
-        line += f", {counted(retakes, 'retake')}"
-    return _Object(number, stamp, record.name, line, retakes, sheet, ring, enrollment_items(record), unfold)
+    if record.retakes:
+        line += f", {counted(record.retakes, 'retake')}"
+    rows = enrollment_items(record)
+    return ShownObject(number, stamp, record.name, line, sheet, rows, unfold, ring=ring, retakes=record.retakes)
+
+
+def jpeg(image_bgr: Image) -> bytes:
+    """Return a picture of a page as a JPEG file.
+
+    Raises `ExportFailed`: it is too large for one.
+    """
+    encoded, content = cv2.imencode(".jpg", image_bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+    if not encoded:  # a sheet of thousands of views is higher than a JPEG file can be
+        raise ExportFailed("A picture cannot be encoded.", next_step="Show an object with fewer views.")
+    return content.tobytes()
 
 
 def _data_uri(image_bgr: Image) -> str:
-    encoded, jpeg = cv2.imencode(".jpg", image_bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-    assert encoded  # uint8 (H, W, 3) with pixels: `thumbnail` has made it
-    return f"data:image/jpeg;base64,{b64encode(jpeg.tobytes()).decode('ascii')}"
+    return f"data:image/jpeg;base64,{b64encode(jpeg(image_bgr)).decode('ascii')}"
 
 
 def _groups(values: Mapping[str, Any]) -> list[tuple[str, list[tuple[str, str]]]]:

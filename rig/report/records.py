@@ -6,13 +6,13 @@ A record has thumbnails instead of images, so that a long run needs little memor
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
-from itertools import pairwise
+from itertools import accumulate, pairwise
 from typing import Any, Final
 
 from hbr import Outcome
 from hbr.core.angles import wrap180
 from rig.catalog import View
-from rig.charts.polar_path import PathStep
+from rig.charts.compass import PathStep
 from rig.events.compared import Compared, Verified
 from rig.events.events import (
     Accepted,
@@ -37,6 +37,9 @@ TILE: Final = (96, 96)
 
 FRAME: Final = (240, 240)
 """Width and height of a frame of a retrieval, pixels."""
+
+VIEWS: Final = 12
+"""Views of a search that a page shows: a search in motion takes sixty, which nobody reads one by one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -238,6 +241,31 @@ class IdentificationRecord:
         return answer.yaw_set_deg[0] if answer is not None and answer.name is not None and answer.yaw_set_deg else None
 
     @property
+    def shown(self) -> list[ReportView]:
+        """The views of a page: those after which the search decided, at most `VIEWS`, evenly chosen."""
+        decided = {event.index for event in self.ranked}
+        views = [view for view in self.views if view.index in decided] or self.views
+        if len(views) <= VIEWS:
+            return views
+        return [views[round(k * (len(views) - 1) / (VIEWS - 1))] for k in range(VIEWS)]
+
+    @property
+    def in_motion(self) -> bool:
+        """Whether a view was taken in motion."""
+        return any(view.evidence.motion is not None for view in self.views)
+
+    @property
+    def enough(self) -> FrameUsed | None:
+        """The frame in motion after which the evidence was enough for an answer; None if there is none."""
+        return next((used for used in self.used if used.outcome is not Outcome.CONTINUE), None)
+
+    @property
+    def rotated_deg(self) -> dict[int, float]:
+        """The rotation of the camera since the first view, by the index of each view; always the short way."""
+        ways = (abs(wrap180(b.azimuth_deg - a.azimuth_deg)) for a, b in pairwise(self.views))
+        return dict(zip((view.index for view in self.views), accumulate(ways, initial=0.0), strict=False))
+
+    @property
     def steps(self) -> list[PathStep]:
         """The camera's rotations between the views, as the table made them; in motion, those between decisions.
 
@@ -255,6 +283,6 @@ class IdentificationRecord:
                 continue
             if decided is last and after.evidence.motion is not None:
                 rotation_deg += steps.pop().rotation_deg
-            steps.append(PathStep(rotation_deg, decided.s_left, decided.s_right, decided.candidates[:2]))
+            steps.append(PathStep(after.index + 1, rotation_deg))
             last = decided
         return steps

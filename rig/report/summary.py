@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from statistics import fmean, median
 from typing import NamedTuple
 
-from rig.core.phrases import counted, listed, percent_words
+from rig.core.phrases import counted, listed, percent_words, signed
 from rig.events.events import SimilarObjects
 from rig.events.wording import outcome_words, similar_object_words
 from rig.report.records import Correctness, EnrollmentRecord, IdentificationRecord
@@ -124,7 +124,7 @@ def _answer_items(record: IdentificationRecord) -> list[SummaryItem]:
     return [
         SummaryItem("answer", outcome_words(answer)),
         *([] if answer.confidence is None else [SummaryItem("confidence", percent_words(answer.confidence))]),
-        SummaryItem("score", f"{answer.score:.3f}", f"per view; margin {answer.margin:.3f}"),
+        SummaryItem("score", f"{answer.score:.3f}", f"per view; margin {signed(answer.margin, 3)}"),
         SummaryItem("views", f"{answer.views}"),
         SummaryItem("rotation", f"{answer.travelled_deg:.0f}°"),
         SummaryItem("bench time", f"{answer.seconds:.1f} s"),
