@@ -19,7 +19,7 @@ from rig.charts.compass import RingView, azimuth_ring, decision_chart, polar_pat
 from rig.core.errors import ExportFailed, UsageError, os_errors_as
 from rig.core.files import write
 from rig.core.next_steps import Do, in_words
-from rig.core.phrases import azimuth_words, counted, listed, sentence, signed
+from rig.core.phrases import azimuth_words, counted, sentence, signed
 from rig.core.templates import environment
 from rig.events.events import Decided
 from rig.events.note_wording import note_steps, note_words
@@ -43,6 +43,8 @@ STAMP: Final = (56, 56)
 _COLUMNS: Final = 12
 _LEADING: Final = 3
 """Candidates in the table of a view."""
+_REASONS: Final = 3
+"""Reasons of rejected frames that are named before a view."""
 FEW: Final = 3
 """Up to this number of searches or objects are all expanded; of more, only the first and the wrong ones."""
 
@@ -338,7 +340,7 @@ def _frame(record: IdentificationRecord, view: ReportView, styles: Styles) -> _F
         number=view.index + 1,
         picture=_data_uri(view.picture_bgr),
         where=f"{azimuth_words(_report_azimuth_deg(record, view.azimuth_deg))}°",
-        rejected=listed(view.rejected),
+        rejected=_rejections(view),
         leading=leading,
         margin=signed(thought.margin, 3) if thought else "",
         decided=" ".join(sentence(one) for one in words if one),
@@ -346,6 +348,13 @@ def _frame(record: IdentificationRecord, view: ReportView, styles: Styles) -> _F
         decision=decision_words(decided) if decided else "",
         chart=_decision(record, view, decided) if decided else Markup(),
     )
+
+
+def _rejections(view: ReportView) -> str:
+    """Return why frames were rejected before a view. A search in motion may reject dozens."""
+    reasons = dict.fromkeys(view.rejected)
+    more = len(reasons) - _REASONS
+    return "; ".join(list(reasons)[:_REASONS]) + (f"; and {more} more" if more > 0 else "")
 
 
 def _decision(record: IdentificationRecord, view: ReportView, decided: Decided) -> Markup:

@@ -39,7 +39,7 @@ FRAME: Final = (240, 240)
 """Width and height of a frame of a retrieval, pixels."""
 
 VIEWS: Final = 12
-"""Views of a search that a page shows: a search in motion takes sixty, which nobody reads one by one."""
+"""Views of a search that a page shows. A search in motion takes sixty: too many to read one by one."""
 
 
 @dataclass(frozen=True, slots=True)
