@@ -45,9 +45,24 @@ def _rim(every: int = 30) -> list[str]:
         named = azimuth % every == 0
         parts.append(svg.line(polar(RIM, azimuth), polar(RIM + (7 if named else 4), azimuth), "tick"))
         if named:
-            x, y = polar(RIM + 21, azimuth)
-            parts.append(svg.text(f"{azimuth}°", (x, y + 4), "axis"))
+            x, y = polar(RIM + 12, azimuth)
+            anchor = {0: "middle", 180: "middle"}.get(azimuth, "end" if azimuth < 180 else "start")
+            parts.append(svg.text(f"{azimuth}°", (x, y + 4 - 6 * cos(radians(azimuth))), "axis", anchor=anchor))
     return parts
+
+
+def dial() -> str:
+    """Return the circle for the present angle of the table; a script turns its needles and sets the used budget."""
+    ring = {"cx": CENTRE[0], "cy": CENTRE[1], "r": 120.0}
+    needle = {"x1": CENTRE[0], "y1": CENTRE[1], "x2": CENTRE[0]}
+    parts = [
+        *_rim(every=90),
+        svg.element("circle", id="budget", class_="ring", **ring),
+        svg.element("circle", id="used", class_="ring", pathLength=1.0, **ring),
+        svg.element("line", id="gyro", y2=CENTRE[1] - 100, **needle),
+        svg.element("line", id="needle", y2=CENTRE[1] - 148, **needle),
+    ]
+    return svg.drawing(SIZE, SIZE, "angle of the table, seen from above", parts)
 
 
 class RingView(NamedTuple):

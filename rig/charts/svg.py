@@ -8,8 +8,12 @@ from collections.abc import Iterable
 from functools import cache
 from html import escape
 from importlib.resources import files
+from typing import Final
 
 Point = tuple[float, float]
+
+_MARGIN: Final = 12.0
+"""Around a chart in a file of its own."""
 
 
 def number(value: float) -> str:
@@ -66,11 +70,13 @@ def drawing(width: float, height: float, label: str, parts: Iterable[str], *, al
     alone
         For a file of its own, with the style sheet; otherwise the page has it.
     """
-    style = [element("style", _style()), element("rect", width=width, height=height, class_="paper")] if alone else []
-    size = {"viewBox": f"0 0 {number(width)} {number(height)}", "xmlns": "http://www.w3.org/2000/svg"}
+    margin = _MARGIN if alone else 0.0
+    box = {"x": -margin, "y": -margin, "width": width + 2 * margin, "height": height + 2 * margin}
+    style = [element("style", _style()), element("rect", **box, class_="paper")] if alone else []
+    size = {"viewBox": " ".join(map(number, box.values())), "xmlns": "http://www.w3.org/2000/svg"}
     return element("svg", *style, *parts, **size, role="img", aria_label=label, class_="chart")
 
 
 @cache
 def _style() -> str:
-    return files("rig.charts").joinpath("chart.css").read_text("utf-8")
+    return files("rig.charts").joinpath("static/chart.css").read_text("utf-8")
