@@ -3,20 +3,18 @@
 from collections.abc import Collection, Sequence
 from itertools import accumulate
 from math import atan2, ceil, cos, hypot, radians, sin
-from statistics import median
 from typing import Final, NamedTuple
 
 from rig.charts import svg
 from rig.charts.svg import Point
-from rig.core.phrases import azimuth_words, counted, filled
+from rig.core.phrases import azimuth_words, filled
 from rig.events.events import Weighed
 
 SIZE: Final = 400.0
 CENTRE: Final = (SIZE / 2, SIZE / 2)
 RIM: Final = 160.0
 
-# Rings of the chart of an enrollment and of the chart of a path.
-_FLOOR, _CEILING = 62.0, 150.0
+# Rings of the chart of a path.
 _INNERMOST, _OUTERMOST = 34.0, 142.0
 _STOP_PX: Final = 9.0
 _SEEN_PX: Final = 3.0
@@ -63,47 +61,6 @@ def dial() -> str:
         svg.element("line", id="needle", y2=CENTRE[1] - 148, **needle),
     ]
     return svg.drawing(SIZE, SIZE, "angle of the table, seen from above", parts)
-
-
-class RingView(NamedTuple):
-    """A view of an enrollment: its azimuth, its sharpness in squared levels, and the frames rejected before it."""
-
-    azimuth_deg: float
-    sharpness: float
-    retakes: int = 0
-
-
-def azimuth_ring(views: Sequence[RingView]) -> str:
-    """Draw each view of an enrollment as a bar at its azimuth; retaken views have a mark on the rim.
-
-    The length of a bar is proportional to the sharpness; the longest bar reaches `_CEILING`.
-
-    Raises
-    ------
-    ValueError
-        There are no views.
-    """
-    if not views:
-        raise ValueError("an azimuth ring needs at least one view")
-    lowest, middle, sharpest = (of(view.sharpness for view in views) for of in (min, median, max))
-    unit = (_CEILING - _FLOOR) / sharpest if sharpest > 0 else 0.0
-    parts = [*_rim(), svg.circle(CENTRE, _FLOOR, "grid")]
-    for view in views:
-        retaken = f", {counted(view.retakes, 'retake')}" if view.retakes else ""
-        words = f"{azimuth_words(view.azimuth_deg)}°: sharpness {view.sharpness:.1f}{retaken}"
-        ends = polar(_FLOOR, view.azimuth_deg), polar(_FLOOR + unit * view.sharpness, view.azimuth_deg)
-        parts.append(svg.line(*ends, f"bar {'c1' if view.retakes else 'c0'}", svg.title(words)))
-        if view.retakes:
-            parts.append(svg.circle(polar((_CEILING + RIM) / 2, view.azimuth_deg), 4, "retake", svg.title(words)))
-    parts.append(svg.circle(CENTRE, _FLOOR + unit * middle, "median"))
-    for row, words in enumerate(("sharpness", f"median {middle:.0f}", f"{lowest:.0f} to {sharpest:.0f}")):
-        parts.append(svg.text(words, (CENTRE[0], CENTRE[1] - 12 + 17 * row), "small"))
-    retaken_views = sum(1 for view in views if view.retakes)
-    label = (
-        f"Ring of {len(views)} views by azimuth; sharpness from {lowest:.1f} to {sharpest:.1f}, "
-        f"median {middle:.1f}; {retaken_views} retaken"
-    )
-    return svg.drawing(SIZE, SIZE, label, parts)
 
 
 class PathStep(NamedTuple):

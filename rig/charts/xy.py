@@ -87,7 +87,7 @@ class Chart:
     square
         A unit of x is as long as a unit of y.
     wide
-        The legend is beside the axes, for charts of many series; else it is below.
+        For charts of many series.
     """
 
     title: str
@@ -109,13 +109,12 @@ class Chart:
         title = wrap(self.title, int(width / _TITLE_LETTER_PX))
         top = _ROW_PX * (len(title) + 1) + 8
         labelled = [series for series in self.series if series.label]
-        legend_px = _KEY_PX + 14 + _LETTER_PX * max((len(series.label) for series in labelled), default=0)
 
         # The width of the numbers at the y axis decides where the plot begins.
         y_range = _range(self.y, [v for s in self.series for v in (*s.y, *s.low, *s.high)])
         x_range = _range(self.x, [v for s in self.series for v in s.x])
         left = 10 + _LETTER_PX * max(len(words) for _, words in _ticks(self.y, *y_range))
-        right = width - (legend_px if self.wide else 12)
+        right = width - 12
         height = _WIDE_HEIGHT if self.wide else _PLOT_HEIGHT
         if self.square:
             unit_px = min((right - left) / (x_range[1] - x_range[0]), _SQUARE_HEIGHT / (y_range[1] - y_range[0]))
@@ -136,10 +135,7 @@ class Chart:
         parts.append(svg.text(self.x.label, ((left + right) / 2, bottom + 36), "small"))
         for series in self.series:
             parts += _draw(series, x, y)
-        if self.wide:
-            places = [(right + 14, top + 10 + _ROW_PX * row) for row in range(len(labelled))]
-        else:
-            places = _rows(labelled, bottom + 58, width)
+        places = _rows(labelled, bottom + 58, width)
         for series, place in zip(labelled, places, strict=True):
             parts += _key(series, place)
         end = max([bottom + 44, *(place[1] + 8 for place in places)])

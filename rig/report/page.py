@@ -1,22 +1,21 @@
 """The report: one self-contained HTML file."""
 
-from base64 import b64encode
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
-import cv2
 from jinja2 import Template
 from markupsafe import Markup
 
 from hbr import Outcome
 from hbr.core.angles import wrap360
-from rig.charts.candidates import Style, Styles, candidates_chart
-from rig.charts.compass import RingView, azimuth_ring, decision_chart, polar_path
-from rig.core.errors import ExportFailed, UsageError, os_errors_as
+from rig.charts.candidates import Styles, candidates_chart
+from rig.charts.compass import decision_chart, polar_path
+from rig.charts.xy import MEASURED, MODEL, Axis, Chart, Series
+from rig.core.errors import UsageError, os_errors_as
 from rig.core.files import write
 from rig.core.next_steps import Do, in_words
 from rig.core.phrases import azimuth_words, counted, sentence, signed
@@ -33,19 +32,17 @@ from rig.events.wording import (
     share_words,
     verification_words,
 )
-from rig.report.contact_sheet import Image, contact_sheet, thumbnail
-from rig.report.records import TILE, Correctness, EnrollmentRecord, IdentificationRecord, ReportView
-from rig.report.summary import SummaryItem, enrollment_items, totals
+from rig.report.pictures import contact_sheet, data_uri, thumbnail
+from rig.report.records import Correctness, EnrollmentRecord, IdentificationRecord, ReportView
+from rig.report.summary import enrollment_items, totals
 from rig.search.saved_run import SavedRun
 
-JPEG_QUALITY: Final = 84
-STAMP: Final = (56, 56)
-_COLUMNS: Final = 12
+_STAMP: Final = (56, 56)
 _LEADING: Final = 3
 """Candidates in the table of a view."""
 _REASONS: Final = 3
 """Reasons of rejected frames that are named before a view."""
-FEW: Final = 3
+_FEW: Final = 3
 """Up to this number of searches or objects are all expanded; of more, only the first and the wrong ones."""
 
 _HEADS: Final = (
@@ -77,21 +74,6 @@ class Meta:
     date: datetime | None = None
 
 
-class ShownObject(NamedTuple):
-    """An enrolled object on a page: ``stamp`` and ``sheet`` are addresses of its pictures, ``rows`` its numbers."""
-
-    number: int
-    stamp: str
-    name: str
-    line: str
-    sheet: str
-    rows: Sequence[SummaryItem]
-    unfold: bool
-    note: str = ""
-    ring: Markup = Markup()
-    retakes: int = 0
-
-
 def render_report(
     title: str,
     summary: str,
@@ -112,41 +94,20 @@ def render_report(
         Conditions and wall-clock times.
     """
     styles = Styles()
-    return render_page(
-        title,
-        [
-            _object(number, record, unfold=number == 1 or len(enrollments) <= FEW)
-            for number, record in enumerate(enrollments, 1)
-        ],
-        totals(enrollments, identifications),
-        summary=summary,
-        retrievals=[
-            _retrieval(number, record, styles, unfold=number == 1 or len(identifications) <= FEW)
-            for number, record in enumerate(identifications, 1)
-        ],
-        with_truth=any(record.truth is not None for record in identifications),
-        meta=meta,
-    )
-
-
-def render_page(
-    title: str,
-    objects: Sequence[ShownObject],
-    items: Sequence[SummaryItem],
-    *,
-    summary: str = "",
-    retrievals: Sequence["_Retrieval"] = (),
-    with_truth: bool = False,
-    meta: Meta,
-) -> str:
-    """Return a page of objects and searches; ``items`` are the numbers at its top."""
+    with_truth = any(record.truth is not None for record in identifications)
     return _template().render(
         title=title,
         date="" if meta.date is None else f"{meta.date.astimezone(UTC):%Y-%m-%d %H:%M} UTC",
         summary=summary,
-        totals=items,
-        retrievals=retrievals,
-        objects=objects,
+        totals=totals(enrollments, identifications),
+        retrievals=[
+            _retrieval(number, record, styles, unfold=number == 1 or len(identifications) <= _FEW)
+            for number, record in enumerate(identifications, 1)
+        ],
+        objects=[
+            _object(number, record, unfold=number == 1 or len(enrollments) <= _FEW)
+            for number, record in enumerate(enrollments, 1)
+        ],
         with_truth=with_truth,
         heads=[head for head in _HEADS if with_truth or head[0] not in _WITH_TRUTH],
         conditions=_groups(meta.conditions),
@@ -196,52 +157,11 @@ def _template() -> Template:
     return environment("rig.report", "rig.charts").get_template("page.html.j2")
 
 
-class _Leading(NamedTuple):
-    name: str
-    style: Style
-    score: str
-    share: str
+Shown = dict[str, Any]
+"""The values of a part of the page, by their names in the template."""
 
 
-class _Frame(NamedTuple):
-    """A view, and what the search decided after it. The chart of a decision has the same words as its card."""
-
-    number: int
-    picture: str
-    where: str
-    rejected: str
-    leading: list[_Leading]
-    margin: str
-    decided: str
-    moved: str
-    decision: str
-    chart: Markup
-
-
-class _Retrieval(NamedTuple):
-    number: int
-    stamp: str
-    truth: str
-    answer: str
-    correctness: Correctness | None
-    views: str
-    travelled: str
-    pose_error: str
-    score: str
-    margin: str
-    words: str
-    path: Markup
-    path_words: str
-    candidates: Markup
-    motion: str
-    notes: list[str]
-    differs: str
-    frames: list[_Frame]
-    hidden: int
-    unfold: bool
-
-
-def _retrieval(number: int, record: IdentificationRecord, styles: Styles, *, unfold: bool) -> _Retrieval:
+def _retrieval(number: int, record: IdentificationRecord, styles: Styles, *, unfold: bool) -> Shown:
     answer, views, compared = record.answer, record.views, record.compared
     error_deg = record.pose_error_deg
     shown = record.shown
@@ -262,9 +182,9 @@ def _retrieval(number: int, record: IdentificationRecord, styles: Styles, *, unf
             enough_deg=rotated_deg.get(enough.index) if rotated_deg and enough else None,
         )
         candidates = Markup(chart.svg())
-    return _Retrieval(
+    return Shown(
         number=number,
-        stamp=_data_uri(thumbnail(views[0].picture_bgr, STAMP)) if views else "",
+        stamp=data_uri(thumbnail(views[0].picture_bgr, _STAMP)) if views else "",
         truth=_truth(record),
         answer=outcome_words(answer) if answer else "no answer",
         correctness=record.correctness,
@@ -279,7 +199,7 @@ def _retrieval(number: int, record: IdentificationRecord, styles: Styles, *, unf
         candidates=candidates,
         motion=_motion_words(record),
         notes=[f"{sentence(note_words(note))} {in_words(note_steps(note))}" for note in record.notes],
-        differs="" if compared is None or compared.picture_bgr is None else _data_uri(compared.picture_bgr),
+        differs="" if compared is None or compared.picture_bgr is None else data_uri(compared.picture_bgr),
         frames=[_frame(record, view, styles) for view in shown],
         hidden=len(views) - len(shown),
         unfold=unfold or record.correctness is Correctness.WRONG,
@@ -322,13 +242,13 @@ def _motion_words(record: IdentificationRecord) -> str:
     )
 
 
-def _frame(record: IdentificationRecord, view: ReportView, styles: Styles) -> _Frame:
+def _frame(record: IdentificationRecord, view: ReportView, styles: Styles) -> Shown:
     thought = next((event for event in record.ranked if event.index == view.index), None)
     decided = next((event for event in record.decided if event.index == view.index), None)
     leading = []
     if thought:
         leading = [
-            _Leading(one.name, styles[one.name], f"{one.score:.3f}", share_words(one, thought.decision))
+            (one.name, styles[one.name], f"{one.score:.3f}", share_words(one, thought.decision))
             for one in thought.candidates[:_LEADING]
         ]
     # What a search decides at its end follows from all of these, so the last card says all of them.
@@ -336,9 +256,9 @@ def _frame(record: IdentificationRecord, view: ReportView, styles: Styles) -> _F
     if view is record.views[-1]:
         words += [verification_words(record.verified)] if record.verified else []
         words += [comparison_words(record.compared)] if record.compared else []
-    return _Frame(
+    return Shown(
         number=view.index + 1,
-        picture=_data_uri(view.picture_bgr),
+        picture=data_uri(view.picture_bgr),
         where=f"{azimuth_words(_report_azimuth_deg(record, view.azimuth_deg))}°",
         rejected=_rejections(view),
         leading=leading,
@@ -367,38 +287,33 @@ def _decision(record: IdentificationRecord, view: ReportView, decided: Decided) 
     return Markup(decision_chart(here_deg, decided.weighed, decided.rotation_deg, words, seen_deg=seen_deg))
 
 
-def _object(number: int, record: EnrollmentRecord, *, unfold: bool) -> ShownObject:
-    views = record.views
-    sheet = stamp = ""
-    ring = Markup()
-    if views:
-        pictures = [view.picture_bgr for view in views]
-        columns = min(_COLUMNS, len(pictures))
-        sheet = _data_uri(contact_sheet(pictures, [view.azimuth_deg for view in views], columns=columns, tile=TILE))
-        stamp = _data_uri(thumbnail(pictures[0], STAMP))
-        ring = Markup(azimuth_ring([RingView(v.azimuth_deg, v.evidence.sharpness, len(v.rejected)) for v in views]))
+def _object(number: int, record: EnrollmentRecord, *, unfold: bool) -> Shown:
+    views, retakes = record.views, record.retakes
     line = counted(len(views), "view")
     if record.result is None:
         line += f" of {record.planned}: not finished"
-    if record.retakes:
-        line += f", {counted(record.retakes, 'retake')}"
-    rows = enrollment_items(record)
-    return ShownObject(number, stamp, record.name, line, sheet, rows, unfold, ring=ring, retakes=record.retakes)
+    if retakes:
+        line += f", {counted(retakes, 'retake')}"
+    shown = Shown(number=number, name=record.name, line=line, unfold=unfold, items=enrollment_items(record), sheet="")
+    if views:
+        pictures, azimuth_deg = [view.picture_bgr for view in views], [view.azimuth_deg for view in views]
+        label = f"Contact sheet of {record.name}: {line}, each with its azimuth in degrees"
+        shown["sheet"] = Markup(contact_sheet(pictures, azimuth_deg, label))
+        shown["stamp"] = data_uri(thumbnail(pictures[0], _STAMP))
+        shown["sharpness"] = Markup(_sharpness(record).svg())
+    return shown
 
 
-def jpeg(image_bgr: Image) -> bytes:
-    """Return a picture of a page as a JPEG file.
-
-    Raises `ExportFailed`: it is too large for one.
-    """
-    encoded, content = cv2.imencode(".jpg", image_bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-    if not encoded:  # a sheet of thousands of views is higher than a JPEG file can be
-        raise ExportFailed("A picture cannot be encoded.", next_step="Show an object with fewer views.")
-    return content.tobytes()
-
-
-def _data_uri(image_bgr: Image) -> str:
-    return f"data:image/jpeg;base64,{b64encode(jpeg(image_bgr)).decode('ascii')}"
+def _sharpness(record: EnrollmentRecord) -> Chart:
+    """Return the chart of the sharpness of each view."""
+    series = []
+    for label, colour, retaken in (("views", MEASURED, False), ("retaken views", MODEL, True)):
+        views = [view for view in record.views if bool(view.rejected) is retaken]
+        sharpness = [view.evidence.sharpness for view in views]
+        if views:
+            series.append(Series(label, [view.azimuth_deg for view in views], sharpness, colour))
+    around = Axis("azimuth, °", ticks=tuple(90.0 * k for k in range(5)))
+    return Chart("Sharpness of the views", around, Axis("squared levels", span=(0.0,)), series)
 
 
 def _groups(values: Mapping[str, Any]) -> list[tuple[str, list[tuple[str, str]]]]:

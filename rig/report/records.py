@@ -29,7 +29,7 @@ from rig.events.events import (
     Started,
     event_of,
 )
-from rig.report.contact_sheet import Image, Region, thumbnail
+from rig.report.pictures import Image, Region, thumbnail
 from rig.views.capture import ViewEvidence, rejection_text
 
 TILE: Final = (96, 96)

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rig.charts.compass import CENTRE, PathStep, RingView, azimuth_ring, decision_chart, polar, polar_path
+from rig.charts.compass import CENTRE, PathStep, decision_chart, dial, polar, polar_path
 from rig.events.events import Weighed
 from tests.fuzzing import examples
 from tests.rig.charts.drawn import HOSTILE, centre, check_text, having, points, words
@@ -35,8 +35,8 @@ def path(start_deg: float, *rotations_deg: float) -> str:
 
 @pytest.mark.parametrize(
     "svg",
-    [path(0, *[40] * 7), decision_chart(0, WEIGHED, 60, "left 60°"), azimuth_ring([RingView(0, 10.0)])],
-    ids=["path", "decision", "ring"],
+    [path(0, *[40] * 7), decision_chart(0, WEIGHED, 60, "left 60°"), dial()],
+    ids=["path", "decision", "dial"],
 )
 def test_charts_are_readable_at_the_width_of_a_phone(svg: str) -> None:
     width = float(ET.fromstring(svg).get("viewBox", "").split()[2])
@@ -113,38 +113,6 @@ class TestPolarPath:
 
     def test_path_with_an_impossible_rotation_stays_small(self) -> None:
         assert len(path(0.0, 16_949_387.0)) < 200_000
-
-
-class TestAzimuthRing:
-    def test_bars_are_at_the_azimuths_with_lengths_by_sharpness(self) -> None:
-        views = [RingView(0, 100), RingView(90, 50), RingView(217.3, 25, 2)]
-        svg = azimuth_ring(views)
-        lengths = []
-        for bar, view in zip(having(svg, "bar"), views, strict=True):
-            x1, y1, x2, y2 = (float(bar.get(key, "")) for key in ("x1", "y1", "x2", "y2"))
-            assert apart(azimuth_of(x2, y2), view.azimuth_deg) < 0.05
-            lengths.append(hypot(x2 - x1, y2 - y1))
-        assert lengths[1] / lengths[0] == pytest.approx(0.5, abs=1e-3)
-        assert lengths[2] / lengths[0] == pytest.approx(0.25, abs=1e-3)
-
-    def test_retakes_are_marked_at_their_azimuth(self) -> None:
-        svg = azimuth_ring([RingView(0, 100), RingView(120, 50, 1), RingView(240, 50, 3)])
-        marks = having(svg, "retake")
-        assert [round(azimuth_of(*centre(m))) for m in marks] == [120, 240]
-        assert words(marks) == ["120.0°: sharpness 50.0, 1 retake", "240.0°: sharpness 50.0, 3 retakes"]
-
-    def test_ring_shows_its_numbers(self) -> None:
-        svg = azimuth_ring([RingView(0, 100), RingView(120, 50), RingView(240, 70)])
-        assert words(having(svg, "small")) == ["sharpness", "median 70", "50 to 100"]
-        assert "3 views" in ET.fromstring(svg).get("aria-label", "")
-
-    def test_black_views_have_bars_of_length_zero(self) -> None:
-        svg = azimuth_ring([RingView(0, 0.0), RingView(180, 0.0)])
-        assert all(bar.get("x1") == bar.get("x2") for bar in having(svg, "bar"))
-
-    def test_ring_rejects_no_views(self) -> None:
-        with pytest.raises(ValueError, match="at least one view"):
-            azimuth_ring([])
 
 
 ROTATIONS = tuple(float(rotate) for rotate in range(-175, 185, 5) if rotate)
