@@ -99,7 +99,7 @@ def render_report(
         title=title,
         date="" if meta.date is None else f"{meta.date.astimezone(UTC):%Y-%m-%d %H:%M} UTC",
         summary=summary,
-        totals=totals(enrollments, identifications),
+        totals=list(totals(enrollments, identifications)),
         retrievals=[
             _retrieval(number, record, styles, unfold=number == 1 or len(identifications) <= _FEW)
             for number, record in enumerate(identifications, 1)
@@ -169,17 +169,16 @@ def _retrieval(number: int, record: IdentificationRecord, styles: Styles, *, unf
     if views:
         start_deg = _report_azimuth_deg(record, views[0].azimuth_deg)
         path = Markup(polar_path(start_deg, record.steps, named={view.index + 1 for view in shown}))
-    if record.ranked:
-        rotated_deg = record.rotated_deg if record.in_motion else None
-        known = [event for event in record.ranked if rotated_deg is None or event.index in rotated_deg]
-        enough = record.enough if known else None
+    rotated_deg, enough = record.rotated_deg, record.enough
+    known = [event for event in record.ranked if event.index in rotated_deg]  # all, except in a damaged run
+    if known:
         chart = candidates_chart(
-            known or record.ranked[-1:],
+            known,
             styles,
             answer=answer.name if answer is not None and answer.outcome is Outcome.FOUND else None,
             min_score=answer.min_score if answer else None,
-            rotated_deg=rotated_deg if known else None,
-            enough_deg=rotated_deg.get(enough.index) if rotated_deg and enough else None,
+            rotated_deg=rotated_deg if record.in_motion else None,
+            enough_deg=rotated_deg[enough.index] if enough else None,
         )
         candidates = Markup(chart.svg())
     return Shown(
@@ -225,17 +224,16 @@ def _report_azimuth_deg(record: IdentificationRecord, azimuth_deg: float) -> flo
 
 def _motion_words(record: IdentificationRecord) -> str:
     """Return which frames of a search in motion were used; empty for runs that do not contain this."""
-    rotated_deg, enough = record.rotated_deg, record.enough
-    frames = [used for used in record.used if used.index in rotated_deg]
+    frames, enough = record.used, record.enough
     if not frames:
         return ""
     last = frames[-1]
     used = f"{counted(len(frames), 'frame')} of the rotation used (views {frames[0].index + 1} to {last.index + 1})"
     used += f", {last.rejected} rejected."
-    if enough is None or enough.index not in rotated_deg:
+    if enough is None:
         return f"{used} Their evidence was not enough for an answer before the search ended."
     when = f"{enough.seconds:.1f} s after the start"
-    where = f"azimuth {azimuth_words(enough.azimuth_deg)}°, after {rotated_deg[enough.index]:.0f}° of rotation"
+    where = f"azimuth {azimuth_words(enough.azimuth_deg)}°, after {record.rotated_deg[enough.index]:.0f}° of rotation"
     return (
         f"{used} The evidence was enough for an answer from view {enough.index + 1} on: {when}, at {where}. "
         f"The last frame came after {last.seconds:.1f} s."
