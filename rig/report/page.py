@@ -166,7 +166,7 @@ def _retrieval(number: int, record: IdentificationRecord, styles: Styles, *, unf
     error_deg = record.pose_error_deg
     shown = record.shown
     path = candidates = Markup()
-    if views:
+    if len(views) > 1:
         start_deg = _report_azimuth_deg(record, views[0].azimuth_deg)
         path = Markup(polar_path(start_deg, record.steps, named={view.index + 1 for view in shown}))
     rotated_deg, enough = record.rotated_deg, record.enough
@@ -180,7 +180,7 @@ def _retrieval(number: int, record: IdentificationRecord, styles: Styles, *, unf
             rotated_deg=rotated_deg if record.in_motion else None,
             enough_deg=rotated_deg[enough.index] if enough else None,
         )
-        candidates = Markup(chart.svg())
+        candidates = Markup(chart)
     return Shown(
         number=number,
         stamp=data_uri(thumbnail(views[0].picture_bgr, _STAMP)) if views else "",

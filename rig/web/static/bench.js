@@ -8,12 +8,12 @@ function dial(status) {
   const angle = status.table_deg;
   const [low, high] = status.limits_deg || [-360, 360];
   const known = angle !== null && angle !== undefined;
-  const turn = (id, degrees) => {
+  const rotate = (id, degrees) => {
     $(id).toggleAttribute("hidden", degrees === null);
     if (degrees !== null) $(id).setAttribute("transform", `rotate(${-degrees} 200 200)`);
   };
-  turn("needle", known ? angle : null);
-  turn("gyro", known ? gyro : null);
+  rotate("needle", known ? angle : null);
+  rotate("gyro", known ? gyro : null);
   const used = known ? Math.min(Math.abs(angle) / Math.max(Math.abs(angle < 0 ? low : high), 1), 1) : 0;
   $("used").setAttribute("stroke-dasharray", `${used} 1`);
   $("used").setAttribute("transform", `translate(200 200) rotate(-90) scale(1 ${angle < 0 ? 1 : -1}) translate(-200 -200)`);
