@@ -243,6 +243,6 @@ def _key(series: Series, place: Point) -> list[str]:
     parts = []
     if series.curve:
         parts.append(svg.line((left, y - 4), (left + _KEY_PX - 6, y - 4), _curve_class(series)))
-    if series.dots:
+    if series.dots and not series.dashed:  # it would hide the gap between the dashes
         parts.append(svg.circle((left + (_KEY_PX - 6) / 2, y - 4), 3, f"dot {series.colour}"))
     return [*parts, svg.text(series.label, (left + _KEY_PX, y), "name", anchor="start")]
