@@ -15,8 +15,8 @@ CENTRE: Final = (SIZE / 2, SIZE / 2)
 RIM: Final = 160.0
 
 # Rings of the chart of a path.
-_INNERMOST, _OUTERMOST = 34.0, 142.0
-_STOP_PX: Final = 9.0
+_INNERMOST, _OUTERMOST = 60.0, 145.0
+_STOP_PX: Final = 8.0
 _SEEN_PX: Final = 3.0
 _ARROW_PX: Final = 9.0
 _ARC_STEP_DEG: Final = 4.0
