@@ -86,10 +86,11 @@ def write_page(
     count = {status: sum(calibration.status is status for calibration in calibrations) for status in CalibrationStatus}
     template = environment("calibration", "rig.report", "rig.charts").get_template("report.html.j2")
     page = template.render(
-        bench=bench,
-        when=f"{now_utc:%Y-%m-%d %H:%M}",
+        title=f"Calibration of {bench}",
+        date=f"{now_utc:%Y-%m-%d %H:%M} UTC",
+        summary="The errors of the bench itself. Uncertainties are standard uncertainties (1 σ).",
         totals=[
-            {"label": str(status), "value": n}
+            {"label": str(status), "value": n, "note": ""}
             for status, n in count.items()
             if n or status is CalibrationStatus.IN_FORCE
         ],
