@@ -6,12 +6,14 @@ from typing import Final, NamedTuple
 
 from rig.charts import svg
 from rig.charts.xy import Axis, Chart, Series
-from rig.core.phrases import percent, percent_words
+from rig.core.phrases import percent, percent_words, short
 from rig.events.events import Candidate, Ranked
 
 SHOWN: Final = 5
 """Candidates of a chart: more lines cannot be told from each other."""
 _COLOURS: Final = 8
+_LETTERS: Final = 36
+"""Letters of a name; the tables of a page have all of them."""
 _WIDTH, _BAR_PX, _ROW_PX = 400.0, 336.0, 34.0
 _FAR: Final = 3.0
 """A threshold is off the scale if its distance from the scores exceeds their range by this factor."""
@@ -73,7 +75,7 @@ def candidates_chart(
     y = 40.0
     for one in best:
         y += _ROW_PX
-        parts.append(svg.text(one.name, (0, y), "name", anchor="start"))
+        parts.append(svg.text(short(one.name, _LETTERS), (0, y), "name", anchor="start"))
         parts.append(svg.text(_words(one), (_WIDTH, y + 14), "name", anchor="end"))
         length = _BAR_PX * min(max(_value(one), 0.0), 1.0)
         kind = f"bar {styles[one.name].colour}"
@@ -103,7 +105,7 @@ def candidate_lines(
     for one in best:
         points = [after.get(one.name, nan) for after in values]
         colour, dashed = styles[one.name]
-        label = f"{one.name} {_words(one)}"
+        label = f"{short(one.name, _LETTERS)} {_words(one)}"
         series.append(Series(label, x, points, colour, True, True, dashed, bold=one.name == answer))
     words, least = _threshold(ranked[-1], min_score)
     if least is not None:

@@ -100,7 +100,8 @@ class Chart:
     @property
     def label(self) -> str:
         """Alternative text: title, axes, and the last value of each labelled series."""
-        ends = ", ".join(filled("{} {:.4g}", s.label, s.y[-1]) for s in self.series if s.label and len(s.y))
+        shown = [series for series in self.series if series.label and len(series.y) and isfinite(series.y[-1])]
+        ends = ", ".join(filled("{} {:.4g}", series.label, series.y[-1]) for series in shown)
         return f"{self.title}. {self.y.label} against {self.x.label}. Last values: {ends}"
 
     def svg(self, *, alone: bool = False) -> str:
@@ -175,8 +176,10 @@ def _ticks(axis: Axis, low: float, high: float) -> list[tuple[float, str]]:
     if axis.log:
         decades = range(floor(log10(low)), ceil(log10(high)) + 1)
         digits = (1, 2, 5) if len(decades) <= 3 else (1,)
-        ticks = [digit * 10.0**decade for decade in decades for digit in digits]
-        return [(tick, f"{tick:.10g}") for tick in ticks if low <= tick <= high]
+        all_ticks = (digit * 10.0**decade for decade in decades for digit in digits)
+        ticks = [(tick, f"{tick:.10g}") for tick in all_ticks if low <= tick <= high]
+        if len(ticks) > 1:  # a short axis takes those of a linear scale
+            return ticks
     least = (high - low) / _TICKS
     power = floor(log10(least))
     step, power = next(
@@ -184,7 +187,7 @@ def _ticks(axis: Axis, low: float, high: float) -> list[tuple[float, str]]:
     )
     if axis.whole:
         step, power = max(1.0, step), max(0, power)
-    form = f".{max(0, -power)}f" if power > -6 and high < 1e6 else ".3g"
+    form = f".{max(0, -power)}f" if power > -6 and max(abs(low), abs(high)) < 1e6 else ".3g"
     return [
         (step * i, number_words(step * i, form)) for i in range(ceil(low / step - 1e-9), floor(high / step + 1e-9) + 1)
     ]

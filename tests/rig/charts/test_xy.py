@@ -61,6 +61,11 @@ def test_logarithmic_axis_spaces_decades_evenly_and_has_their_numbers() -> None:
     assert {"0.01", "0.1", "1", "10"} <= set(words(having(chart.svg(), "axis")))
 
 
+def test_short_logarithmic_axis_has_numbers() -> None:
+    chart = Chart("t", Axis("x", log=True), Axis("y", log=True), (Series("", [2.1, 4.9], [2.1, 2.1]),))
+    assert {"2.5", "3.0", "4.5"} <= set(words(having(chart.svg(), "axis")))
+
+
 def test_numbers_are_round_and_have_the_decimals_of_their_step() -> None:
     chart = Chart("t", Axis("view", whole=True), Axis("score"), [Series("σ = 0.125", (1, 2, 3), (0.981, 0.99, 0.9874))])
     numbers = words(having(chart.svg(), "axis"))
@@ -178,6 +183,12 @@ class TestCandidates:
     def test_more_objects_than_colours_have_dashed_lines(self) -> None:
         styles = Styles()
         assert len({styles[f"{k}"] for k in range(16)}) == 16
+
+    @pytest.mark.parametrize("views", [1, 2])
+    def test_long_names_are_shortened(self, views: int) -> None:
+        svg = candidates_chart(ranked(*[{"a" * 100: 0.9, "b": 0.8}] * views), Styles())
+        check_text(svg)
+        assert "…" in svg
 
     def test_hostile_names_are_escaped(self) -> None:
         svg = candidates_chart(ranked({HOSTILE: 0.5}), Styles())
