@@ -198,6 +198,12 @@ class Jpeg(Response):
     media_type = "image/jpeg"
 
 
+class Svg(Response):
+    """A chart."""
+
+    media_type = "image/svg+xml"
+
+
 class Bundle(StreamingResponse):
     """A catalog in a file."""
 

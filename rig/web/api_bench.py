@@ -9,7 +9,19 @@ from typing import Annotated, Any, Final
 from fastapi import Header, Request, Response, WebSocket, WebSocketDisconnect
 
 from rig.core.errors import JobNotFound, TooManyListeners
-from rig.web.answers import EventStream, Health, JobMessage, Jpeg, LeaseState, ListOf, LivePictures, Login, Me, Stopped
+from rig.web.answers import (
+    EventStream,
+    Health,
+    JobMessage,
+    Jpeg,
+    LeaseState,
+    ListOf,
+    LivePictures,
+    Login,
+    Me,
+    Stopped,
+    Svg,
+)
 from rig.web.hub import MAX_LISTENERS
 from rig.web.problems import problem
 from rig.web.requests import AnswerBody, HandOverBody, Job, JobRequest, LeaseBody, LoginBody
@@ -204,3 +216,8 @@ def add_jobs(routes: Routes, server: Server) -> None:
         """Return a picture of a recent job as JPEG, the first with number 0."""
         _, found = server.remote.link.call("view", job_id=job_id, number=number)
         return Jpeg(found, headers={"Cache-Control": "private, max-age=3600"})
+
+    @routes.watch.get("/jobs/{job_id}/candidates", tags=["jobs"], response_class=Svg)
+    def get_job_candidates(job_id: str) -> Svg:
+        """Return the chart of the candidates of a recent search as SVG, after its last view."""
+        return Svg(server.remote.ask("candidates", job_id=job_id), headers={"Cache-Control": "no-store"})

@@ -8,8 +8,10 @@ from typing import Any, Final
 
 from fastapi import APIRouter
 from fastapi.responses import HTMLResponse
+from markupsafe import Markup
 from pydantic import BaseModel
 
+from rig.charts.compass import dial
 from rig.core.next_steps import Do
 from rig.core.templates import environment
 from rig.web.requests import AcknowledgeRequest, DoctorRequest, EmptyTableRequest, ReferenceRequest
@@ -70,7 +72,7 @@ def page_actions() -> dict[str, dict[str, Any]]:
 def pages(bench: str) -> APIRouter:
     """Return the routes of the pages of a bench."""
     templates = environment("rig.web", folder="templates")
-    shared = {"bench": bench, "actions": page_actions()}
+    shared = {"bench": bench, "actions": page_actions(), "dial": Markup(dial())}
     router = APIRouter(include_in_schema=False)
 
     def page(name: str) -> None:
