@@ -1,4 +1,4 @@
-"""What the API answers: errors, lists, the bench, and events as those of a saved run and of the stream."""
+"""What the API answers, but for errors: lists, persons, objects, and events of a saved run and of the stream."""
 
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -19,19 +19,6 @@ BOUNDARY: Final = "frame"
 
 def time_text(at: datetime) -> str:
     return at.isoformat(timespec="seconds").replace("+00:00", "Z")
-
-
-class Problem(BaseModel):
-    """An error (RFC 9457)."""
-
-    type: str
-    title: str
-    status: int
-    detail: str
-    code: int | None = None
-    next_step: str | None = None
-    steps: list[str | dict[str, Any]] = []
-    evidence: dict[str, Any] | None = None
 
 
 class ListOf(BaseModel, Generic[Row]):

@@ -14,12 +14,11 @@ from prometheus_client.registry import Collector
 from starlette.exceptions import HTTPException
 
 from rig.core.errors import RigError
-from rig.web.answers import Problem
 from rig.web.api_bench import add_access, add_bench, add_jobs
 from rig.web.api_catalog import add_bundles, add_objects, add_results
 from rig.web.api_records import add_records
 from rig.web.pages import pages
-from rig.web.problems import ProblemResponse
+from rig.web.problems import Problem, ProblemResponse
 from rig.web.requests import JobState
 from rig.web.server import API, Routes, Server, Watcher
 

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from typing import Any, Final, Self
 
 from fastapi.responses import JSONResponse
+from pydantic import BaseModel
 from pydantic_core import to_jsonable_python
 
 from rig.core import errors
@@ -25,6 +26,19 @@ _BY_HUNDRED: Final = {1: 500, 2: 422, 3: 503, 4: 503, 5: 409, 6: 422, 7: 409, 8:
 
 def _status(error: RigError) -> int:
     return _STATUS.get(error.code) or _BY_HUNDRED[error.code // 100]
+
+
+class Problem(BaseModel):
+    """An error (RFC 9457)."""
+
+    type: str
+    title: str
+    status: int
+    detail: str
+    code: int | None = None
+    next_step: str | None = None
+    steps: list[str | dict[str, Any]] = []
+    evidence: dict[str, Any] | None = None
 
 
 def problem(error: RigError) -> dict[str, Any]:
