@@ -92,7 +92,8 @@ class CameraTime(Procedure):
             pictures.BOARD_UPRIGHT,
         )
         bench.place(self.thing)
-        speeds_dps = sorted({*(speed for speed in SPEEDS if speed < config.table.velocity_dps), config.table.velocity_dps})
+        cruise_dps = config.table.velocity_dps
+        speeds_dps = sorted({*(speed for speed in SPEEDS if speed < cruise_dps), cruise_dps})
         passes: list[Pass] = []
         lost = frames = 0
         with Turntable(bench) as table, returning(table) as goto:
