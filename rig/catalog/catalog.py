@@ -17,7 +17,7 @@ from rig.catalog.database import Database
 from rig.catalog.enrolling import OpenEnrollment
 from rig.catalog.facts import Action, Enrollment, Entry, Session, View, digest_of
 from rig.catalog.opening import open_database
-from rig.catalog.records import EnrollmentStatus, Provenance, check_azimuth, checked_texts, clean_name
+from rig.catalog.records import MAX_VIEWS, EnrollmentStatus, Provenance, checked_texts, clean_name, is_plan
 from rig.catalog.state import EnrollmentState, ObjectDetails, ObjectSummary
 from rig.config.catalog_place import CatalogPlace
 from rig.core.clock import Clock
@@ -207,7 +207,7 @@ class Catalog(AbstractContextManager["Catalog"]):
                 state.check_not_enrolled(transaction, known)
 
     def known_objects(self) -> list[ObjectSummary]:
-        """Return the objects that need not be enrolled: those in use. `rig.catalog.shared` adds those of a server."""
+        """Return the objects that need not be enrolled: those in use. `rig.catalog.journal` adds those of a server."""
         return self.objects()
 
     def begin(
@@ -252,10 +252,11 @@ class Catalog(AbstractContextManager["Catalog"]):
         """
         name = clean_name(name)
         plan = tuple(float(azimuth_deg) for azimuth_deg in planned_azimuth_deg)
-        if not plan:
-            raise UsageError("The enrollment has no planned views.", next_step="Plan at least one view.")
-        for azimuth_deg in plan:
-            check_azimuth(azimuth_deg)
+        if not is_plan(plan):
+            raise UsageError(
+                f"An enrollment needs 1 to {MAX_VIEWS} planned views, with azimuths in [0°, 360°).",
+                next_step="Plan other views.",
+            )
         texts = checked_texts(label, note)
         png = None if empty_table is None else images.encode(empty_table)
         now = self.clock.utc()
@@ -264,7 +265,7 @@ class Catalog(AbstractContextManager["Catalog"]):
             if known is not None:
                 if not replace:
                     state.check_not_enrolled(transaction, known)
-                self._end_unfinished(transaction, known)
+                state.end_current(transaction, self.clock, known, EnrollmentStatus.IN_PROGRESS)
             object_id = log.head(transaction)[0] + 1 if known is None else known.object_id
             assert object_id is not None
             enrollment = Enrollment(
@@ -406,22 +407,6 @@ class Catalog(AbstractContextManager["Catalog"]):
         """Return the log: who did what and when, oldest first."""
         with self.database.read() as transaction:
             return log.entries(transaction, since, object_name)
-
-    def _end_unfinished(self, transaction: Transaction, known: Entry) -> None:
-        """Abandon the unfinished enrollment of an object, if there is one."""
-        begun = state.of_status(transaction, known, EnrollmentStatus.IN_PROGRESS)
-        if begun is not None:
-            log.append(
-                transaction,
-                self.clock,
-                Action.ENROLLMENT_ABANDONED,
-                known.object_name,
-                object_id=known.object_id,
-                enrollment_id=begun.enrollment.id,
-                status=EnrollmentStatus.ABANDONED,
-                finished_utc=self.clock.utc(),
-                details={"enrollment_id": begun.enrollment.id},
-            )
 
     def _start_session(
         self,

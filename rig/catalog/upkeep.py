@@ -12,8 +12,8 @@ from sqlalchemy.orm import Session as Transaction
 
 from rig.catalog import derived, log, state
 from rig.catalog.catalog import Catalog
-from rig.catalog.digests import portions
 from rig.catalog.facts import SCHEMA_VERSION, Action, Derived, Enrollment, Entry, Session, View
+from rig.catalog.jobs import portions
 from rig.catalog.records import EnrollmentStatus
 from rig.catalog.state import Ended, Named
 from rig.core.errors import CatalogBusy

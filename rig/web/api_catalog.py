@@ -18,7 +18,7 @@ from rig.catalog.jobs import finished
 from rig.catalog.transfer import CatalogSource, Conflict, transfer
 from rig.core.json_form import plain
 from rig.plans.similar_objects import similar_objects
-from rig.views.description import BENCH_DESCRIPTOR, PAPER_DESCRIPTOR
+from rig.views.description import BENCH_DESCRIPTOR, DESCRIPTORS
 from rig.web.picture import jpeg
 from rig.web.server import API, NameBody, ObjectBody, Page, Routes, Server, cached, long_work, time_text
 
@@ -189,9 +189,7 @@ def add_catalog(routes: Routes, server: Server) -> None:
 
 def _import(server: Server, path: Path, on_conflict: str) -> dict[str, Any]:
     with server.catalog.open_to_change() as catalog, read_bundle(path, catalog.clock) as source:
-        job = transfer(
-            source, catalog, conflict=Conflict(on_conflict), descriptors=(PAPER_DESCRIPTOR,), strict=True, jobs=1
-        )
+        job = transfer(source, catalog, conflict=Conflict(on_conflict), descriptors=DESCRIPTORS, jobs=1)
         return dict(plain(finished(job)))
 
 

@@ -4,7 +4,8 @@ from collections.abc import Callable
 from typing import Any
 
 from rig.catalog import Catalog
-from rig.catalog.shared import Attempts, BackgroundDelivery, JournalState, open_or_copy
+from rig.catalog.copying import Attempts, open_or_copy
+from rig.catalog.journal import BackgroundDelivery, JournalState
 from rig.config.catalog_place import CatalogPlace
 from rig.core.clock import Clock
 

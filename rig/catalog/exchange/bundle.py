@@ -127,7 +127,7 @@ class _Bundled(CatalogSource):
         super().__init__(catalog, own=False)
         self.origin = str(path)
         found = path.stat()
-        self.content = self.reader = partial(_read_member, str(path), found.st_ino, found.st_mtime_ns)
+        self.content = partial(_read_member, str(path), found.st_ino, found.st_mtime_ns)
         self._path, self._folder = path, folder
 
     def items(self) -> Iterator[Item]:

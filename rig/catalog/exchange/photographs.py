@@ -15,8 +15,8 @@ from typing import Any, Final
 from hbr.core.angles import wrap360
 from rig.catalog.exchange.tables import ANGLES, parse_region
 from rig.catalog.facts import Enrollment, Session, View
+from rig.catalog.incoming import ImportProblem, Reason, RejectedFile
 from rig.catalog.records import EnrollmentStatus, Provenance, check_text, clean_name, this_software
-from rig.catalog.rejected import ImportProblem, Reason, RejectedFile
 from rig.catalog.state import EnrollmentState
 from rig.catalog.transfer import Item
 from rig.core.errors import ImportRejected, UsageError
@@ -217,8 +217,8 @@ def _view(photographs: Photographs, row: _Row) -> View:
     for name in ANGLES:
         if row.get(name):
             setattr(view, name, _number(row[name], name))
-    if (view.imu_deg is None) != (view.imu_sigma_deg is None):
-        raise ValueError("imu_deg and imu_sigma_deg: give both or none")
+    if view.problem:
+        raise ValueError(view.problem)
     if row.get("captured_utc"):
         time = datetime.fromisoformat(row["captured_utc"])
         if time.tzinfo is None:

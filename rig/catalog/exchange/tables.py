@@ -119,7 +119,7 @@ def write_folder(folder: Path, source: CatalogSource) -> int:
                     raise ExportFailed(
                         f"{one.item.name!r} has two views from {angle}°.", next_step="Export a bundle instead."
                     )
-                target.write_bytes(source.content(view.image))
+                target.write_bytes(source.catalog.database.images.content(view.image))
                 yield {**row, "image": target.name}
 
     with new_folder(folder) as made:
