@@ -64,12 +64,7 @@ def copy_catalog(source: Catalog, target: Catalog) -> Generator[JobProgress, Non
 
     Every row keeps its id and its digest. An interrupted copy can be repeated.
 
-    Raises
-    ------
-    CatalogError, CatalogBusy
-        The target is not empty, or one of them cannot be used.
-    CatalogDamaged
-        Something in the source is not as it was stored.
+    Raises `CatalogError`, `CatalogBusy`: the target is not empty, or one of them cannot be used.
     """
     with source.database.read() as reading:
         _check_all(reading)
@@ -168,10 +163,7 @@ class Attempts:
 def open_copy(place: CatalogPlace, clock: Clock) -> Catalog:
     """Return the local copy, open for reading; `Catalog.copied_utc` says when it was made.
 
-    Raises
-    ------
-    CatalogUnavailable
-        There is no copy of this catalog.
+    Raises `CatalogUnavailable`: there is no copy of this catalog.
     """
     with suppress(CatalogError):
         copy = Catalog.open(place.copy_folder, clock=clock, create=False, read_only=True)
@@ -195,10 +187,7 @@ def open_or_copy(
     With ``create`` the catalog is created if there is none, and is open for writing. ``attempts`` are those of a
     program that opens the catalog often.
 
-    Raises
-    ------
-    CatalogUnavailable
-        There is no copy either.
+    Raises `CatalogUnavailable`: there is no copy either.
     """
     try:
         return (attempts or Attempts(clock)).open(place, create=create)
@@ -226,12 +215,8 @@ def update_copy(catalog: Catalog) -> bool:
 
     A copy that is damaged, or of another catalog, is made again.
 
-    Raises
-    ------
-    CatalogDamaged
-        The catalog is not as it was stored; the copy stays as it is.
-    CatalogError, CatalogBusy
-        One of them cannot be used, or another program updates the copy.
+    Raises `CatalogDamaged`: the catalog is not as it was stored; the copy stays as it is. `CatalogError`,
+    `CatalogBusy`: one of them cannot be used, or another program updates the copy.
     """
     folder = catalog.place.copy_folder
     try:

@@ -102,12 +102,8 @@ def properties(connection: Connection | Transaction) -> dict[str, str]:
 def check_properties(found: dict[str, str], place: CatalogPlace) -> None:
     """Check that a database is a catalog, of this version.
 
-    Raises
-    ------
-    CatalogError
-        It belongs to another program, or to another version of this one.
-    CatalogDamaged
-        No program has written such a version.
+    Raises `CatalogError`: it belongs to another program, or to another version of this one. `CatalogDamaged`: no
+    program has written such a version.
     """
     if found.get("application") != APPLICATION:
         raise CatalogError(f"{place} is the database of another program.", next_step="Give the place of a catalog.")

@@ -61,10 +61,7 @@ from rig.views.description import (
 def described(catalog: Catalog, enrollment: Enrollment, name: str, *wanted: str) -> Described:
     """Return the stored description of an enrollment, or compute it; by `DESCRIPTORS` or those that are ``wanted``.
 
-    Raises
-    ------
-    CatalogError
-        An image cannot be read, or a view cannot be segmented.
+    Raises `CatalogError`: an image cannot be read, or a view cannot be segmented.
     """
     kinds = wanted or DESCRIPTORS
     seal = seal_of(enrollment)
@@ -94,14 +91,8 @@ def load_views(catalog: Catalog, descriptor: str) -> Generator[JobProgress, None
 
     It yields its progress in enrollments while it describes those that are not described yet.
 
-    Raises
-    ------
-    UsageError
-        There is no such descriptor.
-    CatalogDamaged
-        An object or a view is not as it was stored.
-    CatalogError
-        A view that is not described yet cannot be described.
+    Raises `UsageError`: there is no such descriptor. `CatalogError`: a view that is not described yet cannot be
+    described.
     """
     kind = known_descriptor(descriptor)
     found: dict[str, bytes] = {}
@@ -156,12 +147,7 @@ def redescribe(
 
     Each result is stored at once: after an interruption the next call continues there.
 
-    Raises
-    ------
-    UsageError
-        There is no such descriptor.
-    CatalogError, CatalogBusy
-        The catalog cannot be written.
+    Raises `UsageError`: there is no such descriptor.
     """
     kind = known_descriptor(descriptor)
     found: dict[str, bytes] = {}
@@ -188,10 +174,7 @@ def local_views(catalog: Catalog, name: str, azimuths_deg: Sequence[float]) -> l
     They are cut out as at the enrollment (`hbr.dense.local_difference`). Which these are, `hbr.dense.session.near`
     decides for the bench and for the evaluation.
 
-    Raises
-    ------
-    ObjectNotFound, CatalogError
-        There is no such object, or an image is missing or is not the stored one.
+    Raises `ObjectNotFound`, `CatalogError`: there is no such object, or an image is missing or is not the stored one.
     """
     found = catalog.object(name)
     enrollment = found.complete

@@ -65,14 +65,9 @@ class OpenEnrollment:
         The image is complete under its name before its row is committed. A crash in between leaves an image without a
         row, which is harmless, and never a row without its image.
 
-        Raises
-        ------
-        UsageError
-            The view is not in the plan, a value of it is not possible, or the image has the wrong type or shape.
-        CatalogError
-            The view is stored already, the enrollment is no longer in progress, or the disk is full or fails.
-        CatalogBusy
-            Another process is writing for longer than the timeout.
+        Raises `UsageError`: the view is not in the plan, a value of it is not possible, or the image has the wrong type
+        or shape. `CatalogError`: the view is stored already, the enrollment is no longer in progress, or the disk is
+        full or fails.
         """
         if view.index >= len(self.planned_azimuth_deg):
             raise UsageError(
@@ -110,10 +105,8 @@ class OpenEnrollment:
 
         The previous one is superseded. After an interruption, resume the enrollment and call this again.
 
-        Raises
-        ------
-        CatalogError
-            Planned views are missing, an image cannot be read, or the enrollment is no longer in progress.
+        Raises `CatalogError`: planned views are missing, an image cannot be read, or the enrollment is no longer in
+        progress.
         """
         database, clock = self._database, self._clock
         with database.read() as transaction:
@@ -145,10 +138,7 @@ class OpenEnrollment:
     def discard(self) -> None:
         """Remove an enrollment without views; an object that has no other enrollment goes with it.
 
-        Raises
-        ------
-        CatalogError
-            The enrollment has views or is no longer in progress.
+        Raises `CatalogError`: the enrollment has views or is no longer in progress.
         """
         with self._database.write() as transaction:
             self._check_in_progress(transaction)

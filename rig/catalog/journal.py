@@ -174,12 +174,8 @@ class Delivery:
 def deliver_journal(place: CatalogPlace, clock: Clock, *, replacing: Collection[str] = ()) -> list[Delivery]:
     """Deliver the journal to the server of the catalog.
 
-    Raises
-    ------
-    CatalogUnavailable
-        The server does not answer; the journal keeps everything.
-    CatalogError, CatalogBusy
-        The server or the journal cannot be used, or another program delivers the journal.
+    Raises `CatalogUnavailable`: the server does not answer; the journal keeps everything. `CatalogError`,
+    `CatalogBusy`: the server or the journal cannot be used, or another program delivers the journal.
     """
     with Journal.of(place, clock) as journal, Catalog.open(place, clock=clock) as server:
         return deliver(journal, server, replacing=replacing)
@@ -196,12 +192,7 @@ def deliver(journal: Catalog, server: Catalog, *, replacing: Collection[str] = (
     replacing
         Names of objects that replace those of the server.
 
-    Raises
-    ------
-    CatalogUnavailable
-        The server stopped answering; what was not delivered stays in the journal.
-    CatalogBusy
-        Another program delivers this journal.
+    Raises `CatalogUnavailable`: the server stopped answering; what was not delivered stays in the journal.
     """
     done = []
     with _only_delivery(journal):

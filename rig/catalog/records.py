@@ -74,10 +74,7 @@ class Provenance:
     software
         Name and version of the program.
 
-    Raises
-    ------
-    UsageError
-        The devices or conditions are not JSON values.
+    Raises `UsageError`: the devices or conditions are not JSON values.
     """
 
     bench: str
@@ -93,10 +90,7 @@ class Provenance:
 def clean_name(name: str) -> str:
     """Return the name of an object as the catalog stores and compares it: composed (NFC), without outer spaces.
 
-    Raises
-    ------
-    UsageError
-        The name is empty, is longer than 100 characters or contains characters that cannot be printed.
+    Raises `UsageError`: the name is empty, is longer than 100 characters or contains characters that cannot be printed.
     """
     cleaned = unicodedata.normalize("NFC", name).strip()
     if not cleaned:

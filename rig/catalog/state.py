@@ -110,10 +110,7 @@ class Used:
 def used(transaction: Transaction, *, checked: bool = False) -> list[Used]:
     """Return the enrollments that searches use, in the order in which their objects were added.
 
-    Raises
-    ------
-    CatalogDamaged
-        They are ``checked``, and the name or the seal of an object is not as it was written.
+    Raises `CatalogDamaged`: they are ``checked``, and the name or the seal of an object is not as it was written.
     """
     wanted = (
         select(Named.object_id, Named.object_name, Ended.enrollment_id, Enrollment.key, Ended.seal, Ended.id)
@@ -177,10 +174,7 @@ def changed(names: Sequence[str]) -> CatalogDamaged:
 def find(transaction: Transaction, name: str, *, deleted: bool = False) -> Entry:
     """Return the state of an object in use, or of the last ``deleted`` one that is still stored.
 
-    Raises
-    ------
-    ObjectNotFound
-        There is no such object. The next step lists similar names.
+    Raises `ObjectNotFound`: there is no such object. The next step lists similar names.
     """
     name = clean_name(name)
     among = _among(deleted)
@@ -251,13 +245,7 @@ def check_free(transaction: Transaction, name: str) -> None:
 
 
 def summaries(transaction: Transaction, *, deleted: bool = False, object_id: int | None = None) -> list[ObjectSummary]:
-    """Return the objects in use or the deleted ones, or one object, in the order in which they were added.
-
-    Raises
-    ------
-    CatalogDamaged
-        The state of an object is not as it was written, or the views of its complete enrollment are not all there.
-    """
+    """Return the objects in use or the deleted ones, or one object, in the order in which they were added."""
     conditions = _among(deleted) if object_id is None else [IS_STATE, Named.object_id == object_id]
     count = select(func.count()).where(View.enrollment_id == Ended.enrollment_id).correlate(Ended).scalar_subquery()
     columns = (
@@ -312,13 +300,7 @@ def of_object(object_id: int | None) -> ColumnElement[bool]:
 
 
 def enrollments(transaction: Transaction, *conditions: ColumnElement[bool]) -> list[EnrollmentState]:
-    """Return enrollments with their sessions and views, newest first, all as they were written.
-
-    Raises
-    ------
-    CatalogDamaged
-        They are not.
-    """
+    """Return enrollments with their sessions and views, newest first, all as they were written."""
     wanted = (
         select(Enrollment, Ended)
         .join(Ended, Ended.enrollment_id == Enrollment.id)

@@ -114,12 +114,7 @@ class CatalogSource:
     def items(self) -> Iterator[Item]:
         """Yield the objects in the order in which they were added.
 
-        Raises
-        ------
-        ObjectNotFound
-            There is no object of one of the names.
-        CatalogDamaged
-            Something is not as it was stored, or this program would not have stored it.
+        Raises `ObjectNotFound`: there is no object of one of the names.
         """
         with self.catalog.database.read() as transaction:
             state.used(transaction, checked=True)
@@ -203,18 +198,9 @@ def transfer(
         An enrollment is delivered: it stays as the target has it, even if it was deleted or replaced there. What was
         computed from it goes with it.
 
-    Raises
-    ------
-    UsageError
-        There is no such descriptor, or the label cannot be stored.
-    ImportRejected
-        Nothing is left to transfer, or an image of a catalog was rejected.
-    CatalogDamaged
-        Something in a catalog is not as it was stored.
-    ObjectExists
-        Some objects are in the catalog already, and conflicts are rejected.
-    CatalogError, CatalogBusy
-        A catalog cannot be used.
+    Raises `UsageError`: there is no such descriptor, or the label cannot be stored. `ImportRejected`: nothing is left
+    to transfer, or an image of a catalog was rejected. `ObjectExists`: some objects are in the catalog already, and
+    conflicts are rejected.
     """
     checked_texts(label, None)
     for name in descriptors:

@@ -107,11 +107,6 @@ def collect_garbage(catalog: Catalog, *, old: bool = False, dry_run: bool = Fals
         Also remove the superseded and abandoned enrollments of objects in use.
     dry_run
         Change nothing; only return what would be removed.
-
-    Raises
-    ------
-    CatalogError, CatalogBusy
-        The catalog cannot be written.
     """
     database, store = catalog.database, catalog.database.images
     unused = or_(Named.deleted == true(), Ended.status.in_(_OLD if old else ()))

@@ -105,13 +105,7 @@ class _Image(NamedTuple):
 
 
 def verify(catalog: Catalog, *, jobs: Jobs | None = None) -> Generator[JobProgress, None, Verification]:
-    """Compare every row and every image with its digest; change nothing. ``jobs`` None is one process per core.
-
-    Raises
-    ------
-    CatalogError, CatalogBusy
-        The catalog cannot be read.
-    """
+    """Compare every row and every image with its digest; change nothing. ``jobs`` None is one process per core."""
     findings, of_images = list[Finding](), list[Finding]()
     with catalog.database.read() as transaction:
         objects = transaction.scalar(select(func.count(Enrollment.object_id.distinct()))) or 0

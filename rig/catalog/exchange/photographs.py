@@ -128,12 +128,8 @@ def read_folder(
     now
         Time of the enrollments.
 
-    Raises
-    ------
-    UsageError
-        The pattern does not contain ``{object}`` and ``{angle}`` once each.
-    ImportRejected
-        There is no such folder, or no photograph in it.
+    Raises `UsageError`: the pattern does not contain ``{object}`` and ``{angle}`` once each. `ImportRejected`: there is
+    no such folder, or no photograph in it.
     """
     named = _regex(pattern)
     if not folder.is_dir():
@@ -168,10 +164,7 @@ def read_table(path: Path, *, now: datetime) -> Photographs:
 
     Unknown columns are ignored. A row that cannot be used is rejected; the others are imported.
 
-    Raises
-    ------
-    ImportRejected
-        The file is not such a table.
+    Raises `ImportRejected`: the file is not such a table.
     """
     photographs = Photographs(str(path), path.parent.resolve(), now)
     used = 0
