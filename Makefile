@@ -2,12 +2,14 @@
 
 PYTHON ?= python3
 BIN    := .venv/bin
+CORE   := .venv/.core
 READY  := .venv/.ready
 # One thread is faster here: with several threads, small matrix products wait for each other.
 export OPENBLAS_NUM_THREADS ?= 1
 
 LIBRARY := hbr/kernels/_kernels.so
 
+.NOTPARALLEL:
 .PHONY: FORCE demo web test test-nightly test-kills test-web kernel-test fuzz lint docs wheel bench lock clean test-servers help
 
 help:
@@ -26,7 +28,8 @@ help:
 	@echo "make bench  measure speeds, as ratios to other programs"
 	@echo "make clean  remove the files that these commands made"
 
-demo: $(READY) $(LIBRARY)
+# This needs the packages of the program only, so that a new user waits less.
+demo: $(CORE) $(LIBRARY)
 	@$(BIN)/rig demo
 
 web: $(READY) $(LIBRARY)
@@ -86,22 +89,31 @@ wheel: $(READY)
 bench: $(READY) $(LIBRARY)
 	@for file in benchmarks/bench_*.py; do $(BIN)/python -m benchmarks.$$(basename $$file .py) || exit 1; done
 
-# Locked versions with their hashes, for every platform and Python that the project supports (docs/decisions/0006).
+# Locked versions with their hashes, for every platform and Python that the project supports. No address of an index is in
+# the files, so that uv and pip install the same from any. requirements.lock is for development, .ci/core.lock for the program
+# and its build; what runs outside of .venv has lock files of its own
+# (docs/decisions/0006).
 lock:
 	uv pip compile --universal --python-version 3.11 --generate-hashes --extra dev --upgrade \
 	    --no-header --no-emit-index-url pyproject.toml -o requirements.lock
+	printf 'hatchling\neditables\n' | uv pip compile - pyproject.toml --constraint requirements.lock --universal --python-version 3.11 \
+	    --generate-hashes --no-header --no-emit-index-url -o .ci/core.lock
 	for tool in uv:uv setuptools:backend cyclonedx-bom:sbom 'playwright schemathesis axe-playwright-python:browser' \
 	    'SQLAlchemy>=2.1 psycopg[binary] s3fs moto[server] distributed bluesky bluesky-tiled-plugins tiled[client,server]:servers'; do \
 	    echo $${tool%:*} | tr ' ' '\n' | uv pip compile - --universal --python-version 3.11 \
 	    --generate-hashes --upgrade --no-header --no-emit-index-url -o .ci/$${tool#*:}.lock; done
 
 $(READY): requirements.lock pyproject.toml
-	@sh .ci/setup "$(PYTHON)"
+	@sh .ci/setup "$(PYTHON)" requirements.lock
+	@touch $(CORE) $@
+
+$(CORE): .ci/core.lock pyproject.toml
+	@sh .ci/setup "$(PYTHON)" .ci/core.lock
 	@touch $@
 
 # Compile the kernels if there is a C compiler. Without one, NumPy is used instead (docs/decisions/0040).
 # The library contains a digest of its sources, which shows whether it is current. File times do not show a removed file.
-$(LIBRARY): FORCE | $(READY)
+$(LIBRARY): FORCE | $(CORE)
 	@$(BIN)/python hbr/kernels/compile.py
 
 FORCE:
