@@ -32,9 +32,9 @@ class Catalog(AbstractContextManager["Catalog"]):
     Open it with `Catalog.open`. Several processes may read and write at once. For answers, checks, imports and exports
     use the functions of `rig.catalog.results`, `.derived`, `.verify`, `.upkeep`, `.transfer` and `.exchange`.
 
-    Whatever reads or writes a catalog raises `CatalogDamaged` for what is not as it was stored, `CatalogBusy` if another
-    process writes for longer than the timeout, `CatalogUnavailable` if the server does not answer, and `CatalogError`
-    if the system denies access or the disk is full. The methods name other errors only.
+    Whatever reads or writes a catalog raises `CatalogDamaged` for what is not as it was stored, `CatalogBusy` if
+    another process writes for longer than the timeout, `CatalogUnavailable` if the server does not answer, and
+    `CatalogError` if the system denies access or the disk is full. The methods name other errors only.
 
     Attributes
     ----------

@@ -78,10 +78,6 @@ class Database(ABC):
     def size_bytes(self, transaction: Transaction) -> int:
         """Return the size of the database."""
 
-    def may_have_changed(self) -> bool:
-        """Return whether another query can find something new since the last call."""
-        return True
-
 
 def _transaction(connection: Connection) -> Transaction:
     return Transaction(connection, expire_on_commit=False, autoflush=True)

@@ -221,8 +221,7 @@ class CurrentModel:
         try:
             self._leave_copy()
             rules = self.catalog.path / FILE
-            changed = self.catalog.database.may_have_changed()
-            version = self.catalog.version() if changed or not self.version else self.version
+            version = self.catalog.version()
             state = version, rules.stat().st_mtime_ns if rules.exists() else None
             if state != self._loaded_state:
                 self._model = load_model(self.catalog, descriptor=self.descriptor, progress=progress)
