@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from hbr.core.angles import wrap360
 from rig.bench import Bench
 from rig.catalog import Catalog, OpenEnrollment, Provenance, View
-from rig.catalog.derived import unfinished_camera_settings
+from rig.catalog.sessions import unfinished_camera_settings
 from rig.core.clock import seconds_between
 from rig.core.errors import LimitExceeded, ObjectMoved, RigError, RotationDisagreement
 from rig.core.json_form import plain

@@ -23,7 +23,7 @@ from rig.catalog.transfer import CatalogSource, Conflict, Transferred, transfer
 from rig.core.errors import CatalogDamaged, CatalogError, JobNotFound
 from rig.core.json_form import plain
 from rig.plans.similar_objects import similar_objects
-from rig.views.description import BENCH_DESCRIPTOR, PAPER_DESCRIPTOR
+from rig.views.description import BENCH_DESCRIPTOR, DESCRIPTORS
 from rig.web.answers import (
     Bundle,
     Deleted,
@@ -231,8 +231,7 @@ def add_bundles(routes: Routes, server: Server) -> None:
 
         def store() -> Transferred:
             with server.catalog.open_to_change() as catalog, read_bundle(path, catalog.clock) as source:
-                only = (PAPER_DESCRIPTOR,)
-                return finished(transfer(source, catalog, conflict=on_conflict, descriptors=only, strict=True, jobs=1))
+                return finished(transfer(source, catalog, conflict=on_conflict, descriptors=DESCRIPTORS, jobs=1))
 
         with TemporaryDirectory(prefix="rig-import-") as folder:
             path = Path(folder) / "upload.rigcat.zip"

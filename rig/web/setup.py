@@ -11,7 +11,8 @@ from typing import Any, Final
 from pydantic import BaseModel, ConfigDict, Field
 
 from rig.catalog import Catalog
-from rig.catalog.shared import Attempts, BackgroundDelivery, JournalState, open_or_copy
+from rig.catalog.copying import Attempts, open_or_copy
+from rig.catalog.journal import BackgroundDelivery, JournalState
 from rig.config import RigConfig
 from rig.config.catalog_place import CatalogPlace
 from rig.core.clock import Clock

@@ -200,8 +200,8 @@ def deliver(
 
     Example: rig catalog deliver --rename mug-white mug-white-2
     """
-    from rig.catalog.shared import Journal, deliver_journal, delivery_words
-    from rig.catalog.shared import discard as remove
+    from rig.catalog.journal import Journal, deliver_journal, delivery_words
+    from rig.catalog.journal import discard as remove
 
     place = settings.place
     if place.url is None:
