@@ -14,7 +14,7 @@ from typing import Annotated, Any, Final, Unpack
 import typer
 from typer.core import TyperGroup
 
-from rig.cli.bench import config, doctor, find, head, jog, serve, servo, setup, snapshot, table
+from rig.cli.bench import config, doctor, head, serve, servo, setup, snapshot, table
 from rig.cli.catalog import catalog, exchange, results, upkeep  # noqa: F401 - upkeep adds its commands
 from rig.cli.objects import enroll, evaluate, identify, runs
 from rig.cli.ui.command import show_error, without_color
@@ -52,10 +52,11 @@ class _Commands(TyperGroup):
         The help of Typer begins with the options. It also imports a parser of Markdown, which takes longer than all
         this.
         """
-        from rich.console import Console
         from rich.panel import Panel
         from rich.table import Table
         from rich.text import Text
+
+        from rig.cli.ui.present import console
 
         texts: dict[str, str] = {str(one.name): inspect.getdoc(one.callback) or "" for one in app.registered_commands}
         for group in app.registered_groups:
@@ -66,8 +67,9 @@ class _Commands(TyperGroup):
         panels["Plug-ins"] = {name: text for name, text in texts.items() if name not in named}
         options: Any = self.get_params(ctx)
         panels["Options"] = {f"{', '.join(one.opts)} {one.metavar or ''}".rstrip(): one.help for one in options}
-        screen = Console(highlight=False, markup=False, emoji=False)
-        screen.print(f"\n {self.get_usage(ctx)}\n\n {self.help}\n")
+        screen = console()
+        screen.width = min(screen.width, 120)
+        screen.print(Text(f"\n {self.get_usage(ctx)}\n\n {self.help}\n"))
         for title, rows in panels.items():
             table = Table.grid(padding=(0, 2, 0, 0))
             table.add_column(style="bold cyan", width=max(map(len, rows if title == "Options" else texts)))
@@ -75,7 +77,7 @@ class _Commands(TyperGroup):
                 table.add_row(name, Text(text))
             if rows:
                 screen.print(Panel(table, title=title, title_align="left", border_style="dim"))
-        screen.print(f"\n{self.epilog}\n", soft_wrap=True)
+        screen.print(Text(f"\n{self.epilog}\n"), soft_wrap=True)
 
     def invoke(self, ctx: Any) -> Any:
         handle_signals()  # from here on, a signal unwinds the stack; until here the program was at its start
@@ -167,12 +169,12 @@ app.command("empty-table")(snapshot.empty_table)
 app.command("snapshot")(snapshot.snapshot)
 app.command("goto", context_settings={"ignore_unknown_options": True})(table.goto)  # an angle can be negative
 app.command("home")(table.home)
-app.command("jog")(jog.jog)
+app.command("jog")(table.jog)
 app.command("status")(table.status)
 app.command("stop")(table.stop)
 app.command("acknowledge")(table.acknowledge)
 app.command("doctor")(doctor.doctor)
-app.command("find")(find.find)
+app.command("find")(doctor.find)
 app.command("setup")(setup.setup)
 app.command("serve")(serve.serve)
 app.add_typer(results.app, name="results")

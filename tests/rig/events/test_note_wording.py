@@ -5,7 +5,7 @@ import pytest
 from hbr.dense.stopping import Limitation, LimitationCode
 from rig.core.next_steps import Do, steps_as_json
 from rig.events.events import Note, NoteCode, WaitReason
-from rig.events.note_wording import limitation_words, note_steps, note_words, wait_words
+from rig.events.wording import limitation_words, note_steps, note_words, wait_words
 from tests.rig.report.report_samples import NOTE
 
 

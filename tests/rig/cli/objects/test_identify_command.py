@@ -127,10 +127,9 @@ def test_dense_is_the_default_strategy(rig, enrolled):
         done = rig("identify", "--json", "--set", "bench.sim.object=lamp", *words)
         return [json.loads(line) for line in done.stdout.splitlines() if "event" in line], done.stderr
 
-    events, _ = searched("--top", "1", "--save-run", "runs/own")
+    events, _ = searched("--save-run", "runs/own")
     started, *_, answer, _ = (event for event in events if event["event"] != "empty_table_image")
     assert (started["strategy"], started["descriptor"], answer["name"]) == ("dense", "edges+colours", "lamp")
-    assert all(len(event["candidates"]) == 1 for event in events if event["event"] == "ranked")
     assert 0.9 < answer["confidence"] <= 1
     assert answer["open_set_score"] >= answer["open_set_threshold"]
     assert started["notes"][0]["code"] == "rates-not-guaranteed"
@@ -231,7 +230,7 @@ def test_ambiguous_object_ends_with_exit_code_10(rig):
     before = path.read_text(encoding="utf-8")
     try:
         path.write_text(json.dumps(json.loads(before) | {"min_confidence": 1.5, "open_set_thresholds": [None] * 4}))
-        words = ("identify", "--strategy", "dense", "--max-views", "2", "--set", "bench.sim.object=dice")
+        words = ("identify", "--strategy", "dense", "--set", "identify.max_views=2", "--set", "bench.sim.object=dice")
         done = rig(*words, "--json", "--save-run", "runs/ambiguous")
         answer = json.loads(done.stdout.splitlines()[-2])
         assert done.exit_code == EXIT_AMBIGUOUS
