@@ -14,8 +14,7 @@ from rig.core.errors import BenchBusy, DeviceMismatch, DeviceNotFound, DeviceSil
 from rig.core.json_form import plain
 from rig.core.next_steps import Do, steps_as_json
 from rig.devices.camera import Camera
-from rig.devices.imu import Imu
-from rig.devices.open_imu import open_imu
+from rig.devices.imu import Imu, open_imu
 from rig.doctor.camera import open_camera
 from rig.doctor.context import DoctorContext
 from rig.safety.saved_state import ServerAddress, server_address
