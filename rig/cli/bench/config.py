@@ -160,12 +160,9 @@ def _print_json(
     values: "Values",
     rows: "Sequence[tuple[KeyInfo, Any, list[tuple[str, Any]]]]",
 ) -> None:
-    from rig.config.values import search_paths
-
     settings.print_json(
         {
             "path": values.path,
-            "searched": search_paths(),
             "keys": {
                 info.name: {
                     "value": value,
