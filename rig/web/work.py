@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager, closing, nullcontext
-from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, Final, Protocol
 
@@ -16,6 +15,7 @@ from rig.core.errors import UsageError
 from rig.core.json_form import plain
 from rig.core.next_steps import NextSteps, as_steps, steps_as_json
 from rig.core.phrases import counted, duration_words
+from rig.core.plugins import plugins
 from rig.doctor.context import open_context
 from rig.doctor.finding import Finding, finding_words
 from rig.events.events import Accepted, Decided, Enrolled, Event, Identified, Ranked, Started, event_dict
@@ -31,14 +31,9 @@ from rig.plans.estimate import TimeLeft
 from rig.plans.operator import Choice, Operator, Question
 from rig.plans.tray import TrayItem
 from rig.web import requests
-from rig.web.bench_catalog import BenchCatalog
 from rig.web.picture import Outliner, jpeg
-from rig.web.requests import (
-    Job,
-    JobState,
-    TrayObject,
-)
-from rig.web.setup import Setup
+from rig.web.requests import Job, JobState, TrayObject
+from rig.web.setup import BenchCatalog, Setup
 from rig.web.worker import BenchWorker
 
 VIEW_PX: Final = 480
@@ -57,23 +52,11 @@ class Calibration(Protocol):
 
 def calibrations() -> dict[str, Calibration]:
     """Return the installed calibrations by name."""
-    return {point.name: point.load() for point in sorted(entry_points(group=CALIBRATIONS), key=lambda p: p.name)}
+    return dict(sorted(plugins(CALIBRATIONS)))
 
 
 class ServedDesk(Desk):
-    """The desk of a job of the server, and its operator: the bench is open, and the pages ask.
-
-    Parameters
-    ----------
-    worker
-        Owns the bench.
-    job
-        The running job.
-    setup
-        The served bench.
-    catalog
-        Opens the bench's catalog.
-    """
+    """The desk of a job of the server, and its operator: the bench is open, and the pages ask."""
 
     is_there = True
     log_waits_for_server = False  # which may be away: that would delay the answer to a STOP
@@ -211,9 +194,9 @@ def _enroll(desk: ServedDesk, **parameters: Any) -> Steps[None]:
     return enroll(desk, **parameters, ask=False)
 
 
-def _tray(desk: ServedDesk, objects: list[TrayObject], views: int | None) -> Steps[None]:
+def _tray(desk: ServedDesk, objects: list[TrayObject], **parameters: Any) -> Steps[None]:
     items = [TrayItem(number, one.name, one.label, one.note, one.views) for number, one in enumerate(objects, 1)]
-    return enroll_list(desk, items, views=views, ask=False)
+    return enroll_list(desk, items, **parameters, ask=False)
 
 
 def _dry_run(desk: ServedDesk, objects: list[TrayObject], **parameters: Any) -> Steps[None]:

@@ -43,22 +43,8 @@ class JobCancelled(Exception):
 class BenchWorker:
     """Runs jobs on one bench.
 
-    Parameters
-    ----------
-    open_bench
-        Opens the bench.
-    queue
-        The source of the jobs.
-    publish
-        Sends a message to the listeners: its kind, and its JSON values. It must not wait.
-    picture
-        Receives the camera's frames.
-    run_job
-        Runs a job to its end: `rig.web.work.ServedDesk`.
-    stops
-        Receives the requests to stop.
-    clock
-        The computer's clock.
+    ``publish`` sends a message to the listeners, its kind and its JSON values; it must not wait. ``run_job`` runs a job
+    to its end: `rig.web.work.ServedDesk`.
     """
 
     def __init__(

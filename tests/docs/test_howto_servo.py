@@ -55,9 +55,8 @@ def test_row_of_a_package_opens_and_finds_a_dynamixel(rows):
 
 
 def test_models_of_no_package_are_a_configuration_error():
-    config = load_config(None, ["servo.model=ax_18a"])
     with pytest.raises(ConfigError):
-        SimDevices.connected(config, World(seed=1))
+        load_config(None, ["servo.model=ax_18a"])
 
 
 class Controller:

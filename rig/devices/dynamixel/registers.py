@@ -9,7 +9,7 @@ from functools import cache
 from struct import Struct
 from typing import Any, Self
 
-from rig.config.servos import USE_ANOTHER, differences, model_file_exists, model_registers, sdk_models
+from rig.config.servos import GROUP, USE_ANOTHER, differences, model_file_exists, model_registers, sdk_models
 from rig.core.errors import ConfigError, DeviceMismatch
 from rig.core.plugins import plugins
 
@@ -33,9 +33,6 @@ _SIGNED = frozenset(
 # A register that is missing in the .model files: (address, size, name), and its first firmware by model.
 _STARTUP = (60, 1, "Startup Configuration")
 _STARTUP_FIRMWARE = {"xl330": 46, "xc330": 46, "x": 45}
-
-GROUP = "rig.servos"
-"""Entry-point group in which packages name a `DynamixelModel`, or a `rig.devices.servo.ServoDriver`."""
 
 
 @dataclass(frozen=True, slots=True)

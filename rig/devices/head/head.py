@@ -42,6 +42,8 @@ from rig.devices.head.samples import HeadClock, HeadSensor, SampleStream, head_s
 from rig.devices.head.status import HeadIdentity, HeadStatus, head_fault, sensor_error
 from rig.devices.imu import ImuSamples
 
+POWER_UP_S = 0.6
+"""Time from closing the relay of the servo's supply until the servo answers."""
 HEARTBEATS_PER_DEADMAN = 4
 FIRST_HEARTBEATS = 8
 """Heartbeats that compare the clocks before the first sample is dated."""
@@ -187,7 +189,7 @@ class RigHead:
                 return fault
         if config.power:
             self.set_power(True)
-            self._clock.sleep(config.power_up_s)
+            self._clock.sleep(POWER_UP_S)
         if config.light is not None:
             self.set_light(config.light)
         return fault
@@ -407,7 +409,7 @@ def powered(config: RigConfig, open_port: Callable[[], SerialConnection], clock:
     try:
         head.check()
         head.set_power(True)
-        clock.sleep(config.head.power_up_s)
+        clock.sleep(POWER_UP_S)
         yield
     finally:
         head.close()
