@@ -85,6 +85,15 @@ class DeviceScan:
     """Two servos with the same id were found."""
 
     @property
+    def settings(self) -> dict[Key, Any]:
+        """The settings of the unambiguous devices: those of which exactly one was found."""
+        wanted: dict[Key, Any] = {}
+        for what, found in self.candidates.items():
+            if len(found) == 1 and not (what == "servo" and self.duplicate_ids):
+                wanted |= found[0].settings
+        return wanted
+
+    @property
     def candidates(self) -> dict[str, list[Candidate]]:
         """The devices found that the rig can use, by what they may be."""
         servos = [

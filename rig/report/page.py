@@ -21,12 +21,13 @@ from rig.core.next_steps import Do, in_words
 from rig.core.phrases import azimuth_words, counted, sentence, signed
 from rig.core.templates import environment
 from rig.events.events import Decided
-from rig.events.note_wording import note_steps, note_words
 from rig.events.wording import (
     answer_words,
     comparison_words,
     decision_words,
     move_words,
+    note_steps,
+    note_words,
     outcome_words,
     ranking_words,
     share_words,

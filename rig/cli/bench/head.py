@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from rig.cli.bench.findings import doctor_context
+from rig.cli.bench.doctor import doctor_context
 from rig.cli.ui.command import command
 from rig.cli.ui.settings import Settings
 

@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rig.cli.bench.findings import doctor_context, show_progress
+from rig.cli.bench.doctor import doctor_context, show_progress
 from rig.cli.ui.command import command
 from rig.cli.ui.exit_codes import EXIT_DEVICE
 from rig.cli.ui.options import YesOption

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
-from rig.cli.bench.findings import doctor_context, show_findings
+from rig.cli.bench.doctor import doctor_context, show_findings
 from rig.cli.ui import prompts
 from rig.cli.ui.command import command
 from rig.cli.ui.settings import Settings

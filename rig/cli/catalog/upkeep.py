@@ -290,7 +290,7 @@ def fit(
 
 
 def _fit_lines(found: "FittedRule", objects: int) -> list[str]:
-    from rig.events.note_wording import limitation_words
+    from rig.events.wording import limitation_words
 
     rule = found.rule
     searched = (f"{found.searched} of " if 0 < found.searched < objects else "") + counted(objects, "object")

@@ -9,7 +9,6 @@ import pytest
 
 from rig.bench.computer import Computer
 from rig.bench.hardware import camera_settings
-from rig.cli.bench.find import proposed_settings
 from rig.config import CameraConfig, load_config
 from rig.core.errors import DeviceNotFound, DeviceSilent
 from rig.devices.opencv_camera import OpenCvCamera, TimeBase
@@ -155,7 +154,7 @@ def test_sensor_on_the_ribbon_cable_is_recognised_and_not_opened(receiver, monke
         monkeypatch.setitem(sys.modules, "picamera2", ModuleType("picamera2"))
         (found,) = scan.find_cameras(bench.context)
         assert (found.code, found.parameters["number"]) == (FindingCode.RIBBON_CAMERA, 0)
-        assert proposed_settings(DeviceScan(ribbons=[0])) == {("camera", "source"): "picamera2:0"}
+        assert DeviceScan(ribbons=[0]).settings == {("camera", "source"): "picamera2:0"}
 
 
 @pytest.mark.parametrize(

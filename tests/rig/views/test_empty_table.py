@@ -18,7 +18,7 @@ from rig.config import RigConfig, load_config
 from rig.core.errors import StateNotStored, TableNotEmpty, UsageError, ViewRejected
 from rig.core.next_steps import Do
 from rig.events.events import EmptyTableImage, NoteCode, Warned
-from rig.events.note_wording import note_steps, note_words
+from rig.events.wording import note_steps, note_words
 from rig.plans.enroll import enroll
 from rig.plans.photograph_table import photograph_table
 from rig.safety.saved_state import FileStore, MemoryStore
