@@ -51,10 +51,7 @@ def find_servo_fault(
 ) -> RigError | None:
     """Return the error that forbids a servo to work (hardware error, temperature, supply); None if it may work.
 
-    Parameters
-    ----------
-    again
-        The servo had a fault before: it must also have cooled down by `COOLER_C`.
+    ``again`` if the servo had a fault before: it must also have cooled down by `COOLER_C`.
     """
     evidence = {
         "temperature_c": state.temperature_c,
@@ -93,20 +90,10 @@ def find_servo_fault(
 
 
 class MotionMonitor:
-    """Checks the servo's readings during one motion.
+    """Checks the servo's readings during one motion between two table angles.
 
-    Parameters
-    ----------
-    config
-        The limits of the rig.
-    limits
-        The limits at which the servo shuts down.
-    start_deg, goal_deg
-        Table angles at which the motion begins and ends.
-    tolerance_deg
-        Distance from the goal that counts as arrived.
-    cruise_dps
-        Highest speed of the table.
+    ``limits`` are those at which the servo shuts down. ``tolerance_deg`` is the distance from the goal that counts as
+    arrived, ``cruise_dps`` the highest speed of the table.
     """
 
     def __init__(
@@ -130,16 +117,9 @@ class MotionMonitor:
         self._stood: deque[tuple[int, float]] = deque()
 
     def check(self, state: ServoState, angle_deg: float, lag_deg: float | None) -> None:
-        """Check one reading.
+        """Check one reading, by which the table is at ``angle_deg``.
 
-        Parameters
-        ----------
-        state
-            The servo's reading.
-        angle_deg
-            The table's angle from this reading.
-        lag_deg
-            Angle by which the table is behind the servo's profile; None if that is not known.
+        ``lag_deg`` is the angle by which the table is behind the servo's profile; None if that is not known.
 
         Raises `DeviceFault`, `Overheated`, `SupplyOutOfRange`, `Stalled`, `Overloaded`, `FollowingError`, `NoProgress`:
         the motion must be stopped.

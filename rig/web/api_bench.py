@@ -152,3 +152,9 @@ def add_jobs(routes: Routes, server: Server) -> None:
         """Return a picture of a recent job as JPEG, the first with number 0."""
         _, found = server.remote.link.call("view", job_id=job_id, number=number)
         return Response(found, media_type="image/jpeg", headers={"Cache-Control": "private, max-age=3600"})
+
+    @routes.watch.get("/jobs/{job_id}/candidates", tags=["jobs"], response_class=Response)
+    def candidates(job_id: str) -> Response:
+        """Return the chart of the candidates of a recent search as SVG, after its last view."""
+        svg = server.remote.ask("candidates", job_id=job_id)
+        return Response(svg, media_type="image/svg+xml", headers={"Cache-Control": "no-store"})

@@ -59,7 +59,7 @@ def create_app(server: Server) -> FastAPI:
     for router in (routes.public, routes.watch, routes.operate):
         app.include_router(router, prefix=API, responses=_ERRORS)
     app.include_router(pages(server))
-    app.mount("/static", StaticFiles(packages=[("rig.web", "static")]), name="static")
+    app.mount("/static", StaticFiles(packages=[("rig.web", "static"), ("rig.charts", "static")]), name="static")
 
     @app.get("/metrics", include_in_schema=False)
     def metrics(_person: Watcher) -> Response:

@@ -38,7 +38,9 @@ class BenchSide:
 
     def __init__(self, setup: Setup, folder: Path, clock: SystemClock, report: Callable[[str], None]) -> None:
         def opened() -> Bench:
-            return open_bench(setup.bench, setup.config, seed=setup.seed, show_frame=self.picture.show)
+            bench = open_bench(setup.bench, setup.config, seed=setup.seed)
+            bench.camera.observers.append(self.picture.show)
+            return bench
 
         def run(worker: BenchWorker, job: Job) -> None:
             ServedDesk(worker, job, setup, catalog).run()
@@ -54,6 +56,7 @@ class BenchSide:
         self._functions: Functions = {
             **{name: validate_call(getattr(self.queue, name)) for name in asked},
             "view": self._view,
+            "candidates": self._candidates,
             "picture": self._picture,
             "numbers": self._numbers,
         }
@@ -86,6 +89,11 @@ class BenchSide:
         if not 0 <= number < len(pictures):
             raise JobNotFound("There is no such picture (any more).", next_step="The catalog has all enrolled views.")
         return None, pictures[number]
+
+    def _candidates(self, job_id: str) -> str:
+        if job_id not in self.worker.charts:
+            raise JobNotFound("There is no such chart (any more).", next_step="Open the report of the saved run.")
+        return self.worker.charts[job_id]
 
     def _picture(self, after: int) -> tuple[dict[str, Any], bytes]:
         """Return the newest frame, unless its number is ``after``, and ask the camera for more."""

@@ -4,7 +4,9 @@ from typing import TYPE_CHECKING, Final
 
 from fastapi import APIRouter, Request
 from fastapi.responses import HTMLResponse
+from markupsafe import Markup
 
+from rig.charts.compass import dial
 from rig.core.templates import environment
 from rig.web.next_steps import page_actions
 
@@ -26,7 +28,7 @@ PAGES: Final = {
 def pages(server: "Server") -> APIRouter:
     """Return the routes of the pages."""
     templates = environment("rig.web", folder="templates")
-    shared = {"bench": server.bench, "actions": page_actions()}
+    shared = {"bench": server.bench, "actions": page_actions(), "dial": Markup(dial())}
     router = APIRouter(include_in_schema=False)
 
     def page(name: str) -> None:

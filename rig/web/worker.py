@@ -90,6 +90,8 @@ class BenchWorker:
         """Number of stops before the present job: a further one stops it."""
         self.views: dict[str, list[bytes]] = {}
         """Pictures of the last jobs as JPEG."""
+        self.charts: dict[str, str] = {}
+        """Charts of the candidates of the last jobs as SVG, after their last view."""
         self._status_ns = 0
         self._polled_ns: int | None = None
         self.intervals_s: deque[float] = deque(maxlen=INTERVALS)
@@ -121,6 +123,7 @@ class BenchWorker:
         self.views[job.id] = []
         for old in list(self.views)[:-JOBS_WITH_PICTURES]:
             del self.views[old]
+            self.charts.pop(old, None)
         self._polled_ns = None
         state, error = JobState.FAILED, None
         try:

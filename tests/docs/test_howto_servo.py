@@ -9,7 +9,7 @@ from rig import Catalog, enroll
 from rig.bench.hardware import assemble
 from rig.config import load_config
 from rig.core.errors import ConfigError
-from rig.devices.dynamixel.opening import open_servo
+from rig.devices.dynamixel.servo import open_servo
 from rig.events.events import Enrolled, Moved
 from rig.safety.saved_state import MemoryStore
 from rig.safety.supervisor import TableState

@@ -152,7 +152,7 @@ def export(
         typer.Argument(metavar="[NAME]...", help="Names of the objects (default: all).", autocompletion=object_names),
     ] = None,
     format_: Annotated[
-        Literal["bundle", "folder", "csv", "json", "parquet", "html", "coco", "yolo"] | None,
+        Literal["bundle", "folder", "csv", "json", "parquet", "coco", "yolo"] | None,
         typer.Option("--format", help="Format (default: by the suffix of the target, folder without one)."),
     ] = None,
     label: Annotated[str | None, typer.Option(help="Only objects with this label.")] = None,
@@ -160,8 +160,8 @@ def export(
     """Export objects in an open format.
 
     Formats: bundle (everything, for rig import), folder (images named as in COIL-100, with a table views.csv), csv,
-    json and parquet (table without images), html (folder with a page and contact sheets), coco and yolo (training sets
-    with boxes and masks, divided into train, val and test).
+    json and parquet (table without images), coco and yolo (training sets with boxes and masks, divided into train, val
+    and test).
 
     Example: rig export tray.rigcat.zip --label kitchen --bench sim
 
@@ -172,7 +172,6 @@ def export(
     from rig.catalog.exchange.training import Annotations, write_training
     from rig.catalog.transfer import CatalogSource
     from rig.core.json_form import plain
-    from rig.report.catalog_page import write_catalog_page
 
     form = format_ or _FORMAT_OF.get(target.suffix.lower())
     if form is None:
@@ -203,8 +202,6 @@ def export(
                 count = write_bundle(target, source)
             case "folder":
                 count = write_folder(target, source)
-            case "html":
-                count = write_catalog_page(target, source)
             case _:
                 count = write_views(target, source, TableFormat(form))
     settings.say(
