@@ -78,7 +78,7 @@ def _print(table: Table, others: Mapping[str, Table]) -> tuple[Any, list[Any]]:
 
 
 def _coloured(value: Any, colours: Mapping[str, Colour]) -> Any:
-    """Return ``value`` with colours in place of their names."""
+    """Return ``value`` with colours in place of their names; so a text cannot be the name of a colour."""
     if isinstance(value, list):
         return [_coloured(each, colours) for each in value]
     return colours.get(value, value) if isinstance(value, str) else value
