@@ -17,10 +17,10 @@ from rig.devices.picamera2_capture import Picamera2Capture, camera_number
 from rig.doctor.device_scan import DeviceScan
 from rig.doctor.finding import FindingCode
 from rig.safety.saved_state import MemoryStore
-from sim import picamera2
 from sim.camera import SimCapture
 from sim.objects.shelf import shelf
 from sim.world import World
+from tests import fake_picamera2 as picamera2
 from tests.rig.doctor.doctor_parts import unopened
 
 
