@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from rig.bench import Bench
 from rig.catalog import Catalog, Provenance
+from rig.catalog.journal import open_for_enrollment
 from rig.catalog.records import Outcome
 from rig.catalog.results import Answer, NewResult, record
-from rig.catalog.shared import open_for_enrollment
 from rig.config.catalog_place import CatalogPlace
 from rig.core.clock import Clock
 from rig.core.errors import CatalogUnavailable, RigError
