@@ -29,8 +29,7 @@ from rig.config import ViewConfig
 from rig.core.errors import CatalogError, RigError, UsageError
 from rig.core.files import json_values
 from rig.core.next_steps import Do
-from rig.views.description import DESCRIPTORS, EnrollmentDescriber, within
-from rig.views.segmentation_evidence import check_evidence
+from rig.views.description import DESCRIPTORS, EnrollmentDescriber, check_evidence, within
 
 SEGMENTATION: Final = "segmentation"
 """The kind of the stored silhouettes: a list of the evidence of each view (`hbr.segmentation.segment`)."""

@@ -60,7 +60,7 @@ class OpenEnrollment:
     def add(self, view: View, image_bgr: NDArray[np.uint8], encoded: Future[bytes] | None = None) -> View:
         """Store a view and its image, uint8 (H, W, 3) BGR. Both are durable when this returns.
 
-        ``encoded`` is the image as PNG, if `rig.views.image_files.Encoder` began with it before.
+        ``encoded`` is the image as PNG, if another thread began with it before.
 
         The image is complete under its name before its row is committed. A crash in between leaves an image without a
         row, which is harmless, and never a row without its image.

@@ -15,7 +15,7 @@ from rig.config.servos import USE_ANOTHER
 from rig.config.toml_file import Key
 from rig.core.errors import DeviceNotFound, RigError
 from rig.core.next_steps import Do, SomeSteps
-from rig.devices.head.opening import open_head
+from rig.devices.head.head import open_head
 from rig.devices.head.protocol import BAUD
 from rig.devices.opencv_capture import modes_of
 from rig.devices.picamera2_capture import import_picamera2

@@ -9,6 +9,7 @@ Decisions: docs/decisions/0002, docs/decisions/0047.
 """
 
 from collections.abc import Generator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -38,7 +39,7 @@ from rig.plans.estimate import even_azimuths, table_angles
 from rig.views.capture import Attempt, Viewer, image_similarity
 from rig.views.description import DescribedView, ViewDescriber
 from rig.views.empty_table import empty_table_status
-from rig.views.image_files import Encoder
+from rig.views.image_files import encode
 
 SAME_SIMILARITY: Final = 0.97
 """Two images of an object at one angle are more similar; after a shift by a centimetre they are less similar."""
@@ -183,7 +184,7 @@ class EnrollmentViews:
         # Check the nearest frame to each angle, and store the accepted ones.
         locks, locks_hold = before.evidence.locks, before.evidence.locks_hold and after.evidence.locks_hold
         stored: set[int] = set()
-        encoder = Encoder()
+        encoder = ThreadPoolExecutor(1, "encoder")
         for index, angle_deg in angles_deg.items():
             _, frame = nearest.pop(index, (inf, None))
             if frame is None:
@@ -195,7 +196,7 @@ class EnrollmentViews:
             if not attempt.accepted:
                 yield Rejected(index, attempt.number, attempt.reasons, attempt.evidence)
                 continue
-            attempt = replace(attempt, encoded=encoder.begin(attempt.image_bgr))
+            attempt = replace(attempt, encoded=encoder.submit(encode, attempt.image_bgr))
             segmented = self.segment(attempt.image_bgr)
             attempt = frames.at_the_object(attempt, segmented.segmentation, trajectory)
             assert attempt.evidence.motion is not None

@@ -14,8 +14,7 @@ from rig.core.json_form import plain
 from rig.core.next_steps import Do, in_words, steps_as_json, steps_from_json
 from rig.core.phrases import angle_words, budget_words, filled
 from rig.devices.camera import Camera, CameraLocks
-from rig.devices.imu import Imu
-from rig.devices.open_imu import open_imu
+from rig.devices.imu import Imu, open_imu
 from rig.doctor.camera import lock_words, open_camera
 from rig.doctor.context import DoctorContext
 from rig.safety.saved_state import ServerAddress

@@ -71,13 +71,13 @@ def settings_(
 
     Example: rig servo settings --write --bench sim
     """
-    from rig.devices.dynamixel.settings import ServoMode, compare
+    from rig.devices.dynamixel.settings import compare
     from rig.devices.dynamixel.settings import write as write_settings
     from rig.doctor.single_servo import single_servo
 
     with doctor_context(settings) as context, single_servo(context, show_progress) as servo:
         show_progress("")
-        differences = compare(servo.bus, servo.found.bus_id, servo.table, ServoMode(context.config.table.mode))
+        differences = compare(servo.bus, servo.found.bus_id, servo.table, context.config.table.mode)
         if not settings.json:
             print(servo.found)
             print("\n".join(f"  {difference}" for difference in differences) or "  all as required")

@@ -20,8 +20,13 @@ from rig.catalog.verify import Problem, verify
 from rig.config import ViewConfig
 from rig.core.errors import CatalogBusy, CatalogDamaged, CatalogError, UsageError
 from rig.search.model import load_model
-from rig.views.description import BENCH_DESCRIPTOR, DESCRIPTORS, PAPER_DESCRIPTOR, EnrollmentDescriber
-from rig.views.segmentation_evidence import SegmentationSummary
+from rig.views.description import (
+    BENCH_DESCRIPTOR,
+    DESCRIPTORS,
+    PAPER_DESCRIPTOR,
+    EnrollmentDescriber,
+    SegmentationSummary,
+)
 from sim.clock import VirtualClock
 from tests.rig.catalog.catalog_samples import PROVENANCE, OpenCatalog, forget, plan, record, sql, without_waiting
 

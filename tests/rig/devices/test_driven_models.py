@@ -96,7 +96,7 @@ def drives_rightly(model: str) -> bool:
 
 
 def test_all_models_of_the_sdk_are_in_the_list():
-    assert len(NUMBERS) == 60  # and the AX-12A, which has a driver of its own
+    assert len(NUMBERS) == 60  # and the AX-12A, which has no file
     assert len(REJECTED) == 26
 
 

@@ -20,7 +20,7 @@ def test_enrollment_ends_with_similar_objects_and_a_report(enrolled):
     assert events[-1]["event"] == "enrolled"
     page = (folder / "lamp.html").read_text(encoding="utf-8")
     assert "Contact sheet of lamp: 6 views" in page
-    assert "Ring of 6 views by azimuth" in page
+    assert "Sharpness of the views" in page
     assert "looks like" in page
     assert not re.search(r'(src|href)="(?!data:|#)', page)  # the page is self-contained
 
