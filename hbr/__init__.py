@@ -14,9 +14,8 @@ from hbr.descriptors.together import ViewsTogether
 from hbr.model.views import PackedViews, Views
 from hbr.paper.hough import Extension, Ranking, retrieve
 from hbr.paper.index import ViewIndex
-from hbr.paper.margin import score_margin
 from hbr.paper.next_view import Decision, Side, next_view
-from hbr.paper.open_set import open_set_threshold
+from hbr.paper.open_set import open_set_threshold, score_margin
 from hbr.segmentation import Background, Segmentation, hypotheses, segment
 
 __all__ = [

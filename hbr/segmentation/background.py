@@ -65,8 +65,6 @@ class Method(StrEnum):
     """The same network, with the background that the other views of the search or enrollment show."""
     GUESS = "guess"
     """The object has other colours than the frame's border. Often wrong."""
-    GIVEN_BOX = "given-box"
-    """The caller gave the box."""
     NONE = "none"
     """No object was found."""
 

@@ -258,7 +258,6 @@ def identify(
     strategy: AnyStrategy | str | None = None,
     seed: int = 0,
     top: int = SHOWN,
-    empty_table: NDArray[np.uint8] | None = None,
     live: Callable[[FrameUsed], object] = lambda _: None,
 ) -> Generator[Event, None, Identified]:
     """Identify the object on the table; yields events and returns the answer.
@@ -287,9 +286,6 @@ def identify(
         For strategies that draw random numbers.
     top
         The number of candidates that the events name.
-    empty_table : uint8 array (H, W, 3), optional
-        The empty-table image for the segmentation; by default the one from `rig.search.model.empty_table_for`. With
-        this image, or with the bench's own, an empty table is noticed.
     live
         Called with the event of each frame of a search in motion while the table rotates; the plan yields these events
         when it has stopped. It must return at once.
@@ -315,10 +311,7 @@ def identify(
         require_camera_time(bench.config)
     viewer = Viewer(bench.camera, bench.config)
     check_camera(bench, model.camera)
-    notes = model.notes
-    if empty_table is None:
-        empty_table, more = empty_table_for(bench, model)
-        notes += more
+    empty_table, about_table = empty_table_for(bench, model)
     own = empty_table_status(bench).table if empty_table is None else None
     describe = SearchDescriber(
         bench.config.view,
@@ -338,7 +331,7 @@ def identify(
         strategy=search.strategy.name,
         seed=seed,
         descriptor=search.descriptor,
-        notes=notes,
+        notes=(*model.notes, *about_table),
     )
     # Take views until the search ends.
     kind = ViewsInMotion if search.in_motion else ViewsAtRest
