@@ -9,7 +9,7 @@ from hbr.dense.stopping import Outcome, StopDecision, StoppingRule, StopReason
 from hbr.descriptors import Descriptor, descriptor
 from hbr.descriptors.cedd import cedd, pack, unpack, unpack_rows
 from hbr.descriptors.registry import describe
-from hbr.descriptors.tanimoto import tanimoto
+from hbr.descriptors.similarity import tanimoto
 from hbr.descriptors.together import ViewsTogether
 from hbr.model.views import PackedViews, Views
 from hbr.paper.hough import Extension, Ranking, retrieve

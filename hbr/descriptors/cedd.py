@@ -16,10 +16,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hbr.core.arrays import BoolArray, FloatArray, ImageArray, IndexArray, LevelArray, RealArray
-from hbr.core.validation import check_image
+from hbr.core.arrays import BoolArray, FloatArray, ImageArray, IndexArray, LevelArray, RealArray, check_image
 from hbr.descriptors.base import Descriptor
-from hbr.descriptors.tanimoto import squares, tanimoto, tanimoto_of_dots
+from hbr.descriptors.similarity import squares, tanimoto, tanimoto_of_dots
 from hbr.kernels import calls
 from hbr.segmentation import Segmentation
 

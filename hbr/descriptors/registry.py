@@ -10,8 +10,7 @@ import numpy as np
 from hbr.core.arrays import FloatArray, ImageArray, IndexArray, LevelArray
 from hbr.descriptors.base import Comparison, CompiledDescriptor, Descriptor, Shift
 from hbr.descriptors.cedd import Cedd
-from hbr.descriptors.colours import Colours
-from hbr.descriptors.edges import Edges
+from hbr.descriptors.edges_and_colours import Colours, Edges
 from hbr.descriptors.embedding import MODEL_NAME, PREFIX, Embedding
 from hbr.kernels.calls import Measure
 from hbr.segmentation import Background, Segmentation, segment

@@ -10,7 +10,7 @@ import numpy as np
 
 from hbr.core.angles import wrap180, wrap360
 from hbr.core.arrays import FloatArray, IndexArray
-from hbr.descriptors.tanimoto import tanimoto
+from hbr.descriptors.similarity import tanimoto
 from hbr.model.views import Views
 from hbr.paper.hough import Ranking
 

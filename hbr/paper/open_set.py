@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from hbr.core.arrays import FloatArray, LevelArray
-from hbr.descriptors.tanimoto import tanimoto
+from hbr.descriptors.similarity import tanimoto
 from hbr.model.views import Views
 from hbr.paper.hough import Ranking
 

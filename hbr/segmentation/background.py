@@ -18,8 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hbr.core.arrays import FloatArray, ImageArray
-from hbr.core.validation import check_frame
+from hbr.core.arrays import FloatArray, ImageArray, check_frame
 from hbr.kernels import calls
 
 Mask = NDArray[np.bool_]

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from hbr.core.arrays import ImageArray
 from hbr.segmentation.background import Background, Difference, Frame, Illumination, Issue, IssueCode, Mask, Method
 from hbr.segmentation.cut_out import Box, Found, Segmentation
-from hbr.segmentation.network import shares
-from hbr.segmentation.silhouette import guess_object, silhouette
+from hbr.segmentation.silhouette import guess_object, shares, silhouette
 
 #: Probabilities above which a pixel belongs to the object: of the first segmentation, and of further ones.
 _LEVELS: Final = (0.5, 0.2, 0.8)

@@ -17,7 +17,7 @@ from rig.catalog.exchange.bundle import read_bundle, write_bundle
 from rig.catalog.jobs import finished
 from rig.catalog.transfer import CatalogSource, Conflict, transfer
 from rig.core.json_form import plain
-from rig.plans.similar_objects import similar_objects
+from rig.plans.enroll import similar_objects
 from rig.views.description import BENCH_DESCRIPTOR, PAPER_DESCRIPTOR
 from rig.web.picture import jpeg
 from rig.web.server import API, NameBody, ObjectBody, Page, Routes, Server, cached, long_work, time_text
