@@ -10,10 +10,9 @@ from collections.abc import Callable
 from dynamixel_sdk import COMM_SUCCESS, Protocol2PacketHandler
 
 from rig.config import ServoConfig
-from rig.devices.dynamixel.opening import open_servo
 from rig.devices.dynamixel.port import READ_SLICE_S, ClockedPort
-from rig.devices.dynamixel.register_servo import RegisterServo
 from rig.devices.dynamixel.registers import control_table
+from rig.devices.dynamixel.servo import DynamixelServo, open_servo
 from sim.noise import NoiseModel
 from sim.servo import Frame, ServoBus, SimSerial, Source, XSeriesServo
 from sim.world import World
@@ -56,7 +55,7 @@ def best_us(calls: list[Callable[[], object]]) -> list[float]:
     return best
 
 
-def opened() -> tuple[RegisterServo, RepeatingSerial, ServoBus]:
+def opened() -> tuple[DynamixelServo, RepeatingSerial, ServoBus]:
     """Return a driver of a simulated servo, its port, and the bus between them."""
     world = World(noise=NoiseModel.none())
     bus = ServoBus(world.clock)
@@ -79,7 +78,7 @@ def answers_of(bus: ServoBus, calls: list[Callable[[], object]]) -> dict[bytes, 
     return dict(zip(requests, answers, strict=True))
 
 
-def bare_read(servo: RegisterServo, serial: SimSerial) -> Callable[[], None]:
+def bare_read(servo: DynamixelServo, serial: SimSerial) -> Callable[[], None]:
     port, sdk = ClockedPort(serial, servo.bus.port.clock), Protocol2PacketHandler()
 
     def read() -> None:

@@ -61,7 +61,7 @@ def last(events: Iterator[Any]) -> CalibrationResult:
 def imu_scale(seed: int) -> tuple[CalibrationResult, Truth]:
     with opened(seed) as (bench, parts):
         part = parts.imu.inertial
-        return last(GyroScale().live(bench)), {"scale": (1 / float(part.gyro_gain[2] * part.up[2]), "")}
+        return last(GyroScale(8).live(bench)), {"scale": (1 / float(part.gyro_gain[2] * part.up[2]), "")}
 
 
 def imu_noise(seed: int) -> tuple[CalibrationResult, Truth]:
@@ -76,7 +76,7 @@ def imu_noise(seed: int) -> tuple[CalibrationResult, Truth]:
             "rate_random_walk": (noise.gyro_bias_walk_dps_rts, "°/s/√s"),
             "bias_slope": (slope, "°/s/°C"),
         }
-        return last(GyroNoise().live(bench)), truth
+        return last(GyroNoise(20.0).live(bench)), truth
 
 
 def mounting(seed: int) -> tuple[CalibrationResult, Truth]:
@@ -91,12 +91,12 @@ def mounting(seed: int) -> tuple[CalibrationResult, Truth]:
 def backlash(seed: int) -> tuple[CalibrationResult, Truth]:
     backlash_deg = float(np.random.default_rng(seed).uniform(0.05, 1.0))
     with opened(seed, NoiseModel(backlash_deg=backlash_deg)) as (bench, _):
-        return last(Backlash().live(bench)), {"backlash": (backlash_deg, "°")}
+        return last(Backlash(24).live(bench)), {"backlash": (backlash_deg, "°")}
 
 
 def encoder(seed: int) -> tuple[CalibrationResult, Truth]:
     with opened(seed, NoiseModel(encoder_harmonic_deg=0.2)) as (bench, parts):
-        result = last(Encoder().live(bench))
+        result = last(Encoder(2).live(bench))
         (a1, b1), (a2, b2) = parts.servo._controller.harmonics_deg
         # The angle 0 of the servo is 180° from that of the shaft, so odd harmonics change their sign.
         return result, {"cos1": (-a1, "°"), "sin1": (-b1, "°"), "cos2": (a2, "°"), "sin2": (b2, "°")}
@@ -106,7 +106,7 @@ def motion(seed: int) -> tuple[CalibrationResult, Truth]:
     rng = np.random.default_rng(seed)
     speed, ramp = rng.uniform(40, 120), rng.uniform(100, 500)
     with opened(seed, None, f"table.velocity_dps={speed}", f"table.acceleration_dps2={ramp}") as (bench, _):
-        result = last(MotionModel().live(bench))
+        result = last(MotionModel(3).live(bench))
         with Turntable(bench) as table:
             profile = table._profile
         assert profile is not None

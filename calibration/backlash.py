@@ -69,10 +69,12 @@ class Backlash(Procedure):
     """A procedure that measures the backlash by ``reversals`` of the table around its present angle."""
 
     names, title, devices, valid_days, plots = (NAME,), "backlash of the gears", ("servo", "imu"), 90, (plot,)
-    reversals: int = 24
+    reversals: int
+
+    def __post_init__(self) -> None:
+        require_at_least(MIN_REVERSALS, self.reversals, "reversals")
 
     def measure(self, bench: Bench, *_: CalibrationResult) -> Measured:
-        require_at_least(MIN_REVERSALS, self.reversals, "reversals")
         legs: list[Leg] = []
         # Without the usual approach from one side, because the backlash is measured.
         with Turntable(bench, trust_gyro=False, approach_deg=0.0) as table:

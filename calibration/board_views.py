@@ -13,7 +13,7 @@ from calibration import pictures
 from calibration.procedure import Ask, Evaluation
 from rig.bench import Bench
 from rig.calibrations import CalibrationResult, RejectionCode
-from rig.charts.xy import LIMIT, MEASURED, MODEL, OTHER, Axis, Chart, Series
+from rig.charts.xy import FOURTH, LIMIT, MEASURED, MODEL, OTHER, Axis, Chart, Series
 from rig.core.phrases import angle_words, percent
 from rig.events.events import Event
 from rig.jobs.desk import Progress
@@ -162,7 +162,7 @@ def by_stand(views: Sequence[Mapping[str, Any]]) -> list[tuple[str, str, list[Ma
     numbers = sorted({view["stand"] for view in views})
     return [
         (f"stand {number + 1}", colour, [view for view in views if view["stand"] == number])
-        for number, colour in zip(numbers, (MEASURED, MODEL, OTHER, "#cc79a7"), strict=False)
+        for number, colour in zip(numbers, (MEASURED, MODEL, OTHER, FOURTH), strict=False)
     ]
 
 

@@ -80,7 +80,6 @@ class CameraTime(Procedure):
     """Three months, because time stamps depend on camera, driver, USB port and kernel."""
     thing: str = BOARD
     """The object that the simulated bench puts on the table: the board, or an object with texture."""
-    rounds: int = 1
 
     def measure(self, bench: Bench, *_: CalibrationResult) -> Measured:
         found = Evaluation(name=NAME, residual_unit="°", limit=MAX_ANGLE_DEG)
@@ -93,15 +92,15 @@ class CameraTime(Procedure):
             pictures.BOARD_UPRIGHT,
         )
         bench.place(self.thing)
-        speeds = [speed for speed in SPEEDS if speed < config.table.velocity_dps] + [config.table.velocity_dps]
+        cruise_dps = config.table.velocity_dps
+        speeds_dps = sorted({*(speed for speed in SPEEDS if speed < cruise_dps), cruise_dps})
         passes: list[Pass] = []
         lost = frames = 0
         with Turntable(bench) as table, returning(table) as goto:
-            length_deg = ARC_DEG + 2 * _ramp_deg(max(speeds), bench)
+            length_deg = ARC_DEG + 2 * _ramp_deg(max(speeds_dps), bench)
             middle_deg = lower_end(bench, table.rest_deg, length_deg) + length_deg / 2
             flights = FlightFrames(bench, table)
             worst_deg = 0.0
-            speeds_dps = [speed for _ in range(self.rounds) for speed in sorted({*speeds, speeds[0]})]
             for number, speed in enumerate(speeds_dps):
                 half_deg = ARC_DEG / 2 + _ramp_deg(speed, bench)
                 ends_deg = middle_deg - half_deg, middle_deg + half_deg
@@ -116,7 +115,7 @@ class CameraTime(Procedure):
                     passes.append(one)
                 yield Progress((number + 1) / len(speeds_dps), f"{speed:.0f} °/s in both directions")
         share = lost / max(lost + frames, 1)
-        found = evaluate(passes, exposure_ms=config.camera.exposure_us * 1e-3, fastest_dps=max(speeds), bench=bench)
+        found = evaluate(passes, exposure_ms=config.camera.exposure_us * 1e-3, fastest_dps=max(speeds_dps), bench=bench)
         found.reject_if(worst_deg > SLIP_DEG, RejectionCode.PLATTER_SLIPPED, residual_deg=worst_deg)
         found.reject_if(share > MAX_LOST, RejectionCode.FRAMES_LOST, lost=share, limit=MAX_LOST)
         if found.estimates:

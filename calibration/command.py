@@ -1,217 +1,62 @@
 """`rig calibrate ...`."""
 
+import inspect
 import sys
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from calibration.jobs import CALIBRATIONS, Calibration
 from calibration.outcome import as_json, plain_value, stored_results
 from rig.cli.ui.command import command
 from rig.cli.ui.exit_codes import EXIT_QUALITY
+from rig.cli.ui.options import show_parameters
 from rig.cli.ui.settings import Settings
 from rig.core.next_steps import Do, in_words
 
 if TYPE_CHECKING:
     from calibration.procedure import Procedure
-    from rig.views.charuco_board import Board
-
-MARKER_SHARE = 11 / 15
-"""Side of a marker over that of its square, on every printed board."""
-
-Minutes = Annotated[float, typer.Option(min=3.0, help="Minutes of recording the gyro at rest.")]
-BoardColumns = Annotated[int, typer.Option(min=3, max=20, help="Squares across the board.")]
-BoardRows = Annotated[int, typer.Option(min=3, max=20, help="Squares down the board.")]
-SquareMm = Annotated[float, typer.Option(min=2, max=100, help="Side of a square in mm, measured on the print.")]
-
-RadiusMm = Annotated[float, typer.Option(min=5, max=1000, help="Radius of the largest object about the axis, in mm.")]
-HeightMm = Annotated[float, typer.Option(min=5, max=2000, help="Height of the tallest object, in mm.")]
-MiddleMm = Annotated[
-    float, typer.Option(min=0, max=1000, help="Height of the upright board's middle above the platter, in mm.")
-]
-LensMm = Annotated[
-    float | None,
-    typer.Option(min=20, max=10_000, help="Distance from lens to axis in mm, if measured: checks the board's size."),
-]
 
 app = typer.Typer(help="Measure the bench's own errors.", no_args_is_help=True)
 
 
-@app.command("servo")
-@command
-def servo(
-    settings: Settings,
-    reversals: Annotated[int, typer.Option(min=6, help="Reversals for the backlash.")] = 24,
-    revolutions: Annotated[int, typer.Option(min=1, help="Revolutions for the encoder.")] = 2,
-    rounds: Annotated[int, typer.Option(min=2, help="Rounds of timed rotations.")] = 3,
-) -> None:
-    """Calibrate direction, gear ratio, backlash, encoder and motion of the servo.
+def run(settings: Settings, *procedures: "Procedure") -> None:
+    """Run procedures on the bench one after the other, store and report each result, and apply those that passed.
 
-    Takes some minutes. Exit code 6 if a calibration does not pass.
+    A result that passed is in force for the next procedure. The first that does not pass ends the series.
 
-    Example: rig calibrate servo --bench sim
+    Raises
+    ------
+    typer.Exit
+        With code 6 if a calibration did not pass.
     """
-    from calibration.procedures import Backlash, Encoder, MotionModel
+    from calibration.procedure import calibrated
+    from rig.cli.ui.desk import CommandDesk
 
-    run(settings, Backlash(reversals), Encoder(revolutions), MotionModel(rounds))
-
-
-@app.command("cable")
-@command
-def cable(settings: Settings) -> None:
-    """Measure the cable budget: rotate the table by hand to both ends of the cable. The torque is off.
-
-    Example: rig calibrate cable
-    """
-    from calibration.procedures import Cable
-
-    run(settings, Cable())
+    desk = CommandDesk(settings, with_json=True)  # a person must put the board there
+    if not desk.run(calibrated(desk, procedures)):
+        raise typer.Exit(EXIT_QUALITY)
 
 
-@app.command("imu")
-@command
-def imu(
-    settings: Settings,
-    revolutions: Annotated[int, typer.Option(min=4, help="Least number of revolutions, both directions together.")] = 8,
-    minutes: Minutes = 20.0,
-    repeats: Annotated[int, typer.Option(min=4, help="Repeated rotations at each speed, to verify σ.")] = 10,
-) -> None:
-    """Calibrate scale, mounting and noise of the gyro, and verify the uncertainty of rotations.
+def _command_of(calibration: Calibration) -> Callable[..., None]:
+    """Return the command that runs a calibration; it has the parameters and the docstring of its procedures."""
 
-    Takes half an hour. Exit code 6 if a calibration does not pass.
+    def start(settings: Settings, **options: Any) -> None:
+        if procedures := calibration.procedures(**options):  # none if the board is only printed
+            run(settings, *procedures)
+        if calibration is CALIBRATIONS["all"] and options["thing"] is None:
+            print(f"Next: {Do.CALIBRATE(name='noise').command} NAME, with an object.", file=sys.stderr)
 
-    Example: rig calibrate imu --bench sim --revolutions 12
-    """
-    from calibration.procedures import GyroNoise, GyroRotation, GyroScale, ImuMounting
-
-    run(settings, GyroScale(revolutions), ImuMounting(), GyroNoise(minutes), GyroRotation(repeats))
+    own = inspect.signature(calibration.procedures).parameters.values()
+    show_parameters(start, [next(iter(inspect.signature(start).parameters.values())), *own])
+    start.__doc__ = calibration.procedures.__doc__
+    return command(start)
 
 
-@app.command("camera")
-@command
-def camera(settings: Settings, columns: BoardColumns = 8, rows: BoardRows = 6, square_mm: SquareMm = 15.0) -> None:
-    """Calibrate sharpness, noise, flat field, drift and lens of the camera, with a grey card and the printed board.
-
-    Example: rig calibrate camera --bench sim
-    """
-    from calibration.procedures import CameraCard, CameraModel, CameraNoise
-
-    run(settings, CameraNoise(), CameraCard(), CameraModel(_board(columns, rows, square_mm)))
-
-
-@app.command("table")
-@command
-def table(
-    settings: Settings,
-    columns: BoardColumns = 8,
-    rows: BoardRows = 6,
-    square_mm: SquareMm = 15.0,
-    radius_mm: RadiusMm = 80.0,
-    height_mm: HeightMm = 150.0,
-    middle_mm: MiddleMm = 75.0,
-    lens_mm: LensMm = None,
-    print_board: Annotated[
-        Path | None,
-        typer.Option("--print-board", metavar="FILE", help="Write the board as .pdf or .png to print, and stop."),
-    ] = None,
-) -> None:
-    """Calibrate the position and the wobble of the table's axis in the camera's frame. Calibrate the camera first.
-
-    The result sets the region of interest (view.roi) for objects of the given radius and height.
-
-    Example: rig calibrate table --print-board board.pdf
-    """
-    from calibration.procedures import TableAxis
-    from calibration.table_axis import ObjectSpace
-
-    board = _board(columns, rows, square_mm)
-    if print_board is not None:
-        from calibration.print_board import write_board
-
-        print(write_board(board, print_board))
-        return
-    run(settings, TableAxis(board, ObjectSpace(radius_mm, height_mm, middle_mm, lens_mm)))
-
-
-@app.command("camera-time")
-@command
-def camera_time(
-    settings: Settings,
-    thing: Annotated[
-        str | None,
-        typer.Option(
-            "--object", metavar="NAME", help="Object that the simulated bench puts on the table (default: the board)."
-        ),
-    ] = None,
-) -> None:
-    """Calibrate when frames are exposed, so that views can be taken while the table rotates.
-
-    Put the board, or an object with texture, on the table. Exit code 6 if the frames' times jitter too much.
-
-    Example: rig calibrate camera-time --bench sim
-
-    Example: rig calibrate camera-time --bench sim --object mug-star
-    """
-    from calibration.procedures import CameraTime
-
-    run(settings, CameraTime() if thing is None else CameraTime(thing))
-
-
-@app.command("noise")
-@command
-def noise(
-    settings: Settings,
-    name: Annotated[str, typer.Argument(help="Object to put on the table, for example an enrolled one.")],
-    placements: Annotated[int, typer.Option(min=2, help="Number of placements at the same mark.")] = 5,
-    error_rate: Annotated[
-        float, typer.Option(min=0.001, max=0.2, help="Share of known objects that may be taken for unknown.")
-    ] = 0.02,
-) -> None:
-    """Calibrate the similarity of repeated views; it sets margin and threshold of identification.
-
-    Example: rig calibrate noise mug-star --bench sim --placements 5
-    """
-    from calibration.procedures import Repeatability
-
-    run(settings, Repeatability(name, placements, error_rate))
-
-
-@app.command("all")
-@command
-def everything(
-    settings: Settings,
-    minutes: Minutes = 20.0,
-    columns: BoardColumns = 8,
-    rows: BoardRows = 6,
-    square_mm: SquareMm = 15.0,
-    radius_mm: RadiusMm = 80.0,
-    height_mm: HeightMm = 150.0,
-    middle_mm: MiddleMm = 75.0,
-    lens_mm: LensMm = None,
-    thing: Annotated[
-        str | None,
-        typer.Option("--object", metavar="NAME", help="Object for the similarity of repeated views, measured last."),
-    ] = None,
-) -> None:
-    """Calibrate servo and IMU, which need no operator, then camera and table, with card and board.
-
-    Takes about an hour, and stops at the first calibration that does not pass. Calibrate the cable before.
-
-    Example: rig calibrate all --bench sim --object mug-star
-    """
-    from calibration import procedures as p
-    from calibration.table_axis import ObjectSpace
-
-    board = _board(columns, rows, square_mm)
-    servo_and_imu = (p.Backlash(), p.Encoder(), p.MotionModel(), p.GyroScale(), p.ImuMounting(), p.GyroNoise(minutes))
-    camera_and_table = (
-        *(p.CameraNoise(), p.CameraCard(), p.CameraModel(board)),
-        p.TableAxis(board, ObjectSpace(radius_mm, height_mm, middle_mm, lens_mm)),
-    )
-    repeated = () if thing is None else (p.Repeatability(thing),)
-    run(settings, *servo_and_imu, p.GyroRotation(), *camera_and_table, *repeated)
-    if thing is None:
-        print(f"Next: {Do.CALIBRATE(name='noise').command} NAME, with an object.", file=sys.stderr)
+for _name, _calibration in CALIBRATIONS.items():
+    app.command(_name)(_command_of(_calibration))
 
 
 @app.command("report")
@@ -288,27 +133,3 @@ def history(
         print(f"{result.when_utc:%Y-%m-%d %H:%M}  {result.name:<16} {outcome}")
     if not results:
         print(f"No calibrations{f' of {name}' if name else ''} in {store.folder}.")
-
-
-def run(settings: Settings, *procedures: "Procedure") -> None:
-    """Run procedures on the bench one after the other, store and report each result, and apply those that passed.
-
-    A result that passed is in force for the next procedure. The first that does not pass ends the series.
-
-    Raises
-    ------
-    typer.Exit
-        With code 6 if a calibration did not pass.
-    """
-    from calibration.jobs import calibrated
-    from rig.cli.ui.desk import CommandDesk
-
-    desk = CommandDesk(settings, with_json=True)  # a person must put the board there
-    if not desk.run(calibrated(desk, procedures)):
-        raise typer.Exit(EXIT_QUALITY)
-
-
-def _board(columns: int, rows: int, square_mm: float) -> "Board":
-    from rig.views.charuco_board import Board
-
-    return Board(columns, rows, square_mm, square_mm * MARKER_SHARE)

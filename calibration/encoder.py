@@ -80,10 +80,12 @@ class Encoder(Procedure):
     """A procedure that measures the encoder's error over ``revolutions`` of the table, in even steps upwards."""
 
     names, title, devices, valid_days, plots = (NAME,), "error of the encoder", ("servo", "imu"), 365, (plot,)
-    revolutions: int = 2
+    revolutions: int
+
+    def __post_init__(self) -> None:
+        require_at_least(MIN_REVOLUTIONS, self.revolutions, "revolutions")
 
     def measure(self, bench: Bench, *_: CalibrationResult) -> Measured:
-        require_at_least(MIN_REVOLUTIONS, self.revolutions, "revolutions")
         config, revolution_deg = bench.config.table, bench.servo.revolution_deg
         low, high = config.limits_deg
         first_deg = low + config.approach_deg

@@ -78,10 +78,12 @@ class GyroNoise(Procedure):
     """
 
     names, title, devices, valid_days, plots = (NAME,), "noise of the gyro", ("imu",), 365, (plot,)
-    minutes: float = 20.0
+    minutes: float
+
+    def __post_init__(self) -> None:
+        require_at_least(MIN_MINUTES, self.minutes, "minutes")
 
     def measure(self, bench: Bench, *_: CalibrationResult) -> Measured:
-        require_at_least(MIN_MINUTES, self.minutes, "minutes")
         imu, clock = bench.imu, bench.clock
         per_block = round(BLOCK_S * imu.rate_hz)
         waiting = np.empty((0, 3))

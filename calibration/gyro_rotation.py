@@ -81,10 +81,12 @@ class GyroRotation(Procedure):
     """A procedure that rotates back and forth ``repeats`` times at each speed, around the table's present angle."""
 
     names, title, devices, valid_days, plots = (NAME,), "scatter of rotations", ("servo", "imu"), 180, (plot,)
-    repeats: int = 10
+    repeats: int
+
+    def __post_init__(self) -> None:
+        require_at_least(MIN_REPEATS, self.repeats, "repeats")
 
     def measure(self, bench: Bench, *_: CalibrationResult) -> Measured:
-        require_at_least(MIN_REPEATS, self.repeats, "repeats")
         velocity_dps = bench.config.table.velocity_dps
         moves: list[TimedLeg] = []
         index = 0

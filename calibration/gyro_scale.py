@@ -72,10 +72,12 @@ class GyroScale(Procedure):
     names, title, devices, plots = (NAME,), "scale of the gyro", ("servo", "imu"), (plot,)
     valid_days = 180
     """Half a year, to notice a loose sensor; the scale changes by mounting and temperature, not by use."""
-    revolutions: int = 8
+    revolutions: int
+
+    def __post_init__(self) -> None:
+        require_at_least(2 * MIN_LEGS, self.revolutions, "revolutions")
 
     def measure(self, bench: Bench, *_: CalibrationResult) -> Measured:
-        require_at_least(2 * MIN_LEGS, self.revolutions, "revolutions")
         low_deg, high_deg = bench.config.table.limits_deg
         # Downwards the table overshoots its goal and comes back, so that every rest has the backlash on the same side.
         low_deg += bench.config.table.approach_deg

@@ -1,104 +1,245 @@
-"""The calibrations as jobs; those of `rig serve` are entry points of the group ``rig.calibrations``."""
+"""The calibrations that a person starts: each is a command of `rig calibrate`, and a job of `rig serve`.
 
+A calibration says here once what it is called, what it needs and what it runs; command, job and page derive from it.
+The entry points of the group ``rig.calibrations`` name them for the server. This module imports none of numpy, cv2 and
+scipy: `rig --help` must start at once.
+"""
+
+import inspect
 from collections.abc import Callable, Sequence
-from contextlib import closing
 from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
-from calibration.outcome import as_json, in_force, outcome_text
-from calibration.procedure import Ask, Procedure
-from calibration.procedures import (
-    Backlash,
-    CameraCard,
-    CameraModel,
-    CameraNoise,
-    CameraTime,
-    Encoder,
-    GyroNoise,
-    GyroRotation,
-    GyroScale,
-    ImuMounting,
-    MotionModel,
-    Repeatability,
-    TableAxis,
-)
-from calibration.table_axis import ObjectSpace
-from rig.bench import Bench, calibrate
-from rig.calibrations import CalibrationResult, CalibrationStore
+import typer
+
 from rig.core.errors import UsageError
-from rig.jobs.desk import Desk, Remark, Result, Steps
-from rig.jobs.regions import warn_of_other_regions
-from rig.plans.operator import Choice, Question, Subject
-from rig.views.charuco_board import Board
 
-BOARD = Board(8, 6, 15.0, 11.0)
-"""The board that `rig calibrate table --print-board` writes; other boards need the command line."""
+if TYPE_CHECKING:
+    from calibration.procedure import Procedure
+    from rig.jobs.desk import Desk, Steps
+    from rig.views.charuco_board import Board
 
+MARKER_SHARE = 11 / 15
+"""Side of a marker over that of its square, on every printed board."""
 
-def calibrated(desk: Desk, procedures: Sequence[Procedure]) -> Steps[bool]:
-    """Run procedures one after the other, and store each result; return whether all of them passed.
-
-    A result that passed is in force for the next procedure. The first that does not pass ends the job.
-    """
-    with desk.open_bench() as bench:
-        store = CalibrationStore(bench.config.calibration_path(bench.name))
-        for procedure in procedures:
-            passed = yield from _measured(desk, bench, store, procedure)
-            if not passed:
-                return False
-            reported, region = bench.calibration_findings, bench.config.view.roi
-            calibrate(bench, store)
-            for finding in bench.calibration_findings:
-                if finding not in reported:  # a setting in the configuration takes precedence
-                    yield Remark(f"{finding}.")
-            if bench.config.view.roi != region and desk.place.may_exist():
-                with desk.open_to_read() as catalog:
-                    yield from warn_of_other_regions(bench, catalog)
-    return True
-
-
-def _measured(desk: Desk, bench: Bench, store: CalibrationStore, procedure: Procedure) -> Steps[bool]:
-    """Run one procedure, and store its results up to the first that does not pass; return whether all passed."""
-    required = [in_force(bench, name) for name in procedure.requires]
-    with closing(procedure.live(bench, *required)) as steps:
-        for step in steps:
-            if isinstance(step, CalibrationResult):
-                path = store.add(step)
-                then = ", in force from now on." if step.passed else "; earlier results stay in force."
-                outcome = {"event": "calibrated", "passed": step.passed, "id": step.id, "file": str(path)}
-                yield Result({**outcome, **as_json(step)}, f"{outcome_text(step)}\nStored in {path}{then}")
-                if not step.passed:
-                    return False
-            elif isinstance(step, Ask):
-                question = Question(Subject.CALIBRATION, step.words, picture=step.picture)
-                if not desk.operator.is_there:
-                    yield Remark(step.words, is_warning=False, picture=step.picture)
-                elif desk.operator.choose(question) is Choice.STOP:
-                    return False
-            else:
-                yield step
-    return True
+Minutes = Annotated[float, typer.Option(help="Minutes of recording the gyro at rest.")]
+BoardColumns = Annotated[int, typer.Option(min=3, max=20, help="Squares across the board.")]
+BoardRows = Annotated[int, typer.Option(min=3, max=20, help="Squares down the board.")]
+SquareMm = Annotated[float, typer.Option(min=2, max=100, help="Side of a square in mm, measured on the print.")]
+RadiusMm = Annotated[float, typer.Option(min=5, max=1000, help="Radius of the largest object about the axis, in mm.")]
+HeightMm = Annotated[float, typer.Option(min=5, max=2000, help="Height of the tallest object, in mm.")]
+MiddleMm = Annotated[
+    float, typer.Option(min=0, max=1000, help="Height of the upright board's middle above the platter, in mm.")
+]
+LensMm = Annotated[
+    float | None,
+    typer.Option(min=20, max=10_000, help="Distance from lens to axis in mm, if measured: checks the board's size."),
+]
 
 
 @dataclass(frozen=True, slots=True)
-class CalibrationJob:
-    """A calibration that `rig serve` offers; ``thing`` is the object, if one is needed."""
+class Calibration:
+    """Procedures that run one after the other.
+
+    Attributes
+    ----------
+    title
+        Its name on a page, with what it needs; empty if only a terminal offers it.
+    procedures
+        Returns the procedures. Its parameters are the options of the command, its docstring is the command's help. A
+        parameter without a default is the name of an object.
+    """
 
     title: str
-    procedures: Callable[[str | None], Sequence[Procedure]]
+    procedures: "Callable[..., Sequence[Procedure]]"
 
-    def __call__(self, desk: Desk, thing: str | None) -> Steps[bool]:
-        return (yield from calibrated(desk, self.procedures(thing)))
+    def __call__(self, desk: "Desk", thing: str | None) -> "Steps[bool]":
+        """Run the procedures with their usual options, as a job of the server."""
+        from calibration.procedure import calibrated
+
+        objects = [one for one in inspect.signature(self.procedures).parameters.values() if one.default is one.empty]
+        if objects and not thing:
+            raise UsageError("No object is given.", next_step="Give the name of an enrolled object.")
+        return (yield from calibrated(desk, self.procedures(*[thing for _ in objects])))
 
 
-def _repeatability(thing: str | None) -> Sequence[Procedure]:
-    if not thing:
-        raise UsageError("No object is given.", next_step="Give the name of an enrolled object.")
-    return [Repeatability(thing)]
+def _titled(title: str = "") -> "Callable[[Callable[..., Sequence[Procedure]]], Calibration]":
+    return lambda procedures: Calibration(title, procedures)
 
 
-servo = CalibrationJob("Servo (minutes)", lambda _: [Backlash(), Encoder(), MotionModel()])
-imu = CalibrationJob("IMU (half an hour)", lambda _: [GyroScale(), ImuMounting(), GyroNoise(20.0), GyroRotation()])
-camera = CalibrationJob("Camera (card and board)", lambda _: [CameraNoise(), CameraCard(), CameraModel(BOARD)])
-table = CalibrationJob("Table axis (board)", lambda _: [TableAxis(BOARD, ObjectSpace(80.0, 150.0, 75.0, None))])
-noise = CalibrationJob("Repeated views (an object)", _repeatability)
-camera_time = CalibrationJob("Time of the frames (board, or an object with texture)", lambda _: [CameraTime()])
+@_titled("Servo (minutes)")
+def servo(
+    reversals: Annotated[int, typer.Option(help="Reversals for the backlash.")] = 24,
+    revolutions: Annotated[int, typer.Option(help="Revolutions for the encoder.")] = 2,
+    rounds: Annotated[int, typer.Option(help="Rounds of timed rotations.")] = 3,
+) -> "Sequence[Procedure]":
+    """Calibrate direction, gear ratio, backlash, encoder and motion of the servo.
+
+    Takes some minutes. Exit code 6 if a calibration does not pass.
+
+    Example: rig calibrate servo --bench sim
+    """
+    from calibration.procedures import Backlash, Encoder, MotionModel
+
+    return Backlash(reversals), Encoder(revolutions), MotionModel(rounds)
+
+
+@_titled()
+def cable() -> "Sequence[Procedure]":
+    """Measure the cable budget: rotate the table by hand to both ends of the cable. The torque is off.
+
+    Example: rig calibrate cable
+    """
+    from calibration.procedures import Cable
+
+    return (Cable(),)
+
+
+@_titled("IMU (half an hour)")
+def imu(
+    revolutions: Annotated[int, typer.Option(help="Least number of revolutions, both directions together.")] = 8,
+    minutes: Minutes = 20.0,
+    repeats: Annotated[int, typer.Option(help="Repeated rotations at each speed, to verify σ.")] = 10,
+) -> "Sequence[Procedure]":
+    """Calibrate scale, mounting and noise of the gyro, and verify the uncertainty of rotations.
+
+    Takes half an hour. Exit code 6 if a calibration does not pass.
+
+    Example: rig calibrate imu --bench sim --revolutions 12
+    """
+    from calibration.procedures import GyroNoise, GyroRotation, GyroScale, ImuMounting
+
+    return GyroScale(revolutions), ImuMounting(), GyroNoise(minutes), GyroRotation(repeats)
+
+
+@_titled("Camera (card and board)")
+def camera(columns: BoardColumns = 8, rows: BoardRows = 6, square_mm: SquareMm = 15.0) -> "Sequence[Procedure]":
+    """Calibrate sharpness, noise, flat field, drift and lens of the camera, with a grey card and the printed board.
+
+    Example: rig calibrate camera --bench sim
+    """
+    from calibration.procedures import CameraCard, CameraModel, CameraNoise
+
+    return CameraNoise(), CameraCard(), CameraModel(_board(columns, rows, square_mm))
+
+
+@_titled("Table axis (board)")
+def table(
+    columns: BoardColumns = 8,
+    rows: BoardRows = 6,
+    square_mm: SquareMm = 15.0,
+    radius_mm: RadiusMm = 80.0,
+    height_mm: HeightMm = 150.0,
+    middle_mm: MiddleMm = 75.0,
+    lens_mm: LensMm = None,
+    print_board: Annotated[
+        Path | None,
+        typer.Option("--print-board", metavar="FILE", help="Write the board as .pdf or .png to print, and stop."),
+    ] = None,
+) -> "Sequence[Procedure]":
+    """Calibrate the position and the wobble of the table's axis in the camera's frame. Calibrate the camera first.
+
+    The result sets the region of interest (view.roi) for objects of the given radius and height.
+
+    Example: rig calibrate table --print-board board.pdf
+    """
+    board = _board(columns, rows, square_mm)
+    if print_board is not None:
+        from calibration.print_board import write_board
+
+        print(write_board(board, print_board))
+        return ()
+    from calibration.procedures import TableAxis
+    from calibration.table_axis import ObjectSpace
+
+    return (TableAxis(board, ObjectSpace(radius_mm, height_mm, middle_mm, lens_mm)),)
+
+
+@_titled("Time of the frames (board, or an object with texture)")
+def camera_time(
+    thing: Annotated[
+        str | None,
+        typer.Option(
+            "--object", metavar="NAME", help="Object that the simulated bench puts on the table (default: the board)."
+        ),
+    ] = None,
+) -> "Sequence[Procedure]":
+    """Calibrate when frames are exposed, so that views can be taken while the table rotates.
+
+    Put the board, or an object with texture, on the table. Exit code 6 if the frames' times jitter too much.
+
+    Example: rig calibrate camera-time --bench sim
+
+    Example: rig calibrate camera-time --bench sim --object mug-star
+    """
+    from calibration.procedures import CameraTime
+
+    return (CameraTime() if thing is None else CameraTime(thing),)
+
+
+@_titled("Repeated views (an object)")
+def noise(
+    name: Annotated[str, typer.Argument(help="Object to put on the table, for example an enrolled one.")],
+    placements: Annotated[int, typer.Option(help="Number of placements at the same mark.")] = 5,
+    error_rate: Annotated[
+        float, typer.Option(min=0.001, max=0.2, help="Share of known objects that may be taken for unknown.")
+    ] = 0.02,
+) -> "Sequence[Procedure]":
+    """Calibrate the similarity of repeated views; it sets margin and threshold of identification.
+
+    Example: rig calibrate noise mug-star --bench sim --placements 5
+    """
+    from calibration.procedures import Repeatability
+
+    return (Repeatability(name, placements, error_rate),)
+
+
+@_titled()
+def everything(
+    minutes: Minutes = 20.0,
+    columns: BoardColumns = 8,
+    rows: BoardRows = 6,
+    square_mm: SquareMm = 15.0,
+    radius_mm: RadiusMm = 80.0,
+    height_mm: HeightMm = 150.0,
+    middle_mm: MiddleMm = 75.0,
+    lens_mm: LensMm = None,
+    thing: Annotated[
+        str | None,
+        typer.Option("--object", metavar="NAME", help="Object for the similarity of repeated views, measured last."),
+    ] = None,
+) -> "Sequence[Procedure]":
+    """Calibrate servo and IMU, which need no operator, then camera and table, with card and board.
+
+    Takes about an hour, and stops at the first calibration that does not pass. Calibrate the cable before, and repeated
+    views afterwards if no object is given.
+
+    Example: rig calibrate all --bench sim --object mug-star
+    """
+    return (
+        *servo.procedures(),
+        *imu.procedures(minutes=minutes),
+        *camera.procedures(columns, rows, square_mm),
+        *table.procedures(columns, rows, square_mm, radius_mm, height_mm, middle_mm, lens_mm),
+        *(noise.procedures(thing) if thing is not None else ()),
+    )
+
+
+CALIBRATIONS = {
+    "servo": servo,
+    "cable": cable,
+    "imu": imu,
+    "camera": camera,
+    "table": table,
+    "camera-time": camera_time,
+    "noise": noise,
+    "all": everything,
+}
+"""The calibrations by the names of their commands, in the order of the help."""
+
+
+def _board(columns: int, rows: int, square_mm: float) -> "Board":
+    from rig.views.charuco_board import Board
+
+    return Board(columns, rows, square_mm, square_mm * MARKER_SHARE)

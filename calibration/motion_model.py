@@ -76,10 +76,12 @@ class MotionModel(Procedure):
     """A procedure that measures the time of rotations over seven distances in both directions, ``rounds`` times."""
 
     names, title, devices, valid_days, plots = (NAME,), "duration of rotations", ("servo",), 180, (plot,)
-    rounds: int = 3
+    rounds: int
+
+    def __post_init__(self) -> None:
+        require_at_least(MIN_ROUNDS, self.rounds, "rounds")
 
     def measure(self, bench: Bench, *_: CalibrationResult) -> Measured:
-        require_at_least(MIN_ROUNDS, self.rounds, "rounds")
         moves: list[TimedMove] = []
         with Turntable(bench, approach_deg=0.0) as table:
             base_deg = lower_end(bench, table.rest_deg, DISTANCES_DEG[-1])

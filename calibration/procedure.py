@@ -11,15 +11,18 @@ from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Any, ClassVar, Self
 
-from rig.bench import Bench
-from rig.calibrations import CalibrationResult, Estimate, Rejection, RejectionCode
+from calibration.outcome import as_json, in_force, outcome_text
+from rig.bench import Bench, calibrate
+from rig.calibrations import CalibrationResult, CalibrationStore, Estimate, Rejection, RejectionCode
 from rig.calibrations.rejection import rejection
 from rig.charts.xy import Chart
 from rig.core.errors import LimitExceeded, UsageError
 from rig.events.events import Event
-from rig.jobs.desk import Progress
+from rig.jobs.desk import Desk, Progress, Remark, Result, Steps
+from rig.jobs.regions import warn_of_other_regions
 from rig.motion.move import Move
 from rig.motion.turntable import Turntable
+from rig.plans.operator import Choice, Question, Subject
 
 Plot = Callable[[CalibrationResult], Chart | None]
 
@@ -144,6 +147,51 @@ class Procedure(ABC):
                     yield event.result(when_utc=when_utc, device=device, valid_days=self.valid_days)
                 else:
                     yield event
+
+
+def calibrated(desk: Desk, procedures: Sequence[Procedure]) -> Steps[bool]:
+    """Run procedures one after the other, and store each result; return whether all of them passed.
+
+    A result that passed is in force for the next procedure. The first that does not pass ends the job.
+    """
+    with desk.open_bench() as bench:
+        store = CalibrationStore(bench.config.calibration_path(bench.name))
+        for procedure in procedures:
+            passed = yield from _measured(desk, bench, store, procedure)
+            if not passed:
+                return False
+            reported, region = bench.calibration_findings, bench.config.view.roi
+            calibrate(bench, store)
+            for finding in bench.calibration_findings:
+                if finding not in reported:  # a setting in the configuration takes precedence
+                    yield Remark(f"{finding}.")
+            if bench.config.view.roi != region and desk.place.may_exist():
+                with desk.open_to_read() as catalog:
+                    yield from warn_of_other_regions(bench, catalog)
+    return True
+
+
+def _measured(desk: Desk, bench: Bench, store: CalibrationStore, procedure: Procedure) -> Steps[bool]:
+    """Run one procedure, and store its results up to the first that does not pass; return whether all passed."""
+    required = [in_force(bench, name) for name in procedure.requires]
+    with closing(procedure.live(bench, *required)) as steps:
+        for step in steps:
+            if isinstance(step, CalibrationResult):
+                path = store.add(step)
+                then = ", in force from now on." if step.passed else "; earlier results stay in force."
+                outcome = {"event": "calibrated", "passed": step.passed, "id": step.id, "file": str(path)}
+                yield Result({**outcome, **as_json(step)}, f"{outcome_text(step)}\nStored in {path}{then}")
+                if not step.passed:
+                    return False
+            elif isinstance(step, Ask):
+                question = Question(Subject.CALIBRATION, step.words, picture=step.picture)
+                if not desk.operator.is_there:
+                    yield Remark(step.words, is_warning=False, picture=step.picture)
+                elif desk.operator.choose(question) is Choice.STOP:
+                    return False
+            else:
+                yield step
+    return True
 
 
 @contextmanager

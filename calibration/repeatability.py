@@ -40,7 +40,6 @@ NAME = "noise.repeatability"
 AZIMUTHS = 12
 ROUNDS = 2
 MIN_PLACEMENTS = 2
-ERROR_RATE = 0.02
 BOOTSTRAPS = 200
 MAX_DRIFT = 0.02
 """Largest loss of similarity between the first and the last placement, compared with consecutive placements."""
@@ -77,8 +76,8 @@ class Repeatability(Procedure):
 
     names, title, devices, valid_days, plots = (NAME,), "repeatability of views", ("camera",), 180, (plot,)
     name: str
-    placements: int = 5
-    error_rate: float = ERROR_RATE
+    placements: int
+    error_rate: float
 
     def measure(self, bench: Bench, *_: CalibrationResult) -> Measured:
         needed = needed_placements(self.error_rate)

@@ -84,12 +84,13 @@ def write_page(
     """
     shown = [_shown(calibration, history) for calibration in calibrations]
     count = {status: sum(calibration.status is status for calibration in calibrations) for status in CalibrationStatus}
-    template = environment("calibration", "rig.report").get_template("report.html.j2")
+    template = environment("calibration", "rig.report", "rig.charts").get_template("report.html.j2")
     page = template.render(
-        bench=bench,
-        when=f"{now_utc:%Y-%m-%d %H:%M}",
+        title=f"Calibration of {bench}",
+        date=f"{now_utc:%Y-%m-%d %H:%M} UTC",
+        summary="The errors of the bench itself. Uncertainties are standard uncertainties (1 σ).",
         totals=[
-            {"label": str(status), "value": n}
+            {"label": str(status), "value": n, "note": ""}
             for status, n in count.items()
             if n or status is CalibrationStatus.IN_FORCE
         ],
@@ -112,7 +113,7 @@ def _shown(calibration: BenchCalibration, history: Sequence[CalibrationResult]) 
         calibration.repetition.command,
         [f"Rejected on {latest.when_utc:%Y-%m-%d %H:%M} UTC: {rejection}" for rejection in latest.rejections],
         # Trusted markup: the SVG escapes its texts.
-        [Markup(figure.svg(themed=True)) for figure in plots(result)],
+        [Markup(figure.svg()) for figure in plots(result)],
         [(part, _words(identity)) for part, identity in result.device.items() if part in ("servo", "imu", "camera")],
         residual_words(result),
         [f"{key} = {plain_value(value)}" for key, value in result.settings.items()],

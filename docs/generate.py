@@ -198,7 +198,7 @@ def errors_page() -> str:
 def _next_steps() -> list[str]:
     """Return a section with the actions of next steps."""
     from rig.core.next_steps import Do
-    from rig.web.next_steps import JOBS, PAGES
+    from rig.web.pages import JOB_OF_STEP, PAGE_OF_STEP
 
     lines = [
         "## Next steps\n",
@@ -209,7 +209,8 @@ def _next_steps() -> list[str]:
         "|---|---|---|---|",
     ]
     for action in Do:
-        page = "a button" if action in JOBS else f"a link to `{PAGES[action]}`" if action in PAGES else ""
+        link = f"a link to `{PAGE_OF_STEP[action]}`" if action in PAGE_OF_STEP else ""
+        page = "a button" if action in JOB_OF_STEP else link
         command = f"`{action().command}`" if action.command else ""
         lines.append(f"| `{action}` | {action().text} | {command} | {page} |")
     return [*lines, ""]

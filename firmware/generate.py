@@ -18,7 +18,7 @@ BEGIN, END = "<!-- generated from protocol.toml -->", "<!-- end of generated par
 
 Table = dict[str, Any]
 
-FIRMWARE_ONLY = {"tick_us", "estop_ticks", "deadman_default_ms", "trigger_min_us", "trigger_max_us"}
+FIRMWARE_ONLY = {"tick_us", "estop_ticks", "deadman_default_ms", "trigger_min_us", "trigger_max_us", "capability"}
 
 
 def size(message: Table) -> int:
@@ -122,6 +122,22 @@ def sentence(text: str) -> str:
     return f"{text[0].upper()}{text[1:]}."
 
 
+MESSAGE = (
+    "",
+    "",
+    "class HeadMessage:",
+    '    """A message: its id, and the layout of its body."""',
+    "",
+    "    __slots__ = ()",
+    "    ID: ClassVar[int]",
+    "    LAYOUT: ClassVar[Struct]",
+    "",
+    '    def __init_subclass__(cls, number: int | None = None, layout: str = "") -> None:',
+    "        if number is not None:  # a dataclass with slots makes its class twice, the second time without arguments",
+    "            cls.ID, cls.LAYOUT = number, Struct(layout)",
+)
+
+
 def module(table: Table) -> str:
     major, minor, patch = table["firmware"]
     lines = [
@@ -143,16 +159,19 @@ def module(table: Table) -> str:
         shown = f"0x{value:08X}" if value > 1 << 31 else f"{value:_}" if value > 99_999 else str(value)
         lines += [f"{name.upper()} = {shown}", f'"""{sentence(doc)}"""']
     for enum in table["enum"]:
+        if enum["name"] in FIRMWARE_ONLY:
+            continue
         flags = "bits" in enum["doc"].lower()
         lines += ["", "", f"class {camel(enum['name'])}({'IntFlag' if flags else 'IntEnum'}):"]
         lines += [f'    """{enum["doc"]}"""', ""]
         lines += [f"    {n.upper()} = {v}" for n, v in enum["values"]]
+    lines += MESSAGE
     for message in table["message"]:
         fields = message["fields"]
-        lines += ["", "", "@dataclass(frozen=True, slots=True)", f"class {camel(message['name'])}:"]
         layout = "<" + "".join(PY_FORMATS[kind] for _, kind, _ in fields)
-        lines += [f'    """{message["doc"]}"""', "", f"    ID: ClassVar[int] = 0x{message['id']:02X}"]
-        lines += [f'    LAYOUT: ClassVar[Struct] = Struct("{layout}")']
+        kind = f'HeadMessage, number=0x{message["id"]:02X}, layout="{layout}"'
+        lines += ["", "", "@dataclass(frozen=True, slots=True)", f"class {camel(message['name'])}({kind}):"]
+        lines += [f'    """{message["doc"]}"""', *([""] if fields else [])]
         for name, _, doc in fields:
             field = f"    {name}: int" + " = 0" * name.startswith("pad_")
             comment = f"  # {sentence(doc)}" if doc and doc != "0" else ""

@@ -14,6 +14,7 @@ from sim.optics import SUPERSAMPLING, Optics
 from sim.world import SimObject
 
 TEXTURE_PX_MM = 10
+_FAR = 1e4  # texels: outside every texture
 
 
 @dataclass(frozen=True)
@@ -67,29 +68,43 @@ class BoardOnPlatter:
         rotation, translation = self.optics.to_camera(table_deg)
         return rotation @ on_platter, rotation @ corner + translation
 
-    def draw(self, image: Image, azimuth_deg: float, offset_mm: tuple[float, float] = (0.0, 0.0)) -> None:  # noqa: ARG002
-        """Draw the board into ``image``; `centre_mm` is its position, not ``offset_mm``."""
+    def draw(
+        self,
+        image: Image,
+        azimuth_deg: float,
+        offset_mm: tuple[float, float] = (0.0, 0.0),  # noqa: ARG002
+        rows: tuple[int, int] = (0, HEIGHT),
+    ) -> None:
+        """Draw the board into ``image``, at least between two ``rows``.
+
+        `centre_mm` is its position, not ``offset_mm``.
+        """
         rotation, translation = self.pose(azimuth_deg)
         normal = rotation[:, 2]
         if float(normal @ translation) <= 0:  # the camera sees its back
             return
         x, y = self._box(rotation, translation)
-        if x.start == x.stop or y.start == y.stop:  # out of the frame
+        y = slice(max(y.start, rows[0]), min(y.stop, rows[1]))
+        if x.start >= x.stop or y.start >= y.stop:  # out of the frame
             return
         # A ray r meets the board's plane where the homography [r1 r2 t]⁻¹ takes it.
-        to_board = np.linalg.inv(np.column_stack([rotation[:, 0], rotation[:, 1], translation]))
-        fine = tuple(slice(each.start * SUPERSAMPLING, each.stop * SUPERSAMPLING) for each in (y, x))
-        rays = self.optics.rays().reshape(HEIGHT * SUPERSAMPLING, WIDTH * SUPERSAMPLING, 2)[fine]
-        at = rays @ to_board[:, :2].T.astype(np.float32) + to_board[:, 2].astype(np.float32)
+        to_board = np.linalg.inv(np.column_stack([rotation[:, 0], rotation[:, 1], translation])).astype(np.float32)
+        fine_y, fine_x = (slice(each.start * SUPERSAMPLING, each.stop * SUPERSAMPLING) for each in (y, x))
+        at = to_board[:, :2] @ self.optics.rays()[fine_y, :, fine_x]
+        at += to_board[:, 2:]
         with np.errstate(divide="ignore", invalid="ignore"):
-            places = at[..., :2] / at[..., 2:] * TEXTURE_PX_MM - 0.5
-        margin = TEXTURE_PX_MM * self.board.margin_mm
-        maps = np.clip(np.nan_to_num(places + np.float32(margin), nan=-1e4), -1e4, 1e4)
-        drawn = cv2.remap(self._texture, maps[..., 0], maps[..., 1], cv2.INTER_LINEAR)
+            places = at[:, :2] / at[:, 2:]
+        places *= TEXTURE_PX_MM
+        places -= 0.5
+        places += np.float32(TEXTURE_PX_MM * self.board.margin_mm)
+        if not at[:, 2].all():  # a ray is parallel to the board
+            np.nan_to_num(places, copy=False, nan=-_FAR)
+        np.clip(places, -_FAR, _FAR, out=places)
+        drawn = cv2.remap(self._texture, places[:, 0], places[:, 1], cv2.INTER_LINEAR)
         size = (x.stop - x.start, y.stop - y.start)
         seen = cv2.resize(drawn, size, interpolation=cv2.INTER_AREA).astype(np.float32)
         cover = seen[..., 1:] / 255
-        image[y, x] = np.clip(seen[..., :1] + image[y, x] * (1 - cover), 0, 255).astype(np.uint8)
+        image[y, x] = np.clip(seen[..., :1] + image[y, x] * (1 - cover), 0, 255)
 
     def _box(self, rotation: Floats, translation: Floats) -> tuple[slice, slice]:
         """Return the columns and rows of the image that show the board."""

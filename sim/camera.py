@@ -350,14 +350,15 @@ class SimCapture:
         steps, weights = row_weights(exposure, readout, n)
         seen = np.zeros((HEIGHT, WIDTH, 3), dtype=np.float32)
         for angle, weight in zip(self._world.table_angles(start + steps.astype(np.int64)), weights, strict=True):
-            rows = np.flatnonzero(weight)
-            if len(rows):
-                part = slice(rows[0], rows[-1] + 1)
-                seen[part] += self._picture(scene, float(angle))[part] * weight[part, None, None]
+            exposed = np.flatnonzero(weight)
+            if len(exposed):
+                rows = int(exposed[0]), int(exposed[-1]) + 1
+                part = slice(*rows)
+                seen[part] += self._picture(scene, float(angle), rows)[part] * weight[part, None, None]
         return seen
 
-    def _picture(self, scene: Scene, table_deg: float) -> Image:
-        """Return the image of a scene under nominal light."""
+    def _picture(self, scene: Scene, table_deg: float, rows: tuple[int, int] = (0, HEIGHT)) -> Image:
+        """Return the image of a scene under nominal light; only the ``rows`` need to be right."""
         table_deg = -table_deg if self.orbits else table_deg
         image = self.backdrop.copy()
         if scene.object is None:
@@ -370,8 +371,11 @@ class SimCapture:
         if self.visit is not None and not isinstance(scene.object, BoardOnPlatter):
             drawn = partial(scene.object.draw, azimuth_deg=table_deg + scene.yaw_deg, offset_mm=offset_mm)
             return self._as_mounted(seen_on_visit(self.visit, drawn, table_deg))
+        if isinstance(scene.object, BoardOnPlatter):
+            scene.object.draw(image, table_deg + scene.yaw_deg, offset_mm, rows)
+            return image
         scene.object.draw(image, table_deg + scene.yaw_deg, offset_mm)
-        return image if isinstance(scene.object, BoardOnPlatter) else self._as_mounted(image)
+        return self._as_mounted(image)
 
     def _as_mounted(self, image: Image) -> Image:
         """Return the drawn image as the camera sees it from its mounting position."""

@@ -113,7 +113,6 @@ def main() -> None:
         lines = screen(output(folder, ["demo"], columns=DEMO_WIDTH))
         enrolled = max(n for n, line in enumerate(lines) if "views enrolled in" in line)
         picture("demo", "make demo", [*lines[:3], "...", *lines[enrolled:]], DEMO_WIDTH)
-        photograph("report", folder / "rig-demo" / "report.html", 990, 2270)
 
 
 if __name__ == "__main__":

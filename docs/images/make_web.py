@@ -36,7 +36,7 @@ def main() -> None:
 
 def photograph(browser: Any, url: str) -> None:
     """Enroll some objects, identify one, and take the picture."""
-    page = browser.new_page(viewport={"width": 1200, "height": 760})
+    page = browser.new_page(viewport={"width": 1200, "height": 1000})
     page.goto(f"{url}enroll")
     for name in ("mug-star", "mug-white", "lamp"):
         page.fill("#name", name)

@@ -11,8 +11,6 @@ from functools import cache, partial
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Protocol, runtime_checkable
 
-import numpy as np
-from numpy.typing import NDArray
 from pydantic import BaseModel
 
 from rig.calibrations import CalibrationStatus, CalibrationStore, apparatus, apply_results
@@ -23,10 +21,9 @@ from rig.core.clock import Clock
 from rig.core.errors import ConfigError, RigError, TorqueStaysOn
 from rig.core.next_steps import NextSteps
 from rig.core.signals import uninterrupted
-from rig.devices.camera import Camera, ShownCamera
+from rig.devices.camera import Camera
 from rig.devices.head.head import RigHead
 from rig.devices.imu import Imu
-from rig.devices.on_demand import OnDemand
 from rig.devices.servo import Servo
 from rig.safety.saved_state import MemoryStore, SessionEnd, StateStore
 from rig.safety.supervisor import Safety
@@ -48,10 +45,12 @@ class Placer(Protocol):
 
 @dataclass(slots=True)
 class Bench(AbstractContextManager["Bench"]):
-    """The devices of one bench, on one clock. IMU and camera may be opened at their first use.
+    """The devices of one bench, on one clock. IMU and camera are opened at their first use, or by `open_devices`.
 
     Attributes
     ----------
+    open_imu, open_camera
+        Open the device; `imu` and `camera` call them once.
     placer
         Puts objects on the table; None if a person does that, before a plan begins.
     conditions
@@ -74,8 +73,8 @@ class Bench(AbstractContextManager["Bench"]):
     config: RigConfig
     clock: Clock
     servo: Servo
-    imu: Imu
-    camera: Camera
+    open_imu: Callable[[], Imu] = field(repr=False)
+    open_camera: Callable[[], Camera] = field(repr=False)
     placer: Placer | None = None
     conditions: Mapping[str, Any] = field(default_factory=dict)
     findings: tuple[str, ...] = ()
@@ -85,6 +84,8 @@ class Bench(AbstractContextManager["Bench"]):
     head: RigHead | None = None
     connections: ExitStack = field(default_factory=ExitStack, repr=False)
     safety: Safety = field(init=False, repr=False)
+    _imu: Imu | None = field(default=None, init=False, repr=False)
+    _camera: Camera | None = field(default=None, init=False, repr=False)
     _end: SessionEnd = field(default=SessionEnd.FINISHED, init=False, repr=False)
     _open: bool = field(default=True, init=False, repr=False)
     _as_opened: tuple[RigConfig, tuple[str, ...]] | None = field(default=None, init=False, repr=False)
@@ -112,14 +113,14 @@ class Bench(AbstractContextManager["Bench"]):
 
     def _close(self) -> None:
         failures: list[Exception] = []
-        for step in (
+        steps: list[Callable[[], object]] = [
             self.servo.torque_off,
             partial(self.safety.end_session, self._end),
             self.servo.close,
-            self.imu.close,
-            self.camera.close,
+            *(device.close for device in (self._imu, self._camera) if device is not None),
             self.connections.close,
-        ):
+        ]
+        for step in steps:
             try:
                 step()
             except (RigError, OSError) as failure:
@@ -139,17 +140,32 @@ class Bench(AbstractContextManager["Bench"]):
         if self.placer is not None:
             self.placer.place(name)
 
+    @property
+    def imu(self) -> Imu:
+        """The IMU; the first use opens it, and raises as `open_devices`."""
+        if self._imu is None:
+            self._imu = self.open_imu()
+        return self._imu
+
+    @imu.setter
+    def imu(self, imu: Imu) -> None:
+        self._imu = imu
+
+    @property
+    def camera(self) -> Camera:
+        """The camera; the first use opens it, and raises as `open_devices`."""
+        if self._camera is None:
+            self._camera = self.open_camera()
+        return self._camera
+
     def open_devices(self, parts: Collection[str]) -> None:
         """Open ``imu`` and ``camera`` now, not at their first use.
 
-        Raises
-        ------
-        DeviceNotFound, DeviceMismatch, DeviceSilent
-            A device is missing, is another one, or does not answer.
+        Raises `DeviceNotFound`, `DeviceMismatch`, `DeviceSilent`: a device is missing, is another one, or does not
+        answer.
         """
         for part in parts:
-            if isinstance(device := getattr(self, part), OnDemand):
-                setattr(self, part, device.open())
+            getattr(self, part)
 
     def devices(self) -> dict[str, Any]:
         """Return the identities of the devices, for records; it opens those that are not open yet."""
@@ -158,12 +174,8 @@ class Bench(AbstractContextManager["Bench"]):
 
     def _identities(self) -> dict[str, Any]:
         """Return the identities of the open devices."""
-        devices = {part: getattr(self, part) for part in ("servo", "imu", "camera")}
-        return {
-            part: asdict(device.identity)
-            for part, device in devices.items()
-            if not isinstance(device, OnDemand) or device.is_open
-        }
+        devices = {"servo": self.servo, "imu": self._imu, "camera": self._camera}
+        return {part: asdict(device.identity) for part, device in devices.items() if device is not None}
 
     def apparatus(self, *parts: str) -> dict[str, Any]:
         """Return the part of the bench that a calibration of ``parts`` (default: all open devices) depends on."""
@@ -206,7 +218,6 @@ def open_bench(
     *,
     seed: int | None = None,
     devices: Collection[str] = DEVICES,
-    show_frame: Callable[[NDArray[np.uint8]], None] | None = None,
 ) -> Bench:
     """Open a bench by name; use it in a ``with`` block.
 
@@ -220,25 +231,16 @@ def open_bench(
         Seed of a simulated bench; a real one ignores it.
     devices
         Devices to open now; the others are opened when they are first used. The servo is always opened.
-    show_frame
-        Called with the image of each frame of the camera, which must be one of ``devices``.
 
-    Raises
-    ------
-    ConfigError
-        The bench does not exist, or its options have mistakes.
-    DeviceNotFound, DeviceMismatch, DeviceSilent
-        A device is missing, is another one, or does not answer.
-    BenchBusy
-        Another program uses the bench.
+    Raises `ConfigError`: the bench does not exist, or its options have mistakes. `DeviceNotFound`, `DeviceMismatch`,
+    `DeviceSilent`: a device is missing, is another one, or does not answer. `BenchBusy`: another program uses the
+    bench.
     """
     config = config or RigConfig()
     kind, options = _kind(name or config.default_bench, config)
     bench = kind.open(config, options, seed)
     try:
         bench.open_devices(devices)
-        if show_frame is not None:
-            bench.camera = ShownCamera(bench.camera, show_frame)
         calibrate(bench, CalibrationStore(config.calibration_path(bench.name)))
     except BaseException:
         bench.close()
@@ -267,10 +269,7 @@ def calibrate(bench: Bench, store: CalibrationStore) -> None:
 
     A second call also applies new calibrations.
 
-    Raises
-    ------
-    ConfigError
-        A calibration sets a value that the configuration does not allow.
+    Raises `ConfigError`: a calibration sets a value that the configuration does not allow.
     """
     bench._as_opened = bench._as_opened or (bench.config, bench.findings)
     config, findings = bench._as_opened
@@ -306,10 +305,7 @@ def _kind(name: str, config: RigConfig) -> tuple[BenchKind, BaseModel]:
 def bench_kind(name: str) -> BenchKind:
     """Return the plug-in of that name.
 
-    Raises
-    ------
-    ConfigError
-        The bench does not exist.
+    Raises `ConfigError`: the bench does not exist.
     """
     if name in _plugins():
         kind: BenchKind = _plugins()[name].load()
@@ -325,10 +321,7 @@ def bench_kind(name: str) -> BenchKind:
 def check_config(read: Values) -> tuple[RigConfig, dict[str, BaseModel]]:
     """Return the configuration and the options of every bench that is installed.
 
-    Raises
-    ------
-    ConfigError
-        The evidence lists all mistakes, including those in the benches' own sections.
+    Raises `ConfigError`: the evidence lists all mistakes, including those in the benches' own sections.
     """
     found: list[str] = []
     config, options = RigConfig(), {}

@@ -6,14 +6,13 @@ Decision: docs/decisions/0001.
 import json
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import replace
-from typing import Any, cast
+from typing import Any
 
 from pydantic import BaseModel
 
 from rig.bench import Bench, BenchKind
 from rig.bench.computer import Computer
-from rig.config import RigConfig, Section
+from rig.config import CameraConfig, RigConfig, Section
 from rig.config.imus import imu_kind
 from rig.core.clock import Clock, SystemClock
 from rig.core.errors import ConfigError, DeviceMismatch, RigError, StateNotStored
@@ -21,15 +20,12 @@ from rig.core.masking import masked
 from rig.core.phrases import angle_range
 from rig.devices.camera import Camera
 from rig.devices.dynamixel.guardian import Guardian
-from rig.devices.dynamixel.opening import open_servo
 from rig.devices.dynamixel.port import SerialConnection
-from rig.devices.head.head import RigHead
-from rig.devices.head.opening import open_head, powered, switch_on
+from rig.devices.dynamixel.servo import open_servo
+from rig.devices.head.head import RigHead, open_head, powered
 from rig.devices.head.protocol import BAUD
-from rig.devices.imu import Imu
-from rig.devices.on_demand import OnDemand
-from rig.devices.open_imu import open_imu
-from rig.devices.opencv_camera import CameraSettings, OpenCvCamera
+from rig.devices.imu import Imu, open_imu
+from rig.devices.opencv_camera import OpenCvCamera
 from rig.devices.opencv_capture import Capture
 from rig.devices.servo import Servo
 from rig.safety.saved_state import BenchLock, FileStore, StateStore
@@ -40,13 +36,7 @@ class NoOptions(Section):
 
 
 class HardwareBench:
-    """Opens the devices in the configuration.
-
-    Attributes
-    ----------
-    name
-        The bench's name. Its state, calibrations and catalog belong to it.
-    """
+    """Opens the devices in the configuration. State, calibrations and catalog belong to its name."""
 
     name = "hardware"
     options: type[BaseModel] = NoOptions
@@ -120,12 +110,9 @@ def assemble(
 
     Nothing moves, and the torque stays as it is. `Bench.safety` then knows whether the table may move.
 
-    Raises
-    ------
-    DeviceNotFound, DeviceMismatch, DeviceSilent
-        A device is missing, is another one, or does not answer. The caller closes the connections.
-    ConfigError
-        The servo does not support the configuration, or does not reach the table's limits.
+    Raises `DeviceNotFound`, `DeviceMismatch`, `DeviceSilent`: a device is missing, is another one, or does not answer.
+    The caller closes the connections. `ConfigError`: the servo does not support the configuration, or does not reach
+    the table's limits.
     """
     with ExitStack() as opened:
         # Open the rig head and the servo.
@@ -134,7 +121,7 @@ def assemble(
         if config.imu.connection == "head" and head_port is not None:
             head = open_head(config, head_port, clock)
             opened.callback(head.close)
-            fault = switch_on(head, config.head, clock)  # first, because the servo's supply may go through it
+            fault = head.switch_on(config.head)  # first, because the servo's supply may go through it
         servo = open_servo(connection, config.servo, clock, config.table.mode, reopen_serial, guardian)
         findings = servo.prepare(write=config.servo.write_settings)
         findings += tuple(f"servo: {one}" for one in servo.remarks)
@@ -142,7 +129,10 @@ def assemble(
         if head is None and (note := imu_kind(config.imu.model).note):
             findings += (f"imu: {note}",)
 
-        # Prepare the camera and the IMU, which are opened at their first use.
+        # IMU and camera are opened at their first use, unless the head is the IMU.
+        def open_sensor() -> Imu:
+            return open_imu(config.imu, i2c_bus, clock) if head is None else head
+
         def open_camera() -> Camera:
             with ExitStack() as failed:
                 source = capture()
@@ -161,23 +151,22 @@ def assemble(
             if config.camera.focus is None:
                 store_focus(state, device, camera.read_locks().focus)
             bench.findings += tuple(
-                f"camera: {n.setting} was set to {n.asked_text}, but the camera reports {n.reported_text}"
+                f"camera: {n.setting} was set to {n.asked}, but the camera reports {n.reported}"
                 for n in camera.rejected_settings
             )
             return camera
 
-        imu = cast(Imu, head or OnDemand(lambda: open_imu(config.imu, i2c_bus, clock)))
-        camera = cast(Camera, OnDemand(open_camera))
         # Connect the safety layer with the devices.
-        bench = Bench(name, config, clock, servo, imu, camera, findings=findings, state=state, head=head)
+        bench = Bench(name, config, clock, servo, open_sensor, open_camera, findings=findings, state=state, head=head)
         bench.safety.connect()
         if head is not None:
             watched = head
+            bench.open_devices(("imu",))
             bench.safety.monitors.append(watched.check)
-            bench.safety.restore_actions.append(lambda: switch_on(watched, config.head, clock))
+            bench.safety.restore_actions.append(lambda: watched.switch_on(config.head))
         if fault is not None:
             bench.safety.latch(fault)
-        bench.safety.acknowledge_checks.append(lambda: imu.read_samples())
+        bench.safety.acknowledge_checks.append(lambda: bench.imu.read_samples())
         bench.findings += bench.safety.findings
         opened.pop_all()
     return bench
@@ -186,10 +175,7 @@ def assemble(
 class CameraPlug:
     """The camera of a source. It keeps its identity when it is plugged in again, and may get another number.
 
-    Attributes
-    ----------
-    device
-        Identifies the camera (`Computer.camera_device`), once it was opened.
+    ``device`` identifies the camera (`Computer.camera_device`), once it was opened.
     """
 
     def __init__(self, computer: Computer, source: int | str) -> None:
@@ -231,9 +217,9 @@ class CameraPlug:
 _FOCUS_FILE = "camera-focus.json"
 
 
-def camera_settings(config: RigConfig, state: StateStore, device: str | None) -> CameraSettings:
+def camera_settings(config: RigConfig, state: StateStore, device: str | None) -> CameraConfig:
     """Return the camera's settings: the configured ones, and the focus that an earlier program has found."""
-    settings = CameraSettings(**config.camera.model_dump(exclude={"source"}))
+    settings = config.camera
     if settings.focus is not None:
         return settings
     try:
@@ -241,7 +227,7 @@ def camera_settings(config: RigConfig, state: StateStore, device: str | None) ->
         focus = float(stored["focus"]) if stored["device"] == device else None
     except (StateNotStored, ValueError, KeyError, TypeError):  # none yet, or damaged: the autofocus settles again
         return settings
-    return replace(settings, focus=focus)
+    return settings.model_copy(update={"focus": focus})
 
 
 def store_focus(state: StateStore, device: str | None, focus: float | None) -> None:

@@ -17,7 +17,7 @@ from rig.catalog.database import Database
 from rig.catalog.enrolling import OpenEnrollment
 from rig.catalog.facts import Action, Enrollment, Entry, Session, View, digest_of
 from rig.catalog.opening import open_database
-from rig.catalog.records import EnrollmentStatus, Provenance, check_azimuth, checked_texts, clean_name
+from rig.catalog.records import MAX_VIEWS, EnrollmentStatus, Provenance, checked_texts, clean_name, is_plan
 from rig.catalog.state import EnrollmentState, ObjectDetails, ObjectSummary
 from rig.config.catalog_place import CatalogPlace
 from rig.core.clock import Clock
@@ -31,6 +31,10 @@ class Catalog(AbstractContextManager["Catalog"]):
     They are in one folder (``catalog.sqlite`` and ``images/``), or on a server for several benches (`CatalogPlace`).
     Open it with `Catalog.open`. Several processes may read and write at once. For answers, checks, imports and exports
     use the functions of `rig.catalog.results`, `.derived`, `.verify`, `.upkeep`, `.transfer` and `.exchange`.
+
+    Whatever reads or writes a catalog raises `CatalogDamaged` for what is not as it was stored, `CatalogBusy` if
+    another process writes for longer than the timeout, `CatalogUnavailable` if the server does not answer, and
+    `CatalogError` if the system denies access or the disk is full. The methods name other errors only.
 
     Attributes
     ----------
@@ -75,14 +79,8 @@ class Catalog(AbstractContextManager["Catalog"]):
         busy_timeout_s
             How long to wait while another process writes.
 
-        Raises
-        ------
-        CatalogError
-            There is no catalog, it is damaged or of another version of the program, or the system denies access.
-        CatalogBusy
-            Another process locks the catalog for longer than the timeout.
-        CatalogUnavailable
-            The server of the catalog does not answer.
+        Raises `CatalogError`: there is no catalog, it is damaged or of another version of the program, or the system
+        denies access. `CatalogUnavailable`: the server of the catalog does not answer.
         """
         place = CatalogPlace.of(path)
         return cls(open_database(place, create=create, read_only=read_only, busy_timeout_s=busy_timeout_s), clock)
@@ -118,12 +116,7 @@ class Catalog(AbstractContextManager["Catalog"]):
     def object(self, name: str) -> ObjectDetails:
         """Return an object with its enrollments and views.
 
-        Raises
-        ------
-        ObjectNotFound
-            There is no object of that name.
-        CatalogDamaged
-            It is not as it was stored.
+        Raises `ObjectNotFound`: there is no object of that name.
         """
         with self.database.read() as transaction:
             found = state.find(transaction, name)
@@ -160,10 +153,7 @@ class Catalog(AbstractContextManager["Catalog"]):
     def view(self, view_id: int) -> View:
         """Return one view.
 
-        Raises
-        ------
-        CatalogError
-            There is no view with that id, or it is not as it was stored.
+        Raises `CatalogError`: there is no view with that id, or it is not as it was stored.
         """
         with self.database.read() as transaction:
             return state.view(transaction, int(view_id))
@@ -178,10 +168,7 @@ class Catalog(AbstractContextManager["Catalog"]):
     def read_image(self, image: str) -> NDArray[np.uint8]:
         """Return the pixels that were stored, uint8 (H, W, 3) BGR, such as those of `View.image`.
 
-        Raises
-        ------
-        CatalogError
-            The file is missing, is not the stored one, or the system denies access.
+        Raises `CatalogError`: the file is missing, is not the stored one, or the system denies access.
         """
         with self.database.catalog_errors():
             return self.database.images.pixels(image)
@@ -207,7 +194,7 @@ class Catalog(AbstractContextManager["Catalog"]):
                 state.check_not_enrolled(transaction, known)
 
     def known_objects(self) -> list[ObjectSummary]:
-        """Return the objects that need not be enrolled: those in use. `rig.catalog.shared` adds those of a server."""
+        """Return the objects that need not be enrolled: those in use. `rig.catalog.journal` adds those of a server."""
         return self.objects()
 
     def begin(
@@ -239,23 +226,17 @@ class Catalog(AbstractContextManager["Catalog"]):
         empty_table : uint8 array (H, W, 3), optional
             The empty-table image of the bench.
 
-        Raises
-        ------
-        UsageError
-            The name or the plan is not valid.
-        ObjectExists
-            The object is enrolled already and ``replace`` is False.
-        CatalogError
-            The object has an unfinished enrollment and ``replace`` is False, or storing fails.
-        CatalogBusy
-            Another process is writing for longer than the timeout.
+        Raises `UsageError`: the name or the plan is not valid. `ObjectExists`: the object is enrolled already and
+        ``replace`` is False. `CatalogError`: the object has an unfinished enrollment and ``replace`` is False, or
+        storing fails.
         """
         name = clean_name(name)
         plan = tuple(float(azimuth_deg) for azimuth_deg in planned_azimuth_deg)
-        if not plan:
-            raise UsageError("The enrollment has no planned views.", next_step="Plan at least one view.")
-        for azimuth_deg in plan:
-            check_azimuth(azimuth_deg)
+        if not is_plan(plan):
+            raise UsageError(
+                f"An enrollment needs 1 to {MAX_VIEWS} planned views, with azimuths in [0°, 360°).",
+                next_step="Plan other views.",
+            )
         texts = checked_texts(label, note)
         png = None if empty_table is None else images.encode(empty_table)
         now = self.clock.utc()
@@ -264,7 +245,7 @@ class Catalog(AbstractContextManager["Catalog"]):
             if known is not None:
                 if not replace:
                     state.check_not_enrolled(transaction, known)
-                self._end_unfinished(transaction, known)
+                state.end_current(transaction, self.clock, known, EnrollmentStatus.IN_PROGRESS)
             object_id = log.head(transaction)[0] + 1 if known is None else known.object_id
             assert object_id is not None
             enrollment = Enrollment(
@@ -289,10 +270,7 @@ class Catalog(AbstractContextManager["Catalog"]):
     def resumable(self, name: str) -> EnrollmentState | None:
         """Return the unfinished enrollment of an object, or None.
 
-        Raises
-        ------
-        ObjectNotFound
-            There is no object of that name.
+        Raises `ObjectNotFound`: there is no object of that name.
         """
         with self.database.read() as transaction:
             return state.of_status(transaction, state.find(transaction, name), EnrollmentStatus.IN_PROGRESS)
@@ -302,14 +280,8 @@ class Catalog(AbstractContextManager["Catalog"]):
     ) -> OpenEnrollment:
         """Continue the unfinished enrollment of an object, on the same bench or on another one.
 
-        Raises
-        ------
-        ObjectNotFound
-            There is no object of that name.
-        CatalogError
-            It has no unfinished enrollment, or storing fails.
-        CatalogBusy
-            Another process is writing for longer than the timeout.
+        Raises `ObjectNotFound`: there is no object of that name. `CatalogError`: it has no unfinished enrollment, or
+        storing fails.
         """
         png = None if empty_table is None else images.encode(empty_table)
         with self.database.write() as transaction:
@@ -330,14 +302,8 @@ class Catalog(AbstractContextManager["Catalog"]):
     def rename(self, name: str, new_name: str) -> None:
         """Give an object another name.
 
-        Raises
-        ------
-        UsageError
-            The new name is not valid.
-        ObjectNotFound
-            There is no object of that name.
-        ObjectExists
-            Another object has the new name.
+        Raises `UsageError`: the new name is not valid. `ObjectNotFound`: there is no object of that name.
+        `ObjectExists`: another object has the new name.
         """
         new_name = clean_name(new_name)
         with self.database.write() as transaction:
@@ -352,12 +318,7 @@ class Catalog(AbstractContextManager["Catalog"]):
     def set_texts(self, name: str, *, label: str | None = None, note: str | None = None) -> None:
         """Change the label and the note of an object. None leaves them unchanged.
 
-        Raises
-        ------
-        UsageError
-            They are not valid text.
-        ObjectNotFound
-            There is no object of that name.
+        Raises `UsageError`: they are not valid text. `ObjectNotFound`: there is no object of that name.
         """
         texts = checked_texts(label, note)
         with self.database.write() as transaction:
@@ -369,10 +330,7 @@ class Catalog(AbstractContextManager["Catalog"]):
     def delete(self, *names: str) -> None:
         """Delete objects, all or none. `undelete` restores them until `collect_garbage` removes them.
 
-        Raises
-        ------
-        ObjectNotFound
-            There is no object of one of these names.
+        Raises `ObjectNotFound`: there is no object of one of these names.
         """
         with self.database.write() as transaction:
             for known in [state.find(transaction, name) for name in dict.fromkeys(names)]:
@@ -382,12 +340,8 @@ class Catalog(AbstractContextManager["Catalog"]):
     def undelete(self, name: str) -> None:
         """Restore the object that was deleted last under this name.
 
-        Raises
-        ------
-        ObjectNotFound
-            There is no deleted object of that name.
-        ObjectExists
-            An object in use has this name.
+        Raises `ObjectNotFound`: there is no deleted object of that name. `ObjectExists`: an object in use has this
+        name.
         """
         with self.database.write() as transaction:
             known = state.find(transaction, name, deleted=True)
@@ -406,22 +360,6 @@ class Catalog(AbstractContextManager["Catalog"]):
         """Return the log: who did what and when, oldest first."""
         with self.database.read() as transaction:
             return log.entries(transaction, since, object_name)
-
-    def _end_unfinished(self, transaction: Transaction, known: Entry) -> None:
-        """Abandon the unfinished enrollment of an object, if there is one."""
-        begun = state.of_status(transaction, known, EnrollmentStatus.IN_PROGRESS)
-        if begun is not None:
-            log.append(
-                transaction,
-                self.clock,
-                Action.ENROLLMENT_ABANDONED,
-                known.object_name,
-                object_id=known.object_id,
-                enrollment_id=begun.enrollment.id,
-                status=EnrollmentStatus.ABANDONED,
-                finished_utc=self.clock.utc(),
-                details={"enrollment_id": begun.enrollment.id},
-            )
 
     def _start_session(
         self,

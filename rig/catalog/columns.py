@@ -42,16 +42,20 @@ _IMAGE_NAME: Final = re.compile(r"[0-9a-f]{64}\.(png|jpg)")
 
 
 class _Checked(TypeDecorator[Any]):
-    """A column whose values are checked when they are read; NULL is left to the definition of the column."""
+    """A column whose values are checked when they are read; NULL is left to the definition of the column.
+
+    ``kind`` is the type of a value. Subclasses that need more than that check it in `check`, or in their conversion.
+    """
+
+    kind: type = object
 
     def __init_subclass__(cls) -> None:
         cls.cache_ok = True  # SQLAlchemy does not inherit it
 
     def check(self, value: Any) -> None:
-        """Raise ValueError or TypeError for a value that this program would not have stored.
-
-        Without one of its own, the conversion of a column checks its values.
-        """
+        """Raise ValueError or TypeError for a value that this program would not have stored."""
+        if not isinstance(value, self.kind):
+            raise TypeError(f"a value that should be of type {self.kind.__name__}")
 
     def result_processor(self, dialect: Dialect, coltype: object) -> Callable[[Any], Any]:
         convert = super().result_processor(dialect, coltype)
@@ -85,25 +89,19 @@ class Utc(_Checked):
 class Words(_Checked):
     """Text. Its order is that of its code points, for any language of the server."""
 
-    impl = Text
+    impl: type[String] = Text
+    kind = str
 
     def load_dialect_impl(self, dialect: Dialect) -> TypeEngine[Any]:
-        return Text(collation="C" if dialect.name == "postgresql" else None)
+        own: Any = self.impl_instance
+        stored: TypeEngine[Any] = type(own)(own.length, collation="C" if dialect.name == "postgresql" else None)
+        return stored
 
-    def check(self, value: Any) -> None:
-        _check_type(value, str)
 
-
-class Name(_Checked):
-    """Text of limited length, ordered as `Words`."""
+class Name(Words):
+    """Text of limited length."""
 
     impl = String
-
-    def load_dialect_impl(self, dialect: Dialect) -> TypeEngine[Any]:
-        return String(self.impl_instance.length, collation="C" if dialect.name == "postgresql" else None)  # type: ignore[attr-defined]
-
-    def check(self, value: Any) -> None:
-        _check_type(value, str)
 
 
 class Status(_Checked):
@@ -119,9 +117,10 @@ class ImageName(_Checked):
     """Name of an image: the SHA-256 of its bytes, and the suffix of its format."""
 
     impl = String(68)
+    kind = str
 
     def check(self, value: Any) -> None:
-        _check_type(value, str)
+        super().check(value)
         if not _IMAGE_NAME.fullmatch(value):
             raise ValueError("a name that is not one of an image")
 
@@ -142,9 +141,7 @@ class Count(_Checked):
     """An integer."""
 
     impl = Integer
-
-    def check(self, value: Any) -> None:
-        _check_type(value, int)
+    kind = int
 
 
 class Nanoseconds(Count):
@@ -157,18 +154,14 @@ class Truth(_Checked):
     """True or false."""
 
     impl = Boolean
-
-    def check(self, value: Any) -> None:
-        _check_type(value, bool)
+    kind = bool
 
 
 class Bytes(_Checked):
     """Bytes."""
 
     impl = LargeBinary
-
-    def check(self, value: Any) -> None:
-        _check_type(value, bytes)
+    kind = bytes
 
 
 class JsonText(_Checked):
@@ -183,15 +176,15 @@ class JsonText(_Checked):
 class JsonMapping(JsonText):
     """A JSON object."""
 
-    def check(self, value: Any) -> None:
-        _check_type(value, dict)
+    kind = dict
 
 
 class Azimuths(JsonText):
     """A tuple of azimuths as JSON."""
 
     def process_result_value(self, value: Any, dialect: Dialect) -> tuple[float, ...]:  # noqa: ARG002
-        _check_type(value, list)
+        if not isinstance(value, list):
+            raise TypeError("a value that should be of type list")
         return tuple(value)
 
     def check(self, value: Any) -> None:
@@ -208,11 +201,6 @@ class RegionOfImage(JsonText):
     def check(self, value: Any) -> None:
         if value is not None and not is_region(value):
             raise ValueError("a region that is not one")
-
-
-def _check_type(value: object, kind: type) -> None:
-    if not isinstance(value, kind):
-        raise TypeError(f"a value that should be of type {kind.__name__}")
 
 
 def _check_number(value: object) -> None:

@@ -78,10 +78,6 @@ class Database(ABC):
     def size_bytes(self, transaction: Transaction) -> int:
         """Return the size of the database."""
 
-    def may_have_changed(self) -> bool:
-        """Return whether another query can find something new since the last call."""
-        return True
-
 
 def _transaction(connection: Connection) -> Transaction:
     return Transaction(connection, expire_on_commit=False, autoflush=True)
@@ -102,12 +98,8 @@ def properties(connection: Connection | Transaction) -> dict[str, str]:
 def check_properties(found: dict[str, str], place: CatalogPlace) -> None:
     """Check that a database is a catalog, of this version.
 
-    Raises
-    ------
-    CatalogError
-        It belongs to another program, or to another version of this one.
-    CatalogDamaged
-        No program has written such a version.
+    Raises `CatalogError`: it belongs to another program, or to another version of this one. `CatalogDamaged`: no
+    program has written such a version.
     """
     if found.get("application") != APPLICATION:
         raise CatalogError(f"{place} is the database of another program.", next_step="Give the place of a catalog.")

@@ -9,14 +9,13 @@ Decisions: docs/decisions/0042, docs/decisions/0053.
 
 import re
 from collections import Counter
-from collections.abc import Callable, Generator, Iterable, Sequence
+from collections.abc import Callable, Generator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple
 
 import numpy as np
-from sqlalchemy import delete, func, select
+from sqlalchemy import func, select
 from sqlalchemy.orm import Session as Transaction
 
 import hbr
@@ -46,7 +45,7 @@ from rig.catalog.describing import (
 )
 from rig.catalog.facts import Action, Derived, Enrollment, Entry, Session, View, seal_of
 from rig.catalog.jobs import JobProgress, finished, processes
-from rig.catalog.records import EnrollmentStatus, JsonObject, Region
+from rig.catalog.records import EnrollmentStatus, Region
 from rig.config import ViewConfig
 from rig.core.errors import CatalogDamaged, CatalogError, RigError
 from rig.core.next_steps import Do
@@ -62,10 +61,7 @@ from rig.views.description import (
 def described(catalog: Catalog, enrollment: Enrollment, name: str, *wanted: str) -> Described:
     """Return the stored description of an enrollment, or compute it; by `DESCRIPTORS` or those that are ``wanted``.
 
-    Raises
-    ------
-    CatalogError
-        An image cannot be read, or a view cannot be segmented.
+    Raises `CatalogError`: an image cannot be read, or a view cannot be segmented.
     """
     kinds = wanted or DESCRIPTORS
     seal = seal_of(enrollment)
@@ -95,14 +91,8 @@ def load_views(catalog: Catalog, descriptor: str) -> Generator[JobProgress, None
 
     It yields its progress in enrollments while it describes those that are not described yet.
 
-    Raises
-    ------
-    UsageError
-        There is no such descriptor.
-    CatalogDamaged
-        An object or a view is not as it was stored.
-    CatalogError
-        A view that is not described yet cannot be described.
+    Raises `UsageError`: there is no such descriptor. `CatalogError`: a view that is not described yet cannot be
+    described.
     """
     kind = known_descriptor(descriptor)
     found: dict[str, bytes] = {}
@@ -151,23 +141,15 @@ class Redescribed:
 
 
 def redescribe(
-    catalog: Catalog, descriptor: str = PAPER_DESCRIPTOR, *, again: bool = False, jobs: Jobs | None = None
+    catalog: Catalog, descriptor: str = PAPER_DESCRIPTOR, *, jobs: Jobs | None = None
 ) -> Generator[JobProgress, None, Redescribed]:
-    """Describe the objects in use that are not described by the present version of a descriptor, or all ``again``.
+    """Describe the objects in use that are not described by the present version of a descriptor.
 
     Each result is stored at once: after an interruption the next call continues there.
 
-    Raises
-    ------
-    UsageError
-        There is no such descriptor.
-    CatalogError, CatalogBusy
-        The catalog cannot be written.
+    Raises `UsageError`: there is no such descriptor.
     """
     kind = known_descriptor(descriptor)
-    if again:
-        with catalog.database.write() as transaction:
-            transaction.execute(delete(Derived).where(Derived.what.in_((kind.name, SEGMENTATION))))
     found: dict[str, bytes] = {}
     _, tasks = _missing(catalog, kind.name, found)
     results = yield from _described_now(catalog, tasks, jobs, required=True)
@@ -192,10 +174,7 @@ def local_views(catalog: Catalog, name: str, azimuths_deg: Sequence[float]) -> l
     They are cut out as at the enrollment (`hbr.dense.local_difference`). Which these are, `hbr.dense.session.near`
     decides for the bench and for the evaluation.
 
-    Raises
-    ------
-    ObjectNotFound, CatalogError
-        There is no such object, or an image is missing or is not the stored one.
+    Raises `ObjectNotFound`, `CatalogError`: there is no such object, or an image is missing or is not the stored one.
     """
     found = catalog.object(name)
     enrollment = found.complete
@@ -226,73 +205,6 @@ def regions_of(catalog: Catalog, enrollment: Enrollment) -> tuple[Region | None,
     with catalog.database.read() as transaction:
         chosen = _regions(transaction).of(transaction, enrollment.id)
     return tuple(view.region if chosen is None else chosen[0] for view in enrollment.views)
-
-
-# What the enrolled views have in common
-
-
-class EmptyTables(NamedTuple):
-    """Names of the objects that were enrolled with an empty-table image and without, and the newest of these images."""
-
-    with_image: tuple[str, ...]
-    without_image: tuple[str, ...]
-    newest: str | None
-
-
-def empty_tables(catalog: Catalog) -> EmptyTables:
-    """Return which of the objects in use were enrolled with an empty-table image."""
-    newest: tuple[int, int] | None = None
-    with_image: dict[str, bool] = {}
-    with catalog.database.read() as transaction:
-        owner = {one.enrollment_id: one.name for one in state.used(transaction)}
-        rows = transaction.execute(
-            select(Session.enrollment_id, Session.number, Session.empty_table).order_by(Session.started_utc)
-        )
-        for enrollment_id, number, image in rows:
-            if (name := owner.get(enrollment_id)) is not None:
-                with_image[name] = with_image.get(name, False) or image is not None
-                newest = newest if image is None else (enrollment_id, number)
-        image = None if newest is None else state.session(transaction, *newest).empty_table
-    with_one = tuple(name for name in owner.values() if with_image.get(name))
-    return EmptyTables(with_one, tuple(name for name in owner.values() if not with_image.get(name)), image)
-
-
-def camera_settings(catalog: Catalog) -> list[dict[str, Any]]:
-    """Return the camera's settings (`rig.devices.camera.CameraLocks`) of the objects in use, each combination once."""
-    with catalog.database.read() as transaction:
-        shown = _settings((view.id, view.evidence) for view in state.first_views(transaction, View.id, View.evidence))
-        for view_id, _ in shown:
-            state.view(transaction, view_id)  # of an edited one nothing is used
-    return [settings for _, settings in shown]
-
-
-def unfinished_camera_settings(catalog: Catalog, name: str) -> list[dict[str, Any]]:
-    """Return the camera's settings of the views of an unfinished enrollment, each combination once."""
-    begun = catalog.resumable(name)
-    shown = () if begun is None else _settings((view.id, view.evidence) for view in begun.enrollment.views)
-    return [settings for _, settings in shown]
-
-
-def _settings(evidence: Iterable[tuple[int, JsonObject | None]]) -> list[tuple[int, dict[str, Any]]]:
-    """Return each combination of the camera's settings once, with the first view that has it."""
-    found: list[tuple[int, dict[str, Any]]] = []
-    for view_id, one in evidence:
-        if one is None:
-            raise damaged("the evidence of a view", None)
-        locks = one.get("locks")
-        if isinstance(locks, dict) and all(locks != known for _, known in found):
-            found.append((view_id, locks))
-    return found
-
-
-def newest_view(catalog: Catalog) -> str | None:
-    """Return the image of the first view of the newest enrollment in use; None if there is none."""
-    with catalog.database.read() as transaction:
-        newest = max((one.enrollment_id for one in state.used(transaction)), default=0)
-        view_id = transaction.scalar(select(View.id).where(View.index == 0, View.enrollment_id == newest))
-        if view_id is None and newest:
-            raise state.changed(["the first view of the newest enrollment"])
-        return None if view_id is None else state.view(transaction, view_id).image
 
 
 def described_regions(catalog: Catalog, bench: str) -> set[tuple[Region | None, tuple[str, ...]]]:

@@ -29,8 +29,7 @@ from rig.config import ViewConfig
 from rig.core.errors import CatalogError, RigError, UsageError
 from rig.core.files import json_values
 from rig.core.next_steps import Do
-from rig.views.description import DESCRIPTORS, EnrollmentDescriber, within
-from rig.views.segmentation_evidence import check_evidence
+from rig.views.description import DESCRIPTORS, EnrollmentDescriber, check_evidence, within
 
 SEGMENTATION: Final = "segmentation"
 """The kind of the stored silhouettes: a list of the evidence of each view (`hbr.segmentation.segment`)."""
@@ -92,10 +91,7 @@ def describe_new(database: Database, enrollment: Enrollment, held: Mapping[str, 
 
     ``held`` are pixels of images that need not be read again.
 
-    Raises
-    ------
-    CatalogError
-        An image cannot be read, or a view cannot be segmented.
+    Raises `CatalogError`: an image cannot be read, or a view cannot be segmented.
     """
     images = database.images
     seal = seal_of(enrollment)
@@ -147,10 +143,7 @@ def describe_task(images: Images, task: Task) -> Described | str:
 def describe(pixels: _Pixels, task: Task, *, threads: int = 1) -> Described:
     """Segment the views of an enrollment together and describe them.
 
-    Raises
-    ------
-    CatalogError
-        An image cannot be read, or a view cannot be segmented.
+    Raises `CatalogError`: an image cannot be read, or a view cannot be segmented.
     """
     count = len(task.views)
     levels: dict[str, list[Levels]] = {name: [np.empty(0, np.uint8)] * count for name in task.names}

@@ -1,9 +1,9 @@
 """Comparison of the digests of many rows, as the database stores them: without making objects of them."""
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping
 from itertools import groupby
 from operator import itemgetter
-from typing import Any, Final, TypeVar
+from typing import Any, Final
 
 from sqlalchemy import ColumnElement, Integer, Text, cast, func, select, type_coerce
 from sqlalchemy.orm import Session as Transaction
@@ -12,8 +12,7 @@ from sqlalchemy.types import NullType
 
 from rig.catalog.columns import JsonText, Number, Truth, Utc
 from rig.catalog.facts import Enrollment, Entry, Row, Session, View, digested, sha256_of
-
-_T = TypeVar("_T")
+from rig.catalog.jobs import portions
 
 AT_ONCE: Final = 100
 """Enrollments whose rows are in memory at once."""
@@ -60,12 +59,6 @@ def damaged_enrollments(transaction: Transaction, seals: Mapping[int, str | None
                         wrong.add(number)
         wrong |= {number for number in own if seals[number] not in (None, sha256_of(tuple(digests[number])))}
         yield from sorted(wrong)
-
-
-def portions(ids: Sequence[_T], size: int) -> Iterator[Sequence[_T]]:
-    """Yield ids or keys in portions."""
-    for start in range(0, len(ids), size):
-        yield ids[start : start + size]
 
 
 def _raw(transaction: Transaction, table: type[Row]) -> list[ColumnElement[Any]]:

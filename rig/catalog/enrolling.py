@@ -3,7 +3,6 @@
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 from datetime import timedelta
-from math import isfinite
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +13,7 @@ from rig.catalog import log, state
 from rig.catalog.database import Database
 from rig.catalog.describing import MOST_HELD_BYTES, describe_new
 from rig.catalog.facts import Action, Enrollment, Session, View, digest_of
-from rig.catalog.records import EnrollmentStatus, as_json, check_azimuth, is_region
+from rig.catalog.records import EnrollmentStatus, as_json
 from rig.core.clock import Clock
 from rig.core.errors import CatalogError, UsageError
 from rig.core.next_steps import Do
@@ -61,19 +60,14 @@ class OpenEnrollment:
     def add(self, view: View, image_bgr: NDArray[np.uint8], encoded: Future[bytes] | None = None) -> View:
         """Store a view and its image, uint8 (H, W, 3) BGR. Both are durable when this returns.
 
-        ``encoded`` is the image as PNG, if `rig.views.image_files.Encoder` began with it before.
+        ``encoded`` is the image as PNG, if another thread began with it before.
 
         The image is complete under its name before its row is committed. A crash in between leaves an image without a
         row, which is harmless, and never a row without its image.
 
-        Raises
-        ------
-        UsageError
-            The view is not in the plan, a value of it is not possible, or the image has the wrong type or shape.
-        CatalogError
-            The view is stored already, the enrollment is no longer in progress, or the disk is full or fails.
-        CatalogBusy
-            Another process is writing for longer than the timeout.
+        Raises `UsageError`: the view is not in the plan, a value of it is not possible, or the image has the wrong type
+        or shape. `CatalogError`: the view is stored already, the enrollment is no longer in progress, or the disk is
+        full or fails.
         """
         if view.index >= len(self.planned_azimuth_deg):
             raise UsageError(
@@ -111,10 +105,8 @@ class OpenEnrollment:
 
         The previous one is superseded. After an interruption, resume the enrollment and call this again.
 
-        Raises
-        ------
-        CatalogError
-            Planned views are missing, an image cannot be read, or the enrollment is no longer in progress.
+        Raises `CatalogError`: planned views are missing, an image cannot be read, or the enrollment is no longer in
+        progress.
         """
         database, clock = self._database, self._clock
         with database.read() as transaction:
@@ -132,35 +124,21 @@ class OpenEnrollment:
         with database.write() as transaction:
             self._check_in_progress(transaction)
             known = state.by_id(transaction, enrollment.object_id)
-            before = state.of_status(transaction, known, EnrollmentStatus.COMPLETE)
-            if before is not None:
-                self._end(transaction, Action.ENROLLMENT_SUPERSEDED, EnrollmentStatus.SUPERSEDED, before)
-            log.append(
-                transaction,
-                clock,
-                Action.ENROLLED,
-                known.object_name,
-                object_id=enrollment.object_id,
-                enrollment_id=self.id,
-                status=EnrollmentStatus.COMPLETE,
-                finished_utc=clock.utc(),
-                seal=seal,
-                details={"enrollment_id": self.id, "views": len(self.planned_azimuth_deg)},
-            )
+            state.end_current(transaction, clock, known, EnrollmentStatus.COMPLETE)
+            done = state.EnrollmentState(enrollment, EnrollmentStatus.COMPLETE, clock.utc(), seal)
+            log.append(transaction, clock, Action.ENROLLED, known.object_name, **state.ending(done))
 
     def abandon(self) -> None:
         """Abandon the enrollment. Its images stay, and the complete enrollment before it stays in use."""
         with self._database.write() as transaction:
             self._check_in_progress(transaction)
-            self._end(transaction, Action.ENROLLMENT_ABANDONED, EnrollmentStatus.ABANDONED)
+            known = state.by_id(transaction, self.enrollment.object_id)
+            state.end_current(transaction, self._clock, known, EnrollmentStatus.IN_PROGRESS)
 
     def discard(self) -> None:
         """Remove an enrollment without views; an object that has no other enrollment goes with it.
 
-        Raises
-        ------
-        CatalogError
-            The enrollment has views or is no longer in progress.
+        Raises `CatalogError`: the enrollment has views or is no longer in progress.
         """
         with self._database.write() as transaction:
             self._check_in_progress(transaction)
@@ -185,29 +163,6 @@ class OpenEnrollment:
                 details={"enrollment_id": self.id},
             )
 
-    def _end(
-        self,
-        transaction: Transaction,
-        action: Action,
-        status: EnrollmentStatus,
-        ended: state.EnrollmentState | None = None,
-    ) -> None:
-        """End an enrollment, this one or the ``ended`` one; the object may have another name now."""
-        enrollment = self.enrollment if ended is None else ended.enrollment
-        finished_utc = self._clock.utc() if ended is None else ended.finished_utc
-        log.append(
-            transaction,
-            self._clock,
-            action,
-            state.by_id(transaction, enrollment.object_id).object_name,
-            object_id=enrollment.object_id,
-            enrollment_id=enrollment.id,
-            status=status,
-            finished_utc=finished_utc,
-            seal=None if ended is None else ended.seal,
-            details={"enrollment_id": enrollment.id},
-        )
-
     def _missing(self, transaction: Transaction) -> tuple[int, ...]:
         present = set(transaction.scalars(select(View.index).where(View.enrollment_id == self.id)))
         return tuple(index for index in range(len(self.planned_azimuth_deg)) if index not in present)
@@ -231,32 +186,16 @@ class OpenEnrollment:
 
 
 def check_view(view: View) -> None:
-    """Check the values of a view that is not stored yet.
-
-    Raises
-    ------
-    UsageError
-        A number is out of range or not finite, or the evidence is not JSON.
-    """
+    """Check the values of a view that is not stored yet, and make them plain numbers and JSON; a `UsageError`."""
     view.index = int(view.index)
     if view.captured_ns is not None:
         view.captured_ns = int(view.captured_ns)
-    if view.index < 0:
-        raise UsageError(f"View index {view.index} is negative.", next_step="Number the views of a plan from 0.")
     for name in ("commanded_deg", "encoder_deg", "azimuth_deg", "imu_deg", "imu_sigma_deg"):
-        value = getattr(view, name)
-        if value is not None:
+        if (value := getattr(view, name)) is not None:
             setattr(view, name, float(value) + 0.0)
-        if not isfinite(value or 0.0):
-            raise UsageError(f"View {view.index} has {name} = {value}.", next_step="Store measured angles.")
-    check_azimuth(view.azimuth_deg)
-    if (view.imu_deg is None) != (view.imu_sigma_deg is None) or (view.imu_sigma_deg or 0.0) < 0:
+    if problem := view.problem:
         raise UsageError(
-            f"View {view.index} has an IMU angle of {view.imu_deg} with an uncertainty of {view.imu_sigma_deg}.",
-            next_step="Give both, with an uncertainty of 0 or more, or None for both.",
+            f"View {view.index} cannot be stored: {problem}.",
+            next_step="Store measured values, and None for what was not measured.",
         )
     view.evidence = as_json(view.evidence, f"The evidence of view {view.index}")
-    if view.region is not None and not is_region(view.region):
-        raise UsageError(
-            f"View {view.index} has the region {view.region}.", next_step="Give x, y, width, height in pixels."
-        )

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 from enum import StrEnum
 from functools import cache
+from math import isfinite
 from typing import Any, Final
 
 from sqlalchemy import (
@@ -44,7 +45,7 @@ from rig.catalog.columns import (
     Words,
     damaged,
 )
-from rig.catalog.records import MAX_NAME_LENGTH, EnrollmentStatus, JsonObject, Provenance, Region
+from rig.catalog.records import MAX_NAME_LENGTH, EnrollmentStatus, JsonObject, Provenance, Region, is_region
 
 SCHEMA_VERSION: Final = 1
 """Version of the tables below."""
@@ -240,6 +241,22 @@ class View(Row):
         ForeignKeyConstraint(["enrollment_id", "session"], [Session.enrollment_id, Session.number]),
         {"sqlite_autoincrement": True},
     )
+
+    @property
+    def problem(self) -> str:
+        """What is wrong with a value that this program does not store; empty if nothing is."""
+        numbers = (self.azimuth_deg, self.commanded_deg, self.encoder_deg, self.imu_deg, self.imu_sigma_deg)
+        if not all(isfinite(number) for number in numbers if number is not None):
+            return "an angle is not a finite number"
+        if self.index < 0 or not 0 <= self.azimuth_deg < 360:
+            return f"the index {self.index} is negative, or the azimuth {self.azimuth_deg}° is not in [0°, 360°)"
+        if (self.imu_deg is None) != (self.imu_sigma_deg is None):
+            return "imu_deg and imu_sigma_deg: give both or none"
+        if (self.imu_sigma_deg or 0.0) < 0:
+            return f"imu_sigma_deg is {self.imu_sigma_deg}, a negative uncertainty"
+        if self.region is not None and not is_region(self.region):
+            return f"the region {self.region} is not x, y, width and height in pixels"
+        return ""
 
 
 class Derived(Row):

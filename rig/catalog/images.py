@@ -61,10 +61,7 @@ class Images(ABC):
     def content(self, name: str) -> bytes:
         """Return the bytes of an image.
 
-        Raises
-        ------
-        CatalogError
-            It is missing, cannot be read, or is not the one that was stored.
+        Raises `CatalogError`: it is missing, cannot be read, or is not the one that was stored.
         """
         fix = (Do.VERIFY_CATALOG(), "Then restore it from a backup, or", Do.ENROLL_AGAIN())
         try:
@@ -326,10 +323,7 @@ class FsspecImages(Images):
 def open_images(place: CatalogPlace) -> Images:
     """Return the store of the images of a catalog; nothing is read yet.
 
-    Raises
-    ------
-    ExtraMissing
-        The packages for this kind of store are not installed.
+    Raises `ExtraMissing`: the packages for this kind of store are not installed.
     """
     if place.images is None:
         return FolderImages(place.path)

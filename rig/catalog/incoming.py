@@ -1,11 +1,15 @@
-"""The images of a transfer: each is read, compared with its name, stored and described, in several processes."""
+"""The images of a transfer: each is read, compared with its name, stored and described, in several processes.
+
+A file that cannot be used is rejected, with the reason.
+"""
 
 import zlib
 from collections.abc import Callable, Generator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from enum import Enum, unique
 from functools import partial
-from typing import Final
+from typing import Any, Final
 from zipfile import BadZipFile
 
 import numpy as np
@@ -14,10 +18,49 @@ from numpy.typing import NDArray
 from rig.catalog import describing
 from rig.catalog.images import Images, name_of
 from rig.catalog.jobs import JobProgress, processes
-from rig.catalog.rejected import ImportProblem, Reason, RejectedFile
 from rig.core.errors import CatalogDamaged, CatalogError, UsageError
 from rig.core.processes import Jobs, map_in_processes
 from rig.views.image_files import BadImage, decode
+
+
+@unique
+class ImportProblem(Enum):
+    """A reason why a file is not imported: the name is its code, the value the template of its text."""
+
+    NOT_A_FILE = "is not a file"
+    LINK_OUTSIDE = "is a link to a file outside the folder"
+    NAME_PATTERN = "does not match the pattern {pattern}"
+    SAME_AZIMUTH = "shows {name!r} from the same azimuth as {other}"
+    INVALID_VALUE = "{error}"
+    UNREADABLE = "cannot be read: {error}"
+    INVALID_IMAGE = "cannot be used: {error}"
+    OTHER_IMAGE = "is not the stored image"
+    NOT_DESCRIBED = "cannot be described: {error}"
+
+
+@dataclass(frozen=True, slots=True)
+class Reason:
+    """An `ImportProblem` with the values of its text."""
+
+    code: ImportProblem
+    values: dict[str, Any] = field(default_factory=dict)
+
+    def __str__(self) -> str:
+        return self.code.value.format_map(self.values)
+
+
+@dataclass(frozen=True, slots=True)
+class RejectedFile:
+    """A file that is not imported, and why."""
+
+    path: str
+    reason: Reason
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the file with the code and the text of the reason."""
+        code = self.reason.code.name.lower()
+        return {"path": self.path, "code": code, "values": self.reason.values, "reason": str(self.reason)}
+
 
 _READ_ERRORS: Final = (
     OSError,

@@ -1,4 +1,4 @@
-"""Parts that the long jobs of a catalog share: progress, and portions of images for processes."""
+"""Parts that the long jobs of a catalog share: progress, and portions of images or rows."""
 
 import os
 from collections.abc import Callable, Generator, Iterable, Iterator
@@ -34,10 +34,10 @@ def finished(job: Generator[JobProgress, None, _T], progress: Callable[[JobProgr
         progress(at)
 
 
-def portions(items: Iterable[_T]) -> Iterator[tuple[_T, ...]]:
+def portions(items: Iterable[_T], size: int = PORTION) -> Iterator[tuple[_T, ...]]:
     """Yield the items in portions."""
     waiting = iter(items)
-    while portion := tuple(islice(waiting, PORTION)):
+    while portion := tuple(islice(waiting, size)):
         yield portion
 
 

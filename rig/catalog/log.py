@@ -59,6 +59,12 @@ def add(transaction: Transaction, *entries: Entry) -> None:
         transaction.execute(update(Property).where(Property.key == "head").values(value=value))
 
 
+def same(entry: Entry, **others: Any) -> Entry:
+    """Return a line for the log of another catalog; these columns are other ones."""
+    columns = {name: getattr(entry, name) for name in _COLUMNS if name != "digest"}
+    return Entry(**columns | others)
+
+
 class _End(NamedTuple):
     """The last line and its digest, and how many lines have a value in each column of `_COUNTED`."""
 

@@ -28,11 +28,8 @@ _NAMES_ANOTHER_FILE: Final = bytes.fromhex("d9d505f920a163d7")
 def check_folder(root: Path) -> None:
     """Check the folder of a catalog before SQLite opens a file in it.
 
-    Raises
-    ------
-    CatalogDamaged
-        Something of the catalog in the folder ``root`` is a link; a file that belongs to SQLite has a second name or is
-        a pipe or a device; or there is a rollback journal, which this program does not use.
+    Raises `CatalogDamaged`: something of the catalog in the folder ``root`` is a link; a file that belongs to SQLite
+    has a second name or is a pipe or a device; or there is a rollback journal, which this program does not use.
     """
     for name in _OWN:
         if (root / name).is_symlink():
@@ -80,10 +77,7 @@ def _check_rollback_journal(root: Path) -> None:
 def image_file(root: Path, path: str) -> Path:
     """Return the file of an image at a path within ``images/`` of the catalog in the folder ``root``.
 
-    Raises
-    ------
-    CatalogDamaged
-        A link leads out of the images of the catalog, or the file is a pipe or a device.
+    Raises `CatalogDamaged`: a link leads out of the images of the catalog, or the file is a pipe or a device.
     """
     for part in (*reversed(PurePosixPath(path).parents), PurePosixPath(path)):
         with suppress(FileNotFoundError):

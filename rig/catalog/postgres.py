@@ -21,9 +21,6 @@ from rig.core.errors import CatalogError, CatalogUnavailable, ConfigError, Extra
 from rig.core.files import json_values, make_folder
 from rig.core.next_steps import Do
 
-CHANNEL: Final = "hbr_rig_catalog"
-"""Channel of the notifications about changes; the payload is the id of the catalog."""
-
 _CREATION: Final = 0x48425200
 """Lock of the creation of the tables."""
 
@@ -78,7 +75,6 @@ class PostgresDatabase(Database):
         self._snapshots = engine.execution_options(isolation_level="REPEATABLE READ", postgresql_readonly=True)
         self._changes = engine.execution_options(isolation_level="READ COMMITTED")
         self._dispose = engine.dispose
-        self._listener: Any = None
         try:
             with self.catalog_errors():
                 self._open(create=create and not read_only)
@@ -88,8 +84,6 @@ class PostgresDatabase(Database):
 
     def close(self) -> None:
         self._dispose()
-        if self._listener is not None:
-            self._listener.close()
 
     @contextmanager
     def _reading(self) -> Iterator[Connection]:
@@ -105,7 +99,6 @@ class PostgresDatabase(Database):
             connection.execute(text(f"SELECT pg_advisory_xact_lock({_CATALOG})"))
             check_properties(properties(connection), self.place)
             yield connection
-            connection.execute(select(func.pg_notify(CHANNEL, self.id)))
 
     def catalog_errors(self) -> AbstractContextManager[None]:
         return server_errors(self.place, self._busy_timeout_s)
@@ -150,25 +143,6 @@ class PostgresDatabase(Database):
             if _has_tables(connection):
                 return  # another process was faster
             create_tables(connection)
-
-    def may_have_changed(self) -> bool:
-        """Return whether the server has sent a notification; True without a connection: the next query reports it."""
-        import psycopg
-
-        try:
-            if self._listener is None or self._listener.closed:
-                url = make_url(str(self.place.url)).set(drivername="postgresql").render_as_string(hide_password=False)
-                self._listener = psycopg.connect(url, autocommit=True, connect_timeout=5)
-                self._listener.execute(f"LISTEN {CHANNEL}")
-                return True  # what happened before is not known
-            found = False
-            for one in self._listener.notifies(timeout=0):
-                found = found or one.payload == self.id
-            self._listener.execute("SELECT 1")
-            return found
-        except (psycopg.Error, OSError):  # the connection is lost
-            self._listener = None
-            return True
 
     def size_bytes(self, transaction: Transaction) -> int:
         sizes = (transaction.scalar(select(func.pg_total_relation_size(name))) or 0 for name in Row.metadata.tables)

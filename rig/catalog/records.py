@@ -15,6 +15,8 @@ from rig.core.errors import UsageError
 from rig.core.next_steps import Do
 
 MAX_NAME_LENGTH: Final = 100
+MAX_VIEWS: Final = 10_000
+"""Most views of one enrollment: one every 0.036°."""
 
 JsonObject = Mapping[str, Any]
 Region = tuple[int, int, int, int]
@@ -25,6 +27,11 @@ def is_region(value: Sequence[object]) -> bool:
     """Return whether these are x, y, width and height of a part of some image."""
     numbers = [number for number in value if type(number) is int]
     return len(numbers) == len(value) == 4 and min(numbers[:2]) >= 0 and min(numbers[2:]) >= 1
+
+
+def is_plan(azimuths_deg: Sequence[float]) -> bool:
+    """Return whether an enrollment can have views at these azimuths."""
+    return 1 <= len(azimuths_deg) <= MAX_VIEWS and all(0 <= azimuth_deg < 360 for azimuth_deg in azimuths_deg)
 
 
 class EnrollmentStatus(StrEnum):
@@ -67,10 +74,7 @@ class Provenance:
     software
         Name and version of the program.
 
-    Raises
-    ------
-    UsageError
-        The devices or conditions are not JSON values.
+    Raises `UsageError`: the devices or conditions are not JSON values.
     """
 
     bench: str
@@ -86,10 +90,7 @@ class Provenance:
 def clean_name(name: str) -> str:
     """Return the name of an object as the catalog stores and compares it: composed (NFC), without outer spaces.
 
-    Raises
-    ------
-    UsageError
-        The name is empty, is longer than 100 characters or contains characters that cannot be printed.
+    Raises `UsageError`: the name is empty, is longer than 100 characters or contains characters that cannot be printed.
     """
     cleaned = unicodedata.normalize("NFC", name).strip()
     if not cleaned:
@@ -125,12 +126,6 @@ def checked_texts(label: str | None, note: str | None) -> dict[str, str]:
     for key, text in given.items():
         check_text(text, key)
     return given
-
-
-def check_azimuth(azimuth_deg: float) -> None:
-    """Raise `UsageError` for an azimuth outside [0, 360)."""
-    if not 0 <= azimuth_deg < 360:
-        raise UsageError(f"The azimuth {azimuth_deg}° is not in [0°, 360°).", next_step="Wrap azimuths to [0°, 360°).")
 
 
 def as_json(values: JsonObject, what: str) -> dict[str, Any]:

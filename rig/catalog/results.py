@@ -169,10 +169,7 @@ class ResultFilter:
 def clean_text(text: str, what: str) -> str:
     """Return a sample, an operator or a reason as it is stored, without outer spaces.
 
-    Raises
-    ------
-    UsageError
-        It is empty, too long, or contains characters that cannot be printed.
+    Raises `UsageError`: it is empty, too long, or contains characters that cannot be printed.
     """
     cleaned = text.strip()
     if not cleaned:
@@ -192,12 +189,7 @@ def record(catalog: Catalog, new: NewResult, image_bgr: NDArray[np.uint8] | None
     Both are durable when this returns. The image is complete under its name before the line is committed. A crash in
     between leaves an image that no line names, which is harmless.
 
-    Raises
-    ------
-    UsageError
-        The sample or the operator is not valid text.
-    CatalogError, CatalogBusy
-        The catalog cannot be written.
+    Raises `UsageError`: the sample or the operator is not valid text.
     """
     sample = None if new.answered.sample is None else clean_text(new.answered.sample, "sample")
     fact: dict[str, Any] = {"answer": new.details, "image": None, "image_bytes": None}
@@ -217,13 +209,7 @@ def record(catalog: Catalog, new: NewResult, image_bgr: NDArray[np.uint8] | None
 
 
 def find_results(catalog: Catalog, wanted: ResultFilter = ResultFilter()) -> list[Result]:
-    """Return results with their corrections, oldest first.
-
-    Raises
-    ------
-    CatalogDamaged
-        A result or a correction is not as it was recorded.
-    """
+    """Return results with their corrections, oldest first."""
     with catalog.database.read() as transaction:
         log.check_complete(transaction)
         found = _load(transaction, or_(wanted.lines(), Entry.action == Action.RESULT_CORRECTED))
@@ -233,12 +219,7 @@ def find_results(catalog: Catalog, wanted: ResultFilter = ResultFilter()) -> lis
 def find_result(catalog: Catalog, result_id: int) -> Result:
     """Return a result.
 
-    Raises
-    ------
-    CatalogError
-        There is no result of this number.
-    CatalogDamaged
-        It is not as it was recorded.
+    Raises `CatalogError`: there is no result of this number.
     """
     with catalog.database.read() as transaction:
         return _find(transaction, result_id)
@@ -259,14 +240,9 @@ def correct(
     The ``reason`` is stored with the correction and in the log. An ``unknown`` object is not in the catalog. The
     ``operator`` corrects it; None for the user's account.
 
-    Raises
-    ------
-    UsageError
-        A text is not valid, nothing is corrected, or the object is both named and unknown.
-    ObjectNotFound
-        There is no object of that name.
-    CatalogError, CatalogBusy
-        There is no such result, or the catalog cannot be written.
+    Raises `UsageError`: a text is not valid, nothing is corrected, or the object is both named and unknown.
+    `ObjectNotFound`: there is no object of that name. `CatalogError`, `CatalogBusy`: there is no such result, or the
+    catalog cannot be written.
     """
     reason = clean_text(reason, "reason")
     operator = _operator(operator)

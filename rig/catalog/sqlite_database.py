@@ -176,10 +176,7 @@ def connect(root: Path, mode: str, busy_timeout_s: float) -> sqlite3.Connection:
     mode
         ``rw`` or ``ro``, with further parameters of SQLite's URIs.
 
-    Raises
-    ------
-    CatalogDamaged
-        As for `check_folder`.
+    Raises `CatalogDamaged`: as for `check_folder`.
     """
     check_folder(root)
     connection = sqlite3.connect(

@@ -6,11 +6,11 @@ says which these are.
 
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from difflib import get_close_matches
 from hashlib import sha256
-from typing import Any
+from typing import Any, Final
 
 from sqlalchemy import ColumnElement, and_, exists, false, func, or_, select, true, union
 from sqlalchemy.orm import Session as Transaction
@@ -18,9 +18,11 @@ from sqlalchemy.orm import aliased, selectinload
 
 from rig.catalog import digests, log
 from rig.catalog.columns import damaged
-from rig.catalog.facts import Enrollment, Entry, View, damaged_parts, digest_of
+from rig.catalog.facts import Action, Enrollment, Entry, View, damaged_parts, digest_of, seal_of
 from rig.catalog.facts import Session as EnrollmentSession
-from rig.catalog.records import EnrollmentStatus, clean_name
+from rig.catalog.jobs import portions
+from rig.catalog.records import EnrollmentStatus, clean_name, is_plan
+from rig.core.clock import Clock
 from rig.core.errors import CatalogDamaged, CatalogError, ObjectExists, ObjectNotFound
 from rig.core.next_steps import Do
 
@@ -38,6 +40,12 @@ def _is_last(entry: type[Entry], key: str, sets: str) -> ColumnElement[bool]:
     )
     return and_(getattr(entry, sets).is_not(None), ~later)
 
+
+CURRENT: Final = {
+    EnrollmentStatus.COMPLETE: (EnrollmentStatus.SUPERSEDED, Action.ENROLLMENT_SUPERSEDED),
+    EnrollmentStatus.IN_PROGRESS: (EnrollmentStatus.ABANDONED, Action.ENROLLMENT_ABANDONED),
+}
+"""An object has one enrollment of each such status. What becomes of it if it gets another one."""
 
 IS_STATE = _is_last(Named, "object_id", "deleted")
 IS_STATUS = _is_last(Ended, "enrollment_id", "status")
@@ -102,10 +110,7 @@ class Used:
 def used(transaction: Transaction, *, checked: bool = False) -> list[Used]:
     """Return the enrollments that searches use, in the order in which their objects were added.
 
-    Raises
-    ------
-    CatalogDamaged
-        They are ``checked``, and the name or the seal of an object is not as it was written.
+    Raises `CatalogDamaged`: they are ``checked``, and the name or the seal of an object is not as it was written.
     """
     wanted = (
         select(Named.object_id, Named.object_name, Ended.enrollment_id, Enrollment.key, Ended.seal, Ended.id)
@@ -130,9 +135,7 @@ def first_views(transaction: Transaction, *columns: Any) -> list[Any]:
     ids = sorted(one.enrollment_id for one in used(transaction))
     wanted = select(*columns).where(View.index == 0).order_by(View.enrollment_id)
     return [
-        row
-        for part in digests.portions(ids, 500)
-        for row in transaction.execute(wanted.where(View.enrollment_id.in_(part)))
+        row for part in portions(ids, 500) for row in transaction.execute(wanted.where(View.enrollment_id.in_(part)))
     ]
 
 
@@ -171,10 +174,7 @@ def changed(names: Sequence[str]) -> CatalogDamaged:
 def find(transaction: Transaction, name: str, *, deleted: bool = False) -> Entry:
     """Return the state of an object in use, or of the last ``deleted`` one that is still stored.
 
-    Raises
-    ------
-    ObjectNotFound
-        There is no such object. The next step lists similar names.
+    Raises `ObjectNotFound`: there is no such object. The next step lists similar names.
     """
     name = clean_name(name)
     among = _among(deleted)
@@ -245,13 +245,7 @@ def check_free(transaction: Transaction, name: str) -> None:
 
 
 def summaries(transaction: Transaction, *, deleted: bool = False, object_id: int | None = None) -> list[ObjectSummary]:
-    """Return the objects in use or the deleted ones, or one object, in the order in which they were added.
-
-    Raises
-    ------
-    CatalogDamaged
-        The state of an object is not as it was written, or the views of its complete enrollment are not all there.
-    """
+    """Return the objects in use or the deleted ones, or one object, in the order in which they were added."""
     conditions = _among(deleted) if object_id is None else [IS_STATE, Named.object_id == object_id]
     count = select(func.count()).where(View.enrollment_id == Ended.enrollment_id).correlate(Ended).scalar_subquery()
     columns = (
@@ -306,13 +300,7 @@ def of_object(object_id: int | None) -> ColumnElement[bool]:
 
 
 def enrollments(transaction: Transaction, *conditions: ColumnElement[bool]) -> list[EnrollmentState]:
-    """Return enrollments with their sessions and views, newest first, all as they were written.
-
-    Raises
-    ------
-    CatalogDamaged
-        They are not.
-    """
+    """Return enrollments with their sessions and views, newest first, all as they were written."""
     wanted = (
         select(Enrollment, Ended)
         .join(Ended, Ended.enrollment_id == Enrollment.id)
@@ -340,20 +328,18 @@ def is_possible(enrollment: Enrollment, ended: Entry) -> bool:
     A sender can give any values the right digests.
     """
     sessions, plan = range(len(enrollment.sessions)), enrollment.planned_azimuth_deg
+    is_complete = ended.status == EnrollmentStatus.COMPLETE
     return (
-        ended.object_id == enrollment.object_id
+        is_plan(plan)
+        and ended.object_id == enrollment.object_id
+        and (ended.finished_utc is None) == (ended.status == EnrollmentStatus.IN_PROGRESS)
+        and not (is_complete and enrollment.missing)
         and [session.number for session in enrollment.sessions] == list(sessions)
         and all((one.empty_table is None) == (one.empty_table_bytes is None) for one in enrollment.sessions)
-        and all(0 <= azimuth_deg < 360 for azimuth_deg in (*plan, *(view.azimuth_deg for view in enrollment.views)))
         and all(
-            0 <= view.index < len(plan)
-            and view.session in sessions
-            and (view.imu_deg is None) == (view.imu_sigma_deg is None)
-            and (view.imu_sigma_deg or 0.0) >= 0
-            and view.image_bytes > 0
+            not view.problem and view.index < len(plan) and view.session in sessions and view.image_bytes > 0
             for view in enrollment.views
         )
-        and (ended.status != EnrollmentStatus.COMPLETE or (ended.finished_utc is not None and not enrollment.missing))
     )
 
 
@@ -394,6 +380,33 @@ def unfinished(transaction: Transaction, state: Entry) -> EnrollmentState:
 def of_status(transaction: Transaction, state: Entry, status: EnrollmentStatus) -> EnrollmentState | None:
     """Return the enrollment of an object that is complete or in progress; None if there is none."""
     return next(iter(enrollments(transaction, of_object(state.object_id), Ended.status == status)), None)
+
+
+def ending(one: EnrollmentState) -> dict[str, Any]:
+    """Return the columns of a line of the log that gives an enrollment its status."""
+    enrollment, has_ended = one.enrollment, one.status in (EnrollmentStatus.COMPLETE, EnrollmentStatus.SUPERSEDED)
+    return {
+        "object_id": enrollment.object_id,
+        "enrollment_id": enrollment.id,
+        "status": one.status,
+        "finished_utc": one.finished_utc,
+        "seal": seal_of(enrollment) if has_ended else None,
+        "details": {"enrollment_id": enrollment.id, "views": len(enrollment.views)},
+    }
+
+
+def end_current(
+    transaction: Transaction, clock: Clock, known: Entry, status: EnrollmentStatus, *, kept: Collection[str] = ()
+) -> None:
+    """End the enrollment of an object that is complete or in progress, if there is one: another one replaces it.
+
+    ``kept`` are the keys of enrollments that are not ended.
+    """
+    before = of_status(transaction, known, status)
+    if before is not None and before.enrollment.key not in kept:
+        ended, action = CURRENT[status]
+        one = replace(before, status=ended, finished_utc=before.finished_utc or clock.utc())
+        log.append(transaction, clock, action, known.object_name, **ending(one))
 
 
 def check_not_enrolled(transaction: Transaction, state: Entry) -> None:

@@ -8,7 +8,6 @@ Decision: docs/decisions/0015.
 
 import secrets
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from enum import StrEnum
@@ -20,7 +19,6 @@ from sqlalchemy.orm import Session as Transaction
 from rig.catalog import describing, digests, log, state
 from rig.catalog.catalog import Catalog
 from rig.catalog.columns import damaged
-from rig.catalog.digests import portions
 from rig.catalog.facts import (
     Action,
     Derived,
@@ -33,23 +31,13 @@ from rig.catalog.facts import (
     seal_of,
     sha256_of,
 )
-from rig.catalog.incoming import ReadImages, Reading, read_images
-from rig.catalog.jobs import JobProgress
+from rig.catalog.incoming import ImportProblem, ReadImages, Reading, Reason, RejectedFile, read_images
+from rig.catalog.jobs import JobProgress, portions
 from rig.catalog.records import EnrollmentStatus, check_text, checked_texts, clean_name
-from rig.catalog.rejected import RejectedFile
 from rig.catalog.state import Ended, EnrollmentState, Named
 from rig.core.errors import CatalogDamaged, ImportRejected, ObjectExists, RigError, UsageError
 from rig.core.next_steps import Do
 from rig.core.processes import Jobs
-
-MAX_VIEWS: Final = 10_000
-"""Most views of one enrollment: one every 0.036°."""
-
-_CURRENT: Final = {
-    EnrollmentStatus.COMPLETE: (EnrollmentStatus.SUPERSEDED, Action.ENROLLMENT_SUPERSEDED),
-    EnrollmentStatus.IN_PROGRESS: (EnrollmentStatus.ABANDONED, Action.ENROLLMENT_ABANDONED),
-}
-"""An object has one enrollment of each such status. What becomes of it if it gets another one."""
 
 _OF_SESSION: Final = ("number", "started_utc", "provenance", "empty_table", "empty_table_bytes")
 _OF_VIEW: Final = tuple(name for name, _ in digested(View) if name != "session")
@@ -92,7 +80,7 @@ class Source(Protocol):
 
     @property
     def content(self) -> Callable[[str], bytes]:
-        """Function that returns the bytes of an image. It can be sent to other processes."""
+        """Function that returns the bytes of an image, unchecked. It can be sent to other processes."""
 
     def items(self) -> Iterator[Item]:
         """Yield the objects."""
@@ -121,19 +109,12 @@ class CatalogSource:
         self.used_only = used_only
         self.own = own
         self.origin = str(catalog.place)
-        self.content: Callable[[str], bytes] = catalog.database.images.content
-        self.reader: Callable[[str], bytes] = catalog.database.images.read
-        """Returns the bytes under the name of an image, unchecked."""
+        self.content: Callable[[str], bytes] = catalog.database.images.read
 
     def items(self) -> Iterator[Item]:
         """Yield the objects in the order in which they were added.
 
-        Raises
-        ------
-        ObjectNotFound
-            There is no object of one of the names.
-        CatalogDamaged
-            Something is not as it was stored, or this program would not have stored it.
+        Raises `ObjectNotFound`: there is no object of one of the names.
         """
         with self.catalog.database.read() as transaction:
             state.used(transaction, checked=True)
@@ -170,14 +151,9 @@ def _check(item: Item) -> None:
             check_text(text, "text")
     except UsageError as error:
         raise damaged(error.what.rstrip("."), item.name) from error
-    current = [one.status for one in item.enrollments if one.status in _CURRENT]
+    current = [one.status for one in item.enrollments if one.status in state.CURRENT]
     if len(set(current)) < len(current):
         raise damaged(f"the number of enrollments of {item.name!r} that are {current[0]}", len(current))
-    for one in item.enrollments:
-        if not 1 <= len(one.enrollment.planned_azimuth_deg) <= MAX_VIEWS:
-            raise damaged("the number of planned views", len(one.enrollment.planned_azimuth_deg))
-        if (one.finished_utc is None) != (one.status == EnrollmentStatus.IN_PROGRESS):
-            raise damaged("the end of an enrollment", one.finished_utc)
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,30 +170,26 @@ class Transferred:
 
 def transfer(
     source: Source,
-    target: Catalog | None,
+    target: Catalog,
     *,
     conflict: Conflict = Conflict.REJECT,
     label: str | None = None,
     descriptors: Sequence[str] = (),
-    strict: bool = False,
     jobs: Jobs | None = None,
     dry_run: bool = False,
     once: bool = False,
 ) -> Generator[JobProgress, None, Transferred]:
     """Transfer objects into a catalog, all or nothing; it yields its progress in images.
 
-    An enrollment has a key. If the target has it already, with the same views, it is not added a second time.
+    An enrollment has a key. If the target has it already, with the same views, it is not added a second time. Of
+    photographs, those that cannot be used are left out; of a catalog, nothing is transferred if one image is wrong.
 
     Parameters
     ----------
-    target
-        The catalog; None is one that does not exist yet, for a ``dry_run``.
     label
         Label of new objects that have none.
     descriptors
         Descriptors to be computed at once; others are computed when they are needed.
-    strict
-        Transfer nothing if one image cannot be used. Objects of a catalog are always transferred so.
     jobs
         Number of processes, or a cluster; None for one process per core.
     dry_run
@@ -226,34 +198,22 @@ def transfer(
         An enrollment is delivered: it stays as the target has it, even if it was deleted or replaced there. What was
         computed from it goes with it.
 
-    Raises
-    ------
-    UsageError
-        There is no such descriptor, or the label cannot be stored.
-    ImportRejected
-        Nothing is left to transfer, or an image was rejected and the transfer is strict.
-    CatalogDamaged
-        Something in a catalog is not as it was stored.
-    ObjectExists
-        Some objects are in the catalog already, and conflicts are rejected.
-    CatalogError, CatalogBusy
-        A catalog cannot be used.
+    Raises `UsageError`: there is no such descriptor, or the label cannot be stored. `ImportRejected`: nothing is left
+    to transfer, or an image of a catalog was rejected. `ObjectExists`: some objects are in the catalog already, and
+    conflicts are rejected.
     """
     checked_texts(label, None)
     for name in descriptors:
         describing.known_descriptor(name)
     catalog = source if isinstance(source, CatalogSource) else None
     is_own = catalog is not None and catalog.own
-    strict = strict or catalog is not None
-    if strict and source.rejected:
-        raise _rejection(source, source.rejected)
-    store = None if dry_run or target is None else target.database.images
+    strict = catalog is not None
+    store = None if dry_run else target.database.images
 
     # Check all rows, then all images. Photographs are stored at once, without those that are rejected.
     plan = _Plan(tuple(source.items()))
-    if target is not None:
-        with target.database.read() as transaction:
-            plan = plan.compared(transaction, conflict, once=once)
+    with target.database.read() as transaction:
+        plan = plan.compared(transaction, conflict, once=once)
     names = tuple(dict.fromkeys(descriptors))
     tasks = [
         describing.task_of(one.enrollment, one.enrollment.key, item.name, names, None)
@@ -261,12 +221,12 @@ def transfer(
         for one in item.enrollments
     ]
     reading = Reading(
-        source.content if catalog is None else catalog.reader,
+        source.content,
         store if is_own or not strict else None,
         is_named=catalog is not None,
         decodes=bool(names) or not is_own,
     )
-    with nullcontext() if target is None else target.database.catalog_errors():
+    with target.database.catalog_errors():
         found = yield from read_images(reading, tasks, strict=strict and not dry_run, jobs=jobs)
     rejected = (*source.rejected, *found.rejected_files)
     plan = replace(plan, wanted=_kept(plan.wanted, found, are_photographs=catalog is None))
@@ -274,7 +234,7 @@ def transfer(
         raise _rejection(source, rejected)
 
     # Store the images of a strict transfer, now that all of them are right. Then add all rows.
-    if store is not None and target is not None:
+    if store is not None:
         with target.database.catalog_errors():
             if reading.store is None:
                 storing = replace(reading, store=store, decodes=False)
@@ -288,8 +248,9 @@ def transfer(
             plan = plan.compared(transaction, conflict, once=once)  # another process may have added objects
             missing = store.missing({name for name, _ in found.images.values()})
             for image, (name, _) in found.images.items():
-                if name in missing:  # `collect_garbage` removed it: an object that was deleted had it, too
-                    store.put(source.content(image))
+                # `collect_garbage` removed it: an object that was deleted had it, too
+                if name in missing and store.put(source.content(image)) != name:
+                    raise _rejection(source, [RejectedFile(image, Reason(ImportProblem.OTHER_IMAGE))])
             if plan.wanted:
                 new = _add(transaction, target, plan, label)
                 details = {"origin": source.origin, "objects": plan.names, "views": plan.views}
@@ -466,10 +427,12 @@ def _add(transaction: Transaction, target: Catalog, plan: _Plan, label: str | No
     new: dict[str, Enrollment] = {}
     for item in plan.wanted:
         found = state.state_of(transaction, item.name)
-        object_id = found.object_id if found is not None else log.head(transaction)[0] + 1
-        about: dict[str, Any] = {"object_name": item.name, "object_id": object_id}
+        object_id = log.head(transaction)[0] + 1 if found is None else found.object_id
+        assert object_id is not None
         texts = {"label": item.label or label or "", "note": item.note}
-        columns = {} if found is not None else state.columns(None, item.created_utc, texts)
+        columns = {}
+        if found is None:
+            columns = {**state.columns(None, item.created_utc, texts), "object_id": object_id}
         there = {
             key: known.state
             for one in item.enrollments
@@ -478,27 +441,25 @@ def _add(transaction: Transaction, target: Catalog, plan: _Plan, label: str | No
             and _are_equal(known.state, one)
         }
         # End what the new enrollments replace.
-        for status in _CURRENT.keys() & {one.status for one in item.enrollments}:
-            before = None if found is None else state.of_status(transaction, found, status)
-            if before is not None and before.enrollment.key not in there:
-                ended, action = _CURRENT[status]
-                one = replace(before, status=ended, finished_utc=before.finished_utc or target.clock.utc())
-                log.append(transaction, target.clock, action, **about, **_status_of(one))
+        for status in state.CURRENT.keys() & {one.status for one in item.enrollments}:
+            if found is not None:
+                state.end_current(transaction, target.clock, found, status, kept=there)
         # Add them, or bring those that the object has already into use again.
         for one in item.enrollments:
             key = one.enrollment.key
             if key not in there:
                 if key in plan.known:  # with other views, or of an object that is deleted or has another name
                     _digest(one.enrollment, secrets.token_hex(32))
-                new[key] = _store(transaction, one.enrollment, about["object_id"])
+                new[key] = _store(transaction, one.enrollment, object_id)
             elif there[key].status == one.status:
                 continue
             else:
                 one = replace(one, enrollment=there[key].enrollment)
-            log.append(transaction, target.clock, Action.IMPORTED, **about, **_status_of(one), **columns)
+            line = {**columns, **state.ending(one)}
+            log.append(transaction, target.clock, Action.IMPORTED, item.name, **line)
             columns = {}
         if columns:
-            log.append(transaction, target.clock, Action.IMPORTED, **about, **columns)
+            log.append(transaction, target.clock, Action.IMPORTED, item.name, **columns)
     return new
 
 
@@ -506,18 +467,6 @@ def _are_equal(one: EnrollmentState, other: EnrollmentState) -> bool:
     """Return whether two enrollments with one key have the same views: one of them may have been continued."""
     digests = [[view.digest for view in each.enrollment.views] for each in (one, other)]
     return digests[0] == digests[1]
-
-
-def _status_of(one: EnrollmentState) -> dict[str, Any]:
-    """Return the columns of a line of the log that gives an enrollment this status."""
-    is_sealed = one.status in (EnrollmentStatus.COMPLETE, EnrollmentStatus.SUPERSEDED)
-    return {
-        "enrollment_id": one.enrollment.id,
-        "status": one.status,
-        "finished_utc": one.finished_utc,
-        "seal": seal_of(one.enrollment) if is_sealed else None,
-        "details": {"enrollment_id": one.enrollment.id, "views": len(one.enrollment.views)},
-    }
 
 
 def _store(transaction: Transaction, enrollment: Enrollment, object_id: int) -> Enrollment:

@@ -12,8 +12,8 @@ from sqlalchemy.orm import Session as Transaction
 
 from rig.catalog import derived, log, state
 from rig.catalog.catalog import Catalog
-from rig.catalog.digests import portions
 from rig.catalog.facts import SCHEMA_VERSION, Action, Derived, Enrollment, Entry, Session, View
+from rig.catalog.jobs import portions
 from rig.catalog.records import EnrollmentStatus
 from rig.catalog.state import Ended, Named
 from rig.core.errors import CatalogBusy
@@ -107,11 +107,6 @@ def collect_garbage(catalog: Catalog, *, old: bool = False, dry_run: bool = Fals
         Also remove the superseded and abandoned enrollments of objects in use.
     dry_run
         Change nothing; only return what would be removed.
-
-    Raises
-    ------
-    CatalogError, CatalogBusy
-        The catalog cannot be written.
     """
     database, store = catalog.database, catalog.database.images
     unused = or_(Named.deleted == true(), Ended.status.in_(_OLD if old else ()))

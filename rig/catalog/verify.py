@@ -105,13 +105,7 @@ class _Image(NamedTuple):
 
 
 def verify(catalog: Catalog, *, jobs: Jobs | None = None) -> Generator[JobProgress, None, Verification]:
-    """Compare every row and every image with its digest; change nothing. ``jobs`` None is one process per core.
-
-    Raises
-    ------
-    CatalogError, CatalogBusy
-        The catalog cannot be read.
-    """
+    """Compare every row and every image with its digest; change nothing. ``jobs`` None is one process per core."""
     findings, of_images = list[Finding](), list[Finding]()
     with catalog.database.read() as transaction:
         objects = transaction.scalar(select(func.count(Enrollment.object_id.distinct()))) or 0
@@ -147,7 +141,7 @@ def row_checks(transaction: Transaction) -> Iterator[Callable[[Transaction], Ite
         yield partial(_lines, first, min(first + _LINES - 1, last))
     yield partial(_lines, last + 1, None)  # the lines since then, and the end of the log
     yield from (_end, _missing)
-    yield from (partial(_enrollments, part) for part in digests.portions(ids, _ENROLLMENTS))
+    yield from (partial(_enrollments, part) for part in portions(ids, _ENROLLMENTS))
 
 
 def _lines(first: int, last: int | None, transaction: Transaction) -> Iterator[Finding]:
@@ -201,7 +195,7 @@ def _images(catalog: Catalog, changed: Collection[int]) -> Iterator[_Image]:
         ids = transaction.scalars(select(Enrollment.id).order_by(Enrollment.id)).all()
     named = select(Named.object_name, _IMAGE.view_id, _IMAGE.image, _IMAGE.image_bytes).select_from(NAMED_IMAGES)
     named = named.outerjoin(Enrollment, Enrollment.id == _IMAGE.enrollment_id).outerjoin(Named, _OWNS)
-    for part in (*digests.portions([one for one in ids if one not in changed], _ENROLLMENTS), None):
+    for part in (*portions([one for one in ids if one not in changed], _ENROLLMENTS), None):
         of_these = _IMAGE.enrollment_id.is_(None) if part is None else _IMAGE.enrollment_id.in_(part)
         with catalog.database.read() as transaction:
             found = transaction.execute(named.where(of_these, _IMAGE.image.is_not(None))).all()

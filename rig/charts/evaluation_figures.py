@@ -5,123 +5,107 @@ from dataclasses import replace
 from math import ceil
 from typing import Any, Final
 
-from rig.charts.xy import INK, Axis, Chart, Series
+from rig.charts.candidates import Style, Styles
+from rig.charts.xy import Axis, Chart, Series
 
-#: Colour and dashes of each method, the same in every figure (Okabe and Ito's palette, for all kinds of colour vision).
-_STYLES: Final = {
-    "single": ("#8a8f96", True),
-    "hbr-visual": ("#56b4e9", False),
-    "hbr-0": ("#009e73", False),
-    "hbr-0-orient": ("#009e73", True),
-    "hbr": ("#0072b2", False),
-    "hbr-orient": ("#0072b2", True),
-    "ahbr": ("#d55e00", False),
-    "ahbr-orient": ("#d55e00", True),
-    "ahbr-90": ("#8c2d04", False),
-    "coin": ("#cc79a7", False),
-    "sweep-45": (INK, False),
-    "sweep-90": (INK, True),
-    "dense": ("#6a3d9a", False),
-    "dense-coin": ("#cc79a7", False),
-    "dense-random": ("#0072b2", False),
-    "dense-45": (INK, False),
-    "dense-90": (INK, True),
-    "dense-mutual": ("#009e73", False),
-    "dense-oracle": ("#b08900", True),
-}
-_OTHERS: Final = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", INK, "#8a8f96", "#b08900")
-_BEST_10: Final = ("#b08900", False)
 _HIT_RATE: Final = Axis("hit rate, %")
-#: More bands than these hide each other; the tables have all intervals.
-_BANDS: Final = ("hbr", "ahbr", "dense")
+_PREFERRED: Final = ("hbr", "ahbr", "dense")
+"""Methods with bands of uncertainty: more of them would hide each other, and the tables have all intervals."""
+_PATH_OF_HBR: Final = ("single", "hbr-visual", "hbr-0", "hbr-0-orient")
+"""Methods with the same rotations as HBR."""
+_ORIENT: Final = "-orient"
 
 
 def figures(results: dict[str, Any]) -> dict[str, Chart]:
     """Return the figures that the results allow, by the name of their file."""
-    drawn = {"hit-rate": hit_rate_figure(results), "travel": travel_figure(results)}
-    methods = [m for m in results["methods"] if m["name"] in ("hbr", "ahbr", "dense")] or results["methods"][:2]
-    drawn["pose"] = pose_figure(results, methods)
-    for prefix, title, words in (
-        ("omega-", "weight of the orientation, ω", "ω-sweep"),
+    methods, styles = results["methods"], Styles()
+    by_method = [(method, _style(method["name"], styles)) for method in methods]
+    preferred = [one for one in by_method if one[0]["name"] in _PREFERRED] or by_method[:2]
+    last = max(point["views"] for method in methods for point in method["curve"])
+    travel = [_against_travel(*one) for one in by_method if one[0]["name"] not in _PATH_OF_HBR]
+    farthest = max((x for series in travel for x in series.x), default=0.0)
+    right_angles = tuple(90.0 * i for i in range(max(2, ceil(farthest / 90) + 1)))
+    drawn = {
+        "hit-rate": (
+            Axis("views of the object, N", ticks=tuple(range(1, last + 1))),
+            _HIT_RATE,
+            [series for method, style in by_method for series in _against_views(method, style, styles)],
+        ),
+        "travel": (Axis("mean rotation, °", ticks=right_angles), _HIT_RATE, travel),
+        "pose": (
+            Axis("objects, each curve sorted by its error", whole=True, span=(1.0,)),
+            Axis("RMSE of the orientation, °", span=(0.0,)),
+            [series for method, style in preferred for series in _pose_errors(method, style)],
+        ),
+    }
+    for prefix, x_label, file in (
+        ("omega-", "weight of the orientation, ω", "omega-sweep"),
         ("list-", "length of the retrieval lists", "list-sweep"),
     ):
-        swept = [m for m in results["methods"] if m["name"].startswith(prefix)]
+        swept = [method for method in methods if method["name"].startswith(prefix)]
         if len(swept) > 1:
-            drawn[words.replace("ω", "omega")] = _sweep_figure(results, swept, prefix, title)
-    return drawn
+            values = tuple(method["name"].removeprefix(prefix) for method in swept)
+            axis = Axis(x_label, ticks=tuple(range(len(values))), names=values)
+            drawn[file] = (axis, _HIT_RATE, _sweep(swept))
+    title = _title(results)
+    return {file: Chart(title, *axes_and_series, wide=True) for file, axes_and_series in drawn.items()}
 
 
-def hit_rate_figure(results: dict[str, Any]) -> Chart:
-    """Return the hit rate against the number of views, with 95 % Wilson intervals, and Best 10 of HBR (Fig. 6)."""
-    series = []
-    for m, method in enumerate(results["methods"]):
-        colour, dashed = _style(method["name"], m)
-        curve = method["curve"]
-        drawn = _rates(method["label"], colour, dashed, [p["views"] for p in curve], curve)
-        series.append(drawn if method["name"] in _BANDS or len(curve) == 1 else replace(drawn, low=(), high=()))
-        if method["name"] == "hbr":
-            best10 = [{**p, "hit_rate": p["best10_rate"]} for p in curve]
-            for point in best10:
-                point["hit_rate_low"], point["hit_rate_high"] = point["best10_low"], point["best10_high"]
-            series.append(_rates("Best 10 of HBR", *_BEST_10, [p["views"] for p in curve], best10))
-    last = max(p["views"] for method in results["methods"] for p in method["curve"])
-    views = Axis("views of the object, N", ticks=tuple(range(1, last + 1)))
-    return Chart(_title(results), views, _HIT_RATE, tuple(series), wide=True)
+def _style(name: str, styles: Styles) -> Style:
+    """Return the style of a method; its variant with the orientation has the same colour, dashed."""
+    colour, dashed = styles[name.removesuffix(_ORIENT)]
+    return Style(colour, dashed or name.endswith(_ORIENT))
 
 
-def travel_figure(results: dict[str, Any]) -> Chart:
-    """Return the figure of the hit rate against the mean rotation."""
-    series = []
-    for m, method in enumerate(results["methods"]):
-        if method["name"] in ("single", "hbr-visual", "hbr-0", "hbr-0-orient"):
-            continue  # the same rotations as HBR
-        colour, dashed = _style(method["name"], m)
-        travelled = [p["travelled_mean_deg"] for p in method["curve"]]
-        drawn = _rates(method["label"], colour, dashed, travelled, method["curve"])
-        series.append(drawn if method["name"] in _BANDS else replace(drawn, low=(), high=()))
-    farthest = max((x for s in series for x in s.x), default=0.0)
-    ticks = tuple(90.0 * i for i in range(max(2, ceil(farthest / 90) + 1)))
-    return Chart(_title(results), Axis("mean rotation, °", ticks=ticks), _HIT_RATE, tuple(series), wide=True)
+def _against_views(method: dict[str, Any], style: Style, styles: Styles) -> list[Series]:
+    """Return the hit rate with its 95 % Wilson intervals, and Best 10 of HBR (Fig. 6 of the paper)."""
+    curve = method["curve"]
+    views = [point["views"] for point in curve]
+    series = [_rates(method["label"], style, views, curve, has_band=method["name"] in _PREFERRED or len(curve) == 1)]
+    if method["name"] == "hbr":
+        label = "Best 10 of HBR"
+        series.append(_rates(label, styles[label], views, curve, "best10_rate", "best10_low", "best10_high"))
+    return series
 
 
-def pose_figure(results: dict[str, Any], methods: Sequence[dict[str, Any]]) -> Chart:
+def _against_travel(method: dict[str, Any], style: Style) -> Series:
+    travelled = [point["travelled_mean_deg"] for point in method["curve"]]
+    return _rates(method["label"], style, travelled, method["curve"], has_band=method["name"] in _PREFERRED)
+
+
+def _pose_errors(method: dict[str, Any], style: Style) -> list[Series]:
     """Return the RMSE of each object's estimated orientation after all views, sorted by size (Fig. 5 of the paper).
 
     Dashed: the plain error. Solid: the error to the nearest orientation from which the object looks the same.
     """
     series = []
-    for m, method in enumerate(methods):
-        colour, _ = _style(method["name"], m)
-        for key, dashed, words in (
-            ("pose_rmse_deg_by_object", True, "plain"),
-            ("alike_rmse_deg_by_object", False, "similar"),
-        ):
-            errors = sorted(error for error in method[key] if error is not None)
-            places = range(1, len(errors) + 1)
-            label = f"{method['label']}, {words}"
-            series.append(Series(label, places, errors, colour, dots=len(errors) == 1, curve=True, dashed=dashed))
-    objects = Axis("objects, each curve sorted by its error", whole=True, span=(1.0,))
-    return Chart(_title(results), objects, Axis("RMSE of the orientation, °", span=(0.0,)), tuple(series), wide=True)
+    for key, dashed, words in (("pose", True, "plain"), ("alike", False, "similar")):
+        errors = sorted(error for error in method[f"{key}_rmse_deg_by_object"] if error is not None)
+        label, places = f"{method['label']}, {words}", range(1, len(errors) + 1)
+        series.append(Series(label, places, errors, style.colour, dots=len(errors) == 1, curve=True, dashed=dashed))
+    return series
 
 
-def _sweep_figure(results: dict[str, Any], methods: Sequence[dict[str, Any]], prefix: str, x_label: str) -> Chart:
+def _sweep(methods: Sequence[dict[str, Any]]) -> list[Series]:
     """Return the hit rate against a setting for several numbers of views; the setting's values have equal distances."""
-    values = [method["name"].removeprefix(prefix) for method in methods]
-    series = []
-    for i, n in enumerate(range(2, len(methods[0]["curve"]) + 1, 2)):
-        points = [method["curve"][n - 1] for method in methods]
-        series.append(_rates(f"N = {n}", _OTHERS[i % len(_OTHERS)], False, range(len(points)), points))
-    axis = Axis(x_label, ticks=tuple(range(len(values))), names=tuple(values))
-    return Chart(_title(results), axis, _HIT_RATE, tuple(series), wide=True)
+    styles, places = Styles(), range(len(methods))
+    return [
+        _rates(f"N = {n}", styles[f"{n}"], places, [method["curve"][n - 1] for method in methods])
+        for n in range(2, len(methods[0]["curve"]) + 1, 2)
+    ]
 
 
-def _rates(label: str, colour: str, dashed: bool, x: Sequence[float], points: Sequence[dict[str, Any]]) -> Series:
-    rate, low, high = ([100 * p[key] for p in points] for key in ("hit_rate", "hit_rate_low", "hit_rate_high"))
-    return Series(label, x, rate, colour, curve=True, dashed=dashed, low=low, high=high)
-
-
-def _style(name: str, position: int) -> tuple[str, bool]:
-    return _STYLES.get(name, (_OTHERS[position % len(_OTHERS)], False))
+def _rates(
+    label: str,
+    style: Style,
+    x: Sequence[float],
+    points: Sequence[dict[str, Any]],
+    *keys: str,
+    has_band: bool = True,
+) -> Series:
+    rate, low, high = ([100 * p[key] for p in points] for key in keys or ("hit_rate", "hit_rate_low", "hit_rate_high"))
+    series = Series(label, x, rate, style.colour, curve=True, dashed=style.dashed, low=low, high=high)
+    return series if has_band else replace(series, low=(), high=())
 
 
 def _title(results: dict[str, Any]) -> str:

@@ -1,13 +1,19 @@
-"""SVG elements for the charts of a search: escaped text, and equal bytes for equal numbers.
+"""SVG elements for all charts: escaped text, and equal bytes for equal numbers.
 
-Shapes carry classes; the page's style sheet sets their colours for light and dark mode. These charts stay hand-written:
-a report has some sixty of them, and Matplotlib would make them larger and slower (docs/decisions/0035).
+Shapes have classes. One style sheet, `chart.css`, gives them their colours in light and dark mode.
+Decision: docs/decisions/0035.
 """
 
 from collections.abc import Iterable
+from functools import cache
 from html import escape
+from importlib.resources import files
+from typing import Final
 
 Point = tuple[float, float]
+
+_MARGIN: Final = 12.0
+"""Around a chart in a file of its own."""
 
 
 def number(value: float) -> str:
@@ -54,8 +60,23 @@ def circle(at: Point, radius: float, class_: str, *content: str) -> str:
     return element("circle", *content, cx=at[0], cy=at[1], r=radius, class_=class_)
 
 
-def drawing(width: float, height: float, label: str, parts: Iterable[str]) -> str:
-    """Return the complete chart; ``label`` is its alternative text."""
-    return element(
-        "svg", *parts, viewBox=f"0 0 {number(width)} {number(height)}", role="img", aria_label=label, class_="chart"
-    )
+def drawing(width: float, height: float, label: str, parts: Iterable[str], *, alone: bool = False) -> str:
+    """Return the complete chart.
+
+    Parameters
+    ----------
+    label
+        Its alternative text.
+    alone
+        For a file of its own, with the style sheet; otherwise the page has it.
+    """
+    margin = _MARGIN if alone else 0.0
+    box = {"x": -margin, "y": -margin, "width": width + 2 * margin, "height": height + 2 * margin}
+    style = [element("style", _style()), element("rect", **box, class_="paper")] if alone else []
+    size = {"viewBox": " ".join(map(number, box.values())), "xmlns": "http://www.w3.org/2000/svg"}
+    return element("svg", *style, *parts, **size, role="img", aria_label=label, class_="chart")
+
+
+@cache
+def _style() -> str:
+    return files("rig.charts").joinpath("static/chart.css").read_text("utf-8")

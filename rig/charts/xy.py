@@ -1,73 +1,40 @@
-"""Charts over two axes, drawn by Matplotlib: SVG for pages in light and dark mode, PNG for everything else.
+"""Charts over two axes."""
 
-Import this module only when a chart is written: Matplotlib takes about a second to load. Decision:
-docs/decisions/0035.
-"""
-
-import re
-from collections.abc import Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
-from html import escape
-from io import BytesIO, StringIO
-from math import ceil, floor, log10
-from typing import TYPE_CHECKING, Final
+from itertools import groupby
+from math import ceil, floor, isfinite, log10
+from textwrap import wrap
+from typing import Final
 
+from rig.charts import svg
+from rig.charts.svg import Point
 from rig.core.phrases import filled
+from rig.core.phrases import number as number_words
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+MEASURED, MODEL, OTHER, FOURTH, LIMIT = "c0", "c1", "c2", "c3", "limit"
+"""One colour for each role of a series, in every chart: classes of `chart.css`."""
 
-INK, SOFT, GRID, PAPER = "#1d2126", "#5b636d", "#e4e7ea", "#ffffff"
-MEASURED, MODEL, LIMIT, OTHER = "#0072b2", "#d55e00", "#b3261e", "#009e73"
-"""One colour for each role of a series, in every chart: Okabe and Ito's palette, and a red for limits."""
-
-_THEME: Final = {INK: "--ink", SOFT: "--soft", GRID: "--rule", PAPER: "--card"}
-"""Colours that a page replaces by those of its style sheet, which has a dark mode."""
-_DPI: Final = 100
+_WIDTH, _WIDE = 400.0, 760.0
+"""Letters of a chart that is 400 wide are legible on a phone."""
+_PLOT_HEIGHT, _SQUARE_HEIGHT, _WIDE_HEIGHT = 190.0, 340.0, 320.0
+_LETTER_PX, _TITLE_LETTER_PX = 7.6, 8.6
+"""Widths of a letter at the size of a phone, estimated: nothing here knows the font."""
+_ROW_PX: Final = 17.0
+_KEY_PX: Final = 22.0
 _MARGIN: Final = 0.04
 """Share of an axis between its ends and the data."""
-_STYLE: Final = {
-    "axes.axisbelow": True,
-    "axes.edgecolor": GRID,
-    "axes.labelcolor": SOFT,
-    "axes.labelsize": 9,
-    "axes.spines.left": False,
-    "axes.spines.right": False,
-    "axes.spines.top": False,
-    "axes.titlecolor": INK,
-    "axes.titlelocation": "left",
-    "axes.titlesize": 10,
-    "axes.titleweight": "bold",
-    "axes.grid": True,
-    "axes.grid.axis": "y",
-    "figure.facecolor": PAPER,
-    "axes.facecolor": PAPER,
-    "font.family": "sans-serif",
-    "font.sans-serif": ["DejaVu Sans"],
-    "grid.color": GRID,
-    "legend.fontsize": 9,
-    "legend.frameon": False,
-    "legend.labelcolor": INK,
-    "lines.linewidth": 1.6,
-    "lines.markersize": 4,
-    "svg.fonttype": "none",  # text stays text: it can be selected, read aloud and themed
-    "svg.hashsalt": "hbr-rig",  # equal charts give equal bytes
-    "xtick.color": SOFT,
-    "xtick.labelsize": 9,
-    "ytick.color": SOFT,
-    "ytick.labelsize": 9,
-    "ytick.major.size": 0,
-}
+_MANY: Final = 100
+"""More points than these are smaller, because they would hide each other."""
+_TICKS: Final = 8
 
 
 @dataclass(frozen=True)
 class Series:
     """Points (``dots``), a curve, or both; ``low`` and ``high`` bound an uncertainty band.
 
-    A series without a label has no entry in the legend.
+    A series without a label has no entry in the legend. The colour is a class of `chart.css`. A value of y that is not
+    finite makes a gap.
     """
 
     label: str
@@ -79,6 +46,7 @@ class Series:
     dashed: bool = False
     low: Sequence[float] = ()
     high: Sequence[float] = ()
+    bold: bool = False
 
 
 @dataclass(frozen=True)
@@ -119,7 +87,7 @@ class Chart:
     square
         A unit of x is as long as a unit of y.
     wide
-        The legend is beside the axes, for charts of many series; else it is below.
+        For charts of many series.
     """
 
     title: str
@@ -132,128 +100,152 @@ class Chart:
     @property
     def label(self) -> str:
         """Alternative text: title, axes, and the last value of each labelled series."""
-        ends = ", ".join(filled("{} {:.4g}", s.label, s.y[-1]) for s in self.series if s.label and len(s.y))
+        shown = [series for series in self.series if series.label and len(series.y) and isfinite(series.y[-1])]
+        ends = ", ".join(filled("{} {:.4g}", series.label, series.y[-1]) for series in shown)
         return f"{self.title}. {self.y.label} against {self.x.label}. Last values: {ends}"
 
-    def svg(self, *, themed: bool = False) -> str:
-        """Return SVG markup; equal charts give equal bytes.
+    def svg(self, *, alone: bool = False) -> str:
+        """Return SVG markup; ``alone`` for a file of its own (see `rig.charts.svg.drawing`)."""
+        width = _WIDE if self.wide else _WIDTH
+        title = wrap(self.title, int(width / _TITLE_LETTER_PX))
+        top = _ROW_PX * (len(title) + 1) + 8
+        labelled = [series for series in self.series if series.label]
 
-        Parameters
-        ----------
-        themed
-            For a page with the report's style sheet: text, grid and background take the colours of its light or dark
-            mode. Otherwise the chart needs no style sheet.
-        """
-        return _compact(self._markup, self.label, themed=themed)
+        # The width of the numbers at the y axis decides where the plot begins.
+        y_range = _range(self.y, [v for s in self.series for v in (*s.y, *s.low, *s.high)])
+        x_range = _range(self.x, [v for s in self.series for v in s.x])
+        left = 10 + _LETTER_PX * max(len(words) for _, words in _ticks(self.y, *y_range))
+        right = width - 12
+        height = _WIDE_HEIGHT if self.wide else _PLOT_HEIGHT
+        if self.square:
+            unit_px = min((right - left) / (x_range[1] - x_range[0]), _SQUARE_HEIGHT / (y_range[1] - y_range[0]))
+            height = unit_px * (y_range[1] - y_range[0])
+            right = left + unit_px * (x_range[1] - x_range[0])
+        bottom = top + height
+        x = _Scale(self.x, *x_range, left, right)
+        y = _Scale(self.y, *y_range, *((top, bottom) if self.y.falling else (bottom, top)))
 
-    def png(self) -> bytes:
-        """Return a PNG file of twice the size in CSS pixels."""
-        file = BytesIO()
-        with _style():
-            self._figure.savefig(file, format="png", dpi=2 * _DPI)
-        return file.getvalue()
-
-    @cached_property
-    def _markup(self) -> str:
-        file = StringIO()
-        with _style():
-            self._figure.savefig(file, format="svg", metadata={"Date": None, "Creator": None})
-        return file.getvalue()
-
-    @cached_property
-    def _figure(self) -> "Figure":
-        from matplotlib.figure import Figure
-
-        with _style():
-            size = (8.6, 4.4) if self.wide else (6.4, 5.2 if self.square else 3.9)
-            figure = Figure(figsize=size, dpi=_DPI, layout="constrained")
-            axes = figure.add_subplot()
-            axes.set_title(self.title, wrap=True)
-            for series in self.series:
-                _draw(axes, series)
-            _scale(axes, self.x, "x")
-            _scale(axes, self.y, "y")
-            if self.square:
-                axes.set_aspect("equal")
-            if any(series.label for series in self.series) and self.wide:
-                figure.legend(loc="outside right center")  # below a long title
-            elif any(series.label for series in self.series):
-                figure.legend(loc="outside lower left", ncols=4)
-            # Lay the chart out once. With a layout engine, each file would draw the chart twice.
-            if engine := figure.get_layout_engine():
-                engine.execute(figure)
-            figure.set_layout_engine(None)
-        return figure
+        parts = [svg.text(words, (0, 13 + _ROW_PX * row), "title", anchor="start") for row, words in enumerate(title)]
+        parts.append(svg.text(self.y.label, (0, top - 9), "small", anchor="start"))
+        for value, words in _ticks(self.y, *y_range):
+            parts.append(svg.line((left, y(value)), (right, y(value)), "grid"))
+            parts.append(svg.text(words, (left - 6, y(value) + 4), "axis", anchor="end"))
+        for at, words in _without_overlap([(x(value), words) for value, words in _ticks(self.x, *x_range)]):
+            parts.append(svg.line((at, bottom), (at, bottom + 4), "tick"))
+            parts.append(svg.text(words, (at, bottom + 18), "axis"))
+        parts.append(svg.text(self.x.label, ((left + right) / 2, bottom + 36), "small"))
+        for series in self.series:
+            parts += _draw(series, x, y)
+        places = _rows(labelled, bottom + 58, width)
+        for series, place in zip(labelled, places, strict=True):
+            parts += _key(series, place)
+        end = max([bottom + 44, *(place[1] + 8 for place in places)])
+        return svg.drawing(width, end, self.label, parts, alone=alone)
 
 
-def _style() -> "AbstractContextManager[None]":
-    import matplotlib as mpl
+class _Scale:
+    """The position of a value on an axis."""
 
-    return mpl.rc_context(_STYLE)  # type: ignore[arg-type]
+    def __init__(self, axis: Axis, low: float, high: float, low_px: float, high_px: float) -> None:
+        self._log, self._least, self._low_px = axis.log, low, low_px
+        self._low = log10(low) if axis.log else low
+        self._unit_px = (high_px - low_px) / ((log10(high) if axis.log else high) - self._low)
+
+    def __call__(self, value: float) -> float:
+        shown = log10(max(value, self._least)) if self._log else value
+        return self._low_px + (shown - self._low) * self._unit_px
 
 
-def _draw(axes: "Axes", series: Series) -> None:
-    """Draw the band, the curve and the points of one series."""
-    if len(series.low) > 1:
-        axes.fill_between(series.x, series.low, series.high, color=series.colour, alpha=0.1, linewidth=0)
-    elif series.low:
-        axes.vlines(series.x, series.low, series.high, color=series.colour)
-    axes.plot(
-        series.x,
-        series.y,
-        color=series.colour,
-        linestyle=("--" if series.dashed else "-") if series.curve else "none",
-        marker="o" if series.dots else "",
-        label=series.label or "_hidden",
+def _range(axis: Axis, values: Sequence[float]) -> tuple[float, float]:
+    """Return the ends of an axis: data, ticks and included values, with a margin beyond the data."""
+    shown = [value for value in (*values, *axis.span, *axis.ticks) if isfinite(value) and (value > 0 or not axis.log)]
+    low, high = (min(shown), max(shown)) if shown else (0.0, 1.0)
+    if axis.log:
+        ratio = max(high / low, 2.0) ** _MARGIN
+        return low / ratio, high * ratio
+    if high - low <= 1e-9 * max(abs(low), abs(high)):  # neighbouring numbers would be equal
+        low, high = low - (abs(low) or 1.0) / 2, high + (abs(high) or 1.0) / 2
+    margin = _MARGIN * (high - low)
+    return low if low in axis.span else low - margin, high if high in axis.span else high + margin
+
+
+def _ticks(axis: Axis, low: float, high: float) -> list[tuple[float, str]]:
+    """Return the values of an axis that have a number, and their words."""
+    if axis.ticks:
+        return list(zip(axis.ticks, axis.names or [number_words(tick, "g") for tick in axis.ticks], strict=True))
+    if axis.log:
+        decades = range(floor(log10(low)), ceil(log10(high)) + 1)
+        digits = (1, 2, 5) if len(decades) <= 3 else (1,)
+        all_ticks = (digit * 10.0**decade for decade in decades for digit in digits)
+        ticks = [(tick, f"{tick:.10g}") for tick in all_ticks if low <= tick <= high]
+        if len(ticks) > 1:  # a short axis takes those of a linear scale
+            return ticks
+    least = (high - low) / _TICKS
+    power = floor(log10(least))
+    step, power = next(
+        (digit * 10.0**p, p) for p in (power, power + 1) for digit in (1, 2, 5) if digit * 10.0**p >= least
     )
+    if axis.whole:
+        step, power = max(1.0, step), max(0, power)
+    form = f".{max(0, -power)}f" if power > -6 and max(abs(low), abs(high)) < 1e6 else ".3g"
+    return [
+        (step * i, number_words(step * i, form)) for i in range(ceil(low / step - 1e-9), floor(high / step + 1e-9) + 1)
+    ]
 
 
-def _scale(axes: "Axes", axis: Axis, which: str) -> None:
-    """Set label, scale, limits and ticks of one axis."""
-    from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, StrMethodFormatter
-
-    ruler = axes.xaxis if which == "x" else axes.yaxis
-    set_limits = axes.set_xlim if which == "x" else axes.set_ylim
-    axes.set(**{f"{which}label": axis.label})
-    if axis.log:
-        axes.set(**{f"{which}scale": "log"})
-    low, high = axes.get_xlim() if which == "x" else axes.get_ylim()
-    if axis.log:
-        decades = ceil(log10(high)) - floor(log10(low))
-        ruler.set_major_locator(LogLocator(subs=(1, 2, 5) if decades <= 2 else (1,)))
-        ruler.set_major_formatter(StrMethodFormatter("{x:.10g}"))
-        ruler.set_minor_formatter(NullFormatter())
-    elif axis.ticks:
-        ruler.set_ticks(axis.ticks, axis.names or [f"{tick:g}" for tick in axis.ticks])
-        low, high = min(low, axis.ticks[0]), max(high, axis.ticks[-1])
-    else:
-        ruler.set_major_locator(MaxNLocator(7, integer=axis.whole, steps=[1, 2, 5, 10]))
-    low, high = min((low, *axis.span)), max((high, *axis.span))
-    if axis.span and not axis.log:
-        # Matplotlib's margin is a share of the data's range, which may be a small part of the axis.
-        first, last = sorted(axes.dataLim.intervalx if which == "x" else axes.dataLim.intervaly)
-        margin = _MARGIN * (high - low)
-        low = low if low in axis.span else min(low, first - margin)
-        high = high if high in axis.span else max(high, last + margin)
-    set_limits((high, low) if axis.falling else (low, high))
+def _without_overlap(ticks: Sequence[tuple[float, str]]) -> Iterator[tuple[float, str]]:
+    """Yield ticks whose numbers have room; others are left out."""
+    free_px = -_LETTER_PX
+    for at, words in ticks:
+        half = _LETTER_PX * len(words) / 2
+        if at - half >= free_px:
+            yield at, words
+            free_px = at + half + _LETTER_PX
 
 
-def _two_decimals(number: re.Match[str]) -> str:
-    return f"{float(number[0]):.2f}".rstrip("0").rstrip(".")
+def _draw(series: Series, x: _Scale, y: _Scale) -> list[str]:
+    """Return the band, the curve and the points of one series."""
+    parts = []
+    if len(series.low) > 0:
+        edge = [(x(at), y(low)) for at, low in zip(series.x, series.low, strict=True)]
+        edge += [(x(at), y(high)) for at, high in zip(reversed(series.x), reversed(series.high), strict=True)]
+        one = len(series.low) == 1
+        parts.append(svg.path(edge, f"{'curve' if one else 'band'} {series.colour}", close=not one))
+    points = [(at, value) if isfinite(value) else None for at, value in zip(series.x, series.y, strict=True)]
+    if series.curve:
+        for drawn, run in groupby(points, key=bool):
+            if drawn:
+                parts.append(svg.path([(x(p[0]), y(p[1])) for p in run if p], _curve_class(series)))
+    if series.dots:
+        radius = 3 if len(points) <= _MANY else 2
+        for at, value in filter(None, points):
+            words = filled("{}: {:.4g} at {:g}", series.label, value, round(at, 3))
+            parts.append(svg.circle((x(at), y(value)), radius, f"dot {series.colour}", svg.title(words)))
+    return parts
 
 
-def _compact(svg: str, label: str, *, themed: bool) -> str:
-    """Return Matplotlib's SVG with an alternative text, free to scale, without what a page does not need."""
-    svg = svg[svg.index("<svg") :]
-    box = re.search(r'viewBox="[^"]*"', svg)
-    body = svg[svg.index(">") + 1 :]
-    body = re.sub(r"<metadata>.*?</metadata>|<!--.*?-->", "", body, flags=re.DOTALL)
-    body = re.sub(r'<g id="[a-z_0-9.]+"', "<g", body)  # ids would repeat on a page of several charts
-    body = re.sub(r"<[^>]*>", lambda tag: re.sub(r"-?\d+\.\d{3,}", _two_decimals, tag[0]), body)  # not in the texts
-    body = re.sub(r"\s*\n\s*", " ", body)
-    body = re.sub(r"font: ([^;\"]*?)'DejaVu Sans'[^;\"]*", r"font: \1system-ui, 'DejaVu Sans', sans-serif", body)
-    if themed:
-        for colour, variable in _THEME.items():
-            body = body.replace(colour, f"var({variable}, {colour})")
-    head = f'<svg xmlns="http://www.w3.org/2000/svg" xmlns:xlink="http://www.w3.org/1999/xlink" {box[0] if box else ""}'
-    return f'{head} role="img" aria-label="{escape(label)}">{body.strip()}\n'
+def _curve_class(series: Series) -> str:
+    return f"curve {series.colour}{' dashed' if series.dashed else ''}{' bold' if series.bold else ''}"
+
+
+def _rows(labelled: Sequence[Series], top: float, width: float) -> list[Point]:
+    """Return the places of the legend's entries below a chart, row by row."""
+    places: list[Point] = []
+    at, row = 0.0, 0
+    for series in labelled:
+        needed = _KEY_PX + _LETTER_PX * len(series.label) + 12
+        if at and at + needed > width:
+            at, row = 0.0, row + 1
+        places.append((at, top + _ROW_PX * row))
+        at += needed
+    return places
+
+
+def _key(series: Series, place: Point) -> list[str]:
+    left, y = place
+    parts = []
+    if series.curve:
+        parts.append(svg.line((left, y - 4), (left + _KEY_PX - 6, y - 4), _curve_class(series)))
+    if series.dots and not series.dashed:  # it would hide the gap between the dashes
+        parts.append(svg.circle((left + (_KEY_PX - 6) / 2, y - 4), 3, f"dot {series.colour}"))
+    return [*parts, svg.text(series.label, (left + _KEY_PX, y), "name", anchor="start")]

@@ -1,19 +1,20 @@
 """The command line program `rig`: all commands, grouped as in its help."""
 
+import inspect
+import re
 import signal
 import sys
-import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
 from copy import copy
 from importlib.metadata import entry_points, version
 from io import TextIOWrapper
-from typing import Annotated, Any, Unpack
+from typing import Annotated, Any, Final, Unpack
 
 import typer
 from typer.core import TyperGroup
 
-from rig.cli.bench import config, doctor, find, head, jog, serve, servo, setup, snapshot, table
+from rig.cli.bench import config, doctor, head, serve, servo, setup, snapshot, table
 from rig.cli.catalog import catalog, exchange, results, upkeep  # noqa: F401 - upkeep adds its commands
 from rig.cli.objects import enroll, evaluate, identify, runs
 from rig.cli.ui.command import show_error, without_color
@@ -44,6 +45,39 @@ class _Commands(TyperGroup):
             context = super().make_context(info_name, args, parent, **extra)
         context.meta[_WANTS_JSON] = wants_json
         return context
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:  # noqa: ARG002
+        """Print the commands in their panels, and then the options.
+
+        The help of Typer begins with the options. It also imports a parser of Markdown, which takes longer than all
+        this.
+        """
+        from rich.panel import Panel
+        from rich.table import Table
+        from rich.text import Text
+
+        from rig.cli.ui.present import console
+
+        texts: dict[str, str] = {str(one.name): inspect.getdoc(one.callback) or "" for one in app.registered_commands}
+        for group in app.registered_groups:
+            texts[str(group.name)] = str(group.typer_instance.info.help) if group.typer_instance else ""
+        texts = {name: re.split(r"\.\s", text)[0].removesuffix(".") + "." for name, text in texts.items()}
+        named = {name for names in PANELS.values() for name in names}
+        panels = {title: {name: texts[name] for name in names if name in texts} for title, names in PANELS.items()}
+        panels["Plug-ins"] = {name: text for name, text in texts.items() if name not in named}
+        options: Any = self.get_params(ctx)
+        panels["Options"] = {f"{', '.join(one.opts)} {one.metavar or ''}".rstrip(): one.help for one in options}
+        screen = console()
+        screen.width = min(screen.width, 120)
+        screen.print(Text(f"\n {self.get_usage(ctx)}\n\n {self.help}\n"))
+        for title, rows in panels.items():
+            table = Table.grid(padding=(0, 2, 0, 0))
+            table.add_column(style="bold cyan", width=max(map(len, rows if title == "Options" else texts)))
+            for name, text in rows.items():
+                table.add_row(name, Text(text))
+            if rows:
+                screen.print(Panel(table, title=title, title_align="left", border_style="dim"))
+        screen.print(Text(f"\n{self.epilog}\n"), soft_wrap=True)
 
     def invoke(self, ctx: Any) -> Any:
         handle_signals()  # from here on, a signal unwinds the stack; until here the program was at its start
@@ -110,33 +144,44 @@ common.__doc__ = None  # or it would replace the help of the app
 show_parameters(common, spread(common))
 app.callback()(common)
 
-OBJECTS, BENCH, MORE = "Objects", "Bench", "More"  # panels of the help
+PANELS: Final = {
+    "Start here": (
+        *("doctor", "empty-table", "enroll", "identify", "results", "catalog"),
+        *("status", "stop", "acknowledge", "serve"),
+    ),
+    "Saved searches and experiments": ("replay", "report", "eval"),
+    "Exchange and log": ("import", "export", "log"),
+    "Table": ("home", "goto", "jog"),
+    "Devices and settings": ("setup", "find", "config", "calibrate", "snapshot", "servo", "head"),
+    "Simulated bench": ("demo", "faults", "sim-bench", "sim-head", "sim-servo"),
+}
+"""The panels of the help, with their commands in order. The first one has the commands of a day."""
 
-app.command("enroll", rich_help_panel=OBJECTS)(enroll.enroll)
-app.command("identify", rich_help_panel=OBJECTS)(identify.identify)
-app.command("replay", rich_help_panel=OBJECTS)(runs.replay)
-app.command("report", rich_help_panel=OBJECTS)(runs.report)
-app.command("empty-table", rich_help_panel=BENCH)(snapshot.empty_table)
-app.command("goto", rich_help_panel=BENCH, context_settings={"ignore_unknown_options": True})(table.goto)
-app.command("home", rich_help_panel=BENCH)(table.home)
-app.command("jog", rich_help_panel=BENCH)(jog.jog)
-app.command("status", rich_help_panel=BENCH)(table.status)
-app.command("stop", rich_help_panel=BENCH)(table.stop)
-app.command("acknowledge", rich_help_panel=BENCH)(table.acknowledge)
-app.command("snapshot", rich_help_panel=BENCH)(snapshot.snapshot)
-app.command("doctor", rich_help_panel=BENCH)(doctor.doctor)
-app.command("serve", rich_help_panel=BENCH)(serve.serve)
-app.command("find", rich_help_panel=BENCH)(find.find)
-app.command("setup", rich_help_panel=BENCH)(setup.setup)
-app.command("import", rich_help_panel=OBJECTS)(exchange.import_)
-app.command("export", rich_help_panel=OBJECTS)(exchange.export)
-app.command("log", rich_help_panel=OBJECTS)(results.log)
-app.add_typer(results.app, name="results", rich_help_panel=OBJECTS)
-app.add_typer(catalog.app, name="catalog", rich_help_panel=OBJECTS)
-app.add_typer(config.app, name="config", rich_help_panel=BENCH)
-app.add_typer(head.app, name="head", rich_help_panel=BENCH)
-app.add_typer(servo.app, name="servo", rich_help_panel=BENCH)
-app.command("eval", rich_help_panel=MORE)(evaluate.evaluate)
+app.command("enroll")(enroll.enroll)
+app.command("identify")(identify.identify)
+app.command("replay")(runs.replay)
+app.command("report")(runs.report)
+app.command("eval")(evaluate.evaluate)
+app.command("import")(exchange.import_)
+app.command("export")(exchange.export)
+app.command("log")(results.log)
+app.command("empty-table")(snapshot.empty_table)
+app.command("snapshot")(snapshot.snapshot)
+app.command("goto", context_settings={"ignore_unknown_options": True})(table.goto)  # an angle can be negative
+app.command("home")(table.home)
+app.command("jog")(table.jog)
+app.command("status")(table.status)
+app.command("stop")(table.stop)
+app.command("acknowledge")(table.acknowledge)
+app.command("doctor")(doctor.doctor)
+app.command("find")(doctor.find)
+app.command("setup")(setup.setup)
+app.command("serve")(serve.serve)
+app.add_typer(results.app, name="results")
+app.add_typer(catalog.app, name="catalog")
+app.add_typer(config.app, name="config")
+app.add_typer(head.app, name="head")
+app.add_typer(servo.app, name="servo")
 for _point in sorted(entry_points(group=GROUP), key=lambda point: point.name):
     try:
         _plugin = _point.load()
@@ -145,20 +190,22 @@ for _point in sorted(entry_points(group=GROUP), key=lambda point: point.name):
         print(neutral(_notice), file=sys.stderr)
         continue
     if isinstance(_plugin, typer.Typer):
-        app.add_typer(_plugin, name=_point.name, rich_help_panel=MORE)
+        app.add_typer(_plugin, name=_point.name)
     else:
-        app.command(_point.name, rich_help_panel=MORE)(_plugin)
+        app.command(_point.name)(_plugin)
 
 
-def _with_command(first: list[str]) -> typer.Typer:
-    """Return the app with only the command that the first argument names; with all if it names none.
+def _with_commands_for(arguments: list[str]) -> typer.Typer:
+    """Return the app with the commands that a start with these arguments needs; with all if that is not clear.
 
-    Typer builds every command that an app has, at each start: half the computing of a short command such as status.
+    Typer builds every command that an app has, with its options, at each start: half the computing of a short command
+    such as status. The help of `rig` reads only their texts.
     """
     only = copy(app)
-    only.registered_commands = [one for one in app.registered_commands if one.name in first]
-    only.registered_groups = [one for one in app.registered_groups if one.name in first]
-    return only if only.registered_commands or only.registered_groups else app
+    only.registered_commands = [one for one in app.registered_commands if one.name in arguments[:1]]
+    only.registered_groups = [one for one in app.registered_groups if one.name in arguments[:1]]
+    is_help = arguments in ([], ["--help"], ["-h"])
+    return only if is_help or only.registered_commands or only.registered_groups else app
 
 
 def main() -> None:
@@ -171,7 +218,7 @@ def main() -> None:
     with checked_output():
         try:
             try:
-                _with_command(sys.argv[1:2])()
+                _with_commands_for(sys.argv[1:])()
             finally:
                 sys.stdout.flush()
         except OutputFailed as error:
@@ -181,6 +228,8 @@ def main() -> None:
             discard(sys.stdout)
             sys.exit(EXIT_BY_SIGNAL + signal.SIGPIPE)
         except Exception:  # a mistake in this program; its text can contain anything
+            import traceback
+
             print(neutral(traceback.format_exc()), file=sys.stderr, end="")
             step = "Report this text, the command, and the version (rig --version)."
             print(f"Error {RigError.code} ({RigError.title}).\nNext step: {step}", file=sys.stderr)

@@ -40,7 +40,7 @@ class CatalogPlace:
 
     @property
     def copy_folder(self) -> Path:
-        """Folder of the local copy of a catalog on a server (`rig.catalog.shared`)."""
+        """Folder of the local copy of a catalog on a server (`rig.catalog.copying`)."""
         return self.path / "local-copy"
 
     def may_exist(self) -> bool:

@@ -97,7 +97,6 @@ class HeadConfig(Section):
         description="duty cycle of the ring light while the bench is open; none: no light is connected to the head",
     )
     power: bool = Field(False, description="whether the servo's supply goes through the head's relay")
-    power_up_s: float = Field(0.6, ge=0.1, le=5, description="time from closing that relay until the servo answers")
 
 
 class CameraConfig(Section):

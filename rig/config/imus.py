@@ -1,6 +1,6 @@
 """The table of inertial sensors: one row for each. A supported sensor is its row and its driver.
 
-`rig.config` takes the names and addresses from it, `rig.devices.open_imu` the driver, the search and the doctor the
+`rig.config` takes the names and addresses from it, `rig.devices.imu` the driver, the search and the doctor the
 identities, and the simulator the simulated sensor. A package adds rows by entry points of the group ``rig.imus``.
 
 Decision: docs/decisions/0041.

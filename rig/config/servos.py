@@ -4,12 +4,19 @@ The driver is written for the XL430-W250. It fits the models whose `.model` file
 unit of speed, and registers.
 """
 
+import difflib
 from collections.abc import Mapping
 from functools import cache
+from importlib.metadata import entry_points
 from importlib.resources import files
 from math import pi
 
 REFERENCE = "xl430_w250"
+OWN = "ax_12a"
+"""The model that the rig knows without the SDK, which has no file for it."""
+GROUP = "rig.servos"
+"""Entry-point group in which packages name a `rig.devices.dynamixel.registers.DynamixelModel`, or a
+`rig.devices.servo.ServoDriver`."""
 USE_ANOTHER = "Use a servo of the X series or the MX series (2.0), or an AX-12A"
 
 _PACKAGE, _FOLDER = "dynamixel_easy_sdk", "control_table"
@@ -57,7 +64,13 @@ def differences(model: str) -> tuple[str, ...]:
 
 
 def driven(model: str) -> str:
-    """Return the value of ``servo.model``; raises ValueError for a model of the SDK that the driver does not fit."""
+    """Return the value of ``servo.model``; raises ValueError for an unknown model, or one that no driver fits."""
+    models = [OWN, *sdk_models().values()]
+    if model not in models:
+        models += (point.name for point in entry_points(group=GROUP))  # only now, because looking them up takes 10 ms
+    if model not in models:
+        near = difflib.get_close_matches(model, [name for name in models if not differences(name)], n=1)
+        raise ValueError("unknown model" + (f"; did you mean {near[0]}?" if near else "; `rig find` names yours"))
     if reasons := differences(model):
         raise ValueError(f"the rig cannot drive this model: {'; '.join(reasons)}. {USE_ANOTHER}")
     return model

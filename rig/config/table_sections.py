@@ -107,11 +107,6 @@ class SafetyConfig(Section):
         le=100,
         description="largest part of the servo's torque (or current limit) that is not an overload",
     )
-    stall_s: float = Field(0.25, ge=0.05, le=1, description="how long the servo may push without rotating")
-    overload_s: float = Field(
-        0.8, ge=0.1, le=5, description="how long the servo may rotate with overload, or lag behind its profile"
-    )
-    no_progress_s: float = Field(1.0, ge=0.3, le=5, description="how long the servo may stand still before its goal")
     temperature_margin_c: float = Field(
         5.0, ge=0, le=40, description="distance from the temperature at which the servo shuts down"
     )

@@ -1,7 +1,7 @@
 """The next step of an error, a note or a finding, as data that each presenter words in its own way.
 
 A next step is a list of sentences, for what only hands can do, and of actions of the rig with their parameters. This
-module words it for a terminal. The page `rig.web.next_steps` words it as buttons and links.
+module words it for a terminal. The page `rig.web.pages` words it as buttons and links.
 
 Decision: docs/decisions/0066.
 """

@@ -1,8 +1,20 @@
 """Numbers, times and lists as people read them."""
 
 from collections.abc import Iterable, Sequence
+from enum import StrEnum
 from string import Formatter
-from typing import Any
+from typing import Any, Self
+
+
+class Worded(StrEnum):
+    """A code that records contain, and the text that people read: a template for `filled`."""
+
+    words: str
+
+    def __new__(cls, value: str, words: str = "") -> Self:
+        member = str.__new__(cls, value)
+        member._value_, member.words = value, words
+        return member
 
 
 def whole(text: str) -> int | None:

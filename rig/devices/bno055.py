@@ -49,22 +49,12 @@ SLOW_BUS = (
 
 
 @dataclass(frozen=True, slots=True)
-class Bno055Calibration:
-    """The sensor's calibration status: 0 not at all, 3 fully. Without magnetometer only ``gyro`` matters."""
-
-    system: int
-    gyro: int
-    accelerometer: int
-    magnetometer: int
-
-
-@dataclass(frozen=True, slots=True)
 class _Reading:
-    """The registers from the gyro to the power mode, read in one transfer."""
+    """The registers from the gyro to the power mode, read in one transfer; ``calibrated`` says that of the gyro."""
 
     gyro_dps: Floats
     orientation: Floats
-    calibration: Bno055Calibration
+    calibrated: bool
 
 
 class Bno055:
@@ -74,21 +64,9 @@ class Bno055:
     are further apart than the gyro's period, they are interpolated. Therefore the rates are only correct if the sensor
     is read while the table moves, as the control loop does.
 
-    Parameters
-    ----------
-    bus
-        Number of the I2C bus, or the path of its device file.
-    address
-        0x28, or 0x29 with ADR high.
-
-    Raises
-    ------
-    DeviceNotFound
-        The bus cannot be opened, or no device acknowledges the address, even a second after power-up.
-    DeviceMismatch
-        Another device answers there.
-    DeviceFault
-        Its fusion does not run, or it does not keep its settings.
+    Raises `DeviceNotFound`: the bus cannot be opened, or no device acknowledges the address, even a second after
+    power-up. `DeviceMismatch`: another device answers there. `DeviceFault`: its fusion does not run, or it does not
+    keep its settings.
     """
 
     rate_hz = RATE_HZ
@@ -118,12 +96,8 @@ class Bno055:
     def read_samples(self) -> ImuSamples:
         """Return samples for the time since the last call.
 
-        Raises
-        ------
-        DeviceSilent
-            The sensor does not answer, even after retries.
-        DeviceFault
-            The sensor was reset, its fusion stopped, or its data are impossible.
+        Raises `DeviceSilent`: the sensor does not answer, even after retries. `DeviceFault`: the sensor was reset, its
+        fusion stopped, or its data are impossible.
         """
         now_ns = self._clock.now_ns()
         reading = self._read()
@@ -134,9 +108,12 @@ class Bno055:
             self.statistics.overflows += 1
             self._start_over(reading, now_ns)
             return ImuSamples(np.empty(0, np.int64), np.empty((0, 3)), int(count))
+        # Interpolate the gyro between this reading and the last one, one sample for each of its periods.
         share = np.arange(1, count + 1) / count
         time_ns = self._newest_ns + np.rint((now_ns - self._newest_ns) * share).astype(np.int64)
         gyro = self._last.gyro_dps + (reading.gyro_dps - self._last.gyro_dps) * (share - 0.5 / count)[:, None]
+        # Correct the samples so that they add up to the rotation that the chip integrated itself. A small difference is
+        # carried to the next reading: it is the orientation's resolution and age.
         owed_deg = self._owed_deg + _rotation_deg(self._last.orientation, reading.orientation) - gyro.sum(0) / RATE_HZ
         fastest = max(float(np.linalg.norm(self._last.gyro_dps)), float(np.linalg.norm(reading.gyro_dps)))
         carried = (_CARRIED_DEG + _ORIENTATION_AGE_S * fastest) / max(float(np.linalg.norm(owed_deg)), 1e-9)
@@ -156,10 +133,6 @@ class Bno055:
         self._read()
         return float(int.from_bytes(self._registers.read(_TEMP, 1), "little", signed=True))
 
-    def calibration(self) -> Bno055Calibration:
-        """Return the calibration status; the gyro's reaches 3 after a few seconds at rest."""
-        return self._read().calibration
-
     # -- setting up ---------------------------------------------------------------------------------------------------
 
     def _identify(self) -> ImuIdentity:
@@ -172,6 +145,7 @@ class Bno055:
                 if self._clock.now_ns() > deadline_ns:
                     raise self._registers.not_found(silent, "ADR pin (low 0x28, high 0x29)") from silent
                 self._clock.sleep(_POLL_S)
+        # A wrong identity that changes, or is one bit late, comes from the bus, and not from another chip.
         if got not in KIND.identities:
             again = {self._registers.read(KIND.register, 1)[0] for _ in range(_IDENTITY_READS)}
             if again & {*KIND.identities, *(_late_by_one_bit(one) for one in KIND.identities)} or len(again) > 1:
@@ -201,7 +175,7 @@ class Bno055:
                     raise
             else:
                 # Without calibration the orientation drifts. On a moving table, calibration never completes.
-                if reading.calibration.gyro == 3 or waited_s > _LEARN_S:
+                if reading.calibrated or waited_s > _LEARN_S:
                     break
         self._start_over(reading, self._clock.now_ns())
 
@@ -222,9 +196,8 @@ class Bno055:
             mode = status[4] & 0x0F  # the upper bits are reserved
             good = (status[0], status[2], mode, status[5] & 3) == (_FUSION_RUNNING, 0, _IMU_MODE, 0)
             if good and abs(float(orientation @ orientation) - 1) < 0.01:
-                stat = block[0x21]
-                calibration = Bno055Calibration(stat >> 6, stat >> 4 & 3, stat >> 2 & 3, stat & 3)
-                return _Reading(np.frombuffer(block[:6], "<i2") / LSB_PER_DPS, orientation, calibration)
+                calibrated = block[0x21] >> 4 & 3 == 3  # CALIB_STAT: 0 not at all, 3 fully, after some seconds at rest
+                return _Reading(np.frombuffer(block[:6], "<i2") / LSB_PER_DPS, orientation, calibrated)
             self.statistics.corrupt += 1
         reset = mode == _CONFIG_MODE
         raise DeviceFault(

@@ -74,6 +74,9 @@ class Frame:
 class Camera(Protocol):
     """A source of frames."""
 
+    observers: list[Callable[[NDArray[np.uint8]], object]]
+    """Called with each image that `capture` returns: for displays."""
+
     @property
     def identity(self) -> CameraIdentity: ...
 
@@ -88,26 +91,3 @@ class Camera(Protocol):
         """Return the settings as the camera reports them now."""
 
     def close(self) -> None: ...
-
-
-class ShownCamera:
-    """A camera that also shows the image of each of its frames, for example on a page."""
-
-    def __init__(self, camera: Camera, show: Callable[[NDArray[np.uint8]], None]) -> None:
-        self._camera = camera
-        self._show = show
-
-    @property
-    def identity(self) -> CameraIdentity:
-        return self._camera.identity
-
-    def capture(self, after_ns: int, meanwhile: Callable[[], object] | None = None) -> Frame:
-        frame = self._camera.capture(after_ns, meanwhile)
-        self._show(frame.image_bgr)
-        return frame
-
-    def read_locks(self) -> CameraLocks:
-        return self._camera.read_locks()
-
-    def close(self) -> None:
-        self._camera.close()

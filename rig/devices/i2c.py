@@ -39,19 +39,9 @@ class I2cStatistics:
 
 
 class I2cRegisters:
-    """Registers of the device at ``address``.
+    """Registers of the device at ``address`` (7 bits) of ``bus``: its number, or the path of its device file.
 
-    Parameters
-    ----------
-    bus
-        Number of the I2C bus, or the path of its device file.
-    address
-        The device's address, 7 bits.
-
-    Raises
-    ------
-    DeviceNotFound
-        The bus cannot be opened.
+    Raises `DeviceNotFound`: the bus cannot be opened.
     """
 
     def __init__(self, bus: int | str, address: int, clock: Clock) -> None:
@@ -82,12 +72,7 @@ class I2cRegisters:
     def transfer(self, transfer: Callable[[], _T]) -> _T:
         """Return the result of ``transfer``; repeat it if the bus fails.
 
-        Raises
-        ------
-        DeviceNotFound
-            A kernel driver uses the address.
-        DeviceSilent
-            Every attempt failed.
+        Raises `DeviceNotFound`: a kernel driver uses the address. `DeviceSilent`: every attempt failed.
         """
         for attempt in range(ATTEMPTS):
             if attempt:

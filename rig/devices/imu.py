@@ -1,14 +1,16 @@
-"""The interface of an inertial sensor on the platter, and the code that its drivers share."""
+"""The interface of an inertial sensor on the platter, what its drivers share, and opening the configured one."""
 
 from dataclasses import dataclass
+from pkgutil import resolve_name
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.config.imus import ImuKind, likely_device, recognised
+from rig.config import ImuConfig
+from rig.config.imus import ImuKind, imu_kind, likely_device, recognised
 from rig.core.clock import Clock
-from rig.core.errors import DeviceMismatch
+from rig.core.errors import ConfigError, DeviceMismatch
 from rig.core.next_steps import Do
 
 
@@ -110,10 +112,7 @@ class ImuDriver(Protocol):
 def identified(kind: ImuKind, got: int, address: int, bus: str, gyro_noise_dps_rthz: float) -> ImuIdentity:
     """Return the identity of a sensor whose identity register has the value ``got``.
 
-    Raises
-    ------
-    DeviceMismatch
-        It is another sensor than ``kind``.
+    Raises `DeviceMismatch`: it is another sensor than ``kind``.
     """
     if got not in kind.identities:
         other = recognised(address, kind.register, got)
@@ -127,3 +126,22 @@ def identified(kind: ImuKind, got: int, address: int, bus: str, gyro_noise_dps_r
             evidence={"got": got, "expected": kind.identities[0]},
         )
     return ImuIdentity(kind.name, address, got, gyro_noise_dps_rthz)
+
+
+def open_imu(config: ImuConfig, bus: int | str, clock: Clock) -> Imu:
+    """Open the sensor at ``config.address`` of ``bus`` (a number, or the path of a device file).
+
+    Raises `ConfigError`, `DeviceNotFound`, `DeviceMismatch`, `DeviceFault`, `DeviceSilent`: the driver of a plug-in
+    cannot be loaded; otherwise see the driver of the model.
+    """
+    kind = imu_kind(config.model)
+    try:
+        driver: ImuDriver = resolve_name(kind.driver)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ConfigError(
+            f"The driver {kind.driver} of the {kind.name} cannot be loaded.",
+            next_step="Fix or uninstall the package that provides it, or set imu.model to another sensor.",
+            evidence={"reason": str(error)},
+        ) from error
+    settings = {name: getattr(config, name) for name in kind.settings}
+    return driver(bus, clock=clock, address=config.address, **settings)

@@ -49,10 +49,6 @@ class Mpu6050:
 
     Parameters
     ----------
-    bus
-        Number of the I2C bus, or the path of its device file.
-    address
-        0x68, or 0x69 with AD0 high.
     range_dps
         Full scale of the gyro: 250, 500, 1000 or 2000 °/s.
     rate_hz
@@ -60,16 +56,9 @@ class Mpu6050:
     bandwidth_hz
         Bandwidth of the gyro's low-pass: 188, 98, 42, 20, 10 or 5 Hz; below half of ``rate_hz`` to avoid aliasing.
 
-    Raises
-    ------
-    ConfigError
-        The sensor does not have a setting.
-    DeviceNotFound
-        The bus cannot be opened, or no device acknowledges the address.
-    DeviceMismatch
-        Another device answers there.
-    DeviceFault
-        The sensor does not keep its settings.
+    Raises `ConfigError`: the sensor does not have a setting. `DeviceNotFound`: the bus cannot be opened, or no device
+    acknowledges the address. `DeviceMismatch`: another device answers there. `DeviceFault`: the sensor does not keep
+    its settings.
     """
 
     KIND: ClassVar[ImuKind] = imu_kind("mpu6050")
@@ -119,13 +108,10 @@ class Mpu6050:
     def read_samples(self) -> ImuSamples:
         """Return the samples in the FIFO; `FifoTimes` dates them.
 
-        Raises
-        ------
-        DeviceSilent
-            The sensor does not answer, even after retries.
-        DeviceFault
-            The sensor fell asleep or lost its settings (a brown-out).
+        Raises `DeviceSilent`: the sensor does not answer, even after retries. `DeviceFault`: the sensor fell asleep or
+        lost its settings (a brown-out).
         """
+        # How many bytes are there? Two times bound the moment at which the sensor counted them.
         before_ns = self._clock.now_ns()
         count = self._fifo_count()
         after_ns = self._clock.now_ns()
@@ -133,11 +119,13 @@ class Mpu6050:
             self._implausible(count, after_ns) and self._implausible(count := self._fifo_count(), after_ns)
         ):
             return self._start_over()  # incomplete twice, so it is not a frame that is being written
+        # How many samples should be there? Another program may have emptied the FIFO, or the sensor was reset.
         samples, missing = count // _FRAME, 0
         due = self._times.due(before_ns)
         if samples < 0.9 * due - 2:  # the sensor's clock is off by at most 5 % (PS 6.6): samples are missing
             self._check_settings()
             missing = round(due) - samples
+        # A FIFO that overflows while it is read shifts its frames.
         full_ns = before_ns + round((self.FIFO_BYTES - count) // _FRAME * self._times.period_ns)
         data = self._pop(count, full_ns) if count else b""
         if data is None:
@@ -255,11 +243,8 @@ class Mpu6050Clone(Mpu6050):
     The driver assumes the worst values of the family: the smallest FIFO and the largest noise. The temperature has the
     MPU-6050's scale.
 
-    Raises
-    ------
-    DeviceMismatch
-        Its samples come at another rate, are all equal or wild, gravity is not 1 g, or its gyro does not respond to its
-        self-test.
+    Raises `DeviceMismatch`: its samples come at another rate, are all equal or wild, gravity is not 1 g, or its gyro
+    does not respond to its self-test.
     """
 
     KIND = imu_kind("mpu6050_clone")
@@ -268,6 +253,7 @@ class Mpu6050Clone(Mpu6050):
 
     def _set_up(self) -> None:
         super()._set_up()
+        # Its samples and gravity at rest.
         due = min(float(_TESTED_SAMPLES), _TESTED_S * self.rate_hz)
         self._clock.sleep(due / self.rate_hz)
         samples, gravity_g = self.read_samples(), float(np.linalg.norm(self.read_gravity_g()))
@@ -282,6 +268,7 @@ class Mpu6050Clone(Mpu6050):
             problems.append(f"its rates scatter by {noise_dps:.0f} °/s")
         if not 0.8 < gravity_g < 1.2:
             problems.append(f"gravity is {gravity_g:.2f} g")
+        # Its self-test, only if the samples can be trusted.
         response_dps = np.zeros(3) if problems else self._self_test(rates.mean(axis=0))
         low_dps, high_dps = _SELF_TEST_DPS
         if not problems and not all(low_dps <= abs(one) <= high_dps for one in response_dps):

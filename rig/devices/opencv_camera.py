@@ -5,26 +5,26 @@ known in one of three ways (`TimeBase`), which is determined when the camera is 
 
 - stamped: ``CAP_PROP_POS_MSEC`` is the bench's monotonic clock in milliseconds, as in V4L2. Each frame has its time.
 - paced: a live source with other stamps. A frame for which `grab` had to wait is new, and its exposure began at most
-  ``latency_s`` before it arrived. The frames before it empty the buffer.
+  `LATENCY_FRAMES` before it arrived. The frames before it empty the buffer.
 - recorded: a source with a known number of frames, such as a video file. A frame counts as exposed when it is read.
 """
 
 from collections import deque
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass
 from enum import Enum
 from math import floor
-from typing import Any
+from typing import Any, Final
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
+from rig.config import CameraConfig
 from rig.core.clock import Clock, seconds_between
 from rig.core.errors import DeviceFault, DeviceMismatch, DeviceNotFound, DeviceSilent
 from rig.devices import v4l2
 from rig.devices.camera import CameraIdentity, CameraLocks, Frame
-from rig.devices.camera_settings import CameraSettings as CameraSettings
-from rig.devices.camera_settings import RejectedSetting as RejectedSetting
 from rig.devices.opencv_capture import Capture, modes_of, waiter_of
 from rig.devices.v4l2 import choose_mode
 
@@ -32,6 +32,10 @@ V4L2_EXPOSURE_MANUAL = 1
 _V4L2_EXPOSURE_AUTO = (0, 3)  # fully automatic, and aperture priority: the camera sets the time
 _EXPOSURE_UNIT_US = 100.0  # V4L2_CID_EXPOSURE_ABSOLUTE
 
+TIMEOUT_S = 3.0
+"""How long `OpenCvCamera.capture` waits for a new frame, and for a camera that was unplugged."""
+LATENCY_FRAMES = 3
+"""For a paced source: longest time from the start of the exposure until `grab` returns, in periods."""
 _PROBES = 16  # frames to examine when opened: more than a driver buffers
 _RETRIES = 5  # attempts to grab a frame
 _FRESH_S = 1.0  # largest age of a frame that the camera just delivered
@@ -43,6 +47,21 @@ _EXPOSURE_CHANGE_FRAMES = 4  # a sensor applies a new exposure time up to this n
 _FOCUS_STILL_S, _FOCUS_LIMIT_S = 1.0, 8.0
 _FOCUS_CHANGE = 0.1  # share of the sharpness that changes while the lens moves
 
+_LOCKS: Final[dict[str, tuple[int, Callable[[float], Any]]]] = {
+    "exposure_us": (cv2.CAP_PROP_EXPOSURE, lambda value: value * _EXPOSURE_UNIT_US),
+    "gain": (cv2.CAP_PROP_GAIN, float),
+    "white_balance_k": (cv2.CAP_PROP_WB_TEMPERATURE, float),
+    "auto_exposure": (cv2.CAP_PROP_AUTO_EXPOSURE, lambda value: value in _V4L2_EXPOSURE_AUTO),
+    "auto_white_balance": (cv2.CAP_PROP_AUTO_WB, bool),
+    "focus": (cv2.CAP_PROP_FOCUS, float),
+    "autofocus": (cv2.CAP_PROP_AUTOFOCUS, bool),
+    "sharpness": (cv2.CAP_PROP_SHARPNESS, float),
+    "backlight_compensation": (cv2.CAP_PROP_BACKLIGHT, float),
+    "power_line_frequency": (v4l2.POWER_LINE_FREQUENCY, float),
+    "dynamic_frame_rate": (v4l2.EXPOSURE_DYNAMIC_FRAMERATE, bool),
+}
+"""Property of each field of `CameraLocks`, and the conversion to the field's unit."""
+
 
 class TimeBase(Enum):
     """The ways in which the time of a frame is known."""
@@ -50,6 +69,22 @@ class TimeBase(Enum):
     STAMPED = "stamped"
     PACED = "paced"
     RECORDED = "recorded"
+
+
+@dataclass(frozen=True, slots=True)
+class RejectedSetting:
+    """A setting that the camera did not accept: the requested and the reported value, as text."""
+
+    setting: str
+    asked: str
+    reported: str
+
+
+def _value_text(setting: str, value: float) -> str:
+    if setting != "fourcc":
+        return f"{value:g}"
+    letters = max(round(value), 0).to_bytes(8, "little").rstrip(b"\0").decode("ascii", "replace")
+    return letters if letters.isprintable() and letters else "unknown"
 
 
 class OpenCvCamera:
@@ -60,31 +95,18 @@ class OpenCvCamera:
     capture
         An open source, for example from `open_capture`. The camera closes it.
     settings
-        Requested settings. `rejected_settings` lists those that the camera did not accept.
-    name
-        The camera's name in records.
-    device
-        Identity of the camera itself, at any port; None if it is not known.
-    timeout_s
-        How long `capture` waits for a new frame.
-    latency_s
-        For a paced source: longest time from the start of the exposure until `grab` returns; None: three frames.
+        Requested settings; None leaves one to the camera, except the focus, which is locked after the autofocus.
+        `rejected_settings` lists those that the camera did not accept.
+    name, device
+        See `CameraIdentity`.
     reopen
         Opens the source again (raises DeviceNotFound while it is missing). A camera that was unplugged for less than
-        ``timeout_s`` gets its settings again and continues.
+        `TIMEOUT_S` gets its settings again and continues.
     node
         Returns what identifies the device file now, None if it is missing. Another value than at the opening means that
         the camera was unplugged: `cv2.VideoCapture.isOpened` stays True on V4L2.
 
-    Attributes
-    ----------
-    modes
-        The modes that the camera offers; empty if they are not known.
-
-    Raises
-    ------
-    DeviceSilent
-        The camera delivers no frames.
+    Raises `DeviceSilent`: the camera delivers no frames.
     """
 
     def __init__(
@@ -92,11 +114,9 @@ class OpenCvCamera:
         capture: Capture,
         *,
         clock: Clock,
-        settings: CameraSettings | None = None,
+        settings: CameraConfig | None = None,
         name: str = "camera",
         device: str | None = None,
-        timeout_s: float = 3.0,
-        latency_s: float | None = None,
         reopen: Callable[[], Capture] | None = None,
         node: Callable[[], object] = lambda: None,
     ) -> None:
@@ -104,12 +124,13 @@ class OpenCvCamera:
         self._reopen = reopen
         self._node = node
         self._node_opened = node()
-        self._settings = settings or CameraSettings()
+        self._settings = settings or CameraConfig()
         self._missing = capture.get(_UNKNOWN_PROPERTY)
         self.modes = modes_of(capture)
+        self.observers: list[Callable[[NDArray[np.uint8]], object]] = []
         self.returns = 0
         self._clock = clock
-        self._timeout_s = timeout_s
+        # Lock the settings, then read back what the camera made of them.
         self._supported: set[int] = set()
         self.rejected_settings: tuple[RejectedSetting, ...] = self._configure(self._settings)
         self.identity = CameraIdentity(
@@ -120,10 +141,11 @@ class OpenCvCamera:
             device,
         )
         self._period_s = 1 / self.identity.fps if 1 <= self.identity.fps <= 1000 else 1 / 30
-        self._latency_ns = round((3 * self._period_s if latency_s is None else latency_s) * 1e9)
+        self._latency_ns = round(LATENCY_FRAMES * self._period_s * 1e9)
         self._last_stamp_ns = -1
         self._arrived_ns = clock.now_ns()
         self._waits_s: deque[float] = deque([self._period_s], maxlen=4)
+        # Only frames show how their time is known, and where the autofocus stops.
         self.time_base: TimeBase = TimeBase.STAMPED
         self.time_base = self._find_time_base()
         if self._settings.focus is None and self.time_base is not TimeBase.RECORDED:
@@ -136,57 +158,41 @@ class OpenCvCamera:
         ``meanwhile`` is called several times per second while the method waits for a slow or an unplugged camera. If it
         raises an error, the wait ends, and the next call waits again.
 
-        Raises
-        ------
-        DeviceSilent
-            No such frame arrived within the time-out, or the camera stopped delivering frames.
-        DeviceMismatch
-            After it was unplugged, another camera answers, or the camera has another mode.
+        Raises `DeviceSilent`: no such frame arrived within the time-out, or the camera stopped delivering frames.
+        `DeviceMismatch`: after it was unplugged, another camera answers, or the camera has another mode.
         """
-        deadline_ns = max(self._clock.now_ns(), after_ns) + round(max(self._timeout_s, 3 * max(self._waits_s)) * 1e9)
+        # A camera that is slower than its mode says gets the time of three of its frames.
+        deadline_ns = max(self._clock.now_ns(), after_ns) + round(max(TIMEOUT_S, 3 * max(self._waits_s)) * 1e9)
         dropped = 0
         while True:
             if self.time_base is TimeBase.RECORDED:
                 self._clock.sleep(seconds_between(self._clock.now_ns(), after_ns))
             exposed_ns = self._grab(meanwhile)
             if exposed_ns is not None and exposed_ns >= after_ns:
-                return Frame(self._retrieve(), exposed_ns, self.time_base is TimeBase.STAMPED)
+                image_bgr = self._retrieve()
+                for observer in self.observers:
+                    observer(image_bgr)
+                return Frame(image_bgr, exposed_ns, self.time_base is TimeBase.STAMPED)
             dropped += 1
             if self._clock.now_ns() > deadline_ns:
                 raise DeviceSilent(
-                    f"{self.identity.name} delivered no new frame in {self._timeout_s:g} s.",
+                    f"{self.identity.name} delivered no new frame in {TIMEOUT_S:g} s.",
                     next_step="Check the camera's cable. If the exposure is long or the USB bus is busy, give a longer "
                     "time-out.",
                     evidence={"dropped_frames": dropped, "time_base": self.time_base.value, "after_ns": after_ns},
                 )
 
     def read_locks(self) -> CameraLocks:
-        exposure = self._known(cv2.CAP_PROP_EXPOSURE)
-        auto_exposure = self._known(cv2.CAP_PROP_AUTO_EXPOSURE)
-        auto_white_balance = self._known(cv2.CAP_PROP_AUTO_WB)
-        autofocus = self._known(cv2.CAP_PROP_AUTOFOCUS)
-        dynamic = self._known(v4l2.EXPOSURE_DYNAMIC_FRAMERATE)
+        reported = {name: (self._known(prop), convert) for name, (prop, convert) in _LOCKS.items()}
         return CameraLocks(
-            exposure_us=None if exposure is None else exposure * _EXPOSURE_UNIT_US,
-            gain=self._known(cv2.CAP_PROP_GAIN),
-            white_balance_k=self._known(cv2.CAP_PROP_WB_TEMPERATURE),
-            auto_exposure=None if auto_exposure is None else auto_exposure in _V4L2_EXPOSURE_AUTO,
-            auto_white_balance=None if auto_white_balance is None else auto_white_balance != 0,
-            focus=self._known(cv2.CAP_PROP_FOCUS),
-            autofocus=None if autofocus is None else autofocus != 0,
-            sharpness=self._known(cv2.CAP_PROP_SHARPNESS),
-            backlight_compensation=self._known(cv2.CAP_PROP_BACKLIGHT),
-            power_line_frequency=self._known(v4l2.POWER_LINE_FREQUENCY),
-            dynamic_frame_rate=None if dynamic is None else dynamic != 0,
+            **{name: None if value is None else convert(value) for name, (value, convert) in reported.items()}
         )
 
     def change_exposure(self, exposure_us: float) -> int:
         """Change the locked exposure time until the camera is opened again.
 
-        Returns
-        -------
-        int
-            Time in ns from which `capture` returns frames of this exposure time: the camera takes some frames for it.
+        Return the time in ns from which `capture` returns frames of this exposure time: it takes the camera some
+        frames.
         """
         self._capture.set(cv2.CAP_PROP_EXPOSURE, round(exposure_us / _EXPOSURE_UNIT_US))
         return self._clock.now_ns() + round(_EXPOSURE_CHANGE_FRAMES * max(self._period_s, *self._waits_s) * 1e9)
@@ -196,7 +202,7 @@ class OpenCvCamera:
 
     # -- settings -----------------------------------------------------------------------------------------------------
 
-    def _configure(self, settings: CameraSettings) -> tuple[RejectedSetting, ...]:
+    def _configure(self, settings: CameraConfig) -> tuple[RejectedSetting, ...]:
         """Request all settings; UVC requires that an automatic is switched off before its value is set."""
         asked: list[tuple[str, int, float]] = []
 
@@ -215,7 +221,7 @@ class OpenCvCamera:
         if settings.exposure_us is not None:
             ask("auto_exposure", cv2.CAP_PROP_AUTO_EXPOSURE, V4L2_EXPOSURE_MANUAL)
             ask("exposure_100us", cv2.CAP_PROP_EXPOSURE, round(settings.exposure_us / _EXPOSURE_UNIT_US))
-            ask("dynamic_frame_rate", v4l2.EXPOSURE_DYNAMIC_FRAMERATE, settings.dynamic_frame_rate)
+            ask("dynamic_frame_rate", v4l2.EXPOSURE_DYNAMIC_FRAMERATE, 0)
         ask("gain", cv2.CAP_PROP_GAIN, settings.gain)
         ask("sharpness", cv2.CAP_PROP_SHARPNESS, settings.sharpness)
         ask("backlight_compensation", cv2.CAP_PROP_BACKLIGHT, settings.backlight_compensation)
@@ -228,16 +234,16 @@ class OpenCvCamera:
         ask("focus", cv2.CAP_PROP_FOCUS, settings.focus)
         read_back = [(name, prop, value, self._capture.get(prop)) for name, prop, value in asked]
         return tuple(
-            RejectedSetting(name, value, reported)
+            RejectedSetting(name, _value_text(name, value), _value_text(name, reported))
             for name, prop, value, reported in read_back
             if prop not in self._supported or abs(reported - value) > (0.01 * abs(value) if name != "fourcc" else 0)
         )
 
-    def _pixel_format(self, settings: CameraSettings) -> str | None:
+    def _pixel_format(self, settings: CameraConfig) -> str | None:
         """Return the pixel format to request; None leaves it to the camera."""
-        if settings.fourcc is not None or settings.width is None or settings.height is None:
+        if settings.fourcc is not None:
             return settings.fourcc
-        mode = choose_mode(self.modes, settings.width, settings.height, settings.fps or 0.0)
+        mode = choose_mode(self.modes, settings.width, settings.height, settings.fps)
         return None if mode is None else mode.fourcc
 
     def _known(self, prop: int) -> float | None:
@@ -262,16 +268,17 @@ class OpenCvCamera:
                 break
         self._capture.set(cv2.CAP_PROP_AUTOFOCUS, 0)
         if (reported := self._capture.get(cv2.CAP_PROP_AUTOFOCUS)) != 0:
-            self.rejected_settings += (RejectedSetting("autofocus", 0, reported),)
+            self.rejected_settings += (RejectedSetting("autofocus", "0", f"{reported:g}"),)
 
     def _hold(self) -> None:
         """Request the camera's own values of the manual controls, too, when it was plugged in again."""
         locks = self.read_locks()
+        # These are not requested by default, and a camera forgets them without power.
         names = ("focus", "sharpness", "backlight_compensation", "power_line_frequency")
         own: dict[str, Any] = {name: getattr(locks, name) for name in names if getattr(self._settings, name) is None}
         if locks.autofocus:
             del own["focus"]
-        self._settings = replace(self._settings, **own)
+        self._settings = self._settings.model_copy(update=own)
 
     # -- frames -------------------------------------------------------------------------------------------------------
 
@@ -292,13 +299,10 @@ class OpenCvCamera:
 
         If the source does not report this, wait until shortly before the next frame, estimated from the last ones.
 
-        Raises
-        ------
-        DeviceSilent
-            The stream hangs.
+        Raises `DeviceSilent`: the stream hangs.
         """
         if wait := waiter_of(self._capture):
-            limit_s, begun_ns = max(self._timeout_s, 3 * max(self._waits_s)), self._clock.now_ns()
+            limit_s, begun_ns = max(TIMEOUT_S, 3 * max(self._waits_s)), self._clock.now_ns()
             while not wait(_SLICE_S):
                 if seconds_between(begun_ns, self._clock.now_ns()) > limit_s:
                     raise self._no_frames(1, limit_s)
@@ -326,9 +330,10 @@ class OpenCvCamera:
 
     def _reconnect(self, reopen: Callable[[], Capture], meanwhile: Callable[[], object]) -> None:
         """Wait until the camera is connected again, and set it up as before."""
+        # Wait for it.
         self._capture.release()
         meanwhile()
-        end_ns = self._clock.now_ns() + round(self._timeout_s * 1e9)
+        end_ns = self._clock.now_ns() + round(TIMEOUT_S * 1e9)
         while True:
             try:
                 self._capture = reopen()
@@ -337,12 +342,13 @@ class OpenCvCamera:
             except DeviceNotFound as missing:
                 if self._clock.now_ns() > end_ns:
                     raise DeviceSilent(
-                        f"{self.identity.name} was disconnected for more than {self._timeout_s:g} s.",
+                        f"{self.identity.name} was disconnected for more than {TIMEOUT_S:g} s.",
                         next_step=missing.steps,
                         evidence=missing.evidence,
                     ) from missing
                 self._clock.sleep(_REPLUG_PAUSE_S)
                 meanwhile()
+        # Set it up as before, and accept no other camera.
         meanwhile()
         self._last_stamp_ns = -1
         rejected_settings, mode = self._configure(self._settings), (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)
@@ -366,7 +372,7 @@ class OpenCvCamera:
     def _grab_now(self, meanwhile: Callable[[], object] | None) -> int | None:
         first_ns = self._clock.now_ns()
         attempts, waited_s = 0, 0.0
-        while attempts < _RETRIES and waited_s <= self._timeout_s:  # V4L2 itself waits long for a hanging stream
+        while attempts < _RETRIES and waited_s <= TIMEOUT_S:  # V4L2 itself waits long for a hanging stream
             if attempts:
                 self._clock.sleep(self._period_s)
             asked_ns = self._clock.now_ns()

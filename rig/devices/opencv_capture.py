@@ -100,10 +100,8 @@ def open_capture(source: int | str | Path) -> Capture:
 
     ``picamera2`` or ``picamera2:1`` is a camera on the ribbon cable of a Raspberry Pi.
 
-    Raises
-    ------
-    DeviceNotFound
-        The source does not exist, the user may not open it, or another program uses it; the next step says which.
+    Raises `DeviceNotFound`: the source does not exist, the user may not open it, or another program uses it; the next
+    step says which.
     """
     if (number := camera_number(source)) is not None:
         return Picamera2Capture(number)

@@ -78,15 +78,10 @@ class Picamera2Capture:
     in decibels (20 log10 of libcamera's AnalogueGain), focus in dioptres (LensPosition), sharpness as libcamera's.
     `get` returns the value in the metadata of a frame, -1 for a setting that the camera lacks.
 
-    Parameters
-    ----------
-    number
-        The number of the camera (`rpicam-hello --list-cameras`).
+    ``number`` is that of `rpicam-hello --list-cameras`.
 
-    Raises
-    ------
-    DeviceNotFound
-        picamera2 is not installed or cannot be imported, there is no such camera, or another program uses it.
+    Raises `DeviceNotFound`: picamera2 is not installed or cannot be imported, there is no such camera, or another
+    program uses it.
     """
 
     def __init__(self, number: int) -> None:

@@ -87,10 +87,7 @@ class Servo(Protocol):
     def prepare(self, *, write: bool) -> tuple[str, ...]:
         """Compare the servo's permanent settings with the required ones; return the changes.
 
-        Raises
-        ------
-        DeviceMismatch
-            Settings differ, and ``write`` is False.
+        Raises `DeviceMismatch`: settings differ, and ``write`` is False.
         """
 
     @property

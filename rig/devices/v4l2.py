@@ -91,14 +91,7 @@ def choose_mode(
 ) -> VideoMode | None:
     """Return the best offered mode: first the size that is nearest, then one that is fast enough, then uncompressed.
 
-    Parameters
-    ----------
-    offered
-        The modes of the camera.
-    width, height, fps
-        The wanted mode.
-    fourcc
-        The only pixel format to choose from.
+    With ``fourcc`` the mode has this pixel format.
     """
 
     def rank(mode: VideoMode) -> tuple[float, bool, bool, float, int]:

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import ExitStack, closing
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from typing import Any
 
 import cv2
@@ -89,7 +89,7 @@ def open_camera(context: DoctorContext, *, refocus: bool = False) -> OpenCvCamer
     with ExitStack() as failed:
         failed.callback(capture.release)
         if refocus:
-            settings = replace(settings, focus=None)
+            settings = settings.model_copy(update={"focus": None})
             capture.set(cv2.CAP_PROP_AUTOFOCUS, 1)
         camera = OpenCvCamera(
             capture,
@@ -118,7 +118,7 @@ def _locks(context: DoctorContext, source: OpenCvCamera) -> Iterator[Finding]:
     locks = source.read_locks()
     fix = f"v4l2-ctl --list-ctrls-menus -d {context.config.camera.source}"
     for one in source.rejected_settings:
-        found = {"setting": one.setting, "requested": one.asked_text, "reported": one.reported_text}
+        found = {"setting": one.setting, "requested": one.asked, "reported": one.reported}
         yield warning("camera", FindingCode.SETTING_REJECTED, fix, **found)
     wanted = context.config.camera
     not_locked = [

@@ -15,7 +15,7 @@ from rig.config.servos import USE_ANOTHER
 from rig.config.toml_file import Key
 from rig.core.errors import DeviceNotFound, RigError
 from rig.core.next_steps import Do, SomeSteps
-from rig.devices.head.opening import open_head
+from rig.devices.head.head import open_head
 from rig.devices.head.protocol import BAUD
 from rig.devices.opencv_capture import modes_of
 from rig.devices.picamera2_capture import import_picamera2
@@ -83,6 +83,15 @@ class DeviceScan:
     heads: list[SerialPort] = field(default_factory=list)
     duplicate_ids: bool = False
     """Two servos with the same id were found."""
+
+    @property
+    def settings(self) -> dict[Key, Any]:
+        """The settings of the unambiguous devices: those of which exactly one was found."""
+        wanted: dict[Key, Any] = {}
+        for what, found in self.candidates.items():
+            if len(found) == 1 and not (what == "servo" and self.duplicate_ids):
+                wanted |= found[0].settings
+        return wanted
 
     @property
     def candidates(self) -> dict[str, list[Candidate]]:

@@ -9,10 +9,9 @@ import numpy as np
 from rig.config import ImuConfig
 from rig.core.next_steps import Do, SomeSteps
 from rig.devices.bno055 import SLOW_BUS
-from rig.devices.head.opening import open_head
+from rig.devices.head.head import open_head
 from rig.devices.head.protocol import BAUD
-from rig.devices.imu import Imu, ImuSamples
-from rig.devices.open_imu import open_imu
+from rig.devices.imu import Imu, ImuSamples, open_imu
 from rig.doctor.bus_scan import FoundImu, scan_imus, unusable_address, use_another_imu
 from rig.doctor.context import DoctorContext
 from rig.doctor.finding import Finding, FindingCode, bad, fine, of_error, warning

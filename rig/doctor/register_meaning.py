@@ -1,8 +1,8 @@
 """The meaning of a servo's registers, with the units of the e-manual."""
 
 from rig.core.phrases import angle_words, filled, number
-from rig.devices.dynamixel.register_servo import hardware_errors
 from rig.devices.dynamixel.registers import ControlTable
+from rig.devices.dynamixel.servo import hardware_errors
 
 BAUD_CODES = {9_600: 0, 57_600: 1, 115_200: 2, 1_000_000: 3, 2_000_000: 4, 3_000_000: 5, 4_000_000: 6, 4_500_000: 7}
 """Values of Baud Rate, Protocol 2.0."""

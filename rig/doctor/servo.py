@@ -9,9 +9,7 @@ from rig.config.servos import USE_ANOTHER
 from rig.core.clock import seconds_between
 from rig.core.errors import DeviceMismatch, DeviceNotFound, DeviceSilent
 from rig.core.next_steps import Do, SomeSteps
-from rig.devices.dynamixel.opening import open_servo
 from rig.devices.dynamixel.port import SerialConnection
-from rig.devices.dynamixel.register_servo import RegisterServo
 from rig.devices.dynamixel.registers import (
     DynamixelModel,
     control_table,
@@ -20,6 +18,7 @@ from rig.devices.dynamixel.registers import (
     protocol_of,
     servo_plugin,
 )
+from rig.devices.dynamixel.servo import DynamixelServo, open_servo
 from rig.devices.servo import Servo
 from rig.doctor.bus_scan import BAUD_RATES, BAUD_RATES_1, BaudScan, FoundServo, scan_servos, without_echoes
 from rig.doctor.context import DoctorContext
@@ -71,11 +70,11 @@ def servo(context: DoctorContext) -> Iterator[Finding | str]:
         for remark in found.remarks:
             fix = "Stay at the bench, or use a servo of the X series"
             yield warning("servo", FindingCode.SERVO_LIMITATION, fix, remark=remark)
-        if isinstance(found, RegisterServo):
+        if isinstance(found, DynamixelServo):
             yield from _others_on_bus(context, wire)
             yield from _settings(found)
         yield from _condition(context, found)
-        if isinstance(found, RegisterServo):
+        if isinstance(found, DynamixelServo):
             yield from _bus_quality(context, found)
 
 
@@ -148,7 +147,7 @@ def foreign_bytes(port: str, scan: BaudScan) -> Finding:
     return warning("servo", FindingCode.FOREIGN_BYTES, fix, port=port, baud=scan.baud)
 
 
-def _settings(found: RegisterServo) -> Iterator[Finding]:
+def _settings(found: DynamixelServo) -> Iterator[Finding]:
     differences = found.setting_differences()
     if not differences:
         yield fine("servo", FindingCode.SETTINGS_CORRECT)
@@ -190,7 +189,7 @@ def _condition(context: DoctorContext, found: Servo) -> Iterator[Finding]:
         yield fine("servo", FindingCode.TEMPERATURE, **temperature)
 
 
-def _bus_quality(context: DoctorContext, found: RegisterServo) -> Iterator[Finding]:
+def _bus_quality(context: DoctorContext, found: DynamixelServo) -> Iterator[Finding]:
     clock = context.computer.clock
     before = found.bus_statistics
     ticks = _ticks(found)
@@ -216,7 +215,7 @@ def _bus_quality(context: DoctorContext, found: RegisterServo) -> Iterator[Findi
         yield fine("servo", FindingCode.READINGS, **quality)
 
 
-def _ticks(found: RegisterServo) -> int | None:
+def _ticks(found: DynamixelServo) -> int | None:
     """Return the servo's own clock in milliseconds; None for a model without a clock."""
     table = control_table(found.identity.model, found.identity.firmware)
     if "Realtime Tick" not in table:

@@ -90,7 +90,7 @@ def write_results(results: Mapping[str, Any], folder: Path) -> None:
         "results.csv": text.getvalue().encode(),
     }
     if "methods" in results:
-        files |= {f"{name}.svg": figure.svg().encode() for name, figure in figures(dict(results)).items()}
+        files |= {f"{name}.svg": figure.svg(alone=True).encode() for name, figure in figures(dict(results)).items()}
     step = Do.RUN_AGAIN(out="FOLDER")
     with os_errors_as(UsageError, f"The results cannot be written to {folder}.", next_step=step):
         folder.mkdir(parents=True, exist_ok=True)

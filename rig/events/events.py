@@ -26,7 +26,7 @@ SCHEMA = 1
 
 
 class NoteCode(StrEnum):
-    """The subjects of notes; `rig.events.note_wording.note_words` has their sentences."""
+    """The subjects of notes; `rig.events.wording.note_words` has their sentences."""
 
     MIXED_EMPTY_TABLE = "mixed-empty-table"
     ENROLLED_WITHOUT_EMPTY_TABLE = "enrolled-without-empty-table"

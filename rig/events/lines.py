@@ -38,17 +38,19 @@ from rig.events.events import (
     Waiting,
     Warned,
 )
-from rig.events.note_wording import note_steps, note_words, wait_words
 from rig.events.wording import (
     answer_lines,
     comparison_words,
     decision_words,
     move_words,
+    note_steps,
+    note_words,
     scan_words,
     share_words,
     similar_objects_words,
     unwinding_words,
     verification_words,
+    wait_words,
 )
 from rig.views.capture import rejection_text
 

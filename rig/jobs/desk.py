@@ -10,7 +10,7 @@ from rig.bench import Bench
 from rig.bench.bench import DEVICES
 from rig.catalog import Action, Catalog
 from rig.catalog.jobs import JobProgress
-from rig.catalog.shared import deliver_journal, delivery_words, failure_words, open_for_enrollment
+from rig.catalog.journal import deliver_journal, delivery_words, failure_words, open_for_enrollment
 from rig.config import RigConfig
 from rig.config.catalog_place import CatalogPlace
 from rig.core.clock import Clock, SystemClock

@@ -1,18 +1,32 @@
-"""The job that checks everything that a bench needs."""
+"""The job that checks everything that a bench needs, and the support bundle with what it found."""
 
+import json
+import platform
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
+from importlib.metadata import distributions
+from io import BytesIO
 from pathlib import Path
+from typing import Any
+from zipfile import ZIP_DEFLATED, ZipFile
 
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.catalog import Catalog
 from rig.config import RigConfig
 from rig.core.errors import ConfigError, RigError
+from rig.core.json_form import plain
+from rig.core.masking import masked
 from rig.core.next_steps import Do
 from rig.doctor import examination
 from rig.doctor.checks import CHECKS
 from rig.doctor.context import DoctorContext
 from rig.doctor.finding import Finding, FindingCode, Severity, bad, fine, of_error
 from rig.jobs.desk import Result, Steps
+from rig.safety.saved_state import FileStore
+from rig.views.image_files import encode
 
 
 def check_configuration(
@@ -87,3 +101,55 @@ def _findings(
             yield from examination.run_checks(context, CHECKS, progress)
     except RigError as error:  # there is no such bench, or no such part of it
         yield of_error("bench", error)
+
+
+def support_bundle(
+    findings: Sequence[Mapping[str, Any]],
+    load: Callable[[], RigConfig],
+    file: Path | None,
+    bench: str | None,
+    open_catalog: Callable[[], Catalog],
+    image_bgr: Callable[[], NDArray[np.uint8]] | None,
+) -> bytes:
+    """Return a ZIP file for a person who helps without seeing the bench: findings, log, configuration and versions.
+
+    ``image_bgr`` takes an image of the camera for it. Passwords and tokens are masked. What cannot be read is left out;
+    the list ``missing`` in ``versions.json`` has the reason.
+    """
+
+    def log() -> bytes:
+        with open_catalog() as catalog:
+            return _masked_json([plain(entry) | {"time_utc": entry.time_utc.isoformat()} for entry in catalog.log()])
+
+    def state() -> bytes:
+        path = load().state_path(bench or load().default_bench)
+        return _masked_json(FileStore(path).load().model_dump(mode="json"))
+
+    parts = {
+        "configuration.json": lambda: _masked_json(load().model_dump(mode="json")),
+        "state.json": state,
+        "log.json": log,
+    }
+    if file is not None:
+        parts["rig.toml"] = lambda: str(masked(file.read_text("utf-8"))).encode()
+    if image_bgr is not None:
+        parts["camera.png"] = lambda: encode(image_bgr())
+    contents: dict[str, bytes] = {"findings.json": _masked_json(findings)}
+    missing: list[str] = []
+    for name, read in parts.items():
+        try:
+            contents[name] = read()
+        except (RigError, OSError) as error:
+            missing.append(f"{name}: {error}")
+    versions = {one.metadata["Name"]: one.version for one in distributions()}
+    system = {"python": platform.python_version(), "system": platform.platform(), "machine": platform.machine()}
+    contents["versions.json"] = _masked_json({**system, "packages": versions, "missing": missing})
+    packed = BytesIO()
+    with ZipFile(packed, "w", ZIP_DEFLATED) as bundle:
+        for name, content in contents.items():
+            bundle.writestr(name, content)
+    return packed.getvalue()
+
+
+def _masked_json(value: Any) -> bytes:
+    return json.dumps(masked(value), indent=1, default=str).encode()

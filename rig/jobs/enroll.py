@@ -4,7 +4,7 @@ from collections.abc import Generator, Mapping, Sequence
 from contextlib import AbstractContextManager, closing, nullcontext
 
 from rig.catalog import Catalog
-from rig.catalog.shared import comparable_views, journal_words
+from rig.catalog.journal import comparable_views, journal_words
 from rig.core.clock import Clock
 from rig.events.events import Enrolled, Event, Started
 from rig.jobs.desk import Desk, Remark, Steps

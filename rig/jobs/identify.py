@@ -17,7 +17,6 @@ from rig.plans.identify import identify as identify_one
 from rig.plans.identify import watch as watch_table
 from rig.search.model import CurrentModel
 from rig.search.saved_run import saving
-from rig.search.session import SHOWN
 from rig.search.strategies import descriptor_for
 from rig.search.strategies import strategy as strategy_named
 from rig.views.description import PAPER_DESCRIPTOR
@@ -29,7 +28,6 @@ def identify(
     *,
     strategy: str | None = None,
     max_views: int | None = None,
-    top: int = SHOWN,
     seed: int = 0,
     watch: bool = False,
     sample: str | None = None,
@@ -48,7 +46,7 @@ def identify(
         Its name; the default is ``identify.strategy``.
     max_views
         The default is ``identify.max_views``.
-    top, seed, live
+    seed, live
         As for `rig.plans.identify.identify`.
     watch
         Wait for the next object after each answer, until the job is closed.
@@ -92,7 +90,7 @@ def identify(
             def one() -> Generator[Event, None, Identified]:
                 enrolled = model() if watch else known  # objects enrolled meanwhile are found
                 return identify_one(
-                    bench, enrolled, config=settings, placer=placer, strategy=chosen, seed=seed, top=top, live=live
+                    bench, enrolled, config=settings, placer=placer, strategy=chosen, seed=seed, live=live
                 )
 
             events: Generator[Event, None, object] = watch_table(bench, one) if watch else one()

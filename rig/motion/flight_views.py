@@ -13,7 +13,7 @@ from rig.devices.camera import CameraLocks, Frame
 from rig.motion.scan_speed import smear_px, time_sigma_ms
 from rig.motion.trajectory import Trajectory
 from rig.motion.turntable import Flight, Turntable
-from rig.views.capture import Attempt, ImageQuality, MotionEvidence, RejectReason, ViewEvidence
+from rig.views.capture import Attempt, MotionEvidence, checked
 from rig.views.stream import FrameStream, after_middle_row_ns, middle_ns
 
 READINGS: Final = 8
@@ -26,21 +26,9 @@ FEWEST_STAMPS: Final = 4
 
 @dataclass(eq=False)
 class FlightFrames:
-    """The frames of one flight, or of several flights with one trajectory.
+    """The frames of one flight, or of several flights with one trajectory; the table must have torque on.
 
-    Parameters
-    ----------
-    bench, table
-        An open bench, and its table with torque on.
-    newest
-        Whether frames are dropped for which the program is too slow.
-
-    Attributes
-    ----------
-    recorder
-        The recorder of the trajectory.
-    stream
-        The frames of the camera.
+    With ``newest`` those frames are dropped for which the program is too slow.
     """
 
     bench: Bench
@@ -104,56 +92,31 @@ class FlightFrames:
     ) -> Attempt:
         """Return a frame of this flight as an attempt at a view: its evidence, and the reasons to reject it.
 
-        Parameters
-        ----------
-        locks, locks_hold
-            The camera's settings before the flight, and whether they have not changed.
-        stamps
-            The number of the last time stamps that the frame's is compared with; 0 for all of this flight.
+        ``locks`` are the camera's settings before the flight. The frame's time stamp is compared with the last
+        ``stamps`` ones; 0 for all of this flight.
         """
         config = self.bench.config
-        quality = ImageQuality.of(frame.image_bgr, config.view)
         middle = middle_ns(frame.exposed_ns, config.camera_time)
         motion = trajectory.at([middle])
         speed_dps = abs(float(motion.rate_dps[0]))
         time_deg = speed_dps * time_sigma_ms(config) * 1e-3
-        evidence = MotionEvidence(
-            middle,
-            float(motion.angle_deg[0]),
-            float(np.hypot(motion.sigma_deg[0], time_deg)),
-            speed_dps,
-            smear_px(config, speed_dps),
-            trajectory.residual_deg,
-        )
-        reasons = []
-        if not frame.stamped or frame.exposed_ns in self.irregular_ns(stamps):
-            reasons.append(RejectReason.TIME_UNCERTAIN)
-        if evidence.angle_sigma_deg > config.view.max_angle_sigma_deg or not trajectory.consistent:
-            reasons.append(RejectReason.ANGLE_UNCERTAIN)
-        if evidence.smear_px > 1.1 * config.view.max_smear_px:  # the speed varies about the chosen one
-            reasons.append(RejectReason.SMEARED)
-        if frame.repeated:
-            reasons.append(RejectReason.REPEATED_FRAME)
-        if not locks_hold:
-            reasons.append(RejectReason.LOCKS_CHANGED)
-        reasons += quality.reasons(config.view)
-        return Attempt(
+        return checked(
             1,
-            frame.image_bgr,
-            ViewEvidence(
-                settled_ns=self._begun_ns,
-                exposed_ns=frame.exposed_ns,
-                sharpness=quality.sharpness,
-                mean_level=quality.mean_level,
-                dark_share=quality.dark_share,
-                saturated_share=quality.saturated_share,
-                repeated=frame.repeated,
-                locks=locks,
-                locks_hold=locks_hold,
-                stillness=None,
-                motion=evidence,
+            frame,
+            config.view,
+            settled_ns=self._begun_ns,
+            locks=locks,
+            locks_hold=locks_hold,
+            motion=MotionEvidence(
+                middle,
+                float(motion.angle_deg[0]),
+                float(np.hypot(motion.sigma_deg[0], time_deg)),
+                speed_dps,
+                smear_px(config, speed_dps),
+                trajectory.residual_deg,
             ),
-            tuple(reasons),
+            time_known=frame.stamped and frame.exposed_ns not in self.irregular_ns(stamps),
+            angle_known=trajectory.consistent,
         )
 
     def at_the_object(

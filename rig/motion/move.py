@@ -75,7 +75,7 @@ FRAMES: Final = 1.5
 
 
 @dataclass(frozen=True, slots=True)
-class MotionModel:
+class MotionTimes:
     """The duration of moves and views, from the table's motion profile and the camera's frame rate."""
 
     config: RigConfig

@@ -44,7 +44,7 @@ FEWEST_READINGS: Final = 4
 
 
 @dataclass(frozen=True, slots=True)
-class Motion:
+class PlatterMotion:
     """Angle, its standard uncertainty (°), and rate (°/s) of the platter at some times, float64 (n,) each."""
 
     angle_deg: Floats
@@ -54,19 +54,13 @@ class Motion:
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """The platter's angle as a function of time; `TrajectoryRecorder.fit` makes it.
-
-    Attributes
-    ----------
-    residual_deg
-        The largest mean deviation of `SLIP_READINGS` encoder readings in a row.
-    start_ns, end_ns
-        Times of the first and the last gyro sample.
-    """
+    """The platter's angle as a function of time; `TrajectoryRecorder.fit` makes it."""
 
     residual_deg: float
+    """The largest mean deviation of `SLIP_READINGS` encoder readings in a row."""
     start_ns: int
     end_ns: int
+    """Times of the first and the last gyro sample."""
     _values: Floats
     _covariance: Floats
     _time_s: Floats
@@ -80,7 +74,7 @@ class Trajectory:
         """Whether encoder and gyro measured the same motion, apart from their known errors."""
         return self.residual_deg <= SLIP_DEG
 
-    def at(self, times_ns: ArrayLike) -> Motion:
+    def at(self, times_ns: ArrayLike) -> PlatterMotion:
         """Return the platter's motion at some times, int64 (n,); outside the samples the uncertainty grows fast."""
         t: Floats = (np.atleast_1d(np.asarray(times_ns, np.int64)) - self.start_ns).astype(np.float64) * 1e-9
         delay_s = self._values[3]
@@ -95,7 +89,7 @@ class Trajectory:
         unknown = ACCELERATION_DPS2 / 4 * np.square(np.where(outside_s == 0, inside_s, outside_s))
         variance = np.einsum("ij,jk,ik->i", design, self._covariance, design) + self._drift_deg**2 + unknown**2
         variance += np.square(rate * READ_TIME_S)  # the same error applies to all readings
-        return Motion(angle, np.sqrt(variance), rate * (1 + self._values[2]) - self._values[1])
+        return PlatterMotion(angle, np.sqrt(variance), rate * (1 + self._values[2]) - self._values[1])
 
 
 def _design(at_s: Floats, t: Floats, time_s: Floats, rate: Floats, integral: Floats, gaps: Floats) -> Floats:
@@ -107,13 +101,7 @@ def _design(at_s: Floats, t: Floats, time_s: Floats, rate: Floats, integral: Flo
 
 @dataclass(eq=False)
 class TrajectoryRecorder:
-    """Collects encoder readings and gyro samples of a motion.
-
-    Attributes
-    ----------
-    readings
-        The encoder readings so far: times and table angles.
-    """
+    """Collects encoder readings (times and table angles) and gyro samples of a motion."""
 
     resolution_deg: float
     backlash_deg: float

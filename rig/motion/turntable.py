@@ -72,8 +72,6 @@ class Turntable(AbstractContextManager["Turntable"]):
 
     Parameters
     ----------
-    bench
-        An open bench.
     trust_gyro
         Whether a motion is stopped if the gyro contradicts the encoder. Calibrations of the gyro set it to False.
     first_rest_s
@@ -198,6 +196,7 @@ class Turntable(AbstractContextManager["Turntable"]):
         cable; its own watchdog stops it. `MotionStopped`: the operator requested a stop. `FaultLatched`, `NotReady`: an
         earlier motion was interrupted.
         """
+        # All stops are known before anything moves, so that the whole path can be stored and monitored.
         self.check_target(target_deg)
         waypoints = self._waypoints(target_deg)
         rotation = self._begin(*waypoints)
@@ -402,6 +401,7 @@ class Turntable(AbstractContextManager["Turntable"]):
         arrival = self._arrival_at(goal_deg, quiet_s, self._allowed_s(goal_deg - self._rest_deg))
         rest_deg = None
         while rest_deg is None:
+            # The next frame may change the goal.
             asked_deg = flight.each()
             next_deg = goal_deg if asked_deg is None else min(max(asked_deg, low_deg), high_deg)
             state, angle_deg = self._read(gyro_now=True)

@@ -9,6 +9,7 @@ Decisions: docs/decisions/0002, docs/decisions/0047.
 """
 
 from collections.abc import Generator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -23,7 +24,7 @@ from hbr.model import symmetry
 from hbr.model.views import Views
 from rig.bench import Bench
 from rig.catalog import Catalog, OpenEnrollment, Provenance, View
-from rig.catalog.derived import unfinished_camera_settings
+from rig.catalog.sessions import unfinished_camera_settings
 from rig.core.clock import seconds_between
 from rig.core.errors import LimitExceeded, ObjectMoved, ObjectNotFound, RigError, RotationDisagreement
 from rig.core.json_form import plain
@@ -40,7 +41,7 @@ from rig.plans.estimate import even_azimuths, table_angles
 from rig.views.capture import Attempt, Viewer, image_similarity
 from rig.views.description import DescribedView, ViewDescriber
 from rig.views.empty_table import empty_table_status
-from rig.views.image_files import Encoder
+from rig.views.image_files import encode
 
 SAME_SIMILARITY: Final = 0.97
 """Two images of an object at one angle are more similar; after a shift by a centimetre they are less similar."""
@@ -187,7 +188,7 @@ class EnrollmentViews:
         # Check the nearest frame to each angle, and store the accepted ones.
         locks, locks_hold = before.evidence.locks, before.evidence.locks_hold and after.evidence.locks_hold
         stored: set[int] = set()
-        encoder = Encoder()
+        encoder = ThreadPoolExecutor(1, "encoder")
         for index, angle_deg in angles_deg.items():
             _, frame = nearest.pop(index, (inf, None))
             if frame is None:
@@ -199,7 +200,7 @@ class EnrollmentViews:
             if not attempt.accepted:
                 yield Rejected(index, attempt.number, attempt.reasons, attempt.evidence)
                 continue
-            attempt = replace(attempt, encoded=encoder.begin(attempt.image_bgr))
+            attempt = replace(attempt, encoded=encoder.submit(encode, attempt.image_bgr))
             segmented = self.segment(attempt.image_bgr)
             attempt = frames.at_the_object(attempt, segmented.segmentation, trajectory)
             assert attempt.evidence.motion is not None

@@ -14,7 +14,7 @@ from rig.core.clock import seconds_between
 from rig.core.errors import LimitExceeded
 from rig.core.next_steps import Do
 from rig.events.events import Accepted, Event
-from rig.motion.move import MotionModel
+from rig.motion.move import MotionTimes
 from rig.motion.scan_speed import takes_in_motion
 from rig.motion.turntable import Turntable
 
@@ -131,7 +131,7 @@ def dry_run(
     known = {} if catalog is None else {summary.name: summary for summary in catalog.known_objects()}
     table_deg = Turntable(bench).angle_deg()
     limits_deg, sign = bench.config.table.limits_deg, bench.config.table.orientation_sign
-    model = MotionModel(bench.config)
+    model = MotionTimes(bench.config)
     found = []
     for given, own_views in names.items():
         name = clean_name(given)
@@ -190,14 +190,14 @@ class TimeLeft:
     Parameters
     ----------
     model
-        Motion model of the bench.
+        Durations of moves and views on the bench.
     angles_deg
         Table angles of the coming views, in their order.
     in_motion
         Whether they are taken in one revolution; they are reported after it.
     """
 
-    model: MotionModel
+    model: MotionTimes
     angles_deg: Sequence[float]
     in_motion: bool = False
     _exposed_ns: list[int] = field(default_factory=list, init=False)

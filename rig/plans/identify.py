@@ -22,9 +22,9 @@ from hbr.dense.local_difference import LocalView
 from hbr.dense.session import answered
 from rig.bench import Bench, Placer
 from rig.catalog import Catalog, Provenance
+from rig.catalog.journal import open_for_enrollment
 from rig.catalog.records import Outcome
 from rig.catalog.results import Answer, NewResult, record
-from rig.catalog.shared import open_for_enrollment
 from rig.config import RigConfig
 from rig.config.catalog_place import CatalogPlace
 from rig.core.clock import Clock, seconds_between

@@ -1,6 +1,5 @@
 """Reports: collected from the events of a plan, written as one self-contained HTML file."""
 
-from rig.report.contact_sheet import contact_sheet, thumbnail
 from rig.report.page import Meta, render_report, write_report
 from rig.report.records import Correctness, EnrollmentRecord, IdentificationRecord, Truth
 from rig.report.summary import count_of
@@ -11,9 +10,7 @@ __all__ = [
     "IdentificationRecord",
     "Meta",
     "Truth",
-    "contact_sheet",
     "count_of",
     "render_report",
-    "thumbnail",
     "write_report",
 ]

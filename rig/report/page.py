@@ -1,50 +1,50 @@
 """The report: one self-contained HTML file."""
 
-from base64 import b64encode
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
-import cv2
 from jinja2 import Template
 from markupsafe import Markup
 
+from hbr import Outcome
 from hbr.core.angles import wrap360
-from rig.charts.azimuth_ring import RingView, azimuth_ring
-from rig.charts.decision_chart import decision_chart
-from rig.charts.polar_path import polar_path
-from rig.charts.score_chart import score_chart
+from rig.charts.candidates import Styles, candidates_chart
+from rig.charts.compass import decision_chart, polar_path
+from rig.charts.xy import MEASURED, MODEL, Axis, Chart, Series
 from rig.core.errors import UsageError, os_errors_as
 from rig.core.files import write
 from rig.core.next_steps import Do, in_words
-from rig.core.phrases import azimuth_words, counted, listed, sentence, signed
+from rig.core.phrases import azimuth_words, counted, sentence, signed
 from rig.core.templates import environment
-from rig.events.events import Candidate, Ranked
-from rig.events.note_wording import note_steps, note_words
+from rig.events.events import Decided
 from rig.events.wording import (
     answer_words,
     comparison_words,
     decision_words,
     move_words,
+    note_steps,
+    note_words,
     outcome_words,
     ranking_words,
     share_words,
     verification_words,
 )
-from rig.report.arc_figure import ArcFigure, arc_figure
-from rig.report.contact_sheet import Image, contact_sheet, thumbnail
-from rig.report.records import TILE, Correctness, EnrollmentRecord, IdentificationRecord
-from rig.report.summary import SummaryItem, enrollment_items, totals
+from rig.report.pictures import contact_sheet, data_uri, thumbnail
+from rig.report.records import Correctness, EnrollmentRecord, IdentificationRecord, ReportView
+from rig.report.summary import enrollment_items, totals
+from rig.search.saved_run import SavedRun
 
-JPEG_QUALITY: Final = 84
-COLUMNS: Final = 12
 _STAMP: Final = (56, 56)
+_LEADING: Final = 3
+"""Candidates in the table of a view."""
+_REASONS: Final = 3
+"""Reasons of rejected frames that are named before a view."""
 _FEW: Final = 3
 """Up to this number of searches or objects are all expanded; of more, only the first and the wrong ones."""
-
 
 _HEADS: Final = (
     ("#", "number of the search; it leads to its details", "n"),
@@ -94,14 +94,15 @@ def render_report(
     meta
         Conditions and wall-clock times.
     """
+    styles = Styles()
     with_truth = any(record.truth is not None for record in identifications)
     return _template().render(
         title=title,
         date="" if meta.date is None else f"{meta.date.astimezone(UTC):%Y-%m-%d %H:%M} UTC",
         summary=summary,
-        totals=totals(enrollments, identifications),
+        totals=list(totals(enrollments, identifications)),
         retrievals=[
-            _retrieval(number, record, unfold=number == 1 or len(identifications) <= _FEW)
+            _retrieval(number, record, styles, unfold=number == 1 or len(identifications) <= _FEW)
             for number, record in enumerate(identifications, 1)
         ],
         objects=[
@@ -113,6 +114,29 @@ def render_report(
         conditions=_groups(meta.conditions),
         wall_clock=_groups(meta.wall_clock),
     )
+
+
+def run_report(saved: SavedRun) -> str:
+    """Return the page about a saved run: the answer, the camera's path, the candidates and the decisions.
+
+    Raises
+    ------
+    UsageError
+        The run is damaged.
+    """
+    record = IdentificationRecord(region=saved.config.view.roi)
+    about = saved.about
+    with saved.damage():
+        for event in saved.events():
+            record.add(event)
+        answer = record.answer
+        found = "no answer" if answer is None else outcome_words(answer)
+        meta = Meta(
+            conditions={"bench": about["bench"], **record.conditions, "devices": about["devices"]},
+            wall_clock={"software": about["software"]},
+            date=datetime.fromisoformat(about["started_utc"]),
+        )
+        return render_report(f"Search: {found}", _answer(record), [], [record], meta=meta)
 
 
 def write_report(path: Path, html: str) -> None:
@@ -131,80 +155,36 @@ def write_report(path: Path, html: str) -> None:
 
 @cache
 def _template() -> Template:
-    return environment("rig.report").get_template("page.html.j2")
+    return environment("rig.report", "rig.charts").get_template("page.html.j2")
 
 
-class _Frame(NamedTuple):
-    number: int
-    picture: str
-    where: str
-    rejected: str
-    leading: list[tuple[str, str, str]]
-    margin: str
-    decided: str
-    moved: str
-    decision: str
+Shown = dict[str, Any]
+"""The values of a part of the page, by their names in the template."""
 
 
-class _Retrieval(NamedTuple):
-    number: int
-    stamp: str
-    truth: str
-    answer: str
-    correctness: Correctness | None
-    views: str
-    travelled: str
-    pose_error: str
-    score: str
-    margin: str
-    words: str
-    path: Markup
-    compared: bool
-    scores: Markup
-    arc: ArcFigure
-    notes: list[str]
-    decisions: list[Markup]
-    differs: str
-    verification: str
-    comparison: str
-    frames: list[_Frame]
-    unfold: bool
-
-
-class _Object(NamedTuple):
-    number: int
-    stamp: str
-    name: str
-    line: str
-    retakes: int
-    sheet: str
-    ring: Markup
-    items_: list[SummaryItem]
-    unfold: bool
-
-
-def _retrieval(number: int, record: IdentificationRecord, *, unfold: bool) -> _Retrieval:
+def _retrieval(number: int, record: IdentificationRecord, styles: Styles, *, unfold: bool) -> Shown:
     answer, views, compared = record.answer, record.views, record.compared
     error_deg = record.pose_error_deg
-    path = scores = Markup()
-    if views:
+    shown = record.shown
+    path = candidates = Markup()
+    if len(views) > 1:
         start_deg = _report_azimuth_deg(record, views[0].azimuth_deg)
-        scale = "azimuth on the table" if record.yaw_deg is None else "azimuth as enrolled"
-        path = Markup(polar_path(start_deg, record.steps, scale=scale))
-    if record.ranked:
-        rounds = [{c.name: c.score for c in ranked.candidates} for ranked in record.ranked]
-        truth = record.truth.name if record.truth else None
-        scores = Markup(
-            score_chart(
-                rounds,
-                winner=answer.name if answer else None,
-                truth=truth,
-                min_score=answer.min_score if answer else None,
-            )
+        path = Markup(polar_path(start_deg, record.steps, named={view.index + 1 for view in shown}))
+    rotated_deg, enough = record.rotated_deg, record.enough
+    known = [event for event in record.ranked if event.index in rotated_deg]  # all, except in a damaged run
+    if known:
+        chart = candidates_chart(
+            known,
+            styles,
+            answer=answer.name if answer is not None and answer.outcome is Outcome.FOUND else None,
+            min_score=answer.min_score if answer else None,
+            rotated_deg=rotated_deg if record.in_motion else None,
+            enough_deg=rotated_deg[enough.index] if enough else None,
         )
-    return _Retrieval(
+        candidates = Markup(chart)
+    return Shown(
         number=number,
-        stamp=_data_uri(thumbnail(views[0].picture_bgr, _STAMP)) if views else "",
+        stamp=data_uri(thumbnail(views[0].picture_bgr, _STAMP)) if views else "",
         truth=_truth(record),
         answer=outcome_words(answer) if answer else "no answer",
         correctness=record.correctness,
@@ -213,19 +193,21 @@ def _retrieval(number: int, record: IdentificationRecord, *, unfold: bool) -> _R
         pose_error="–" if error_deg is None else f"{error_deg:.1f}°",
         score=f"{answer.score:.3f}" if answer else "–",
         margin=signed(answer.margin, 3) if answer else "–",
-        words=answer_words(answer) if answer else "The search ended without an answer.",
+        words=_answer(record),
         path=path,
-        compared=any(event.s_left is not None for event in record.decided),
-        scores=scores,
-        arc=arc_figure(record),
+        path_words="on the table" if record.yaw_deg is None else "as enrolled",
+        candidates=candidates,
+        motion=_motion_words(record),
         notes=[f"{sentence(note_words(note))} {in_words(note_steps(note))}" for note in record.notes],
-        decisions=_decisions(record),
-        differs="" if compared is None or compared.picture_bgr is None else _data_uri(compared.picture_bgr),
-        verification="" if record.verified is None else sentence(verification_words(record.verified)),
-        comparison="" if compared is None else sentence(comparison_words(compared)),
-        frames=_frames(record),
+        differs="" if compared is None or compared.picture_bgr is None else data_uri(compared.picture_bgr),
+        frames=[_frame(record, view, styles) for view in shown],
+        hidden=len(views) - len(shown),
         unfold=unfold or record.correctness is Correctness.WRONG,
     )
+
+
+def _answer(record: IdentificationRecord) -> str:
+    return answer_words(record.answer) if record.answer else "The search ended without an answer."
 
 
 def _truth(record: IdentificationRecord) -> str:
@@ -241,79 +223,96 @@ def _report_azimuth_deg(record: IdentificationRecord, azimuth_deg: float) -> flo
     return wrap360(azimuth_deg - (record.yaw_deg or 0.0))
 
 
-def _leading(one: Candidate, ranked: Ranked) -> tuple[str, str, str]:
-    return one.name, f"{one.score:.3f}", share_words(one, ranked.decision)
+def _motion_words(record: IdentificationRecord) -> str:
+    """Return which frames of a search in motion were used; empty for runs that do not contain this."""
+    frames, enough = record.used, record.enough
+    if not frames:
+        return ""
+    last = frames[-1]
+    used = f"{counted(len(frames), 'frame')} of the rotation used (views {frames[0].index + 1} to {last.index + 1})"
+    used += f", {last.rejected} rejected."
+    if enough is None:
+        return f"{used} Their evidence was not enough for an answer before the search ended."
+    when = f"{enough.seconds:.1f} s after the start"
+    where = f"azimuth {azimuth_words(enough.azimuth_deg)}°, after {record.rotated_deg[enough.index]:.0f}° of rotation"
+    return (
+        f"{used} The evidence was enough for an answer from view {enough.index + 1} on: {when}, at {where}. "
+        f"The last frame came after {last.seconds:.1f} s."
+    )
 
 
-def _decisions(record: IdentificationRecord) -> list[Markup]:
-    """Return a chart for each decision that compared all possible rotations."""
-    seen_deg = {view.index: _report_azimuth_deg(record, view.azimuth_deg) for view in record.views}
-    return [
-        Markup(
-            decision_chart(
-                seen_deg[event.index],
-                event.weighed,
-                event.rotation_deg,
-                reason=event.reason,
-                candidates=event.candidates,
-                seen_deg=[azimuth_deg for index, azimuth_deg in seen_deg.items() if index <= event.index],
-                number=event.index + 1,
-            )
-        )
-        for event in record.decided
-        if event.weighed is not None and event.weighed.rotations_deg and event.index in seen_deg
-    ]
+def _frame(record: IdentificationRecord, view: ReportView, styles: Styles) -> Shown:
+    thought = next((event for event in record.ranked if event.index == view.index), None)
+    decided = next((event for event in record.decided if event.index == view.index), None)
+    leading = []
+    if thought:
+        leading = [
+            (one.name, styles[one.name], f"{one.score:.3f}", share_words(one, thought.decision))
+            for one in thought.candidates[:_LEADING]
+        ]
+    # What a search decides at its end follows from all of these, so the last card says all of them.
+    words = [ranking_words(thought)]
+    if view is record.views[-1]:
+        words += [verification_words(record.verified)] if record.verified else []
+        words += [comparison_words(record.compared)] if record.compared else []
+    return Shown(
+        number=view.index + 1,
+        picture=data_uri(view.picture_bgr),
+        where=f"{azimuth_words(_report_azimuth_deg(record, view.azimuth_deg))}°",
+        rejected=_rejections(view),
+        leading=leading,
+        margin=signed(thought.margin, 3) if thought else "",
+        decided=" ".join(sentence(one) for one in words if one),
+        moved=sentence(move_words(view.move)) if view.move and view.index else "",
+        decision=decision_words(decided) if decided else "",
+        chart=_decision(record, view, decided) if decided else Markup(),
+    )
 
 
-def _frames(record: IdentificationRecord) -> list[_Frame]:
-    ranked = {event.index: event for event in record.ranked}
-    decided = {event.index: event for event in record.decided}
-    frames = []
-    for view in record.views:
-        thought = ranked.get(view.index)
-        decision = decided.get(view.index)
-        frames.append(
-            _Frame(
-                number=view.index + 1,
-                picture=_data_uri(view.picture_bgr),
-                where=f"{azimuth_words(_report_azimuth_deg(record, view.azimuth_deg))}°",
-                rejected=listed(view.rejected),
-                leading=[_leading(c, thought) for c in thought.candidates[:3]] if thought else [],
-                decided=sentence(words) if (words := ranking_words(thought)) else "",
-                margin=signed(thought.margin, 3) if thought else "",
-                moved=sentence(move_words(view.move)) if view.move and view.index else "",
-                decision=decision_words(decision) if decision else "",
-            )
-        )
-    return frames
+def _rejections(view: ReportView) -> str:
+    """Return why frames were rejected before a view. A search in motion may reject dozens."""
+    reasons = dict.fromkeys(view.rejected)
+    more = len(reasons) - _REASONS
+    return "; ".join(list(reasons)[:_REASONS]) + (f"; and {more} more" if more > 0 else "")
 
 
-def _object(number: int, record: EnrollmentRecord, *, unfold: bool) -> _Object:
-    views = record.views
-    sheet = stamp = ""
-    ring = Markup()
-    if views:
-        pictures = [view.picture_bgr for view in views]
-        sheet = _data_uri(
-            contact_sheet(
-                pictures, [view.azimuth_deg for view in views], columns=min(COLUMNS, len(pictures)), tile=TILE
-            )
-        )
-        stamp = _data_uri(thumbnail(pictures[0], _STAMP))
-        ring = Markup(azimuth_ring([RingView(v.azimuth_deg, v.evidence.sharpness, len(v.rejected)) for v in views]))
-    retakes = record.retakes
+def _decision(record: IdentificationRecord, view: ReportView, decided: Decided) -> Markup:
+    """Return the chart of a decision; empty if the search did not compare all possible rotations."""
+    if decided.weighed is None or not decided.weighed.rotations_deg:
+        return Markup()
+    seen_deg = [_report_azimuth_deg(record, one.azimuth_deg) for one in record.views if one.index < view.index]
+    here_deg = _report_azimuth_deg(record, view.azimuth_deg)
+    words = f"Decision after view {view.index + 1}: {decision_words(decided)}"
+    return Markup(decision_chart(here_deg, decided.weighed, decided.rotation_deg, words, seen_deg=seen_deg))
+
+
+def _object(number: int, record: EnrollmentRecord, *, unfold: bool) -> Shown:
+    views, retakes = record.views, record.retakes
     line = counted(len(views), "view")
     if record.result is None:
         line += f" of {record.planned}: not finished"
     if retakes:
         line += f", {counted(retakes, 'retake')}"
-    return _Object(number, stamp, record.name, line, retakes, sheet, ring, enrollment_items(record), unfold)
+    shown = Shown(number=number, name=record.name, line=line, unfold=unfold, items=enrollment_items(record), sheet="")
+    if views:
+        pictures, azimuth_deg = [view.picture_bgr for view in views], [view.azimuth_deg for view in views]
+        label = f"Contact sheet of {record.name}: {line}, each with its azimuth in degrees"
+        shown["sheet"] = Markup(contact_sheet(pictures, azimuth_deg, label))
+        shown["stamp"] = data_uri(thumbnail(pictures[0], _STAMP))
+        shown["sharpness"] = Markup(_sharpness(record).svg())
+    return shown
 
 
-def _data_uri(image_bgr: Image) -> str:
-    encoded, jpeg = cv2.imencode(".jpg", image_bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-    assert encoded  # uint8 (H, W, 3) with pixels: `thumbnail` has made it
-    return f"data:image/jpeg;base64,{b64encode(jpeg.tobytes()).decode('ascii')}"
+def _sharpness(record: EnrollmentRecord) -> Chart:
+    """Return the chart of the sharpness of each view."""
+    series = []
+    for label, colour, retaken in (("views", MEASURED, False), ("retaken views", MODEL, True)):
+        views = [view for view in record.views if bool(view.rejected) is retaken]
+        sharpness = [view.evidence.sharpness for view in views]
+        if views:
+            series.append(Series(label, [view.azimuth_deg for view in views], sharpness, colour))
+    around = Axis("azimuth, °", ticks=tuple(90.0 * k for k in range(5)))
+    return Chart("Sharpness of the views", around, Axis("squared levels", span=(0.0,)), series)
 
 
 def _groups(values: Mapping[str, Any]) -> list[tuple[str, list[tuple[str, str]]]]:
@@ -334,5 +333,5 @@ def _text(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:g}"
     if isinstance(value, list | tuple):
-        return ", ".join(_text(item) for item in value)
+        return ", ".join(_text(item) for item in value) or "–"
     return str(value)

@@ -4,15 +4,15 @@ A record has thumbnails instead of images, so that a long run needs little memor
 """
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from enum import StrEnum
-from itertools import pairwise
-from typing import Any, Final
+from itertools import accumulate, pairwise
+from typing import Any, ClassVar, Final
 
 from hbr import Outcome
 from hbr.core.angles import wrap180
 from rig.catalog import View
-from rig.charts.polar_path import PathStep
+from rig.charts.compass import PathStep
 from rig.events.compared import Compared, Verified
 from rig.events.events import (
     Accepted,
@@ -29,7 +29,7 @@ from rig.events.events import (
     Started,
     event_of,
 )
-from rig.report.contact_sheet import Image, Region, thumbnail
+from rig.report.pictures import Image, Region, thumbnail
 from rig.views.capture import ViewEvidence, rejection_text
 
 TILE: Final = (96, 96)
@@ -37,6 +37,9 @@ TILE: Final = (96, 96)
 
 FRAME: Final = (240, 240)
 """Width and height of a frame of a retrieval, pixels."""
+
+VIEWS: Final = 12
+"""Views of a search that a page shows. A search in motion takes sixty: too many to read one by one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,36 +54,8 @@ class ReportView:
     rejected: tuple[str, ...]
 
 
-@dataclass(slots=True)
-class _ViewCollector:
-    """Collects the events of a view into a `ReportView`."""
-
-    size: tuple[int, int]
-    region: Region | None
-    views: list[ReportView] = field(default_factory=list)
-    _move: Moved | None = None
-    _rejected: list[str] = field(default_factory=list)
-
-    def add(self, event: Event) -> None:
-        match event:
-            case Moved():
-                self._move = event
-            case Rejected():
-                self._rejected.append(", ".join(rejection_text(reason, event.evidence) for reason in event.reasons))
-            case Accepted():
-                rejected, self._rejected = tuple(self._rejected), []
-                self.views.append(replace(self.view(event), move=self._move, rejected=rejected))
-            case _:
-                pass
-
-    def view(self, taken: Accepted) -> ReportView:
-        box = None if taken.segmentation is None else taken.segmentation.get("box_px")
-        picture = thumbnail(taken.image_bgr, self.size, self.region, box)
-        return ReportView(taken.index, taken.azimuth_deg, picture, taken.evidence, None, ())
-
-
-class EnrollmentRecord:
-    """One enrollment, collected event by event.
+class _Record:
+    """The views of a plan, collected event by event.
 
     Parameters
     ----------
@@ -88,18 +63,49 @@ class EnrollmentRecord:
         The part of the images to show: x, y, width, height in pixels (`view.roi` of the configuration); None shows all.
     """
 
+    size: ClassVar[tuple[int, int]]
+    """Width and height of its pictures."""
+
     def __init__(self, *, region: Region | None = None) -> None:
+        self.views: list[ReportView] = []
+        """The accepted views in the order of capture."""
+        self.conditions: Mapping[str, Any] = {}
+        self._region = region
+        self._move: Moved | None = None
+        self._rejected: list[str] = []
+
+    def add(self, event: Event) -> None:
+        """Add the next event of the plan."""
+        match event:
+            case Started():
+                self.conditions = event.conditions
+            case Moved():
+                self._move = event
+            case Rejected():
+                self._rejected.append(", ".join(rejection_text(reason, event.evidence) for reason in event.reasons))
+            case Accepted():
+                rejected, self._rejected = tuple(self._rejected), []
+                self.views.append(self._view(event, self._move, rejected))
+            case _:
+                pass
+
+    def _view(self, taken: Accepted, move: Moved | None = None, rejected: tuple[str, ...] = ()) -> ReportView:
+        box = None if taken.segmentation is None else taken.segmentation.get("box_px")
+        picture = thumbnail(taken.image_bgr, self.size, self._region, box)
+        return ReportView(taken.index, taken.azimuth_deg, picture, taken.evidence, move, rejected)
+
+
+class EnrollmentRecord(_Record):
+    """One enrollment, collected event by event."""
+
+    size = TILE
+
+    def __init__(self, *, region: Region | None = None) -> None:
+        super().__init__(region=region)
         self.name = ""
         self.planned = 0
-        self.conditions: Mapping[str, Any] = {}
         self.result: Enrolled | None = None
         self.similar: SimilarObjects | None = None
-        self._collector = _ViewCollector(TILE, region)
-
-    @property
-    def views(self) -> list[ReportView]:
-        """The accepted views in the order of capture."""
-        return self._collector.views
 
     @property
     def retakes(self) -> int:
@@ -107,10 +113,9 @@ class EnrollmentRecord:
         return sum(len(view.rejected) for view in self.views)
 
     def add(self, event: Event) -> None:
-        """Add the next event of the plan."""
-        self._collector.add(event)
+        super().add(event)
         if isinstance(event, Started):
-            self.name, self.planned, self.conditions = event.name or "", event.views, event.conditions
+            self.name, self.planned = event.name or "", event.views
         elif isinstance(event, Enrolled):
             self.result = event
         elif isinstance(event, SimilarObjects):
@@ -124,8 +129,8 @@ class EnrollmentRecord:
                 taken = {name: getattr(view, name) for name in ("index", "azimuth_deg", "evidence")}
                 event = event_of({"event": "accepted", **taken, "segmentation": segmentation or None})
                 assert isinstance(event, Accepted)
-                self._collector.views.append(self._collector.view(replace(event, image_bgr=image_bgr)))
-        self._collector.views.sort(key=lambda view: view.index)
+                self.views.append(self._view(replace(event, image_bgr=image_bgr)))
+        self.views.sort(key=lambda view: view.index)
         self.planned = max(self.planned, len(self.views))
 
 
@@ -156,20 +161,14 @@ class Correctness(StrEnum):
     WRONG = "wrong"
 
 
-class IdentificationRecord:
-    """One search, collected event by event.
+class IdentificationRecord(_Record):
+    """One search, collected event by event; ``truth`` is the object on the table, None if it is not known."""
 
-    Parameters
-    ----------
-    truth
-        The object on the table; None if it is not known.
-    region
-        The part of the images to show: x, y, width, height in pixels (`view.roi` of the configuration); None shows all.
-    """
+    size = FRAME
 
     def __init__(self, *, truth: Truth | None = None, region: Region | None = None) -> None:
+        super().__init__(region=region)
         self.truth = truth
-        self.conditions: Mapping[str, Any] = {}
         self.notes: tuple[Note, ...] = ()
         self.ranked: list[Ranked] = []
         self.used: list[FrameUsed] = []
@@ -177,19 +176,12 @@ class IdentificationRecord:
         self.verified: Verified | None = None
         self.compared: Compared | None = None
         self.answer: Identified | None = None
-        self._collector = _ViewCollector(FRAME, region)
-
-    @property
-    def views(self) -> list[ReportView]:
-        """The accepted views in the order of capture."""
-        return self._collector.views
 
     def add(self, event: Event) -> None:
-        """Add the next event of the plan."""
-        self._collector.add(event)
+        super().add(event)
         match event:
             case Started():
-                self.conditions, self.notes = event.conditions, event.notes
+                self.notes = event.notes
             case Ranked():
                 self.ranked.append(event)
             case FrameUsed():
@@ -238,6 +230,32 @@ class IdentificationRecord:
         return answer.yaw_set_deg[0] if answer is not None and answer.name is not None and answer.yaw_set_deg else None
 
     @property
+    def shown(self) -> list[ReportView]:
+        """The views of a page: those after which the search decided, at most `VIEWS`, evenly chosen."""
+        decided = {event.index for event in self.ranked}
+        views = [view for view in self.views if view.index in decided] or self.views
+        if len(views) <= VIEWS:
+            return views
+        return [views[round(k * (len(views) - 1) / (VIEWS - 1))] for k in range(VIEWS)]
+
+    @property
+    def in_motion(self) -> bool:
+        """Whether a view was taken in motion."""
+        return any(view.evidence.motion is not None for view in self.views)
+
+    @property
+    def enough(self) -> FrameUsed | None:
+        """The frame in motion after which the evidence was enough for an answer; None if there is none."""
+        taken = self.rotated_deg
+        return next((one for one in self.used if one.outcome is not Outcome.CONTINUE and one.index in taken), None)
+
+    @property
+    def rotated_deg(self) -> dict[int, float]:
+        """The rotation of the camera since the first view, by the index of each view; always the short way."""
+        ways = (abs(wrap180(b.azimuth_deg - a.azimuth_deg)) for a, b in pairwise(self.views))
+        return dict(zip((view.index for view in self.views), accumulate(ways, initial=0.0), strict=False))
+
+    @property
     def steps(self) -> list[PathStep]:
         """The camera's rotations between the views, as the table made them; in motion, those between decisions.
 
@@ -255,6 +273,6 @@ class IdentificationRecord:
                 continue
             if decided is last and after.evidence.motion is not None:
                 rotation_deg += steps.pop().rotation_deg
-            steps.append(PathStep(rotation_deg, decided.s_left, decided.s_right, decided.candidates[:2]))
+            steps.append(PathStep(after.index + 1, rotation_deg))
             last = decided
         return steps

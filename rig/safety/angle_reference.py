@@ -6,16 +6,14 @@ revolutions of the cable, latched fault.
 Decision: docs/decisions/0009.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from enum import StrEnum
 from math import cos, isclose, radians, sin
 from typing import Final
 
 from hbr.core.angles import wrap180
 from rig.config import TableConfig
 from rig.core.errors import StateNotStored
-from rig.core.phrases import filled
+from rig.core.phrases import Worded, filled
 from rig.devices.servo import Servo, ServoCondition, ServoIdentity
 from rig.safety.saved_state import BenchState, LatchedFault, SavedTable, StateStore
 
@@ -27,22 +25,40 @@ OVERSHOOT_DEG = 5.0
 """How far an interrupted motion may overshoot its path."""
 
 
-class AngleFinding(StrEnum):
+class AngleFinding(Worded):
     """Result of comparing the servo's position with the stored one."""
 
-    UNCHANGED = "unchanged"
-    ROTATED_BY_HAND = "rotated-by-hand"
-    REVOLUTIONS_RESTORED = "revolutions-restored"
-    MOTION_INTERRUPTED = "motion-interrupted"
-    NEVER_REFERENCED = "never-referenced"
-    OTHER_SERVO = "other-servo"
-    OTHER_FIRMWARE = "other-firmware"
-    POWER_LOST_IN_MOTION = "power-lost-in-motion"
-    NOT_ON_PATH = "not-on-path"
-    ROTATED_WITHOUT_POWER = "rotated-without-power"
-    POSITION_CHANGED = "position-changed"
-    SETTINGS_CHANGED = "settings-changed"
-    BEYOND_LIMITS = "beyond-limits"
+    UNCHANGED = "unchanged", "the table is where it was"
+    ROTATED_BY_HAND = (
+        "rotated-by-hand",
+        "the table was rotated by hand while the servo counted (now {now:.1f}°, before {before:.1f}°)",
+    )
+    REVOLUTIONS_RESTORED = (
+        "revolutions-restored",
+        "the servo lost its supply and {lost} of its revolutions; they were restored from the stored state",
+    )
+    MOTION_INTERRUPTED = (
+        "motion-interrupted",
+        "the last program was interrupted during a motion; the servo kept its count (now {now:.1f}°)",
+    )
+    NEVER_REFERENCED = "never-referenced", "it was never set on this bench"
+    OTHER_SERVO = "other-servo", "another servo is connected than last time"
+    OTHER_FIRMWARE = "other-firmware", "the servo's firmware changed from {before_firmware} to {firmware}"
+    POWER_LOST_IN_MOTION = "power-lost-in-motion", "the servo lost its supply during a motion"
+    NOT_ON_PATH = (
+        "not-on-path",
+        "a motion was interrupted, and the servo is at {now:.1f}°, which is not on its path",
+    )
+    ROTATED_WITHOUT_POWER = (
+        "rotated-without-power",
+        "the table was rotated while the servo had no supply (now {now:.1f}°, before {before:.1f}°)",
+    )
+    POSITION_CHANGED = "position-changed", "the servo is at {now:.1f}°, but it was left at {before:.1f}°"
+    SETTINGS_CHANGED = (
+        "settings-changed",
+        "table.zero_deg, table.direction or servo.gear_ratio was changed since the angle was stored",
+    )
+    BEYOND_LIMITS = "beyond-limits", "the table is at {table:.1f}°, beyond its cable budget"
 
 
 _CERTAIN: Final = frozenset(
@@ -53,46 +69,13 @@ _CERTAIN: Final = frozenset(
         AngleFinding.MOTION_INTERRUPTED,
     }
 )
-_TEXTS: Final[Mapping[AngleFinding, str]] = {
-    AngleFinding.UNCHANGED: "the table is where it was",
-    AngleFinding.ROTATED_BY_HAND: "the table was rotated by hand while the servo counted (now {now:.1f}°, before "
-    "{before:.1f}°)",
-    AngleFinding.REVOLUTIONS_RESTORED: "the servo lost its supply and {lost} of its revolutions; they were restored "
-    "from the stored state",
-    AngleFinding.MOTION_INTERRUPTED: "the last program was interrupted during a motion; the servo kept its count "
-    "(now {now:.1f}°)",
-    AngleFinding.NEVER_REFERENCED: "it was never set on this bench",
-    AngleFinding.OTHER_SERVO: "another servo is connected than last time",
-    AngleFinding.OTHER_FIRMWARE: "the servo's firmware changed from {before_firmware} to {firmware}",
-    AngleFinding.POWER_LOST_IN_MOTION: "the servo lost its supply during a motion",
-    AngleFinding.NOT_ON_PATH: "a motion was interrupted, and the servo is at {now:.1f}°, which is not on its path",
-    AngleFinding.ROTATED_WITHOUT_POWER: "the table was rotated while the servo had no supply (now {now:.1f}°, before "
-    "{before:.1f}°)",
-    AngleFinding.POSITION_CHANGED: "the servo is at {now:.1f}°, but it was left at {before:.1f}°",
-    AngleFinding.SETTINGS_CHANGED: "table.zero_deg, table.direction or servo.gear_ratio was changed since the angle "
-    "was stored",
-    AngleFinding.BEYOND_LIMITS: "the table is at {table:.1f}°, beyond its cable budget",
-}
 
 
 @dataclass(frozen=True, slots=True)
 class SavedAngleCheck:
-    """Result of `check_saved_angle`.
+    """Result of `check_saved_angle`: the finding, and the numbers of its text.
 
-    Attributes
-    ----------
-    finding
-        Result of the comparison.
-    shift_deg
-        Angle that must be added to the servo's positions.
-    position_deg, saved_position_deg
-        The servo's position now and when it was stored.
-    firmware, saved_firmware
-        The servo's firmware now and when it was stored.
-    lost_revolutions
-        Revolutions that the servo no longer counts.
-    table_deg
-        The table's angle, if it is beyond the limits.
+    ``shift_deg`` must be added to the servo's positions. ``table_deg`` is the table's angle if it is beyond the limits.
     """
 
     finding: AngleFinding
@@ -111,7 +94,7 @@ class SavedAngleCheck:
 
     def __str__(self) -> str:
         return filled(
-            _TEXTS[self.finding],
+            self.finding.words,
             now=self.position_deg,
             before=self.saved_position_deg,
             firmware=self.firmware,
@@ -247,6 +230,7 @@ class TableRecord:
             self._state.table, self._servo.identity, state.position_deg, condition, self._servo.revolution_deg
         )
         self.angle_reference.shift_deg = check.shift_deg
+        # With other settings, the stored positions mean other angles.
         if check.finding is not AngleFinding.NEVER_REFERENCED and self._settings_changed():
             check = replace(check, finding=AngleFinding.SETTINGS_CHANGED)
         elif check.certain and self.beyond_limits(table_deg := self.angle_reference.to_table(state.position_deg)):

@@ -10,7 +10,6 @@ time t is
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from enum import StrEnum
 from math import hypot, inf, isfinite, sqrt
 from typing import Literal
 
@@ -20,7 +19,7 @@ from numpy.typing import NDArray
 from rig.core.clock import Clock
 from rig.core.errors import ConfigError, DeviceFault, DeviceSilent, NotReady, UsageError
 from rig.core.json_form import NumberOrNull
-from rig.core.phrases import signed
+from rig.core.phrases import Worded, filled, signed
 from rig.devices.imu import Imu
 
 Axis = Literal["x", "y", "z"]
@@ -36,6 +35,8 @@ FINE_DPS = 550.0
 """Up to this range, a sensor's steps are small enough to show its noise."""
 REST_PEAK_DPS = 0.5
 """Largest deviation from the mean rate at rest: eight sigma of the sensor's noise, a ringing of 0.01°."""
+AGREED_SIGMAS = 4.0
+"""Largest difference of encoder and gyro that agrees, in standard deviations, apart from the backlash."""
 MAX_BIAS_DPS = 25.0
 """Largest bias of a gyro: ±20 °/s (PS-MPU-6000A, 6.1), and a margin for temperature."""
 
@@ -50,11 +51,11 @@ class Bias:
     samples: int
 
 
-class GyroIssue(StrEnum):
+class GyroIssue(Worded):
     """The reasons why a rotation by the gyro is not valid."""
 
-    LOST_SAMPLES = "lost-samples"
-    OUT_OF_RANGE = "out-of-range"
+    LOST_SAMPLES = "lost-samples", "the sensor lost {limit:.0f} samples"
+    OUT_OF_RANGE = "out-of-range", "the rate exceeded the gyro's range of {limit:g} °/s"
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,12 +78,7 @@ class Rotation:
     @property
     def reason(self) -> str:
         """The issue in words; empty if there is none."""
-        match self.issue:
-            case GyroIssue.LOST_SAMPLES:
-                return f"the sensor lost {self.limit:.0f} samples"
-            case GyroIssue.OUT_OF_RANGE:
-                return f"the rate exceeded the gyro's range of {self.limit:g} °/s"
-        return ""
+        return "" if self.issue is None else filled(self.issue.words, limit=self.limit)
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,13 +107,11 @@ class Stillness:
     """Whether these values count as rest."""
 
 
-def compare(
-    encoder_deg: float, gyro: Rotation, *, encoder_sigma_deg: float, backlash_deg: float = 0.0, k: float = 4.0
-) -> Agreement:
+def compare(encoder_deg: float, gyro: Rotation, *, encoder_sigma_deg: float, backlash_deg: float = 0.0) -> Agreement:
     """Compare a rotation by the encoder with the gyro's.
 
     The encoder is on the shaft and does not measure the gears' backlash: a difference of up to ``backlash_deg`` plus
-    ``k`` standard deviations agrees.
+    `AGREED_SIGMAS` standard deviations agrees.
 
     Raises `UsageError`: the gyro's rotation is not valid.
     """
@@ -125,7 +119,9 @@ def compare(
         raise UsageError(
             f"The gyro's rotation is not valid: {gyro.reason}.", next_step="Check `valid` before comparing."
         )
-    return Agreement(encoder_deg - gyro.angle_deg, k * hypot(gyro.sigma_deg, encoder_sigma_deg) + backlash_deg)
+    return Agreement(
+        encoder_deg - gyro.angle_deg, AGREED_SIGMAS * hypot(gyro.sigma_deg, encoder_sigma_deg) + backlash_deg
+    )
 
 
 def finite(value: float) -> float | None:
@@ -161,6 +157,7 @@ class GyroRotationMeter:
                 f"uncertainty {scale_sigma}.",
                 next_step="Set axis x, y or z, sign 1 or -1, a positive scale, and an uncertainty of at least 0.",
             )
+        # The sensor's axes and scale, and the uncertainty of its samples.
         self._imu = imu
         self._clock = clock
         self._column = "xyz".index(axis)
@@ -169,6 +166,7 @@ class GyroRotationMeter:
         self.arw = imu.identity.gyro_noise_dps_rthz / sqrt(2)
         """The angle random walk by the datasheet, in °/√s."""
         self._saturated_dps = imu.range_dps
+        # The memory of the last samples, and the integral since the last rest.
         self._time_ns: NDArray[np.int64] = np.empty(0, np.int64)
         self._rate_dps: NDArray[np.float64] = np.empty(0)
         self._drain_s = min(DRAIN_S, DRAIN_SAMPLES / imu.rate_hz)
@@ -298,7 +296,7 @@ class GyroRotationMeter:
         rate = new.gyro_dps[:, self._column]
         for tap in self.taps:
             tap(new.time_ns, self._to_table * rate)
-        if new.lost:
+        if new.lost:  # an integral across missing samples is not valid
             self._time_ns, self._rate_dps = self._time_ns[:0], self._rate_dps[:0]
         self._time_ns = np.concatenate([self._time_ns, new.time_ns])
         self._rate_dps = np.concatenate([self._rate_dps, rate])

@@ -28,6 +28,14 @@ STANDING_DPS = 3.0
 """Speed below which the shaft counts as standing still: two units of the servo's velocity reading."""
 HELD_DEG = 2.0
 """Distance from the goal up to which friction holds the table, because the servo's position controller is too weak."""
+STALL_S = 0.25
+"""How long the servo may push without rotating."""
+OVERLOAD_S = 0.8
+"""How long the servo may rotate with overload: longer than a start takes."""
+LAG_S = OVERLOAD_S / 2
+"""How long the shaft may lag behind the servo's profile."""
+NO_PROGRESS_S = 1.0
+"""How long the servo may stand still before its goal."""
 VOLTAGE_S = 0.1
 """How long a bad voltage must last: starting motors make it dip."""
 COOLER_C = 5.0
@@ -51,10 +59,7 @@ def find_servo_fault(
 ) -> RigError | None:
     """Return the error that forbids a servo to work (hardware error, temperature, supply); None if it may work.
 
-    Parameters
-    ----------
-    again
-        The servo had a fault before: it must also have cooled down by `COOLER_C`.
+    ``again`` if the servo had a fault before: it must also have cooled down by `COOLER_C`.
     """
     evidence = {
         "temperature_c": state.temperature_c,
@@ -93,20 +98,10 @@ def find_servo_fault(
 
 
 class MotionMonitor:
-    """Checks the servo's readings during one motion.
+    """Checks the servo's readings during one motion between two table angles.
 
-    Parameters
-    ----------
-    config
-        The limits of the rig.
-    limits
-        The limits at which the servo shuts down.
-    start_deg, goal_deg
-        Table angles at which the motion begins and ends.
-    tolerance_deg
-        Distance from the goal that counts as arrived.
-    cruise_dps
-        Highest speed of the table.
+    ``limits`` are those at which the servo shuts down. ``tolerance_deg`` is the distance from the goal that counts as
+    arrived, ``cruise_dps`` the highest speed of the table.
     """
 
     def __init__(
@@ -125,21 +120,14 @@ class MotionMonitor:
         self._goal_deg = goal_deg
         self._tolerance_deg = tolerance_deg
         self._standing_dps = min(STANDING_DPS, cruise_dps / 2)
-        self._standing_deg = min(tolerance_deg, cruise_dps * config.no_progress_s) / 2
+        self._standing_deg = min(tolerance_deg, cruise_dps * NO_PROGRESS_S) / 2
         self._since_ns: dict[str, int] = {}
         self._stood: deque[tuple[int, float]] = deque()
 
     def check(self, state: ServoState, angle_deg: float, lag_deg: float | None) -> None:
-        """Check one reading.
+        """Check one reading, by which the table is at ``angle_deg``.
 
-        Parameters
-        ----------
-        state
-            The servo's reading.
-        angle_deg
-            The table's angle from this reading.
-        lag_deg
-            Angle by which the table is behind the servo's profile; None if that is not known.
+        ``lag_deg`` is the angle by which the table is behind the servo's profile; None if that is not known.
 
         Raises `DeviceFault`, `Overheated`, `SupplyOutOfRange`, `Stalled`, `Overloaded`, `FollowingError`, `NoProgress`:
         the motion must be stopped.
@@ -158,13 +146,13 @@ class MotionMonitor:
         # Load: a blocked table, then one that is hard to rotate.
         standing = abs(state.velocity_dps) < self._standing_dps
         pushing = abs(state.load_percent) >= config.max_load_percent
-        if self._lasts("stall", pushing and standing, state.time_ns, config.stall_s):
+        if self._lasts("stall", pushing and standing, state.time_ns, STALL_S):
             raise Stalled(
                 f"The table is blocked at {angle_words(angle_deg)}: the servo pushes, but the table does not rotate.",
                 next_step="Remove what blocks the table; check the cable, too.",
                 evidence=evidence,
             )
-        if self._lasts("overload", pushing, state.time_ns, config.overload_s):
+        if self._lasts("overload", pushing, state.time_ns, OVERLOAD_S):
             raise Overloaded(
                 f"The table is hard to rotate: {abs(state.load_percent):.0f} % of the servo's torque.",
                 next_step="Look for friction (cable, bearing) and for an object that is too heavy.",
@@ -172,7 +160,7 @@ class MotionMonitor:
             )
         # Position: behind the profile, then off the path.
         lagging = lag_deg is not None and abs(lag_deg) > config.following_error_deg
-        if self._lasts("lag", lagging, state.time_ns, config.overload_s / 2):
+        if self._lasts("lag", lagging, state.time_ns, LAG_S):
             raise FollowingError(
                 f"The table is {abs(lag_deg or 0.0):.1f}° away from the servo's motion profile.",
                 next_step="Look for what slows the table down; a weak supply is a possible cause.",
@@ -218,12 +206,12 @@ class MotionMonitor:
         return seconds_between(self._since_ns.setdefault(name, time_ns), time_ns) >= seconds
 
     def _stands_still(self, time_ns: int, angle_deg: float) -> bool:
-        """Return whether the angle has not changed by more than its noise for ``no_progress_s``."""
+        """Return whether the angle has not changed by more than its noise for `NO_PROGRESS_S`."""
         stood = self._stood
         if stood and abs(angle_deg - stood[0][1]) > self._standing_deg:
             stood.clear()
         stood.append((time_ns, angle_deg))
-        return seconds_between(stood[0][0], time_ns) >= self._config.no_progress_s
+        return seconds_between(stood[0][0], time_ns) >= NO_PROGRESS_S
 
 
 class SlipMonitor:

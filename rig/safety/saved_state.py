@@ -15,7 +15,7 @@ import sys
 from contextlib import AbstractContextManager, suppress
 from enum import StrEnum
 from pathlib import Path
-from typing import Any, ClassVar, Protocol, TextIO
+from typing import Any, ClassVar, TextIO
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
@@ -149,51 +149,17 @@ class ServerAddress(_Saved):
     certificate: str | None = None
 
 
-class StateStore(Protocol):
-    """Stores the state of one bench.
-
-    Methods that write raise `StateNotStored` if the disk is full, or may not be written to. `read_file` raises it if
-    the file exists but cannot be read.
-    """
-
-    outlasts_program: ClassVar[bool]
-    """Whether the next program finds the state: a latched fault then stays latched until it is acknowledged."""
-
-    def load(self) -> BenchState: ...
-
-    def save(self, state: BenchState) -> None:
-        """Store ``state``; on return it survives a power cut."""
-
-    def latch(self, fault: LatchedFault | None) -> None:
-        """Store the latched fault, even on a full disk if a state was saved before; None removes it."""
-
-    def listen(self) -> None:
-        """Receive requests to stop from now on. Raises `StateNotStored`."""
-
-    def stop_requested(self) -> bool:
-        """Return whether the operator requested a stop; called in each round of the control loop."""
-
-    def request_stop(self) -> None:
-        """Request a stop from the program that uses the bench; may be called from any thread."""
-
-    def clear_stop(self) -> None:
-        """Take the requests as carried out: the torque is off. Who waits for an answer gets it."""
-
-    def stop_listening(self) -> None:
-        """Receive no more requests to stop."""
-
-    def read_file(self, name: str) -> bytes | None:
-        """Return the file ``name`` that was stored beside the state; None if there is none."""
-
-    def store_file(self, name: str, content: bytes) -> None:
-        """Store a file beside the state; on return it survives a power cut."""
-
-    def remove_file(self, name: str) -> None:
-        """Delete the file ``name`` if it exists."""
-
-
 class MemoryStore:
-    """State that ends with its program, for a simulated bench."""
+    """State that ends with its program, for a simulated bench.
+
+    All stores have these methods. Those of a `FileStore` that write raise `StateNotStored` if the disk is full, or may
+    not be written to; `read_file` raises it if the file exists but cannot be read.
+
+    Attributes
+    ----------
+    outlasts_program
+        Whether the next program finds the state: a latched fault then stays latched until it is acknowledged.
+    """
 
     outlasts_program: ClassVar[bool] = False
 
@@ -206,33 +172,42 @@ class MemoryStore:
         return self.state
 
     def save(self, state: BenchState) -> None:
+        """Store ``state``; on return it survives a power cut."""
         self.state = state
 
     def latch(self, fault: LatchedFault | None) -> None:
+        """Store the latched fault, even on a full disk if a state was saved before; None removes it."""
         self.state = self.state.model_copy(update={"fault": fault})
 
     def listen(self) -> None:
+        """Receive requests to stop from now on."""
         self.stop = False
 
     def stop_requested(self) -> bool:
+        """Return whether the operator requested a stop; called in each round of the control loop."""
         return self.stop
 
     def request_stop(self) -> None:
+        """Request a stop from the program that uses the bench; may be called from any thread."""
         self.stop = True
 
     def clear_stop(self) -> None:
+        """Take the requests as carried out: the torque is off. Who waits for an answer gets it."""
         self.stop = False
 
     def stop_listening(self) -> None:
-        """Do nothing."""
+        """Receive no more requests to stop."""
 
     def read_file(self, name: str) -> bytes | None:
+        """Return the file ``name`` that was stored beside the state; None if there is none."""
         return self.files.get(name)
 
     def store_file(self, name: str, content: bytes) -> None:
+        """Store a file beside the state; on return it survives a power cut."""
         self.files[name] = content
 
     def remove_file(self, name: str) -> None:
+        """Delete the file ``name`` if it exists."""
         self.files.pop(name, None)
 
 
@@ -261,6 +236,7 @@ class FileStore:
         file may have contained one.
         """
         state, fault, damage = BenchState(), None, ""
+        # The state: its checksum finds a byte that the disk changed.
         try:
             state = BenchState.model_validate_json(self._file.read_bytes())
             if state.version != VERSION:
@@ -275,6 +251,7 @@ class FileStore:
             damage = f"{self._file} cannot be read: {error.strerror}"
         except ValidationError as error:
             damage = f"{self._file} is damaged: {error.errors(include_url=False)[0]['msg']}"
+        # The latch is newer than the state if the disk was full.
         try:
             text = self._latch.read_bytes()
             if len(text) != LATCH_BYTES:
@@ -368,6 +345,9 @@ class FileStore:
     def remove_file(self, name: str) -> None:
         with suppress(OSError):
             (self.path / name).unlink()
+
+
+StateStore = MemoryStore | FileStore
 
 
 def begin_session(store: StateStore, clock: Clock) -> SavedSession | None:

@@ -145,10 +145,7 @@ def listen(folder: Path) -> StopListener:
 class StopRequest:
     """A request to stop, sent to the program that uses the bench with the state folder ``folder``; it never waits.
 
-    Attributes
-    ----------
-    connection
-        The connection that receives the answer: one byte, or its end. None if no program listens.
+    Its ``connection`` receives the answer: one byte, or its end. It is None if no program listens.
     """
 
     def __init__(self, folder: Path) -> None:

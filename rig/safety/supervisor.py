@@ -123,16 +123,8 @@ class Motion:
 class Safety:
     """State, latched fault and angle reference of one bench's table.
 
-    Parameters
-    ----------
-    servo
-        The servo. It is only read, except by `acknowledge` with a reboot.
-    config
-        The bench's configuration.
-    clock
-        Clock for the times of the faults.
-    store
-        Store in which the state survives the process; None holds it in memory.
+    The servo is only read, except by `set_goal`, and by `acknowledge` with a reboot. The state survives the process in
+    ``store``; None holds it in memory.
     """
 
     def __init__(self, servo: Servo, config: RigConfig, clock: Clock, store: StateStore | None = None) -> None:
@@ -189,6 +181,7 @@ class Safety:
         Raises `DeviceSilent`: the servo does not answer.
         """
         self._store.listen()
+        # What the last program left: it may have been killed, with the torque on.
         condition = self._servo.read_condition()
         findings = [f"the bench's stored state is lost: {self._record.damage}"] if self._record.damage else []
         if condition.torque:
@@ -258,6 +251,7 @@ class Safety:
         self.check_stop_request()
         motion = Motion()
         path = [self.angle_reference.to_servo(angle) for angle in ends_deg]
+        # If the program is killed, the next one knows where the servo may be.
         self._record.save_position(path_deg=(min(path), max(path)))
         try:
             self._apply(StateEvent.START)
@@ -340,27 +334,20 @@ class Safety:
     def acknowledge(self, *, reboot: bool = False) -> TableState:
         """Acknowledge the latched fault after its cause is gone: servo, settings, supply and angle are checked.
 
-        Problems that do not show at rest (a jam, a loose platter) show in the next motion.
-
-        Parameters
-        ----------
-        reboot
-            Restart the servo first: nothing else clears its hardware errors.
-
-        Returns
-        -------
-        TableState
-            READY, or UNREFERENCED if the table's angle is uncertain.
+        Problems that do not show at rest (a jam, a loose platter) show in the next motion. With ``reboot`` the servo
+        restarts first: nothing else clears its hardware errors. The new state is READY, or UNREFERENCED if the table's
+        angle is uncertain.
 
         Raises `DeviceFault`, `Overheated`, `SupplyOutOfRange`, `DeviceMismatch`, `DeviceSilent`: the cause is still
         there; the fault stays.
         """
+        # First the supply: without it the servo could not answer.
         for restore in self.restore_actions:
             restore()
         if self.state in (TableState.DISCONNECTED, TableState.STOPPED):
             self.prepare()
         if reboot:
-            if self._record.check_angle():
+            if self._record.check_angle():  # the servo forgets its revolutions, the stored angle gives them back
                 self._record.save_position()
             self._servo.reboot()
         else:

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 import hbr
 from hbr.dense.arc import ArcSession, fit_arc_confidence
 from rig.bench import Bench
-from rig.catalog import Catalog, derived
+from rig.catalog import Catalog, derived, sessions
+from rig.catalog.copying import Attempts, update_copy
 from rig.catalog.jobs import JobProgress
-from rig.catalog.shared import Attempts, update_copy
 from rig.config import RigConfig
 from rig.core.errors import CatalogError, CatalogUnavailable, RigError, UsageError
 from rig.core.next_steps import Do
@@ -140,7 +140,7 @@ def load_model(
     notes: tuple[Note, ...] = ()
     if copied is not None:
         notes = (Note(NoteCode.LOCAL_COPY, {"copied_utc": f"{copied:%Y-%m-%d %H:%M:%S} UTC"}),)
-    camera = tuple(derived.camera_settings(catalog))
+    camera = tuple(sessions.camera_settings(catalog))
     if not len(views) or views.descriptor != BENCH_DESCRIPTOR:
         # without views, any search may say that the catalog is empty
         return Model(hbr.ViewIndex(views if len(views) else hbr.Views.empty()), notes=notes, camera=camera)
@@ -148,7 +148,7 @@ def load_model(
     rule, about_rule = stopping_rule_of(catalog.path, index)
     notes += about_rule
     # Were the objects enrolled with an empty-table image, and what does their bench look like?
-    before = derived.empty_tables(catalog)
+    before = sessions.empty_tables(catalog)
     with_image = len(before.with_image) >= len(before.without_image)
     others = before.without_image if with_image else before.with_image
     if others:
@@ -157,7 +157,7 @@ def load_model(
     with suppress(CatalogError):  # rig catalog verify reports it; the bench has its own image
         if with_image and before.newest is not None:
             table = bench_image = catalog.read_image(before.newest)
-        elif (view := derived.newest_view(catalog)) is not None:
+        elif (view := sessions.newest_view(catalog)) is not None:
             bench_image = catalog.read_image(view)
     return Model(index, rule, notes, with_image, camera, table, bench_image, partial(derived.local_views, catalog))
 
@@ -221,8 +221,7 @@ class CurrentModel:
         try:
             self._leave_copy()
             rules = self.catalog.path / FILE
-            changed = self.catalog.database.may_have_changed()
-            version = self.catalog.version() if changed or not self.version else self.version
+            version = self.catalog.version()
             state = version, rules.stat().st_mtime_ns if rules.exists() else None
             if state != self._loaded_state:
                 self._model = load_model(self.catalog, descriptor=self.descriptor, progress=progress)

@@ -22,7 +22,7 @@ from hbr.dense.arc import ARC_DEG, STEP_DEG
 from rig.config import IdentifyConfig, RigConfig
 from rig.core.errors import UsageError
 from rig.events.events import RotationReason, Weighed
-from rig.motion.move import MotionModel, equivalent_within
+from rig.motion.move import MotionTimes, equivalent_within
 from rig.motion.scan_speed import scan_speed
 from rig.views.description import BENCH_DESCRIPTOR, PAPER_DESCRIPTOR
 
@@ -172,7 +172,7 @@ def reachable_rotations(config: RigConfig, table_deg: float) -> tuple[NDArray[np
 
     If the short way exceeds the cable budget, the table rotates the long way round, which takes longer.
     """
-    model = MotionModel(config)
+    model = MotionTimes(config)
     rotations_deg, seconds = [], []
     for rotation_deg in (np.arange(ROTATION_STEP_DEG - 180, 180 + ROTATION_STEP_DEG, ROTATION_STEP_DEG)).tolist():
         asked_deg = table_deg + config.table.orientation_sign * rotation_deg

@@ -1,9 +1,8 @@
 """Captures frames for views and checks them: image quality, camera settings, and whether the table stood still."""
 
-from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import Future
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from enum import StrEnum
 from math import isfinite
 
 import cv2
@@ -11,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.config import RigConfig, ViewConfig
-from rig.core.phrases import filled
+from rig.core.phrases import Worded, filled
 from rig.devices.camera import Camera, CameraLocks, Frame
 from rig.safety.gyro_rotation import Stillness
 from rig.views.description import within
-from rig.views.image_files import Encoder
+from rig.views.image_files import encode
 from rig.views.stream import exposed_before_stamp_ns
 
 DARK_LEVEL = 8
@@ -26,25 +25,34 @@ MAX_NOISE = 0.3
 """Largest share of such variance in an image. Half a frame of random bytes has more."""
 MOST_REPEATED = 10
 """Repeated frames of one view that do not count as retakes: a camera on a busy bus sends some frames twice."""
+SMEAR_MARGIN = 1.1
+"""Allowed excess of the smear, because the speed varies about the chosen one."""
 SIMILARITY_PX = 4
 """Side of the squares that `image_similarity` averages over."""
 
 
-class RejectReason(StrEnum):
-    """The reasons to reject a frame. `rejection_text` has their texts."""
+class RejectReason(Worded):
+    """The reasons to reject a frame; the texts contain numbers of its `ViewEvidence`."""
 
-    EXPOSED_EARLY = "exposed-early"
-    GYRO_INCOMPLETE = "gyro-incomplete"
-    TABLE_MOVED = "table-moved"
-    REPEATED_FRAME = "repeated-frame"
-    LOCKS_CHANGED = "locks-changed"
-    TOO_DARK = "too-dark"
-    OVEREXPOSED = "overexposed"
-    BLURRED = "blurred"
-    NOISE = "noise"
-    SMEARED = "smeared"
-    ANGLE_UNCERTAIN = "angle-uncertain"
-    TIME_UNCERTAIN = "time-uncertain"
+    EXPOSED_EARLY = "exposed-early", "exposed before the table stood still"
+    GYRO_INCOMPLETE = (
+        "gyro-incomplete",
+        "the gyro's samples are incomplete: it is unknown whether the table stood still",
+    )
+    TABLE_MOVED = (
+        "table-moved",
+        "the table moved ({0.stillness.peak_rate_dps:.2f} °/s, shaft {0.stillness.encoder_change_deg:.2f}°, "
+        "platter {0.stillness.platter_change_deg:+.2f}°)",
+    )
+    REPEATED_FRAME = "repeated-frame", "the camera repeated its last frame"
+    LOCKS_CHANGED = "locks-changed", "a setting of the camera has changed"
+    TOO_DARK = "too-dark", "too dark (mean level {0.mean_level:.1f}, {0.dark_share:.0%} black)"
+    OVEREXPOSED = "overexposed", "overexposed ({0.saturated_share:.0%} saturated)"
+    BLURRED = "blurred", "blurred (sharpness {0.sharpness:.1f})"
+    NOISE = "noise", "noise instead of an image"
+    SMEARED = "smeared", "smeared by {0.motion.smear_px:.1f} px at {0.motion.speed_dps:.0f} °/s"
+    ANGLE_UNCERTAIN = "angle-uncertain", "the angle is uncertain by {0.motion.angle_sigma_deg:.2f}°"
+    TIME_UNCERTAIN = "time-uncertain", "the time stamp does not fit the camera's rhythm"
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,16 +157,14 @@ class ImageQuality:
 
     def reasons(self, config: ViewConfig) -> list[RejectReason]:
         """Return the reasons to reject a frame of this quality."""
-        reasons = []
-        if self.mean_level < config.min_mean or self.dark_share > config.max_dark:
-            reasons.append(RejectReason.TOO_DARK)
-        if self.saturated_share > config.max_saturated:
-            reasons.append(RejectReason.OVEREXPOSED)
-        if self.sharpness < config.min_sharpness:
-            reasons.append(RejectReason.BLURRED)
-        elif self.noise_share > MAX_NOISE:
-            reasons.append(RejectReason.NOISE)
-        return reasons
+        blurred = self.sharpness < config.min_sharpness
+        exceeded = {
+            RejectReason.TOO_DARK: self.mean_level < config.min_mean or self.dark_share > config.max_dark,
+            RejectReason.OVEREXPOSED: self.saturated_share > config.max_saturated,
+            RejectReason.BLURRED: blurred,
+            RejectReason.NOISE: not blurred and self.noise_share > MAX_NOISE,
+        }
+        return [reason for reason, holds in exceeded.items() if holds]
 
 
 def _variance(total: int, squares: int, count: int) -> float:
@@ -185,6 +191,62 @@ def image_similarity(image_bgr: NDArray[np.uint8], other_bgr: NDArray[np.uint8],
     return float(cv2.matchTemplate(small[0], small[1], cv2.TM_CCOEFF_NORMED)[0, 0])
 
 
+def checked(
+    number: int,
+    frame: Frame,
+    config: ViewConfig,
+    *,
+    settled_ns: int,
+    locks: CameraLocks,
+    locks_hold: bool,
+    stillness: Stillness | None = None,
+    motion: MotionEvidence | None = None,
+    early: bool = False,
+    time_known: bool = True,
+    angle_known: bool = True,
+) -> Attempt:
+    """Return a frame as an attempt at a view: its evidence, and which limits of a view this exceeds.
+
+    Parameters
+    ----------
+    settled_ns, locks, locks_hold, stillness, motion
+        See `ViewEvidence`; a frame has either ``stillness`` or ``motion``.
+    early
+        Whether the exposure began before the table came to rest.
+    time_known, angle_known
+        Whether the frame's time can be trusted, and whether encoder and gyro agree about its angle.
+    """
+    quality = ImageQuality.of(frame.image_bgr, config)
+    evidence = ViewEvidence(
+        settled_ns=settled_ns,
+        exposed_ns=frame.exposed_ns,
+        sharpness=quality.sharpness,
+        mean_level=quality.mean_level,
+        dark_share=quality.dark_share,
+        saturated_share=quality.saturated_share,
+        repeated=frame.repeated,
+        locks=locks,
+        locks_hold=locks_hold,
+        stillness=stillness,
+        motion=motion,
+    )
+    # Each limit of a view, apart from those of its image.
+    unknown = stillness is not None and not isfinite(stillness.peak_rate_dps)
+    exceeded = {
+        RejectReason.EXPOSED_EARLY: early,
+        RejectReason.GYRO_INCOMPLETE: unknown,
+        RejectReason.TABLE_MOVED: stillness is not None and not unknown and not stillness.still,
+        RejectReason.TIME_UNCERTAIN: not time_known,
+        RejectReason.ANGLE_UNCERTAIN: motion is not None
+        and (motion.angle_sigma_deg > config.max_angle_sigma_deg or not angle_known),
+        RejectReason.SMEARED: motion is not None and motion.smear_px > SMEAR_MARGIN * config.max_smear_px,
+        RejectReason.REPEATED_FRAME: frame.repeated,
+        RejectReason.LOCKS_CHANGED: not locks_hold,
+    }
+    reasons = [reason for reason, holds in exceeded.items() if holds]
+    return Attempt(number, frame.image_bgr, evidence, (*reasons, *quality.reasons(config)))
+
+
 class Viewer:
     """Captures views with one camera, whose locked settings must not change after the viewer was made.
 
@@ -195,7 +257,8 @@ class Viewer:
 
     def __init__(self, camera: Camera, config: RigConfig, *, encodes: bool = False) -> None:
         self._camera = camera
-        self._encoder = Encoder() if encodes else None
+        # One thread, because encoding leaves the interpreter to the others; it ends with the last reference to it.
+        self._encoder = ThreadPoolExecutor(1, "encoder") if encodes else None
         self._config = config.view
         self._early_ns = exposed_before_stamp_ns(config)
         self._locks = camera.read_locks()
@@ -222,67 +285,30 @@ class Viewer:
         while number - repeated <= self._config.retakes:
             number += 1
             frame = self._camera.capture(after_ns, meanwhile)
-            encoded = None if self._encoder is None else self._encoder.begin(frame.image_bgr)
-            attempt = self._check(number, frame, settled_ns, check_still(after_ns - self._early_ns))
+            encoded = None if self._encoder is None else self._encoder.submit(encode, frame.image_bgr)
+            stillness, locks = check_still(after_ns - self._early_ns), self._camera.read_locks()
+            attempt = checked(
+                number,
+                replace(frame, repeated=self._last is not None and np.array_equal(frame.image_bgr, self._last)),
+                self._config,
+                settled_ns=settled_ns,
+                locks=locks,
+                locks_hold=locks == self._locks,
+                stillness=stillness,
+                early=frame.exposed_ns < settled_ns + self._early_ns,
+            )
             attempt = replace(attempt, encoded=encoded)
             self._last = frame.image_bgr
             yield attempt
             if attempt.accepted:
                 return
+            # A camera on a busy bus repeats frames; that is no failed attempt.
             if attempt.reasons == (RejectReason.REPEATED_FRAME,) and repeated < MOST_REPEATED:
                 repeated += 1
             after_ns = frame.exposed_ns + 1
 
-    def _check(self, number: int, frame: Frame, settled_ns: int, stillness: Stillness) -> Attempt:
-        quality = ImageQuality.of(frame.image_bgr, self._config)
-        locks = self._camera.read_locks()
-        evidence = ViewEvidence(
-            settled_ns=settled_ns,
-            exposed_ns=frame.exposed_ns,
-            sharpness=quality.sharpness,
-            mean_level=quality.mean_level,
-            dark_share=quality.dark_share,
-            saturated_share=quality.saturated_share,
-            repeated=self._last is not None and np.array_equal(frame.image_bgr, self._last),
-            locks=locks,
-            locks_hold=locks == self._locks,
-            stillness=stillness,
-        )
-        reasons = []
-        if frame.exposed_ns < settled_ns + self._early_ns:
-            reasons.append(RejectReason.EXPOSED_EARLY)
-        if not isfinite(stillness.peak_rate_dps):
-            reasons.append(RejectReason.GYRO_INCOMPLETE)
-        elif not stillness.still:
-            reasons.append(RejectReason.TABLE_MOVED)
-        if evidence.repeated:
-            reasons.append(RejectReason.REPEATED_FRAME)
-        if not evidence.locks_hold:
-            reasons.append(RejectReason.LOCKS_CHANGED)
-        reasons += quality.reasons(self._config)
-        return Attempt(number, frame.image_bgr, evidence, tuple(reasons))
-
-
-_TEXTS: Mapping[str, str] = {
-    RejectReason.EXPOSED_EARLY: "exposed before the table stood still",
-    RejectReason.GYRO_INCOMPLETE: "the gyro's samples are incomplete: it is unknown whether the table stood still",
-    RejectReason.TABLE_MOVED: "the table moved ({0.stillness.peak_rate_dps:.2f} °/s, "
-    "shaft {0.stillness.encoder_change_deg:.2f}°, platter {0.stillness.platter_change_deg:+.2f}°)",
-    RejectReason.REPEATED_FRAME: "the camera repeated its last frame",
-    RejectReason.LOCKS_CHANGED: "a setting of the camera has changed",
-    RejectReason.TOO_DARK: "too dark (mean level {0.mean_level:.1f}, {0.dark_share:.0%} black)",
-    RejectReason.OVEREXPOSED: "overexposed ({0.saturated_share:.0%} saturated)",
-    RejectReason.BLURRED: "blurred (sharpness {0.sharpness:.1f})",
-    RejectReason.NOISE: "noise instead of an image",
-    RejectReason.SMEARED: "smeared by {0.motion.smear_px:.1f} px at {0.motion.speed_dps:.0f} °/s",
-    RejectReason.ANGLE_UNCERTAIN: "the angle is uncertain by {0.motion.angle_sigma_deg:.2f}°",
-    RejectReason.TIME_UNCERTAIN: "the time stamp does not fit the camera's rhythm",
-}
-
 
 def rejection_text(reason: str, evidence: ViewEvidence | ImageQuality) -> str:
-    """Return the text of a `RejectReason`, with the numbers of the evidence; any other text is returned unchanged.
-
-    Version 0.1 saved the text itself.
-    """
-    return filled(_TEXTS[reason], evidence) if reason in _TEXTS else str(reason)
+    """Return the text of a `RejectReason`, with the numbers of the evidence; an unknown one is returned as it is."""
+    known = set(RejectReason)
+    return filled(RejectReason(reason).words, evidence) if reason in known else str(reason)

@@ -14,14 +14,7 @@ DICTIONARY: Final = cv2.aruco.DICT_4X4_50
 class Board:
     """A ChArUco board: a chessboard with a marker in each white square, which identifies the corners.
 
-    Attributes
-    ----------
-    columns, rows
-        Numbers of squares.
-    square_mm, marker_mm
-        Side of a square and of a marker.
-    margin_mm
-        Width of the white margin around the squares.
+    ``columns`` and ``rows`` count the squares; around them is a white margin.
     """
 
     columns: int = 8

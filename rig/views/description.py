@@ -1,9 +1,10 @@
-"""Description of views: the levels of several descriptors, and the evidence of the segmentation.
+"""Description of views: the levels of several descriptors, and the evidence of the segmentation with its summary.
 
 Decision: docs/decisions/0029.
 """
 
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 
 import hbr
 from hbr.descriptors.together import LearnedBackground
-from hbr.segmentation import MIN_AGREEMENT, Issue, IssueCode
+from hbr.segmentation import MIN_AGREEMENT, Issue, IssueCode, Method
 from hbr.segmentation.background import Frame
 from hbr.segmentation.segment import evidence_together, stored_segmentation
 from rig.config import ViewConfig
@@ -27,6 +28,19 @@ DESCRIPTORS: Final = (PAPER_DESCRIPTOR, BENCH_DESCRIPTOR)
 """The descriptors of every enrolled view."""
 IN_A_ROW: Final = 3
 """Number of successive frames that must differ from the empty-table image: one or two can show the operator's arm."""
+
+_TEXT: Final = {
+    IssueCode.TABLE_SIZE: "the empty-table image has another size than the frames",
+    IssueCode.TABLE_DIFFERS: "the surroundings do not look like the empty-table image",
+    IssueCode.BACKDROP_EXPOSURE: "the backdrop is too dark or overexposed to measure its colour",
+    IssueCode.BACKDROP_COLOURS: "the backdrop has several colours, so none can be taken for grey",
+    IssueCode.BACKDROP_COLOURFUL: "the backdrop is not grey",
+    IssueCode.BACKDROP_LEVEL: "the backdrop is too dark or too bright to correct the exposure",
+    IssueCode.BACKGROUND_NOT_PLAIN: "the background is not plain",
+    IssueCode.NO_GUESS: "no part of the frame stands out",
+    IssueCode.NO_OBJECT: "no object was found while the table rotated",
+    IssueCode.NO_DIFFERENCE: "nothing differs from the background",
+}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,10 +74,7 @@ class DescribedView:
 def within(image_bgr: NDArray[np.uint8], region: tuple[int, int, int, int] | None) -> NDArray[np.uint8]:
     """Return a region of an image, uint8 (h, w, 3); the whole image if the region is None.
 
-    Raises
-    ------
-    UsageError
-        The region does not lie within the image.
+    Raises `UsageError`: the region does not lie within the image.
     """
     if region is None:
         return image_bgr
@@ -79,21 +90,11 @@ def within(image_bgr: NDArray[np.uint8], region: tuple[int, int, int, int] | Non
 class ViewDescriber:
     """Segments views of one bench, and describes them by several descriptors.
 
-    The paper's descriptors describe the whole region of interest. All others describe only the object.
+    The paper's descriptors describe the whole region of interest. All others describe only the object. Without any
+    descriptor, each view is only segmented; with the paper's alone, it is not. The empty-table image is a whole frame
+    of the same size as the views.
 
-    Parameters
-    ----------
-    config
-        Configuration with the region of interest to describe.
-    names
-        The descriptors. Without any, each view is only segmented; with the paper's alone, it is not.
-    empty_table : uint8 array (H, W, 3), optional
-        The bench's empty-table image: a whole frame of the same size as the views.
-
-    Raises
-    ------
-    ValueError
-        A descriptor is unknown.
+    Raises `ValueError`: a descriptor is unknown.
     """
 
     def __init__(
@@ -110,12 +111,8 @@ class ViewDescriber:
     def __call__(self, image_bgr: NDArray[np.uint8]) -> DescribedView:
         """Describe a frame, uint8 (H, W, 3).
 
-        Raises
-        ------
-        UsageError
-            The region does not lie within the frame.
-        ValueError
-            The region is too small for a segmentation.
+        Raises `UsageError`: the region does not lie within the frame. `ValueError`: the region is too small for a
+        segmentation.
         """
         if not self._segments:
             return DescribedView(self._levels(within(image_bgr, self.region), None), None)
@@ -128,10 +125,7 @@ class ViewDescriber:
 
         ``stored`` is the evidence of an enrolled view, which keeps its silhouette (`hbr.segmentation.segment`).
 
-        Raises
-        ------
-        UsageError, ValueError
-            As for a call, or the stored evidence is damaged.
+        Raises `UsageError`, `ValueError`: as for a call, or the stored evidence is damaged.
         """
         background, issues = self._prepared_table(image_bgr)
         found = stored_segmentation(within(image_bgr, self.region), stored, empty_table=background)
@@ -181,10 +175,7 @@ class EnrollmentDescriber(ViewDescriber):
     def learn(self, image_bgr: NDArray[np.uint8]) -> int:
         """Learn the background from the next view, uint8 (H, W, 3); return the number of the view.
 
-        Raises
-        ------
-        UsageError, ValueError
-            As for `ViewDescriber`, or the view has another size than the others.
+        Raises `UsageError`, `ValueError`: as for `ViewDescriber`, or the view has another size than the others.
         """
         self._learned.add(within(image_bgr, self.region))
         return len(self._learned) - 1
@@ -206,21 +197,8 @@ class SearchDescriber(ViewDescriber):
     The background is learned from all views of the search, so that each view also improves the earlier ones
     (`hbr.ViewsTogether`). The levels have a row for each segmentation.
 
-    Parameters
-    ----------
-    config, empty_table
-        As for `ViewDescriber`.
-    name
-        The descriptor.
-    revise
-        Whether earlier views are segmented again with each new one; not in a search in motion, which has many views.
-    bench_image : uint8 array (H, W, 3), optional
-        Shows the bench of the enrollment; the first frame is compared with it.
-
-    Raises
-    ------
-    ValueError
-        The descriptor is unknown.
+    With ``revise`` earlier views are segmented again with each new one; not in a search in motion, which has many
+    views. The first frame is compared with ``bench_image``, uint8 (H, W, 3), which shows the bench of the enrollment.
     """
 
     def __init__(
@@ -238,11 +216,6 @@ class SearchDescriber(ViewDescriber):
         self._bench_image = bench_image
         self._same_bench: bool | None = None
         self._views: hbr.ViewsTogether | None = None
-
-    @property
-    def segmentations(self) -> list[hbr.Segmentation]:
-        """The likeliest segmentation of each view so far; empty if the descriptor needs none."""
-        return [] if self._views is None else [several[0] for several in self._views.segmentations]
 
     @property
     def hypotheses(self) -> list[tuple[hbr.Segmentation, ...]]:
@@ -267,3 +240,65 @@ class SearchDescriber(ViewDescriber):
         return DescribedView(
             {self._name: levels}, found.evidence(), problem, revised, self._views.reliable, self._same_bench
         )
+
+
+@dataclass(frozen=True, slots=True)
+class SegmentationSummary:
+    """Summary of the segmentation of several views: numbers of views."""
+
+    views: int
+    """Views with segmentation evidence."""
+    found: int
+    """Views in which the object was found reliably, and not only guessed."""
+    guessed: int
+    corrected: int
+    """Views whose illumination was corrected."""
+    issues: Mapping[str, int]
+    """Views with each `hbr.segmentation.IssueCode`, the most frequent first."""
+
+    @classmethod
+    def of(cls, evidence: Iterable[Mapping[str, Any] | None]) -> "SegmentationSummary":
+        """Summarise the stored evidence of views; None is a view without segmentation."""
+        views = [one for one in evidence if one is not None]
+        boxes = [one for one in views if one.get("box_px") is not None]
+        guessed = sum(one.get("method") == Method.GUESS for one in boxes)
+        codes = Counter(code for one in views for code in {issue["code"]: None for issue in one.get("issues", ())})
+        return cls(
+            views=len(views),
+            found=len(boxes) - guessed,
+            guessed=guessed,
+            corrected=sum(one.get("gains_bgr") is not None for one in views),
+            issues=dict(codes.most_common()),
+        )
+
+    @property
+    def text(self) -> str:
+        """The summary in one line; empty if no view has segmentation evidence."""
+        if not self.views:
+            return ""
+        guessed = f", guessed in {self.guessed}" if self.guessed else ""
+        known = set(IssueCode)
+        issues = "".join(
+            f"; {_TEXT[IssueCode(code)] if code in known else code} ({count})" for code, count in self.issues.items()
+        )
+        return (
+            f"object found in {self.found} of {self.views} views{guessed}, illumination corrected in {self.corrected}"
+            f"{issues}"
+        )
+
+
+def check_evidence(evidence: object) -> None:
+    """Raise TypeError if a JSON value is not segmentation evidence, on which a reader would fail."""
+    if not isinstance(evidence, Mapping) or not isinstance(evidence.get("issues", []), list):
+        raise TypeError("the evidence of a segmentation that is not one")
+    for issue in evidence.get("issues", []):
+        if not isinstance(issue, Mapping) or not isinstance(issue.get("code"), str):
+            raise TypeError("the evidence of a segmentation with an issue without a code")
+    for name, length in (("box_px", 4), ("gains_bgr", 3)):
+        numbers = evidence.get(name)
+        if numbers is not None and not (
+            isinstance(numbers, list | tuple)
+            and len(numbers) == length
+            and all(isinstance(number, int | float) for number in numbers)
+        ):
+            raise TypeError(f"the evidence of a segmentation whose {name} is not {length} numbers")

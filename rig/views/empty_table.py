@@ -47,20 +47,9 @@ def _problem(values: object) -> TableProblem | None:
 class EmptyTable(BaseModel):
     """An empty-table image, and how it was taken; without its pixels, the content of the JSON file beside it.
 
-    Attributes
-    ----------
-    image_bgr : uint8 array (H, W, 3)
-        A whole frame.
-    taken_utc
-        Date and time.
-    camera, locks
-        The camera and its settings.
-    evidence
-        The measurements that the image was accepted with.
-    noticed
-        A problem that a search or an enrollment has noticed since then.
-    image
-        The file, whose name contains the SHA-256 of its bytes.
+    ``image_bgr`` is a whole frame, uint8 (H, W, 3). The image was accepted with the measurements ``evidence``. A search
+    or an enrollment may have ``noticed`` a problem since then. The name of the file ``image`` contains the SHA-256 of
+    its bytes.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", arbitrary_types_allowed=True)
@@ -116,10 +105,7 @@ def empty_table_status(bench: Bench) -> EmptyTableStatus:
 def store_empty_table(bench: Bench, table: EmptyTable) -> None:
     """Store an image instead of the previous one, which stays until the new one is completely on the disk.
 
-    Raises
-    ------
-    StateNotStored
-        The disk is full or not writable.
+    Raises `StateNotStored`: the disk is full or not writable.
     """
     png = images.encode(table.image_bgr)
     stored = table.model_copy(update={"image": f"empty-table-{images.digest(png)}.png"})

@@ -24,6 +24,11 @@ STEP_LEVELS: Final = 8.0
 CELLS: Final = 6
 """Smallest number of changed cells of `GRID`² that are an object: for example 2 cm in an image of 40 cm."""
 
+STILL_S: Final = 1.5
+"""How long the image must be still."""
+POLL_S: Final = 0.25
+"""Time between two frames."""
+
 SPECK: Final = np.ones((3, 3), np.uint8)
 """Smaller groups of pixels are noise, in images of 128 pixels: an object of 3 % of the image's width is larger."""
 
@@ -36,30 +41,16 @@ class TableWatcher:
     At the first call the table must be empty, because later images are compared with that image. An object is new if
     the image is still, differs from the empty table, and either differs from the image at the start of the wait or
     follows an empty table. The table must be at the same angle each time.
-
-    Parameters
-    ----------
-    bench
-        An open bench.
-    still_s
-        How long the image must be still.
-    poll_s
-        Time between two frames.
     """
 
-    def __init__(self, bench: Bench, *, still_s: float = 1.5, poll_s: float = 0.25) -> None:
+    def __init__(self, bench: Bench) -> None:
         self._bench = bench
-        self._still_s = still_s
-        self._poll_s = poll_s
         self._empty: Cells | None = None
 
     def place(self, name: str | None) -> None:
         """Wait until the next object is on the table. An object to be enrolled (``name``) is there already.
 
-        Raises
-        ------
-        DeviceSilent
-            The camera gives no frame.
+        Raises `DeviceSilent`: the camera gives no frame.
         """
         if name is not None:
             return
@@ -69,7 +60,7 @@ class TableWatcher:
         if self._empty is None:
             self._empty = first
         for now, still_s in frames:
-            if still_s < self._still_s:
+            if still_s < STILL_S:
                 continue
             if not changed(self._empty, now):
                 self._empty, old = now, None  # follow slow changes of the daylight
@@ -79,13 +70,10 @@ class TableWatcher:
     def wait_until_still(self) -> None:
         """Wait until nothing moves before the camera, for example after the operator has scanned a barcode.
 
-        Raises
-        ------
-        DeviceSilent
-            The camera gives no frame.
+        Raises `DeviceSilent`: the camera gives no frame.
         """
         for _, still_s in self._frames():
-            if still_s >= self._still_s:
+            if still_s >= STILL_S:
                 return
 
     def clear(self) -> bool:
@@ -98,7 +86,7 @@ class TableWatcher:
         before, still_since_ns = self._capture(), clock.now_ns()
         yield before, 0.0
         while True:
-            clock.sleep(self._poll_s)
+            clock.sleep(POLL_S)
             now = self._capture()
             if changed(before, now):
                 still_since_ns = clock.now_ns()

@@ -28,13 +28,7 @@ class _NoFrameYet(Exception):
 
 
 class FrameStream:
-    """Delivers the frames of a camera one after the other.
-
-    Attributes
-    ----------
-    skipped
-        Frames that were not used because the program was too slow.
-    """
+    """Delivers the frames of a camera one after the other."""
 
     def __init__(self, camera: Camera, clock: Clock) -> None:
         self._camera = camera
@@ -43,6 +37,7 @@ class FrameStream:
         self._delay_ns = 0
         self._after_ns = clock.now_ns()
         self.skipped = 0
+        """Frames that were not used because the program was too slow."""
 
     @property
     def period_s(self) -> float:
@@ -53,17 +48,10 @@ class FrameStream:
     def next(self, meanwhile: Callable[[], object], *, newest: bool = False) -> Frame | None:
         """Return the next frame; None if the camera has delivered none after `PATIENCE_S`, so that the caller can work.
 
-        Parameters
-        ----------
-        meanwhile
-            Called while the method waits for a slow camera.
-        newest
-            Drop frames that have waited for two periods.
+        ``meanwhile`` is called while the method waits for a slow camera. With ``newest``, frames that have waited for
+        two periods are dropped.
 
-        Raises
-        ------
-        DeviceSilent
-            The camera has failed.
+        Raises `DeviceSilent`: the camera has failed.
         """
         after_ns = self._after_ns
         if newest and self._last is not None:

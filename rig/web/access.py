@@ -5,7 +5,6 @@ Decision: docs/decisions/0039.
 
 import hashlib
 import hmac
-import json
 import secrets
 import threading
 from collections.abc import Callable
@@ -19,19 +18,12 @@ from typing import Any, Final
 from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from rig.core.clock import Clock, seconds_between
-from rig.core.errors import (
-    ConfigError,
-    JobRejected,
-    LeaseHeld,
-    LoginRequired,
-    StateNotStored,
-    os_errors_as,
-)
+from rig.core.errors import ConfigError, JobRejected, LeaseHeld, LoginRequired, StateNotStored, os_errors_as
 from rig.core.files import read, write
 from rig.core.next_steps import Do
 
 TOKENS: Final = "tokens.json"
-PREFIX: Final = "rig_"
+MAX_NAME: Final = 50
 MAX_BYTES: Final = 1_000_000
 SESSION_S: Final = 12 * 3600.0
 """Time for which a login is valid: a working day."""
@@ -39,6 +31,10 @@ MAX_SESSIONS: Final = 1000
 LEASE_S: Final = 45.0
 """Time after which a lease that is not renewed is free, because the operator's browser was closed."""
 MAX_ASKED: Final = 100
+
+
+def new_token() -> str:
+    return f"rig_{secrets.token_urlsafe(32)}"
 
 
 class Role(StrEnum):
@@ -53,7 +49,7 @@ class StoredToken(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    name: str = Field(min_length=1, max_length=50)
+    name: str = Field(min_length=1, max_length=MAX_NAME)
     role: Role
     sha256: str = Field(pattern="^[0-9a-f]{64}$")
     created_utc: AwareDatetime
@@ -102,25 +98,14 @@ class Tokens:
         StateNotStored
             The file cannot be written.
         """
-        token = PREFIX + secrets.token_urlsafe(32)
-        now = self._clock.utc()
-        if not name.isprintable() or name.strip() != name or name.casefold() == LOCAL:
+        if not 0 < len(name) <= MAX_NAME or not name.isprintable() or name.strip() != name or name.casefold() == LOCAL:
             raise ConfigError(
                 f"{name!r} cannot be the name of a token.",
-                next_step=f"Use characters that can be printed, without outer spaces, and another name than {LOCAL}.",
+                next_step=f"Use 1 to {MAX_NAME} characters that can be printed, without outer spaces, but not {LOCAL}.",
             )
-        try:
-            stored = StoredToken(
-                name=name,
-                role=role,
-                sha256=_hash(token),
-                created_utc=now,
-                expires_utc=None if days is None else now + timedelta(days=days),
-            )
-        except (ValidationError, OverflowError) as error:
-            raise ConfigError(
-                f"{name!r} cannot be the name of a token.", next_step="Use 1 to 50 characters."
-            ) from error
+        token, now = new_token(), self._clock.utc()
+        expires = None if days is None else now + timedelta(days=days)
+        stored = StoredToken(name=name, role=role, sha256=_hash(token), created_utc=now, expires_utc=expires)
         self._store([*(other for other in self.stored() if other.name != name), stored])
         return token
 
@@ -128,9 +113,9 @@ class Tokens:
         """Remove a token, and return whether it existed."""
         before = self.stored()
         after = [token for token in before if token.name != name]
-        if len(after) != len(before):
+        if removed := len(after) != len(before):
             self._store(after)
-        return len(after) != len(before)
+        return removed
 
     def stored(self) -> list[StoredToken]:
         """Return the stored tokens. Raises `ConfigError` if their file is damaged."""
@@ -148,10 +133,7 @@ class Tokens:
             The file is damaged, and the token is not one of the last good ones.
         """
         self._read()
-        found = None
-        for stored in self._known:
-            if hmac.compare_digest(sha256, stored.sha256):
-                found = stored
+        found = next((stored for stored in self._known if hmac.compare_digest(sha256, stored.sha256)), None)
         if found is None and self._damage is not None:
             raise self._damage
         if found is None or (found.expires_utc is not None and found.expires_utc <= self._clock.utc()):
@@ -177,7 +159,7 @@ class Tokens:
             )
 
     def _store(self, tokens: list[StoredToken]) -> None:
-        content = json.dumps([token.model_dump(mode="json") for token in tokens], indent=1).encode()
+        content = _STORED.dump_json(tokens, indent=1)
         step = (Do.FREE_DISK(), "Or set state_dir to a folder that you may write to.")
         with os_errors_as(StateNotStored, f"The tokens cannot be stored in {self._file}.", next_step=step):
             self._file.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
@@ -197,7 +179,7 @@ class Sessions:
 
     tokens: Tokens
     clock: Clock
-    local_token: str = field(default_factory=lambda: PREFIX + secrets.token_urlsafe(32), repr=False)
+    local_token: str = field(repr=False)
     """Lets commands of the same user on this computer watch; it ends with the server."""
     _sessions: dict[str, _Session] = field(default_factory=dict)
     _lock: threading.Lock = field(default_factory=threading.Lock)

@@ -1,43 +1,117 @@
-"""The REST API: state, STOP, events, pictures, jobs."""
+"""The REST API: logins, the lease, state, STOP, events, pictures, jobs."""
 
 import asyncio
 import json
 from contextlib import aclosing
-from typing import Annotated, Any
+from importlib.metadata import version
+from typing import Annotated, Any, Final
 
 from fastapi import Header, Request, Response, WebSocket, WebSocketDisconnect
-from fastapi.responses import StreamingResponse
 
 from rig.core.errors import JobNotFound, TooManyListeners
-from rig.web.event_schema import JobMessage
+from rig.web.answers import (
+    EventStream,
+    Health,
+    JobMessage,
+    Jpeg,
+    LeaseState,
+    ListOf,
+    LivePictures,
+    Login,
+    Me,
+    Stopped,
+    Svg,
+)
 from rig.web.hub import MAX_LISTENERS
 from rig.web.problems import problem
-from rig.web.remote_bench import BOUNDARY
-from rig.web.requests import Job, JobRequest
-from rig.web.server import AnswerBody, OperatorPerson, Page, Routes, Server
+from rig.web.requests import AnswerBody, HandOverBody, Job, JobRequest, LeaseBody, LoginBody
+from rig.web.server import API, COOKIE, OperatorPerson, Page, Routes, Server, Watcher, require_operate
 
-MAX_VIEWERS = 50
+MAX_VIEWERS: Final = 50
+_LOCATION: Final[dict[int | str, dict[str, Any]]] = {
+    201: {"headers": {"Location": {"description": "the job", "schema": {"type": "string"}}}}
+}
 
 
-class EventStream(StreamingResponse):
-    """Server-sent events."""
+def add_access(routes: Routes, server: Server) -> None:
+    @routes.public.get("/health", tags=["server"])
+    def get_health() -> Health:
+        """Return whether the server works; needs no login."""
+        return Health(version=version("hbr-rig"), bench_open=bool(server.remote.status.get("open")))
 
-    media_type = "text/event-stream"
+    @routes.public.post("/login", tags=["access"])
+    def login(body: LoginBody, response: Response) -> Login:
+        """Log in with a token; the answer sets a cookie."""
+        secret, person = server.sessions.login(body.token)
+        secure = server.setup.listening.certfile is not None
+        response.set_cookie(COOKIE, secret, httponly=True, samesite="strict", secure=secure, path="/")
+        return Login(name=person.name, role=person.role)
+
+    @routes.public.post("/logout", tags=["access"])
+    def logout(request: Request, response: Response) -> dict[str, Any]:
+        """Log out. The open streams of this login end."""
+        server.sessions.logout(request.cookies.get(COOKIE, ""))
+        server.hub.wake()
+        response.delete_cookie(COOKIE, path="/")
+        return {}
+
+    @routes.watch.get("/me", tags=["access"], response_model=Me)
+    def get_me(person: Watcher) -> Any:
+        """Return who is logged in, and who has the lease."""
+        mine = server.lease.is_held_by(person)
+        return {"name": person.name, "role": person.role, "has_lease": mine, "lease": server.lease.as_json()}
+
+    @routes.watch.get("/lease", tags=["access"], response_model=LeaseState)
+    def get_lease() -> Any:
+        """Return who has the lease."""
+        return server.lease.as_json()
+
+    @routes.watch.post("/lease", tags=["access"], response_model=LeaseState)
+    def take_lease(body: LeaseBody, person: Watcher) -> Any:
+        """Take or renew the lease."""
+        require_operate(person)
+        server.lease.take(person, force=body.force)
+        return server.lease.as_json()
+
+    @routes.watch.post("/lease/ask", tags=["access"], response_model=LeaseState)
+    def ask_for_lease(person: Watcher) -> Any:
+        """Ask the operator who has the lease to hand it over."""
+        require_operate(person)
+        server.lease.ask(person)
+        return server.lease.as_json()
+
+    @routes.watch.post("/lease/hand-over", tags=["access"], response_model=LeaseState)
+    def hand_over_lease(body: HandOverBody, person: Watcher) -> Any:
+        """Give the lease to an operator who asked for it."""
+        server.lease.hand_over(person, body.name, body.client)
+        return server.lease.as_json()
+
+    @routes.watch.delete("/lease", tags=["access"], response_model=LeaseState)
+    def release_lease(person: Watcher) -> Any:
+        """Give the lease back."""
+        server.lease.release(person)
+        return server.lease.as_json()
 
 
 def add_bench(routes: Routes, server: Server) -> None:
     @routes.watch.get("/status", tags=["bench"])
-    def status() -> dict[str, Any]:
+    def get_status() -> dict[str, Any]:
         """Return the state of the bench, as of the last second."""
-        return _status(server)
+        return {
+            **server.remote.status,
+            "bench": server.setup.bench,
+            "server": {"viewers": server.remote.viewers, "listeners": server.hub.listeners},
+            "catalog": server.catalog.state,
+            "problem": server.remote.status.get("problem") or (problem(server.damage) if server.damage else None),
+        }
 
-    @routes.watch.post("/stop", tags=["bench"])
-    async def stop() -> dict[str, Any]:
+    @routes.watch.post("/stop", tags=["bench"], response_model=Stopped)
+    async def stop() -> Any:
         """Stop the table, and cancel all jobs. Needs no lease. The answer says whether the bench has confirmed it."""
         return {**await server.remote.stop(), "status": server.remote.status}
 
     @routes.watch.get("/events", tags=["bench"], response_class=EventStream, responses={200: {"model": JobMessage}})
-    async def events(
+    async def stream_events(
         request: Request, last_event_id: Annotated[str | None, Header(max_length=64)] = None
     ) -> EventStream:
         """Send events: plan, job, status, lease, stop. `Last-Event-ID` continues after a lost connection."""
@@ -64,32 +138,20 @@ def add_bench(routes: Routes, server: Server) -> None:
         finally:
             sending.cancel()
 
-    @routes.watch.get("/picture", tags=["bench"], response_class=Response)
-    async def picture() -> Response:
+    @routes.watch.get("/picture", tags=["bench"], response_class=Jpeg)
+    async def get_picture() -> Jpeg:
         """Return the newest frame of the camera as JPEG; the header X-Rig-Picture-Age has its age in seconds."""
         _, content, age_s = await server.remote.picture()
         if not content:
             raise JobNotFound("The camera has given no frame yet.", next_step="Try again in a second.")
-        headers = {"Cache-Control": "no-store", "X-Rig-Picture-Age": f"{age_s or 0.0:.2f}"}
-        return Response(content, media_type="image/jpeg", headers=headers)
+        return Jpeg(content, headers={"Cache-Control": "no-store", "X-Rig-Picture-Age": f"{age_s or 0.0:.2f}"})
 
-    @routes.watch.get("/live", tags=["bench"], response_class=StreamingResponse)
-    async def live(request: Request) -> StreamingResponse:
+    @routes.watch.get("/live", tags=["bench"], response_class=LivePictures)
+    async def stream_pictures(request: Request) -> LivePictures:
         """Send the camera's frames as MJPEG."""
         _check_number(server.remote.viewers, MAX_VIEWERS)
-        kind = f"multipart/x-mixed-replace; boundary={BOUNDARY}"
         pictures = server.remote.pictures(lambda: server.still_allowed(request))
-        return StreamingResponse(pictures, media_type=kind, headers={"Cache-Control": "no-store"})
-
-
-def _status(server: Server) -> dict[str, Any]:
-    return {
-        **server.remote.status,
-        "bench": server.bench,
-        "server": {"viewers": server.remote.viewers, "listeners": server.hub.listeners},
-        "catalog": server.catalog.state,
-        "problem": server.remote.status.get("problem") or (problem(server.damage) if server.damage else None),
-    }
+        return LivePictures(pictures, headers={"Cache-Control": "no-store"})
 
 
 async def _send_events(server: Server, socket: WebSocket) -> None:
@@ -112,43 +174,50 @@ def _check_number(present: int, most: int) -> None:
 
 
 def add_jobs(routes: Routes, server: Server) -> None:
-    @routes.watch.get("/jobs", tags=["jobs"])
-    def jobs(page: Page) -> Response:
+    @routes.watch.get("/jobs", tags=["jobs"], response_model=ListOf[Job])
+    def list_jobs(page: Page) -> Response:
         """List the jobs, the newest first."""
         return page.of(server.remote.ask("jobs"), "id")
 
-    @routes.operate.post("/jobs", tags=["jobs"], status_code=201, response_model=Job)
-    def submit(body: JobRequest, person: OperatorPerson) -> Any:
+    @routes.operate.post("/jobs", tags=["jobs"], status_code=201, response_model=Job, responses=_LOCATION)
+    def submit_job(body: JobRequest, person: OperatorPerson, response: Response) -> Any:
         """Add a job to the queue."""
-        return server.remote.ask("submit", request=body, operator=person.name)
+        job = server.remote.ask("submit", request=body, operator=person.name)
+        response.headers["Location"] = f"{API}/jobs/{job['id']}"
+        return job
 
     @routes.watch.get("/jobs/{job_id}", tags=["jobs"], response_model=Job)
-    def job(job_id: str) -> Any:
+    def get_job(job_id: str) -> Any:
         """Return a job."""
         return server.remote.ask("job", job_id=job_id)
 
     @routes.operate.post("/jobs/{job_id}/cancel", tags=["jobs"], response_model=Job)
-    def cancel(job_id: str) -> Any:
+    def cancel_job(job_id: str) -> Any:
         """Cancel a job. A running one ends at its next step; views that were taken stay stored."""
         return server.remote.ask("cancel", job_id=job_id)
 
     @routes.operate.post("/jobs/{job_id}/pause", tags=["jobs"], response_model=Job)
-    def pause(job_id: str) -> Any:
+    def pause_job(job_id: str) -> Any:
         """Pause a job after its present view; the table holds its angle."""
         return server.remote.ask("pause", job_id=job_id)
 
     @routes.operate.post("/jobs/{job_id}/resume", tags=["jobs"], response_model=Job)
-    def resume(job_id: str) -> Any:
+    def resume_job(job_id: str) -> Any:
         """Resume a paused job."""
         return server.remote.ask("resume", job_id=job_id)
 
     @routes.operate.post("/jobs/{job_id}/answer", tags=["jobs"], response_model=Job)
-    def answer(job_id: str, body: AnswerBody) -> Any:
+    def answer_job(job_id: str, body: AnswerBody) -> Any:
         """Answer the question of a job."""
         return server.remote.ask("answer", job_id=job_id, choice=body.choice)
 
-    @routes.watch.get("/jobs/{job_id}/views/{number}", tags=["jobs"], response_class=Response)
-    def view(job_id: str, number: int) -> Response:
+    @routes.watch.get("/jobs/{job_id}/views/{number}", tags=["jobs"], response_class=Jpeg)
+    def get_job_view(job_id: str, number: int) -> Jpeg:
         """Return a picture of a recent job as JPEG, the first with number 0."""
         _, found = server.remote.link.call("view", job_id=job_id, number=number)
-        return Response(found, media_type="image/jpeg", headers={"Cache-Control": "private, max-age=3600"})
+        return Jpeg(found, headers={"Cache-Control": "private, max-age=3600"})
+
+    @routes.watch.get("/jobs/{job_id}/candidates", tags=["jobs"], response_class=Svg)
+    def get_job_candidates(job_id: str) -> Svg:
+        """Return the chart of the candidates of a recent search as SVG, after its last view."""
+        return Svg(server.remote.ask("candidates", job_id=job_id), headers={"Cache-Control": "no-store"})

@@ -1,4 +1,4 @@
-"""The REST API: objects, views, import and export."""
+"""The REST API: objects, views, answers with their corrections, the log, import and export."""
 
 import asyncio
 from collections.abc import AsyncIterator
@@ -6,52 +6,51 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated, Any, Final
 
+from anyio import open_file, to_thread
 from fastapi import Query, Request, Response
-from fastapi.responses import StreamingResponse
 from pydantic import Field
 from starlette.background import BackgroundTask
 
-from rig.catalog import ObjectSummary
+from rig.catalog import Catalog, ObjectSummary
 from rig.catalog.derived import views
 from rig.catalog.exchange.bundle import read_bundle, write_bundle
+from rig.catalog.exchange.tables import plain_row
 from rig.catalog.jobs import finished
-from rig.catalog.transfer import CatalogSource, Conflict, transfer
+from rig.catalog.log import shown
+from rig.catalog.records import Outcome
+from rig.catalog.results import Result, ResultFilter, correct, find_result, find_results
+from rig.catalog.transfer import CatalogSource, Conflict, Transferred, transfer
+from rig.core.errors import CatalogDamaged, CatalogError, JobNotFound
 from rig.core.json_form import plain
 from rig.plans.enroll import similar_objects
-from rig.views.description import BENCH_DESCRIPTOR, PAPER_DESCRIPTOR
+from rig.views.description import BENCH_DESCRIPTOR, DESCRIPTORS
+from rig.web.answers import (
+    Bundle,
+    Deleted,
+    EnrollmentRow,
+    Jpeg,
+    ListedObject,
+    ListOf,
+    ObjectRow,
+    ObjectWithViews,
+    ViewRow,
+    time_text,
+)
 from rig.web.picture import jpeg
-from rig.web.server import API, NameBody, ObjectBody, Page, Routes, Server, cached, long_work, time_text
+from rig.web.requests import CorrectionBody, NameBody, ObjectBody
+from rig.web.server import API, OperatorPerson, Page, Routes, Server, cached, long_work
 
 THUMB_PX: Final = 256
 UPLOAD: Final = f"{API}/import"
 CHUNK_BYTES: Final = 65_536
 BYTES_PER_S: Final = 30_000_000
+Number = Annotated[int, Field(ge=0, lt=2**62)]
+Full = Annotated[bool, Query(description="the stored image instead of a small JPEG")]
 
 
-class _Download:
-    """Sends files at `BYTES_PER_S` for all receivers together, so that STOP does not wait behind their data."""
-
-    def __init__(self) -> None:
-        self._next_s = 0.0
-
-    async def stream(self, path: Path) -> AsyncIterator[bytes]:
-        """Yield the content of a file."""
-        from anyio import open_file
-
-        loop = asyncio.get_running_loop()
-        async with await open_file(path, "rb") as file:
-            while chunk := await file.read(CHUNK_BYTES):
-                begin_s = max(loop.time(), self._next_s)
-                self._next_s = begin_s + len(chunk) / BYTES_PER_S
-                await asyncio.sleep(begin_s - loop.time())
-                yield chunk
-
-
-def add_catalog(routes: Routes, server: Server) -> None:
-    download = _Download()
-
-    @routes.watch.get("/objects", tags=["catalog"])
-    def objects(
+def add_objects(routes: Routes, server: Server) -> None:
+    @routes.watch.get("/objects", tags=["catalog"], response_model=ListOf[ListedObject])
+    def list_objects(
         page: Page,
         search: Annotated[str, Query(max_length=100, description="part of the name, label or note")] = "",
         deleted: Annotated[bool, Query(description="list the deleted objects that can be restored")] = False,
@@ -62,106 +61,189 @@ def add_catalog(routes: Routes, server: Server) -> None:
             pictures = {} if deleted else catalog.first_views()
         wanted = search.casefold()
         rows = [
-            {**_summary(one), "picture": pictures.get(one.name)}
+            ListedObject(**_row(one), picture=pictures.get(one.name)).model_dump(mode="json")
             for one in found
             if wanted in f"{one.name}\n{one.label}\n{one.note}".casefold()
         ]
         return page.of(sorted(rows, key=lambda row: row["name"]), "name")
 
     @routes.watch.get("/objects/{name:path}", tags=["catalog"])
-    def one_object(name: str) -> dict[str, Any]:
+    def get_object(name: str) -> ObjectWithViews:
         """Return an object with its enrollments and views."""
         with server.catalog.open_to_read() as catalog:
             found = catalog.object(name)
             similar = similar_objects(views(catalog, BENCH_DESCRIPTOR), found.summary.name) if found.views else None
-        return {
-            **_summary(found.summary),
-            "enrollments": [
-                {
-                    "status": one.status,
-                    "started_utc": time_text(one.enrollment.started_utc),
-                    "finished_utc": time_text(one.finished_utc),
-                    "planned_views": len(one.enrollment.planned_azimuth_deg),
-                    "stored_views": len(one.enrollment.views),
-                    "sessions": [plain(session.provenance) for session in one.enrollment.sessions],
-                }
-                for one in found.enrollments
-            ],
-            "views_taken": [
-                {
-                    "id": view.id,
-                    "index": view.index,
-                    "azimuth_deg": view.azimuth_deg,
-                    "evidence": view.evidence,
-                    "captured_utc": time_text(view.captured_utc),
-                }
-                for view in found.views
-            ],
-            "similar": plain(similar) if similar else None,
-        }
+        enrollments = [
+            EnrollmentRow(
+                status=one.status,
+                started_utc=one.enrollment.started_utc,
+                finished_utc=one.finished_utc,
+                planned_views=len(one.enrollment.planned_azimuth_deg),
+                stored_views=len(one.enrollment.views),
+                sessions=[plain(session.provenance) for session in one.enrollment.sessions],
+            )
+            for one in found.enrollments
+        ]
+        return ObjectWithViews(
+            **_row(found.summary),
+            enrollments=enrollments,
+            views_taken=[ViewRow.model_validate(view) for view in found.views],
+            similar=plain(similar) if similar else None,
+        )
 
     @routes.operate.patch("/objects/{name:path}", tags=["catalog"])
-    def change(name: str, body: ObjectBody) -> dict[str, Any]:
+    def change_object(name: str, body: ObjectBody) -> ObjectRow:
         """Rename or label an object."""
         with server.catalog.open_to_change() as catalog:
             catalog.set_texts(name, label=body.label, note=body.note)
             if body.name is not None:
                 catalog.rename(name, body.name)
-            return _summary(catalog.summary(body.name or name))
+            return ObjectRow.model_validate(catalog.summary(body.name or name))
 
     @routes.operate.delete("/objects/{name:path}", tags=["catalog"])
-    def remove(name: str) -> dict[str, Any]:
+    def delete_object(name: str) -> Deleted:
         """Delete an object. It can be restored until rig catalog gc removes it."""
         with server.catalog.open_to_change() as catalog:
             catalog.delete(name)
-        return {"deleted": name}
+        return Deleted(deleted=name)
 
     @routes.operate.post("/undelete", tags=["catalog"])
-    def restore(body: NameBody) -> dict[str, Any]:
+    def restore_object(body: NameBody) -> ObjectRow:
         """Restore a deleted object."""
         with server.catalog.open_to_change() as catalog:
             catalog.undelete(body.name)
-            return _summary(catalog.summary(body.name))
+            return ObjectRow.model_validate(catalog.summary(body.name))
 
-    @routes.watch.get("/views/{view_id}/image", tags=["catalog"], response_class=Response)
-    def image(
-        request: Request,
-        view_id: Annotated[int, Field(ge=0, lt=2**62)],
-        full: Annotated[bool, Query(description="the stored PNG instead of a small JPEG")] = False,
-    ) -> Response:
+    @routes.watch.get("/views/{view_id}/image", tags=["catalog"], response_class=Jpeg)
+    def get_view_image(request: Request, view_id: Number, full: Full = False) -> Response:
         """Return the image of a view."""
         with server.catalog.open_to_read() as catalog:
-            name = catalog.view(view_id).image
-            digest = f"{name}-{'full' if full else THUMB_PX}"
+            return _image(request, catalog, catalog.view(view_id).image, full=full)
 
-            def answer() -> Response:
-                pixels = catalog.read_image(name)  # and check them
-                if full:
-                    kind = "image/png" if name.endswith(".png") else "image/jpeg"
-                    return Response(catalog.database.images.content(name), media_type=kind)
-                return Response(jpeg(pixels, THUMB_PX), media_type="image/jpeg")
 
-            return cached(request, digest, answer, {"Cache-Control": "private, max-age=86400"})
+def _row(one: ObjectSummary) -> dict[str, Any]:
+    return ObjectRow.model_validate(one).model_dump()
+
+
+def _image(request: Request, catalog: Catalog, name: str, *, full: bool) -> Response:
+    """Return an image of the catalog, unless the sender has it already."""
+
+    def answer() -> Response:
+        pixels = catalog.read_image(name)  # and check them
+        if full:
+            kind = "image/png" if name.endswith(".png") else "image/jpeg"
+            return Response(catalog.database.images.content(name), media_type=kind)
+        return Jpeg(jpeg(pixels, THUMB_PX))
+
+    digest = f"{name}-{'full' if full else THUMB_PX}"
+    return cached(request, digest, answer, {"Cache-Control": "private, max-age=86400"})
+
+
+def _result(catalog: Catalog, result_id: int) -> Result:
+    try:
+        return find_result(catalog, result_id)
+    except CatalogDamaged:
+        raise
+    except CatalogError as error:
+        raise JobNotFound(error.what, next_step=error.steps) from error
+
+
+def add_results(routes: Routes, server: Server) -> None:
+    @routes.watch.get("/results", tags=["results"], response_model=ListOf[dict[str, Any]])
+    def list_results(
+        page: Page,
+        sample: Annotated[str | None, Query(max_length=100)] = None,
+        object_name: Annotated[str | None, Query(alias="object", max_length=100)] = None,
+        outcome: Outcome | None = None,
+    ) -> Response:
+        """List the recorded answers, the newest first. Filters use the corrected values."""
+        with server.catalog.open_to_read() as catalog:
+            found = find_results(catalog, ResultFilter(sample, object_name, outcome))
+        rows = [{**plain_row(one.as_row()), "id": str(one.id)} for one in found]
+        return page.of(rows[::-1], "id")
+
+    @routes.watch.get("/results/{result_id}", tags=["results"])
+    def get_result(result_id: Number) -> dict[str, Any]:
+        """Return a recorded answer. The image of its first view is at ``image``, if one was recorded."""
+        with server.catalog.open_to_read() as catalog:
+            return plain_row(_result(catalog, result_id).as_row())
+
+    @routes.watch.get("/results/{result_id}/image", tags=["results"], response_class=Jpeg)
+    def get_result_image(request: Request, result_id: Number, full: Full = False) -> Response:
+        """Return the image of the first view of a recorded answer."""
+        with server.catalog.open_to_read() as catalog:
+            name = _result(catalog, result_id).image
+            if name is None:
+                raise JobNotFound("The answer has no image.", next_step="Set identify.record to image for later ones.")
+            return _image(request, catalog, name, full=full)
+
+    @routes.operate.post("/results/{result_id}/correct", tags=["results"])
+    def correct_result(body: CorrectionBody, person: OperatorPerson, result_id: Number) -> dict[str, Any]:
+        """Correct the object or the sample of an answer, with the reason. The answer itself stays."""
+        with server.catalog.open_to_change() as catalog:
+            _result(catalog, result_id)
+            correct(
+                catalog,
+                result_id,
+                reason=body.reason,
+                object_name=body.object,
+                unknown=body.unknown,
+                sample=body.sample,
+                operator=person.name,
+            )
+            return plain_row(_result(catalog, result_id).as_row())
+
+    @routes.watch.get("/log", tags=["bench"], response_model=ListOf[dict[str, Any]])
+    def list_log(page: Page) -> Response:
+        """List the catalog's log, the newest first."""
+        with server.catalog.open_to_read() as catalog:
+            entries = catalog.log()
+        rows = [{**shown(entry), "id": str(entry.id), "time_utc": time_text(entry.time_utc)} for entry in entries]
+        return page.of(rows[::-1], "id")
+
+
+# -- bundles -----------------------------------------------------------------------------------------------------------
+
+
+class _Download:
+    """Sends files at `BYTES_PER_S` for all receivers together, so that STOP does not wait behind their data."""
+
+    def __init__(self) -> None:
+        self._next_s = 0.0
+
+    async def stream(self, path: Path) -> AsyncIterator[bytes]:
+        """Yield the content of a file."""
+        loop = asyncio.get_running_loop()
+        async with await open_file(path, "rb") as file:
+            while chunk := await file.read(CHUNK_BYTES):
+                begin_s = max(loop.time(), self._next_s)
+                self._next_s = begin_s + len(chunk) / BYTES_PER_S
+                await asyncio.sleep(begin_s - loop.time())
+                yield chunk
+
+
+def add_bundles(routes: Routes, server: Server) -> None:
+    download = _Download()
 
     @routes.operate.post("/import", tags=["catalog"])
-    async def import_bundle(
-        request: Request,
-        on_conflict: Annotated[str, Query(pattern="^(reject|skip|replace)$")] = "reject",
-    ) -> dict[str, Any]:
+    async def import_bundle(request: Request, on_conflict: Conflict = Conflict.REJECT) -> Transferred:
         """Import a bundle (.rigcat.zip); the body is the file. It is checked as rig import checks it."""
-        from anyio import to_thread
+
+        def store() -> Transferred:
+            with server.catalog.open_to_change() as catalog, read_bundle(path, catalog.clock) as source:
+                return finished(transfer(source, catalog, conflict=on_conflict, descriptors=DESCRIPTORS, jobs=1))
 
         with TemporaryDirectory(prefix="rig-import-") as folder:
             path = Path(folder) / "upload.rigcat.zip"
             with path.open("wb") as file:
                 async for chunk in request.stream():
                     await to_thread.run_sync(file.write, chunk)
-            return await long_work(lambda: _import(server, path, on_conflict))
+            return await long_work(store)
 
-    @routes.watch.get("/export", tags=["catalog"], response_class=StreamingResponse)
-    async def export(
+    @routes.watch.get("/export", tags=["catalog"], response_class=Bundle)
+    async def export_bundle(
         name: Annotated[list[str] | None, Query(description="default: all objects")] = None,
-    ) -> StreamingResponse:
+    ) -> Bundle:
         """Return a bundle with objects."""
         folder = TemporaryDirectory(prefix="rig-export-")
         path = Path(folder.name) / "catalog.rigcat.zip"
@@ -179,24 +261,4 @@ def add_catalog(routes: Routes, server: Server) -> None:
             "Content-Length": str(path.stat().st_size),
             "Content-Disposition": 'attachment; filename="catalog.rigcat.zip"',
         }
-        return StreamingResponse(
-            download.stream(path),
-            media_type="application/zip",
-            headers=headers,
-            background=BackgroundTask(folder.cleanup),
-        )
-
-
-def _import(server: Server, path: Path, on_conflict: str) -> dict[str, Any]:
-    with server.catalog.open_to_change() as catalog, read_bundle(path, catalog.clock) as source:
-        job = transfer(
-            source, catalog, conflict=Conflict(on_conflict), descriptors=(PAPER_DESCRIPTOR,), strict=True, jobs=1
-        )
-        return dict(plain(finished(job)))
-
-
-def _summary(one: ObjectSummary) -> dict[str, Any]:
-    return {
-        **plain(one),
-        **{key: time_text(getattr(one, key)) for key in ("created_utc", "enrolled_utc", "deleted_utc")},
-    }
+        return Bundle(download.stream(path), headers=headers, background=BackgroundTask(folder.cleanup))

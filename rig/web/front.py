@@ -25,13 +25,12 @@ from rig.safety.saved_state import SERVER_FOLDER
 from rig.web.access import Lease, Sessions, Tokens
 from rig.web.api_catalog import UPLOAD
 from rig.web.app import create_app
-from rig.web.bench_catalog import BenchCatalog
 from rig.web.guard import Guard, PatientProtocol
 from rig.web.hub import Hub
 from rig.web.link import Link
 from rig.web.remote_bench import RemoteBench
 from rig.web.server import Server
-from rig.web.setup import WEB_NICE, Listening, Setup, print_note, set_priority, shorten_pauses
+from rig.web.setup import WEB_NICE, BenchCatalog, Listening, Setup, print_note, set_priority, shorten_pauses
 
 MAX_FILES: Final = 65_536
 THREADS: Final = 8
@@ -45,8 +44,7 @@ END_S: Final = 4.0
 def make_server(setup: Setup, clock: SystemClock) -> Server:
     """Return the parts of a server; nothing listens yet, and `Server.remote` is not connected to the bench."""
     hub = Hub(secrets.token_hex(4))
-    place = setup.config.catalog_place(setup.bench)
-    catalog = BenchCatalog(place, clock, lambda state: hub.publish("catalog", state), print_note)
+    catalog = BenchCatalog(setup.catalog_place, clock, lambda state: hub.publish("catalog", state), print_note)
 
     def received(kind: str, data: Any) -> None:
         if kind == "catalog":
@@ -55,23 +53,19 @@ def make_server(setup: Setup, clock: SystemClock) -> Server:
             hub.publish(kind, data)
 
     return Server(
-        bench=setup.bench,
-        config=setup.config,
+        setup=setup,
         clock=clock,
         remote=RemoteBench(setup.state_folder, clock, received),
         hub=hub,
         sessions=Sessions(Tokens(setup.state_folder / SERVER_FOLDER, clock), clock, setup.local_token),
         lease=Lease(clock, lambda values: hub.publish("lease", values)),
-        runs=setup.runs,
         catalog=catalog,
-        needs_login=setup.listening.needs_login,
-        secure_cookies=setup.listening.certfile is not None,
     )
 
 
 def checked_catalog(server: Server) -> AbstractContextManager[object]:
     """Return a check of the catalog during the work of a ``with`` block; damage is on stderr and in the status."""
-    place = server.config.catalog_place(server.bench)
+    place = server.setup.catalog_place
     if not place.may_exist():
         return nullcontext()
 
@@ -82,8 +76,9 @@ def checked_catalog(server: Server) -> AbstractContextManager[object]:
     return BackgroundCheck(place, server.clock, report)
 
 
-def guarded(server: Server, listening: Listening) -> Guard:
+def guarded(server: Server) -> Guard:
     """Return the application of a server behind its guard."""
+    listening = server.setup.listening
     hosts = {"localhost", "127.0.0.1", "::1", listening.host.strip("[]"), *listening.other_hosts}
     return Guard(create_app(server), hosts=hosts, upload_path=UPLOAD, max_upload_bytes=listening.max_upload_bytes)
 
@@ -156,7 +151,7 @@ def main(link_descriptor: int, socket_descriptor: int) -> None:
         threading.Timer(END_S, os._exit, (0,)).start()  # a long export, for example
 
     server.remote.connect(socket.socket(fileno=link_descriptor), ended)
-    web = _Web(uvicorn_config(guarded(server, setup.listening), setup.listening), server.remote.link)
+    web = _Web(uvicorn_config(guarded(server), setup.listening), server.remote.link)
     shorten_pauses()
     with checked_catalog(server), server.catalog.background_delivery():
         web.run([socket.socket(fileno=socket_descriptor)])

@@ -11,13 +11,12 @@ from weakref import WeakKeyDictionary
 
 from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
-from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol, RequestResponseCycle
 
 from rig.core.next_steps import Do, SomeSteps
 from rig.core.phrases import whole
-from rig.web.problems import MEDIA_TYPE, problem_body
+from rig.web.problems import ProblemResponse
 
 MAX_BODY_BYTES: Final = 1_000_000
 """Largest size of a request, except an upload."""
@@ -47,14 +46,8 @@ _HEADERS: Final = [
 class Guard:
     """A layer before the application: rejects foreign and too large requests, and adds headers to responses.
 
-    Parameters
-    ----------
-    app
-        The application.
-    hosts
-        Names and addresses by which browsers may call the server (against DNS rebinding).
-    upload_path, max_upload_bytes
-        The path whose requests may be larger, and their largest size.
+    ``hosts`` are the names and addresses by which browsers may call the server (against DNS rebinding). Requests to
+    ``upload_path`` may be larger than others.
     """
 
     def __init__(self, app: ASGIApp, *, hosts: set[str], upload_path: str, max_upload_bytes: int) -> None:
@@ -108,8 +101,7 @@ class Guard:
         if rejection is None:
             await self._app(scope, limited, guarded)
         else:
-            body, status = problem_body(*rejection), rejection[0]
-            await Response(body, status, media_type=MEDIA_TYPE)(scope, receive, guarded)
+            await ProblemResponse.of_request(*rejection)(scope, receive, guarded)
 
     def _rejection(self, method: str, path: str, headers: Headers) -> tuple[int, str, SomeSteps] | None:
         host = headers.get("host", "")

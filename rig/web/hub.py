@@ -38,12 +38,7 @@ class Message:
 class Hub:
     """A ring of numbered messages.
 
-    Parameters
-    ----------
-    epoch
-        Distinguishes the numbers of this server run from those of an earlier one.
-    capacity
-        Number of messages that are stored.
+    ``epoch`` distinguishes the numbers of this server run from those of an earlier one.
     """
 
     def __init__(self, epoch: str, capacity: int = CAPACITY) -> None:

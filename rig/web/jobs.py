@@ -5,7 +5,6 @@ import secrets
 import threading
 from collections.abc import Callable
 from pathlib import Path
-from shlex import join
 from typing import Final
 
 from pydantic import ValidationError
@@ -14,7 +13,6 @@ from pydantic_core import to_jsonable_python
 from rig.core.clock import Clock
 from rig.core.errors import JobNotFound, JobRejected, ObjectExists, RigError, StateNotStored, os_errors_as
 from rig.core.files import read, write
-from rig.core.masking import masked
 from rig.core.next_steps import Do, NextStep
 from rig.plans.operator import Choice
 from rig.web.requests import EnrollRequest, IdentifyRequest, Job, JobRequest, JobState, Question, TrayRequest
@@ -33,18 +31,8 @@ MAX_BYTES: Final = 20_000_000
 class JobQueue:
     """The jobs of one bench; all methods may be called from any thread.
 
-    Parameters
-    ----------
-    folder
-        Folder of the stored jobs.
-    clock
-        Clock for the times of the jobs.
-    changed
-        Called with each job that has changed.
-    rig_arguments
-        Arguments that let a command of the terminal use the same bench.
-    stops
-        Returns the number of stops so far. A job that was submitted before a stop never starts.
+    ``changed`` gets each job that has changed. ``stops`` returns the number of stops so far: a job that was submitted
+    before a stop never starts.
     """
 
     def __init__(
@@ -52,13 +40,11 @@ class JobQueue:
         folder: Path,
         clock: Clock,
         changed: Callable[[Job], None],
-        rig_arguments: tuple[str, ...] = (),
         stops: Callable[[], int] = lambda: 0,
     ) -> None:
         self._file = folder / FILE
         self._clock = clock
         self._changed = changed
-        self._arguments: tuple[str, ...] = masked(rig_arguments)  # everybody who watches sees the command
         self._lock = threading.RLock()
         self._arrived = threading.Condition(self._lock)
         self._jobs: dict[str, Job] = {}
@@ -241,23 +227,17 @@ class JobQueue:
             self._store(*jobs)
 
     def _offer_to_continue(self, job: Job, error: RigError | None = None) -> None:
-        """Set the request and the command that continue the work of a job that ended early, with this error."""
+        """Set the request that continues the work of a job that ended early, with this error."""
         request = job.request
         if isinstance(request, EnrollRequest):
             actions = [step.action for step in (error.steps if error else ()) if isinstance(step, NextStep)]
             started = job.views > 0 or request.resume or Do.CONTINUE_ENROLLMENT in actions
-            if isinstance(error, ObjectExists) and not started:
-                return  # the same request would be rejected again
-            job.resume = request.model_copy(update={"resume": True, "replace": False}) if started else request
-            words = ["rig", "enroll", request.name, *(["--resume"] if started else [])]
-            if not started and request.replace:
-                words.append("--replace")
-            job.command = join([*words, *self._arguments])
-        elif isinstance(request, TrayRequest):
-            job.resume = request  # complete objects are skipped, and interrupted ones resumed
-        elif isinstance(request, IdentifyRequest):
-            job.resume = request
-            job.command = join(["rig", "identify", *(["--watch"] if request.watch else []), *self._arguments])
+            if started:
+                job.resume = request.model_copy(update={"resume": True, "replace": False})
+            elif not isinstance(error, ObjectExists):  # the same request would be rejected again
+                job.resume = request
+        elif isinstance(request, TrayRequest | IdentifyRequest):
+            job.resume = request  # of a tray, complete objects are skipped, and interrupted ones resumed
 
     def _find(self, job_id: str) -> Job:
         if job_id not in self._jobs:

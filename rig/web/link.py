@@ -35,14 +35,7 @@ They run in the link's own thread. Their `RigError` is raised at the other end.
 class Link:
     """One end of the connection.
 
-    Parameters
-    ----------
-    connection
-        A connected stream socket; the link closes it.
-    functions
-        What the other end may call.
-    ended
-        Called once when the other end has gone.
+    It closes the ``connection``, calls ``functions`` for the other end, and ``ended`` once when that end has gone.
     """
 
     def __init__(self, connection: socket.socket, functions: Functions, ended: Callable[[], None]) -> None:

@@ -1,15 +1,20 @@
-"""The pages. A script fills them from the REST API, so that pages and integrators use one interface."""
+"""The pages, and the buttons and links of next steps on them.
 
-from typing import TYPE_CHECKING, Final
+A script fills the pages from the REST API, so that pages and integrators use one interface. A next step without a
+button or link is done at a terminal of the bench's computer; the page then shows its command.
+"""
 
-from fastapi import APIRouter, Request
+from typing import Any, Final
+
+from fastapi import APIRouter
 from fastapi.responses import HTMLResponse
+from markupsafe import Markup
+from pydantic import BaseModel
 
+from rig.charts.compass import dial
+from rig.core.next_steps import Do
 from rig.core.templates import environment
-from rig.web.next_steps import page_actions
-
-if TYPE_CHECKING:
-    from rig.web.server import Server
+from rig.web.requests import AcknowledgeRequest, DoctorRequest, EmptyTableRequest, ReferenceRequest
 
 PAGES: Final = {
     "": "Bench",
@@ -21,19 +26,60 @@ PAGES: Final = {
     "log": "Log",
     "settings": "Settings",
 }
+JOB_OF_STEP: Final[dict[Do, BaseModel]] = {
+    Do.ACKNOWLEDGE: AcknowledgeRequest(),
+    Do.ACKNOWLEDGE_IN_PROGRAM: AcknowledgeRequest(),
+    Do.DOCTOR: DoctorRequest(),
+    Do.EMPTY_TABLE: EmptyTableRequest(),
+    Do.HOME_HERE: ReferenceRequest(here=True),
+    Do.SET_REVOLUTIONS: ReferenceRequest(),
+}
+"""Requests of jobs, for buttons. The parameters of the step replace fields of the request."""
+PAGE_OF_STEP: Final[dict[Do, str]] = {
+    Do.STATUS: "/",
+    Do.GOTO: "/",
+    Do.CALIBRATE: "/calibrations",
+    Do.SHOW_CONFIGURATION: "/settings",
+    Do.ENROLL: "/enroll",
+    Do.ENROLL_AGAIN: "/enroll",
+    Do.CONTINUE_ENROLLMENT: "/enroll",
+    Do.LIST_OBJECTS: "/catalog",
+    Do.LABEL: "/catalog",
+    Do.RENAME: "/catalog",
+    Do.UNDELETE: "/catalog",
+    Do.LIST_RESULTS: "/runs",
+}
+"""Pages, for links."""
+_WORDS: Final[dict[Do, str]] = {
+    Do.ACKNOWLEDGE_IN_PROGRAM: Do.ACKNOWLEDGE.words,
+    Do.STOP: "press STOP",
+}
+"""What a page says in other words than a terminal."""
 
 
-def pages(server: "Server") -> APIRouter:
-    """Return the routes of the pages."""
+def page_actions() -> dict[str, dict[str, Any]]:
+    """Return for each action its ``words``, and the ``job`` of its button or the ``page`` of its link, if any."""
+    return {
+        str(action): {
+            "words": _WORDS.get(action, action.words),
+            "job": JOB_OF_STEP[action].model_dump(mode="json") if action in JOB_OF_STEP else None,
+            "page": PAGE_OF_STEP.get(action),
+        }
+        for action in Do
+    }
+
+
+def pages(bench: str) -> APIRouter:
+    """Return the routes of the pages of a bench."""
     templates = environment("rig.web", folder="templates")
-    shared = {"bench": server.bench, "actions": page_actions()}
+    shared = {"bench": bench, "actions": page_actions(), "dial": Markup(dial())}
     router = APIRouter(include_in_schema=False)
 
     def page(name: str) -> None:
         template = templates.get_template(f"{name or 'bench'}.html.j2")
 
         @router.get(f"/{name}", response_class=HTMLResponse, name=f"page-{name or 'bench'}")
-        def show(request: Request) -> HTMLResponse:  # noqa: ARG001
+        def show() -> HTMLResponse:
             content = template.render(pages=PAGES, current=name, title=PAGES[name], **shared)
             return HTMLResponse(content, headers={"Cache-Control": "no-cache"})
 

@@ -1,68 +1,70 @@
 """Errors as RFC 9457 problem details."""
 
-import json
-from typing import Any, Final
+from collections.abc import Mapping
+from typing import Any, Final, Self
 
-from rig.core.errors import (
-    BenchBusy,
-    CatalogBusy,
-    ConfigError,
-    Forbidden,
-    JobNotFound,
-    JobRejected,
-    LeaseHeld,
-    LoginRequired,
-    ObjectExists,
-    ObjectNotFound,
-    RigError,
-    TooManyListeners,
-)
-from rig.core.next_steps import SomeSteps, as_steps, in_words, steps_as_json
+from fastapi.responses import JSONResponse
+from pydantic import BaseModel
+from pydantic_core import to_jsonable_python
 
-MEDIA_TYPE: Final = "application/problem+json"
+from rig.core import errors
+from rig.core.errors import RigError
+from rig.core.next_steps import NextSteps, SomeSteps, as_steps, in_words, steps_as_json
 
-_STATUS: Final[dict[type[RigError], int]] = {
-    LoginRequired: 401,
-    Forbidden: 403,
-    TooManyListeners: 503,
-    LeaseHeld: 423,
-    JobNotFound: 404,
-    JobRejected: 409,
-    ObjectNotFound: 404,
-    ObjectExists: 409,
-    BenchBusy: 409,
-    CatalogBusy: 503,
-    ConfigError: 503,
+_STATUS: Final = {
+    errors.LoginRequired.code: 401,
+    errors.Forbidden.code: 403,
+    errors.JobNotFound.code: 404,
+    errors.ObjectNotFound.code: 404,
+    errors.LeaseHeld.code: 423,
+    errors.CatalogBusy.code: 503,
+    errors.TooManyListeners.code: 503,
 }
-_BY_HUNDRED: Final = {1: 500, 2: 422, 3: 500, 4: 503, 5: 409, 6: 422, 7: 409, 8: 404, 9: 409}
+_BY_HUNDRED: Final = {1: 500, 2: 422, 3: 503, 4: 503, 5: 409, 6: 422, 7: 409, 8: 404, 9: 409}
+"""Of the other errors, by the hundreds of their codes."""
 
 
-def status_of(error: RigError) -> int:
-    """Return the HTTP status of an error."""
-    for kind, status in _STATUS.items():
-        if isinstance(error, kind):
-            return status
-    return _BY_HUNDRED.get(error.code // 100, 500)
+def _status(error: RigError) -> int:
+    return _STATUS.get(error.code) or _BY_HUNDRED[error.code // 100]
+
+
+class Problem(BaseModel):
+    """An error (RFC 9457)."""
+
+    type: str
+    title: str
+    status: int
+    detail: str
+    code: int | None = None
+    next_step: str | None = None
+    steps: list[str | dict[str, Any]] = []
+    evidence: dict[str, Any] | None = None
 
 
 def problem(error: RigError) -> dict[str, Any]:
     """Return an error as problem details: ``code``, ``next_step``, ``steps`` and ``evidence`` are extensions."""
-    values = error.as_dict()
-    return {
-        "type": f"urn:hbr-rig:error:{error.code}",
-        "title": error.title,
-        "status": status_of(error),
-        "detail": error.what,
-        "code": error.code,
-        "next_step": error.next_step,
-        "steps": values["steps"],
-        "evidence": json.loads(json.dumps(values["evidence"], default=str)),
-    }
+    more = {"code": error.code, "evidence": to_jsonable_python(error.evidence, fallback=str)}
+    return _problem(f"urn:hbr-rig:error:{error.code}", error.title, _status(error), error.what, error.steps) | more
 
 
-def problem_body(status: int, what: str, next_step: SomeSteps, **more: Any) -> bytes:
-    """Return the JSON text of a problem that is not one of our errors."""
-    steps = as_steps(next_step)
-    values = {"type": "about:blank", "title": "request", "status": status, "detail": what}
-    values |= {"next_step": in_words(steps), "steps": steps_as_json(steps)}
-    return json.dumps({**values, **more}, ensure_ascii=False).encode()
+class ProblemResponse(JSONResponse):
+    """An answer that is an error."""
+
+    media_type = "application/problem+json"
+
+    @classmethod
+    def of(cls, error: RigError) -> Self:
+        return cls(problem(error), _status(error))
+
+    @classmethod
+    def of_request(
+        cls, status: int, what: str, next_step: SomeSteps, headers: Mapping[str, str] | None = None, **more: Any
+    ) -> Self:
+        """Return the answer to a request that HTTP itself does not allow."""
+        values = _problem("about:blank", "request", status, what, as_steps(next_step))
+        return cls({**values, **more}, status, headers)
+
+
+def _problem(kind: str, title: str, status: int, what: str, steps: NextSteps) -> dict[str, Any]:
+    values = {"type": kind, "title": title, "status": status, "detail": what}
+    return {**values, "next_step": in_words(steps), "steps": steps_as_json(steps)}

@@ -8,9 +8,9 @@ from typing import Any, Final
 
 from rig.core.clock import Clock, seconds_between
 from rig.safety.stop_channel import StopAnswer, StopRequest, stop_answer
+from rig.web.answers import BOUNDARY
 from rig.web.link import Link
 
-BOUNDARY: Final = "frame"
 PICTURE_S: Final = 0.08
 """Shortest time between two pictures that are fetched from the bench, for all viewers together."""
 VIEWER_GONE_S: Final = 30.0
@@ -22,19 +22,7 @@ CONFIRM_S: Final = 3.0
 class RemoteBench:
     """The bench of another process.
 
-    Parameters
-    ----------
-    state_folder
-        The bench's state folder, where the stop channel is.
-    clock
-        The computer's clock.
-    received
-        Called with the kind and the values of each event.
-
-    Attributes
-    ----------
-    link
-        Calls the functions of `rig.web.bench_side`, after `connect`.
+    ``received`` gets the kind and the values of each event. ``link`` calls the functions of `rig.web.run.BenchSide`.
     """
 
     link: Link
@@ -63,7 +51,7 @@ class RemoteBench:
         self._received(kind, data)
 
     def ask(self, function: str, **values: Any) -> Any:
-        """Return the result of a function of `rig.web.bench_side`. Raises its errors, and `BenchBusy`."""
+        """Return the result of a function of `rig.web.run`. Raises its errors, and `BenchBusy`."""
         return self.link.call(function, **values)[0]
 
     # -- STOP: it asks no queue, no thread and no disk ----------------------------------------------------------------

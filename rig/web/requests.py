@@ -1,4 +1,4 @@
-"""The requests to the bench: one model for each kind of job."""
+"""What clients send: a model for each kind of job, and the bodies of the other requests; and what a job looks like."""
 
 from enum import StrEnum
 from typing import Annotated, Any, Literal, Self
@@ -14,18 +14,9 @@ class _Request(BaseModel):
 
 Name = Annotated[str, Field(min_length=1, max_length=100, examples=["mug-white"])]
 Views = Annotated[int | None, Field(ge=4, le=720, description="views in a revolution; default: enroll.views")]
-
-
-class EnrollRequest(_Request):
-    """Enroll the object on the table."""
-
-    kind: Literal["enroll"] = "enroll"
-    name: Name
-    views: Views = None
-    label: Annotated[str | None, Field(max_length=1000)] = None
-    note: Annotated[str | None, Field(max_length=10_000)] = None
-    resume: bool = Field(False, description="take the missing views of an interrupted enrollment")
-    replace: bool = Field(False, description="enroll again; the old views stay in use until the new ones are complete")
+Fly = Annotated[
+    bool | None, Field(description="take the views while the table rotates, or at rest; default: enroll.mode")
+]
 
 
 class TrayObject(_Request):
@@ -37,22 +28,34 @@ class TrayObject(_Request):
     views: Views = None
 
 
-class TrayRequest(_Request):
-    """Enroll several objects one after the other. The job asks for each object."""
+class _Replacing(_Request):
+    resume: bool = Field(False, description="take the missing views of an interrupted enrollment")
+    replace: bool = Field(False, description="enroll again; the old views stay in use until the new ones are complete")
 
-    kind: Literal["tray"] = "tray"
+
+class _Tray(_Request):
     objects: Annotated[list[TrayObject], Field(min_length=1, max_length=1000)]
     views: Views = None
+    fly: Fly = None
 
 
-class DryRunRequest(_Request):
+class EnrollRequest(_Replacing, TrayObject):
+    """Enroll the object on the table."""
+
+    kind: Literal["enroll"] = "enroll"
+    fly: Fly = None
+
+
+class TrayRequest(_Tray):
+    """Enroll several objects one after the other. The job asks for each object, and skips those that are complete."""
+
+    kind: Literal["tray"] = "tray"
+
+
+class DryRunRequest(_Replacing, _Tray):
     """Compute what an enrollment would do. Moves nothing and stores nothing."""
 
     kind: Literal["dry-run"] = "dry-run"
-    objects: Annotated[list[TrayObject], Field(min_length=1, max_length=1000)]
-    views: Views = None
-    resume: bool = False
-    replace: bool = False
 
 
 class IdentifyRequest(_Request):
@@ -182,8 +185,7 @@ class Job(BaseModel):
     """A job of the bench.
 
     ``error`` has the fields of an error as ``rig --json`` prints them. ``resume`` is the request that continues the
-    job's work, and ``command`` the same for a terminal; both are None if there is nothing to continue. ``result`` is
-    the last important event of the plan.
+    job's work; None if there is nothing to continue. ``result`` is the last important event of the plan.
     """
 
     model_config = ConfigDict(extra="forbid")
@@ -201,6 +203,56 @@ class Job(BaseModel):
     result_text: str = ""
     error: dict[str, Any] | None = None
     resume: JobRequest | None = None
-    command: str | None = None
     run: str | None = Field(None, description="saved run of an identification, for GET /api/v1/runs/{run}")
     views: int = Field(0, description="number of pictures at GET /api/v1/jobs/{id}/views/{n}")
+
+
+# -- the bodies of the other requests ----------------------------------------------------------------------------------
+
+
+class LoginBody(_Request):
+    """A token."""
+
+    token: Annotated[str, Field(max_length=200)]
+
+
+class LeaseBody(_Request):
+    """How to take the lease."""
+
+    force: bool = Field(False, description="take it over from another operator, who is warned")
+
+
+class HandOverBody(_Request):
+    """Who gets the lease."""
+
+    name: Annotated[str, Field(max_length=50)]
+    client: Annotated[str, Field(max_length=64)] = ""
+
+
+class AnswerBody(_Request):
+    """The answer to the question of a job."""
+
+    choice: Choice
+
+
+class ObjectBody(_Request):
+    """Changes of an object; what is missing stays."""
+
+    name: Annotated[str | None, Field(max_length=1000)] = None
+    label: Annotated[str | None, Field(max_length=1000)] = None
+    note: Annotated[str | None, Field(max_length=10_000)] = None
+
+
+class NameBody(_Request):
+    """The name of an object."""
+
+    name: Annotated[str, Field(max_length=1000)]
+
+
+class CorrectionBody(_Request):
+    """A correction of an answer; what is missing stays."""
+
+    reason: Annotated[str, Field(min_length=1, max_length=1000)]
+    object: Annotated[str | None, Field(max_length=100)] = None
+    unknown: bool = Field(False, description="the object is an unknown one")
+    sample: Annotated[str | None, Field(max_length=100)] = None

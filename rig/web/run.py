@@ -8,7 +8,6 @@ Decision: docs/decisions/0062.
 """
 
 import os
-import secrets
 import socket
 import ssl
 import subprocess
@@ -17,20 +16,29 @@ import threading
 from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
-from typing import Final
+from pathlib import Path
+from typing import Any, Final
 
-from rig.config import RigConfig
+from pydantic import validate_call
+
+from rig.bench import Bench, open_bench
 from rig.core.clock import SystemClock, seconds_between
-from rig.core.errors import RigError, UsageError, WebEnded, os_errors_as
+from rig.core.errors import JobNotFound, RigError, UsageError, WebEnded, os_errors_as
 from rig.core.files import write
 from rig.core.next_steps import Do
 from rig.safety.saved_state import SERVER_FILE, SERVER_FOLDER, BenchLock, ServerAddress
-from rig.web.bench_side import BenchSide
-from rig.web.link import Link
-from rig.web.setup import BENCH_NICE, Listening, Setup, print_note, set_priority, shorten_pauses
+from rig.safety.stop_channel import StopListener, listen
+from rig.web.jobs import JobQueue
+from rig.web.link import Functions, Link
+from rig.web.picture import LivePicture
+from rig.web.requests import Job
+from rig.web.setup import BENCH_NICE, BenchCatalog, Listening, Setup, print_note, set_priority, shorten_pauses
+from rig.web.work import ServedDesk
+from rig.web.worker import BenchWorker
 
 START_S: Final = 30.0
 END_S: Final = 6.0
+"""Longer than `rig.web.front.END_S`, after which a web process ends itself."""
 SILENT_S: Final = 30.0
 """Time without a sign of life after which a web process counts as hanging, and is ended."""
 MAX_STARTS: Final = 3
@@ -38,26 +46,10 @@ STARTS_WITHIN_S: Final = 60.0
 """After `MAX_STARTS` web processes within this time, the server ends."""
 
 
-def run_server(
-    bench: str,
-    config: RigConfig,
-    seed: int | None,
-    arguments: tuple[str, ...],
-    listening: Listening,
-    ready: Callable[[str], None],
-) -> None:
+def run_server(setup: Setup, ready: Callable[[str], None]) -> None:
     """Serve a bench until a signal ends the program; the torque is off on return.
 
-    Parameters
-    ----------
-    bench, config, seed
-        The bench to open.
-    arguments
-        Arguments of `rig` that select the same bench.
-    listening
-        The address at which to listen.
-    ready
-        Called with the address of the page when the server answers.
+    ``ready`` gets the address of the page when the server answers.
 
     Raises
     ------
@@ -68,12 +60,8 @@ def run_server(
     WebEnded
         The web process ends again and again.
     """
-    clock = SystemClock()
+    clock, listening = SystemClock(), setup.listening
     _check_certificate(listening)
-    token = secrets.token_urlsafe(32)
-    setup = Setup(
-        bench=bench, config=config, seed=seed, arguments=arguments, listening=listening, local_token=f"rig_{token}"
-    )
     folder = setup.state_folder / SERVER_FOLDER
     lock = BenchLock(folder, clock)  # one server for each bench
     set_priority(BENCH_NICE)
@@ -103,19 +91,89 @@ def run_server(
         lock.close()
 
 
+class BenchSide:
+    """The queue, the worker and the live picture of a bench, and the functions that the web process calls.
+
+    ``folder`` is that of the stored jobs, and ``report`` gets sentences about the catalog for the terminal.
+    """
+
+    def __init__(self, setup: Setup, folder: Path, clock: SystemClock, report: Callable[[str], None]) -> None:
+        def opened() -> Bench:
+            bench = open_bench(setup.bench, setup.config, seed=setup.seed)
+            bench.camera.observers.append(self.picture.show)
+            return bench
+
+        def run(worker: BenchWorker, job: Job) -> None:
+            ServedDesk(worker, job, setup, catalog).run()
+
+        self.link: Link | None = None
+        self.stops: StopListener = listen(setup.state_folder)
+        self.picture = LivePicture(clock)
+        self.queue = JobQueue(folder, clock, lambda job: self.publish("job", job), self.stops.count)
+        catalog = BenchCatalog(setup.catalog_place, clock, lambda state: self.publish("catalog", state), report)
+        self.worker = BenchWorker(opened, self.queue, self.publish, self.picture, run, self.stops, clock)
+        asked = ("jobs", "job", "submit", "cancel", "pause", "resume", "answer")
+        self._functions: Functions = {
+            **{name: validate_call(getattr(self.queue, name)) for name in asked},
+            "view": self._view,
+            "candidates": self._candidates,
+            "picture": self._picture,
+            "numbers": self._numbers,
+        }
+
+    def publish(self, kind: str, data: Any) -> None:
+        """Send a message to the listeners of the web process, if there is one."""
+        if self.link is not None:
+            self.link.tell("publish", kind=kind, data=data)
+
+    def connect(
+        self,
+        connection: socket.socket,
+        ended: Callable[[], None] = lambda: None,
+        alive: Callable[[], None] = lambda: None,
+    ) -> Link:
+        """Return the link to a web process, which gets events from now on, beginning with the present state.
+
+        ``ended`` is called when the process has gone, and ``alive`` at each of its signs of life.
+        """
+        self.link = link = Link(connection, {**self._functions, "alive": alive}, ended)
+        link.start()
+        self.publish("status", self.worker.status)
+        return link
+
+    def close(self) -> None:
+        self.stops.close()
+
+    def _view(self, job_id: str, number: int) -> tuple[None, bytes]:
+        pictures = self.worker.views.get(job_id, [])
+        if not 0 <= number < len(pictures):
+            raise JobNotFound("There is no such picture (any more).", next_step="The catalog has all enrolled views.")
+        return None, pictures[number]
+
+    def _candidates(self, job_id: str) -> str:
+        if job_id not in self.worker.charts:
+            raise JobNotFound("There is no such chart (any more).", next_step="Open the report of the saved run.")
+        return self.worker.charts[job_id]
+
+    def _picture(self, after: int) -> tuple[dict[str, Any], bytes]:
+        """Return the newest frame, unless its number is ``after``, and ask the camera for more."""
+        self.picture.want()
+        found = self.picture.jpeg() if self.picture.number != after else None
+        number, content = found or (after, b"")
+        return {"number": number, "age_s": self.picture.age_s}, content
+
+    def _numbers(self) -> dict[str, Any]:
+        return {
+            "jobs_ended": self.worker.jobs_ended,
+            "stops": self.stops.count(),
+            "intervals_s": list(self.worker.intervals_s),
+        }
+
+
 class WebProcess:
     """The web process of a server; it is started again if it ends.
 
-    Parameters
-    ----------
-    side
-        The bench, whose calls it makes.
-    setup
-        What the process must know.
-    connection
-        The listening socket, which outlives the process: requests wait in it for the next one.
-    clock
-        The computer's clock.
+    ``connection`` is the listening socket, which outlives the process: requests wait in it for the next one.
     """
 
     def __init__(self, side: BenchSide, setup: Setup, connection: socket.socket, clock: SystemClock) -> None:

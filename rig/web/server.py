@@ -3,26 +3,22 @@
 import asyncio
 import hashlib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from datetime import datetime
-from pathlib import Path
 from typing import Annotated, Any, Final, TypeVar
 
 from fastapi import APIRouter, Depends, Query, Request, Response
-from pydantic import BaseModel, ConfigDict, Field
+from fastapi.security import APIKeyCookie, HTTPBearer
 from starlette.requests import HTTPConnection
 
-from rig.config import RigConfig
 from rig.core.clock import SystemClock
 from rig.core.errors import Forbidden, LoginRequired, RigError, UsageError
 from rig.core.next_steps import Do
-from rig.plans.operator import Choice
 from rig.web.access import LOCAL, Lease, Person, Role, Sessions
-from rig.web.bench_catalog import BenchCatalog
 from rig.web.hub import Hub
 from rig.web.remote_bench import RemoteBench
+from rig.web.setup import BenchCatalog, Setup
 
 COOKIE: Final = "rig-session"
 API: Final = "/api/v1"
@@ -33,29 +29,16 @@ MAX_PAGE: Final = 500
 class Server:
     """The objects that the application works with.
 
-    Attributes
-    ----------
-    remote
-        The bench, which another process owns.
-    needs_login
-        Whether requests need a token.
-    catalog
-        The bench's catalog.
-    damage
-        Damage of the catalog; None if none is known.
+    ``remote`` is the bench, which another process owns; ``damage`` is that of the catalog, None if none is known.
     """
 
-    bench: str
-    config: RigConfig
+    setup: Setup
     clock: SystemClock
     remote: RemoteBench
     hub: Hub
     sessions: Sessions
     lease: Lease
-    runs: Path
     catalog: BenchCatalog
-    needs_login: bool
-    secure_cookies: bool = False
     damage: RigError | None = None
 
     def person(self, request: HTTPConnection) -> Person | None:
@@ -78,7 +61,7 @@ class Server:
             found = self.sessions.find(cookie)
             if found is not None:
                 return Person(found.name, found.role, client)
-        return None if self.needs_login else Person(LOCAL, Role.OPERATE, client)
+        return None if self.setup.listening.needs_login else Person(LOCAL, Role.OPERATE, client)
 
     def still_allowed(self, request: HTTPConnection) -> bool:
         """Return whether the sender of a request that is still open may go on: the token may have been removed."""
@@ -86,73 +69,6 @@ class Server:
             return self.person(request) is not None
         except RigError:
             return False
-
-
-class Body(BaseModel):
-    """A body of a request."""
-
-    model_config = ConfigDict(extra="forbid")
-
-
-class LoginBody(Body):
-    """A token."""
-
-    token: Annotated[str, Field(max_length=200)]
-
-
-class LeaseBody(Body):
-    """How to take the lease."""
-
-    force: bool = Field(False, description="take it over from another operator, who is warned")
-
-
-class HandOverBody(Body):
-    """Who gets the lease."""
-
-    name: Annotated[str, Field(max_length=50)]
-    client: Annotated[str, Field(max_length=64)] = ""
-
-
-class AnswerBody(Body):
-    """The answer to the question of a job."""
-
-    choice: Choice
-
-
-class ObjectBody(Body):
-    """Changes of an object; what is missing stays."""
-
-    name: Annotated[str | None, Field(max_length=1000)] = None
-    label: Annotated[str | None, Field(max_length=1000)] = None
-    note: Annotated[str | None, Field(max_length=10_000)] = None
-
-
-class NameBody(Body):
-    """The name of an object."""
-
-    name: Annotated[str, Field(max_length=1000)]
-
-
-class CorrectionBody(Body):
-    """A correction of an answer; what is missing stays."""
-
-    reason: Annotated[str, Field(min_length=1, max_length=1000)]
-    object: Annotated[str | None, Field(max_length=100)] = None
-    unknown: bool = Field(False, description="the object is an unknown one")
-    sample: Annotated[str | None, Field(max_length=100)] = None
-
-
-class Problem(BaseModel):
-    """An error (RFC 9457)."""
-
-    type: str
-    title: str
-    status: int
-    detail: str
-    code: int | None = None
-    next_step: str | None = None
-    steps: list[str | dict[str, Any]] = []
-    evidence: dict[str, Any] | None = None
 
 
 # These two wait for nothing. As coroutines they need no thread, which a long request could occupy.
@@ -199,47 +115,49 @@ Watcher = Annotated[Person, Depends(watcher)]
 OperatorPerson = Annotated[Person, Depends(operator)]
 
 
+_SCHEMES: Final = (
+    Depends(HTTPBearer(scheme_name="token", description="a token of rig serve --new-token", auto_error=False)),
+    Depends(APIKeyCookie(name=COOKIE, scheme_name="login", description="set by POST /login", auto_error=False)),
+)
+"""For the description of the API only: `Server.person` also knows who needs neither, and the errors."""
+
+
 class Routes:
     """The routes of the API by the right that they need: none, to watch, or to operate the bench."""
 
     def __init__(self) -> None:
         self.public = APIRouter()
-        self.watch = APIRouter(dependencies=[Depends(watcher)])
-        self.operate = APIRouter(dependencies=[Depends(operator)])
+        self.watch = APIRouter(dependencies=[Depends(watcher), *_SCHEMES])
+        self.operate = APIRouter(dependencies=[Depends(operator), *_SCHEMES])
 
 
+@dataclass(frozen=True, slots=True)
 class PageOfList:
     """The page of a list that a request asks for."""
 
-    def __init__(
-        self,
-        request: Request,
-        limit: Annotated[int, Query(ge=1, le=MAX_PAGE)] = 100,
-        after: Annotated[str | None, Query(max_length=100)] = None,
-    ) -> None:
-        self._request = request
-        self._limit = limit
-        self._after = after
+    request: Request
+    limit: Annotated[int, Query(ge=1, le=MAX_PAGE)] = 100
+    after: Annotated[str | None, Query(max_length=100)] = None
 
-    def of(self, rows: list[dict[str, Any]], key: str) -> Response:
+    def of(self, rows: Sequence[dict[str, Any]], key: str) -> Response:
         """Return the page with an ETag, and a link to the next one; ``key`` names the entries."""
         start = 0
-        if self._after is not None:
-            places = [number for number, row in enumerate(rows) if row[key] == self._after]
+        if self.after is not None:
+            places = [number for number, row in enumerate(rows) if row[key] == self.after]
             if not places:
                 raise UsageError(
                     "The list has changed: the entry after which to continue is gone.", next_step="Start again."
                 )
             start = places[0] + 1
-        shown = rows[start : start + self._limit]
-        more = shown[-1][key] if start + self._limit < len(rows) else None
+        shown = rows[start : start + self.limit]
+        more = shown[-1][key] if start + self.limit < len(rows) else None
         values = {"items": shown, "total": len(rows), "next": more}
         body = json.dumps(values, ensure_ascii=False, default=str).encode()
         headers = {"Cache-Control": "private, no-cache"}
         if more is not None:
-            headers["Link"] = f'<{self._request.url.include_query_params(after=more)}>; rel="next"'
+            headers["Link"] = f'<{self.request.url.include_query_params(after=more)}>; rel="next"'
         digest = hashlib.sha256(body).hexdigest()[:32]
-        return cached(self._request, digest, lambda: Response(body, media_type="application/json"), headers)
+        return cached(self.request, digest, lambda: Response(body, media_type="application/json"), headers)
 
 
 Page = Annotated[PageOfList, Depends()]
@@ -252,7 +170,3 @@ def cached(request: Request, digest: str, answer: Callable[[], Response], header
     response = Response(status_code=304) if known else answer()
     response.headers.update({"ETag": etag, **headers})
     return response
-
-
-def time_text(at: datetime | None) -> str | None:
-    return None if at is None else at.isoformat(timespec="seconds").replace("+00:00", "Z")

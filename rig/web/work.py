@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager, closing, nullcontext
-from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, Final, Protocol
 
@@ -11,13 +10,15 @@ from pydantic import BaseModel
 from rig.bench import Bench
 from rig.bench.bench import DEVICES
 from rig.catalog import Catalog
+from rig.charts.candidates import Styles, candidates_chart
 from rig.core.errors import UsageError
 from rig.core.json_form import plain
 from rig.core.next_steps import NextSteps, as_steps, steps_as_json
 from rig.core.phrases import counted, duration_words
+from rig.core.plugins import plugins
 from rig.doctor.context import open_context
 from rig.doctor.finding import Finding, finding_words
-from rig.events.events import Accepted, Decided, Enrolled, Event, Identified, Started, event_dict
+from rig.events.events import Accepted, Decided, Enrolled, Event, Identified, Ranked, Started, event_dict
 from rig.events.lines import next_steps, page_line
 from rig.jobs.desk import Desk, Progress, Remark, Result, Step, Steps
 from rig.jobs.doctor import examine
@@ -25,19 +26,14 @@ from rig.jobs.enroll import enroll, enroll_list, plan
 from rig.jobs.identify import identify
 from rig.jobs.table import acknowledge, goto, home, refer
 from rig.jobs.table_image import take_table_image
-from rig.motion.move import MotionModel
+from rig.motion.move import MotionTimes
 from rig.plans.estimate import TimeLeft
 from rig.plans.operator import Choice, Operator, Question
 from rig.plans.tray import TrayItem
 from rig.web import requests
-from rig.web.bench_catalog import BenchCatalog
 from rig.web.picture import Outliner, jpeg
-from rig.web.requests import (
-    Job,
-    JobState,
-    TrayObject,
-)
-from rig.web.setup import Setup
+from rig.web.requests import Job, JobState, TrayObject
+from rig.web.setup import BenchCatalog, Setup
 from rig.web.worker import BenchWorker
 
 VIEW_PX: Final = 480
@@ -56,23 +52,11 @@ class Calibration(Protocol):
 
 def calibrations() -> dict[str, Calibration]:
     """Return the installed calibrations by name."""
-    return {point.name: point.load() for point in sorted(entry_points(group=CALIBRATIONS), key=lambda p: p.name)}
+    return dict(sorted(plugins(CALIBRATIONS)))
 
 
 class ServedDesk(Desk):
-    """The desk of a job of the server, and its operator: the bench is open, and the pages ask.
-
-    Parameters
-    ----------
-    worker
-        Owns the bench.
-    job
-        The running job.
-    setup
-        The served bench.
-    catalog
-        Opens the bench's catalog.
-    """
+    """The desk of a job of the server, and its operator: the bench is open, and the pages ask."""
 
     is_there = True
     log_waits_for_server = False  # which may be away: that would delay the answer to a STOP
@@ -87,6 +71,8 @@ class ServedDesk(Desk):
         self._catalog = catalog
         self._left: TimeLeft | None = None
         self._outline: Outliner | None = None
+        self._ranked: list[Ranked] = []
+        self._styles = Styles()
 
     def run(self) -> None:
         """Run the job to its end; an operator who cancels closes it, and so the torque goes off."""
@@ -163,8 +149,9 @@ class ServedDesk(Desk):
             bench = self._worker.bench()
             job.progress = requests.Progress(done=0, total=event.views)
             self._outline = Outliner(bench)
-            left = TimeLeft(MotionModel(bench.config), event.angles_deg, in_motion=event.in_motion)
+            left = TimeLeft(MotionTimes(bench.config), event.angles_deg, in_motion=event.in_motion)
             self._left = left if event.angles_deg else None
+            self._ranked.clear()
         if self._left is not None:
             self._left.add(event)
         if isinstance(event, Accepted):
@@ -175,6 +162,9 @@ class ServedDesk(Desk):
             if job.progress is not None:
                 left_s = None if self._left is None else self._left.seconds
                 job.progress = job.progress.model_copy(update={"done": job.progress.done + 1, "seconds_left": left_s})
+        if isinstance(event, Ranked):
+            self._ranked.append(event)
+            self._worker.charts[job.id] = candidates_chart(self._ranked, self._styles, alone=True)
         if isinstance(event, Enrolled | Identified):
             job.result, job.result_text = event_dict(event), text
         self._publish(text, next_steps(event), values)
@@ -204,9 +194,9 @@ def _enroll(desk: ServedDesk, **parameters: Any) -> Steps[None]:
     return enroll(desk, **parameters, ask=False)
 
 
-def _tray(desk: ServedDesk, objects: list[TrayObject], views: int | None) -> Steps[None]:
+def _tray(desk: ServedDesk, objects: list[TrayObject], **parameters: Any) -> Steps[None]:
     items = [TrayItem(number, one.name, one.label, one.note, one.views) for number, one in enumerate(objects, 1)]
-    return enroll_list(desk, items, views=views, ask=False)
+    return enroll_list(desk, items, **parameters, ask=False)
 
 
 def _dry_run(desk: ServedDesk, objects: list[TrayObject], **parameters: Any) -> Steps[None]:

@@ -43,22 +43,8 @@ class JobCancelled(Exception):
 class BenchWorker:
     """Runs jobs on one bench.
 
-    Parameters
-    ----------
-    open_bench
-        Opens the bench.
-    queue
-        The source of the jobs.
-    publish
-        Sends a message to the listeners: its kind, and its JSON values. It must not wait.
-    picture
-        Receives the camera's frames.
-    run_job
-        Runs a job to its end: `rig.web.work.ServedDesk`.
-    stops
-        Receives the requests to stop.
-    clock
-        The computer's clock.
+    ``publish`` sends a message to the listeners, its kind and its JSON values; it must not wait. ``run_job`` runs a job
+    to its end: `rig.web.work.ServedDesk`.
     """
 
     def __init__(
@@ -90,6 +76,8 @@ class BenchWorker:
         """Number of stops before the present job: a further one stops it."""
         self.views: dict[str, list[bytes]] = {}
         """Pictures of the last jobs as JPEG."""
+        self.charts: dict[str, str] = {}
+        """Charts of the candidates of the last jobs as SVG, after their last view."""
         self._status_ns = 0
         self._polled_ns: int | None = None
         self.intervals_s: deque[float] = deque(maxlen=INTERVALS)
@@ -121,6 +109,7 @@ class BenchWorker:
         self.views[job.id] = []
         for old in list(self.views)[:-JOBS_WITH_PICTURES]:
             del self.views[old]
+            self.charts.pop(old, None)
         self._polled_ns = None
         state, error = JobState.FAILED, None
         try:

@@ -4,33 +4,16 @@ The coordinates of a texture are relative to its size: u from 0 (left) to 1 (rig
 body of revolution u = 0.5 is the front, and the sheet is a ring: a shape that exceeds one edge continues at the other.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from math import cos, pi, sin
+from typing import Any
 
 import cv2
 import numpy as np
 
 from sim.objects.projection import Colour, Image, Paint
 
-Brush = Callable[["Sheet"], None]
-
-WHITE: Colour = (238, 240, 240)
-CREAM: Colour = (196, 226, 238)
-BLACK: Colour = (34, 32, 32)
-GREY: Colour = (150, 150, 148)
-RED: Colour = (44, 40, 196)
-ORANGE: Colour = (30, 120, 232)
-YELLOW: Colour = (50, 205, 240)
-GREEN: Colour = (70, 140, 50)
-DARK_GREEN: Colour = (52, 80, 26)
-TEAL: Colour = (150, 150, 40)
-BLUE: Colour = (180, 90, 30)
-NAVY: Colour = (100, 48, 24)
-PURPLE: Colour = (140, 50, 110)
-PINK: Colour = (190, 150, 235)
-BROWN: Colour = (40, 70, 118)
-WOOD: Colour = (110, 165, 205)
-TERRACOTTA: Colour = (72, 104, 190)
+Stroke = Sequence[Any]
 
 _SHIFT = 4
 
@@ -40,6 +23,7 @@ class Sheet:
 
     def __init__(self, shape: tuple[int, int], ground: Colour) -> None:
         self.pixels = np.empty((*shape, 3), dtype=np.uint8)
+        self._shift = 0.0
         self.pixels[:] = ground
 
     @property
@@ -59,8 +43,9 @@ class Sheet:
 
     def polygon(self, points: Sequence[tuple[float, float]], colour: Colour) -> None:
         scale = np.array([self.columns, self.rows], dtype=np.float64)
-        for ring in _rings(min(u for u, _ in points), max(u for u, _ in points)):
-            corners = (np.array(points) + np.array([ring, 0.0])) * scale - 0.5
+        left, right = min(u for u, _ in points), max(u for u, _ in points)
+        for ring in _rings(self._shift + left, self._shift + right):
+            corners = (np.array(points) + np.array([self._shift + ring, 0.0])) * scale - 0.5
             fixed = np.round(corners * (1 << _SHIFT)).astype(np.int32)
             cv2.fillPoly(self.pixels, [fixed], colour, cv2.LINE_AA, _SHIFT)
 
@@ -72,7 +57,7 @@ class Sheet:
 
     def disc(self, u: float, v: float, radius: float, colour: Colour) -> None:
         """Paint a round spot; ``radius`` as a share of the sheet's height."""
-        reach = radius * self.rows / self.columns
+        u, reach = self._shift + u, radius * self.rows / self.columns
         size, y = round(radius * self.rows * (1 << _SHIFT)), round((v * self.rows - 0.5) * (1 << _SHIFT))
         for ring in _rings(u - reach, u + reach):
             x = round(((u + ring) * self.columns - 0.5) * (1 << _SHIFT))
@@ -86,6 +71,13 @@ class Sheet:
             r = radius * (waist if i % 2 else 1.0)
             corners.append((u + r * sin(i * pi / points) * aspect, v - r * cos(i * pi / points)))
         self.polygon(corners, colour)
+
+    def hand(self, clockwise_deg: float, near: float, far: float, half: float, colour: Colour) -> None:
+        """Paint a hand of a dial, from twelve, as a rectangle between two distances from the middle."""
+        a = 2 * pi * clockwise_deg / 360
+        c, s = cos(a), sin(a)
+        corners = ((-half, near), (half, near), (half, far), (-half, far))
+        self.polygon([(0.5 + x * c + y * s, 0.5 + x * s - y * c) for x, y in corners], colour)
 
     def dots(
         self, across: int, down: int, radius: float, colour: Colour, *, top: float = 0.0, bottom: float = 1.0
@@ -105,6 +97,13 @@ class Sheet:
         (w, h), _ = cv2.getTextSize(words, font, scale, thickness)
         origin = (round(u * self.columns - w / 2), round(v * self.rows + h / 2))
         cv2.putText(self.pixels, words, origin, font, scale, colour, thickness, cv2.LINE_AA)
+
+    def spine(self, title: str, ground: Colour, ink: Colour) -> None:
+        """Paint the spine of a book: ``ground`` with ``title`` along it."""
+        first, last = round(self.rows * 0.15), round(self.rows * 0.85)
+        words = Sheet((self.columns, self.rows), ground)
+        words.text(title, 0.5, 0.5, 0.4, ink, width=0.66)
+        self.pixels[first:last] = words.pixels[:, first:last].transpose(1, 0, 2)[:, ::-1]
 
     def lines(self, left: float, top: float, right: float, bottom: float, n: int, colour: Colour, seed: int) -> None:
         """Draw ``n`` lines that look like small print."""
@@ -129,12 +128,25 @@ class Sheet:
         cloud = fine[top : top + self.rows, left : left + self.columns, None] * strength
         self.pixels[:] = np.clip(self.pixels + cloud, 0, 255).astype(np.uint8)
 
-    def around(self, rotation_deg: float, brush: Brush) -> None:
-        """Paint with ``brush`` on the ring, rotated counter-clockwise by ``rotation_deg``."""
+    def around(self, rotation_deg: float, strokes: Sequence[Stroke]) -> None:
+        """Paint ``strokes`` on the ring, rotated counter-clockwise by ``rotation_deg``."""
         by = round(rotation_deg / 360 * self.columns)
         self.pixels = np.roll(self.pixels, -by, axis=1)
-        brush(self)
+        self.paint(strokes)
         self.pixels = np.roll(self.pixels, by, axis=1)
+
+    def repeat(self, n: int, strokes: Sequence[Stroke]) -> None:
+        """Paint ``strokes`` ``n`` times around the ring; texts, lines and mottles are not moved."""
+        for i in range(n):
+            self._shift = i / n
+            self.paint(strokes)
+        self._shift = 0.0
+
+    def paint(self, strokes: Sequence[Stroke]) -> None:
+        """Paint ``strokes`` in their order: each the name of a method, its arguments, and a dict of options."""
+        for name, *arguments in strokes:
+            options = arguments.pop() if isinstance(arguments[-1], dict) else {}
+            getattr(self, name)(*arguments, **options)
 
 
 def _rings(left: float, right: float) -> range:
@@ -142,24 +154,13 @@ def _rings(left: float, right: float) -> range:
     return range(-1 if right > 1 else 0, 2 if left < 0 else 1)
 
 
-def painted(ground: Colour, *brushes: Brush) -> Paint:
-    """Return a texture: ``ground`` with ``brushes`` applied in their order."""
+def painted(ground: Colour, strokes: Sequence[Stroke] = ()) -> Paint:
+    """Return a texture: ``ground`` with ``strokes`` on it."""
 
     def paint(shape: tuple[int, int]) -> Image:
         sheet = Sheet(shape, ground)
-        for brush in brushes:
-            brush(sheet)
+        sheet.paint(strokes)
         # Without this blur, sharp edges alias on surfaces at a slant.
         return np.asarray(cv2.GaussianBlur(sheet.pixels, (0, 0), 0.7), dtype=np.uint8)
 
     return paint
-
-
-def wood(seed: int) -> Brush:
-    """Return the grain of wood, across the sheet."""
-
-    def brush(sheet: Sheet) -> None:
-        sheet.mottle(9.0, (0.5, 0.03), seed)
-        sheet.mottle(5.0, (0.2, 0.012), seed + 1)
-
-    return brush

@@ -1,13 +1,20 @@
-"""The objects that come with the simulated bench."""
+"""The objects that come with the simulated bench: ``objects.toml``, made of a few shapes."""
 
-from collections.abc import Mapping
+import tomllib
+from collections.abc import Callable, Mapping
 from functools import cache
+from importlib.resources import files
+from math import cos, pi, sin
 from types import MappingProxyType
+from typing import Any
 
-from sim.objects.packs import more_twins, packs
-from sim.objects.pottery import pottery
-from sim.objects.solid import Solid
-from sim.objects.toys import toys
+from sim.objects.curves import Curve, smooth
+from sim.objects.paint import painted
+from sim.objects.polyhedron import Face, Polyhedron, box, lying_cylinder, prism, quad, roof, triangle
+from sim.objects.projection import Colour, Paint
+from sim.objects.revolution import Revolution
+from sim.objects.solid import Part, Solid
+from sim.objects.tube import Tube, handle, ray
 
 CONFUSABLE: tuple[tuple[str, str], ...] = (
     ("mug-white", "mug-star"),
@@ -28,14 +35,111 @@ MORE_CONFUSABLE: tuple[tuple[str, str], ...] = (
 """Pairs of which the second one does not stand on the shelf (`twins`)."""
 
 
+Table = dict[str, Any]
+
+
 @cache
 def shelf() -> Mapping[str, Solid]:
     """Return the built-in objects by name. Their textures are painted when they are first drawn."""
-    return MappingProxyType({solid.name: solid for solid in (*pottery(), *packs(), *toys())})
+    left_out = {second for _, second in MORE_CONFUSABLE}
+    return MappingProxyType({name: solid for name, solid in read_objects().items() if name not in left_out})
 
 
 @cache
 def twins() -> Mapping[str, Solid]:
     """Return the objects of all pairs by name, `CONFUSABLE` and `MORE_CONFUSABLE`."""
-    things = {**shelf(), **{solid.name: solid for solid in more_twins()}}
+    things = {**read_objects(), **shelf()}
     return MappingProxyType({name: things[name] for pair in (*CONFUSABLE, *MORE_CONFUSABLE) for name in pair})
+
+
+def read_objects() -> dict[str, Solid]:
+    """Return the objects of ``objects.toml`` by name."""
+    tables = tomllib.loads(files("sim.objects").joinpath("objects.toml").read_text("utf-8"))
+    colours: dict[str, Colour] = {name: (b, g, r) for name, (b, g, r) in tables.pop("colours").items()}
+    objects = {}
+    for name, own in tables.items():
+        base = tables[own["like"]] if "like" in own else {}
+        prints = base.get("prints", {}) | own.get("prints", {})
+        paints: dict[str, Paint] = {}
+        for role, table in prints.items():
+            # A print on the print of the same name begins with that of the object that this one is like.
+            ground, strokes = _print(table, prints if table.get("on") != role else base["prints"])
+            paints[role] = painted(*_coloured([ground, strokes], colours))
+        parts = [_part(table, paints, colours) for table in own.get("parts") or base["parts"]]
+        symmetry_deg = float(own.get("symmetry_deg", base.get("symmetry_deg", 360)))
+        objects[name] = Solid(name, tuple(parts), symmetry_deg)
+    return objects
+
+
+def _print(table: Table, others: Mapping[str, Table]) -> tuple[Any, list[Any]]:
+    """Return ground and strokes of a print."""
+    ground, strokes = _print(others[table["on"]], others) if "on" in table else (table["ground"], [])
+    return ground, [*strokes, *table.get("strokes", ())]
+
+
+def _coloured(value: Any, colours: Mapping[str, Colour]) -> Any:
+    """Return ``value`` with colours in place of their names; so a text cannot be the name of a colour."""
+    if isinstance(value, list):
+        return [_coloured(each, colours) for each in value]
+    return colours.get(value, value) if isinstance(value, str) else value
+
+
+# -- shapes -----------------------------------------------------------------------------------------------------------
+
+
+def _part(table: Table, paints: Mapping[str, Paint], colours: Mapping[str, Colour]) -> Part:
+    """Return a part, with paints or colours in place of their names and curves in place of their descriptions."""
+
+    def paint(value: Any) -> Paint | Colour:
+        return paints.get(value) or colours[value] if isinstance(value, str) else tuple(value)
+
+    read: dict[str, Callable[[Any], Any]] = {
+        **dict.fromkeys(("profile", "inside", "path"), _curve),
+        **dict.fromkeys(("paint", "top", "wall", "end", "slope", "gable", "colour", "lining"), paint),
+        "walls": lambda walls: tuple(paint(wall) for wall in walls),
+        "faces": lambda faces: tuple(_face(face["corners"], paint(face["paint"])) for face in faces),
+    }
+    values = {key: read.get(key, _plain)(value) for key, value in table.items()}
+    shape: Part = _SHAPES[values.pop("shape")](**values)
+    return shape
+
+
+def _plain(value: Any) -> Any:
+    return tuple(value) if isinstance(value, list) else value
+
+
+def _revolution(paint: Paint | Colour, **values: Any) -> Revolution:
+    return Revolution(paint=painted(paint) if isinstance(paint, tuple) else paint, **values)
+
+
+def _face(corners: list[list[float]], paint: Any) -> Face:
+    return triangle(corners, paint) if len(corners) == 3 else quad(corners, paint)
+
+
+_SHAPES: dict[str, Callable[..., Part]] = {
+    "revolution": _revolution,
+    "tube": Tube,
+    "box": box,
+    "prism": prism,
+    "lying_cylinder": lying_cylinder,
+    "roof": roof,
+    "faces": Polyhedron,
+}
+
+
+def _curve(pieces: list[Any]) -> Curve:
+    """Return a curve from points and descriptions of curves."""
+    points: list[tuple[float, ...]] = []
+    for piece in pieces:
+        match piece:
+            case {"smooth": corners}:
+                points += smooth(*map(tuple, corners))
+            case {"handle": values}:
+                points += handle(*values)
+            case {"ray": azimuth_deg, "points": places}:
+                points += ray(azimuth_deg, *places)
+            case {"sphere": radius}:
+                points += [(radius * sin(pi * i / 90), radius * (1 + cos(pi * i / 90))) for i in range(91)]
+            case _:
+                points.append(tuple(piece))
+    return tuple(points)

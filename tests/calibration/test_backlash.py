@@ -33,7 +33,7 @@ def drawn(
 
 
 def run(s, *, during=None) -> CalibrationResult:
-    for event in Backlash().live(s.bench):
+    for event in Backlash(24).live(s.bench):
         if isinstance(event, Moved) and during and (happens := during.get(event.index)):
             happens()
     assert isinstance(event, CalibrationResult)
@@ -97,7 +97,7 @@ def test_slipping_platter_is_rejected(simulated):
 def test_short_cable_and_too_few_reversals_are_rejected_before_moving(simulated):
     s = simulated('table.mode="pan"', "table.limits_deg=[-20, 20]")
     with pytest.raises(LimitExceeded):
-        next(Backlash().live(s.bench))
+        next(Backlash(24).live(s.bench))
     with pytest.raises(UsageError):
         next(Backlash(reversals=2).live(s.bench))
     assert abs(s.world.table_deg()) < 1.0

@@ -62,14 +62,14 @@ def test_applied_result_corrects_the_table_angle(simulated, tmp_path):
             return [table.goto(angle).encoder_deg - s.world.table_deg() for angle in (10.0, 100.0, 190.0, 280.0)]
 
     before = np.ptp(errors())
-    *_, result = Encoder().live(s.bench)
+    *_, result = Encoder(2).live(s.bench)
     assert result.passed, result.rejections
     CalibrationStore(tmp_path).add(result)
     calibrate(s.bench, CalibrationStore(tmp_path))
     after = np.ptp(errors())
     assert before > 0.3
     assert after < 0.15
-    *_, again = Encoder().live(s.bench)  # the result in force does not hide the error
+    *_, again = Encoder(2).live(s.bench)  # the result in force does not hide the error
     for name in NAMES:
         difference = again.estimates[name].value - result.estimates[name].value
         assert abs(difference) < 4 * result.estimates[name].uncertainty
@@ -111,6 +111,6 @@ def test_excessive_error_and_slip_are_rejected():
 def test_short_cable_and_zero_revolutions_are_rejected_before_moving(simulated):
     s = simulated('table.mode="pan"', "table.limits_deg=[-90, 90]")
     with pytest.raises(LimitExceeded):
-        next(Encoder().live(s.bench))
+        next(Encoder(2).live(s.bench))
     with pytest.raises(UsageError):
         next(Encoder(revolutions=0).live(s.bench))

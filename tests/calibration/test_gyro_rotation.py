@@ -68,4 +68,4 @@ def test_too_few_repeats_and_short_cable_are_rejected_before_moving(simulated):
     with pytest.raises(UsageError, match="too few"):
         next(GyroRotation(repeats=3).live(simulated().bench))
     with pytest.raises(LimitExceeded):
-        next(GyroRotation().live(simulated("table.limits_deg=[-20, 20]", 'table.mode="pan"').bench))
+        next(GyroRotation(10).live(simulated("table.limits_deg=[-20, 20]", 'table.mode="pan"').bench))

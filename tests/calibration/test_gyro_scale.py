@@ -158,7 +158,7 @@ def test_noisy_gyro_is_rejected():
 def test_short_cable_is_rejected_before_moving(simulated):
     s = simulated("table.limits_deg=[-180, 181]")
     with pytest.raises(LimitExceeded, match="361°"):
-        next(GyroScale().live(s.bench))
+        next(GyroScale(8).live(s.bench))
     assert s.world.shaft()[0] == pytest.approx(0, abs=0.2)
     with pytest.raises(UsageError, match="too few"):
         next(GyroScale(revolutions=3).live(s.bench))

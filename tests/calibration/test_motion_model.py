@@ -44,7 +44,7 @@ def test_true_values_lie_within_the_stated_uncertainty():
 
 def test_new_rotations_are_predicted(simulated):
     s = simulated("table.velocity_dps=60", "table.acceleration_dps2=150", seed=4)
-    *_, result = MotionModel().live(s.bench)
+    *_, result = MotionModel(3).live(s.bench)
     assert result.passed, result.rejections
     assert result.estimates["pace"].value == pytest.approx(1 / 60, rel=0.05)
     assert s.bench.config.table.approach_deg == 3.0

@@ -10,11 +10,12 @@ from dataclasses import dataclass
 import pytest
 import serial
 
+from rig.config import ImuConfig
 from rig.core.clock import Clock, SystemClock
 from rig.devices.dynamixel.port import SerialConnection
 from rig.devices.head.head import RigHead
 from rig.devices.head.protocol import BAUD, Counters, ReadCounters
-from rig.devices.head.sensors import HeadSensor, head_sensor
+from rig.devices.head.samples import HeadSensor, head_sensor
 from sim.head.board import SimHead
 from sim.head.build import missing
 from sim.head.serial_port import HeadSerial
@@ -47,11 +48,11 @@ def needs(kind: str) -> None:
 
 
 def mpu6050() -> HeadSensor:
-    return head_sensor("mpu6050", address=0x68, range_dps=250, rate_hz=200.0, bandwidth_hz=42)
+    return head_sensor(ImuConfig())
 
 
 def bno055() -> HeadSensor:
-    return head_sensor("bno055", address=0x28, range_dps=2000, rate_hz=100.0, bandwidth_hz=42)
+    return head_sensor(ImuConfig(model="bno055"))
 
 
 @contextmanager

@@ -14,10 +14,10 @@ from rig.core.clock import Clock, SystemClock
 from rig.devices.camera import Camera, CameraIdentity, CameraLocks, Frame
 from rig.devices.opencv_camera import OpenCvCamera
 from rig.devices.opencv_capture import open_capture
-from sim import picamera2
 from sim.camera import SimCapture
 from sim.objects.shelf import shelf
 from sim.world import World
+from tests import fake_picamera2 as picamera2
 
 Opened = tuple[Camera, Clock]
 

@@ -11,7 +11,7 @@ import pytest
 from rig.core.clock import Clock, SystemClock
 from rig.core.errors import DeviceSilent
 from rig.devices.bno055 import Bno055
-from rig.devices.head.sensors import HeadSensor
+from rig.devices.head.samples import HeadSensor
 from rig.devices.imu import Imu
 from rig.devices.mpu6050 import Mpu6050, Mpu6500, Mpu9250
 from sim.i2c import SimI2cBus

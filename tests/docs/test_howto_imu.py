@@ -8,7 +8,7 @@ from rig import Catalog, enroll
 from rig.config import load_config
 from rig.config.imus import imu_kinds
 from rig.core.errors import ConfigError, DeviceMismatch
-from rig.devices.open_imu import open_imu
+from rig.devices.imu import open_imu
 from rig.doctor.bus_scan import scan_imus
 from rig.doctor.device_scan import DeviceScan
 from rig.events.events import Moved

@@ -9,7 +9,7 @@ from rig import Catalog, enroll
 from rig.bench.hardware import assemble
 from rig.config import load_config
 from rig.core.errors import ConfigError
-from rig.devices.dynamixel.opening import open_servo
+from rig.devices.dynamixel.servo import open_servo
 from rig.events.events import Enrolled, Moved
 from rig.safety.saved_state import MemoryStore
 from rig.safety.supervisor import TableState
@@ -55,9 +55,8 @@ def test_row_of_a_package_opens_and_finds_a_dynamixel(rows):
 
 
 def test_models_of_no_package_are_a_configuration_error():
-    config = load_config(None, ["servo.model=ax_18a"])
     with pytest.raises(ConfigError):
-        SimDevices.connected(config, World(seed=1))
+        load_config(None, ["servo.model=ax_18a"])
 
 
 class Controller:

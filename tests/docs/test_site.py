@@ -140,7 +140,7 @@ def test_every_download_has_a_hash(file):
     commands = re.findall(r"\bpip\S* (?:install|sync|wheel|download)\b[^;&\n]*|-m build\b[^;&\n]*", text)
     assert commands
     for command in commands:
-        builds = "-m build" in command or "requirements.lock" in command or '"$lock"' in command or "--no-deps" in command
+        builds = any(part in command for part in ("-m build", "requirements.lock", '"$lock"', "--no-deps"))
         assert "--no-isolation" in command or "--no-build-isolation" in command or not builds, command
         downloads = "-m build" not in command and "--no-deps" not in command
         assert "--require-hashes" in command or "--no-index" in command or not downloads, command

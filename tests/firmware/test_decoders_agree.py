@@ -18,7 +18,7 @@ NIGHTLY_LINES, LINES = 1_000_000, 4_000
 
 PROGRAM = """
 import ctypes, random, sys
-from rig.devices.head.framing import CrcError, Frame, FrameError, LONGEST, decode, encode
+from rig.devices.head.link import CrcError, HeadFrame, FrameError, LONGEST, decode, encode
 
 library, count, seed = ctypes.CDLL(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3])
 library.frame_decode.restype = ctypes.c_int8
@@ -29,7 +29,7 @@ for number in range(count):
     body = draw.randbytes(draw.randrange(MAX_BODY + 1))
     if draw.random() < 0.5:
         body = body.translate(bytes(b if b % 3 else 0 for b in range(256)))
-    frame = Frame(draw.randrange(256), draw.randrange(256), body)
+    frame = HeadFrame(draw.randrange(256), draw.randrange(256), body)
     line = encode(frame)
     room = ctypes.create_string_buffer(bytes([frame.id, frame.sequence]) + body, len(body) + 4)
     out = ctypes.create_string_buffer(LONGEST)

@@ -13,10 +13,10 @@ from threading import Thread
 import pytest
 
 from sim.head import build
-from sim.head.bootloader import ATMEGABOOT, OPTIBOOT, PAGE_BYTES, Arduino, Kind
 from sim.realtime.pace import RealTime
 from sim.realtime.port import PtyPort
 from sim.world import World
+from tests.firmware.bootloader import ATMEGABOOT, OPTIBOOT, PAGE_BYTES, Arduino, Kind
 
 SPEEDS = {getattr(termios, f"B{baud}"): baud for baud in (57_600, 115_200)} | {termios.B38400: 0}
 """Baud rates by their number in the settings of a terminal, which has 38,400 baud before a program opens it."""

@@ -6,14 +6,26 @@ import subprocess
 import pytest
 
 from rig.core.errors import DeviceFault, DeviceNotFound, RequestRejected
-from rig.devices.head.connection import HeadConnection
+from rig.devices.head.link import HeadLink
 from rig.devices.head.protocol import SERIAL_UNSET, Done, Reset, Shutdown
-from rig.devices.head.serial_number import read_identity, store_serial
 from sim.head import build
 from sim.head.board import SimHead
 from sim.head.serial_port import HeadSerial
 from sim.world import World
 from tests.contract.heads import needs
+
+
+def greeted(head: SimHead) -> HeadLink:
+    link = HeadLink(HeadSerial(head), head.clock, lambda _: None, "head")
+    link.greet()
+    return link
+
+
+def stored(head: SimHead, serial: int) -> int:
+    """Store a serial number; return the one that the head reports then."""
+    link = greeted(head)
+    link.store_serial(serial)
+    return link.identity.serial
 
 
 @pytest.fixture(params=["memory", "avr"])
@@ -26,38 +38,33 @@ def head(request):
 
 def test_number_is_stored_read_back_and_kept_over_a_reset(head):
     """On the AVR binary this is the sequence after flashing: the program runs, then stores its number."""
-    clock = head.clock
-    assert read_identity(HeadSerial(head), clock, name="head").serial == SERIAL_UNSET
-    assert store_serial(HeadSerial(head), clock, 17, name="head").serial == 17
+    assert greeted(head).identity.serial == SERIAL_UNSET
+    assert stored(head, 17) == 17
     head.reset(Reset.EXTERNAL)
-    clock.sleep(0.5)
-    assert (
-        read_identity(HeadSerial(head), clock, name="head").serial == 17
-    )  # and the first page of the flash still runs
-    assert store_serial(HeadSerial(head), clock, 2**32 - 2, name="head").serial == 2**32 - 2
+    head.clock.sleep(0.5)
+    assert greeted(head).identity.serial == 17  # and the first page of the flash still runs
+    assert stored(head, 2**32 - 2) == 2**32 - 2
 
 
 def test_number_is_not_stored_while_a_program_uses_the_head(head):
-    clock = head.clock
-    store_serial(HeadSerial(head), clock, 5, name="head")
-    user = HeadConnection(HeadSerial(head), clock, lambda _: None, deadman_ms=2000, name="head", reopen=None)
-    user.greet()
-    user.heartbeat()
+    stored(head, 5)
+    user = greeted(head)
+    user.heartbeat(2000)
     with pytest.raises(RequestRejected):
-        store_serial(HeadSerial(head), clock, 6, name="head")
-    user.link.request(Shutdown(), Done)
-    assert read_identity(HeadSerial(head), clock, name="head").serial == 5
+        stored(head, 6)
+    user.request(Shutdown(), Done)
+    assert greeted(head).identity.serial == 5
 
 
 def test_worn_out_memory_and_missing_head_are_reported(monkeypatch):
     needs("memory")
     head = SimHead(World(), "memory", serial=9)
-    monkeypatch.setattr("rig.devices.head.serial_number.SetSerial", lambda _: Shutdown())
+    monkeypatch.setattr("rig.devices.head.link.SetSerial", lambda _: Shutdown())
     with pytest.raises(DeviceFault, match="did not store"):
-        store_serial(HeadSerial(head), head.clock, 17, name="head")
+        stored(head, 17)
     head.filters.append(lambda _to_head, _byte: None)
     with pytest.raises(DeviceNotFound):
-        read_identity(HeadSerial(head), head.clock, name="head")
+        greeted(head)
     head.close()
 
 

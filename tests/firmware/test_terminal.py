@@ -15,15 +15,16 @@ from tests.programs import Program
 HOST = """
 import sys, serial
 from rig.core.clock import SystemClock
+from rig.config import ImuConfig
 from rig.devices.head import link
 from rig.devices.head.head import RigHead
 from rig.devices.head.protocol import BAUD
-from rig.devices.head.sensors import head_sensor
+from rig.devices.head.samples import head_sensor
 
 link.REPLY_S = 2.0  # the head is a program that may have to wait for a processor
 clock = SystemClock()
 wire = serial.Serial(sys.argv[1], BAUD, timeout=0.002, exclusive=True)
-sensor = head_sensor("mpu6050", address=0x68, range_dps=250, rate_hz=200, bandwidth_hz=42)
+sensor = head_sensor(ImuConfig())
 head = RigHead(wire, clock, sensor, deadman_s=float(sys.argv[2]))
 head.set_power(True)
 head.set_light(0.5)

@@ -86,7 +86,7 @@ ARGUMENTS = st.one_of(
     st.sampled_from(EVIL), st.text(max_size=12).filter(lambda text: "\0" not in text), st.integers().map(str)
 )
 COMMANDS = [
-    *("config get", "config set", "config path", "config check", "catalog list", "catalog show", "catalog rename"),
+    *("config show", "config set", "config check", "catalog list", "catalog show", "catalog rename"),
     *("catalog label", "catalog delete", "catalog verify", "catalog gc", "catalog stats", "log", "status", "goto"),
     *("home", "stop", "acknowledge", "replay", "report", "export", "import", "servo", "catalog copy", "eval"),
 ]
@@ -114,8 +114,8 @@ OPTIONS = [
 @example("import", ["9" * 256])
 @example("eval", ["--json", "9/" * 2100])
 @example("status", ["--seed", "9" * 4000])
-@example("config path", ["--set", "--json"])
-@example("config path", ["--", "--json"])
+@example("config show", ["--set", "--json"])
+@example("config show", ["--", "--json"])
 def test_any_arguments_end_with_a_documented_exit_code(commands, command, arguments):
     commands.fresh()
     commands.run(*command.split(), "--bench", "sim", *arguments)

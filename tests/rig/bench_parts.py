@@ -81,7 +81,7 @@ def program(wires: Wires, i2c: SimI2cBus, state: StateStore, *settings: str, **s
     servo = open_servo(wires, **servo_options)
     imu = Mpu6050(i2c.path, clock=wires.world.clock)
     config = load_config(overrides=settings)
-    bench = Bench("test", config, wires.world.clock, servo, imu, camera=None, state=state)  # type: ignore[arg-type]
+    bench = Bench("test", config, wires.world.clock, servo, lambda: imu, lambda: None, state=state)  # type: ignore[arg-type, return-value]
     bench.safety.connect()
     bench.findings = bench.safety.findings
     end = SessionEnd.FINISHED

@@ -16,7 +16,7 @@ import numpy as np
 
 import hbr
 from rig.catalog import Catalog, OpenEnrollment, View
-from rig.catalog.shared import Journal, deliver
+from rig.catalog.journal import Journal, deliver
 from rig.config.catalog_place import CatalogPlace
 from rig.core.clock import SystemClock
 from rig.core.errors import RigError

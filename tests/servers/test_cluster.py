@@ -23,7 +23,7 @@ from rig.core.errors import ClusterFailed, UsageError
 from rig.core.processes import map_in_processes
 from sim.clock import VirtualClock
 from tests.programs import Program
-from tests.rig.catalog.catalog_samples import fill
+from tests.rig.catalog.catalog_samples import fill, forget
 from tests.rig.cli.objects.test_evaluate import drawing
 
 distributed = pytest.importorskip("distributed", reason="Dask is not installed (make test-servers)")
@@ -95,7 +95,8 @@ def test_catalog_jobs_on_a_cluster_give_the_same_results(cluster: Cluster, tmp_p
         for number in range(4):
             fill(catalog, f"object {number}", 4, 10 * number)
         before = catalog.version()
-        done = finished(derived.redescribe(catalog, again=True, jobs=cluster))
+        forget(catalog)
+        done = finished(derived.redescribe(catalog, jobs=cluster))
         assert (done.described, done.failed) == (16, ())
         assert catalog.version() == before
         store = catalog.database.images

@@ -14,9 +14,9 @@ import pytest
 
 from rig.catalog import Catalog
 from rig.catalog.jobs import finished
+from rig.catalog.journal import Journal, deliver, waiting
 from rig.catalog.results import find_results
 from rig.catalog.results import record as record_result
-from rig.catalog.shared import Journal, deliver, waiting
 from rig.catalog.verify import verify
 from rig.config.catalog_place import CatalogPlace
 from rig.core.clock import SystemClock

@@ -13,11 +13,12 @@ from click import Command, Context
 from sqlalchemy import text
 from typer.testing import Result
 
-from rig.catalog import Catalog, derived
+from rig.catalog import Catalog, derived, sessions
+from rig.catalog.copying import open_copy, open_or_copy, update_copy
 from rig.catalog.jobs import finished
+from rig.catalog.journal import Journal, deliver, journal_folder, waiting
 from rig.catalog.results import correct, find_results
 from rig.catalog.results import record as record_result
-from rig.catalog.shared import Journal, deliver, journal_folder, open_copy, open_or_copy, update_copy, waiting
 from rig.catalog.verify import Problem, verify
 from rig.cli.ui.complete import object_names
 from rig.config.catalog_place import CatalogPlace
@@ -65,7 +66,7 @@ def same_copy(place: CatalogPlace, catalog: Catalog) -> Catalog:
 
 
 def test_copy_has_the_searched_views_and_is_updated(place: CatalogPlace, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rig.catalog.shared._AT_ONCE", 1)
+    monkeypatch.setattr("rig.catalog.copying._AT_ONCE", 1)
     with Catalog.open(place, clock=CLOCK) as catalog:
         assert not update_copy(catalog)
         same_copy(place, catalog).close()
@@ -76,7 +77,7 @@ def test_copy_has_the_searched_views_and_is_updated(place: CatalogPlace, monkeyp
         assert update_copy(catalog)
         with same_copy(place, catalog) as copy:
             assert derived.views(copy).object_names == ("cup", "tin")
-            assert copy.database.images.names() == {derived.empty_tables(catalog).newest}
+            assert copy.database.images.names() == {sessions.empty_tables(catalog).newest}
         derived.choose_region(catalog, (0, 0, 16, 16))
         expected = derived.views(catalog)
         catalog.delete("cup")

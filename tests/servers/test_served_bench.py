@@ -10,9 +10,10 @@ from typing import Any
 import pytest
 
 from rig.catalog import Catalog, derived
+from rig.catalog.copying import open_copy, update_copy
 from rig.catalog.jobs import finished
+from rig.catalog.journal import BackgroundDelivery, Journal, JournalState, waiting
 from rig.catalog.results import find_results
-from rig.catalog.shared import BackgroundDelivery, Journal, JournalState, open_copy, update_copy, waiting
 from rig.catalog.verify import verify
 from rig.config.catalog_place import CatalogPlace
 from rig.core.clock import SystemClock

@@ -14,7 +14,7 @@ import pytest
 
 from rig.catalog import Catalog, derived
 from rig.catalog.jobs import finished
-from rig.catalog.shared import Journal, deliver
+from rig.catalog.journal import Journal, deliver
 from rig.catalog.verify import verify
 from rig.config.catalog_place import CatalogPlace
 from rig.core.clock import seconds_between

@@ -9,14 +9,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hbr import describe, tanimoto
-from sim.objects import paint
 from sim.objects.curves import evenly, smooth
 from sim.objects.paint import Sheet, painted
 from sim.objects.polyhedron import box, lying_cylinder
-from sim.objects.pottery import pottery
 from sim.objects.projection import CENTRE_PX, COS, PX_PER_MM, SIN, Image, Visible
 from sim.objects.revolution import Revolution
-from sim.objects.shelf import CONFUSABLE, MORE_CONFUSABLE, shelf, twins
+from sim.objects.shelf import CONFUSABLE, MORE_CONFUSABLE, read_objects, shelf, twins
 from sim.objects.solid import Part, Solid, empty_platter
 from sim.objects.tube import Tube
 
@@ -27,6 +25,7 @@ def some(names: Iterable[str]) -> list[object]:
 
 
 RED, BLUE = (30, 30, 220), (220, 30, 30)
+GREY, GREEN, YELLOW, WHITE = (150, 150, 148), (70, 140, 50), (50, 205, 240), (238, 240, 240)
 
 
 def render(solid: Visible, azimuth_deg: float, offset_mm: tuple[float, float] = (0.0, 0.0)) -> Image:
@@ -53,10 +52,10 @@ def solid(*parts: Part) -> Solid:
     return Solid("sample", parts)
 
 
-HALVES = painted(BLUE, lambda s: s.panel(0.0, 0.0, 0.5, 1.0, RED))
-PATCH = painted(paint.GREY, lambda s: s.panel(0.48, 0.4, 0.52, 0.6, RED))
+HALVES = painted(BLUE, [["panel", 0.0, 0.0, 0.5, 1.0, RED]])
+PATCH = painted(GREY, [["panel", 0.48, 0.4, 0.52, 0.6, RED]])
 CYLINDER = solid(Revolution(((50.0, 100.0), (50.0, 0.0)), PATCH))
-DIE = solid(box((80, 80, 80), (RED, BLUE, paint.GREEN, paint.YELLOW), top=paint.WHITE))
+DIE = solid(box((80, 80, 80), (RED, BLUE, GREEN, YELLOW), top=WHITE))
 
 
 # -- geometry and orientation -----------------------------------------------------------------------------------------
@@ -74,8 +73,8 @@ def test_mark_on_a_rotated_body_is_where_the_projection_puts_it(azimuth_deg: flo
     "part",
     [
         Revolution(((40.0, 80.0), (40.0, 0.0)), HALVES),
-        box((80, 80, 80), (HALVES, RED, RED, RED), top=paint.GREY),
-        lying_cylinder(40, 60, wall=paint.GREY, end=HALVES, at=(0, 30, 40)),
+        box((80, 80, 80), (HALVES, RED, RED, RED), top=GREY),
+        lying_cylinder(40, 60, wall=GREY, end=HALVES, at=(0, 30, 40)),
     ],
     ids=["revolution", "box", "lying cylinder"],
 )
@@ -123,7 +122,7 @@ def test_inside_of_a_vessel_is_seen_through_its_mouth() -> None:
 def test_box_rotates_counter_clockwise_from_above_and_shows_the_named_sides() -> None:
     positions = [middle(render(DIE, azimuth), RED)[0] for azimuth in (-40.0, -20.0, 0.0, 20.0, 40.0)]
     assert positions == sorted(positions)
-    for azimuth, colour in ((0.0, RED), (-90.0, BLUE), (180.0, paint.GREEN), (90.0, paint.YELLOW)):
+    for azimuth, colour in ((0.0, RED), (-90.0, BLUE), (180.0, GREEN), (90.0, YELLOW)):
         assert middle(render(DIE, azimuth), colour)[0] == pytest.approx(CENTRE_PX[0], abs=1.0)
 
 
@@ -193,8 +192,8 @@ def test_other_objects_differ() -> None:
 
 
 def test_textures_are_the_same_in_every_run() -> None:
-    for fresh in pottery():
-        np.testing.assert_array_equal(render(fresh, 33.0), render(shelf()[fresh.name], 33.0))
+    for name, fresh in list(read_objects().items())[:13]:
+        np.testing.assert_array_equal(render(fresh, 33.0), render(shelf()[name], 33.0))
 
 
 def test_profiles_meet_the_requirements_of_tracing() -> None:

@@ -44,12 +44,7 @@ _DATE: Final = (1980, 1, 1, 0, 0, 0)
 def write_bundle(path: Path, source: CatalogSource) -> int:
     """Write objects with all their enrollments into a new file, all or nothing, and return their number.
 
-    Raises
-    ------
-    ExportFailed
-        The file exists already or cannot be written.
-    CatalogError
-        Something is not as it was stored.
+    Raises `ExportFailed`: the file exists already or cannot be written.
     """
     with new_file(path) as file, ZipFile(file, "w") as archive, TemporaryDirectory(prefix="rig-export-") as folder:
         with Catalog.open(folder, clock=source.catalog.clock) as made:
@@ -99,10 +94,7 @@ class _ArchivedImages(FolderImages):
 def read_bundle(path: Path, clock: Clock) -> Iterator[CatalogSource]:
     """Yield the objects of a bundle as the source of a transfer, which reads the images.
 
-    Raises
-    ------
-    ImportRejected
-        The file is not a bundle, is damaged, of another version, or contains invalid data.
+    Raises `ImportRejected`: the file is not a bundle, is damaged, of another version, or contains invalid data.
     """
     with TemporaryDirectory(prefix="rig-import-") as folder:
         try:
@@ -127,7 +119,7 @@ class _Bundled(CatalogSource):
         super().__init__(catalog, own=False)
         self.origin = str(path)
         found = path.stat()
-        self.content = self.reader = partial(_read_member, str(path), found.st_ino, found.st_mtime_ns)
+        self.content = partial(_read_member, str(path), found.st_ino, found.st_mtime_ns)
         self._path, self._folder = path, folder
 
     def items(self) -> Iterator[Item]:

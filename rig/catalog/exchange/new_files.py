@@ -14,10 +14,7 @@ from rig.core.files import sync_file, sync_folder, sync_tree
 def new_file(path: Path) -> Iterator[IO[bytes]]:
     """Yield a file to write. It becomes ``path`` at the end; after an exception it is deleted.
 
-    Raises
-    ------
-    ExportFailed
-        ``path`` exists already or cannot be written.
+    Raises `ExportFailed`: ``path`` exists already or cannot be written.
     """
     with _made(path) as made:
         with made.open("wb") as file:

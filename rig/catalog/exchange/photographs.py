@@ -15,8 +15,8 @@ from typing import Any, Final
 from hbr.core.angles import wrap360
 from rig.catalog.exchange.tables import ANGLES, parse_region
 from rig.catalog.facts import Enrollment, Session, View
+from rig.catalog.incoming import ImportProblem, Reason, RejectedFile
 from rig.catalog.records import EnrollmentStatus, Provenance, check_text, clean_name, this_software
-from rig.catalog.rejected import ImportProblem, Reason, RejectedFile
 from rig.catalog.state import EnrollmentState
 from rig.catalog.transfer import Item
 from rig.core.errors import ImportRejected, UsageError
@@ -128,12 +128,8 @@ def read_folder(
     now
         Time of the enrollments.
 
-    Raises
-    ------
-    UsageError
-        The pattern does not contain ``{object}`` and ``{angle}`` once each.
-    ImportRejected
-        There is no such folder, or no photograph in it.
+    Raises `UsageError`: the pattern does not contain ``{object}`` and ``{angle}`` once each. `ImportRejected`: there is
+    no such folder, or no photograph in it.
     """
     named = _regex(pattern)
     if not folder.is_dir():
@@ -168,10 +164,7 @@ def read_table(path: Path, *, now: datetime) -> Photographs:
 
     Unknown columns are ignored. A row that cannot be used is rejected; the others are imported.
 
-    Raises
-    ------
-    ImportRejected
-        The file is not such a table.
+    Raises `ImportRejected`: the file is not such a table.
     """
     photographs = Photographs(str(path), path.parent.resolve(), now)
     used = 0
@@ -217,8 +210,8 @@ def _view(photographs: Photographs, row: _Row) -> View:
     for name in ANGLES:
         if row.get(name):
             setattr(view, name, _number(row[name], name))
-    if (view.imu_deg is None) != (view.imu_sigma_deg is None):
-        raise ValueError("imu_deg and imu_sigma_deg: give both or none")
+    if view.problem:
+        raise ValueError(view.problem)
     if row.get("captured_utc"):
         time = datetime.fromisoformat(row["captured_utc"])
         if time.tzinfo is None:

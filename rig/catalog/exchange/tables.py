@@ -101,12 +101,8 @@ def write_folder(folder: Path, source: CatalogSource) -> int:
     -------
     Number of objects, as for all formats.
 
-    Raises
-    ------
-    ExportFailed
-        The folder is not empty or cannot be written, or an object has two views from the same azimuth.
-    CatalogError
-        An image is not the stored one.
+    Raises `ExportFailed`: the folder is not empty or cannot be written, or an object has two views from the same
+    azimuth.
     """
     objects = list(enrolled(source))
 
@@ -119,7 +115,7 @@ def write_folder(folder: Path, source: CatalogSource) -> int:
                     raise ExportFailed(
                         f"{one.item.name!r} has two views from {angle}°.", next_step="Export a bundle instead."
                     )
-                target.write_bytes(source.content(view.image))
+                target.write_bytes(source.catalog.database.images.content(view.image))
                 yield {**row, "image": target.name}
 
     with new_folder(folder) as made:
@@ -130,10 +126,7 @@ def write_folder(folder: Path, source: CatalogSource) -> int:
 def write_views(path: Path, source: CatalogSource, form: TableFormat) -> int:
     """Write the views as a table with their CEDD levels, without their images, and return the number of objects.
 
-    Raises
-    ------
-    ExportFailed
-        The file exists already or cannot be written, or pyarrow is not installed.
+    Raises `ExportFailed`: the file exists already or cannot be written, or pyarrow is not installed.
     """
     objects = list(enrolled(source))
     write_rows(path, form, VIEWS, (row for one in objects for row, _ in _rows(source, one)))

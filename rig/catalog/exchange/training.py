@@ -94,12 +94,7 @@ def write_training(
     Masks are the silhouettes of the descriptors. An image that several views share is annotated once. Of ten views of
     an object in a row, one is for validation and one for the test.
 
-    Raises
-    ------
-    ExportFailed
-        The folder is not empty or cannot be written, or there are no views.
-    CatalogError
-        An image is not the stored one.
+    Raises `ExportFailed`: the folder is not empty or cannot be written, or there are no views.
     """
     objects = list(enrolled(source))
     if not objects:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from pydantic import BaseModel
 
-    from rig.calibrations import BenchCalibration, CalibrationResult
+    from rig.calibrations import CalibrationResult
     from rig.config import RigConfig
     from rig.config.values import Values
     from rig.config.wording import KeyInfo
@@ -56,17 +56,17 @@ def show(
     """Show every key as TOML: its value, where the value comes from, what it overrides, and a description.
 
     A value comes from the defaults, a calibration, the file, or --set; each of them overrides those before it. The
-    bench is not opened: its calibrations are shown as in force if they belong to its present devices.
+    bench is not opened: a calibration counts here if it belongs to its present devices (rig calibrate show).
 
     Example: rig config show servo table.limits_deg
     """
-    from rig.calibrations import CalibrationStatus, apply_results
+    from rig.calibrations import apply_results
     from rig.config.toml_file import stated
+    from rig.config.values import search_paths
     from rig.config.wording import setting_line
 
     values, config, options = _checked(settings)
-    calibrations = _calibrations_on_bench(settings, config)
-    in_force = [calibration.result for calibration in calibrations if calibration.status is CalibrationStatus.IN_FORCE]
+    in_force = _calibrations_in_force(settings, config)
     applied, _ = apply_results(config, in_force)
     layers = _layers(values, settings, in_force)
 
@@ -79,15 +79,13 @@ def show(
         for info, value in every
         if is_wanted(info.name) and not (changed and value == info.default)
     ]
-    calibrations = [
-        one for one in calibrations if is_wanted(one.result.name) or any(map(is_wanted, one.result.settings))
-    ]
-    if wanted and not rows and not calibrations and not changed:
+    if wanted and not rows and not changed:
         raise _unknown(wanted[0], [info.name for info, _ in every])
     if settings.json:
-        _print_json(settings, values, rows, calibrations)
+        _print_json(settings, values, rows)
         return
-    print(f"# {values.path or 'no file: the defaults'}")
+    none = f"no file: the defaults. Looked for: {', '.join(map(str, search_paths()))}"
+    print(f"# {values.path or none}")
     section = None
     for info, value, ((origin, _), *overridden) in rows:
         if info.key[:-1] != section:
@@ -95,48 +93,6 @@ def show(
             print(f"\n[{'.'.join(section)}]" if section else "")
         others = ", ".join(f"{stated(info.key, other)} ({source})" for source, other in overridden)
         print(setting_line(info, value, f"{origin}, overrides {others}" if others else ""))
-    if calibrations:
-        print(f"\n# Calibrations of the bench {settings.bench_name}. With its devices: rig calibrate show")
-    for calibration in calibrations:
-        estimates = ", ".join(f"{name} {estimate}" for name, estimate in calibration.result.estimates.items())
-        is_used = calibration.status is CalibrationStatus.IN_FORCE
-        print(f"#   {f'{calibration.result.id}: {estimates}' if is_used else f'not in force: {calibration}'}")
-
-
-@app.command("path")
-@command
-def path(settings: Settings) -> None:
-    """Print the path of the configuration file in use.
-
-    Example: rig config path
-    """
-    from rig.config.values import default_path, search_paths
-
-    found = settings.config or default_path()
-    none = f"No file: the defaults are used. Looked for: {', '.join(map(str, search_paths()))}"
-    settings.say(str(found or none), {"path": found, "searched": search_paths()})
-
-
-@app.command("init")
-@command
-def init(settings: Settings) -> None:
-    """Write a rig.toml with every key as a comment. An existing file is not changed.
-
-    Example: rig config init --config rig.toml
-    """
-    from rig.config import RigConfig
-    from rig.config.toml_file import save
-    from rig.config.values import FILE_NAME
-    from rig.config.wording import blank_file
-
-    target = settings.config or Path(FILE_NAME)
-    if target.exists():
-        raise ConfigError(
-            f"{target} exists already.",
-            next_step=(Do.SET_KEY(), "Or write another file with --config FILE."),
-        )
-    save(target, blank_file(RigConfig))
-    settings.say(f"Wrote {target}: all keys with their defaults, as comments. Next: rig setup", {"path": target})
 
 
 @app.command("set", context_settings={"ignore_unknown_options": True})
@@ -203,7 +159,6 @@ def _print_json(
     settings: Settings,
     values: "Values",
     rows: "Sequence[tuple[KeyInfo, Any, list[tuple[str, Any]]]]",
-    calibrations: "Sequence[BenchCalibration]",
 ) -> None:
     settings.print_json(
         {
@@ -220,26 +175,18 @@ def _print_json(
                 }
                 for info, value, ((origin, _), *overridden) in rows
             },
-            "calibrations": [
-                {
-                    "id": one.result.id,
-                    "status": one.status,
-                    "estimates": one.result.estimates,
-                    "settings": one.result.settings,
-                }
-                for one in calibrations
-            ],
         }
     )
 
 
-def _calibrations_on_bench(settings: Settings, config: "RigConfig") -> "list[BenchCalibration]":
-    """Return the bench's calibrations; their status as far as it is known without opening the bench."""
-    from rig.calibrations import CalibrationStore, apparatus
+def _calibrations_in_force(settings: Settings, config: "RigConfig") -> "list[CalibrationResult]":
+    """Return the bench's calibrations in force, as far as it is known without opening the bench."""
+    from rig.calibrations import CalibrationStatus, CalibrationStore, apparatus
 
     name = settings.bench or config.default_bench
     mounted = apparatus(name, {part: {} for part in ("servo", "imu", "camera")}, config, {})
-    return CalibrationStore(config.calibration_path(name)).on_bench(mounted, SystemClock().utc())
+    found = CalibrationStore(config.calibration_path(name)).on_bench(mounted, SystemClock().utc())
+    return [one.result for one in found if one.status is CalibrationStatus.IN_FORCE]
 
 
 def _layers(

@@ -1,16 +1,30 @@
-"""`rig doctor`."""
+"""`rig doctor` and `rig find`, and what they share with `rig setup`: the bench to check, its findings, the progress."""
 
 import sys
+from contextlib import closing, contextmanager
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from textwrap import wrap
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rig.cli.bench.findings import doctor_context, print_finding, show_progress
-from rig.cli.bench.snapshot import check_new
 from rig.cli.ui.command import command
+from rig.cli.ui.exit_codes import EXIT_DEVICE
 from rig.cli.ui.settings import Settings
-from rig.core.errors import UsageError
+from rig.cli.ui.terminal import unguarded
+from rig.core.control_characters import neutral
+from rig.core.errors import UsageError, os_errors_as
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+
+    from rich.console import Console
+
+    from rig.devices.camera import CameraIdentity, CameraLocks, Frame
+    from rig.doctor.context import DoctorContext
+    from rig.doctor.examination import Check
+    from rig.doctor.finding import Finding
 
 
 @command
@@ -34,7 +48,9 @@ def doctor(
 
     Example: rig doctor --bench sim
     """
+    from rig.config.values import default_path
     from rig.doctor.computer import udev_rules
+    from rig.jobs.doctor import support_bundle
 
     if udev:
         with doctor_context(settings) as context:
@@ -46,9 +62,17 @@ def doctor(
         raise UsageError("--picture needs a bundle.", next_step="Add --bundle FILE.zip.")
     found = print_findings(settings)
     if bundle is not None:
-        from rig.cli.bench.bundle import write_bundle
-
-        write_bundle(settings, bundle, found["findings"], picture=picture)
+        image = (lambda: take(settings)[0].image_bgr) if picture else None
+        file = settings.config or default_path()
+        packed = support_bundle(
+            found["findings"],
+            settings.load,
+            file,
+            settings.bench,
+            partial(settings.open_catalog, read_only=True),
+            image,
+        )
+        write_new(bundle, packed)
         print(f"Support bundle: {bundle}. Look through it before you send it.", file=sys.stderr)
     if found["exit_code"]:
         raise typer.Exit(found["exit_code"])
@@ -74,3 +98,127 @@ def print_findings(settings: Settings) -> dict[str, Any]:
             found = step.values
             settings.say(step.text, found)
     return found
+
+
+@command
+def find(
+    settings: Settings,
+    both_protocols: Annotated[
+        bool,
+        typer.Option("--all", help="Also search for AX-12A (protocol 1.0) if other servos answered. Takes a minute."),
+    ] = False,
+) -> None:
+    """List the connected servos (at all baud rates), IMUs and cameras, and their settings for rig.toml.
+
+    Writes nothing and moves nothing. Exit code 4 if no device was found.
+
+    Example: rig find --bench sim
+    """
+    from rig.cli.ui.present import console
+    from rig.config.toml_file import with_values
+    from rig.doctor.device_scan import DeviceScan
+
+    scan = DeviceScan(both_protocols)
+    with doctor_context(settings) as context:
+        context.require_free()
+        findings = show_findings(None if settings.json else console(), context, scan.checks)
+    wanted = scan.settings
+    if settings.json:
+        settings.print_json(
+            {
+                "findings": [finding.as_dict() for finding in findings],
+                "settings": {".".join(key): value for key, value in wanted.items()},
+            }
+        )
+    elif wanted:
+        print(f"\nFor rig.toml (`rig setup` writes it):\n\n{with_values('', wanted)}", end="")
+    if not wanted:
+        raise typer.Exit(EXIT_DEVICE)
+
+
+_TOPIC_WIDTH = 12
+_INDENT = 2 + _TOPIC_WIDTH
+
+
+@contextmanager
+def doctor_context(settings: Settings, *, default: bool = False) -> "Iterator[DoctorContext]":
+    """Yield the bench of the common options; with ``default``, ignore the configuration file."""
+    from rig.config import RigConfig
+    from rig.doctor.context import open_context
+
+    config = RigConfig() if default else settings.load()
+    file_options = ("--config", str(settings.config)) if settings.config else ()
+    options = (*(("--bench", settings.bench) if settings.bench else ()), *file_options)
+    options += tuple(part for override in settings.overrides for part in ("--set", override))
+    name = settings.bench or config.default_bench
+    with open_context(name, config, seed=settings.seed, options=options, file_options=file_options) as context:
+        yield context
+
+
+def show_findings(screen: "Console | None", context: "DoctorContext", checks: "Iterable[Check]") -> "list[Finding]":
+    """Run checks, and print and return their findings; nothing is printed without a screen."""
+    from rig.doctor.examination import run_checks
+
+    findings = []
+    for finding in run_checks(context, checks, show_progress):
+        findings.append(finding)
+        if screen is not None:
+            print_finding(screen, finding)
+    return findings
+
+
+def print_finding(screen: "Console", finding: "Finding") -> None:
+    """Print a finding: its mark, its topic, its text, and below it the fix."""
+    from rich.text import Text
+
+    from rig.doctor.finding import MARKS, Severity, finding_words
+
+    style = {Severity.FINE: "green", Severity.WARNING: "yellow", Severity.BAD: "bold red"}[finding.level]
+    width = max(screen.width - _INDENT, 24) if screen.is_terminal else 10_000
+    first, *more = wrap(finding_words(finding), width, break_on_hyphens=False) or [""]
+    screen.print(
+        Text.assemble((MARKS[finding.level], style), f" {finding.topic:{_TOPIC_WIDTH}s}{first}"), soft_wrap=True
+    )
+    for line in more:
+        screen.print(Text(" " * _INDENT + line), soft_wrap=True)
+    if finding.fix:
+        screen.print(Text(f"{' ' * _INDENT}→ {finding.fix}", "bold"), soft_wrap=True)
+
+
+def show_progress(text: str) -> None:
+    """Show progress at a terminal; the next line replaces it."""
+    if sys.stderr.isatty():
+        print(f"\r\x1b[K{neutral(text[:78])}\r", end="", file=unguarded(sys.stderr), flush=True)
+
+
+def take(settings: Settings, *, refocus: bool = False) -> "tuple[Frame, CameraIdentity, CameraLocks]":
+    """Return a frame of the configured camera, the camera, and its settings; with ``refocus`` the focus is new.
+
+    Raises
+    ------
+    BenchBusy
+        Another program uses the bench.
+    DeviceNotFound, DeviceSilent
+        The camera is missing, or delivers no frames.
+    """
+    from rig.doctor.camera import open_camera
+
+    with doctor_context(settings) as context:
+        context.require_free()
+        with closing(open_camera(context, refocus=refocus)) as camera:
+            return camera.capture(context.computer.clock.now_ns()), camera.identity, camera.read_locks()
+
+
+def check_new(file: Path, suffix: str) -> None:
+    """Raise `UsageError` if a file has another suffix, or exists."""
+    if file.suffix.lower() != suffix:
+        raise UsageError(f"{file} does not end with {suffix}.", next_step=f"Give a name that ends with {suffix}.")
+    if file.exists():
+        raise UsageError(f"{file} exists.", next_step="Give another name.")
+
+
+def write_new(file: Path, content: bytes) -> None:
+    """Write a file that does not exist yet. Raises `UsageError` if that is not possible."""
+    what, step = f"{file} cannot be written.", "Choose another folder."
+    with os_errors_as(UsageError, what, next_step=step), file.open("xb") as output:
+        output.write(content)

@@ -1,16 +1,13 @@
 """`rig head`: the rig head's identity and serial number."""
 
 from contextlib import closing
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
-from rig.cli.bench.findings import doctor_context
+from rig.cli.bench.doctor import doctor_context
 from rig.cli.ui.command import command
 from rig.cli.ui.settings import Settings
-
-if TYPE_CHECKING:
-    from rig.devices.head.protocol import Identity
 
 app = typer.Typer(help="Show the rig head, or store its serial number.", no_args_is_help=True)
 
@@ -40,19 +37,18 @@ def set_serial(
 
 def _show(settings: Settings, serial: int | None) -> None:
     """Store the serial number unless it is None, and print the head's identity."""
-    from rig.devices.head.connection import version
+    from rig.devices.head.link import HeadLink, version
     from rig.devices.head.protocol import BAUD, SERIAL_UNSET, Board
-    from rig.devices.head.serial_number import read_identity, store_serial
 
     with doctor_context(settings) as context:
         context.require_free()
         port, clock = context.config.head.port, context.computer.clock
         with closing(context.computer.open_serial(port, BAUD, "head")) as connection:
-            found: Identity
-            if serial is None:
-                found = read_identity(connection, clock, name=port)
-            else:
-                found = store_serial(connection, clock, serial, name=port)
+            link = HeadLink(connection, clock, lambda _event: None, port)
+            link.greet()
+            if serial is not None:
+                link.store_serial(serial)
+    found = link.identity
     stored = None if found.serial == SERIAL_UNSET else found.serial
     board = Board(found.board).name.lower()
     report = {"port": port, "board": board, "firmware": version(found), "serial": stored}

@@ -64,7 +64,7 @@ def serve(
     from rig.safety.saved_state import SERVER_FOLDER
     from rig.web.access import Role, Tokens
     from rig.web.run import run_server
-    from rig.web.setup import Listening
+    from rig.web.setup import Listening, Setup
 
     folder = settings.load().state_path(settings.bench_name) / SERVER_FOLDER
     tokens = Tokens(folder, SystemClock())
@@ -107,7 +107,14 @@ def serve(
             text = "Every user of this computer can operate the bench there. With --login, each needs a token."
             print(text, file=sys.stderr, flush=True)
 
-    run_server(settings.bench_name, settings.load(), settings.seed, arguments, listening, announce)
+    setup = Setup(
+        bench=settings.bench_name,
+        config=settings.load(),
+        seed=settings.seed,
+        arguments=arguments,
+        listening=listening,
+    )
+    run_server(setup, announce)
 
 
 def is_loopback(host: str) -> bool:

@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rig.cli.bench.findings import doctor_context, show_progress
+from rig.cli.bench.doctor import doctor_context, show_progress
 from rig.cli.ui.command import command
 from rig.cli.ui.exit_codes import EXIT_DEVICE
 from rig.cli.ui.options import YesOption
@@ -71,13 +71,13 @@ def settings_(
 
     Example: rig servo settings --write --bench sim
     """
-    from rig.devices.dynamixel.settings import ServoMode, compare
+    from rig.devices.dynamixel.settings import compare
     from rig.devices.dynamixel.settings import write as write_settings
     from rig.doctor.single_servo import single_servo
 
     with doctor_context(settings) as context, single_servo(context, show_progress) as servo:
         show_progress("")
-        differences = compare(servo.bus, servo.found.bus_id, servo.table, ServoMode(context.config.table.mode))
+        differences = compare(servo.bus, servo.found.bus_id, servo.table, context.config.table.mode)
         if not settings.json:
             print(servo.found)
             print("\n".join(f"  {difference}" for difference in differences) or "  all as required")

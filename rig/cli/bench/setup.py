@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
-from rig.cli.bench.findings import doctor_context, show_findings
+from rig.cli.bench.doctor import doctor_context, show_findings
 from rig.cli.ui import prompts
 from rig.cli.ui.command import command
 from rig.cli.ui.settings import Settings
@@ -180,14 +180,14 @@ class Dialogue:
 
     def _permanent_settings(self) -> None:
         """Show the differing settings of the servo's EEPROM, and write them if the operator agrees."""
-        from rig.devices.dynamixel.settings import ServoMode, compare, write
+        from rig.devices.dynamixel.settings import compare, write
         from rig.doctor.single_servo import single_servo
 
         config = self.context.config
         found = config.servo.model_copy(update={"port": self.wanted[_PORT]})
         context = replace(self.context, config=config.model_copy(update={"servo": found}))
         with suppress(SeveralServos), single_servo(context) as servo:
-            differences = compare(servo.bus, servo.found.bus_id, servo.table, ServoMode(config.table.mode))
+            differences = compare(servo.bus, servo.found.bus_id, servo.table, config.table.mode)
             if not differences:
                 return
             print("Some permanent settings of the servo (EEPROM) differ from the required ones:", file=self.out)

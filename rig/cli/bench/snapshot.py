@@ -1,13 +1,12 @@
 """`rig snapshot` and `rig empty-table`."""
 
 import sys
-from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rig.cli.bench.findings import doctor_context
+from rig.cli.bench.doctor import check_new, take, write_new
 from rig.cli.ui.command import command
 from rig.cli.ui.settings import Settings
 from rig.core.errors import UsageError, os_errors_as
@@ -15,7 +14,7 @@ from rig.core.files import write
 from rig.core.next_steps import Do
 
 if TYPE_CHECKING:
-    from rig.devices.camera import CameraIdentity, CameraLocks, Frame
+    pass
 
 
 @command
@@ -89,36 +88,3 @@ def empty_table(
     with os_errors_as(UsageError, f"{show} cannot be written.", next_step="Choose another file with --show."):
         write(show, encode(status.table.image_bgr))
     settings.say(f"{show}: {status.text}", {"file": str(show), **status.as_json()})
-
-
-def take(settings: Settings, *, refocus: bool = False) -> "tuple[Frame, CameraIdentity, CameraLocks]":
-    """Return a frame of the configured camera, the camera, and its settings; with ``refocus`` the focus is new.
-
-    Raises
-    ------
-    BenchBusy
-        Another program uses the bench.
-    DeviceNotFound, DeviceSilent
-        The camera is missing, or delivers no frames.
-    """
-    from rig.doctor.camera import open_camera
-
-    with doctor_context(settings) as context:
-        context.require_free()
-        with closing(open_camera(context, refocus=refocus)) as camera:
-            return camera.capture(context.computer.clock.now_ns()), camera.identity, camera.read_locks()
-
-
-def check_new(file: Path, suffix: str) -> None:
-    """Raise `UsageError` if a file has another suffix, or exists."""
-    if file.suffix.lower() != suffix:
-        raise UsageError(f"{file} does not end with {suffix}.", next_step=f"Give a name that ends with {suffix}.")
-    if file.exists():
-        raise UsageError(f"{file} exists.", next_step="Give another name.")
-
-
-def write_new(file: Path, content: bytes) -> None:
-    """Write a file that does not exist yet. Raises `UsageError` if that is not possible."""
-    what, step = f"{file} cannot be written.", "Choose another folder."
-    with os_errors_as(UsageError, what, next_step=step), file.open("xb") as output:
-        output.write(content)

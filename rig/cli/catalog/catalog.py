@@ -95,7 +95,7 @@ def _as_json(details: "ObjectDetails", described: "Described") -> dict[str, Any]
     """Return an object with its views and their descriptions as JSON values: every column by its name."""
     from rig.catalog.images import path_of
     from rig.core.json_form import plain
-    from rig.views.segmentation_evidence import SegmentationSummary
+    from rig.views.description import SegmentationSummary
 
     def columns(row: Any) -> dict[str, Any]:
         names = [column.key for column in type(row).__mapper__.column_attrs]
@@ -127,7 +127,7 @@ def _as_json(details: "ObjectDetails", described: "Described") -> dict[str, Any]
 
 def _print_object(details: "ObjectDetails", described: "Described") -> None:
     from rig.cli.ui.present import print_table
-    from rig.views.segmentation_evidence import SegmentationSummary
+    from rig.views.description import SegmentationSummary
 
     summary = details.summary
     print("  ".join(filter(None, (summary.name, summary.label))))

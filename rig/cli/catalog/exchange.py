@@ -1,9 +1,10 @@
 """`rig import` and `rig export`."""
 
 import sys
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 import typer
@@ -21,6 +22,7 @@ from rig.core.phrases import counted
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from rig.catalog import Catalog
     from rig.catalog.transfer import Source
 
 SHOWN: Final = 20
@@ -72,18 +74,16 @@ def import_(
     """
     from rig.catalog.transfer import Conflict, transfer
     from rig.core.json_form import plain
-    from rig.views.description import PAPER_DESCRIPTOR
+    from rig.views.description import DESCRIPTORS
 
     clock = SystemClock()
     begin_ns = clock.now_ns()
-    nothing = dry_run and not settings.place.may_exist()
-    opened = nullcontext() if nothing else settings.open_catalog(read_only=dry_run, create=not dry_run)
-    with _source(source, pattern, table_angles) as objects, opened as catalog:
+    with _source(source, pattern, table_angles) as objects, _target(settings, dry_run) as catalog:
         job = transfer(
             *(objects, catalog),
             conflict=Conflict(on_conflict),
             label=label,
-            descriptors=(PAPER_DESCRIPTOR,),
+            descriptors=DESCRIPTORS,
             jobs=jobs_of(jobs, cluster),
             dry_run=dry_run,
         )
@@ -103,6 +103,19 @@ def import_(
         more = len(done.rejected) - SHOWN
         shown += [f"  and {more} others (--json lists all)"] if more > 0 else []
         print(f"{counted(len(done.rejected), 'file')} rejected:", *shown, sep="\n", file=sys.stderr)
+
+
+@contextmanager
+def _target(settings: Settings, dry_run: bool) -> "Iterator[Catalog]":
+    """Yield the catalog; an empty one in its place for a ``dry_run`` before there is one."""
+    from rig.catalog import Catalog
+
+    if not dry_run or settings.place.may_exist():
+        with settings.open_catalog(read_only=dry_run, create=not dry_run) as catalog:
+            yield catalog
+        return
+    with TemporaryDirectory() as folder, Catalog.open(folder, clock=SystemClock()) as catalog:
+        yield catalog
 
 
 @contextmanager
@@ -152,7 +165,7 @@ def export(
         typer.Argument(metavar="[NAME]...", help="Names of the objects (default: all).", autocompletion=object_names),
     ] = None,
     format_: Annotated[
-        Literal["bundle", "folder", "csv", "json", "parquet", "html", "coco", "yolo"] | None,
+        Literal["bundle", "folder", "csv", "json", "parquet", "coco", "yolo"] | None,
         typer.Option("--format", help="Format (default: by the suffix of the target, folder without one)."),
     ] = None,
     label: Annotated[str | None, typer.Option(help="Only objects with this label.")] = None,
@@ -160,8 +173,8 @@ def export(
     """Export objects in an open format.
 
     Formats: bundle (everything, for rig import), folder (images named as in COIL-100, with a table views.csv), csv,
-    json and parquet (table without images), html (folder with a page and contact sheets), coco and yolo (training sets
-    with boxes and masks, divided into train, val and test).
+    json and parquet (table without images), coco and yolo (training sets with boxes and masks, divided into train, val
+    and test).
 
     Example: rig export tray.rigcat.zip --label kitchen --bench sim
 
@@ -172,7 +185,6 @@ def export(
     from rig.catalog.exchange.training import Annotations, write_training
     from rig.catalog.transfer import CatalogSource
     from rig.core.json_form import plain
-    from rig.report.catalog_page import write_catalog_page
 
     form = format_ or _FORMAT_OF.get(target.suffix.lower())
     if form is None:
@@ -203,8 +215,6 @@ def export(
                 count = write_bundle(target, source)
             case "folder":
                 count = write_folder(target, source)
-            case "html":
-                count = write_catalog_page(target, source)
             case _:
                 count = write_views(target, source, TableFormat(form))
     settings.say(

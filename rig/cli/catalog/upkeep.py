@@ -200,8 +200,8 @@ def deliver(
 
     Example: rig catalog deliver --rename mug-white mug-white-2
     """
-    from rig.catalog.shared import Journal, deliver_journal, delivery_words
-    from rig.catalog.shared import discard as remove
+    from rig.catalog.journal import Journal, deliver_journal, delivery_words
+    from rig.catalog.journal import discard as remove
 
     place = settings.place
     if place.url is None:
@@ -290,7 +290,7 @@ def fit(
 
 
 def _fit_lines(found: "FittedRule", objects: int) -> list[str]:
-    from rig.events.note_wording import limitation_words
+    from rig.events.wording import limitation_words
 
     rule = found.rule
     searched = (f"{found.searched} of " if 0 < found.searched < objects else "") + counted(objects, "object")

@@ -36,10 +36,6 @@ def enroll(
         int | None,
         typer.Option(min=4, max=720, metavar="N", help="Number of views in a revolution (default: enroll.views)."),
     ] = None,
-    step: Annotated[
-        float | None,
-        typer.Option(min=0.5, max=90, metavar="DEGREES", help="Angle between two views, instead of --views."),
-    ] = None,
     label: Annotated[
         list[str] | None, typer.Option(metavar="TEXT", help="Label to sort and filter by. Repeatable.")
     ] = None,
@@ -57,12 +53,9 @@ def enroll(
         bool, typer.Option("--replace", help="Enroll again. The old views stay in use until the new ones are complete.")
     ] = False,
     fly: Annotated[
-        bool | None,
-        typer.Option(
-            "--fly/--at-rest",
-            help="Take the views in one revolution without a stop, or at rest (default: enroll.mode).",
-        ),
-    ] = None,
+        bool,
+        typer.Option("--fly", help="Take the views in one revolution without a stop (default: enroll.mode)."),
+    ] = False,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Only show the plan: views, duration, table angles. Nothing moves.")
     ] = False,
@@ -94,16 +87,15 @@ def enroll(
     from rig.plans.tray import read_tray
 
     # Reject wrong options before a device is opened.
-    given = {"--views": views, "--step": step, "--label": label, "--note": note, "--report": report, "--yes": yes}
-    given |= {"--fly": fly is True, "--at-rest": fly is False}
-    views = _views(views, step)
+    given = {"--views": views, "--label": label, "--note": note, "--report": report, "--yes": yes, "--fly": fly}
+    how: dict[str, Any] = {"views": views, "fly": fly or None}
     _check(name, tray, label=label, note=note, resume=resume, replace=replace)
     if report is not None:
         _check_writable(report)
     items = read_tray(tray) if tray else ()
     if dry_run:
         names = {name: None} if name else {item.name: item.views for item in items}
-        plan = planned(CommandDesk(settings), names, views=views, resume=resume, replace=replace, fly=fly)
+        plan = planned(CommandDesk(settings), names, resume=resume, replace=replace, **how)
         _print_plan(settings, plan)
         return
 
@@ -115,11 +107,10 @@ def enroll(
     with desk.background_check():
         if name is not None:
             labels = ", ".join(label) if label else None
-            texts = {"label": labels, "note": note}
-            job = enroll_job(desk, name, views=views, **texts, resume=resume, replace=replace, fly=fly, ask=not yes)
+            job = enroll_job(desk, name, **how, label=labels, note=note, resume=resume, replace=replace, ask=not yes)
             shown.run(job)
         else:
-            shown.run(enroll_list(desk, items, views=views, fly=fly, ask=not yes))
+            shown.run(enroll_list(desk, items, **how, ask=not yes))
             shown.print_total(len(items))
 
 
@@ -131,7 +122,7 @@ def _command(settings: Settings, given: "Mapping[str, Any]", *arguments: str) ->
             if one is True:
                 options.append(option)
             elif one not in (None, False):
-                options += [option, f"{one:g}" if isinstance(one, float) else str(one)]
+                options += [option, str(one)]
     return f"  {shlex.join(['rig', 'enroll', *arguments, *options, *settings.arguments()])}"
 
 
@@ -225,20 +216,6 @@ class _Shown:
         meta = Meta(conditions=self._records[-1].conditions, date=self.desk.bench.clock.utc())
         write_report(path, render_report(f"Enrolled: {title}", "", self._records, [], meta=meta))
         print(f"Report: {path}", file=sys.stderr)
-
-
-def _views(views: int | None, step: float | None) -> int | None:
-    if step is None:
-        return views
-    if views is not None:
-        raise UsageError("--views and --step cannot be used together.", next_step="Remove one of them.")
-    count = round(360.0 / step)
-    if abs(count * step - 360.0) > 1e-6:
-        raise UsageError(
-            f"A revolution cannot be divided into steps of {step:g}°.",
-            next_step=f"Use --views {count} (steps of {360.0 / count:.2f}°), or a step that divides 360.",
-        )
-    return count
 
 
 def _check(name: str | None, tray: Path | None, *, resume: bool, replace: bool, **texts: Any) -> None:

@@ -20,10 +20,6 @@ if TYPE_CHECKING:
 @command
 def identify(
     settings: Settings,
-    max_views: Annotated[
-        int | None,
-        typer.Option(min=1, max=72, metavar="N", help="Largest number of views (default: identify.max_views)."),
-    ] = None,
     strategy: Annotated[
         str | None,
         typer.Option(
@@ -33,7 +29,6 @@ def identify(
             autocompletion=strategy_names,
         ),
     ] = None,
-    top: Annotated[int, typer.Option(min=1, max=100, metavar="N", help="Number of candidates to show.")] = 5,
     save_run: Annotated[
         Path | None, typer.Option(metavar="FOLDER", help="Save images and decisions for rig replay and rig report.")
     ] = None,
@@ -96,8 +91,6 @@ def identify(
         job = identify_job(
             desk,
             strategy=strategy,
-            max_views=max_views,
-            top=top,
             seed=settings.seed or 0,
             watch=watch,
             sample=sample,

@@ -7,8 +7,9 @@ from contextlib import AbstractContextManager, nullcontext, suppress
 from rig.bench import Bench
 from rig.bench.bench import DEVICES
 from rig.catalog import Catalog
+from rig.catalog.copying import open_or_copy
 from rig.catalog.jobs import JobProgress
-from rig.catalog.shared import BackgroundDelivery, open_or_copy, waiting
+from rig.catalog.journal import BackgroundDelivery, waiting
 from rig.catalog.verify import BackgroundCheck
 from rig.cli.ui import prompts
 from rig.cli.ui.present import Progress as ProgressBar

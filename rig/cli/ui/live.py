@@ -34,7 +34,7 @@ from rig.events.events import (
 )
 from rig.events.lines import line
 from rig.events.wording import decision_words, move_words, ranking_words, share_words, similar_objects_words
-from rig.motion.move import MotionModel
+from rig.motion.move import MotionTimes
 from rig.plans.estimate import TimeLeft
 from rig.views.capture import ViewEvidence, rejection_text
 
@@ -196,7 +196,7 @@ class EnrollView(LiveView):
 
     def __init__(self, console: Console, config: RigConfig, heading: str = "") -> None:
         super().__init__(console)
-        self._model = MotionModel(config)
+        self._model = MotionTimes(config)
         self._heading = heading
         self._name = ""
         self._of = 0

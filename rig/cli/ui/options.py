@@ -2,6 +2,7 @@
 
 import inspect
 from collections.abc import Callable, Sequence
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypedDict, get_args, get_type_hints
 
@@ -80,14 +81,15 @@ def spread(function: Callable[..., Any]) -> list[inspect.Parameter]:
     return found
 
 
-def options_of(bundle: type) -> list[inspect.Parameter]:
+@cache
+def options_of(bundle: type) -> tuple[inspect.Parameter, ...]:
     """Return the fields of a `TypedDict` as options; one that is not given is False or None."""
-    return [
+    return tuple(
         inspect.Parameter(
             name, inspect.Parameter.KEYWORD_ONLY, default=False if get_args(kind)[0] is bool else None, annotation=kind
         )
         for name, kind in get_type_hints(bundle, include_extras=True).items()
-    ]
+    )
 
 
 def show_parameters(command: Callable[..., Any], parameters: Sequence[inspect.Parameter]) -> None:

@@ -1,24 +1,27 @@
-"""Tables, progress bars and the text of dry runs on a terminal."""
+"""Tables, progress bars and the text of dry runs on a terminal.
+
+This module imports none of numpy, cv2, scipy and sqlalchemy: `rig --help` must start at once.
+"""
 
 import os
 import sys
 from collections.abc import Iterable, Sequence
 from contextlib import AbstractContextManager
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from rich.cells import cell_len
 from rich.console import Console, ConsoleOptions, RenderableType
-from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
-from rich.progress import Progress as RichProgress
 from rich.segment import Segment
 from rich.table import Table
 from rich.text import Text
 
-from rig.catalog.jobs import JobProgress
 from rig.cli.ui.terminal import unguarded
 from rig.core.control_characters import neutral
 from rig.core.phrases import angle_range, angle_words, azimuth_words, counted, duration_words
-from rig.plans.estimate import DryRun, Obstacle
+
+if TYPE_CHECKING:
+    from rig.catalog.jobs import JobProgress
+    from rig.plans.estimate import DryRun
 
 _PIPE_COLUMNS: Final = 240
 
@@ -65,7 +68,7 @@ def print_table(columns: Sequence[str], rows: Iterable[Sequence[str]], *, right:
     sys.stdout.flush()
 
 
-def dry_run_lines(found: Sequence[DryRun]) -> list[str]:
+def dry_run_lines(found: "Sequence[DryRun]") -> list[str]:
     """Return the plan of enrollments, in lines."""
     lines = []
     for one in found:
@@ -92,7 +95,9 @@ def dry_run_lines(found: Sequence[DryRun]) -> list[str]:
     return [*lines, "Nothing was moved or stored."]
 
 
-def _obstacle_words(one: DryRun) -> str:
+def _obstacle_words(one: "DryRun") -> str:
+    from rig.plans.estimate import Obstacle
+
     match one.obstacle:
         case Obstacle.INTERRUPTED:
             return "its enrollment was interrupted: add --resume or --replace"
@@ -114,6 +119,9 @@ class Progress(AbstractContextManager["Progress"]):
     """A progress bar on stderr, shown from its first call on; only its notes if stderr is not a terminal."""
 
     def __init__(self, title: str) -> None:
+        from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+        from rich.progress import Progress as RichProgress
+
         self._bar = RichProgress(
             TextColumn("{task.description}"),
             BarColumn(),
@@ -129,7 +137,7 @@ class Progress(AbstractContextManager["Progress"]):
     def __exit__(self, *_: object) -> None:
         self._bar.stop()
 
-    def __call__(self, at: JobProgress) -> None:
+    def __call__(self, at: "JobProgress") -> None:
         """Show how much is done."""
         self._bar.start()
         self._bar.start_task(self._task)

@@ -28,12 +28,6 @@ CONFIRM_ATTEMPTS = 16
 """Largest number of repetitions of a reading until only its reply arrives."""
 
 _BITS = 10  # a byte with its start and stop bit
-_ECHO_SIZE = 2  # in Protocol 1.0, an echoed instruction that reads this number of bytes is a valid reply to itself
-
-READ_LENGTHS = {1: 16, 2: 4}
-"""Reads in a row have this number of different lengths, by protocol: a repeated answer to an earlier one does not fit.
-In Protocol 2.0 the servo's clock shows the age of a reading, too."""
-
 Answers = tuple[dict[int, Reply], int]
 """Replies by id, and the SDK's result for missing ones."""
 
@@ -64,20 +58,9 @@ class DynamixelBus:
     write is read back, and each reading is confirmed. In Protocol 1.0 no reading contains its age, so all readings are
     confirmed.
 
-    Parameters
-    ----------
-    port
-        An open port.
-    retries
-        Largest number of repetitions of a transaction before the device counts as silent. All instructions used here
-        are absolute (a read, or a write of a value), so a repetition is harmless.
-    protocol
-        2 (X series, and MX series with firmware for it), or 1 (AX-12A).
-
-    Attributes
-    ----------
-    sampled_ns
-        Time at which the device began to send the last block that was read; it had sampled its registers just before.
+    After ``retries`` repetitions of a transaction the device counts as silent. All instructions used here are absolute
+    (a read, or a write of a value), so a repetition is harmless. ``protocol`` is 2 (X series, and MX series with
+    firmware for it), or 1 (AX-12A).
     """
 
     def __init__(self, port: ClockedPort, retries: int = 3, protocol: int = 2) -> None:
@@ -85,15 +68,15 @@ class DynamixelBus:
         self.statistics = BusStatistics()
         self.protocol = protocol
         self.sampled_ns = 0
+        """When the device began to send the last block that was read; it had sampled its registers just before."""
         self._packets: Packets = Packets1() if protocol == 1 else Packets2()
         self._retries = retries
         self._lock = RLock()
         self._alerts: dict[int, int] = {}
         self._reads = 0
         self._unanswered = False  # the last request, also if Ctrl+C interrupted it: its reply may still arrive
-        self._outstanding: list[
-            tuple[int, int]
-        ] = []  # replies that may still arrive: number of parameters, time of the request
+        # Replies that may still arrive: number of parameters, and time of the request.
+        self._outstanding: list[tuple[int, int]] = []
         self._foreign_ns: int | None = None  # when the last reply arrived that belongs to no request
 
     def alert(self, device_id: int) -> int:
@@ -102,7 +85,7 @@ class DynamixelBus:
 
     def ping(self, device_id: int) -> int:
         """Return the model number of the device."""
-        if self.protocol == 1 or self._is_outstanding(3):  # an echoed ping of Protocol 1.0 is a valid reply to itself
+        if self._packets.echo_sizes or self._is_outstanding(3):  # an echoed ping is a valid reply to itself
             return int.from_bytes(self.read_block(device_id, 0, 3)[:2], "little")
         answer = self._transact("ping", (device_id,), lambda: self._ask(device_id, PING, b"", 3))[device_id]
         return int.from_bytes(answer.data[:2], "little")
@@ -117,7 +100,7 @@ class DynamixelBus:
         already or arrives before the reply to the second reading; then both are discarded.
         """
         data, self.sampled_ns = self._read_once(device_id, address, size)
-        if dated or not (self.protocol == 1 or self._repeats_replies()):
+        if dated or not (self._packets.undated or self._repeats_replies()):
             return data
         counts = self.statistics
         for _ in range(CONFIRM_ATTEMPTS):
@@ -153,6 +136,7 @@ class DynamixelBus:
             return self._ask(device_id, READ, self._packets.read_parameters(start, asked), asked)
 
         reply = self._transact(f"read of {size} bytes at {address}", (device_id,), attempt)[device_id]
+        # The reply ended just now, and took its length at the baud rate.
         sent_ns = reply.size * _BITS * 1_000_000_000 // self.port.baudrate
         return reply.data[skipped : skipped + size], self.port.clock.now_ns() - sent_ns
 
@@ -179,12 +163,9 @@ class DynamixelBus:
     def reboot(self, device_id: int) -> None:
         """Restart a device, which is then silent for some tenths of a second.
 
-        Raises
-        ------
-        UsageError
-            Protocol 1.0 does not have this instruction.
+        Raises `UsageError`: Protocol 1.0 does not have this instruction.
         """
-        if self.protocol == 1:
+        if not self._packets.reboots:
             raise UsageError(
                 "A servo with Protocol 1.0 cannot be restarted over its bus.", next_step="Switch its supply off and on."
             )
@@ -197,24 +178,24 @@ class DynamixelBus:
 
     def _transact(self, what: str, device_ids: Sequence[int], attempt: Callable[[], Answers]) -> dict[int, Reply]:
         """Repeat attempts until all devices have answered or no retries remain; return their replies."""
-        with self._lock:
+        with self._lock:  # the SDK would report to a second thread that the port is busy, or mix up their packets
             for number in range(self._retries + 1):
                 self.statistics.transactions += 1
                 self.statistics.retries += number > 0
                 try:
-                    if self._unanswered:
+                    if self._unanswered:  # the reply to it may be on its way
                         self.port.drain()
                     self._unanswered = True
                     replies, result = attempt()
                 except (serial.SerialException, OSError) as unplugged:
-                    self.port.lost = True
+                    self.port.lost = True  # `reconnect` opens it again
                     step = "Check the adapter's USB plug, then start again."
                     raise self._silent(what, device_ids, f"the port failed: {unplugged}", step) from unplugged
                 except (BusBabble, IndexError):
                     # From some noise the SDK builds a packet that is too short for its own parser.
                     replies, result = {}, COMM_RX_CORRUPT
                 finally:
-                    self.port.is_using = False
+                    self.port.is_using = False  # the SDK leaves it set after an error
                 if result == COMM_SUCCESS:
                     self._unanswered = False
                     self._alerts |= {reply.bus_id: reply.alert for reply in replies.values()}
@@ -226,6 +207,7 @@ class DynamixelBus:
                         raise self._rejected(what, rejected)
                     result, replies = COMM_RX_CORRUPT, {}  # the instruction was damaged on its way: send it again
                 self._count(result)
+            # No attempt succeeded: say what the operator can check.
             missing = [device_id for device_id in device_ids if device_id not in replies]
             advice: SomeSteps = (
                 (
@@ -246,6 +228,7 @@ class DynamixelBus:
         A reply of another length does not belong to this request. A rejection has no parameters: while a reply without
         parameters is missing, a rejection is accepted only if no longer reply arrives.
         """
+        # Send, after old bytes were dropped; from now on a reply of this length is owed.
         answering = (target,) if answering is None else answering
         self._drop_foreign()
         ambiguous = size > 0 and self._is_outstanding(0)
@@ -254,6 +237,7 @@ class DynamixelBus:
         if result != COMM_SUCCESS:
             return {}, result
         self.port.setPacketTimeout(self._packets.reply_size(size) * len(answering))
+        # Collect the replies, and leave out what belongs to no request of ours.
         replies: dict[int, Reply] = {}
         doubtful: dict[int, Reply] = {}
         while len(replies) < len(answering):
@@ -265,7 +249,7 @@ class DynamixelBus:
                 self.statistics.foreign += 1
             elif reply.error and not reply.data and ambiguous:
                 doubtful[reply.bus_id] = reply
-            elif self.protocol == 1 and reply.data == parameters and len(parameters) not in (0, size):
+            elif self._packets.echo_sizes and reply.data == parameters and len(parameters) not in (0, size):
                 pass  # the adapter's echo of the instruction
             elif len(reply.data) != size and not (reply.error and not reply.data):
                 self.statistics.late += 1
@@ -285,9 +269,9 @@ class DynamixelBus:
 
     def _unambiguous(self, address: int, size: int) -> tuple[int, int]:
         """Return start and size of a read that includes ``size`` bytes at ``address`` and has an unambiguous reply."""
-        asked = size + min(self._reads % READ_LENGTHS[self.protocol], address)
+        asked = size + min(self._reads % self._packets.read_lengths, address)
         self._reads += 1
-        while self._is_outstanding(asked) or (self.protocol == 1 and asked == _ECHO_SIZE):
+        while self._is_outstanding(asked) or asked in self._packets.echo_sizes:
             asked += 1
         return max(address - (asked - size), 0), asked
 

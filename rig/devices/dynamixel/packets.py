@@ -6,7 +6,7 @@ whole reply with its length, which the SDK's own read functions ignore.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Protocol
+from typing import ClassVar
 
 from dynamixel_sdk import COMM_SUCCESS, Protocol1PacketHandler, Protocol2PacketHandler
 
@@ -35,33 +35,20 @@ class Reply:
     size: int
 
 
-class Packets(Protocol):
-    """One of the two protocols."""
-
-    rejections: ClassVar[dict[int, str]]
-    """Meaning of the error of a `Reply`."""
-    corrupted: ClassVar[int]
-    """The error of a `Reply` by which the device reports that the instruction arrived damaged."""
-
-    start: ClassVar[bytes]
-    """The first bytes of a packet."""
-
-    def send(self, port: ClockedPort, bus_id: int, instruction: int, parameters: bytes) -> int:
-        """Drop unread bytes and send an instruction; return the SDK's result."""
-
-    def receive(self, port: ClockedPort) -> tuple[Reply | None, int]:
-        """Wait for the next intact status packet; return it, or None and the SDK's result."""
-
-    def reply_size(self, size: int) -> int:
-        """Return the length of a status packet with ``size`` parameters, in bytes."""
-
-    def read_parameters(self, address: int, size: int) -> bytes: ...
-    def write_parameters(self, address: int, data: bytes) -> bytes: ...
-
-
 class Packets2(Protocol2PacketHandler):  # type: ignore[misc]
-    """Protocol 2.0."""
+    """Protocol 2.0.
 
+    ``rejections`` are the meanings of the error of a `Reply`, and ``corrupted`` is the error by which the device
+    reports that the instruction arrived damaged. ``start`` are the first bytes of a packet. Reads in a row have
+    ``read_lengths`` different lengths, so that a repeated answer to an earlier one does not fit. An echoed instruction
+    that reads one of ``echo_sizes`` bytes is a valid reply to itself. The readings are ``undated`` if no servo of the
+    protocol has a clock that shows their age. ``reboots`` is whether there is an instruction to restart.
+    """
+
+    read_lengths: ClassVar[int] = 4
+    echo_sizes: ClassVar[tuple[int, ...]] = ()
+    undated: ClassVar[bool] = False
+    reboots: ClassVar[bool] = True
     rejections: ClassVar[dict[int, str]] = {
         1: "result fail",
         2: "instruction error",
@@ -75,11 +62,13 @@ class Packets2(Protocol2PacketHandler):  # type: ignore[misc]
     start: ClassVar[bytes] = _HEADER
 
     def send(self, port: ClockedPort, bus_id: int, instruction: int, parameters: bytes) -> int:
+        """Drop unread bytes and send an instruction; return the SDK's result."""
         length = len(parameters) + 3
         packet = [0, 0, 0, 0, bus_id, length & 0xFF, length >> 8, instruction, *parameters, 0, 0]
         return int(self.txPacket(port, packet))
 
     def receive(self, port: ClockedPort) -> tuple[Reply | None, int]:
+        """Wait for the next intact status packet; return it, or None and the SDK's result."""
         packet, result = self.rxPacket(port, False)
         if result != COMM_SUCCESS:
             return None, result
@@ -90,6 +79,7 @@ class Packets2(Protocol2PacketHandler):  # type: ignore[misc]
         return Reply(packet[4], body[0] & 0x7F, body[0] & 0x80, bytes(body[1:]), size), result
 
     def reply_size(self, size: int) -> int:
+        """Return the length of a status packet with ``size`` parameters, in bytes."""
         return 11 + size
 
     def read_parameters(self, address: int, size: int) -> bytes:
@@ -119,6 +109,10 @@ class Packets1(Protocol1PacketHandler):  # type: ignore[misc]
     two bytes returns as a valid status packet; `DynamixelBus` never sends one.
     """
 
+    read_lengths: ClassVar[int] = 16
+    echo_sizes: ClassVar[tuple[int, ...]] = (2,)
+    undated: ClassVar[bool] = True
+    reboots: ClassVar[bool] = False
     rejections: ClassVar[dict[int, str]] = {
         0x10: "checksum error",
         0x02: "outside the angle limits",
@@ -149,6 +143,9 @@ class Packets1(Protocol1PacketHandler):  # type: ignore[misc]
 
     def write_parameters(self, address: int, data: bytes) -> bytes:
         return bytes((address,)) + data
+
+
+Packets = Packets1 | Packets2
 
 
 def _restuff(packet: list[int], body: Sequence[int] | bytes) -> list[int]:

@@ -23,6 +23,9 @@ READ_SLICE_S = 0.005
 BABBLE_GRACE_MS = 50.0
 """How long a packet may exceed its timeout while bytes keep arriving; the SDK itself has no limit."""
 
+QUIET_S, DRAIN_S = 0.005, 0.25
+"""How long a bus must be quiet before the next request, and how long to wait for that."""
+
 
 class SerialConnection(Protocol):
     """The part of `serial.Serial` that the port uses."""
@@ -53,10 +56,8 @@ def open_serial(path: str, baud: int, device: str = "servo", clock: Clock | None
 
     With a ``clock``, wait while the guardian of a killed program uses the port.
 
-    Raises
-    ------
-    DeviceNotFound
-        The next step names the likely reason: no such port, no permission, or another program uses it.
+    Raises `DeviceNotFound`: the next step names the likely reason: no such port, no permission, or another program uses
+    it.
     """
     begun_ns = clock.now_ns() if clock else 0
     was_guarded = True  # a guardian may close the port between the attempt to open it and the check of its users
@@ -171,10 +172,7 @@ class ClockedPort(PortHandler):  # type: ignore[misc]
     def reconnect(self) -> bool:
         """Open a lost connection again; return whether there was one.
 
-        Raises
-        ------
-        DeviceNotFound
-            The adapter is not connected yet.
+        Raises `DeviceNotFound`: the adapter is not connected yet.
         """
         if not self.lost or self._reopen is None:
             return False
@@ -187,10 +185,7 @@ class ClockedPort(PortHandler):  # type: ignore[misc]
     def setBaudRate(self, baudrate: int) -> bool:  # noqa: N802 - the SDK's names
         """Set any baud rate that the adapter supports: the SDK's own list lacks 250,000 and 4,500,000.
 
-        Raises
-        ------
-        serial.SerialException, OSError, ValueError
-            The adapter does not support it.
+        Raises `serial.SerialException`, `OSError`, `ValueError`: the adapter does not support it.
         """
         self.ser.baudrate = baudrate
         self.baudrate = baudrate
@@ -219,13 +214,13 @@ class ClockedPort(PortHandler):  # type: ignore[misc]
             raise BusBabble
         return data
 
-    def drain(self, quiet_s: float = 0.005, limit_s: float = 0.25) -> None:
-        """Drop what arrives until the bus has been quiet for ``quiet_s``.
+    def drain(self) -> None:
+        """Drop what arrives until the bus has been quiet for `QUIET_S`.
 
         Otherwise a reply after its timeout would be accepted as the reply to the next request, because Protocol 2.0 has
         no sequence numbers.
         """
         start_ns = last_ns = self.clock.now_ns()
-        while (now_ns := self.clock.now_ns()) - last_ns < quiet_s * 1e9 and now_ns - start_ns < limit_s * 1e9:
+        while (now_ns := self.clock.now_ns()) - last_ns < QUIET_S * 1e9 and now_ns - start_ns < DRAIN_S * 1e9:
             if self.ser.read(256):
                 last_ns = self.clock.now_ns()

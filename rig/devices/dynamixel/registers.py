@@ -3,13 +3,13 @@
 The tables for Protocol 2.0 come from the SDK's `.model` files, the one of the AX-12A from its e-manual page.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from struct import Struct
 from typing import Any, Self
 
-from rig.config.servos import USE_ANOTHER, differences, model_file_exists, model_registers, sdk_models
+from rig.config.servos import GROUP, USE_ANOTHER, differences, model_file_exists, model_registers, sdk_models
 from rig.core.errors import ConfigError, DeviceMismatch
 from rig.core.plugins import plugins
 
@@ -34,24 +34,13 @@ _SIGNED = frozenset(
 _STARTUP = (60, 1, "Startup Configuration")
 _STARTUP_FIRMWARE = {"xl330": 46, "xc330": 46, "x": 45}
 
-GROUP = "rig.servos"
-"""Entry-point group in which packages name a `DynamixelModel`, or a `rig.devices.servo.ServoDriver`."""
-
 
 @dataclass(frozen=True, slots=True)
 class DynamixelModel:
     """A model that has no `.model` file in the SDK.
 
-    Attributes
-    ----------
-    name, number : str, int
-        Value of ``servo.model``, and Model Number.
-    protocol : int
-        1 or 2.
-    registers : tuple of (int, int, str)
-        Address, size and e-manual name of each register.
-    ram_start : int
-        First address of the RAM area.
+    ``name`` is the value of ``servo.model``, ``number`` its Model Number. ``registers`` are address, size and e-manual
+    name of each register; the RAM area begins at ``ram_start``.
     """
 
     name: str
@@ -119,25 +108,16 @@ class Register:
         return int(value).to_bytes(self.size, "little", signed=self.signed)
 
 
-class ControlTable(Mapping[str, Register]):
+class ControlTable(dict[str, Register]):
     """The registers of one model by their e-manual names.
 
     Registers below ``ram_start`` are EEPROM: they survive without supply, and are locked while the torque is on.
     """
 
-    def __init__(self, model: str, registers: Mapping[str, Register], ram_start: int = 64) -> None:
+    def __init__(self, model: str, registers: Iterable[Register], ram_start: int = 64) -> None:
+        super().__init__((register.name, register) for register in registers)
         self.model = model
         self.ram_start = ram_start
-        self._registers = dict(registers)
-
-    def __getitem__(self, name: str) -> Register:
-        return self._registers[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._registers)
-
-    def __len__(self) -> int:
-        return len(self._registers)
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,10 +154,7 @@ def model_numbers() -> Mapping[int, str]:
 def servo_plugin(model: str) -> Any:
     """Return the object that a package names ``model`` in the group `GROUP`; None for other models.
 
-    Raises
-    ------
-    ConfigError
-        A package cannot be loaded.
+    Raises `ConfigError`: a package cannot be loaded.
     """
     if model in model_numbers().values():
         return None
@@ -230,15 +207,12 @@ def _row(model: str) -> DynamixelModel | None:
 def control_table(model: str, firmware: int | None = None) -> ControlTable:
     """Return the control table of ``model`` (e.g. ``"xl430_w250"``), which may change with firmware 52.
 
-    Raises
-    ------
-    ConfigError
-        The model does not exist, or the driver does not fit it.
+    Raises `ConfigError`: the model does not exist, or the driver does not fit it.
     """
     if (row := _row(model)) is not None:
         signed = _SIGNED if row.protocol == 2 else frozenset()
-        listed = (Register(name, address, size, name in signed) for address, size, name in row.registers)
-        return ControlTable(model, {register.name: register for register in listed}, row.ram_start)
+        listed = [Register(name, address, size, name in signed) for address, size, name in row.registers]
+        return ControlTable(model, listed, row.ram_start)
     known = sorted(name for name in model_numbers().values() if not differences(name))
     if model not in known:
         reasons = {"reasons": list(differences(model))} if differences(model) else {}
@@ -250,12 +224,11 @@ def control_table(model: str, firmware: int | None = None) -> ControlTable:
     name = model
     if firmware is not None and firmware >= 52 and model_file_exists(f"{model}_fw52"):
         name = f"{model}_fw52"
-    registers = {
-        label: Register(label, address, size, label in _SIGNED)
-        for label, (address, size) in model_registers(name).items()
-    }
+    registers = [
+        Register(label, address, size, label in _SIGNED) for label, (address, size) in model_registers(name).items()
+    ]
     since = next((version for prefix, version in _STARTUP_FIRMWARE.items() if model.startswith(prefix)), None)
     if firmware is not None and since is not None and firmware >= since:
         address, size, label = _STARTUP
-        registers[label] = Register(label, address, size, signed=False)
+        registers.append(Register(label, address, size, signed=False))
     return ControlTable(model, registers)

@@ -1,21 +1,43 @@
-"""A Dynamixel servo of the X or MX (2.0) series."""
+"""A Dynamixel servo: of the X series, of the MX series (2.0), or an AX-12A.
 
-from collections.abc import Iterator
-from typing import Any
+One class drives all of them. What differs is a row (`ServoSeries`), or follows from the registers that a model lacks.
 
-from rig.core.clock import seconds_between
-from rig.core.errors import DeviceFault, UsageError
+Decision: docs/decisions/0011.
+"""
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from typing import Final
+
+from rig.config import ServoConfig
+from rig.core.clock import Clock, seconds_between
+from rig.core.errors import ConfigError, DeviceFault, DeviceMismatch, DeviceNotFound, DeviceSilent, TorqueStaysOn
 from rig.core.next_steps import Do
 from rig.devices.dynamixel import settings
-from rig.devices.dynamixel.bus import watchdog_units
-from rig.devices.dynamixel.register_servo import RegisterServo, hardware_errors
-from rig.devices.dynamixel.settings import ServoMode
-from rig.devices.servo import MotionProfile, ServoCondition, ServoState
+from rig.devices.dynamixel.bus import DynamixelBus, watchdog_units
+from rig.devices.dynamixel.guardian import Guardian
+from rig.devices.dynamixel.port import ClockedPort, SerialConnection
+from rig.devices.dynamixel.registers import (
+    Block,
+    ControlTable,
+    DynamixelModel,
+    control_table,
+    model_of,
+    protocol_of,
+    require_driven,
+    servo_plugin,
+)
+from rig.devices.dynamixel.settings import Mode, SettingDifference
+from rig.devices.servo import MotionProfile, Servo, ServoCondition, ServoIdentity, ServoLimits, ServoState
+
+BOOT_ALLOWANCE_S = 3.0
+"""How long a servo may be silent after a reboot: some tenths of a second; the e-manual states no number."""
+TORQUE_OFF_ATTEMPTS = 3
+"""Largest number of attempts to switch the torque off and read it back before it counts as on."""
 
 COUNTS_PER_REVOLUTION = 4096
 DEG_PER_COUNT = 360.0 / COUNTS_PER_REVOLUTION
 DPS_PER_UNIT = 0.229 * 6.0  # Velocity registers: 0.229 rev/min
-DPS2_PER_UNIT = 214.577 * 6.0 / 60.0  # Profile Acceleration: 214.577 rev/min^2
 EXTENDED_RANGE_COUNTS = 1_048_575
 WATCHDOG_TRIPPED = 0xFF
 
@@ -26,125 +48,356 @@ TICK_MEMORY_S = 10.0
 """After a longer pause, two readings must agree with each other instead."""
 _FRESH_ATTEMPTS, _RESTARTED = 8, 3
 
-_SPIN_POLL_S, _SPIN_WATCHDOG_S = 0.05, 0.5
+_HARDWARE_ERRORS = {0: "input voltage", 2: "overheating", 3: "motor encoder", 4: "electrical shock", 5: "overload"}
+_AX_ARRIVED_COUNTS = 2  # largest distance from the goal at rest: the compliance margin of 1 count, and 1 count of noise
 
 
-class DynamixelServo(RegisterServo):
-    """A servo whose registers are those of the X series; see `RegisterServo` for its parameters."""
+def _by_direction_bit(value: int) -> int:
+    """Return a speed or a load of Protocol 1.0, whose bit 10 means clockwise: the position falls."""
+    magnitude = value & 0x3FF
+    return -magnitude if value & 0x400 else magnitude
 
-    deg_per_count = DEG_PER_COUNT
 
-    def __init__(self, *arguments: Any, **options: Any) -> None:
-        super().__init__(*arguments, **options)
-        self._dps_per_unit = DPS_PER_UNIT / self._gear_ratio
-        self._dps2_per_unit = DPS2_PER_UNIT / self._gear_ratio
+@dataclass(frozen=True, slots=True)
+class ServoSeries:
+    """What differs between two series of servos: units at the servo's own shaft, and names of registers.
+
+    ``state`` and ``condition`` are the first and the last register of the blocks that `DynamixelServo.read_state` and
+    `DynamixelServo.read_condition` read. ``volatile`` is a register that is 0 after power-up, and that the rig never
+    sets to 0. A servo without a register for the acceleration always has ``dps2_per_unit``.
+    """
+
+    deg_per_count: float
+    dps_per_unit: float
+    dps2_per_unit: float
+    most_units: int
+    counts_revolutions: bool
+    state: tuple[str, str]
+    condition: tuple[str, str]
+    velocity: str
+    voltage: str
+    profile_velocity: str
+    volatile: str
+    signed: Callable[[int], int] = int
+    remarks: tuple[str, ...] = ()
+
+
+SERIES: Final = {
+    2: ServoSeries(
+        deg_per_count=DEG_PER_COUNT,
+        dps_per_unit=DPS_PER_UNIT,
+        dps2_per_unit=214.577 * 6.0 / 60.0,  # Profile Acceleration: 214.577 rev/min²
+        most_units=32767,
+        counts_revolutions=True,
+        state=("Realtime Tick", "Present Temperature"),
+        condition=("Torque Enable", "Profile Acceleration"),
+        velocity="Present Velocity",
+        voltage="Present Input Voltage",
+        profile_velocity="Profile Velocity",
+        volatile="Profile Acceleration",
+    ),
+    1: ServoSeries(
+        deg_per_count=300.0 / 1023,
+        dps_per_unit=0.111 * 6.0,
+        dps2_per_unit=2000.0,  # its fastest acceleration, estimated from its 354 °/s, because no document states it
+        most_units=1023,
+        counts_revolutions=False,
+        state=("Torque Enable", "Moving"),
+        condition=("Torque Enable", "Moving"),
+        velocity="Present Speed",
+        voltage="Present Voltage",
+        profile_velocity="Moving Speed",
+        volatile="Moving Speed",
+        signed=_by_direction_bit,
+        remarks=(
+            "an AX-12A has no watchdog: if the computer fails, it completes its present move",
+            "an AX-12A reaches only 300°: some azimuths of an object are not visible",
+        ),
+    ),
+}
+"""The rows, by protocol."""
+
+
+class DynamixelServo:
+    """A servo on a `DynamixelBus`; implements `rig.devices.servo.Servo`.
+
+    Opening only reads, to compare the model with the configured one. Nothing moves, and the torque stays as it is.
+
+    Parameters
+    ----------
+    model
+        As in `model_of`.
+    gear_ratio
+        Revolutions of the servo for one revolution of the table. All angles and rates of this class are on the table's
+        side of the gear. If the gears reverse the direction, set `table.direction`.
+    guardian
+        Switches the torque off if this program is killed; None if the servo is simulated in this program.
+
+    Raises `ConfigError`: the mode is turntable, but the servo does not count revolutions. `DeviceNotFound`: no servo
+    answers at ``bus_id``. `DeviceMismatch`: another model answers. The rig may be unable to drive it.
+    """
+
+    def __init__(
+        self,
+        bus: DynamixelBus,
+        *,
+        bus_id: int,
+        model: str,
+        clock: Clock,
+        mode: Mode = "turntable",
+        gear_ratio: float = 1.0,
+        guardian: Guardian | None = None,
+    ) -> None:
+        self.bus = bus
+        self._series = SERIES[bus.protocol]
+        if mode == "turntable" and not self._series.counts_revolutions:
+            raise ConfigError(
+                "An AX-12A cannot be a turntable: it measures only 300° and does not count revolutions.",
+                next_step='In [table] set mode = "pan", zero_deg = 150 and limits_deg = [-150, 150] (its 300°), '
+                "or use a servo of the X series.",
+            )
+        self._clock = clock
+        self._id = bus_id
+        self._mode = mode
+        self._guardian = guardian
+        self.resolution_deg = self._series.deg_per_count / gear_ratio
+        self.revolution_deg = 360.0 / gear_ratio
+        self._dps_per_unit = self._series.dps_per_unit / gear_ratio
+        self._dps2_per_unit = self._series.dps2_per_unit / gear_ratio
+        self.remarks = self._series.remarks
+        self._blocks: dict[tuple[str, str], Block] = {}
         self._tick: tuple[int, int] | None = None  # time and Realtime Tick of the last fresh reading
         self._unconfirmed: list[tuple[int, int]] = []  # readings that agree with each other, but not with it
+
+        # Compare the model, then read what its control table depends on.
+        try:
+            number = bus.ping(bus_id)
+        except DeviceSilent as silent:
+            raise DeviceNotFound(
+                f"No servo answers at id {bus_id}.",
+                next_step="Check the servo's power and cable, and servo.id, servo.baud and servo.model in the "
+                "configuration. An AX-12A uses another protocol than the other models.",
+                evidence=silent.evidence,
+            ) from silent
+        found = model_of(number)
+        if found != model:
+            require_driven(number, bus_id)
+            raise DeviceMismatch(
+                f"The servo at id {bus_id} is not the configured model.",
+                next_step=(
+                    "If this is the right servo,",
+                    Do.SET_KEY(key="servo.model", value=found),
+                    "Otherwise connect the right one.",
+                ),
+                evidence={"expected": model, "got": found, "model_number": number},
+            )
+        try:
+            firmware = bus.read(bus_id, control_table(model)["Firmware Version"])
+        except DeviceSilent as silent:
+            silent.add_note("It answers a ping but no read: its Status Return Level is 0, or the bus has errors.")
+            raise
+        self._table: ControlTable = control_table(model, firmware)
+        self.identity = ServoIdentity(model, number, bus_id, firmware)
+        self.limits = ServoLimits(
+            temperature_c=float(self._read("Temperature Limit")),
+            voltage_v=(self._read("Min Voltage Limit") * 0.1, self._read("Max Voltage Limit") * 0.1),
+        )
         # Present Current and Current Limit have the same unit, so their ratio is independent of the model.
         self._current_limit = self._read("Current Limit") if "Present Current" in self._table else None
 
     @property
     def reach_deg(self) -> tuple[float, float]:
-        if self._mode is ServoMode.PAN:
-            return 0.0, (COUNTS_PER_REVOLUTION - 1) * self.resolution_deg
-        return -EXTENDED_RANGE_COUNTS * self.resolution_deg, EXTENDED_RANGE_COUNTS * self.resolution_deg
+        if self._mode == "turntable":
+            low, high = -EXTENDED_RANGE_COUNTS, EXTENDED_RANGE_COUNTS
+        elif "CW Angle Limit" in self._table:
+            low, high = self._read("CW Angle Limit"), self._read("CCW Angle Limit")
+        else:
+            low, high = 0, COUNTS_PER_REVOLUTION - 1
+        return low * self.resolution_deg, high * self.resolution_deg
+
+    @property
+    def bus_statistics(self) -> dict[str, int]:
+        return asdict(self.bus.statistics)
+
+    # -- permanent settings -------------------------------------------------------------------------------------------
+
+    def prepare(self, *, write: bool) -> tuple[str, ...]:
+        differences = self.setting_differences()
+        if not differences:
+            return ()
+        if not write:
+            raise DeviceMismatch(
+                f"{len(differences)} EEPROM settings of the servo differ from what the rig needs.",
+                next_step=(Do.SERVO_SETTINGS(), "Or open the bench once with servo.write_settings = true."),
+                evidence={d.register: f"found {d.found}, wanted {d.wanted}: {d.reason}" for d in differences},
+            )
+        settings.write(self.bus, self._id, self._table, differences)
+        return tuple(f"servo: {d.register} was {d.found}, is now {d.wanted}" for d in differences)
+
+    def setting_differences(self) -> list[SettingDifference]:
+        """Return the EEPROM settings that differ from what the rig needs."""
+        return settings.compare(self.bus, self._id, self._table, self._mode)
+
+    # -- readings -----------------------------------------------------------------------------------------------------
 
     def read_state(self) -> ServoState:
-        time_ns, values = self._read_fresh()
+        series = self._series
+        time_ns, values = self._read_fresh() if "Realtime Tick" in self._table else self._read_block(*series.state)
+        position, trajectory = values["Present Position"], values.get("Position Trajectory")
+        moving = bool(values["Moving"])
+        # A model without Moving Status, trajectory or current has other registers for the same.
+        if (status := values.get("Moving Status")) is not None:
+            in_position = bool(status & 1)
+        else:
+            away = abs(position - values["Goal Position"])
+            in_position = bool(values["Torque Enable"]) and not moving and away <= _AX_ARRIVED_COUNTS
+        if self._current_limit is not None:
+            load_percent = 100.0 * values["Present Current"] / self._current_limit
+        else:
+            load_percent = 0.1 * series.signed(values["Present Load"])
         return ServoState(
             time_ns=time_ns,
             sampled_ns=self.bus.sampled_ns,
-            position_deg=values["Present Position"] * self.resolution_deg,
-            velocity_dps=values["Present Velocity"] * self._dps_per_unit,
-            load_percent=self._load_percent(values),
-            voltage_v=values["Present Input Voltage"] * 0.1,
+            position_deg=position * self.resolution_deg,
+            velocity_dps=series.signed(values[series.velocity]) * self._dps_per_unit,
+            load_percent=load_percent,
+            voltage_v=values[series.voltage] * 0.1,
             temperature_c=float(values["Present Temperature"]),
-            moving=bool(values["Moving"]),
-            in_position=bool(values["Moving Status"] & 1),
+            moving=moving,
+            in_position=in_position,
             hardware_errors=self._hardware_errors() if self.bus.alert(self._id) else (),
-            trajectory_deg=values["Position Trajectory"] * self.resolution_deg,
+            trajectory_deg=None if trajectory is None else trajectory * self.resolution_deg,
         )
 
     def read_condition(self) -> ServoCondition:
-        _, values = self._read_registers("Torque Enable", "Profile Acceleration")
-        watchdog = values["Bus Watchdog"]
+        _, values = self._read_block(*self._series.condition)
+        watchdog = values.get("Bus Watchdog", 0)
         tripped = watchdog == WATCHDOG_TRIPPED
         return ServoCondition(
             torque=bool(values["Torque Enable"]),
             watchdog_armed=0 < watchdog < WATCHDOG_TRIPPED,
             watchdog_tripped=tripped,
             # The rig's profile is never 0. The register is 0 after power-up, and after the watchdog has tripped.
-            power_lost=not tripped and values["Profile Acceleration"] == 0,
-            hardware_errors=hardware_errors(values["Hardware Error Status"]),
+            power_lost=not tripped and values[self._series.volatile] == 0,
+            hardware_errors=hardware_errors(values.get("Hardware Error Status", self.bus.alert(self._id))),
         )
 
+    def verify(self) -> None:
+        self.bus.port.reconnect()
+        number, firmware = self.bus.ping(self._id), self._read("Firmware Version")
+        if (number, firmware) != (self.identity.model_number, self.identity.firmware):
+            raise DeviceMismatch(
+                f"The servo that now answers at id {self._id} is a different one.",
+                next_step="Connect the bench's servo again, or start again with the new one.",
+                evidence={
+                    "expected": f"{self.identity.model}, firmware {self.identity.firmware}",
+                    "got": f"{model_of(number) or f'unknown model {number}'}, firmware {firmware}",
+                },
+            )
+        self.prepare(write=False)
+
+    def reboot(self) -> None:
+        self.bus.reboot(self._id)
+        deadline_ns = self._clock.now_ns() + round(BOOT_ALLOWANCE_S * 1e9)
+        while True:
+            self._clock.sleep(0.1)
+            try:
+                self.verify()
+            except DeviceSilent:
+                if self._clock.now_ns() > deadline_ns:
+                    raise
+            else:
+                return
+
+    # -- motion -------------------------------------------------------------------------------------------------------
+
     def set_profile(self, profile: MotionProfile) -> MotionProfile:
-        velocity = max(round(profile.velocity_dps / self._dps_per_unit), 1)  # 0 means no limit
-        acceleration = max(round(profile.acceleration_dps2 / self._dps2_per_unit), 1)
-        self._write("Profile Acceleration", acceleration)
-        self._write("Profile Velocity", velocity)
+        velocity = min(max(round(profile.velocity_dps / self._dps_per_unit), 1), self._series.most_units)  # 0: no limit
+        acceleration = 1
+        if "Profile Acceleration" in self._table:
+            acceleration = max(round(profile.acceleration_dps2 / self._dps2_per_unit), 1)
+            self._write("Profile Acceleration", acceleration)
+        self._write(self._series.profile_velocity, velocity)
         return MotionProfile(velocity * self._dps_per_unit, acceleration * self._dps2_per_unit)
 
-    def _switch_torque_on(self) -> None:
-        self._reject_errors(self._hardware_errors())
-        # After a killed program the torque may be on: the old goal must not continue when the watchdog is cleared.
-        self._write("Torque Enable", 0)
-        self._write("Bus Watchdog", 0)
-        self._write("Goal Position", self._read("Present Position"))
+    def torque_on(self) -> None:
+        if self._guardian:
+            self._guardian.arm()  # here, so that no command can forget it
+        errors = self._hardware_errors()
+        if errors:
+            raise DeviceFault(
+                f"Servo {self._id} reports a hardware error: {', '.join(errors)}.",
+                next_step="Remove the cause (jam, heat, supply), then power-cycle the servo.",
+                evidence={"hardware_errors": list(errors)},
+            )
+        if "Bus Watchdog" in self._table:
+            # After a killed program the torque may be on: the old goal must not continue when the watchdog is cleared.
+            self._write("Torque Enable", 0)
+            self._write("Bus Watchdog", 0)
+        self._write("Goal Position", self._read("Present Position"))  # on an AX-12A this also switches the torque on
         self._write("Torque Enable", 1)
 
+    def torque_off(self) -> None:
+        for _ in range(TORQUE_OFF_ATTEMPTS):  # read back, because the reply to an earlier write may hide a lost one
+            self._write("Torque Enable", 0)
+            if not self._read("Torque Enable"):
+                if self._guardian:
+                    self._guardian.disarm()
+                return
+        raise TorqueStaysOn(
+            f"Servo {self._id} accepts the instruction to switch its torque off, but its torque stays on.",
+            next_step=("Switch off the servo's supply. If this repeats, replace the servo.", Do.ACKNOWLEDGE()),
+            evidence={"attempts": TORQUE_OFF_ATTEMPTS},
+        )
+
+    def move_to(self, position_deg: float) -> None:
+        self._write("Goal Position", round(position_deg / self.resolution_deg))
+
     def arm_watchdog(self, timeout_s: float) -> None:
-        self._write("Bus Watchdog", watchdog_units(timeout_s))
+        if "Bus Watchdog" in self._table:  # without one, the servo completes its move: see `remarks`
+            self._write("Bus Watchdog", watchdog_units(timeout_s))
 
     def disarm_watchdog(self) -> None:
-        self._write("Bus Watchdog", 0)
+        if "Bus Watchdog" in self._table:
+            self._write("Bus Watchdog", 0)
 
-    def spin(self, velocity_dps: float, seconds: float, acceleration_dps2: float = 240.0) -> Iterator[ServoState]:
-        """Rotate at a constant speed for some time; yield about 20 readings per second.
+    def close(self) -> None:
+        self.bus.close()
+        if self._guardian:
+            self._guardian.close()  # after the port: it needs it if the torque is on
 
-        Only for tables without a cable: `table.limits_deg` is not checked here. The Bus Watchdog is always armed. When
-        the generator ends, the torque goes off and the servo returns to its own mode. The change of mode clears the
-        count of revolutions, so afterwards the table is not referenced.
+    # -- registers ----------------------------------------------------------------------------------------------------
 
-        Raises
-        ------
-        UsageError
-            The speed is 0, or above the servo's Velocity Limit.
-        DeviceFault, DeviceSilent
-            The servo reports a hardware error, or stops answering (its watchdog stops it).
+    def _read(self, name: str) -> int:
+        return self.bus.read(self._id, self._table[name])
+
+    def _write(self, name: str, value: int) -> None:
+        self.bus.write(self._id, self._table[name], value)
+
+    def _hardware_errors(self) -> tuple[str, ...]:
+        """Return the hardware errors of now; each reply of Protocol 1.0 has them, so any reading brings them."""
+        if "Hardware Error Status" in self._table:
+            return hardware_errors(self._read("Hardware Error Status"))
+        self._read("Torque Enable")
+        return hardware_errors(self.bus.alert(self._id))
+
+    def _read_block(self, first: str, last: str, *, dated: bool = False) -> tuple[int, dict[str, int]]:
+        """Read the registers from ``first`` to ``last`` in one transaction; return its time and the values by name.
+
+        ``dated`` if the registers contain the servo's clock, which the caller checks.
         """
-        unit_dps, limit = self._dps_per_unit, self._read("Velocity Limit")
-        units = round(velocity_dps / unit_dps)
-        if not 0 < abs(units) <= limit:
-            raise UsageError(
-                f"The servo cannot rotate the table at {velocity_dps:g} °/s.",
-                next_step=f"Give {unit_dps:.2f} to {limit * unit_dps:.0f} °/s, in either direction.",
-            )
-        self._reject_errors(self._hardware_errors())
-        self._change_mode(ServoMode.SPIN)
-        try:
-            self._write("Bus Watchdog", 0)
-            self._write("Profile Acceleration", max(round(acceleration_dps2 / self._dps2_per_unit), 1))
-            self._arm_guardian()
-            self._write("Torque Enable", 1)  # goal velocity is 0 after a change of mode
-            self.arm_watchdog(_SPIN_WATCHDOG_S)
-            self._write("Goal Velocity", units)
-            begun_ns = self._clock.now_ns()
-            while seconds_between(begun_ns, self._clock.now_ns()) < seconds:
-                self._clock.sleep(_SPIN_POLL_S)
-                yield self._checked(self.read_state())
-            self._write("Goal Velocity", 0)
-            while abs(self._checked(self.read_state()).velocity_dps) > self._dps_per_unit:
-                self._clock.sleep(_SPIN_POLL_S)
-        finally:
-            self.torque_off()
-            self._write("Bus Watchdog", 0)
-            self._change_mode(self._mode)
+        block = self._blocks.get((first, last))
+        if block is None:
+            block = self._blocks[first, last] = Block.of(self._table, first, last)
+        begun_ns = self._clock.now_ns()
+        image = self.bus.read_block(self._id, block.address, block.layout.size, dated=dated)
+        ended_ns = self._clock.now_ns()
+        return (begun_ns + ended_ns) // 2, block.values(image)
 
     def _read_fresh(self) -> tuple[int, dict[str, int]]:
         """Return time and values of a reading whose age the servo's clock confirms; drop repeated old answers."""
         for _ in range(_FRESH_ATTEMPTS):
-            time_ns, values = self._read_registers("Realtime Tick", "Present Temperature", dated=True)
+            time_ns, values = self._read_block(*self._series.state, dated=True)
             if self._is_fresh((time_ns, values["Realtime Tick"])):
                 return time_ns, values
         raise DeviceFault(
@@ -168,26 +421,45 @@ class DynamixelServo(RegisterServo):
         self._unconfirmed.clear()
         return True
 
-    def _load_percent(self, values: dict[str, int]) -> float:
-        if self._current_limit is not None:
-            return 100.0 * values["Present Current"] / self._current_limit
-        return 0.1 * values["Present Load"]
-
-    def _hardware_errors(self) -> tuple[str, ...]:
-        return hardware_errors(self._read("Hardware Error Status"))
-
-    def _checked(self, state: ServoState) -> ServoState:
-        volts = round(state.voltage_v, 1)
-        self._reject_errors(state.hardware_errors, temperature_c=state.temperature_c, voltage_v=volts)
-        return state
-
-    def _change_mode(self, mode: ServoMode) -> None:
-        differences = settings.compare(self.bus, self._id, self._table, mode)
-        settings.write(self.bus, self._id, self._table, differences)
-
 
 def _ticks_agree(earlier: tuple[int, int], later: tuple[int, int]) -> bool:
     """Return whether the servo's clock and the computer's advanced equally between two readings."""
     passed_ms = seconds_between(earlier[0], later[0]) * 1e3
     difference_ms = (later[1] - earlier[1] - passed_ms + TICK_MODULUS_MS / 2) % TICK_MODULUS_MS - TICK_MODULUS_MS / 2
     return abs(difference_ms) <= TICK_TOLERANCE_MS + TICK_DRIFT * passed_ms
+
+
+def hardware_errors(bits: int) -> tuple[str, ...]:
+    """Return the names of the bits of Hardware Error Status."""
+    return tuple(name for bit, name in _HARDWARE_ERRORS.items() if bits >> bit & 1)
+
+
+def open_servo(
+    connection: SerialConnection,
+    config: ServoConfig,
+    clock: Clock,
+    mode: Mode = "turntable",
+    reopen: Callable[[], SerialConnection] | None = None,
+    guardian: Guardian | None = None,
+) -> Servo:
+    """Return the configured servo on ``connection``, for ``mode`` (`table.mode`); write nothing.
+
+    ``reopen`` opens the connection again after its adapter was unplugged. ``guardian`` switches the torque off if this
+    program is killed.
+
+    Raises `ConfigError`: the model does not exist, or does not support the mode. `DeviceNotFound`, `DeviceMismatch`,
+    `DeviceSilent`: no servo answers, another model answers, or the servo stops answering.
+    """
+    driver = servo_plugin(config.model)
+    if driver is not None and not isinstance(driver, DynamixelModel):
+        opened: Servo = driver(connection, config, clock, mode=mode, reopen=reopen)
+        return opened
+    return DynamixelServo(
+        DynamixelBus(ClockedPort(connection, clock, config.port, reopen), config.retries, protocol_of(config.model)),
+        bus_id=config.id,
+        model=config.model,
+        clock=clock,
+        mode=mode,
+        gear_ratio=config.gear_ratio,
+        guardian=guardian,
+    )

@@ -2,22 +2,14 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from enum import StrEnum
+from typing import Final, Literal
 
 from rig.core.errors import RequestRejected
 from rig.devices.dynamixel.bus import DynamixelBus
 from rig.devices.dynamixel.registers import ControlTable
 
-
-class ServoMode(StrEnum):
-    """How the servo is used."""
-
-    TURNTABLE = "turntable"
-    """Rotates over many revolutions in both directions, and counts them (extended position mode)."""
-    PAN = "pan"
-    """Stays within one revolution (position mode): a camera arm, or a swinging table."""
-    SPIN = "spin"
-    """Rotates at a constant speed (velocity mode)."""
+Mode = Literal["turntable", "pan"]
+"""How the servo is used, as `table.mode`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,63 +19,46 @@ class SettingDifference:
     register: str
     found: int
     wanted: int
-    reason: str = ""
+    reason: str
 
     def __str__(self) -> str:
-        return f"{self.register}: {self.found} → {self.wanted}" + (f" ({self.reason})" if self.reason else "")
+        return f"{self.register}: {self.found} → {self.wanted} ({self.reason})"
 
 
-_OPERATING_MODES = {
-    ServoMode.TURNTABLE: (4, "extended position: the table rotates beyond one revolution"),
-    ServoMode.PAN: (3, "position: the arm stays within one revolution"),
-    ServoMode.SPIN: (1, "velocity: a constant speed"),
+_OPERATING_MODES: Final = {
+    "turntable": (4, "extended position: the table rotates beyond one revolution"),
+    "pan": (3, "position: the arm stays within one revolution"),
 }
 _DRIVE_MODE_BITS = 0b1101
 """Drive Mode bits that must be 0: reverse direction, time-based profile, and torque on by goal update."""
-_SHUTDOWN = 0b110100  # overload, electrical shock and overheating must switch the torque off
-_AX_SHUTDOWN = 0b100100
-_RETURN_DELAY = "no delay of replies; the factory setting of 250 costs 0.5 ms per reading"
-_ALL_ANSWERED = "the servo answers each instruction, so a lost one is noticed"
+_SHUTDOWN = 0b110100, "overload, short circuit and overheating switch the torque off"
+_AX_SHUTDOWN = 0b100100, "overload and overheating switch the torque off"
 
 
-def wanted(found: Mapping[str, int], mode: ServoMode = ServoMode.TURNTABLE) -> dict[str, tuple[int, str]]:
-    """Return the required values and their reasons, by register.
+def wanted(found: Mapping[str, int], mode: Mode) -> dict[str, tuple[int, str]]:
+    """Return the required values and their reasons by register, for the present settings of a servo.
 
-    Parameters
-    ----------
-    found
-        The present settings by register, without those that the model lacks.
-    mode
-        How the servo is used.
+    ``found`` has the registers of the model only.
     """
-    if "Operating Mode" not in found:
-        return _wanted_of_ax(found)
+    # An AX-12A has no Operating Mode: two limits of 0 make it rotate endlessly.
+    shutdown, why = _SHUTDOWN if "Operating Mode" in found else _AX_SHUTDOWN
+    wheel_mode = found.get("CW Angle Limit") == found.get("CCW Angle Limit") == 0
     needs = {
         "Drive Mode": (
-            found["Drive Mode"] & ~_DRIVE_MODE_BITS,
+            found.get("Drive Mode", 0) & ~_DRIVE_MODE_BITS,
             "the rig sets the direction (table.direction); velocity-based profile; a goal must not switch torque on",
         ),
         "Operating Mode": _OPERATING_MODES[mode],
         "Homing Offset": (0, "the software has the zero (table.zero_deg); an offset here can move the servo"),
-        "Return Delay Time": (0, _RETURN_DELAY),
-        "Secondary ID": (255, "off: else the servo obeys instructions to a second id"),
-        "Startup Configuration": (0, "no torque and no old goal at power-up"),
-        "Shutdown": (found["Shutdown"] | _SHUTDOWN, "overload, short circuit and overheating switch the torque off"),
-        "Status Return Level": (2, _ALL_ANSWERED),
-    }
-    return {name: need for name, need in needs.items() if name in found}
-
-
-def _wanted_of_ax(found: Mapping[str, int]) -> dict[str, tuple[int, str]]:
-    both_zero = found["CW Angle Limit"] == found["CCW Angle Limit"] == 0
-    needs = {
-        "Return Delay Time": (0, _RETURN_DELAY),
+        "Return Delay Time": (0, "no delay of replies; the factory setting of 250 costs 0.5 ms per reading"),
         "CCW Angle Limit": (
-            1023 if both_zero else found["CCW Angle Limit"],
+            1023 if wheel_mode else found.get("CCW Angle Limit", 0),
             "joint mode: two limits of 0 mean wheel mode",
         ),
-        "Shutdown": (found["Shutdown"] | _AX_SHUTDOWN, "overload and overheating switch the torque off"),
-        "Status Return Level": (2, _ALL_ANSWERED),
+        "Secondary ID": (255, "off: else the servo obeys instructions to a second id"),
+        "Startup Configuration": (0, "no torque and no old goal at power-up"),
+        "Shutdown": (found["Shutdown"] | shutdown, why),
+        "Status Return Level": (2, "the servo answers each instruction, so a lost one is noticed"),
     }
     return {name: need for name, need in needs.items() if name in found}
 
@@ -97,9 +72,7 @@ def read(bus: DynamixelBus, bus_id: int, table: ControlTable) -> dict[str, int]:
     return {r.name: r.decode(image[r.address : r.address + r.size]) for r in kept}
 
 
-def compare(
-    bus: DynamixelBus, bus_id: int, table: ControlTable, mode: ServoMode = ServoMode.TURNTABLE
-) -> list[SettingDifference]:
+def compare(bus: DynamixelBus, bus_id: int, table: ControlTable, mode: Mode = "turntable") -> list[SettingDifference]:
     """Return the settings of a servo that differ from what the rig needs; write nothing."""
     found = read(bus, bus_id, table)
     return [
@@ -112,12 +85,8 @@ def compare(
 def write(bus: DynamixelBus, bus_id: int, table: ControlTable, differences: Sequence[SettingDifference]) -> None:
     """Write settings with the torque off (a servo rejects them otherwise), and read each back.
 
-    Raises
-    ------
-    RequestRejected
-        The servo's torque stays on, or it rejects or loses a value.
-    DeviceSilent
-        The servo stops answering; the values written so far stay, and `compare` returns the others.
+    Raises `RequestRejected`: the servo's torque stays on, or it rejects or loses a value. `DeviceSilent`: the servo
+    stops answering; the values written so far stay, and `compare` returns the others.
     """
     # A servo that does not answer writes would count as silent, so the setting that makes it answer comes first.
     ordered = sorted(differences, key=lambda difference: difference.register != "Status Return Level")

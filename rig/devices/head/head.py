@@ -15,13 +15,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rig.config import HeadConfig, RigConfig
 from rig.core.clock import Clock, seconds_between
-from rig.core.errors import ConfigError, DeviceSilent, RequestRejected, RigError
+from rig.core.errors import DeviceSilent, EmergencyStop, RequestRejected, RigError
 from rig.devices.dynamixel.port import SerialConnection
-from rig.devices.head.connection import HEARTBEATS_PER_DEADMAN, HeadConnection, version
+from rig.devices.head.link import HeadLink, version
 from rig.devices.head.protocol import (
-    DEADMAN_MAX_MS,
-    DEADMAN_MIN_MS,
     SERIAL_UNSET,
     Acknowledge,
     Board,
@@ -39,11 +38,13 @@ from rig.devices.head.protocol import (
     Trigger,
     Triggered,
 )
-from rig.devices.head.sensors import HeadSensor
+from rig.devices.head.samples import HeadClock, HeadSensor, SampleStream, head_sensor
 from rig.devices.head.status import HeadIdentity, HeadStatus, head_fault, sensor_error
-from rig.devices.head.stream import HeadStatistics, SampleStream
 from rig.devices.imu import ImuSamples
 
+POWER_UP_S = 0.6
+"""Time from closing the relay of the servo's supply until the servo answers."""
+HEARTBEATS_PER_DEADMAN = 4
 FIRST_HEARTBEATS = 8
 """Heartbeats that compare the clocks before the first sample is dated."""
 RECOVERY_S = 0.5
@@ -57,27 +58,15 @@ class RigHead:
 
     Parameters
     ----------
-    connection
-        The open port, at `protocol.BAUD`.
+    connection, name, reopen
+        As for `HeadLink`; at `protocol.BAUD`.
     sensor
         The sensor on the head's I2C bus, with its settings.
     deadman_s
         The silence after which the head switches its outputs off.
-    name
-        The port's name, for messages.
-    reopen
-        Opens the port again after the cable was unplugged.
 
-    Raises
-    ------
-    DeviceNotFound
-        Nothing answers that uses the protocol.
-    FirmwareMismatch
-        The head uses another version; the message says which side to update.
-    DeviceSilent, DeviceMismatch
-        The sensor on the head does not answer, or is another one.
-    ConfigError
-        The head does not support ``deadman_s``.
+    Raises `DeviceNotFound`, `FirmwareMismatch`: as `HeadLink.greet`. `DeviceSilent`, `DeviceMismatch`: the sensor on
+    the head does not answer, or is another one.
     """
 
     def __init__(
@@ -91,11 +80,6 @@ class RigHead:
         reopen: Callable[[], SerialConnection] | None = None,
     ) -> None:
         self._deadman_ms = round(1000 * deadman_s)
-        if not DEADMAN_MIN_MS <= self._deadman_ms <= DEADMAN_MAX_MS:
-            raise ConfigError(
-                f"A deadman of {deadman_s:g} s is not possible.",
-                next_step=f"Set head.deadman_s to {DEADMAN_MIN_MS / 1000:g} to {DEADMAN_MAX_MS / 1000:g}.",
-            )
         self._clock = clock
         self._sensor = sensor
         self._lock = Lock()
@@ -103,27 +87,27 @@ class RigHead:
         self._status = HeadStatus()
         self._restart: Reset | None = None
         self._set_up = self._down = self._closed = False
-        self.statistics = HeadStatistics()
-        self._connection = HeadConnection(
-            connection, clock, self._on_event, deadman_ms=self._deadman_ms, name=name, reopen=reopen
-        )
-        self._link, self._timing = self._connection.link, self._connection.timing
+        self._link = HeadLink(connection, clock, self._on_event, name, reopen)
+        self.statistics = self._link.statistics
+        self._timing = HeadClock(2 * self._link.frame_ns(HeartbeatReply.LAYOUT.size))
         self._stream = SampleStream(sensor, clock, self._timing, self.statistics)
+        self._heartbeat_ns = clock.now_ns()
         self._cancel: Callable[[], None] = lambda: None
         try:
-            self._connection.greet()
+            self._link.greet()
             self._begin()
             self._wait_until_running()
         except BaseException:
             self.close()
             raise
+        # Beside the work, not in its control loop: a slow disk or the operator takes longer than a deadman.
         self._cancel = clock.every(deadman_s / HEARTBEATS_PER_DEADMAN, self._in_background)
 
     # -- IMU --------------------------------------------------------------------------------------------------------
 
     @property
     def identity(self) -> HeadIdentity:
-        head, sensor, boards = self._connection.identity, self._sensor, {b.value: b.name.lower() for b in Board}
+        head, sensor, boards = self._link.identity, self._sensor, {b.value: b.name.lower() for b in Board}
         return HeadIdentity(
             model=sensor.kind.name,
             bus_address=sensor.setup.address,
@@ -146,12 +130,8 @@ class RigHead:
     def read_samples(self) -> ImuSamples:
         """Return the samples that arrived since the last call, at most those of `stream.MEMORY_S`.
 
-        Raises
-        ------
-        DeviceSilent
-            The head does not answer and cannot be reconnected, or it lost its sensor.
-        DeviceMismatch
-            Another head or another sensor answers than the one that was opened.
+        Raises `DeviceSilent`: the head does not answer and cannot be reconnected, or it lost its sensor.
+        `DeviceMismatch`: another head or another sensor answers than the one that was opened.
         """
         with self._in_use():
             self._check_sensor()
@@ -191,6 +171,29 @@ class RigHead:
         with self._in_use():
             self._link.request(Relay(int(on)), Done)
 
+    def switch_on(self, config: HeadConfig) -> RigError | None:
+        """Switch on the servo's power and the ring light if they are connected; return the fault that was latched.
+
+        A fault of an earlier program is cleared on the head and returned. The caller latches it, so that the operator
+        must acknowledge it before anything moves.
+
+        Raises `EmergencyStop`: the e-stop is pressed, and the servo's supply goes through it.
+        """
+        fault = self.fault
+        if fault is not None:
+            try:
+                self.acknowledge()
+            except EmergencyStop:
+                if config.power:
+                    raise
+                return fault
+        if config.power:
+            self.set_power(True)
+            self._clock.sleep(POWER_UP_S)
+        if config.light is not None:
+            self.set_light(config.light)
+        return fault
+
     def trigger(self, width_s: float = 0.001) -> int:
         """Send one pulse to the camera; return when it begins, on the bench's clock (ns)."""
         with self._in_use():
@@ -210,9 +213,9 @@ class RigHead:
         """The reason why the head switched its outputs off; None if it did not."""
         return head_fault(
             self._status,
-            port=self._connection.name,
+            port=self._link.name,
             restart=self._restart,
-            start=Reset(self._connection.identity.reset_cause),
+            start=Reset(self._link.identity.reset_cause),
             deadman_ms=self._deadman_ms,
         )
 
@@ -229,12 +232,7 @@ class RigHead:
     def acknowledge(self) -> None:
         """Clear the latched faults after the operator looked at their causes; the outputs stay off.
 
-        Raises
-        ------
-        EmergencyStop
-            The e-stop is still pressed.
-        DeviceSilent
-            The head does not answer.
+        Raises `EmergencyStop`: the e-stop is still pressed. `DeviceSilent`: the head does not answer.
         """
         with self._in_use():
             try:
@@ -261,7 +259,6 @@ class RigHead:
     def health(self) -> dict[str, float]:
         """Return statistics of connection, clock and samples, with units in the names."""
         return {
-            **self._link.counts(),
             **asdict(self.statistics),
             "drift_ppm": round(self._timing.drift_ppm, 1),
             "time_uncertainty_us": round(self._timing.uncertainty_ns / 1000, 1),
@@ -276,10 +273,9 @@ class RigHead:
             if self._down:
                 if self._closed:
                     raise DeviceSilent(
-                        f"The rig head at {self._connection.name} is closed.", next_step="Open the bench again."
+                        f"The rig head at {self._link.name} is closed.", next_step="Open the bench again."
                     )
-                self._connection.reconnect()
-                self.statistics.reconnects += 1
+                self._link.reconnect()
                 self._begin()
                 self._down = False
             self._poll()
@@ -300,7 +296,6 @@ class RigHead:
         """Compare the clocks, set the sensor up and start the stream."""
         self._stream.restart()
         self._timing.restart()
-        self._link.restarted()
         for _ in range(FIRST_HEARTBEATS):
             self._heartbeat()
         self._link.request(self._sensor.setup, Done)
@@ -311,20 +306,24 @@ class RigHead:
     def _poll(self) -> None:
         try:
             self._link.poll()
+            # A head that restarted has lost its sensor's settings, and its clock began again.
             if self._restart is not None and not self._set_up:
-                self._connection.identify()
-                self._restart = Reset(self._connection.identity.reset_cause)
+                self._link.identify()
+                self._restart = Reset(self._link.identity.reset_cause)
                 self._begin()
-            if self._connection.heartbeat_due:
+            elapsed_s = seconds_between(self._heartbeat_ns, self._clock.now_ns())
+            if elapsed_s * HEARTBEATS_PER_DEADMAN * 1000 >= self._deadman_ms:
                 self._heartbeat()
         except DeviceSilent:
             self._down = True
             raise
 
     def _heartbeat(self) -> None:
-        reply = self._connection.heartbeat()
+        reply = self._link.heartbeat(self._deadman_ms)
+        self._heartbeat_ns = self._link.heard_ns
         if not self._take_status(reply):
-            self._connection.compare_clocks(reply)
+            received_us, answered_us = self._timing.unwrap(reply.received_us), self._timing.unwrap(reply.sent_us)
+            self._timing.add(self._link.sent_ns, received_us, answered_us, self._link.heard_ns)
 
     def _on_event(self, event: Sample | StatusChanged) -> None:
         if isinstance(event, StatusChanged):
@@ -368,7 +367,7 @@ class RigHead:
             raise self._sensor_error()
 
     def _sensor_error(self) -> RigError:
-        return sensor_error(self._status, self._sensor, self._connection.name)
+        return sensor_error(self._status, self._sensor, self._link.name)
 
     def _fresh_sample(self) -> Sample:
         """Return a sample that is at most a tenth of a second and a few periods old."""
@@ -383,3 +382,34 @@ class RigHead:
                 if seconds_between(start_ns, now_ns) > RECOVERY_S:
                     raise self._sensor_error()
             self._clock.sleep(0.005)
+
+
+def open_head(config: RigConfig, open_port: Callable[[], SerialConnection], clock: Clock) -> RigHead:
+    """Open the head at ``config.head.port``; its outputs stay off.
+
+    ``open_port`` opens its port, also again after the cable was unplugged.
+
+    Raises ConfigError, DeviceNotFound, FirmwareMismatch, DeviceMismatch, DeviceSilent: see `RigHead`.
+    """
+    sensor, head = head_sensor(config.imu), config.head
+    return RigHead(open_port(), clock, sensor, deadman_s=head.deadman_s, name=head.port, reopen=open_port)
+
+
+@contextmanager
+def powered(config: RigConfig, open_port: Callable[[], SerialConnection], clock: Clock) -> Iterator[None]:
+    """Power the servo for the duration of a ``with`` block if its supply goes through a rig head.
+
+    Raises `EmergencyStop`, `HeartbeatLost`, `HeadRestarted`: the head keeps the supply off until the fault is
+    acknowledged. `DeviceNotFound`, `FirmwareMismatch`, `DeviceMismatch`, `DeviceSilent`: see `RigHead`.
+    """
+    if not (config.imu.connection == "head" and config.head.power):
+        yield
+        return
+    head = open_head(config, open_port, clock)
+    try:
+        head.check()
+        head.set_power(True)
+        clock.sleep(POWER_UP_S)
+        yield
+    finally:
+        head.close()

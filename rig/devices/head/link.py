@@ -1,21 +1,58 @@
-"""Requests to the rig head, its replies and its events: sequence numbers, repetitions, statistics."""
+"""The serial link to a rig head: frames, requests with their replies, events, the greeting, and reconnection.
+
+A frame is COBS, ended by a zero byte, with id, sequence, body and CRC-16 inside (see firmware/PROTOCOL.md).
+"""
 
 import termios
-from collections.abc import Callable
-from dataclasses import astuple, dataclass
+from binascii import crc_hqx
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import asdict, astuple, dataclass
 from typing import TypeVar
 
-from rig.core.clock import Clock
-from rig.core.errors import DeviceSilent, DeviceUnplugged, RequestRejected
+from cobs import cobs
+
+from rig.core.clock import Clock, seconds_between
+from rig.core.errors import (
+    DeviceFault,
+    DeviceMismatch,
+    DeviceNotFound,
+    DeviceSilent,
+    DeviceUnplugged,
+    FirmwareMismatch,
+    RequestRejected,
+)
 from rig.core.next_steps import Do
 from rig.devices.dynamixel.port import SerialConnection
 from rig.devices.head import protocol
-from rig.devices.head.framing import CRC, HEADER, Deframer, Frame, encode
-from rig.devices.head.protocol import Answer, Done, Rejection, Request, Sample, StatusChanged
+from rig.devices.head.protocol import (
+    BAUD,
+    FIRMWARE,
+    MAX_BODY,
+    PROTOCOL_VERSION,
+    Answer,
+    Done,
+    Heartbeat,
+    HeartbeatReply,
+    Hello,
+    Identity,
+    Rejection,
+    Request,
+    Sample,
+    SetSerial,
+    StatusChanged,
+)
+
+HEADER, CRC = 2, 2
+OVERHEAD = HEADER + CRC + 2
+"""Bytes of a frame on the wire besides its body: one of COBS, and the zero."""
+LONGEST = MAX_BODY + OVERHEAD
 
 REPLY_S = 0.06
 """How long a reply may take: 6 ms behind a full transmitter, plus twice a USB adapter's latency timer."""
 ATTEMPTS = 3
+GREETING_S = 3.0
+"""How long the first answer may take: opening its port restarts an Arduino, and its boot loader waits."""
 
 A = TypeVar("A")
 
@@ -30,12 +67,54 @@ _REASONS: dict[int, str] = {
 }
 
 
+class FrameError(ValueError):
+    """The bytes between two zeros are not a frame."""
+
+
+class CrcError(FrameError):
+    """A frame whose checksum is wrong."""
+
+
+@dataclass(frozen=True, slots=True)
+class HeadFrame:
+    """The content of a frame."""
+
+    id: int
+    sequence: int
+    body: bytes
+
+
+def encode(frame: HeadFrame) -> bytes:
+    """Return the frame's bytes on the wire, including the zero that ends them."""
+    content = bytes([frame.id, frame.sequence]) + frame.body
+    encoded: bytes = cobs.encode(content + crc_hqx(content, 0xFFFF).to_bytes(CRC, "big"))
+    return encoded + b"\0"
+
+
+def decode(line: bytes) -> HeadFrame:
+    """Return the frame in ``line``, the bytes between two zeros.
+
+    Raises `CrcError`: the checksum is wrong. `FrameError`: the bytes are not COBS, too few or too many.
+    """
+    if len(line) >= LONGEST:
+        raise FrameError(f"{len(line)} bytes, longer than any frame")
+    try:
+        content = cobs.decode(line)
+    except cobs.DecodeError as error:
+        raise FrameError(str(error)) from error
+    if len(content) < HEADER + CRC:
+        raise FrameError(f"{len(content)} bytes, shorter than any frame")
+    if crc_hqx(content, 0xFFFF):  # over data and its CRC the remainder is 0
+        raise CrcError(f"wrong checksum in {line.hex()}")
+    return HeadFrame(content[0], content[1], content[HEADER:-CRC])
+
+
 @dataclass(slots=True)
-class LinkStatistics:
-    """Statistics of the connection.
+class HeadStatistics:
+    """Counts since the head was opened.
 
     ``missed`` counts events that did not arrive intact, ``late`` replies that came too late, ``retries`` repeated
-    requests.
+    requests, ``lost`` samples that never reached a reader, ``dropped`` those of them for which the head had no room.
     """
 
     frames: int = 0
@@ -44,10 +123,46 @@ class LinkStatistics:
     missed: int = 0
     late: int = 0
     retries: int = 0
+    lost: int = 0
+    dropped: int = 0
+    reconnects: int = 0
+    restarts: int = 0
+
+
+class Deframer:
+    """Splits a stream of bytes into frames, and counts invalid ones."""
+
+    def __init__(self, statistics: HeadStatistics) -> None:
+        self._statistics = statistics
+        self._line = bytearray()
+
+    def feed(self, data: bytes) -> Iterator[HeadFrame]:
+        """Add bytes and yield the frames that they complete."""
+        *lines, rest = (bytes(self._line) + data).split(b"\0")
+        # A frame that is too long is invalid: keep only enough of it to detect that.
+        self._line[:] = rest[:LONGEST]
+        for line in filter(None, lines):
+            try:
+                frame = decode(line)
+            except CrcError:
+                self._statistics.crc_errors += 1
+            except FrameError:
+                self._statistics.malformed += 1
+            else:
+                self._statistics.frames += 1
+                yield frame
+
+    def missing(self, length: int) -> int:
+        """Return how many bytes the present frame lacks, at least 1, if it has ``length`` bytes with its zero."""
+        return max(length - len(self._line), 1)
+
+    def reset(self) -> None:
+        """Drop an incomplete frame."""
+        self._line.clear()
 
 
 class HeadLink:
-    """Requests, replies and events on an open port of a head.
+    """Requests, replies and events on the port of one rig head.
 
     Parameters
     ----------
@@ -57,33 +172,98 @@ class HeadLink:
         Called with each `Sample` and `StatusChanged` that arrives.
     name
         The port's name, for messages.
+    reopen
+        Opens the port again after the cable was unplugged; None if that is not possible.
     """
 
+    identity: Identity
+
     def __init__(
-        self, connection: SerialConnection, clock: Clock, on_event: Callable[[Sample | StatusChanged], None], name: str
+        self,
+        connection: SerialConnection,
+        clock: Clock,
+        on_event: Callable[[Sample | StatusChanged], None],
+        name: str,
+        reopen: Callable[[], SerialConnection] | None = None,
     ) -> None:
         self.name = name
-        self.statistics = LinkStatistics()
+        self.statistics = HeadStatistics()
         self.sent_ns = self.heard_ns = clock.now_ns()
         """When the last request was sent, and when its reply arrived."""
         self._connection = connection
         self._clock = clock
         self._on_event = on_event
-        self._deframer = Deframer()
+        self._reopen = reopen
+        self._deframer = Deframer(self.statistics)
         self._sequence = 0
         self._event_sequence: int | None = None
-        self._reply: Frame | None = None
+        self._reply: HeadFrame | None = None
 
     def frame_ns(self, body_bytes: int) -> float:
         """Return the time that a frame with such a body takes on the wire."""
-        return (body_bytes + HEADER + CRC + 2) * 10e9 / self._connection.baudrate
+        return (body_bytes + OVERHEAD) * 10e9 / self._connection.baudrate
 
     def close(self) -> None:
         self._connection.close()
 
-    def replace(self, connection: SerialConnection) -> None:
-        """Continue with a port that was opened again."""
-        self._connection = connection
+    # -- the greeting -------------------------------------------------------------------------------------------------
+
+    def greet(self) -> None:
+        """Wait until the head answers, and check that it uses this program's protocol.
+
+        Raises `DeviceNotFound`: nothing answers that uses the protocol. `FirmwareMismatch`: the head uses another
+        version; the message says which side to update.
+        """
+        self.identity = self._greet()
+
+    def identify(self) -> None:
+        """Ask for the head's identity again, after it restarted."""
+        self.identity = self.request(Hello(PROTOCOL_VERSION), Identity)
+        self._event_sequence = None
+
+    def reconnect(self) -> None:
+        """Open the port again, and continue only with the same head.
+
+        Raises `DeviceSilent`: the port is still gone, or nothing answers. `DeviceMismatch`: another head answers.
+        """
+        if self._reopen is None:
+            raise DeviceSilent(
+                f"The rig head at {self.name} stopped answering.",
+                next_step="Check its USB cable, then open the bench again.",
+                evidence=asdict(self.statistics),
+            )
+        with suppress(OSError):
+            self._connection.close()
+        try:
+            self._connection = self._reopen()
+            found = self._greet()
+        except DeviceNotFound as gone:
+            raise DeviceSilent(gone.what, next_step=gone.steps, evidence=gone.evidence) from gone
+        same = ("board", "serial", "protocol", "major", "minor", "patch")
+        pairs = {name: (getattr(found, name), getattr(self.identity, name)) for name in same}
+        if changed := {name: pair for name, pair in pairs.items() if pair[0] != pair[1]}:
+            raise DeviceMismatch(
+                f"The rig head that now answers at {self.name} is a different one.",
+                next_step="Connect the bench's own head, or open the bench again.",
+                evidence={name: {"got": got, "expected": expected} for name, (got, expected) in changed.items()},
+            )
+        self.identity = found
+        self.statistics.reconnects += 1
+
+    def store_serial(self, serial: int) -> None:
+        """Store a serial number, 0 to 2³² − 2, in the head, and read it back.
+
+        Raises `RequestRejected`: a program uses the head, or its firmware is older than 1.1. `DeviceFault`: the head
+        reports another number afterwards.
+        """
+        self.request(SetSerial(serial), Done)
+        self.identify()
+        if self.identity.serial != serial:
+            raise DeviceFault(
+                f"The rig head at {self.name} did not store its serial number.",
+                next_step="Try again. If this repeats, its EEPROM is worn out: use another board.",
+                evidence={"requested": serial, "reported": self.identity.serial},
+            )
 
     def start(self) -> None:
         """End a frame that an earlier program may have sent in part, and drop the replies that it did not read."""
@@ -92,29 +272,49 @@ class HeadLink:
         self._deframer.reset()
         self._event_sequence = None
 
-    def poll(self) -> None:
-        """Process the bytes that have arrived, without waiting."""
-        if waiting := self._guarded(lambda: self._connection.in_waiting):
-            self._take(self._guarded(lambda: self._connection.read(waiting)))
+    def _greet(self) -> Identity:
+        start_ns = self._clock.now_ns()
+        while True:
+            try:
+                self.start()
+                found = self.request(Hello(PROTOCOL_VERSION), Identity, attempts=1)
+                break
+            except DeviceUnplugged:
+                raise
+            except DeviceSilent as silent:
+                if seconds_between(start_ns, self._clock.now_ns()) > GREETING_S:
+                    raise DeviceNotFound(
+                        f"No rig head answers at {self.name}.",
+                        next_step=f"Check that head.port is the head's port, and flash the head: make -C firmware "
+                        f"flash PORT={self.name}.",
+                        evidence={"baud": BAUD, **asdict(self.statistics)},
+                    ) from silent
+        if found.protocol != PROTOCOL_VERSION:
+            ours = ".".join(map(str, FIRMWARE))
+            older = found.protocol < PROTOCOL_VERSION
+            raise FirmwareMismatch(
+                f"The rig head at {self.name} (firmware {version(found)}) uses protocol {found.protocol}, this "
+                f"program protocol {PROTOCOL_VERSION}.",
+                next_step=f"Flash the head with firmware {ours}: make -C firmware flash PORT={self.name}."
+                if older
+                else "Update this program: the head's firmware is newer.",
+                evidence={"head": found.protocol, "program": PROTOCOL_VERSION, "firmware": version(found)},
+            )
+        return found
+
+    # -- requests -----------------------------------------------------------------------------------------------------
 
     def request(self, message: Request, expected: type[A], *, attempts: int = ATTEMPTS) -> A:
         """Send ``message`` and return its reply; events that arrive meanwhile are passed on.
 
         A repetition has the same sequence number: the head replies again, but does nothing twice.
 
-        Raises
-        ------
-        DeviceSilent
-            The head did not reply to any of the ``attempts``.
-        DeviceUnplugged
-            The port is gone.
-        RequestRejected
-            The head rejected the request; the error says why.
+        Raises `DeviceSilent`: the head did not reply to any of the ``attempts``. `DeviceUnplugged`: the port is gone.
+        `RequestRejected`: the head rejected the request; the error says why.
         """
         self._sequence = (self._sequence + 1) % 256
-        body = message.LAYOUT.pack(*astuple(message))
-        frame = encode(Frame(message.ID, self._sequence, body))
-        reply_bytes = protocol.REPLIES.get(type(message), Done).LAYOUT.size + HEADER + CRC + 2
+        frame = encode(HeadFrame(message.ID, self._sequence, message.LAYOUT.pack(*astuple(message))))
+        reply_bytes = protocol.REPLIES.get(type(message), Done).LAYOUT.size + OVERHEAD
         for attempt in range(attempts):
             self.statistics.retries += bool(attempt)
             self._reply = None
@@ -134,26 +334,48 @@ class HeadLink:
         raise DeviceSilent(
             f"The rig head at {self.name} does not answer.",
             next_step="Check its USB cable and supply, and that head.port is not the port of another board.",
-            evidence={"request": type(message).__name__.lower(), "attempts": attempts, **self.counts()},
+            evidence={"request": type(message).__name__.lower(), "attempts": attempts, **asdict(self.statistics)},
         )
 
-    def counts(self) -> dict[str, int]:
-        """Return the statistics by name."""
-        s, d = self.statistics, self._deframer
-        s.frames, s.crc_errors, s.malformed = d.frames, d.crc_errors, d.malformed
-        return {name: getattr(s, name) for name in s.__dataclass_fields__}
+    def heartbeat(self, deadman_ms: int) -> HeartbeatReply:
+        """Send heartbeats until one is answered; each repetition is a new heartbeat with its own times."""
+        for _ in range(ATTEMPTS - 1):
+            try:
+                return self.request(Heartbeat(deadman_ms), HeartbeatReply, attempts=1)
+            except DeviceUnplugged:
+                raise
+            except DeviceSilent:
+                continue
+        return self.request(Heartbeat(deadman_ms), HeartbeatReply, attempts=1)
+
+    def poll(self) -> None:
+        """Process the bytes that have arrived, without waiting."""
+        if waiting := self._guarded(lambda: self._connection.in_waiting):
+            self._take(self._guarded(lambda: self._connection.read(waiting)))
 
     def _answer(self, message: Request) -> Answer | None:
         """Return the reply to ``message`` if it has arrived."""
         frame, self._reply = self._reply, None
-        if frame is None:
+        answer = None if frame is None else _parse(frame)
+        if not isinstance(answer, Done):
+            return answer
+        if answer.request != message.ID:
             return None
-        answer = _parse(frame)
-        if isinstance(answer, Done):
-            if answer.request == message.ID and answer.rejection != Rejection.NONE:
-                raise rejection(self.name, message, answer.rejection)
-            return answer if answer.request == message.ID else None
+        if answer.rejection != Rejection.NONE:
+            raise self._rejected(message, answer.rejection)
         return answer
+
+    def _rejected(self, message: Request, reason: int) -> RequestRejected:
+        words = _REASONS.get(reason, f"unknown reason {reason}")
+        what = type(message).__name__.lower()
+        latched = reason in (Rejection.FAULT_LATCHED, Rejection.CAUSE_PERSISTS)
+        return RequestRejected(
+            f"The rig head at {self.name} rejected the request '{what}': {words}.",
+            next_step=("Remove the cause of the fault.", Do.ACKNOWLEDGE())
+            if latched
+            else "Flash the firmware of this program: make -C firmware flash.",
+            evidence={"request": what, "rejection": reason},
+        )
 
     def _read(self, frame_bytes: int) -> bytes:
         """Read the bytes that have arrived, or wait for those that the present frame still lacks."""
@@ -168,17 +390,13 @@ class HeadLink:
             else:
                 self.statistics.late += 1
 
-    def _event(self, frame: Frame) -> None:
+    def _event(self, frame: HeadFrame) -> None:
         event = _parse(frame)
         if isinstance(event, Sample | StatusChanged):
             if self._event_sequence is not None:
                 self.statistics.missed += (frame.sequence - self._event_sequence - 1) % 256
             self._event_sequence = frame.sequence
             self._on_event(event)
-
-    def restarted(self) -> None:
-        """Restart the count of events, because the head restarted."""
-        self._event_sequence = None
 
     def _guarded(self, use: Callable[[], A]) -> A:
         try:
@@ -191,21 +409,12 @@ class HeadLink:
             ) from gone
 
 
-def rejection(name: str, message: Request, reason: int) -> RequestRejected:
-    """Return the error for a request that the head at ``name`` rejected."""
-    words = _REASONS.get(reason, f"unknown reason {reason}")
-    what = type(message).__name__.lower()
-    latched = reason in (Rejection.FAULT_LATCHED, Rejection.CAUSE_PERSISTS)
-    return RequestRejected(
-        f"The rig head at {name} rejected the request '{what}': {words}.",
-        next_step=("Remove the cause of the fault.", Do.ACKNOWLEDGE())
-        if latched
-        else "Flash the firmware of this program: make -C firmware flash.",
-        evidence={"request": what, "rejection": reason},
-    )
+def version(identity: Identity) -> str:
+    """Return the firmware's version as text."""
+    return f"{identity.major}.{identity.minor}.{identity.patch}"
 
 
-def _parse(frame: Frame) -> Answer | None:
+def _parse(frame: HeadFrame) -> Answer | None:
     """Return the frame as a message; None if it is no message of this protocol."""
     kind = protocol.MESSAGES.get(frame.id)
     if kind is None or kind.LAYOUT.size != len(frame.body):

@@ -26,16 +26,6 @@ class Board(IntEnum):
     ATMEGA328P = 2
 
 
-class Capability(IntFlag):
-    """Bits of `identity.capabilities`."""
-
-    IMU = 1
-    LIGHT = 2
-    TRIGGER = 4
-    ESTOP = 8
-    RELAY = 16
-
-
 class Reset(IntEnum):
     """Why the head started."""
 
@@ -110,21 +100,29 @@ class SampleFlag(IntFlag):
     EDGE = 1
 
 
+class HeadMessage:
+    """A message: its id, and the layout of its body."""
+
+    __slots__ = ()
+    ID: ClassVar[int]
+    LAYOUT: ClassVar[Struct]
+
+    def __init_subclass__(cls, number: int | None = None, layout: str = "") -> None:
+        if number is not None:  # a dataclass with slots makes its class twice, the second time without arguments
+            cls.ID, cls.LAYOUT = number, Struct(layout)
+
+
 @dataclass(frozen=True, slots=True)
-class Hello:
+class Hello(HeadMessage, number=0x01, layout="<B"):
     """Ask for the head's identity; the head answers any protocol version."""
 
-    ID: ClassVar[int] = 0x01
-    LAYOUT: ClassVar[Struct] = Struct("<B")
     protocol: int  # Protocol version of the host.
 
 
 @dataclass(frozen=True, slots=True)
-class Heartbeat:
+class Heartbeat(HeadMessage, number=0x02, layout="<HIII"):
     """Heartbeat of the host. It has as many bytes as its reply, so that both take the same time on the wire."""
 
-    ID: ClassVar[int] = 0x02
-    LAYOUT: ClassVar[Struct] = Struct("<HIII")
     deadman_ms: int  # Longest silence until the next heartbeat.
     pad_0: int = 0
     pad_1: int = 0
@@ -132,55 +130,42 @@ class Heartbeat:
 
 
 @dataclass(frozen=True, slots=True)
-class Shutdown:
+class Shutdown(HeadMessage, number=0x03, layout="<"):
     """Switch the outputs and the deadman off, and end the stream."""
-
-    ID: ClassVar[int] = 0x03
-    LAYOUT: ClassVar[Struct] = Struct("<")
 
 
 @dataclass(frozen=True, slots=True)
-class Acknowledge:
+class Acknowledge(HeadMessage, number=0x04, layout="<B"):
     """Clear latched faults whose cause is gone."""
 
-    ID: ClassVar[int] = 0x04
-    LAYOUT: ClassVar[Struct] = Struct("<B")
     faults: int  # The faults that the operator has seen; others stay.
 
 
 @dataclass(frozen=True, slots=True)
-class Light:
+class Light(HeadMessage, number=0x05, layout="<B"):
     """Set the ring light."""
 
-    ID: ClassVar[int] = 0x05
-    LAYOUT: ClassVar[Struct] = Struct("<B")
     level: int  # Duty in 1/255; 0 is off.
 
 
 @dataclass(frozen=True, slots=True)
-class Relay:
+class Relay(HeadMessage, number=0x06, layout="<B"):
     """Close or open the servo-power relay."""
 
-    ID: ClassVar[int] = 0x06
-    LAYOUT: ClassVar[Struct] = Struct("<B")
     closed: int  # 0 or 1.
 
 
 @dataclass(frozen=True, slots=True)
-class Trigger:
+class Trigger(HeadMessage, number=0x07, layout="<H"):
     """Send one pulse to the camera."""
 
-    ID: ClassVar[int] = 0x07
-    LAYOUT: ClassVar[Struct] = Struct("<H")
     width_us: int  # Length of the pulse.
 
 
 @dataclass(frozen=True, slots=True)
-class Imu:
+class Imu(HeadMessage, number=0x08, layout="<BBBBB"):
     """Set up the sensor; `status_changed` and each `heartbeat_reply` report the result."""
 
-    ID: ClassVar[int] = 0x08
-    LAYOUT: ClassVar[Struct] = Struct("<BBBBB")
     model: int  # Imu_model.
     address: int  # 7-bit I2C address.
     divider: int  # MPU-6050: SMPLRT_DIV, the rate is 1 kHz / (1 + divider).
@@ -189,47 +174,36 @@ class Imu:
 
 
 @dataclass(frozen=True, slots=True)
-class Stream:
+class Stream(HeadMessage, number=0x09, layout="<B"):
     """Start or stop sending samples."""
 
-    ID: ClassVar[int] = 0x09
-    LAYOUT: ClassVar[Struct] = Struct("<B")
     on: int  # 0 or 1.
 
 
 @dataclass(frozen=True, slots=True)
-class ReadCounters:
+class ReadCounters(HeadMessage, number=0x0A, layout="<"):
     """Ask for the counters of errors since the start."""
-
-    ID: ClassVar[int] = 0x0A
-    LAYOUT: ClassVar[Struct] = Struct("<")
 
 
 @dataclass(frozen=True, slots=True)
-class SetSerial:
+class SetSerial(HeadMessage, number=0x0B, layout="<I"):
     """Store the serial number in permanent memory, but not while the head is active. Since firmware 1.1."""
 
-    ID: ClassVar[int] = 0x0B
-    LAYOUT: ClassVar[Struct] = Struct("<I")
     serial: int  # Serial number; serial_unset removes it.
 
 
 @dataclass(frozen=True, slots=True)
-class Done:
+class Done(HeadMessage, number=0x80, layout="<BB"):
     """The request was carried out or rejected; also the reply to unknown requests."""
 
-    ID: ClassVar[int] = 0x80
-    LAYOUT: ClassVar[Struct] = Struct("<BB")
     request: int  # Message id of the request.
     rejection: int  # Rejection; 0 if it was carried out.
 
 
 @dataclass(frozen=True, slots=True)
-class Identity:
+class Identity(HeadMessage, number=0x81, layout="<BBBBBBBII"):
     """Identity of the head."""
 
-    ID: ClassVar[int] = 0x81
-    LAYOUT: ClassVar[Struct] = Struct("<BBBBBBBII")
     protocol: int  # Protocol version of the head.
     major: int  # Firmware version.
     minor: int
@@ -242,11 +216,9 @@ class Identity:
 
 
 @dataclass(frozen=True, slots=True)
-class HeartbeatReply:
+class HeartbeatReply(HeadMessage, number=0x82, layout="<IIBBBBBB"):
     """Two times of the head's clock, and its status."""
 
-    ID: ClassVar[int] = 0x82
-    LAYOUT: ClassVar[Struct] = Struct("<IIBBBBBB")
     received_us: int  # When the heartbeat's last byte arrived.
     sent_us: int  # When the first byte of this reply leaves.
     state: int  # State.
@@ -258,21 +230,17 @@ class HeartbeatReply:
 
 
 @dataclass(frozen=True, slots=True)
-class Triggered:
+class Triggered(HeadMessage, number=0x87, layout="<IH"):
     """The pulse started."""
 
-    ID: ClassVar[int] = 0x87
-    LAYOUT: ClassVar[Struct] = Struct("<IH")
     time_us: int  # Its leading edge.
     width_us: int  # Its length.
 
 
 @dataclass(frozen=True, slots=True)
-class Counters:
+class Counters(HeadMessage, number=0x8A, layout="<HHHHHHHHHH"):
     """Counters since the start; they stop at 65535."""
 
-    ID: ClassVar[int] = 0x8A
-    LAYOUT: ClassVar[Struct] = Struct("<HHHHHHHHHH")
     frames: int  # Whole frames received.
     crc_errors: int  # Frames with a wrong CRC.
     malformed: int  # Frames that are not COBS, too short or too long.
@@ -286,11 +254,9 @@ class Counters:
 
 
 @dataclass(frozen=True, slots=True)
-class Sample:
+class Sample(HeadMessage, number=0xC0, layout="<HIBBhhhhhhh"):
     """One sample of the sensor."""
 
-    ID: ClassVar[int] = 0xC0
-    LAYOUT: ClassVar[Struct] = Struct("<HIBBhhhhhhh")
     index: int  # Count of the sensor's samples, including lost ones.
     time_us: int  # The head's clock.
     flags: int  # Sample_flag bits.
@@ -305,11 +271,9 @@ class Sample:
 
 
 @dataclass(frozen=True, slots=True)
-class StatusChanged:
+class StatusChanged(HeadMessage, number=0xC1, layout="<IBBBBBB"):
     """The state, a fault, the e-stop or the sensor changed; also the first message after a start."""
 
-    ID: ClassVar[int] = 0xC1
-    LAYOUT: ClassVar[Struct] = Struct("<IBBBBBB")
     time_us: int  # When.
     state: int  # State.
     faults: int  # Fault bits.

@@ -15,7 +15,7 @@ from rig.core.errors import (
 )
 from rig.core.next_steps import Do
 from rig.devices.head.protocol import HeadFault, HeadState, HeartbeatReply, ImuStatus, Input, Reset, StatusChanged
-from rig.devices.head.sensors import HeadSensor
+from rig.devices.head.samples import HeadSensor
 from rig.devices.imu import ImuIdentity
 
 _RESTARTS = {
@@ -66,18 +66,7 @@ def head_fault(
 ) -> RigError | None:
     """Return the error for the reason why the head switched its outputs off; None if it did not.
 
-    Parameters
-    ----------
-    status
-        The head's status.
-    port
-        Its port, for the message.
-    restart
-        Cause of a restart while the head was in use; None if it did not restart.
-    start
-        Cause of the start before the head was opened.
-    deadman_ms
-        The deadman in force.
+    ``restart`` is the cause of a restart while the head was in use, ``start`` that of its start before it was opened.
     """
     faults = status.faults
     evidence: dict[str, Any] = {"faults": faults.name, "port": port}

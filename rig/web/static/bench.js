@@ -1,38 +1,23 @@
 import { $, API, duration, h, listJobs, nextSteps, number, on, start, submit } from "./rig.js";
 
-/** Return a point of the dial: 0° is at the top, angles grow counter-clockwise, as the table's do seen from above. */
-const polar = (degrees, radius) => {
-  const a = ((-degrees - 90) * Math.PI) / 180;
-  return [Math.cos(a) * radius, Math.sin(a) * radius];
-};
 const STATES = ["disconnected", "connected", "unreferenced", "ready", "moving", "stopped", "fault"];
 let gyro = null;
 
+/** Turn the needles of the dial: 0° is at the top, angles grow counter-clockwise, as the table's do seen from above. */
 function dial(status) {
   const angle = status.table_deg;
   const [low, high] = status.limits_deg || [-360, 360];
   const known = angle !== null && angle !== undefined;
-  const parts = [h("circle", { r: 96, fill: "none", stroke: "currentColor", "stroke-width": 2 })];
-  for (let mark = 0; mark < 360; mark += 30) {
-    const [x1, y1] = polar(mark, 90);
-    const [x2, y2] = polar(mark, 96);
-    const [tx, ty] = polar(mark, mark % 180 ? 111 : 104); // beside the tick, which otherwise looks like a minus sign
-    parts.push(h("line", { x1, y1, x2, y2, stroke: "currentColor" }));
-    if (mark % 90 === 0) parts.push(h("text", { x: tx, y: ty + 4 }, `${mark}`));
-  }
-  if (known) {
-    const used = Math.min(Math.abs(angle) / Math.max(Math.abs(angle < 0 ? low : high), 1), 1);
-    const circumference = 2 * Math.PI * 72;
-    parts.push(h("circle", { r: 72, fill: "none", stroke: "var(--line)", "stroke-width": 10 }));
-    parts.push(h("circle", { r: 72, fill: "none", stroke: used > 0.9 ? "var(--red)" : "var(--blue)", "stroke-width": 10, "stroke-dasharray": `${circumference * used} ${circumference}`, transform: `rotate(-90) scale(${angle < 0 ? "1 1" : "1 -1"})` }));
-    const needle = (degrees, radius, colour, width) => {
-      const [x2, y2] = polar(degrees, radius);
-      return h("line", { x1: 0, y1: 0, x2, y2, stroke: colour, "stroke-width": width, "stroke-linecap": "round" });
-    };
-    if (gyro !== null) parts.push(needle(gyro, 60, "var(--amber)", 9));
-    parts.push(needle(angle, 88, "currentColor", 4), h("circle", { r: 6, fill: "currentColor" }));
-  }
-  $("dial").replaceChildren(...parts);
+  const rotate = (id, degrees) => {
+    $(id).toggleAttribute("hidden", degrees === null);
+    if (degrees !== null) $(id).setAttribute("transform", `rotate(${-degrees} 200 200)`);
+  };
+  rotate("needle", known ? angle : null);
+  rotate("gyro", known ? gyro : null);
+  const used = known ? Math.min(Math.abs(angle) / Math.max(Math.abs(angle < 0 ? low : high), 1), 1) : 0;
+  $("used").setAttribute("stroke-dasharray", `${used} 1`);
+  $("used").setAttribute("transform", `translate(200 200) rotate(-90) scale(1 ${angle < 0 ? 1 : -1}) translate(-200 -200)`);
+  $("used").classList.toggle("much", used > 0.9);
   const moving = status.servo && status.servo.moving ? ` at ${number(status.velocity_dps, 0)} °/s` : "";
   $("dial-text").textContent = known ? `${number(angle, 2)}°${moving}` : "angle in doubt";
 }

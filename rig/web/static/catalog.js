@@ -31,27 +31,11 @@ async function open(name) {
   $("object-body").replaceChildren(
     h("p", {}, similar ? `Similar objects: ${similar}` : "No similar object."),
     h("ul", { class: "list" }, ...enrollments.map((words) => h("li", {}, words))),
-    ring(one.views_taken),
+    h("ol", { class: "thumbs" }, ...one.views_taken.map((view) => h("li", {}, h("img", { src: `${API}/views/${view.id}/image`, alt: "", loading: "lazy" }), `${view.azimuth_deg.toFixed(0)}°`))),
   );
   for (const element of $("edit").elements) if (element.id !== "close") element.disabled = !canOperate();
   $("object").show();
   $("object").scrollTop = 0;
-}
-
-/** Return the views in a circle at their azimuths, counter-clockwise from the bottom, which is the camera's side. */
-function ring(views) {
-  const step = Math.max(1, Math.ceil(views.length / 24));
-  const some = views.filter((_, k) => k % step === 0);
-  const width = Math.min(220, 2400 / Math.max(some.length, 6));
-  const parts = some.flatMap((view) => {
-    const angle = ((view.azimuth_deg + 90) * Math.PI) / 180;
-    const [x, y] = [Math.cos(angle) * 400, Math.sin(angle) * 400];
-    return [
-      h("image", { href: `${API}/views/${view.id}/image`, x: x - width / 2, y: y - width / 2, width, height: width }),
-      h("text", { x: x * 0.66, y: y * 0.66 + 6 }, `${view.azimuth_deg.toFixed(0)}°`),
-    ];
-  });
-  return h("svg", { class: "ring", viewBox: "-520 -520 1040 1040", role: "img", "aria-label": `${some.length} of ${views.length} views by azimuth` }, ...parts);
 }
 
 async function upload(file) {

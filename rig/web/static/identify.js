@@ -1,4 +1,4 @@
-import { $, followJobs, h, nextSteps, number, on, percent, start } from "./rig.js";
+import { $, API, followJobs, h, nextSteps, number, on, percent, start } from "./rig.js";
 
 function oneSample() {
   $("sample").disabled = $("watch").checked;
@@ -23,17 +23,10 @@ function clear() {
   answer("Searching …", "", "");
 }
 
-function bars(candidates, unknown = false) {
-  const rows = candidates.slice(0, 6).flatMap((one) => {
-    const share = one.probability ?? one.score;
-    const words = one.probability === null ? number(one.score, 3) : percent(share);
-    const bar = h("div", { "aria-hidden": "true" });
-    bar.style.width = `${Math.max(share, 0) * 100}%`;
-    return [h("span", {}, one.name), h("span", {}, bar), h("span", {}, words)];
-  });
-  $("candidates").replaceChildren(h("div", { class: "bar-chart" }, ...rows));
-  const meaning = candidates[0].probability === null ? "Score per view." : "Shares among the enrolled objects.";
-  $("shares").textContent = unknown ? `${meaning} The object on the table is none of them.` : meaning;
+/** Show the chart of the candidates after a number of views. The server draws it; its words are for screen readers. */
+function chart(job, views, candidates) {
+  const words = candidates.map((one) => `${one.name} ${one.probability === null ? number(one.score, 3) : percent(one.probability)}`);
+  $("candidates").replaceChildren(h("img", { src: `${API}/jobs/${job}/candidates?views=${views}`, alt: words.join(", ") }));
 }
 
 export function result(event) {
@@ -41,14 +34,15 @@ export function result(event) {
   if (event.outcome === "found") answer(event.name, "found", lines[0]);
   else if (event.outcome === "ambiguous") answer(event.possible.join(" or "), "ambiguous", lines[0]);
   else answer("Unknown object", "unknown", lines[0]);
-  bars(event.candidates, event.outcome === "unknown");
+  chart(event.job, event.views, event.candidates);
+  $("shares").textContent = event.outcome === "unknown" ? "The object on the table is none of them." : "";
 }
 
 on("shown-plan", (event) => {
   if (event.event === "frame_used") return answer("Searching …", "", event.text.trim());
   if (event.event === "started") clear();
   if (event.event === "waiting") answer(event.reason === "first-object" ? "Put an object on the table" : "Put the next object on the table", "", "");
-  if (event.event === "ranked") bars(event.candidates);
+  if (event.event === "ranked") chart(event.job, event.index + 1, event.candidates);
   if (event.event === "identified") result(event);
   if (event.event === "failed") noAnswer(event);
   if (event.text) for (const words of event.text.split("\n")) $("steps").append(h("li", {}, words.trim()));
@@ -59,7 +53,7 @@ followJobs(["identify"], (job, isOther) => {
     clear();
     if (job.state === "queued") answer("Waiting for the bench …", "", "");
   }
-  if (job.result && job.result.event === "identified" && !job.request.watch) result({ ...job.result, text: job.result_text });
+  if (job.result && job.result.event === "identified" && !job.request.watch) result({ ...job.result, job: job.id, text: job.result_text });
   if (job.state === "failed") noAnswer(job.error);
   if (["cancelled", "interrupted"].includes(job.state)) answer("Stopped", "", "");
 }, (event) => `view ${event.index + 1}, ${event.azimuth_deg.toFixed(0)}°`);

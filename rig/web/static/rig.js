@@ -14,7 +14,7 @@ export const $ = (id) => document.getElementById(id);
 
 /** Return a new element. Attributes are an object (on… are listeners), children are nodes or text. */
 export function h(tag, attributes = {}, ...children) {
-  const svg = ["svg", "path", "circle", "line", "text", "rect", "g", "image"].includes(tag);
+  const svg = ["path", "rect"].includes(tag);
   const element = svg ? document.createElementNS("http://www.w3.org/2000/svg", tag) : document.createElement(tag);
   for (const [key, value] of Object.entries(attributes)) {
     if (key.startsWith("on")) element.addEventListener(key.slice(2), value);

@@ -31,7 +31,7 @@ IMPORTED = (
     *("rig.cli.ui.prompts", "rig.cli.ui.present", "rig.doctor.checks", "rig.doctor.device_scan"),
     *("rig.doctor.single_servo", "rig.motion.stop_request", "rig.plans.enroll", "rig.plans.identify"),
     *("rig.plans.photograph_table", "rig.plans.tray"),
-    *("rig.report.contact_sheet", "rig.search.model", "dynamixel_easy_sdk"),
+    *("rig.report.pictures", "rig.search.model", "dynamixel_easy_sdk"),
     *("rich._emoji_codes", "typer._adapters"),
 )
 """Modules that are imported once for all programs, because an emulated processor takes seconds for it."""

@@ -18,9 +18,10 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from sqlalchemy import Engine, event
+from sqlalchemy import Engine, delete, event
 
 from rig.catalog import Catalog, Provenance, View
+from rig.catalog.facts import Derived
 from rig.catalog.jobs import finished as finished
 from rig.catalog.records import Outcome
 from rig.catalog.results import Answer, NewResult
@@ -125,6 +126,12 @@ def other_program(path: Path, name: str, views: int, die_before: int = 0) -> Pro
     """Start a program that enrolls, or records answers if ``views`` is 0; it dies before that step of storing."""
     code = "from tests.rig.catalog.catalog_samples import main; main()"
     return Program(str(path), name, str(views), str(die_before), code=code)
+
+
+def forget(catalog: Catalog) -> None:
+    """Remove everything that can be computed again."""
+    with catalog.database.write() as transaction:
+        transaction.execute(delete(Derived))
 
 
 def files(catalog: Catalog) -> set[str]:

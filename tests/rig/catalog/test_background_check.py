@@ -122,7 +122,7 @@ def test_enrollment_reports_a_flipped_byte_of_another_object(rig, root: Path) ->
 
 def test_watch_reports_a_flipped_byte_of_an_object_that_it_does_not_load(rig, root: Path) -> None:
     flip(root, name_of(encode(image(90))).encode())
-    words = ["identify", "--watch", "--scan", "--strategy", "sweep", "--max-views", "2"]
+    words = ["identify", "--watch", "--scan", "--strategy", "sweep", "--set", "identify.max_views=2"]
     done = rig(*words, "--set", "bench.sim.object=dice", input="S-1\n\n")  # ends when there is no further sample
     assert "'gone' in the catalog changed after they were stored" in done.stderr
 

@@ -1,6 +1,7 @@
 """A catalog returns what was stored, and searches use complete enrollments only."""
 
 import hashlib
+from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime, timedelta, timezone
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -18,7 +19,7 @@ from rig.catalog import Catalog, EnrollmentStatus, OpenEnrollment, Provenance, V
 from rig.catalog.derived import views as searched
 from rig.core.errors import CatalogError, ObjectExists, ObjectNotFound, UsageError
 from rig.core.next_steps import Do
-from rig.views.image_files import Encoder
+from rig.views.image_files import encode
 from sim.clock import EPOCH, VirtualClock
 from tests.fuzzing import examples
 from tests.rig.catalog.catalog_samples import PROVENANCE, fill, image, plan, record
@@ -269,8 +270,8 @@ def test_add_rejects_invalid_images(catalog: Catalog, bad: np.ndarray) -> None:
     enrollment = begin(catalog, "mug")
     with pytest.raises(UsageError):
         enrollment.add(record(0), bad)
-    with pytest.raises(UsageError):
-        enrollment.add(record(0), bad, Encoder().begin(bad))
+    with ThreadPoolExecutor(1) as encoding, pytest.raises(UsageError):
+        enrollment.add(record(0), bad, encoding.submit(encode, bad))
     assert enrollment.missing() == (0, 1, 2)
 
 

@@ -20,10 +20,15 @@ from rig.catalog.verify import Problem, verify
 from rig.config import ViewConfig
 from rig.core.errors import CatalogBusy, CatalogDamaged, CatalogError, UsageError
 from rig.search.model import load_model
-from rig.views.description import BENCH_DESCRIPTOR, DESCRIPTORS, PAPER_DESCRIPTOR, EnrollmentDescriber
-from rig.views.segmentation_evidence import SegmentationSummary
+from rig.views.description import (
+    BENCH_DESCRIPTOR,
+    DESCRIPTORS,
+    PAPER_DESCRIPTOR,
+    EnrollmentDescriber,
+    SegmentationSummary,
+)
 from sim.clock import VirtualClock
-from tests.rig.catalog.catalog_samples import PROVENANCE, OpenCatalog, plan, record, sql, without_waiting
+from tests.rig.catalog.catalog_samples import PROVENANCE, OpenCatalog, forget, plan, record, sql, without_waiting
 
 REGION = (8, 0, 64, 64)
 VIEWS = 4
@@ -100,11 +105,6 @@ def rows(catalog: Catalog) -> dict[tuple[str, str], tuple[str, bytes, str]]:
 def change(catalog: Catalog, **values: Any) -> None:
     with catalog.database.write() as transaction:
         transaction.execute(update(Derived).values(**values))
-
-
-def forget(catalog: Catalog) -> None:
-    with catalog.database.write() as transaction:
-        transaction.execute(delete(Derived))
 
 
 @pytest.mark.parametrize("kind", [BENCH_DESCRIPTOR, PAPER_DESCRIPTOR])
@@ -286,7 +286,8 @@ def test_an_object_whose_image_is_missing_is_named(catalog: Catalog) -> None:
 
 def test_describing_again_gives_the_same_levels(catalog: Catalog) -> None:
     before, stored = load(catalog)[0], rows(catalog)
-    done = finished(derived.redescribe(catalog, BENCH_DESCRIPTOR, again=True, jobs=1))
+    forget(catalog)
+    done = finished(derived.redescribe(catalog, BENCH_DESCRIPTOR, jobs=1))
     assert (done.described, done.unchanged, done.failed) == (len(NAMES) * VIEWS, 0, ())
     assert rows(catalog) == stored
     assert equal(load(catalog)[0], before)
@@ -346,7 +347,8 @@ def test_a_changed_empty_table_image_is_found_and_not_used(catalog: Catalog) -> 
     path.write_bytes(path.read_bytes()[:-20])
     found = finished(verify(catalog, jobs=1)).findings
     assert {finding.problem for finding in found} == {Problem.CHANGED_IMAGE}
-    done = finished(derived.redescribe(catalog, BENCH_DESCRIPTOR, again=True, jobs=1))
+    forget(catalog)
+    done = finished(derived.redescribe(catalog, BENCH_DESCRIPTOR, jobs=1))
     assert (done.described, len(done.failed)) == (0, len(NAMES))
 
 

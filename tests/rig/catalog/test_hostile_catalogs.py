@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from typer.testing import Result
 
-from rig.catalog import Action, Catalog, derived
+from rig.catalog import Action, Catalog, derived, sessions
 from rig.catalog.exchange.bundle import read_bundle, write_bundle
 from rig.catalog.facts import Enrollment, Entry, Session, View, digested, sha256_of
 from rig.catalog.images import path_of
@@ -145,9 +145,9 @@ def move(catalog: Catalog, folder: Path) -> None:
 
 def answer(catalog: Catalog, _: Path) -> None:
     derived.views(catalog, "edges+colours")
-    derived.camera_settings(catalog)
-    derived.empty_tables(catalog)
-    derived.newest_view(catalog)
+    sessions.camera_settings(catalog)
+    sessions.empty_tables(catalog)
+    sessions.newest_view(catalog)
     derived.described_regions(catalog, "bench-1")
     derived.local_views(catalog, "mug", [0.0])
 
@@ -517,8 +517,8 @@ SHOWN: dict[str, Callable[[Catalog], Any]] = {
     "identify": lambda catalog: (
         derived.views(catalog, "edges+colours").object_names,
         derived.views(catalog, "edges+colours").azimuth_deg.tolist(),
-        derived.empty_tables(catalog).newest,
-        derived.newest_view(catalog),
+        sessions.empty_tables(catalog).newest,
+        sessions.newest_view(catalog),
     ),
     "export": lambda catalog: ascii(
         [

@@ -21,6 +21,7 @@ from tests.rig.catalog.catalog_samples import (
     files,
     fill,
     finished,
+    forget,
     image,
     plan,
     record,
@@ -217,7 +218,8 @@ class TestRedescribe:
     def test_interrupted_job_continues(self, catalog: Catalog) -> None:
         for number in range(3):
             fill(catalog, f"mug-{number}", 2, 10 * number)
-        job = derived.redescribe(catalog, again=True, jobs=1)
+        forget(catalog)
+        job = derived.redescribe(catalog, jobs=1)
         assert list(itertools.islice(job, 2)) == [JobProgress(0, 3), JobProgress(1, 3)]
         job.close()
         done = finished(derived.redescribe(catalog, jobs=1))
@@ -227,7 +229,8 @@ class TestRedescribe:
         fill(catalog, "mug", 3, 0)
         fill(catalog, "tin", 2, 10)
         catalog.image_path(catalog.object("mug").views[1].image).unlink()
-        done = finished(derived.redescribe(catalog, again=True))
+        forget(catalog)
+        done = finished(derived.redescribe(catalog))
         assert (done.described, [name for name, _ in done.failed]) == (2, ["mug"])
         with pytest.raises(CatalogError, match=r"'mug' cannot be described.*missing"):
             derived.views(catalog)

@@ -72,8 +72,9 @@ def test_catalog_depends_on_nothing_but_the_seed(rig):
 
 def test_a_search_can_end_after_the_only_view_that_it_may_take(rig):
     rig("enroll", "mug-dots", "--views", "6")
-    for strategy in ("dense", "hbr"):  # one view, although identify.min_views is 2
-        done = rig("identify", "--set", "bench.sim.object=mug-dots", "--max-views", "1", "--strategy", strategy)
+    one_view = ("--set", "identify.max_views=1", "--set", "identify.min_views=1")
+    for strategy in ("dense", "hbr"):
+        done = rig("identify", "--set", "bench.sim.object=mug-dots", *one_view, "--strategy", strategy)
         assert (done.exit_code, done.stdout.count("candidates:")) in ((0, 1), (10, 1))
 
 

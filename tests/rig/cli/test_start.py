@@ -68,7 +68,7 @@ def test_ctrl_c_at_the_start_ends_the_program_without_a_traceback(moment, words,
 
 
 @pytest.mark.parametrize("moment", ["atexit", "threads"])
-@pytest.mark.parametrize("words", ["--version", "config path"])
+@pytest.mark.parametrize("words", ["--version", "config show"])
 def test_ctrl_c_at_the_end_keeps_the_exit_code_and_prints_no_traceback(moment, words, tmp_path):
     done = interrupted(tmp_path, moment, *words.split())
     assert (done.returncode, done.stderr) == (0, "")
@@ -76,9 +76,9 @@ def test_ctrl_c_at_the_end_keeps_the_exit_code_and_prints_no_traceback(moment, w
 
 
 def test_ignored_ctrl_c_stays_ignored_until_a_command_begins(tmp_path):
-    done = interrupted(tmp_path, "typer", "config", "path", handler=signal.SIG_IGN)
+    done = interrupted(tmp_path, "typer", "config", "show", handler=signal.SIG_IGN)
     assert (done.returncode, done.stderr) == (0, "")
-    done = interrupted(tmp_path, "platformdirs", "config", "path", handler=signal.SIG_IGN)
+    done = interrupted(tmp_path, "platformdirs", "config", "show", handler=signal.SIG_IGN)
     assert (done.returncode, done.stderr) == (130, "Interrupted.\n")
 
 

@@ -110,6 +110,8 @@ def test_missing_servo_of_a_real_bench_is_reported_with_the_parts_to_check(setti
     [
         ("table.watchdog_s=0.1", "twice poll_s"),
         ("table.limits_deg=[-1e9, 1e9]", "within ±90000"),
+        ("servo.model=xl430-w250", "unknown model; did you mean xl430_w250?"),
+        ("servo.model=lx16a", "unknown model; `rig find` names yours"),
     ],
 )
 def test_settings_beyond_the_servos_limits_are_rejected(setting, words):

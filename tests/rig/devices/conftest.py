@@ -10,7 +10,7 @@ from sim.objects.shelf import shelf
 from sim.world import World
 from tests.contract.heads import Head, opened_head
 from tests.rig.bench_parts import Wires, servo_wires
-from tests.rig.devices.mpu6050_bench import Bench
+from tests.rig.imu_bench import ImuBench
 
 
 @pytest.fixture
@@ -23,8 +23,8 @@ def world() -> World:
 
 
 @pytest.fixture
-def bench() -> Iterator[Bench]:
-    with Bench() as b:
+def bench() -> Iterator[ImuBench]:
+    with ImuBench() as b:
         yield b
 
 
@@ -34,7 +34,7 @@ def wires() -> Wires:
 
 
 @pytest.fixture
-def imu(bench: Bench) -> Mpu6050:
+def imu(bench: ImuBench) -> Mpu6050:
     return bench.open()
 
 

@@ -12,43 +12,31 @@ from hypothesis import strategies as st
 from rig.core.errors import DeviceFault, DeviceMismatch, DeviceNotFound, DeviceSilent
 from rig.devices.bno055 import Bno055
 from rig.motion.turntable import Turntable
-from sim.i2c import SimI2cBus
 from sim.imu.bno055 import SILENT_S, SimBno055
-from sim.motion import to_position, to_velocity
+from sim.motion import to_position
 from sim.noise import NoiseModel
-from sim.world import World
 from tests.fuzzing import examples
+from tests.rig.imu_bench import ImuBench
 
 AT = 0x28
 
 
-class Bench:
-    """A world and the sensor in it, powered for a while."""
-
-    def __init__(self, noise: NoiseModel | None = None, chip_id: int = 0xA0, *, powered_s: float = 2.0) -> None:
-        self.world = World(noise=noise or NoiseModel.none())
-        self.clock = self.world.clock
-        self.sensor = SimBno055(self.world, chip_id=chip_id)
-        self.bus = SimI2cBus(self.clock)
-        self.bus.attach(AT, self.sensor)
-        self.clock.sleep(powered_s)
-
-    def open(self) -> Bno055:
-        return Bno055(self.bus.path, clock=self.clock)
-
-    def rotate(self, dps: float) -> None:
-        self.world.drive(to_velocity(self.clock.now_ns() * 1e-9, self.world.table_deg(), dps, dps, 1.0))
+def powered(noise: NoiseModel | None = None, chip_id: int = 0xA0, *, powered_s: float = 2.0) -> ImuBench:
+    """Return a world and the sensor in it, powered for a while."""
+    bench = ImuBench(noise, device=SimBno055, driver=Bno055, chip_id=chip_id)
+    bench.clock.sleep(powered_s)
+    return bench
 
 
 @pytest.fixture
-def bench() -> Iterator[Bench]:
-    bench = Bench()
+def bench() -> Iterator[ImuBench]:
+    bench = powered()
     yield bench
     bench.bus.close()
 
 
 @pytest.fixture
-def imu(bench: Bench) -> Iterator[Bno055]:
+def imu(bench: ImuBench) -> Iterator[Bno055]:
     with closing(bench.open()) as imu:
         yield imu
 
@@ -57,16 +45,16 @@ def imu(bench: Bench) -> Iterator[Bno055]:
 
 
 def test_opening_waits_for_a_starting_sensor() -> None:
-    bench = Bench(powered_s=0.0)
+    bench = powered(powered_s=0.0)
     with closing(bench.bus), closing(bench.open()) as imu:
         assert bench.clock.now_ns() > SILENT_S * 1e9
         assert (imu.identity.model, imu.identity.who_am_i) == ("BNO055", 0xA0)
 
 
 def test_opening_waits_for_the_gyro_calibration() -> None:
-    bench = Bench(NoiseModel())
+    bench = powered(NoiseModel())
     with closing(bench.bus), closing(bench.open()) as imu:
-        assert imu.calibration().gyro == 3
+        assert imu._last.calibrated
         imu.read_samples()
         rotated = 0.0
         for _ in range(100):
@@ -75,23 +63,23 @@ def test_opening_waits_for_the_gyro_calibration() -> None:
         assert abs(rotated) < 0.3
 
 
-def test_opening_on_a_moving_table_ends_in_bounded_time(bench: Bench) -> None:
+def test_opening_on_a_moving_table_ends_in_bounded_time(bench: ImuBench) -> None:
     bench.rotate(20.0)
     with closing(bench.open()) as imu:
-        assert imu.calibration().gyro == 0
+        assert not imu._last.calibrated
         assert bench.clock.now_ns() < 6.5e9
 
 
 @pytest.mark.parametrize(("chip_id", "likely"), [(0x00, "SDA is held low"), (0xFF, "not connected"), (0x42, "BNO085")])
 def test_wrong_chip_is_named(chip_id: int, likely: str) -> None:
-    bench = Bench(chip_id=chip_id)
+    bench = powered(chip_id=chip_id)
     with closing(bench.bus), pytest.raises(DeviceMismatch, match=likely) as caught:
         bench.open()
     assert caught.value.evidence == {"got": chip_id, "expected": 0xA0}
     assert bench.sensor._registers[0x3D] == 0  # nothing was written to the unknown device
 
 
-def test_missing_sensor_names_address_and_next_step(bench: Bench) -> None:
+def test_missing_sensor_names_address_and_next_step(bench: ImuBench) -> None:
     bench.bus.detach(AT)
     with pytest.raises(DeviceNotFound, match="0x28") as caught:
         bench.open()
@@ -121,7 +109,7 @@ def test_samples_sum_to_the_rotation_for_any_reading_pattern(angles: list[float]
     So a rotation of some hundredths of a degree in a second of rest, or the end of a larger one, becomes an error of as
     many hundredths per second.
     """
-    bench = Bench()
+    bench = powered()
     with closing(bench.bus), closing(bench.open()) as imu:
         imu.read_samples()
         for angle in angles:
@@ -138,7 +126,7 @@ def test_samples_sum_to_the_rotation_for_any_reading_pattern(angles: list[float]
             assert rotated == pytest.approx(measured_deg, abs=2 * (CARRIED_DEG + ROUNDED_DEG))
 
 
-def test_saturation_matches_the_stated_range(bench: Bench, imu: Bno055) -> None:
+def test_saturation_matches_the_stated_range(bench: ImuBench, imu: Bno055) -> None:
     imu.read_samples()
     bench.rotate(2100.0)
     bench.clock.sleep(0.1)
@@ -150,18 +138,18 @@ def test_saturation_matches_the_stated_range(bench: Bench, imu: Bno055) -> None:
 # -- what goes wrong ---------------------------------------------------------------------------------------------------
 
 
-def test_reset_while_running_is_detected(bench: Bench, imu: Bno055) -> None:
+def test_reset_while_running_is_detected(bench: ImuBench, imu: Bno055) -> None:
     bench.sensor.power_cycle()
     with pytest.raises(DeviceSilent, match="acknowledge"):
         imu.read_samples()
     bench.clock.sleep(SILENT_S)
-    for reading in (imu.read_samples, imu.read_gravity_g, imu.temperature_c, imu.calibration):
+    for reading in (imu.read_samples, imu.read_gravity_g, imu.temperature_c):
         with pytest.raises(DeviceFault, match="supply was interrupted") as caught:
             reading()
     assert caught.value.evidence["operating_mode"] == {"got": 0, "expected": 8}
 
 
-def test_stopped_fusion_is_detected(bench: Bench, imu: Bno055) -> None:
+def test_stopped_fusion_is_detected(bench: ImuBench, imu: Bno055) -> None:
     bench.sensor.fail(0x0A)
     with pytest.raises(DeviceFault, match="fusion") as caught:
         imu.read_samples()
@@ -169,21 +157,21 @@ def test_stopped_fusion_is_detected(bench: Bench, imu: Bno055) -> None:
     assert "i2c-gpio" in caught.value.next_step
 
 
-def test_changed_units_are_detected(bench: Bench, imu: Bno055) -> None:
+def test_changed_units_are_detected(bench: ImuBench, imu: Bno055) -> None:
     bench.sensor._registers[0x3B] = 0x02  # another program wants radians
     with pytest.raises(DeviceFault) as caught:
         imu.read_samples()
     assert caught.value.evidence["unit_selection"] == {"got": 2, "expected": 0}
 
 
-def test_stuck_bus_and_missing_sensor_are_distinguished(bench: Bench, imu: Bno055) -> None:
+def test_stuck_bus_and_missing_sensor_are_distinguished(bench: ImuBench, imu: Bno055) -> None:
     bench.bus.stuck = True
     with pytest.raises(DeviceSilent, match="stuck") as caught:
         imu.read_samples()
     assert "SDA" in caught.value.next_step
 
 
-def test_failed_transfer_is_repeated(bench: Bench, imu: Bno055) -> None:
+def test_failed_transfer_is_repeated(bench: ImuBench, imu: Bno055) -> None:
     imu.read_samples()
     bench.clock.sleep(0.1)
     bench.bus.nack(1)
@@ -209,7 +197,7 @@ def test_bench_with_bno055_moves_settles_and_agrees(simulated) -> None:
 
 
 @pytest.mark.parametrize("share", [1.0, 0.6])
-def test_bus_that_corrupts_the_identity_is_named_with_its_fix(bench: Bench, share: float) -> None:
+def test_bus_that_corrupts_the_identity_is_named_with_its_fix(bench: ImuBench, share: float) -> None:
     bench.bus.stretch_errors = share
     with pytest.raises(DeviceFault) as corrupt:
         for _ in range(8):  # a single reading may be right
@@ -218,7 +206,7 @@ def test_bus_that_corrupts_the_identity_is_named_with_its_fix(bench: Bench, shar
     assert "i2c-gpio" in corrupt.value.next_step
 
 
-def test_rare_corrupt_readings_are_repeated_and_counted(bench: Bench, imu: Bno055) -> None:
+def test_rare_corrupt_readings_are_repeated_and_counted(bench: ImuBench, imu: Bno055) -> None:
     bench.bus.stretch_errors = 0.2
     bench.rotate(30.0)
     begun_ns = bench.clock.now_ns()

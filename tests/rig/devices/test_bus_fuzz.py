@@ -15,8 +15,7 @@ from hypothesis import strategies as st
 from rig.config import ImuConfig
 from rig.core.errors import DeviceSilent, RequestRejected, RigError
 from rig.devices.dynamixel.registers import control_table
-from rig.devices.imu import Imu
-from rig.devices.open_imu import open_imu
+from rig.devices.imu import Imu, open_imu
 from sim.clock import VirtualClock
 from sim.i2c import SimI2cBus
 from sim.imu.bno055 import SimBno055

@@ -8,7 +8,6 @@ from math import degrees
 
 import pytest
 
-from rig.cli.bench.find import proposed_settings
 from rig.config import load_config
 from rig.core.errors import ConfigError, DeviceMismatch
 from rig.devices.dynamixel.registers import control_table
@@ -96,7 +95,7 @@ def drives_rightly(model: str) -> bool:
 
 
 def test_all_models_of_the_sdk_are_in_the_list():
-    assert len(NUMBERS) == 60  # and the AX-12A, which has a driver of its own
+    assert len(NUMBERS) == 60  # and the AX-12A, which has no file
     assert len(REJECTED) == 26
 
 
@@ -140,7 +139,7 @@ def test_scan_and_doctor_report_a_servo_that_the_rig_cannot_drive(number, name):
         (found,) = (one for one in scan.find_servos(bench.context) if not isinstance(one, str))
         assert (found.code, str(found.parameters["found"]).partition(",")[0]) == (FindingCode.SERVO_NOT_DRIVEN, name)
         assert "X series" in found.fix
-        assert proposed_settings(scan) == {}
+        assert scan.settings == {}
         problem = bench.problem("servo")
         assert "cannot drive" in problem.parameters["what"]
         assert "X series" in problem.fix  # not `rig config set servo.model`

@@ -30,15 +30,6 @@ def test_factory_settings_are_rejected_with_a_list_of_differences_and_not_change
     assert "write_settings" in caught.value.next_step
 
 
-def test_settings_are_written_once_and_reported(wires):
-    servo = DynamixelServo(open_bus(wires), bus_id=1, model="xl430_w250", clock=wires.world.clock)
-    assert servo.prepare(write=True) == (
-        "servo: Operating Mode was 3, is now 4",
-        "servo: Return Delay Time was 250, is now 0",
-    )
-    assert servo.prepare(write=False) == ()
-
-
 def test_wrong_model_is_named():
     wires = servo_wires(model="xm430_w350")
     with pytest.raises(DeviceMismatch) as caught:

@@ -2,6 +2,7 @@
 
 import pytest
 
+from rig.config import load_config
 from rig.core.errors import (
     ConfigError,
     DeviceMismatch,
@@ -17,6 +18,8 @@ from rig.core.next_steps import Do
 from rig.devices.head.head import RigHead
 from rig.devices.head.protocol import (
     BAUD,
+    DEADMAN_MAX_MS,
+    DEADMAN_MIN_MS,
     PROTOCOL_VERSION,
     HeadFault,
     HeadState,
@@ -106,9 +109,13 @@ def test_missing_or_wrong_sensor_is_reported():
             RigHead(HeadSerial(head), world.clock, mpu6050())
 
 
-def test_impossible_deadman_is_rejected(opened):
-    with pytest.raises(ConfigError, match="deadman"):
-        RigHead(HeadSerial(opened.head), opened.clock, mpu6050(), deadman_s=3.0)
+def test_only_deadmen_of_the_head_can_be_configured():
+    shortest_s, longest_s = DEADMAN_MIN_MS / 1000, DEADMAN_MAX_MS / 1000
+    for seconds in (shortest_s, longest_s):
+        assert load_config(None, [f"head.deadman_s={seconds}"]).head.deadman_s == seconds
+    for seconds in (0.99 * shortest_s, 1.01 * longest_s):
+        with pytest.raises(ConfigError):
+            load_config(None, [f"head.deadman_s={seconds}"])
 
 
 # -- outputs -----------------------------------------------------------------------------------------------------
@@ -177,7 +184,7 @@ def test_deadman_has_the_configured_duration(deadman_s):
     with opened_head(noise=NoiseModel.none(), deadman_s=deadman_s) as h:
         h.imu.set_power(True)
         h.imu._cancel()
-        last_ns = h.imu._connection._heartbeat_ns
+        last_ns = h.imu._heartbeat_ns
         h.clock.sleep(3.0)
         silent_s = (h.head.pulses("relay")[-1][0] - last_ns) * 1e-9
         assert deadman_s * 0.99 - 0.002 <= silent_s <= deadman_s * 1.01 + 0.001

@@ -8,15 +8,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rig.devices.head import protocol
-from rig.devices.head.framing import LONGEST, CrcError, Deframer, Frame, FrameError, decode, encode
+from rig.devices.head.link import LONGEST, CrcError, Deframer, FrameError, HeadFrame, HeadStatistics, decode, encode
 from tests.fuzzing import fuzz_settings
 
 BYTE = st.integers(0, 255)
-FRAMES = st.builds(Frame, BYTE, BYTE, st.binary(max_size=protocol.MAX_BODY))
+FRAMES = st.builds(HeadFrame, BYTE, BYTE, st.binary(max_size=protocol.MAX_BODY))
 
 
 def test_checksum_is_crc_16_ccitt_false():
-    line = encode(Frame(0x31, 0x32, b"3456789"))
+    line = encode(HeadFrame(0x31, 0x32, b"3456789"))
     assert cobs.decode(line[:-1]) == b"123456789" + (0x29B1).to_bytes(2, "big")
 
 
@@ -34,9 +34,9 @@ def test_flipped_bit_is_always_detected(frame, data):
     line = bytearray(encode(frame)[:-1])
     bit = data.draw(st.integers(0, 8 * len(line) - 1))
     line[bit // 8] ^= 1 << bit % 8
-    deframer = Deframer()
-    assert list(deframer.feed(bytes(line) + b"\0")) == []
-    assert deframer.crc_errors + deframer.malformed >= 1
+    found = HeadStatistics()
+    assert list(Deframer(found).feed(bytes(line) + b"\0")) == []
+    assert found.crc_errors + found.malformed >= 1
 
 
 @fuzz_settings()
@@ -54,13 +54,13 @@ def test_random_bytes_raise_only_frame_errors(line):
 def test_frames_are_found_however_the_stream_is_split(parts, data):
     stream, expected = b"\0", []
     for part in parts:
-        if isinstance(part, Frame):
+        if isinstance(part, HeadFrame):
             stream += encode(part)
             expected.append(part)
         else:
             stream += part.replace(b"\0", b"\1") + b"\0"  # noise that ends before the next frame
     cuts = sorted(data.draw(st.lists(st.integers(0, len(stream)), max_size=8)))
-    deframer = Deframer()
+    deframer = Deframer(HeadStatistics())
     got = [f for a, b in zip([0, *cuts], [*cuts, len(stream)], strict=True) for f in deframer.feed(stream[a:b])]
     assert [f for f in got if f in expected] == expected
     for frame in got:  # noise that is a valid frame by chance has a right checksum
@@ -69,15 +69,15 @@ def test_frames_are_found_however_the_stream_is_split(parts, data):
 
 
 def test_endless_frame_uses_bounded_memory():
-    deframer = Deframer()
+    deframer = Deframer(HeadStatistics())
     for _ in range(1000):
         assert list(deframer.feed(b"\xff" * 4096)) == []
     assert len(deframer._line) <= LONGEST
-    assert list(deframer.feed(b"\0" + encode(Frame(1, 2, b"3")))) == [Frame(1, 2, b"3")]
+    assert list(deframer.feed(b"\0" + encode(HeadFrame(1, 2, b"3")))) == [HeadFrame(1, 2, b"3")]
 
 
 def test_wrong_checksum_and_garbage_are_distinguished():
-    line = bytearray(encode(Frame(1, 2, b"abc"))[:-1])
+    line = bytearray(encode(HeadFrame(1, 2, b"abc"))[:-1])
     line[3] ^= 0x10
     with pytest.raises(CrcError):
         decode(bytes(line))

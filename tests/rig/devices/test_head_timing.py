@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rig.devices.head.timing import HeadClock
+from rig.devices.head.samples import HeadClock
 from tests.fuzzing import examples
 
 LINE_NS = 1_600_000

@@ -11,14 +11,14 @@ from rig.core.errors import DeviceFault, DeviceSilent
 from rig.devices.mpu6050 import Mpu6050
 from sim.motion import to_position
 from tests.fuzzing import examples
-from tests.rig.devices.mpu6050_bench import AT, Bench
+from tests.rig.imu_bench import AT, ImuBench
 from tests.sim.truth import table_rates
 
 # -- samples ------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("range_dps", [250, 500, 1000, 2000])
-def test_rates_are_in_degrees_per_second_up_to_the_end_of_all_ranges(bench: Bench, range_dps: int) -> None:
+def test_rates_are_in_degrees_per_second_up_to_the_end_of_all_ranges(bench: ImuBench, range_dps: int) -> None:
     imu = bench.open(range_dps=range_dps)
     bench.rotate(-123.4)
     bench.clock.sleep(0.3)
@@ -35,7 +35,7 @@ def test_rates_are_in_degrees_per_second_up_to_the_end_of_all_ranges(bench: Benc
 def test_sample_times_are_even_and_correct(pauses_ms: list[int], divider: int) -> None:
     """Times are computed from the count and the rate; they must be the true sample times."""
     period_ns = divider * 1_000_000
-    with Bench() as bench:
+    with ImuBench() as bench:
         imu = bench.open(rate_hz=1000 / divider)
         start_ns = bench.sensor._epoch_ns
         parts, newest_ns = [], 0
@@ -56,7 +56,7 @@ def test_sample_times_are_even_and_correct(pauses_ms: list[int], divider: int) -
 
 
 @pytest.mark.parametrize("clock_error", [-0.03, -0.005, 0.005, 0.03])
-def test_times_follow_a_sensor_whose_clock_is_off(bench: Bench, clock_error: float) -> None:
+def test_times_follow_a_sensor_whose_clock_is_off(bench: ImuBench, clock_error: float) -> None:
     bench.sensor.clock_error = clock_error
     imu = bench.open()
     last_ns = 0
@@ -70,7 +70,7 @@ def test_times_follow_a_sensor_whose_clock_is_off(bench: Bench, clock_error: flo
         last_ns = samples.time_ns[-1]
 
 
-def test_samples_match_the_motion(bench: Bench) -> None:
+def test_samples_match_the_motion(bench: ImuBench) -> None:
     """The order within the FIFO and the times: each sample shows the rate of its own moment (less the filter's lag)."""
     imu = bench.open(bandwidth_hz=188)
     now_s = bench.clock.now_ns() * 1e-9
@@ -86,7 +86,7 @@ def test_samples_match_the_motion(bench: Bench) -> None:
     np.testing.assert_allclose(rate, table_rates(bench.world, time_ns), atol=400 * 0.006)
 
 
-def test_reading_samples_takes_two_transactions(bench: Bench, imu: Mpu6050) -> None:
+def test_reading_samples_takes_two_transactions(bench: ImuBench, imu: Mpu6050) -> None:
     bench.clock.sleep(0.5)
     before = imu.statistics.transfers
     samples = imu.read_samples()
@@ -94,7 +94,7 @@ def test_reading_samples_takes_two_transactions(bench: Bench, imu: Mpu6050) -> N
     assert bench.bus.wire[-1].data == b"".join(np.rint(samples.gyro_dps * 131).astype(">i2"))
 
 
-def test_gravity_and_temperature_are_measured(bench: Bench, imu: Mpu6050) -> None:
+def test_gravity_and_temperature_are_measured(bench: ImuBench, imu: Mpu6050) -> None:
     bench.sensor.temperature_c = 31.0
     bench.clock.sleep(0.1)
     assert imu.read_gravity_g() == pytest.approx([0, 0, 1], abs=1e-4)
@@ -105,7 +105,9 @@ def test_gravity_and_temperature_are_measured(bench: Bench, imu: Mpu6050) -> Non
 
 
 @pytest.mark.parametrize("delay_ns", [0, 100_000])
-def test_nack_of_the_count_or_the_data_is_retried_and_loses_nothing(bench: Bench, delay_ns: int, imu: Mpu6050) -> None:
+def test_nack_of_the_count_or_the_data_is_retried_and_loses_nothing(
+    bench: ImuBench, delay_ns: int, imu: Mpu6050
+) -> None:
     bench.clock.sleep(0.1)
     bench.clock.call_at(bench.clock.now_ns() + delay_ns, bench.bus.nack)
     samples = imu.read_samples()
@@ -115,7 +117,7 @@ def test_nack_of_the_count_or_the_data_is_retried_and_loses_nothing(bench: Bench
 
 
 @pytest.mark.parametrize("fault", [ENXIO, ETIMEDOUT, EIO], ids=["unplugged", "stuck", "stuck behind a USB adapter"])
-def test_missing_sensor_raises_device_silent(bench: Bench, fault: int, imu: Mpu6050) -> None:
+def test_missing_sensor_raises_device_silent(bench: ImuBench, fault: int, imu: Mpu6050) -> None:
     bench.clock.sleep(0.1)
     if fault == ENXIO:
         bench.bus.detach(AT)
@@ -126,7 +128,7 @@ def test_missing_sensor_raises_device_silent(bench: Bench, fault: int, imu: Mpu6
     assert (caught.value.evidence["attempts"], caught.value.evidence["errno"]) == (3, fault)
 
 
-def test_fifo_overflow_is_reported_and_cleared(bench: Bench, imu: Mpu6050) -> None:
+def test_fifo_overflow_is_reported_and_cleared(bench: ImuBench, imu: Mpu6050) -> None:
     bench.rotate(30.0)
     bench.clock.sleep(1.5)
     overflowed = imu.read_samples()
@@ -142,7 +144,7 @@ def test_fifo_overflow_is_reported_and_cleared(bench: Bench, imu: Mpu6050) -> No
 
 @pytest.mark.parametrize("pause_ms", [140, 240])
 def test_fifo_that_overflows_between_count_and_data_gives_no_corrupt_samples(
-    bench: Bench, pause_ms: int, imu: Mpu6050
+    bench: ImuBench, pause_ms: int, imu: Mpu6050
 ) -> None:
     """A computer that is busy, or sleeps, continues late."""
     bench.rotate(100.0)
@@ -168,7 +170,7 @@ def test_fifo_that_overflows_between_count_and_data_gives_no_corrupt_samples(
 @examples(17)
 def test_full_fifo_never_corrupts_samples(frames: int, early_us: int) -> None:
     """Another sample may arrive between the reading of the count and that of the data."""
-    with Bench() as bench:
+    with ImuBench() as bench:
         imu = bench.open()
         bench.rotate(100.0)
         imu.read_samples()
@@ -182,7 +184,7 @@ def test_full_fifo_never_corrupts_samples(frames: int, early_us: int) -> None:
 
 
 @pytest.mark.parametrize("after_bytes", [2, 6, 12, 100])
-def test_interrupted_transfer_counts_lost_samples(bench: Bench, after_bytes: int, imu: Mpu6050) -> None:
+def test_interrupted_transfer_counts_lost_samples(bench: ImuBench, after_bytes: int, imu: Mpu6050) -> None:
     bench.rotate(10.0)
     bench.clock.sleep(0.2)
     bench.bus.cut_read(after_bytes)  # the two bytes of the count still pass
@@ -197,7 +199,7 @@ def test_interrupted_transfer_counts_lost_samples(bench: Bench, after_bytes: int
 
 
 @pytest.mark.parametrize("polled_ms", [5, 20, 100, 500])
-def test_power_cycle_is_detected(bench: Bench, polled_ms: int, imu: Mpu6050) -> None:
+def test_power_cycle_is_detected(bench: ImuBench, polled_ms: int, imu: Mpu6050) -> None:
     bench.rotate(45.0)
     bench.clock.sleep(0.1)
     imu.read_samples()
@@ -223,7 +225,7 @@ def test_power_cycle_is_detected(bench: Bench, polled_ms: int, imu: Mpu6050) -> 
     ],
 )
 def test_settings_changed_by_another_program_are_detected(
-    bench: Bench, register: int, value: int, words: str, evidence: dict[str, object], imu: Mpu6050
+    bench: ImuBench, register: int, value: int, words: str, evidence: dict[str, object], imu: Mpu6050
 ) -> None:
     bench.write(register, value)
     bench.clock.sleep(0.4)
@@ -232,7 +234,7 @@ def test_settings_changed_by_another_program_are_detected(
     assert caught.value.evidence.items() >= evidence.items()
 
 
-def test_samples_read_by_another_program_count_as_lost(bench: Bench, imu: Mpu6050) -> None:
+def test_samples_read_by_another_program_count_as_lost(bench: ImuBench, imu: Mpu6050) -> None:
     bench.clock.sleep(0.3)
     bench.write(0x6A, 0x04)
     bench.write(0x6A, 0x40)

@@ -19,12 +19,12 @@ from sim.imu.mpu6050 import SimMpu6050, SimMpu6050Clone, SimMpu6500, SimMpu9250
 from sim.noise import NoiseModel
 from sim.objects.shelf import shelf
 from sim.world import World
-from tests.rig.devices.mpu6050_bench import AT, Bench
+from tests.rig.imu_bench import AT, ImuBench
 
 # -- opening ------------------------------------------------------------------------------------------------------
 
 
-def test_opening_wakes_and_configures_the_sensor(bench: Bench) -> None:
+def test_opening_wakes_and_configures_the_sensor(bench: ImuBench) -> None:
     imu = bench.open(range_dps=500, rate_hz=100, bandwidth_hz=20)
     written = bytes(bench.sensor._registers)
     assert written[0x19:0x1D] == bytes([9, 4, 0x08, 0x00])
@@ -35,7 +35,7 @@ def test_opening_wakes_and_configures_the_sensor(bench: Bench) -> None:
     assert imu.range_dps == pytest.approx(500, rel=0.002)
 
 
-def test_opening_resets_the_sensor(bench: Bench) -> None:
+def test_opening_resets_the_sensor(bench: ImuBench) -> None:
     bench.open(range_dps=2000, rate_hz=1000).close()
     bench.rotate(90.0)
     bench.clock.sleep(2.0)
@@ -53,7 +53,7 @@ def test_opening_resets_the_sensor(bench: Bench) -> None:
     ],
 )
 def test_wrong_chip_is_named(who_am_i: int, likely: str) -> None:
-    with Bench(who_am_i=who_am_i) as bench:
+    with ImuBench(who_am_i=who_am_i) as bench:
         with pytest.raises(DeviceMismatch, match=likely) as caught:
             bench.open()
         assert caught.value.evidence == {"got": who_am_i, "expected": 0x68}
@@ -65,7 +65,7 @@ def test_wrong_chip_is_named(who_am_i: int, likely: str) -> None:
     ("who_am_i", "model"), [(0x70, "mpu6500"), (0x71, "mpu9250"), (0x72, "mpu6050_clone"), (0x98, "mpu6050_clone")]
 )
 def test_other_sensor_with_a_driver_is_the_next_step(who_am_i: int, model: str) -> None:
-    with Bench(who_am_i=who_am_i) as bench, pytest.raises(DeviceMismatch) as caught:
+    with ImuBench(who_am_i=who_am_i) as bench, pytest.raises(DeviceMismatch) as caught:
         bench.open()
     assert caught.value.steps == (Do.SET_KEY(key="imu.model", value=model),)
 
@@ -77,7 +77,7 @@ PARTS = [(Mpu6500, SimMpu6500), (Mpu9250, SimMpu9250), (Mpu6050Clone, SimMpu6050
 
 @pytest.mark.parametrize(("driver", "device"), PARTS)
 def test_fifo_of_512_bytes_is_read_until_it_is_full(driver: type[Mpu6050], device: type[SimMpu6050]) -> None:
-    with Bench(NoiseModel(), device=device) as bench:
+    with ImuBench(NoiseModel(), device=device) as bench:
         imu = bench.open(driver)
         imu.read_samples()
         bench.clock.sleep(0.415)  # 84 samples of 6 bytes fit
@@ -89,7 +89,7 @@ def test_fifo_of_512_bytes_is_read_until_it_is_full(driver: type[Mpu6050], devic
 
 @pytest.mark.parametrize(("driver", "device"), PARTS[:2])
 def test_temperature_has_the_scale_of_the_part(driver: type[Mpu6050], device: type[SimMpu6050]) -> None:
-    with Bench(device=device) as bench:
+    with ImuBench(device=device) as bench:
         bench.sensor.temperature_c = 31.5
         imu = bench.open(driver)
         bench.clock.sleep(0.1)
@@ -97,7 +97,7 @@ def test_temperature_has_the_scale_of_the_part(driver: type[Mpu6050], device: ty
 
 
 def test_mpu6500_that_is_awake_after_a_reset_is_a_fault() -> None:
-    with Bench(device=SimMpu6500) as bench:
+    with ImuBench(device=SimMpu6500) as bench:
         imu = bench.open(Mpu6500)
         bench.sensor.power_cycle()
         with pytest.raises(DeviceFault, match="supply was interrupted"):
@@ -108,7 +108,7 @@ def test_mpu6500_that_is_awake_after_a_reset_is_a_fault() -> None:
 @pytest.mark.parametrize("rate_hz", [4.0, 200.0, 1000.0])
 @pytest.mark.parametrize("device", [SimMpu6050, SimMpu6050Clone])
 def test_clone_with_plausible_samples_is_accepted(who_am_i: int, rate_hz: float, device: type[SimMpu6050]) -> None:
-    with Bench(NoiseModel(), who_am_i=who_am_i, device=device) as bench:
+    with ImuBench(NoiseModel(), who_am_i=who_am_i, device=device) as bench:
         imu = bench.open(Mpu6050Clone, rate_hz=rate_hz)
         assert (imu.identity.model, imu.identity.who_am_i) == ("MPU-6050 clone", who_am_i)
         bench.clock.sleep(max(0.03, 4 / rate_hz))
@@ -132,7 +132,7 @@ def test_clone_with_plausible_samples_is_accepted(who_am_i: int, rate_hz: float,
     ids=["rate", "frozen", "gravity", "noise", "self-test"],
 )
 def test_clone_with_implausible_samples_is_rejected(spoil: Any, problem: str) -> None:
-    with Bench(NoiseModel(), device=SimMpu6050Clone) as bench:
+    with ImuBench(NoiseModel(), device=SimMpu6050Clone) as bench:
         spoil(bench.sensor)
         with pytest.raises(DeviceMismatch, match=problem):
             bench.open(Mpu6050Clone)
@@ -145,7 +145,7 @@ def test_opening_a_bench_notes_a_clone() -> None:
         assert any("clone" in finding for finding in bench.findings)
 
 
-def test_missing_sensor_names_address_and_next_step(bench: Bench) -> None:
+def test_missing_sensor_names_address_and_next_step(bench: ImuBench) -> None:
     bench.bus.detach(AT)
     with pytest.raises(DeviceNotFound, match="0x68") as caught:
         bench.open()
@@ -188,7 +188,7 @@ def test_file_that_is_not_a_bus_is_rejected_and_closed(tmp_path: Path) -> None:
     assert open_files() == before
 
 
-def test_all_wrong_settings_are_reported_at_once(bench: Bench) -> None:
+def test_all_wrong_settings_are_reported_at_once(bench: ImuBench) -> None:
     with pytest.raises(ConfigError) as caught:
         bench.open(range_dps=300, rate_hz=210, bandwidth_hz=44)
     assert set(caught.value.evidence) == {"range_dps", "rate_hz", "bandwidth_hz"}
@@ -196,7 +196,7 @@ def test_all_wrong_settings_are_reported_at_once(bench: Bench) -> None:
 
 @given(rate_hz=st.floats(allow_nan=True, allow_infinity=True) | st.integers(1, 1000).map(lambda n: 1000 / n))
 def test_rate_is_set_exactly_or_rejected(rate_hz: float) -> None:
-    with Bench() as bench:
+    with ImuBench() as bench:
         divides = rate_hz in [1000 / n for n in range(1, 257)]
         try:
             assert bench.open(rate_hz=rate_hz).rate_hz == pytest.approx(rate_hz)
@@ -206,7 +206,7 @@ def test_rate_is_set_exactly_or_rejected(rate_hz: float) -> None:
             assert any(rate_hz == pytest.approx(1000 / n) for n in range(1, 257))
 
 
-def test_sensor_that_loses_settings_is_a_fault(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sensor_that_loses_settings_is_a_fault(bench: ImuBench, monkeypatch: pytest.MonkeyPatch) -> None:
     kept = bench.sensor.write
     monkeypatch.setattr(bench.sensor, "write", lambda data: kept(data[:1]) + len(data) - 1)
     with pytest.raises(DeviceFault) as caught:
@@ -214,7 +214,7 @@ def test_sensor_that_loses_settings_is_a_fault(bench: Bench, monkeypatch: pytest
     assert caught.value.evidence["register_0x23"] == {"got": "00", "expected": "70"}
 
 
-def test_closed_driver_leaves_no_open_file(bench: Bench) -> None:
+def test_closed_driver_leaves_no_open_file(bench: ImuBench) -> None:
     before = open_files()
     imu = bench.open()
     assert open_files() == before + 1

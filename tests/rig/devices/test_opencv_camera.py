@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 
 from rig.bench.hardware import camera_settings
+from rig.config import CameraConfig
 from rig.core.clock import SystemClock
 from rig.core.errors import DeviceFault, DeviceNotFound, DeviceSilent
-from rig.devices import v4l2
-from rig.devices.opencv_camera import CameraSettings, OpenCvCamera, TimeBase
+from rig.devices import opencv_camera, v4l2
+from rig.devices.opencv_camera import OpenCvCamera, TimeBase
 from rig.devices.opencv_capture import open_capture
 from sim.camera import SimCapture
 from sim.frame_times import FPS
@@ -40,7 +41,7 @@ class ForeignStamps(SimCapture):
 
 
 def test_settings_are_locked_and_read_back(world: World) -> None:
-    settings = CameraSettings(exposure_us=8000, gain=3, white_balance_k=4200, focus=100)
+    settings = CameraConfig(exposure_us=8000, gain=3, white_balance_k=4200, focus=100)
     capture = SimCapture(world)
     camera = OpenCvCamera(capture, clock=world.clock, settings=settings, name="desk camera")
     assert camera.rejected_settings == ()
@@ -56,7 +57,7 @@ def test_settings_are_locked_and_read_back(world: World) -> None:
 
 
 def test_unset_settings_stay_automatic(world: World) -> None:
-    settings = CameraSettings(exposure_us=None, gain=None, white_balance_k=None)
+    settings = CameraConfig(exposure_us=None, gain=None, white_balance_k=None)
     camera = OpenCvCamera(SimCapture(world), clock=world.clock, settings=settings)
     before = camera.read_locks()
     assert (before.auto_exposure, before.exposure_us is None) == (True, False)
@@ -66,22 +67,15 @@ def test_unset_settings_stay_automatic(world: World) -> None:
 
 
 def test_rejected_setting_is_reported(world: World) -> None:
-    settings = CameraSettings(width=1920, exposure_us=90_000, gain=99)
+    settings = CameraConfig(width=1920, exposure_us=90_000, gain=99)
     camera = OpenCvCamera(SimCapture(world), clock=world.clock, settings=settings)
     assert {(n.setting, n.asked, n.reported) for n in camera.rejected_settings} == {
-        ("width", 1920, 640),
-        ("exposure_100us", 900, 333),
-        ("gain", 99, 24),
+        ("width", "1920", "640"),
+        ("exposure_100us", "900", "333"),
+        ("gain", "99", "24"),
     }
     assert camera.identity.width == 640
     assert camera.read_locks().gain == 24
-
-
-@pytest.mark.parametrize("field", ["width", "height", "fps", "exposure_us", "white_balance_k"])
-def test_impossible_settings_are_rejected(field: str) -> None:
-    for value in (0, -1, float("nan"), float("inf")):
-        with pytest.raises(ValueError, match=field):
-            CameraSettings(**{field: value})
 
 
 # -- which frame ------------------------------------------------------------------------------------------------------
@@ -152,13 +146,13 @@ class Lagging(SimCapture):
 
 def test_camera_with_only_old_frames_times_out(world: World) -> None:
     capture = Lagging(world)
-    camera = OpenCvCamera(capture, clock=world.clock, timeout_s=1.5)
+    camera = OpenCvCamera(capture, clock=world.clock)
     capture.stuck_at_ms = capture.get(cv2.CAP_PROP_POS_MSEC)
     asked_ns = world.clock.now_ns()
-    with pytest.raises(DeviceSilent, match=r"no new frame in 1\.5 s") as error:
+    with pytest.raises(DeviceSilent, match="no new frame in 3 s") as error:
         camera.capture(asked_ns)
-    assert error.value.evidence["dropped_frames"] == pytest.approx(1.5 * FPS, abs=3)
-    assert world.clock.now_ns() - asked_ns == pytest.approx(1.5e9, abs=2 * PERIOD_NS)
+    assert error.value.evidence["dropped_frames"] == pytest.approx(3 * FPS, abs=3)
+    assert world.clock.now_ns() - asked_ns == pytest.approx(3e9, abs=2 * PERIOD_NS)
 
 
 def test_decreasing_stamps_are_not_trusted(world: World) -> None:
@@ -249,12 +243,16 @@ def stream() -> Iterator[tuple[str, list[float]]]:
 
 
 @pytest.mark.realtime
-def test_network_stream_is_current_after_a_pause(stream: tuple[str, list[float]]) -> None:
+def test_network_stream_is_current_after_a_pause(
+    stream: tuple[str, list[float]], monkeypatch: pytest.MonkeyPatch
+) -> None:
     url, level = stream
+    monkeypatch.setattr(opencv_camera, "TIMEOUT_S", 20.0)
     clock = SystemClock()
-    settings = CameraSettings(None, None, None, None, None, None)
+    settings = CameraConfig(exposure_us=None, gain=None, white_balance_k=None)
     # The latency gives a busy computer time to read the buffered frames, so that a pause does not count as waiting.
-    camera = OpenCvCamera(open_capture(url), clock=clock, settings=settings, timeout_s=20.0, latency_s=0.4)
+    monkeypatch.setattr(opencv_camera, "LATENCY_FRAMES", 12)
+    camera = OpenCvCamera(open_capture(url), clock=clock, settings=settings)
     try:
         assert camera.time_base is TimeBase.PACED
         clock.sleep(0.5)  # frames pile up in the socket
@@ -299,7 +297,7 @@ def test_drift_of_a_control_from_zero_is_noticed(world: World) -> None:
     """On V4L2, 0 is a value, and -1 says that the camera lacks the control."""
     capture = SimCapture(world)
     capture.remembers = False
-    camera = OpenCvCamera(capture, clock=world.clock, settings=CameraSettings(gain=None))
+    camera = OpenCvCamera(capture, clock=world.clock, settings=CameraConfig(gain=None))
     before = camera.read_locks()
     assert (before.gain, before.backlight_compensation) == (0, 0)
     capture.drift(gain_db=6)
@@ -334,7 +332,7 @@ def test_all_controls_that_the_camera_has_are_locked(world: World) -> None:
         def set(self, prop: int, value: float) -> bool:
             return prop not in self.missing and super().set(prop, value)
 
-    settings = CameraSettings(sharpness=10, backlight_compensation=1, power_line_frequency=1)
+    settings = CameraConfig(sharpness=10, backlight_compensation=1, power_line_frequency=1)
     locks = OpenCvCamera(SimCapture(world), clock=world.clock, settings=settings).read_locks()
     assert (locks.gain, locks.sharpness, locks.backlight_compensation) == (0, 10, 1)
     assert (locks.power_line_frequency, locks.dynamic_frame_rate) == (1, False)
@@ -345,14 +343,14 @@ def test_all_controls_that_the_camera_has_are_locked(world: World) -> None:
 
 
 def test_pixel_format_is_chosen_or_configured(world: World) -> None:
-    for settings, fourcc in ((CameraSettings(), "YUYV"), (CameraSettings(fourcc="MJPG"), "MJPG")):
+    for settings, fourcc in ((CameraConfig(), "YUYV"), (CameraConfig(fourcc="MJPG"), "MJPG")):
         capture = SimCapture(world)
         camera = OpenCvCamera(capture, clock=world.clock, settings=settings)
         assert capture.get(cv2.CAP_PROP_FOURCC) == cv2.VideoWriter.fourcc(*fourcc)
         assert camera.rejected_settings == ()
-    camera = OpenCvCamera(SimCapture(world), clock=world.clock, settings=CameraSettings(fourcc="H264"))
+    camera = OpenCvCamera(SimCapture(world), clock=world.clock, settings=CameraConfig(fourcc="H264"))
     (rejected,) = camera.rejected_settings
-    assert (rejected.setting, rejected.asked_text, rejected.reported_text) == ("fourcc", "H264", "MJPG")
+    assert (rejected.setting, rejected.asked, rejected.reported) == ("fourcc", "H264", "MJPG")
 
 
 def test_autofocus_is_pinned_where_it_settles(world: World) -> None:
@@ -373,5 +371,5 @@ def test_focus_is_stored_for_the_next_program(simulated, world: World) -> None:
     assert camera_settings(config, state, device).focus is None
     capture = SimCapture(world)
     capture.drift(autofocus=True, focus=0)
-    camera = OpenCvCamera(capture, clock=world.clock, settings=CameraSettings(focus=33))
+    camera = OpenCvCamera(capture, clock=world.clock, settings=CameraConfig(focus=33))
     assert (camera.read_locks().focus, camera.read_locks().autofocus) == (33, False)

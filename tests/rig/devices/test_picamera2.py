@@ -9,19 +9,18 @@ import pytest
 
 from rig.bench.computer import Computer
 from rig.bench.hardware import camera_settings
-from rig.cli.bench.find import proposed_settings
-from rig.config import load_config
+from rig.config import CameraConfig, load_config
 from rig.core.errors import DeviceNotFound, DeviceSilent
-from rig.devices.opencv_camera import CameraSettings, OpenCvCamera, TimeBase
+from rig.devices.opencv_camera import OpenCvCamera, TimeBase
 from rig.devices.opencv_capture import open_capture
 from rig.devices.picamera2_capture import Picamera2Capture, camera_number
 from rig.doctor.device_scan import DeviceScan
 from rig.doctor.finding import FindingCode
 from rig.safety.saved_state import MemoryStore
-from sim import picamera2
 from sim.camera import SimCapture
 from sim.objects.shelf import shelf
 from sim.world import World
+from tests import fake_picamera2 as picamera2
 from tests.rig.doctor.doctor_parts import unopened
 
 
@@ -54,7 +53,7 @@ def test_settings_are_locked_and_read_back_from_the_frames(world, sensor):
 
 def test_configured_settings_are_in_force_before_they_are_read(world, sensor):
     """libcamera applies a setting some frames after it was requested."""
-    settings = CameraSettings(320, 240, exposure_us=5000, gain=6, white_balance_k=3000, focus=2, sharpness=4)
+    settings = CameraConfig(width=320, height=240, exposure_us=5000, gain=6, white_balance_k=3000, focus=2, sharpness=4)
     camera = OpenCvCamera(open_capture("picamera2:0"), clock=world.clock, settings=settings)
     locks = camera.read_locks()
     assert camera.rejected_settings == ()
@@ -69,9 +68,9 @@ def test_configured_settings_are_in_force_before_they_are_read(world, sensor):
 
 
 def test_value_beyond_the_range_is_reported(world, sensor):
-    camera = OpenCvCamera(open_capture("picamera2"), clock=world.clock, settings=CameraSettings(exposure_us=90_000))
+    camera = OpenCvCamera(open_capture("picamera2"), clock=world.clock, settings=CameraConfig(exposure_us=90_000))
     (rejected,) = camera.rejected_settings
-    assert (rejected.setting, rejected.asked, rejected.reported) == ("exposure_100us", 900, 330)
+    assert (rejected.setting, rejected.asked, rejected.reported) == ("exposure_100us", "900", "330")
 
 
 def test_time_stamp_is_the_start_of_the_exposure(world, sensor):
@@ -155,7 +154,7 @@ def test_sensor_on_the_ribbon_cable_is_recognised_and_not_opened(receiver, monke
         monkeypatch.setitem(sys.modules, "picamera2", ModuleType("picamera2"))
         (found,) = scan.find_cameras(bench.context)
         assert (found.code, found.parameters["number"]) == (FindingCode.RIBBON_CAMERA, 0)
-        assert proposed_settings(DeviceScan(ribbons=[0])) == {("camera", "source"): "picamera2:0"}
+        assert DeviceScan(ribbons=[0]).settings == {("camera", "source"): "picamera2:0"}
 
 
 @pytest.mark.parametrize(

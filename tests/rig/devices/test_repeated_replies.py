@@ -6,7 +6,7 @@ import pytest
 
 from rig.config import load_config
 from rig.core.errors import RigError
-from rig.devices.dynamixel.opening import open_servo as open_configured
+from rig.devices.dynamixel.servo import open_servo as open_configured
 from rig.devices.servo import MotionProfile
 from sim.devices import SimDevices
 from sim.noise import NoiseModel

@@ -1,6 +1,4 @@
-"""The servo drivers on every simulated model: as a turntable, behind a gear, as an arm, and at constant speed."""
-
-from contextlib import closing
+"""The servo drivers on every simulated model: as a turntable, behind a gear, and as an arm."""
 
 import pytest
 from hypothesis import given
@@ -9,10 +7,8 @@ from hypothesis import strategies as st
 from rig.config import load_config
 from rig.core.errors import ConfigError, DeviceFault, DeviceMismatch, DeviceSilent, RequestRejected, UsageError
 from rig.devices.dynamixel import settings as permanent
-from rig.devices.dynamixel.opening import open_servo
-from rig.devices.dynamixel.register_servo import RegisterServo
-from rig.devices.dynamixel.servo import DynamixelServo
-from rig.devices.dynamixel.settings import ServoMode, SettingDifference
+from rig.devices.dynamixel.servo import DynamixelServo, open_servo
+from rig.devices.dynamixel.settings import SettingDifference
 from rig.devices.servo import MotionProfile
 from rig.motion.turntable import Turntable
 from sim.devices import SimDevices
@@ -30,7 +26,7 @@ def parts_of(*overrides: str, noise: NoiseModel | None = None) -> SimDevices:
         return devices
 
 
-def servo_of(devices: SimDevices, *overrides: str, write: bool = True) -> RegisterServo:
+def servo_of(devices: SimDevices, *overrides: str, write: bool = True) -> DynamixelServo:
     config = load_config(None, overrides)
     servo = open_servo(devices.adapter, config.servo, devices.world.clock, config.table.mode)
     if write:
@@ -38,7 +34,7 @@ def servo_of(devices: SimDevices, *overrides: str, write: bool = True) -> Regist
     return servo
 
 
-def go(devices: SimDevices, servo: RegisterServo, angle_deg: float) -> float:
+def go(devices: SimDevices, servo: DynamixelServo, angle_deg: float) -> float:
     """Move to ``angle_deg`` and return the true rotation of the table's shaft."""
     start_deg = devices.world.shaft()[0]
     servo.set_profile(MotionProfile(90.0, 500.0))
@@ -227,43 +223,6 @@ def test_sign_of_the_orientation_depends_on_what_the_servo_rotates(carries: str,
     assert load_config(None, [f"table.carries={carries}"]).table.orientation_sign == sign
 
 
-# -- constant speed ----------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("dps", [30.0, -60.0])
-def test_spin_rotates_at_constant_speed_and_restores_the_mode(dps: float, devices: SimDevices) -> None:
-    servo = servo_of(devices)
-    assert isinstance(servo, DynamixelServo)
-    speeds = [state.velocity_dps for state in servo.spin(dps, 5.0)]
-    assert 80 < len(speeds) < 110
-    assert speeds[20:] == pytest.approx([dps] * len(speeds[20:]), abs=0.7)
-    assert devices.world.shaft()[0] == pytest.approx(5.0 * dps, rel=0.05)
-    assert devices.servo.memory["Operating Mode"] == 4
-    assert devices.servo.memory["Torque Enable"] == 0
-    assert servo.setting_differences() == []
-
-
-def test_abandoned_spin_is_stopped_by_the_watchdog(devices: SimDevices) -> None:
-    servo = servo_of(devices)
-    assert isinstance(servo, DynamixelServo)
-    spin = servo.spin(60.0, 60.0)
-    next(spin)
-    devices.world.clock.sleep(3.0)  # the host does something else
-    assert devices.world.shaft()[1] == 0.0
-    with closing(spin):
-        pass
-    assert devices.servo.memory["Torque Enable"] == 0
-    assert devices.servo.memory["Operating Mode"] == 4
-
-
-def test_impossible_speed_is_rejected_with_the_possible_range() -> None:
-    servo = servo_of(parts_of())
-    assert isinstance(servo, DynamixelServo)
-    with pytest.raises(UsageError) as caught:
-        next(servo.spin(1000.0, 1.0))
-    assert "1.37 to 364 °/s" in caught.value.next_step
-
-
 # -- permanent settings ------------------------------------------------------------------------------------------------
 
 WRONG = {
@@ -288,7 +247,7 @@ def test_wrong_settings_are_found_explained_written_and_verified(devices: SimDev
     with pytest.raises(DeviceMismatch, match="7 EEPROM settings"):
         servo.prepare(write=False)
     assert {name: devices.servo.memory[name] for name in WRONG} == before  # nothing without a confirmation
-    servo.write_settings(differences)
+    permanent.write(servo.bus, 1, servo._table, differences)
     assert servo.setting_differences() == []
     assert devices.servo.memory["Shutdown"] == 52
 
@@ -313,13 +272,11 @@ def test_setting_that_is_not_stored_is_reported(devices: SimDevices) -> None:
     servo = servo_of(devices, write=False)
     devices.servo._on_write["Homing Offset"] = lambda: devices.servo.memory.__setitem__("Homing Offset", 5)
     with pytest.raises(RequestRejected, match="Homing Offset") as caught:
-        servo.write_settings([SettingDifference("Homing Offset", 5, 0)])
+        permanent.write(servo.bus, 1, servo._table, [SettingDifference("Homing Offset", 5, 0, "")])
     assert caught.value.evidence == {"register": "Homing Offset", "wrote": 0, "read_back": 5}
 
 
 def test_pan_servo_needs_the_position_mode(devices: SimDevices) -> None:
     servo = servo_of(devices, write=False)
-    found = {d.register: d.wanted for d in permanent.compare(servo.bus, 1, servo._table, ServoMode.PAN)}
+    found = {d.register: d.wanted for d in permanent.compare(servo.bus, 1, servo._table, "pan")}
     assert "Operating Mode" not in found  # the factory's
-    found = {d.register: d.wanted for d in permanent.compare(servo.bus, 1, servo._table, ServoMode.SPIN)}
-    assert found["Operating Mode"] == 1

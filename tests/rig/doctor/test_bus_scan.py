@@ -13,7 +13,7 @@ from rig.config.imus import imu_kinds
 from rig.core.errors import DeviceNotFound
 from rig.core.next_steps import Do
 from rig.devices.dynamixel.registers import model_numbers
-from rig.devices.open_imu import open_imu
+from rig.devices.imu import open_imu
 from rig.devices.v4l2 import CAPTURE, M2M, M2M_MPLANE, VideoMode, capabilities
 from rig.doctor.bus_scan import BAUD_RATES, BaudScan, scan_imus, scan_servos, without_echoes
 from rig.doctor.device_scan import DeviceScan, FoundCamera, camera_settings

@@ -12,7 +12,7 @@ from rig.config import load_config
 from rig.core.errors import LimitExceeded
 from rig.core.next_steps import Do
 from rig.events.events import Accepted, Enrolled, Moved, Started
-from rig.motion.move import MotionModel
+from rig.motion.move import MotionTimes
 from rig.motion.turntable import Turntable
 from rig.plans.enroll import enroll
 from rig.plans.estimate import TimeLeft, dry_run, even_azimuths, table_angles
@@ -63,7 +63,7 @@ def test_motion_model_predicts_the_duration_within_10_percent(simulated, tmp_pat
     s = simulated(seed=3)
     with Catalog.open(tmp_path, clock=s.bench.clock) as catalog:
         (before,) = dry_run(s.bench, catalog, {"dice": None}, views=views)
-        left = TimeLeft(MotionModel(s.bench.config), before.angles_deg)
+        left = TimeLeft(MotionTimes(s.bench.config), before.angles_deg)
         predicted = []
         for event in enroll(s.bench, catalog, "dice", views=views):
             left.add(event)
@@ -84,7 +84,7 @@ def test_motion_model_predicts_the_duration_within_10_percent(simulated, tmp_pat
 def test_move_is_estimated_with_the_time_in_which_the_table_must_be_quiet(quiet_s):
     with motion_bench(f"table.quiet_s={quiet_s}") as (bench, _), Turntable(bench) as table:
         table.goto(10.0)
-        assert MotionModel(bench.config).move_s(90.0) == pytest.approx(table.goto(100.0).seconds, abs=0.1)
+        assert MotionTimes(bench.config).move_s(90.0) == pytest.approx(table.goto(100.0).seconds, abs=0.1)
 
 
 def test_dry_run_shows_the_actions_and_moves_and_stores_nothing(simulated, tmp_path):
@@ -119,6 +119,6 @@ def test_dry_run_shows_the_actions_and_moves_and_stores_nothing(simulated, tmp_p
 
 
 def test_downward_moves_take_longer():
-    model = MotionModel(load_config())
+    model = MotionTimes(load_config())
     assert model.move_s(-90) > model.move_s(90) > model.move_s(10)
     assert model.enrollment_s(0.0, ()) == 0.0

@@ -11,7 +11,7 @@ from rig.catalog import Catalog
 from rig.catalog.results import find_results
 from rig.core.next_steps import Do
 from rig.events.events import Accepted, Identified, NoteCode, Recorded, Warned
-from rig.events.note_wording import note_steps
+from rig.events.wording import note_steps
 from rig.plans.identify import ResultRecorder
 from tests.rig.report.report_samples import identifying
 

@@ -74,9 +74,9 @@ class TestEnrollment:
 class TestIdentification:
     def test_steps_are_the_measured_rotations(self) -> None:
         rotations = (90.0, 47.3, -120.5)
-        revolutions = identified(rotations_deg=rotations).steps
-        assert [rotate.rotation_deg for rotate in revolutions] == pytest.approx(list(rotations))
-        assert [(rotate.s_left, rotate.s_right) for rotate in revolutions] == [(None, None), (0.41, 0.66), (0.66, 0.41)]
+        steps = identified(rotations_deg=rotations).steps
+        assert [step.rotation_deg for step in steps] == pytest.approx(list(rotations))
+        assert [step.number for step in steps] == [2, 3, 4]
 
     @pytest.mark.parametrize("rotation_deg", [-270.0, 250.0, 359.0])
     def test_steps_count_whole_revolutions(self, rotation_deg: float) -> None:

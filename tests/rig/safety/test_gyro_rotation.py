@@ -11,31 +11,18 @@ from hypothesis import strategies as st
 
 from rig.core.errors import ConfigError, DeviceFault, DeviceSilent, NotReady, UsageError
 from rig.devices.imu import ImuSamples
-from rig.devices.mpu6050 import Mpu6050
 from rig.safety.gyro_rotation import GyroIssue, GyroRotationMeter, Rotation, compare
-from sim.i2c import SimI2cBus
-from sim.imu.mpu6050 import SimMpu6050
 from sim.motion import to_position, to_velocity
 from sim.noise import NoiseModel
-from sim.world import World
+from tests.rig.imu_bench import ImuBench
 
 
-class Bench:
+class GyroBench(ImuBench):
+    """A bench with noise, whose sensor is open, and the meter of its rotations."""
+
     def __init__(self, noise: NoiseModel | None = None, seed: int = 0, rate_hz: float = 200, **heading: Any) -> None:
-        self.world = World(noise=noise or NoiseModel(), seed=seed)
-        self.clock = self.world.clock
-        self.sensor = SimMpu6050(self.world)
-        self.bus = SimI2cBus(self.clock)
-        self.bus.attach(0x68, self.sensor)
-        self.imu = Mpu6050(self.bus.path, clock=self.clock, rate_hz=rate_hz)
-        self.heading = GyroRotationMeter(self.imu, self.clock, **heading)
-
-    def __enter__(self) -> "Bench":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.imu.close()
-        self.bus.close()
+        super().__init__(noise or NoiseModel(), seed)
+        self.heading = GyroRotationMeter(self.open(rate_hz=rate_hz), self.clock, **heading)
 
     def drive(self, by_deg: float, v_max: float = 90.0) -> None:
         self.world.drive(to_position(self.clock.now_ns() * 1e-9, *self.world.shaft(), self.shaft + by_deg, v_max, 300))
@@ -57,8 +44,8 @@ class Bench:
 
 
 @pytest.fixture
-def bench() -> Iterator[Bench]:
-    with Bench() as b:
+def bench() -> Iterator[GyroBench]:
+    with GyroBench() as b:
         yield b
 
 
@@ -68,7 +55,7 @@ def bench() -> Iterator[Bench]:
 def test_bias_is_within_its_uncertainty() -> None:
     pulls = []
     for seed in range(60):
-        with Bench(seed=seed) as bench:
+        with GyroBench(seed=seed) as bench:
             bias = bench.heading.rest()
             pulls.append((bias.rate_dps - bench.sensor.inertial.gyro_bias_dps[2]) / bias.sigma_dps)
             assert bias.samples >= 100
@@ -76,7 +63,7 @@ def test_bias_is_within_its_uncertainty() -> None:
     assert 0.75 < np.std(pulls) < 1.35  # 60 draws: ±20 % at two sigma
 
 
-def test_longer_rest_reduces_the_bias_uncertainty(bench: Bench) -> None:
+def test_longer_rest_reduces_the_bias_uncertainty(bench: GyroBench) -> None:
     first = bench.heading.rest()
     bench.clock.sleep(0.5)
     before_ns = bench.clock.now_ns()
@@ -87,7 +74,7 @@ def test_longer_rest_reduces_the_bias_uncertainty(bench: Bench) -> None:
 
 
 @pytest.mark.parametrize("when_s", [0.1, 0.5, 1.2])
-def test_bias_is_rejected_while_the_table_moves(bench: Bench, when_s: float) -> None:
+def test_bias_is_rejected_while_the_table_moves(bench: GyroBench, when_s: float) -> None:
     known = bench.heading.rest()
     bench.drive(90.0)
     bench.clock.sleep(when_s)
@@ -98,7 +85,7 @@ def test_bias_is_rejected_while_the_table_moves(bench: Bench, when_s: float) -> 
     bench.heading.rest()  # starts again
 
 
-def test_bias_is_rejected_during_a_steady_rotation(bench: Bench) -> None:
+def test_bias_is_rejected_during_a_steady_rotation(bench: GyroBench) -> None:
     bench.world.drive(to_velocity(bench.clock.now_ns() * 1e-9, 0.0, 60.0, 60.0, 1.0))
     bench.clock.sleep(1.0)
     bench.imu.read_samples()
@@ -107,17 +94,17 @@ def test_bias_is_rejected_during_a_steady_rotation(bench: Bench) -> None:
 
 
 def test_noisy_sensor_has_a_larger_bias_uncertainty() -> None:
-    with Bench(NoiseModel().with_values(gyro_noise_dps_rthz=0.02)) as noisy, Bench() as normal:
+    with GyroBench(NoiseModel().with_values(gyro_noise_dps_rthz=0.02)) as noisy, GyroBench() as normal:
         assert noisy.heading.rest().sigma_dps > 2 * normal.heading.rest().sigma_dps
 
 
 @pytest.mark.parametrize("duration_s", [0.0, -1.0, 1.01, inf])
-def test_invalid_rest_duration_is_rejected(bench: Bench, duration_s: float) -> None:
+def test_invalid_rest_duration_is_rejected(bench: GyroBench, duration_s: float) -> None:
     with pytest.raises(UsageError):
         bench.heading.rest(duration_s)
 
 
-def test_sensor_without_samples_is_not_at_rest(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sensor_without_samples_is_not_at_rest(bench: GyroBench, monkeypatch: pytest.MonkeyPatch) -> None:
     bench.heading.rest()
     assert bench.heading.peak_dps() < 1
     empty = ImuSamples(np.empty(0, np.int64), np.empty((0, 3)))
@@ -134,7 +121,7 @@ def test_sensor_without_samples_is_not_at_rest(bench: Bench, monkeypatch: pytest
 
 @pytest.mark.parametrize("by_deg", [90.0, -35.0, 5.0, -180.0])
 def test_rotation_without_errors_is_exact(by_deg: float) -> None:
-    with Bench(NoiseModel.none()) as bench:
+    with GyroBench(NoiseModel.none()) as bench:
         bench.heading.rest(1.0)  # a sensor without noise does not count as hanging
         rotation = bench.move(by_deg)
         assert rotation.valid
@@ -143,7 +130,7 @@ def test_rotation_without_errors_is_exact(by_deg: float) -> None:
 
 @pytest.mark.parametrize("rate_hz", [50, 100, 500, 1000])
 def test_fifo_is_read_in_time_at_each_rate(rate_hz: float) -> None:
-    with Bench(NoiseModel.none(), rate_hz=rate_hz) as bench:
+    with GyroBench(NoiseModel.none(), rate_hz=rate_hz) as bench:
         bench.heading.rest()
         rotation = bench.move(60.0)
         assert rotation.valid
@@ -167,7 +154,7 @@ def test_errors_match_the_stated_uncertainty(noise: NoiseModel, scale_sigma: flo
     """The ratio |error|/σ over parts and moves shows that the uncertainty is neither too small nor too large."""
     pulls = []
     for seed in range(80):
-        with Bench(noise, seed, scale_sigma=scale_sigma) as bench:
+        with GyroBench(noise, seed, scale_sigma=scale_sigma) as bench:
             bench.heading.rest()
             before = bench.world.table_deg()
             rotation = bench.move([30.0, -90.0, 5.0, 150.0][seed % 4])
@@ -181,7 +168,7 @@ def test_errors_match_the_stated_uncertainty(noise: NoiseModel, scale_sigma: flo
 
 def test_uncertainty_grows_with_time_angle_and_bias_uncertainty() -> None:
     noise = NoiseModel.none().with_values(gyro_noise_dps_rthz=0.005)
-    with Bench(noise, scale_sigma=0.02) as bench:
+    with GyroBench(noise, scale_sigma=0.02) as bench:
         bias = bench.heading.rest()
         rotation = bench.move(60.0, v_max=30.0)
         arw = 0.005 / sqrt(2)
@@ -192,17 +179,17 @@ def test_uncertainty_grows_with_time_angle_and_bias_uncertainty() -> None:
 
 
 def test_mounting_upside_down_and_scale_are_corrected() -> None:
-    with Bench(NoiseModel.none(), sign=-1, scale=1.5) as bench:
+    with GyroBench(NoiseModel.none(), sign=-1, scale=1.5) as bench:
         bench.heading.rest()
         assert bench.move(40.0).angle_deg == pytest.approx(-60.0, abs=0.03)
-    with Bench(NoiseModel.none(), axis="x") as bench:
+    with GyroBench(NoiseModel.none(), axis="x") as bench:
         bench.heading.rest()
         assert bench.move(40.0).angle_deg == pytest.approx(0.0, abs=0.01)
 
 
 def test_slipping_platter_disagrees_with_the_encoder() -> None:
     noise = NoiseModel().with_values(gyro_scale_error=0, imu_tilt_deg=0)
-    with Bench(noise, scale_sigma=0.001) as bench:
+    with GyroBench(noise, scale_sigma=0.001) as bench:
         bench.heading.rest()
         good = compare(30.0, bench.move(30.0), encoder_sigma_deg=0.05, backlash_deg=0.25)
         assert good.agrees
@@ -215,7 +202,7 @@ def test_slipping_platter_disagrees_with_the_encoder() -> None:
 
 
 @pytest.mark.parametrize("steady", [False, True])
-def test_shock_or_rate_beyond_the_range_is_not_valid(bench: Bench, steady: bool) -> None:
+def test_shock_or_rate_beyond_the_range_is_not_valid(bench: GyroBench, steady: bool) -> None:
     bench.heading.rest()
     if steady:
         bench.world.drive(to_velocity(bench.clock.now_ns() * 1e-9, 0.0, 0.0, 400.0, 2000.0))
@@ -231,7 +218,7 @@ def test_shock_or_rate_beyond_the_range_is_not_valid(bench: Bench, steady: bool)
     assert rotation.issue is GyroIssue.OUT_OF_RANGE
 
 
-def test_rotation_with_lost_samples_is_not_valid(bench: Bench) -> None:
+def test_rotation_with_lost_samples_is_not_valid(bench: GyroBench) -> None:
     bench.heading.rest()
     bench.heading.begin()
     bench.drive(90.0)
@@ -245,14 +232,14 @@ def test_rotation_with_lost_samples_is_not_valid(bench: Bench) -> None:
     assert bench.move(20.0).valid
 
 
-def test_overflow_between_moves_is_harmless(bench: Bench) -> None:
+def test_overflow_between_moves_is_harmless(bench: GyroBench) -> None:
     bench.heading.rest()
     bench.clock.sleep(20.0)
     bench.heading.rest()
     assert bench.move(45.0).angle_deg == pytest.approx(45.0, rel=0.04)
 
 
-def test_update_leaves_the_bus_alone_while_the_fifo_is_nearly_empty(bench: Bench) -> None:
+def test_update_leaves_the_bus_alone_while_the_fifo_is_nearly_empty(bench: GyroBench) -> None:
     bench.heading.rest()
     bench.heading.begin()
     before = bench.imu.statistics.transfers
@@ -265,7 +252,7 @@ def test_update_leaves_the_bus_alone_while_the_fifo_is_nearly_empty(bench: Bench
 # -- at rest or not -----------------------------------------------------------------------------------------------
 
 
-def test_peak_rate_distinguishes_moving_ringing_and_rest(bench: Bench) -> None:
+def test_peak_rate_distinguishes_moving_ringing_and_rest(bench: GyroBench) -> None:
     assert bench.heading.peak_dps() == inf  # nothing is known yet
     bench.heading.rest(0.2)
     assert bench.heading.peak_dps(0.15) < inf
@@ -289,7 +276,7 @@ def test_peak_rate_distinguishes_moving_ringing_and_rest(bench: Bench) -> None:
 # -- misuse -------------------------------------------------------------------------------------------------------
 
 
-def test_wrong_order_of_calls_is_rejected(bench: Bench) -> None:
+def test_wrong_order_of_calls_is_rejected(bench: GyroBench) -> None:
     with pytest.raises(NotReady, match="bias"):
         bench.heading.begin()
     with pytest.raises(NotReady, match="begun"):
@@ -301,7 +288,7 @@ def test_wrong_order_of_calls_is_rejected(bench: Bench) -> None:
         bench.heading.end()
 
 
-def test_rest_drops_the_rotation_of_an_interrupted_move(bench: Bench) -> None:
+def test_rest_drops_the_rotation_of_an_interrupted_move(bench: GyroBench) -> None:
     bench.heading.rest()
     bench.heading.begin()
     bench.drive(20.0)
@@ -314,7 +301,7 @@ def test_rest_drops_the_rotation_of_an_interrupted_move(bench: Bench) -> None:
 
 
 @pytest.mark.parametrize("wrong", [{"axis": "w"}, {"sign": 0}, {"scale": 0.0}, {"scale": -1.0}, {"scale_sigma": -0.1}])
-def test_impossible_mounting_is_rejected(bench: Bench, wrong: dict[str, Any]) -> None:
+def test_impossible_mounting_is_rejected(bench: GyroBench, wrong: dict[str, Any]) -> None:
     with pytest.raises(ConfigError):
         GyroRotationMeter(bench.imu, bench.clock, **wrong)
 
@@ -346,7 +333,7 @@ def test_agreement_is_symmetric_and_bounded(encoder: float, gyro: float, sigma: 
     ],
 )
 @pytest.mark.parametrize("moving", [True, False])
-def test_gyro_that_repeats_one_sample_is_detected(bench: Bench, hung: Any, words: str, moving: bool) -> None:
+def test_gyro_that_repeats_one_sample_is_detected(bench: GyroBench, hung: Any, words: str, moving: bool) -> None:
     bench.heading.rest()
     bench.sensor.distortions.append(lambda w: hung(w).astype(">i2"))
     broken_ns = bench.clock.now_ns()
@@ -360,7 +347,7 @@ def test_gyro_that_repeats_one_sample_is_detected(bench: Bench, hung: Any, words
 
 @given(st.floats(0.01, 1.0))  # a sample of the last 5 ms may arrive later
 def test_rotation_until_a_time_before_the_rest_is_zero(before_s):
-    with Bench() as bench:
+    with GyroBench() as bench:
         bench.heading.rest()
         bench.heading.begin()
         bench.clock.sleep(0.2)

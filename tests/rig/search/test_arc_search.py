@@ -14,7 +14,7 @@ from rig import Catalog, enroll, identify, load_model
 from rig.bench import Bench
 from rig.core.errors import MotionStopped, RigError, Stalled, UsageError
 from rig.events.events import Accepted, Decided, FrameUsed, Identified, Moved, Ranked
-from rig.report.run_report import run_report
+from rig.report.page import run_report
 from rig.search.model import Model
 from rig.search.replay import check
 from rig.search.saved_run import RunWriter, load_run
@@ -74,7 +74,7 @@ def test_search_ends_during_the_rotation_and_can_be_replayed(model: Model, tmp_p
     assert live[-1].outcome is hbr.Outcome.FOUND
     enough = next(one for one in live if one.outcome is not hbr.Outcome.CONTINUE)
     report = run_report(load_run(tmp_path / "run"))
-    assert "Probability along the arc" in report
+    assert "rotation since the first view, °" in report
     assert f"enough for an answer from view {enough.index + 1} on: {enough.seconds:.1f} s after the start" in report
     decisions = [e.candidates[0].probability for e in events if isinstance(e, Ranked)]
     assert len(decisions) < 1 + len(in_motion)

@@ -18,14 +18,13 @@ from rig.config import RigConfig, load_config
 from rig.core.errors import StateNotStored, TableNotEmpty, UsageError, ViewRejected
 from rig.core.next_steps import Do
 from rig.events.events import EmptyTableImage, NoteCode, Warned
-from rig.events.note_wording import note_steps, note_words
+from rig.events.wording import note_steps, note_words
 from rig.plans.enroll import enroll
 from rig.plans.photograph_table import photograph_table
 from rig.safety.saved_state import FileStore, MemoryStore
-from rig.views.description import BENCH_DESCRIPTOR
+from rig.views.description import BENCH_DESCRIPTOR, SegmentationSummary
 from rig.views.empty_table import MAX_AGE_H, empty_table_status
 from rig.views.object_presence import TableWatcher
-from rig.views.segmentation_evidence import SegmentationSummary
 from rig.views.table_problems import TableProblem, TableProblemCode
 from sim import disk
 from sim.bench import ShelfOperator, open_sim_bench

@@ -19,8 +19,8 @@ from fastapi.testclient import TestClient
 
 from rig.config import load_config
 from rig.core.clock import SystemClock
-from rig.web.bench_side import BenchSide
 from rig.web.front import guarded, make_server
+from rig.web.run import BenchSide
 from rig.web.server import Server
 from rig.web.setup import Listening, Setup
 from tests.small import SMALL
@@ -49,6 +49,7 @@ class Served:
         """Submit a job, and return it when it has ended."""
         answer = self.client.post("/api/v1/jobs", json=request)
         assert answer.status_code == 201, answer.text
+        assert answer.headers["location"] == f"/api/v1/jobs/{answer.json()['id']}"
         return self.wait(answer.json()["id"])
 
     def wait(self, job_id: str, *states: str) -> dict[str, Any]:
@@ -89,7 +90,7 @@ def starting(folder: Path) -> Iterator[Callable[..., Served]]:
         listening = Listening(host="127.0.0.1", port=0, needs_login=needs_login, max_upload_bytes=2_000_000)
         setup = Setup(bench="sim", config=config, seed=1, arguments=("--bench", "sim"), listening=listening)
         side, server, disconnect = connected(setup)
-        client = TestClient(guarded(server, listening), base_url="http://127.0.0.1", client=("127.0.0.1", 50000))
+        client = TestClient(guarded(server), base_url="http://127.0.0.1", client=("127.0.0.1", 50000))
         thread = threading.Thread(target=side.worker.run, daemon=True)
         thread.start()
 

@@ -19,7 +19,7 @@ def clock():
 
 @pytest.fixture
 def sessions(tmp_path, clock):
-    return Sessions(Tokens(tmp_path, clock), clock)
+    return Sessions(Tokens(tmp_path, clock), clock, "rig_local")
 
 
 def test_token_is_stored_as_a_hash_in_a_private_file(tmp_path, sessions):

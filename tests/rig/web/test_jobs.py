@@ -82,13 +82,3 @@ def test_only_the_answers_that_a_job_offers_are_accepted(queue):
         queue.answer(job.id, Choice.RESTART)
     queue.answer(job.id, Choice.SKIP)
     assert queue.answered(running) is Choice.SKIP
-
-
-def test_command_that_continues_a_job_shows_no_password(tmp_path):
-    arguments = ("--set", "catalog.url=postgresql://anna:secret@host/rig")
-    queue = JobQueue(tmp_path, VirtualClock(), lambda _job: None, arguments)
-    queue.submit(EnrollRequest(name="lamp"), "anna")
-    queue.hold()
-    assert "rig enroll lamp" in queue.jobs()[0].command
-    assert "secret" not in queue.jobs()[0].command
-    assert b"secret" not in (tmp_path / "jobs.json").read_bytes()

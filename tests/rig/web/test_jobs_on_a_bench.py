@@ -51,7 +51,7 @@ def halted(monkeypatch) -> Halted:
         bench.safety.observers.append(observe)
         return bench
 
-    monkeypatch.setattr("rig.web.bench_side.open_bench", opened)
+    monkeypatch.setattr("rig.web.run.open_bench", opened)
     return halt
 
 
@@ -76,6 +76,12 @@ def test_enrolled_object_is_identified_and_its_run_is_saved(serve):
     fixed = {"object": "lamp", "reason": "read the label"}
     assert served.client.post(f"/api/v1/results/{answer['id']}/correct", json=fixed).json()["object"] == "lamp"
     assert served.client.get("/api/v1/results?object=mug-white").json()["total"] == 0
+    assert served.client.get(f"/api/v1/results/{answer['id']}").json()["object"] == "lamp"
+    image = served.client.get(f"/api/v1/results/{answer['id']}/image")
+    assert image.headers["content-type"] == "image/jpeg"
+    assert image.content.startswith(b"\xff\xd8")
+    for path in ("results/999", "results/999/image"):
+        assert served.client.get(f"/api/v1/{path}").status_code == 404
 
 
 def test_sample_is_not_accepted_for_several_objects(serve):
@@ -106,7 +112,7 @@ def test_listeners_learn_when_a_job_ends_after_the_answer_to_a_stop(serve, halte
     job = served.client.post("/api/v1/jobs", json={"kind": "goto", "angle_deg": 350}).json()
     assert halted.reached.wait(60.0)
     with halted.lock:
-        request = StopRequest(served.server.config.state_path("sim"))
+        request = StopRequest(served.server.setup.config.state_path("sim"))
         assert request.answer() is None
     assert served.wait(job["id"])["state"] == "cancelled"
     assert request.answer() is StopAnswer.TORQUE_OFF
@@ -138,7 +144,7 @@ def test_job_that_meets_an_interrupted_enrollment_offers_to_continue_it(serve):
     worker.publish = publish
     job = served.run(kind="enroll", name="lamp", views=4)
     assert (job["state"], job["views"], job["error"]["code"]) == ("failed", 0, 700)
-    assert job["command"] == "rig enroll lamp --resume --bench sim"
+    assert job["resume"]["resume"]
     done = served.run(**job["resume"])
     assert (done["state"], done["views"]) == ("done", 2)
 
@@ -200,7 +206,7 @@ def test_job_of_a_killed_server_is_interrupted_and_its_views_are_found_again(ser
     again = serve()
     (job,) = again.client.get("/api/v1/jobs").json()["items"]
     assert job["state"] == "interrupted"
-    assert (job["resume"]["resume"], job["command"]) == (True, "rig enroll lamp --resume --bench sim")
+    assert job["resume"]["resume"]
     with Catalog.open(tmp_path / "catalog", clock=SystemClock(), read_only=True) as catalog:
         assert [one.views for one in catalog.objects()] == [6]
 
@@ -247,7 +253,7 @@ def test_doctor_examines_a_bench_that_cannot_be_opened(serve, monkeypatch):
     def missing(*_arguments: Any, **_options: Any) -> Bench:
         raise DeviceNotFound("The camera is missing.", next_step="Connect it.")
 
-    monkeypatch.setattr("rig.web.bench_side.open_bench", missing)
+    monkeypatch.setattr("rig.web.run.open_bench", missing)
     served = serve()
     assert served.run(kind="home")["error"]["what"] == "The camera is missing."
     assert served.run(kind="doctor")["state"] == "done"

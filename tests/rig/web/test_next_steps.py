@@ -3,9 +3,8 @@
 import pytest
 
 from rig.core.next_steps import Do, in_words
-from rig.web.next_steps import JOBS, PAGES, page_actions
-from rig.web.pages import PAGES as ALL_PAGES
-from rig.web.work import JOBS as JOBS_OF_REQUESTS
+from rig.web.pages import JOB_OF_STEP, PAGE_OF_STEP, PAGES, page_actions
+from rig.web.work import JOBS
 
 
 def test_each_action_is_worded_for_a_page_and_for_a_terminal():
@@ -19,15 +18,15 @@ def test_each_action_is_worded_for_a_page_and_for_a_terminal():
         assert (shown["job"] is None) or (shown["page"] is None)
 
 
-@pytest.mark.parametrize("action", JOBS)
+@pytest.mark.parametrize("action", JOB_OF_STEP)
 def test_each_button_is_a_job_that_takes_the_parameters_of_its_step(action):
     parameters = {Do.SET_REVOLUTIONS: {"revolutions": -1}, Do.EMPTY_TABLE: {"anyway": True}}.get(action, {})
     if action in (Do.ACKNOWLEDGE, Do.ACKNOWLEDGE_IN_PROGRAM):
         parameters = {"reboot": True}
     request = {**page_actions()[str(action)]["job"], **action(**parameters).parameters}
-    assert type(JOBS[action]).model_validate(request)
-    assert type(JOBS[action]) in JOBS_OF_REQUESTS
+    assert type(JOB_OF_STEP[action]).model_validate(request)
+    assert type(JOB_OF_STEP[action]) in JOBS
 
 
 def test_each_link_leads_to_a_page():
-    assert {page.removeprefix("/") for page in PAGES.values()} <= ALL_PAGES.keys()
+    assert {page.removeprefix("/") for page in PAGE_OF_STEP.values()} <= PAGES.keys()

@@ -13,8 +13,8 @@ def serve(tmp_path, monkeypatch):
     """Run `rig serve`; a server that would start is returned instead."""
     started: list[Listening] = []
 
-    def run_server(_bench, _config, _seed, _arguments, listening, ready):
-        started.append(listening)
+    def run_server(setup, ready):
+        started.append(setup.listening)
         ready("http://127.0.0.1:1/")
 
     monkeypatch.setattr("rig.web.run.run_server", run_server)

@@ -53,7 +53,7 @@ def motion(monkeypatch: pytest.MonkeyPatch) -> Motion:
         motion.watch(bench)
         return bench
 
-    monkeypatch.setattr("rig.web.bench_side.open_bench", opened)
+    monkeypatch.setattr("rig.web.run.open_bench", opened)
     return motion
 
 
@@ -70,7 +70,7 @@ def moving(serve: Any, motion: Motion) -> Iterator[Served]:
 
 
 def request_stop(served: Served) -> StopRequest:
-    return StopRequest(served.server.config.state_path("sim"))
+    return StopRequest(served.server.setup.config.state_path("sim"))
 
 
 def table_deg(served: Served) -> float:
@@ -237,7 +237,7 @@ def test_stop_during_a_pause_within_a_search_holds_the_cable_budget(serve):
     before_deg = table_deg(served)
     assert served.client.post("/api/v1/stop").json()["ended"]
     assert served.wait(job["id"])["state"] == "cancelled"
-    low, high = served.server.config.table.limits_deg
+    low, high = served.server.setup.config.table.limits_deg
     assert low <= table_deg(served) <= high
     assert table_deg(served) == pytest.approx(before_deg, abs=0.5)
     assert served.run(kind="home")["state"] == "done"

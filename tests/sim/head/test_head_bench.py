@@ -6,7 +6,7 @@ from hbr.core.angles import wrap180
 from rig.catalog import Catalog, derived
 from rig.config import load_config
 from rig.core.errors import DeviceSilent, EmergencyStop, FaultLatched, HeadRestarted, ViewRejected
-from rig.devices.head.opening import powered
+from rig.devices.head.head import powered
 from rig.devices.head.protocol import Reset
 from rig.events.events import Accepted
 from rig.motion.turntable import Turntable

@@ -22,8 +22,8 @@ from rig.config import load_config
 from rig.core.clock import SystemClock, seconds_between
 from rig.core.errors import BenchBusy, ConfigError, DeviceNotFound, EmergencyStop, UsageError
 from rig.core.files import json_values
-from rig.devices.dynamixel.opening import open_servo
 from rig.devices.dynamixel.port import open_serial
+from rig.devices.dynamixel.servo import open_servo
 from rig.motion.turntable import Turntable
 from sim.bench import ShelfOperator
 from sim.devices import SimDevices

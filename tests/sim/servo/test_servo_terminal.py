@@ -12,8 +12,8 @@ from dynamixel_sdk import COMM_SUCCESS, PortHandler, Protocol2PacketHandler
 
 from rig.config import ServoConfig
 from rig.core.clock import SystemClock
-from rig.devices.dynamixel.opening import open_servo
 from rig.devices.dynamixel.port import open_serial
+from rig.devices.dynamixel.servo import open_servo
 from rig.devices.servo import MotionProfile
 from tests.programs import Program
 

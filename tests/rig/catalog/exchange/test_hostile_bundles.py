@@ -103,7 +103,7 @@ class TestHostileBundles:
             ("UPDATE views SET captured_utc = 'yesterday'", "yesterday|datetime"),
             ("DELETE FROM views WHERE view_index = 1", "belongs to no view|changed after"),
             ("UPDATE log SET finished_utc = NULL", "changed after"),
-            ("UPDATE log SET status = 'in progress'", "end of an enrollment"),
+            ("UPDATE log SET status = 'in progress'", "changed after"),
             ("UPDATE log SET status = 'finished'", "finished"),
             ("UPDATE log SET object_id = 9", "owner of an enrollment"),
             ("UPDATE properties SET value = '2' WHERE key = 'version'", "another version"),
@@ -122,7 +122,7 @@ class TestHostileBundles:
 
     @pytest.mark.parametrize(
         ("views", "words"),
-        [(20_000, "number of planned views"), (0, "number of planned views|changed after")],
+        [(20_000, "changed after"), (0, "changed after")],
     )
     def test_impossible_plans_are_rejected(
         self, bundle: Path, open_catalog: OpenCatalog, views: int, words: str

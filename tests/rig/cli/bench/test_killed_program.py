@@ -18,8 +18,8 @@ from rig.cli.main import app
 from rig.config import load_config
 from rig.core.clock import SystemClock
 from rig.core.errors import DeviceNotFound
-from rig.devices.dynamixel.opening import open_servo
 from rig.devices.dynamixel.port import GUARDIAN, open_serial
+from rig.devices.dynamixel.servo import open_servo
 from sim.realtime.wire import send_command
 from tests.programs import Program
 
@@ -37,7 +37,7 @@ from rig.cli.ui.command import command
 from rig.cli.ui.settings import Settings
 from rig.core.clock import SystemClock
 from rig.devices.dynamixel.guardian import Guardian
-from rig.devices.dynamixel.opening import open_servo
+from rig.devices.dynamixel.servo import open_servo
 from rig.devices.dynamixel.port import open_serial
 from rig.devices.imu import ImuIdentity, ImuSamples
 from rig.safety.saved_state import FileStore
@@ -68,7 +68,7 @@ def go(settings: Settings) -> None:
         guardian = Guardian(port.port, port.baud, port.model, port.id)
     servo = open_servo(bus, port, CLOCK, guardian=guardian)
     servo.prepare(write=True)
-    bench = Bench("hardware", config, CLOCK, servo, StillImu(), None, state=FileStore(config.state_path("hardware")))
+    bench = Bench("hardware", config, CLOCK, servo, StillImu, None, state=FileStore(config.state_path("hardware")))
     bench.safety.connect()
     if bench.safety.doubt:
         bench.safety.set_angle(0.0)
@@ -187,33 +187,6 @@ def test_table_stops_however_the_program_ends(servo, tmp_path):
 def test_guardian_switches_the_torque_off_of_a_killed_program(servo, number):
     process, _ = moving(servo, GUARD="1")
     process.send_signal(signal.Signals[number])
-    ended(process)
-    until(lambda: is_torque_off(servo), 30.0)
-
-
-SPIN = """
-from rig.config import load_config
-from rig.core.clock import SystemClock
-from rig.devices.dynamixel.guardian import Guardian
-from rig.devices.dynamixel.opening import open_servo
-from rig.devices.dynamixel.port import open_serial
-import sys
-
-config = load_config(None, sys.argv[1:]).servo
-guardian = Guardian(config.port, config.baud, config.model, config.id)
-servo = open_servo(open_serial(config.port, config.baud), config, SystemClock(), guardian=guardian)
-servo.prepare(write=True)
-for state in servo.spin(60.0, 600.0):
-    if abs(state.velocity_dps) > 30.0:
-        print("moving", flush=True)
-"""
-
-
-@pytest.mark.nightly
-def test_guardian_switches_the_torque_off_of_a_spinning_servo(servo):
-    process = Program(*servo, code=SPIN)
-    assert process.stdout.readline() == "moving\n", process.stderr.read()
-    process.send_signal(signal.SIGKILL)
     ended(process)
     until(lambda: is_torque_off(servo), 30.0)
 

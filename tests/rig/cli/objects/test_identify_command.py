@@ -17,7 +17,7 @@ from rig.catalog import Catalog
 from rig.catalog.facts import Derived
 from rig.catalog.images import FolderImages
 from rig.cli.main import app
-from rig.cli.ui.exit_codes import EXIT_AMBIGUOUS, EXIT_QUALITY, EXIT_UNKNOWN
+from rig.cli.ui.exit_codes import EXIT_QUALITY, EXIT_UNKNOWN
 from rig.core.clock import SystemClock
 from rig.search.model import CurrentModel
 from rig.views.object_presence import TableWatcher
@@ -127,10 +127,9 @@ def test_dense_is_the_default_strategy(rig, enrolled):
         done = rig("identify", "--json", "--set", "bench.sim.object=lamp", *words)
         return [json.loads(line) for line in done.stdout.splitlines() if "event" in line], done.stderr
 
-    events, _ = searched("--top", "1", "--save-run", "runs/own")
+    events, _ = searched("--save-run", "runs/own")
     started, *_, answer, _ = (event for event in events if event["event"] != "empty_table_image")
     assert (started["strategy"], started["descriptor"], answer["name"]) == ("dense", "edges+colours", "lamp")
-    assert all(len(event["candidates"]) == 1 for event in events if event["event"] == "ranked")
     assert 0.9 < answer["confidence"] <= 1
     assert answer["open_set_score"] >= answer["open_set_threshold"]
     assert started["notes"][0]["code"] == "rates-not-guaranteed"
@@ -223,28 +222,6 @@ def test_watch_finds_objects_that_were_enrolled_meanwhile(rig, enrolled):
         assert rig("enroll", "amphora", "--views", "4").exit_code == 0
         assert "amphora" not in before.views.object_names
         assert "amphora" in model().views.object_names
-
-
-def test_ambiguous_object_ends_with_exit_code_10(rig):
-    assert rig("catalog", "fit").exit_code == 0
-    path = Path("catalog/search_rules.json")
-    before = path.read_text(encoding="utf-8")
-    try:
-        path.write_text(json.dumps(json.loads(before) | {"min_confidence": 1.5, "open_set_thresholds": [None] * 4}))
-        words = ("identify", "--strategy", "dense", "--max-views", "2", "--set", "bench.sim.object=dice")
-        done = rig(*words, "--json", "--save-run", "runs/ambiguous")
-        answer = json.loads(done.stdout.splitlines()[-2])
-        assert done.exit_code == EXIT_AMBIGUOUS
-        assert (answer["outcome"], answer["name"], answer["confidence"]) == ("ambiguous", "dice", None)
-        assert {one["name"] for one in answer["candidates"] if one["probability"] > 0} == set(answer["possible"])
-        assert in_json(rig("results", "list", "--json"))[-1]["confidence"] is None
-        assert answer["possible"] == [one["name"] for one in answer["candidates"]]
-        assert "\nAmbiguous: dice" in rig("replay", "runs/ambiguous").stdout
-        assert rig("replay", "runs/ambiguous", "--check").exit_code == 0
-        assert rig("report", "runs/ambiguous").exit_code == 0
-        assert "Search: dice or " in Path("runs/ambiguous/report.html").read_text(encoding="utf-8")
-    finally:
-        path.unlink()
 
 
 def test_unknown_object_has_no_confidence_anywhere(rig):

@@ -16,7 +16,7 @@ from rich.table import Table
 from rich.text import Text
 from typer.testing import CliRunner
 
-from rig.cli.bench.findings import show_progress
+from rig.cli.bench.doctor import show_progress
 from rig.cli.main import app
 from rig.cli.ui.command import show_error
 from rig.cli.ui.present import console
@@ -121,7 +121,7 @@ def test_every_console_guards_its_text():
         ["config", "show"],
         *(
             pytest.param(words, marks=pytest.mark.nightly)
-            for words in (["config", "path", "--json"], ["--help"], ["nix", "--json"])
+            for words in (["config", "show", "--json"], ["--help"], ["nix", "--json"])
         ),
     ],
 )

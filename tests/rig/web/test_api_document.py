@@ -1,19 +1,52 @@
-"""The OpenAPI document has the schema of the events of saved runs and of the stream, and both send such events."""
+"""The OpenAPI document is the committed one, describes all answers and events, and the server sends such events.
+
+``python -m tests.rig.web.test_api_document`` writes it again.
+"""
 
 import json
 from dataclasses import fields
-from typing import get_args
+from pathlib import Path
+from typing import Any, get_args
 
 import pytest
 
+from rig.config import RigConfig
+from rig.core.clock import SystemClock
 from rig.events.events import Event, event_dict, event_of
+from rig.web.app import create_app
+from rig.web.front import make_server
+from rig.web.setup import Listening, Setup
 
 KINDS = {next(f.default for f in fields(kind) if f.name == "event") for kind in get_args(Event)}
 
+COMMITTED = Path(__file__).parents[3] / "docs" / "reference" / "openapi.json"
+PUBLIC = {"get_health", "login", "logout"}
+
+
+def made() -> dict[str, Any]:
+    setup = Setup(bench="sim", config=RigConfig(), listening=Listening(host="127.0.0.1", port=0))
+    return create_app(make_server(setup, SystemClock())).openapi()
+
 
 @pytest.fixture(scope="module")
-def document(served):
-    return served.client.get("/api/v1/openapi.json").json()
+def document():
+    return made()
+
+
+def test_committed_document_is_that_of_the_program(served, document):
+    assert served.client.get("/api/v1/openapi.json").json() == document
+    assert json.loads(COMMITTED.read_text()) == document, "python -m tests.rig.web.test_api_document writes it again"
+
+
+def test_each_operation_has_a_plain_name_a_schema_for_its_answer_and_the_right_that_it_needs(document):
+    operations = [one for methods in document["paths"].values() for one in methods.values()]
+    assert len({one["operationId"] for one in operations}) == len(operations) > 40
+    for one in operations:
+        (answer,) = (found for status, found in one["responses"].items() if status.startswith("2"))
+        assert all(content["schema"] for content in answer["content"].values()), one["operationId"]
+        assert one["operationId"].isidentifier()
+        assert ("security" in one) == (one["operationId"] not in PUBLIC)
+    assert document["components"]["securitySchemes"].keys() == {"token", "login"}
 
 
 @pytest.mark.parametrize(
@@ -52,3 +85,7 @@ def test_stream_and_saved_run_send_such_events(serve):
     for data in (*sent, *saved):
         assert data.keys() - event_dict(event_of(data)).keys() <= {"job", "text", "steps", "picture", "outline_px"}
         assert event_dict(event_of(data)).items() <= data.items()
+
+
+if __name__ == "__main__":
+    COMMITTED.write_text(json.dumps(made(), indent=1, ensure_ascii=False) + "\n")

@@ -1,4 +1,4 @@
-"""A world with an MPU-6050 on a simulated I2C bus, and the driver once it is opened."""
+"""A world with an inertial sensor on a simulated I2C bus, and its driver once it is opened."""
 
 from typing import Any
 
@@ -12,28 +12,30 @@ from sim.world import World
 AT = 0x68
 
 
-class Bench:
-    """A world, the sensor in it, and the driver once it is opened."""
+class ImuBench:
+    """A world, the sensor in it, and the driver once it is opened; ``options`` are those of the simulated sensor."""
 
     def __init__(
         self,
         noise: NoiseModel | None = None,
         seed: int = 0,
-        who_am_i: int | None = None,
-        device: type[SimMpu6050] = SimMpu6050,
+        device: Any = SimMpu6050,
+        driver: Any = Mpu6050,
+        **options: Any,
     ) -> None:
         self.world = World(noise=noise or NoiseModel.none(), seed=seed)
         self.clock = self.world.clock
-        self.sensor = device(self.world, who_am_i=who_am_i)
+        self.sensor = device(self.world, **options)
         self.bus = SimI2cBus(self.clock)
-        self.bus.attach(AT, self.sensor)
-        self.imu: Mpu6050 | None = None
+        self.bus.attach(self.sensor.address, self.sensor)
+        self.driver = driver
+        self.imu: Any = None
 
-    def open(self, driver: type[Mpu6050] = Mpu6050, **settings: Any) -> Mpu6050:
-        self.imu = driver(self.bus.path, clock=self.clock, **settings)
+    def open(self, driver: Any = None, **settings: Any) -> Any:
+        self.imu = (driver or self.driver)(self.bus.path, clock=self.clock, **settings)
         return self.imu
 
-    def __enter__(self) -> "Bench":
+    def __enter__(self) -> "ImuBench":
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -42,8 +44,7 @@ class Bench:
         self.bus.close()
 
     def rotate(self, dps: float) -> None:
-        now_ns = self.clock.now_ns()
-        self.world.drive(to_velocity(now_ns * 1e-9, self.world.table_deg(), dps, dps, 1.0))
+        self.world.drive(to_velocity(self.clock.now_ns() * 1e-9, self.world.table_deg(), dps, dps, 1.0))
 
     def write(self, *data: int) -> None:
         """Write a register as another program on the bus would, without the driver."""

@@ -1,35 +1,30 @@
-"""A catalog on a server, as a bench uses it: with the journal and the local copy of this computer.
+"""The journal: the catalog of this computer for what is enrolled and answered before a catalog on a server gets it.
 
-Both are ordinary catalogs in folders. Enrollments go into the journal, and from there to the server. Searches read the
-local copy while the server does not answer. Commands and the web server open their catalogs here, so that each of them
-works without the server.
+Commands and the web server open their catalogs here, so that each of them works while the server does not answer.
 
 Decision: docs/decisions/0051.
 """
 
 import fcntl
-import json
 import os
-import shutil
 import threading
 from collections.abc import Callable, Collection, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass, field
-from datetime import datetime, timedelta
+from datetime import timedelta
 from pathlib import Path
 from typing import Any, Final, Self, TypeVar
 
 import numpy as np
-from sqlalchemy import ColumnElement, Table, and_, delete, func, insert, select
+from sqlalchemy import ColumnElement, and_, func, select
 from sqlalchemy.orm import Session as Transaction
 
 import hbr
 from rig.catalog import derived, log, state
 from rig.catalog.catalog import Catalog
-from rig.catalog.database import properties
-from rig.catalog.digests import portions
+from rig.catalog.copying import Attempts, open_copy, open_or_copy
 from rig.catalog.enrolling import OpenEnrollment
-from rig.catalog.facts import Action, Derived, Enrollment, Entry, Property, Row, Session, View
+from rig.catalog.facts import Action, Enrollment, Entry
 from rig.catalog.jobs import JobProgress, finished
 from rig.catalog.records import EnrollmentStatus, JsonObject
 from rig.catalog.state import ObjectSummary
@@ -46,7 +41,7 @@ from rig.core.errors import (
     ObjectNotFound,
     RigError,
 )
-from rig.core.files import json_values, no_follow
+from rig.core.files import no_follow
 from rig.core.next_steps import Do
 from rig.views.description import BENCH_DESCRIPTOR
 
@@ -58,101 +53,15 @@ RETRY_S: Final = 15.0
 """Time until the next attempt, if the server did not answer or a person has to decide about a name."""
 END_S: Final = 5.0
 """How long the end of a program waits for a delivery; the next program continues it."""
-RULES: Final = "search_rules.json"
-"""The stopping rule beside a catalog (`rig.search.stopping_rules`)."""
 
-_PATIENCE: Final = 20
 _LOCK: Final = "delivering"
-_COPY: Final = "copy"
-"""Property of a local copy: of which catalog, up to which line of its log, and when."""
 _SAME_ANSWER: Final = timedelta(hours=1)
 """An answer is recorded at most so long after a first attempt whose commit the server could not confirm."""
-_AT_ONCE: Final = 100
-"""Enrollments, and lines of the log, that are read from the server at once."""
-
-
-# Open
-
-
-class Attempts:
-    """Attempts to open catalogs, with pauses, so that the operator does not wait repeatedly for a server that is down.
-
-    An attempt that failed after a time t is repeated after 20 t: a host that rejects a connection takes milliseconds,
-    a network that drops packets takes seconds. Until then the same error is raised at once.
-    """
-
-    def __init__(self, clock: Clock) -> None:
-        self._clock = clock
-        self._not_before_ns = clock.now_ns()
-        self._error: CatalogUnavailable | None = None
-
-    def open(self, place: CatalogPlace, *, create: bool = False) -> Catalog:
-        """Open a catalog, for reading only unless it is created if there is none; errors as `Catalog.open`."""
-        begun_ns = self._clock.now_ns()
-        if self._error is not None and begun_ns < self._not_before_ns:
-            raise self._error.with_traceback(None)  # a traceback grows each time that an error is raised
-        try:
-            return Catalog.open(place, clock=self._clock, create=create, read_only=not create)
-        except CatalogUnavailable as error:
-            now_ns = self._clock.now_ns()
-            self._error, self._not_before_ns = error, now_ns + _PATIENCE * (now_ns - begun_ns)
-            raise
-
-
-def open_copy(place: CatalogPlace, clock: Clock) -> Catalog:
-    """Return the local copy, open for reading; `Catalog.copied_utc` says when it was made.
-
-    Raises
-    ------
-    CatalogUnavailable
-        There is no copy of this catalog.
-    """
-    with suppress(CatalogError):
-        copy = Catalog.open(place.copy_folder, clock=clock, create=False, read_only=True)
-        with copy.database.read() as transaction:
-            made = _copied(transaction)
-        if made.get("catalog") == str(place):
-            copy.copied_utc, copy.copy_of = datetime.fromisoformat(made["copied_utc"]), place
-            return copy
-        copy.close()
-    raise CatalogUnavailable(
-        f"This computer has no copy of the catalog {place}.",
-        next_step="Search once while the server answers: the search makes the copy.",
-    )
-
-
-def open_or_copy(
-    place: CatalogPlace, clock: Clock, *, create: bool = False, attempts: Attempts | None = None
-) -> Catalog:
-    """Return a catalog, open for reading; its local copy while its server or its store does not answer.
-
-    With ``create`` the catalog is created if there is none, and is open for writing. ``attempts`` are those of a
-    program that opens the catalog often.
-
-    Raises
-    ------
-    CatalogUnavailable
-        There is no copy either.
-    """
-    try:
-        return (attempts or Attempts(clock)).open(place, create=create)
-    except CatalogUnavailable as error:
-        try:
-            return open_copy(place, clock)
-        except CatalogUnavailable as missing:
-            raise CatalogUnavailable(
-                f"{error.what} {missing.what}",
-                next_step=(*error.steps, *missing.steps),
-                evidence=error.evidence,
-            ) from error
 
 
 def open_for_enrollment(place: CatalogPlace, clock: Clock) -> Catalog:
     """Open the catalog for new views: the journal of this computer if the catalog is on a server."""
     return Catalog.open(place, clock=clock) if place.url is None else Journal.of(place, clock)
-
-
-# The journal
 
 
 def journal_folder(place: CatalogPlace) -> Path:
@@ -265,12 +174,8 @@ class Delivery:
 def deliver_journal(place: CatalogPlace, clock: Clock, *, replacing: Collection[str] = ()) -> list[Delivery]:
     """Deliver the journal to the server of the catalog.
 
-    Raises
-    ------
-    CatalogUnavailable
-        The server does not answer; the journal keeps everything.
-    CatalogError, CatalogBusy
-        The server or the journal cannot be used, or another program delivers the journal.
+    Raises `CatalogUnavailable`: the server does not answer; the journal keeps everything. `CatalogError`,
+    `CatalogBusy`: the server or the journal cannot be used, or another program delivers the journal.
     """
     with Journal.of(place, clock) as journal, Catalog.open(place, clock=clock) as server:
         return deliver(journal, server, replacing=replacing)
@@ -287,12 +192,7 @@ def deliver(journal: Catalog, server: Catalog, *, replacing: Collection[str] = (
     replacing
         Names of objects that replace those of the server.
 
-    Raises
-    ------
-    CatalogUnavailable
-        The server stopped answering; what was not delivered stays in the journal.
-    CatalogBusy
-        Another program delivers this journal.
+    Raises `CatalogUnavailable`: the server stopped answering; what was not delivered stays in the journal.
     """
     done = []
     with _only_delivery(journal):
@@ -404,19 +304,12 @@ def _deliver_answers(journal: Catalog, server: Catalog) -> None:
                 number = last = last + 1
             numbers[entry.result] = number
             if _key(entry.record) not in known:
-                log.add(writing, _same(entry, result=number, details={**entry.details, "result": number}))
+                log.add(writing, log.same(entry, result=number, details={**entry.details, "result": number}))
     journal.note(Action.DELIVERED, line=max(waiting))
 
 
 def _key(record: JsonObject | None) -> object:
     return (record or {}).get("key")
-
-
-def _same(entry: Entry, **others: Any) -> Entry:
-    """Return a line of the log for another catalog; these columns are other ones."""
-    columns = {column.name: getattr(entry, column.name) for column in Entry.__table__.columns}
-    del columns["digest"]
-    return Entry(**{**columns, **others})
 
 
 def delivery_words(one: Delivery, place: CatalogPlace) -> str:
@@ -430,113 +323,6 @@ def failure_words(error: RigError) -> str:
     """Return the reason why nothing could be delivered, as sentences."""
     kept = "What is in the journal of this computer is delivered later"
     return f"{error.what} {kept}. Next step: {error.next_step}"
-
-
-# The local copy
-
-
-def _copied(transaction: Transaction) -> dict[str, Any]:
-    """Return what a local copy has: place and id of the catalog, last line of its log with its digest, and the time."""
-    stored = transaction.scalar(select(Property.value).where(Property.key == _COPY))
-    with suppress(ValueError, TypeError):
-        return dict(json_values((stored or "").encode()))
-    return {}
-
-
-def update_copy(catalog: Catalog) -> bool:
-    """Bring the local copy up to date; return whether anything had changed. Only what is new is read.
-
-    A copy that is damaged, or of another catalog, is made again.
-
-    Raises
-    ------
-    CatalogDamaged
-        The catalog is not as it was stored; the copy stays as it is.
-    CatalogError, CatalogBusy
-        One of them cannot be used, or another program updates the copy.
-    """
-    folder = catalog.place.copy_folder
-    try:
-        changed = _update(catalog, folder)
-    except CatalogDamaged:
-        made = folder.with_name(f"{folder.name}.new")
-        shutil.rmtree(made, ignore_errors=True)
-        changed = _update(catalog, made)
-        shutil.rmtree(folder, ignore_errors=True)
-        made.rename(folder)
-    with suppress(FileNotFoundError):
-        shutil.copyfile(catalog.path / RULES, folder / RULES)
-    return changed
-
-
-def _update(catalog: Catalog, folder: Path) -> bool:
-    with Catalog.open(folder, clock=catalog.clock) as copy:
-        with catalog.database.read() as reading, copy.database.write() as writing:
-            before = _copied(writing)
-            line, digest = log.head(reading)
-            own = {"catalog": str(catalog.place), "id": properties(reading)["id"]}
-            now = {**own, "line": line, "digest": digest, "copied_utc": catalog.clock.utc().isoformat()}
-            known = reading.scalar(select(Entry.digest).where(Entry.id == before.get("line"))) or ""
-            if {**before, **own, "digest": known} != before and log.head(writing)[0]:
-                raise CatalogDamaged("The local copy is one of another catalog.", next_step=Do.RUN_AGAIN())
-            _copy_log(reading, writing, after=before.get("line", 0))
-            _copy_enrollments(reading, writing)
-            _copy_derived(reading, writing)
-            writing.merge(Property(key=_COPY, value=json.dumps(now)))
-        newest = derived.empty_tables(copy).newest
-        store = copy.database.images
-        with copy.database.catalog_errors():
-            if newest is not None and not store.size(newest):
-                with suppress(CatalogError):  # rig catalog verify reports it
-                    store.put(catalog.database.images.content(newest))
-            store.remove(store.names() - {newest})
-    return bool(before.get("line") != line)
-
-
-def _copy_log(reading: Transaction, writing: Transaction, *, after: int) -> None:
-    """Add the new lines of the catalog's log to that of the copy, without answers: so it has the same state."""
-    new = select(Entry).where(Entry.result.is_(None)).order_by(Entry.id).limit(_AT_ONCE)
-    while part := reading.scalars(new.where(Entry.id > after)).all():
-        state.check_lines(reading, [one.id for one in part])
-        log.add(writing, *map(_same, part))
-        after = part[-1].id
-        reading.expunge_all()
-
-
-def _copy_enrollments(reading: Transaction, writing: Transaction) -> None:
-    """Copy the rows of the enrollments that searches use, with their ids, and remove the others."""
-    used = {one.enrollment_id for one in state.used(reading)}
-    known = set(writing.scalars(select(Enrollment.id)))
-    owners: tuple[tuple[type[Row], Any], ...] = (
-        (Enrollment, Enrollment.id),
-        (Session, Session.enrollment_id),
-        (View, View.enrollment_id),
-    )
-    for part in portions(sorted(known - used), _AT_ONCE):
-        for table, owner in reversed(owners):
-            writing.execute(delete(table).where(owner.in_(part)))
-    for part in portions(sorted(used - known), _AT_ONCE):
-        for table, owner in owners:
-            _copy_rows(reading, writing, table, owner.in_(part))
-
-
-def _copy_derived(reading: Transaction, writing: Transaction) -> None:
-    """Copy what is computed from these enrollments, if it is new or another program has computed it again."""
-    used = {one.seal for one in state.used(writing)}
-    columns = select(Derived.seal, Derived.what, Derived.made_by, Derived.sha256)
-    there = {tuple(row) for row in reading.execute(columns) if row.seal in used}
-    here = {tuple(row) for row in writing.execute(columns)}
-    for part in portions(sorted({str(row[0]) for row in there ^ here}), _AT_ONCE):
-        writing.execute(delete(Derived).where(Derived.seal.in_(part)))
-        _copy_rows(reading, writing, Derived, Derived.seal.in_(used.intersection(part)))
-
-
-def _copy_rows(reading: Transaction, writing: Transaction, table: type[Row], wanted: ColumnElement[bool]) -> None:
-    columns = table.__table__
-    assert isinstance(columns, Table)
-    rows = [dict(row) for row in reading.execute(select(columns).where(wanted)).mappings()]
-    if rows:
-        writing.execute(insert(columns), rows)
 
 
 # During other work

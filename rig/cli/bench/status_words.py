@@ -1,105 +1,12 @@
-"""What `rig status` reports: as JSON values, and these in words."""
+"""What `rig status` reports, in words."""
 
-import json
-import ssl
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import closing
 from typing import Any, Final
-from urllib.parse import urlsplit
-from urllib.request import Request, urlopen
 
-from rig.bench import Bench
-from rig.core.errors import BenchBusy, RigError
-from rig.core.json_form import plain
-from rig.core.next_steps import Do, in_words, steps_as_json, steps_from_json
+from rig.core.next_steps import in_words, steps_from_json
 from rig.core.phrases import angle_words, budget_words, filled
-from rig.devices.camera import Camera, CameraLocks
-from rig.devices.imu import Imu
-from rig.devices.open_imu import open_imu
-from rig.doctor.camera import lock_words, open_camera
-from rig.doctor.context import DoctorContext
-from rig.safety.saved_state import ServerAddress
-
-
-def report_of(bench: Bench) -> dict[str, Any]:
-    """Return the state of an open bench and of its devices."""
-    state, safety = bench.servo.read_state(), bench.safety
-    report: dict[str, Any] = {
-        "bench": bench.name,
-        "state": str(safety.state),
-        "fault": safety.fault.as_dict() if safety.fault else None,
-        "doubt": str(safety.doubt) if safety.doubt else None,
-        "table_deg": None if safety.doubt else safety.angle_reference.to_table(state.position_deg),
-        "limits_deg": list(bench.config.table.limits_deg),
-        "servo": {**plain(bench.servo.identity), **plain(state), "bus": dict(bench.servo.bus_statistics)},
-        "imu": _read(lambda: _imu_values(bench.imu)),
-        **({"head": bench.head.report()} if bench.head else {}),
-        "camera": _read(lambda: _camera_values(bench.camera)),
-    }
-    steps = steps_as_json(safety.next_step or bench.calibration_steps)
-    return {**report, "findings": list(bench.findings), "steps": steps}  # opening the camera adds some findings
-
-
-def report_without_servo(context: DoctorContext, missing: RigError) -> dict[str, Any]:
-    """Return what works of a bench that cannot be opened."""
-    config, computer = context.config, context.computer
-
-    def imu() -> dict[str, Any]:
-        with closing(open_imu(config.imu, computer.i2c_path(config.imu.bus), computer.clock)) as sensor:
-            return _imu_values(sensor)
-
-    def camera() -> dict[str, Any]:
-        with closing(open_camera(context)) as opened:
-            return _camera_values(opened)
-
-    return {
-        "bench": context.bench,
-        "servo": {"error": missing.as_dict()},
-        **({"imu": _read(imu)} if config.imu.connection == "i2c" else {}),
-        "camera": _read(camera),
-    }
-
-
-def report_of_server(server: ServerAddress) -> dict[str, Any]:
-    """Return what the server reports that uses the bench, and its page.
-
-    Raises
-    ------
-    BenchBusy
-        It does not answer.
-    """
-    place = urlsplit(server.url)
-    everywhere = place.hostname in ("0.0.0.0", "::")
-    url = f"{place.scheme}://{f'127.0.0.1:{place.port}' if everywhere else place.netloc}/api/v1/status"
-    context = ssl.create_default_context(cafile=server.certificate) if server.certificate else None
-    if context is not None:
-        context.check_hostname = False  # the certificate is the one in the file, with any name
-    request = Request(url, headers={"Authorization": f"Bearer {server.token}"})
-    try:
-        with urlopen(request, timeout=5, context=context) as answer:
-            return {**json.load(answer), "page": server.url}
-    except (OSError, ValueError) as error:
-        raise BenchBusy(
-            f"The server at {server.url} uses the bench and does not answer.",
-            next_step=("If it hangs,", Do.STOP(), f"Or end process {server.pid}."),
-            evidence={"reason": str(error)},
-        ) from error
-
-
-def _imu_values(imu: Imu) -> dict[str, Any]:
-    return {**plain(imu.identity), "temperature_c": imu.temperature_c()}
-
-
-def _camera_values(camera: Camera) -> dict[str, Any]:
-    return {**plain(camera.identity), "locks": plain(camera.read_locks())}
-
-
-def _read(values: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-    """Return the values of a device; if it does not work, its error."""
-    try:
-        return values()
-    except RigError as error:
-        return {"error": error.as_dict()}
+from rig.devices.camera import CameraLocks
+from rig.doctor.camera import lock_words
 
 
 def report_lines(report: Mapping[str, Any]) -> Iterator[str]:
