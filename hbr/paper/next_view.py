@@ -7,11 +7,10 @@ from dataclasses import dataclass
 from typing import Final, Literal, get_args
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from hbr.core.angles import wrap180, wrap360
 from hbr.core.arrays import FloatArray, IndexArray
-from hbr.descriptors.tanimoto import tanimoto
+from hbr.descriptors.similarity import tanimoto
 from hbr.model.views import Views
 from hbr.paper.hough import Ranking
 
@@ -20,6 +19,8 @@ Side = Literal["left", "right"]
 _SECTOR_DEG: Final = 90.0
 _CENTRES_DEG: Final = np.arange(4) * _SECTOR_DEG + _SECTOR_DEG / 2
 _BEST: Final = 10
+#: A rotation that ends as close as this to a visited orientation is extended.
+_REVISIT_DEG: Final = 10.0
 
 
 @dataclass(frozen=True)
@@ -52,24 +53,19 @@ class Decision:
     detour_deg: float
 
 
-def next_view(
-    ranking: Ranking, *, visited_deg: ArrayLike | None = None, revisit_deg: float = 10.0, side: Side | None = None
-) -> Decision:
+def next_view(ranking: Ranking, *, side: Side | None = None) -> Decision:
     """Choose the side on which the candidates differ most, and the rotation to the next sector centre there.
 
     The views of an object are divided into four sectors of 90 degrees, each represented by an average view (Eq. 5).
     The sector centre is that of the best candidate. The candidates are the objects on the last retrieval list; if there
-    are fewer than two, the ten best ones of the ranking.
+    are fewer than two, the ten best ones of the ranking. A rotation that ends within 10 degrees of an orientation that
+    was visited before is extended by 90 degrees, repeatedly until it is clear of all. If all four ends are visited, the
+    first one is used.
 
     Parameters
     ----------
     ranking : Ranking
         A ranking of at least two queries.
-    visited_deg : array, optional
-        Orientations to avoid; by default those of the ranking's queries. That of the last query is always avoided.
-    revisit_deg : float
-        A rotation that ends this close to a visited orientation, or closer, is extended by 90 degrees, repeatedly until
-        it is clear of all. If all four ends are visited, the first one is used.
     side : {"left", "right"}, optional
         Rotate to this side by the same step, independently of the similarities: a control for measurements.
 
@@ -81,16 +77,10 @@ def next_view(
     Raises
     ------
     ValueError
-        The ranking has only one query, `revisit_deg` is out of range, a visited orientation is not finite, or `side`
-        is unknown.
+        The ranking has only one query, or `side` is unknown.
     """
     if len(ranking.orientation_deg) < 2:
         raise ValueError("a decision needs two queries; rotate to the second view by a fixed step such as +90 degrees")
-    visited = np.asarray(ranking.orientation_deg if visited_deg is None else visited_deg, np.float64).ravel()
-    if not np.isfinite(visited).all():
-        raise ValueError(f"visited_deg is {visited}; leave unknown orientations out")
-    if not 0 <= revisit_deg < _SECTOR_DEG / 2:
-        raise ValueError(f"revisit_deg is {revisit_deg}; at least 0 and less than {_SECTOR_DEG / 2} is needed")
     if side not in (None, *get_args(Side)):
         raise ValueError(f"side {side!r} is unknown; use left or right, or None to decide by the candidates")
 
@@ -107,7 +97,7 @@ def next_view(
     sign = 1 if side == "left" else -1
     step = float(_next_sector(ranking.pose_deg[:1], sign)[1][0])
     here = float(ranking.orientation_deg[-1])
-    detour = _detour(here + sign * step, sign, np.append(visited, here), revisit_deg)
+    detour = _detour(here + sign * step, sign, ranking.orientation_deg)
     rotation = sign * (step + detour)
     return Decision(side, rotation, s_left, s_right, tuple(candidates.tolist()), wrap360(here + rotation), detour)
 
@@ -137,8 +127,8 @@ def _average_view(views: Views, object_index: int, sector: int) -> FloatArray:
     return mean
 
 
-def _detour(landing_deg: float, sign: int, visited_deg: FloatArray, revisit_deg: float) -> float:
+def _detour(landing_deg: float, sign: int, visited_deg: FloatArray) -> float:
     for detour_deg in np.arange(4) * _SECTOR_DEG:
-        if np.all(np.abs(wrap180(landing_deg + sign * detour_deg - visited_deg)) > revisit_deg):
+        if np.all(np.abs(wrap180(landing_deg + sign * detour_deg - visited_deg)) > _REVISIT_DEG):
             return float(detour_deg)
     return 0.0
