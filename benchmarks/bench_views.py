@@ -21,8 +21,7 @@ from hbr.core.arrays import ImageArray
 from hbr.drawing.bench import HARD, Bench, Visit
 from hbr.segmentation import Method
 from hbr.segmentation.background import shrunk
-from hbr.segmentation.network import shares
-from hbr.segmentation.silhouette import guess_object
+from hbr.segmentation.silhouette import guess_object, shares
 
 DESCRIPTORS = ("cedd", "edges+colours")
 DESCRIPTOR = "edges+colours"

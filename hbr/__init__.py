@@ -9,14 +9,13 @@ from hbr.dense.stopping import Outcome, StopDecision, StoppingRule, StopReason
 from hbr.descriptors import Descriptor, descriptor
 from hbr.descriptors.cedd import cedd, pack, unpack, unpack_rows
 from hbr.descriptors.registry import describe
-from hbr.descriptors.tanimoto import tanimoto
+from hbr.descriptors.similarity import tanimoto
 from hbr.descriptors.together import ViewsTogether
 from hbr.model.views import PackedViews, Views
 from hbr.paper.hough import Extension, Ranking, retrieve
 from hbr.paper.index import ViewIndex
-from hbr.paper.margin import score_margin
 from hbr.paper.next_view import Decision, Side, next_view
-from hbr.paper.open_set import open_set_threshold
+from hbr.paper.open_set import open_set_threshold, score_margin
 from hbr.segmentation import Background, Segmentation, hypotheses, segment
 
 __all__ = [

@@ -16,10 +16,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hbr.core.arrays import BoolArray, FloatArray, ImageArray, IndexArray, LevelArray, RealArray
-from hbr.core.validation import check_image
+from hbr.core.arrays import BoolArray, FloatArray, ImageArray, IndexArray, LevelArray, RealArray, check_image
 from hbr.descriptors.base import Descriptor
-from hbr.descriptors.tanimoto import squares, tanimoto, tanimoto_of_dots
+from hbr.descriptors.similarity import squares, tanimoto, tanimoto_of_dots
 from hbr.kernels import calls
 from hbr.segmentation import Segmentation
 
@@ -166,19 +165,17 @@ def cedd(image_bgr: ImageArray) -> LevelArray:
     return levels.astype(np.uint8)
 
 
-def describe(image_bgr: ImageArray, *, size: tuple[int, int] | None = None) -> LevelArray:
+def describe(image_bgr: ImageArray) -> LevelArray:
     """Return the CEDD levels of the whole image, scaled to a size that the block grid covers.
 
-    Without `size`, an image with a side above 640 pixels is scaled down to that side; then each side becomes the
-    nearest multiple of 80 (half-way up), at least 80: 640 x 480 stays, 128 x 128 becomes 160 x 160, 1920 x 1080 becomes
-    640 x 400. Compare only views of frames of the same size.
+    An image with a side above 640 pixels is scaled down to that side; then each side becomes the nearest multiple of 80
+    (half-way up), at least 80: 640 x 480 stays, 128 x 128 becomes 160 x 160, 1920 x 1080 becomes 640 x 400. Compare
+    only views of frames of the same size.
 
     Parameters
     ----------
     image_bgr : uint8 array (H, W, 3)
         As for `cedd`; no side may be 0.
-    size : (int, int), optional
-        Width and height, multiples of 80.
 
     Returns
     -------
@@ -188,13 +185,9 @@ def describe(image_bgr: ImageArray, *, size: tuple[int, int] | None = None) -> L
     Raises
     ------
     TypeError, ValueError
-        As for `cedd`, or a side of `size` is not a positive multiple of 80.
+        As for `cedd`, or a side is 0.
     """
-    check_image(image_bgr)
-    if size is not None and any(side <= 0 or side % GRID for side in size):
-        raise ValueError(f"size is {size}; both sides must be positive multiples of {GRID}, e.g. (640, 480)")
-    height, width = image_bgr.shape[:2]
-    return cedd(_resize(image_bgr, *(size or _covered_size(width, height))))
+    return cedd(covered(image_bgr))
 
 
 def covered(image_bgr: ImageArray) -> ImageArray:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from hbr.core.arrays import ImageArray, LevelArray
 from hbr.descriptors.base import Descriptor
-from hbr.descriptors.cosine import Cosine
+from hbr.descriptors.similarity import Cosine
 from hbr.segmentation import Segmentation, segment
 
 #: The name of such a descriptor is this prefix and the SHA-256 of the model file.

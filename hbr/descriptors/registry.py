@@ -10,12 +10,10 @@ import numpy as np
 from hbr.core.arrays import FloatArray, ImageArray, IndexArray, LevelArray
 from hbr.descriptors.base import Comparison, CompiledDescriptor, Descriptor, Shift
 from hbr.descriptors.cedd import Cedd
-from hbr.descriptors.cedd import describe as describe_by_cedd
-from hbr.descriptors.colours import Colours
-from hbr.descriptors.edges import Edges
+from hbr.descriptors.edges_and_colours import Colours, Edges
 from hbr.descriptors.embedding import MODEL_NAME, PREFIX, Embedding
 from hbr.kernels.calls import Measure
-from hbr.segmentation import Background, Box, Segmentation, segment
+from hbr.segmentation import Background, Segmentation, segment
 
 
 @dataclass(frozen=True)
@@ -193,10 +191,8 @@ _named = descriptor  # `describe` has a parameter of this name
 def describe(
     image_bgr: ImageArray,
     *,
-    size: tuple[int, int] | None = None,
     descriptor: str | Descriptor = "cedd",
     empty_table: Background | ImageArray | None = None,
-    box: Box | None = None,
 ) -> LevelArray:
     """Return the levels of an image by the paper's CEDD, or by another descriptor.
 
@@ -213,16 +209,11 @@ def describe(
     ----------
     image_bgr : uint8 array (H, W, 3)
         The image, in OpenCV's channel order. No side may be 0.
-    size : (int, int), optional
-        Width and height, multiples of 80, to which the whole image is scaled; only for CEDD. By default, an image with
-        a side above 640 pixels is scaled down to that side; then each side becomes the nearest multiple of 80.
     descriptor : str or Descriptor
         One of `hbr.descriptors.names`.
     empty_table : Background, or uint8 array (H, W, 3), optional
         The empty-table image, from the same camera position: of today, or of the day of the enrollment. Pass a
         `Background` for many frames. An image that does not fit the frame is not used.
-    box : (int, int, int, int), optional
-        The object's x, y, width, height in pixels. By default, the object is searched for.
 
     Returns
     -------
@@ -232,13 +223,7 @@ def describe(
     Raises
     ------
     TypeError, ValueError
-        The array is no such image, the descriptor is unknown, or the options contradict each other.
+        The array is no such image, or the descriptor is unknown.
     """
-    if descriptor == "cedd" and empty_table is None and box is None:
-        return describe_by_cedd(image_bgr, size=size)
-    if size is not None:
-        raise ValueError(f"size is {size}; it is possible only with plain CEDD of the whole image")
     chosen = _named(descriptor) if isinstance(descriptor, str) else descriptor
-    if empty_table is None and box is None:
-        return chosen.describe(image_bgr)
-    return chosen.describe(segment(image_bgr, empty_table=empty_table, box=box))
+    return chosen.describe(image_bgr if empty_table is None else segment(image_bgr, empty_table=empty_table))

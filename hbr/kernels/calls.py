@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hbr.core.arrays import FloatArray, ImageArray, IndexArray, LevelArray
-from hbr.core.cores import THREADS
-from hbr.kernels.library import address, library, run
+from hbr.kernels.library import THREADS, address, library, run
 
 _ROWS_OF_A_THREAD: Final = 100_000
 """Smallest number of rows for a thread: fewer take less time than its start."""

@@ -41,6 +41,11 @@ _SIGNATURES: Final[dict[str, tuple[Any, ...]]] = {
     ),
 }  # fmt: skip
 
+_CORES: Final = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+THREADS: Final = min(_CORES, 4)
+"""Threads of one large computation. More of them would wait for the memory or for the interpreter."""
+
 _forced_off = False
 
 

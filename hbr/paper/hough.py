@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from hbr.core.angles import revolutions_between
 from hbr.core.arrays import FloatArray, IndexArray, LevelArray, first_maximum, lengths, ranges
-from hbr.descriptors.tanimoto import tanimoto
+from hbr.descriptors.similarity import tanimoto
 from hbr.kernels import calls
 from hbr.model.views import Views
 from hbr.paper.index import ViewIndex, check_queries

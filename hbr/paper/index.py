@@ -8,7 +8,7 @@ import numpy as np
 
 from hbr.core.arrays import FloatArray, IndexArray, LevelArray
 from hbr.descriptors.cedd import BINS
-from hbr.descriptors.tanimoto import squares, tanimoto, tanimoto_of_dots
+from hbr.descriptors.similarity import squares, tanimoto, tanimoto_of_dots
 from hbr.kernels import library
 from hbr.kernels.calls import ByteRows
 from hbr.model.views import Views

@@ -7,19 +7,20 @@ from dataclasses import dataclass
 from typing import Final, Literal, get_args
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from hbr.core.angles import wrap180, wrap360
 from hbr.core.arrays import FloatArray, IndexArray
-from hbr.descriptors.tanimoto import tanimoto
+from hbr.descriptors.similarity import tanimoto
 from hbr.model.views import Views
 from hbr.paper.hough import Ranking
 
 Side = Literal["left", "right"]
 
+#: Average views of an object, N~M of Eq. 5: the paper's number.
 SECTORS: Final = 4
-"""Average views of an object, N~M of Eq. 5: the paper's number."""
 _BEST: Final = 10
+#: A rotation that ends as close as this to a visited orientation is extended.
+_REVISIT_DEG: Final = 10.0
 
 
 @dataclass(frozen=True)
@@ -52,33 +53,23 @@ class Decision:
     detour_deg: float
 
 
-def next_view(
-    ranking: Ranking,
-    *,
-    visited_deg: ArrayLike | None = None,
-    revisit_deg: float = 10.0,
-    side: Side | None = None,
-    sectors: int = SECTORS,
-) -> Decision:
+def next_view(ranking: Ranking, *, side: Side | None = None, sectors: int = SECTORS) -> Decision:
     """Choose the side on which the candidates differ most, and the rotation to the next sector centre there.
 
     The views of an object are divided into equal sectors, each represented by an average view (Eq. 5). The sector
     centre is that of the best candidate. The candidates are the objects on the last retrieval list; if there are fewer
-    than two, the ten best ones of the ranking.
+    than two, the ten best ones of the ranking. A rotation that ends within 10 degrees of an orientation that was
+    visited before is extended by a sector, repeatedly until it is clear of all. If all ends are visited, the first one
+    is used.
 
     Parameters
     ----------
     ranking : Ranking
         A ranking of at least two queries.
-    visited_deg : array, optional
-        Orientations to avoid; by default those of the ranking's queries. That of the last query is always avoided.
-    revisit_deg : float
-        A rotation that ends this close to a visited orientation, or closer, is extended by a sector, repeatedly until
-        it is clear of all. If all ends are visited, the first one is used.
     side : {"left", "right"}, optional
         Rotate to this side by the same step, independently of the similarities: a control for measurements.
     sectors : int
-        Number of sectors (N~M), at least 2.
+        Number of sectors (N~M), 2 to 16.
 
     Returns
     -------
@@ -88,18 +79,12 @@ def next_view(
     Raises
     ------
     ValueError
-        The ranking has only one query, `revisit_deg` or `sectors` is out of range, a visited orientation is not finite,
-        or `side` is unknown.
+        The ranking has only one query, `sectors` is out of range, or `side` is unknown.
     """
     if len(ranking.orientation_deg) < 2:
         raise ValueError("a decision needs two queries; rotate to the second view by a fixed step such as +90 degrees")
-    visited = np.asarray(ranking.orientation_deg if visited_deg is None else visited_deg, np.float64).ravel()
-    if not np.isfinite(visited).all():
-        raise ValueError(f"visited_deg is {visited}; leave unknown orientations out")
-    if sectors < 2:
-        raise ValueError(f"sectors is {sectors}; at least 2 are needed, {SECTORS} by default")
-    if not 0 <= revisit_deg < 180 / sectors:
-        raise ValueError(f"revisit_deg is {revisit_deg}; at least 0 and less than {180 / sectors} is needed")
+    if not 2 <= sectors <= 16:  # the centres of more sectors are too close to each other to avoid a visited one
+        raise ValueError(f"sectors is {sectors}; 2 to 16 are possible, {SECTORS} by default")
     if side not in (None, *get_args(Side)):
         raise ValueError(f"side {side!r} is unknown; use left or right, or None to decide by the candidates")
 
@@ -108,7 +93,7 @@ def next_view(
         candidates = np.sort(ranking.object_index[:_BEST])
     pose_of = dict(zip(ranking.object_index.tolist(), ranking.pose_deg.tolist(), strict=True))
     poses = np.array([pose_of[j] for j in candidates.tolist()])
-    centres_deg = (np.arange(sectors) + 0.5) * 360 / sectors
+    centres_deg: FloatArray = (np.arange(sectors) + 0.5) * (360 / sectors)
     s_left = _side_similarity(ranking.views, candidates, _next_sector(poses, +1, centres_deg)[0], centres_deg)
     s_right = _side_similarity(ranking.views, candidates, _next_sector(poses, -1, centres_deg)[0], centres_deg)
 
@@ -117,7 +102,7 @@ def next_view(
     sign = 1 if side == "left" else -1
     step = float(_next_sector(ranking.pose_deg[:1], sign, centres_deg)[1][0])
     here = float(ranking.orientation_deg[-1])
-    detour = _detour(here + sign * step, sign * 360 / sectors, np.append(visited, here), revisit_deg)
+    detour = _detour(here + sign * step, sign * 360 / sectors, ranking.orientation_deg)
     rotation = sign * (step + detour)
     return Decision(side, rotation, s_left, s_right, tuple(candidates.tolist()), wrap360(here + rotation), detour)
 
@@ -132,10 +117,8 @@ def _next_sector(pose_deg: FloatArray, sign: int, centres_deg: FloatArray) -> tu
 def _side_similarity(views: Views, candidates: IndexArray, places: IndexArray, centres_deg: FloatArray) -> float:
     """Return the sum of the similarities of all pairs of candidates, each in the sector at its place (Eq. 6)."""
     half_deg = 180 / len(centres_deg)
-    centres = centres_deg[places].tolist()
-    averages = np.stack(
-        [_average_view(views, j, centre, half_deg) for j, centre in zip(candidates.tolist(), centres, strict=True)]
-    )
+    own = zip(candidates.tolist(), centres_deg[places].tolist(), strict=True)
+    averages = np.stack([_average_view(views, j, centre_deg, half_deg) for j, centre_deg in own])
     return float(np.triu(tanimoto(averages, averages), k=1).sum())
 
 
@@ -150,9 +133,9 @@ def _average_view(views: Views, object_index: int, centre_deg: float, half_deg: 
     return mean
 
 
-def _detour(landing_deg: float, sector_deg: float, visited_deg: FloatArray, revisit_deg: float) -> float:
-    """Return the multiple of a sector, without sign, that leads to an orientation away from those visited."""
+def _detour(landing_deg: float, sector_deg: float, visited_deg: FloatArray) -> float:
+    """Return the multiple of a sector, without sign, that leads away from the visited orientations."""
     for count in range(round(360 / abs(sector_deg))):
-        if np.all(np.abs(wrap180(landing_deg + count * sector_deg - visited_deg)) > revisit_deg):
+        if np.all(np.abs(wrap180(landing_deg + count * sector_deg - visited_deg)) > _REVISIT_DEG):
             return count * abs(sector_deg)
     return 0.0

@@ -18,8 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hbr.core.arrays import FloatArray, ImageArray
-from hbr.core.validation import check_frame
+from hbr.core.arrays import FloatArray, ImageArray, check_frame
 from hbr.kernels import calls
 
 Mask = NDArray[np.bool_]
@@ -65,8 +64,6 @@ class Method(StrEnum):
     """The same network, with the background that the other views of the search or enrollment show."""
     GUESS = "guess"
     """The object has other colours than the frame's border. Often wrong."""
-    GIVEN_BOX = "given-box"
-    """The caller gave the box."""
     NONE = "none"
     """No object was found."""
 

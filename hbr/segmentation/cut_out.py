@@ -95,14 +95,13 @@ class Segmentation:
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """A silhouette or box that was found in a frame; the object is cut out only if it is needed.
+    """A silhouette that was found in a frame; the object is cut out only if it is needed.
 
-    Its attributes are those of `Segmentation`; ``given`` is a box that the caller gave.
+    Its attributes are those of `Segmentation`.
     """
 
     image: ImageArray
     silhouette: NDArray[np.bool_] | None
-    given: Box | None
     correction: Illumination | None
     agreement: float | None
     method: Method
@@ -111,8 +110,8 @@ class Found:
     @cached_property
     def box(self) -> Box | None:
         """The object's x, y, width and height in pixels of the frame; None if no object was found."""
-        if self.given is not None or self.silhouette is None:
-            return self.given
+        if self.silhouette is None:
+            return None
         height, width = self.image.shape[:2]
         return _box_of(self.silhouette, width, height)
 
@@ -131,8 +130,6 @@ class Found:
         if found is not None:
             ratio = found.shape[1] / width
             mask = _square(found.astype(np.uint8) * 255, left * ratio, top * ratio, side * ratio, cv2.BORDER_CONSTANT)
-        elif box is not None:
-            mask = _box_mask(box, left, top, side)
         else:
             mask = np.full((CROP_PX, CROP_PX), 255, np.uint8)
         gains = None if correction is None else correction.gains
@@ -150,14 +147,6 @@ def _box_of(found: NDArray[np.bool_], width: int, height: int) -> Box:
     across, down = width / found.shape[1], height / found.shape[0]
     left, top = int(x * across), int(y * down)
     return left, top, min(width, round((x + w) * across)) - left, min(height, round((y + h) * down)) - top
-
-
-def _box_mask(box: Box, left: float, top: float, side: float) -> NDArray[np.uint8]:
-    scale = CROP_PX / side
-    mask = np.zeros((CROP_PX, CROP_PX), np.uint8)
-    x, y = round((box[0] - left) * scale), round((box[1] - top) * scale)
-    mask[y : y + round(box[3] * scale), x : x + round(box[2] * scale)] = 255
-    return mask
 
 
 def _square(

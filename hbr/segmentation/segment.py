@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from hbr.core.arrays import ImageArray
 from hbr.segmentation.background import Background, Difference, Frame, Illumination, Issue, IssueCode, Mask, Method
 from hbr.segmentation.cut_out import Box, Found, Segmentation
-from hbr.segmentation.network import shares
-from hbr.segmentation.silhouette import guess_object, silhouette
+from hbr.segmentation.silhouette import guess_object, shares, silhouette
 
 #: Probabilities above which a pixel belongs to the object: of the first segmentation, and of further ones.
 _LEVELS: Final = (0.5, 0.2, 0.8)
@@ -33,7 +32,6 @@ def segment(
     image_bgr: ImageArray | Frame,
     *,
     empty_table: Background | ImageArray | None = None,
-    box: Box | None = None,
 ) -> Segmentation:
     """Find the object in a frame, crop it to a fixed size, and correct its illumination.
 
@@ -51,8 +49,6 @@ def segment(
         The frame; or a `hbr.segmentation.background.Frame`, if the frame is segmented more than once.
     empty_table : Background, or uint8 array (H, W, 3), optional
         The empty-table image. For many frames, pass a `Background`: it is prepared only once.
-    box : (int, int, int, int), optional
-        The object's x, y, width, height in pixels, if they are known. The object is not searched for then.
 
     Returns
     -------
@@ -62,18 +58,11 @@ def segment(
     Raises
     ------
     TypeError, ValueError
-        The frame is no such image, the empty-table image has another size, or the box is outside the frame.
+        The frame is no such image, or the empty-table image has another size.
     """
     frame = Frame.of(image_bgr)
     background, difference = compared(frame, empty_table)
-    height, width = frame.image.shape[:2]
-    if box is not None:
-        x, y, w, h = box
-        if w < 2 or h < 2 or x < 0 or y < 0 or x + w > width or y + h > height:
-            raise ValueError(
-                f"box {box} is not within the frame of {width} x {height} pixels; give x, y, width, height"
-            )
-    return _found(frame, background, difference, box).cut_out()
+    return _found(frame, background, difference).cut_out()
 
 
 def compared(frame: Frame, empty_table: Background | ImageArray | None) -> tuple[Background | None, Difference | None]:
@@ -90,12 +79,7 @@ def compared(frame: Frame, empty_table: Background | ImageArray | None) -> tuple
     return background, frame.difference(background)
 
 
-def _found(
-    frame: Frame,
-    background: Background | None,
-    difference: Difference | None,
-    box: Box | None = None,
-) -> Found:
+def _found(frame: Frame, background: Background | None, difference: Difference | None) -> Found:
     issues: list[Issue] = []
     correction: Illumination | None = None
     found: Mask | None = None
@@ -108,7 +92,7 @@ def _found(
                 issues.append(Issue(background.issue))
         else:
             issues.append(Issue(IssueCode.TABLE_DIFFERS, {"agreement": round(difference.agreement, 3)}))
-    if found is None and box is None:
+    if found is None:
         if frame.differs is not None:
             method = Method.PLAIN_BACKGROUND
             found = silhouette(frame.differs, framed=False)
@@ -121,12 +105,10 @@ def _found(
             found = None if cut is None else silhouette(cut, framed=False)
             if found is None:
                 issues.append(Issue(IssueCode.NO_GUESS))
-    if box is not None:
-        method = Method.GIVEN_BOX
-    elif found is None:
+    if found is None:
         method = Method.NONE
     agreement = None if difference is None else difference.agreement
-    return Found(frame.image, found, box, correction, agreement, method, tuple(issues))
+    return Found(frame.image, found, correction, agreement, method, tuple(issues))
 
 
 def hypotheses(
@@ -180,7 +162,7 @@ def hypotheses(
         if difference is not None:
             issues.insert(0, Issue(IssueCode.TABLE_DIFFERS, {"agreement": round(difference.agreement, 3)}))
         agreement = None if difference is None else difference.agreement
-        like = Found(frame.image, None, None, None, agreement, Method.NONE, tuple(issues))
+        like = Found(frame.image, None, None, agreement, Method.NONE, tuple(issues))
         share = shares(frame.small, learned.difference(frame.small), learned=True).object
         levels = _LEVELS if most > 1 else (_ENROLLED_LEVEL,)
         found = [*_by_network(share, Method.ROTATION, like, levels=levels)]
@@ -213,7 +195,7 @@ def _by_network(
 ) -> list[Found]:
     """Return the silhouettes at these probabilities, with the illumination and the evidence of another one."""
     masks = [mask for level in levels if (mask := _object_in(share, level)) is not None]
-    return [replace(like, silhouette=mask, given=None, method=method) for mask in masks]
+    return [replace(like, silhouette=mask, method=method) for mask in masks]
 
 
 def _object_in(share: NDArray[np.float32], level: float) -> Mask | None:
@@ -274,7 +256,7 @@ def stored_segmentation(
     found = mask_from(evidence[MASK], frame.small.shape[:2]) if MASK in evidence else None
     issues = tuple(_issue(one) for one in evidence.get("issues", ()))
     agreement = None if difference is None else difference.agreement
-    return Found(frame.image, found, None, correction, agreement, Method(evidence["method"]), issues).cut_out()
+    return Found(frame.image, found, correction, agreement, Method(evidence["method"]), issues).cut_out()
 
 
 def mask_text(found: Mask) -> str:

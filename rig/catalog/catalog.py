@@ -356,10 +356,10 @@ class Catalog(AbstractContextManager["Catalog"]):
         with self.database.write() as transaction:
             log.append(transaction, self.clock, action, object_name, details=details)
 
-    def log(self, *, since: datetime | None = None, object_name: str | None = None) -> list[Entry]:
+    def log(self, *, since: datetime | None = None) -> list[Entry]:
         """Return the log: who did what and when, oldest first."""
         with self.database.read() as transaction:
-            return log.entries(transaction, since, object_name)
+            return log.entries(transaction, since)
 
     def _start_session(
         self,

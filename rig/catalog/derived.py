@@ -19,10 +19,10 @@ from sqlalchemy import func, select
 from sqlalchemy.orm import Session as Transaction
 
 import hbr
-from hbr.core.cores import THREADS
 from hbr.dense.local_difference import LocalView
 from hbr.dense.session import near
 from hbr.descriptors import descriptor, names
+from hbr.kernels.library import THREADS
 from rig.calibrations.store import CALIBRATIONS
 from rig.catalog import log, state
 from rig.catalog.catalog import Catalog

@@ -18,8 +18,8 @@ from numpy.typing import ArrayLike, NDArray
 from sqlalchemy import delete, insert, select
 from sqlalchemy.orm import Session as Transaction
 
-from hbr.core.cores import THREADS
 from hbr.descriptors import Descriptor, descriptor, names
+from hbr.kernels.library import THREADS
 from rig.catalog.database import Database
 from rig.catalog.facts import Derived, Enrollment, seal_of
 from rig.catalog.images import Images

@@ -121,13 +121,11 @@ def shown(entry: Entry) -> dict[str, Any]:
     return {name: getattr(entry, name) for name in names}
 
 
-def entries(transaction: Transaction, since: datetime | None = None, object_name: str | None = None) -> list[Entry]:
+def entries(transaction: Transaction, since: datetime | None = None) -> list[Entry]:
     """Return the log, oldest first, with masked secrets."""
     wanted = select(Entry).order_by(Entry.id)
     if since is not None:
         wanted = wanted.where(Entry.time_utc >= since)
-    if object_name is not None:
-        wanted = wanted.where(Entry.object_name == object_name)
     found = list(transaction.scalars(wanted))
     transaction.expunge_all()
     for entry in found:

@@ -142,15 +142,13 @@ _OF_ITS_OBJECT: Final = ("yaw_deg", "yaw_sigma_deg", "period_deg", "confidence")
 
 @dataclass(frozen=True, slots=True)
 class ResultFilter:
-    """Which results to list; None and False mean all. Samples, objects and outcomes are those after corrections."""
+    """Which results to list; None means all. Samples, objects and outcomes are those after corrections."""
 
     sample: str | None = None
     object_name: str | None = None
     outcome: Outcome | None = None
-    bench: str | None = None
     since: datetime | None = None
     before: datetime | None = None
-    corrected: bool = False
 
     def lines(self) -> ColumnElement[bool]:
         """Return which answers have the right time; the other values may be corrected."""
@@ -160,10 +158,8 @@ class ResultFilter:
 
     def accepts(self, result: Result) -> bool:
         """Return whether the values after the last correction are the wanted ones."""
-        now = (result.provenance.bench, result.current.sample, result.current.object_name, result.current.outcome)
-        wanted = (self.bench, self.sample, self.object_name, self.outcome)
-        same = all(one in (None, value) for one, value in zip(wanted, now, strict=True))
-        return same and bool(result.corrections or not self.corrected)
+        wanted = (self.outcome, self.object_name, self.sample)
+        return all(one in (None, value) for one, value in zip(wanted, result.current, strict=True))
 
 
 def clean_text(text: str, what: str) -> str:

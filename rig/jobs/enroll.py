@@ -11,8 +11,8 @@ from rig.jobs.desk import Desk, Remark, Steps
 from rig.jobs.regions import warn_of_other_regions
 from rig.jobs.table_image import refresh_table_image
 from rig.plans.enroll import enroll as enroll_views
+from rig.plans.enroll import similar_objects
 from rig.plans.estimate import DryRun, dry_run
-from rig.plans.similar_objects import similar_objects
 from rig.plans.tray import TrayItem, enroll_tray, left_to_enroll
 
 

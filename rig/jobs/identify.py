@@ -12,9 +12,9 @@ from rig.events.events import Event, FrameUsed, Identified, Started
 from rig.jobs.desk import Desk, Steps
 from rig.jobs.regions import warn_of_other_regions
 from rig.jobs.table_image import refresh_table_image
+from rig.plans.identify import ResultRecorder
 from rig.plans.identify import identify as identify_one
 from rig.plans.identify import watch as watch_table
-from rig.plans.record import ResultRecorder
 from rig.search.model import CurrentModel
 from rig.search.saved_run import saving
 from rig.search.strategies import descriptor_for

@@ -11,7 +11,7 @@ Decisions: docs/decisions/0002, docs/decisions/0047.
 from collections.abc import Generator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from math import inf
 from typing import Final
@@ -20,16 +20,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hbr.core.angles import wrap360
+from hbr.model import symmetry
+from hbr.model.views import Views
 from rig.bench import Bench
 from rig.catalog import Catalog, OpenEnrollment, Provenance, View
 from rig.catalog.sessions import unfinished_camera_settings
 from rig.core.clock import seconds_between
-from rig.core.errors import LimitExceeded, ObjectMoved, RigError, RotationDisagreement
+from rig.core.errors import LimitExceeded, ObjectMoved, ObjectNotFound, RigError, RotationDisagreement
 from rig.core.json_form import plain
 from rig.core.next_steps import Do
 from rig.core.phrases import angle_words
 from rig.devices.camera import Frame
-from rig.events.events import Enrolled, Event, Rejected, ScanStarted, Started
+from rig.events.events import Enrolled, Event, Rejected, ScanStarted, SimilarObject, SimilarObjects, Started
 from rig.motion.flight_views import FlightFrames
 from rig.motion.move import Move
 from rig.motion.scan_speed import require_camera_time, scan_speed, takes_in_motion
@@ -45,6 +47,8 @@ SAME_SIMILARITY: Final = 0.97
 """Two images of an object at one angle are more similar; after a shift by a centimetre they are less similar."""
 NEAR_SHARE: Final = 0.6
 """Largest distance of a frame from its planned angle, as a share of the step."""
+SHOWN_SIMILAR: Final = 3
+"""Similar objects that are named after an enrollment."""
 HELD_DEG: Final = 15.0
 """Largest distance of a frame from its planned angle, as far as it is known during the revolution."""
 
@@ -416,3 +420,30 @@ def enroll(
     done = Enrolled(enrollment.object_name, views, retakes, seconds_between(started_ns, bench.clock.now_ns()))
     yield done
     return done
+
+
+def similar_objects(views: Views, name: str) -> SimilarObjects:
+    """Measure how similar an enrolled object is to itself from other sides, and to the other objects.
+
+    Raises `ObjectNotFound`: the object has no views.
+    """
+    if name not in views.object_names:
+        raise ObjectNotFound(
+            f"{name!r} has no complete enrollment.",
+            next_step=(Do.ENROLL(name=name), "Or", Do.CONTINUE_ENROLLMENT(name=name)),
+        )
+    number = views.object_names.index(name)
+    own = symmetry.symmetry(views, number)
+    return SimilarObjects(
+        name=name,
+        period_deg=own.period_deg if own else None,
+        neighbour_similarity=own.neighbours if own else None,
+        period_similarity=own.similarity if own else None,
+        objects=tuple(
+            SimilarObject(
+                name=views.object_names[one.object_index],
+                **{key: value for key, value in asdict(one).items() if key != "object_index"},
+            )
+            for one in symmetry.similar_objects(views, number, SHOWN_SIMILAR)
+        ),
+    )

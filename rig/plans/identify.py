@@ -3,7 +3,7 @@
 View, rank, decide, rotate, until the search ends. In motion, the first view is taken at rest. Then the table rotates
 along an arc; each frame is checked, described and added to the belief. Each time the frames have covered another step
 of the circle, the search decides: it ends during the rotation, continues, or gives the table another goal without a
-stop. If the table arrives first, the next view is taken at rest.
+stop. If the table arrives first, the next view is taken at rest. `ResultRecorder` records the answers in a catalog.
 
 Decisions: docs/decisions/0002, docs/decisions/0047.
 """
@@ -11,6 +11,7 @@ Decisions: docs/decisions/0002, docs/decisions/0047.
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
+from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -20,11 +21,18 @@ from hbr.core.angles import wrap360
 from hbr.dense.local_difference import LocalView
 from hbr.dense.session import answered
 from rig.bench import Bench, Placer
+from rig.catalog import Catalog, Provenance
+from rig.catalog.journal import open_for_enrollment
+from rig.catalog.records import Outcome
+from rig.catalog.results import Answer, NewResult, record
 from rig.config import RigConfig
-from rig.core.clock import seconds_between
-from rig.core.errors import CatalogError, MotionStopped, NoObject, RigError, ViewRejected
+from rig.config.catalog_place import CatalogPlace
+from rig.core.clock import Clock, seconds_between
+from rig.core.errors import CatalogError, CatalogUnavailable, MotionStopped, NoObject, RigError, ViewRejected
+from rig.core.next_steps import steps_as_json
 from rig.devices.camera import CameraLocks, Frame
 from rig.events.events import (
+    Accepted,
     Event,
     Failed,
     FrameUsed,
@@ -32,11 +40,13 @@ from rig.events.events import (
     Moved,
     Note,
     NoteCode,
+    Recorded,
     Rejected,
     Started,
     Waiting,
     WaitReason,
     Warned,
+    event_dict,
 )
 from rig.motion.flight_views import FlightFrames
 from rig.motion.move import FIRST_REST_S, Move
@@ -258,7 +268,6 @@ def identify(
     strategy: AnyStrategy | str | None = None,
     seed: int = 0,
     top: int = SHOWN,
-    empty_table: NDArray[np.uint8] | None = None,
     live: Callable[[FrameUsed], object] = lambda _: None,
 ) -> Generator[Event, None, Identified]:
     """Identify the object on the table; yields events and returns the answer.
@@ -287,9 +296,6 @@ def identify(
         For strategies that draw random numbers.
     top
         The number of candidates that the events name.
-    empty_table : uint8 array (H, W, 3), optional
-        The empty-table image for the segmentation; by default the one from `rig.search.model.empty_table_for`. With
-        this image, or with the bench's own, an empty table is noticed.
     live
         Called with the event of each frame of a search in motion while the table rotates; the plan yields these events
         when it has stopped. It must return at once.
@@ -315,10 +321,7 @@ def identify(
         require_camera_time(bench.config)
     viewer = Viewer(bench.camera, bench.config)
     check_camera(bench, model.camera)
-    notes = model.notes
-    if empty_table is None:
-        empty_table, more = empty_table_for(bench, model)
-        notes += more
+    empty_table, about_table = empty_table_for(bench, model)
     own = empty_table_status(bench).table if empty_table is None else None
     describe = SearchDescriber(
         bench.config.view,
@@ -338,7 +341,7 @@ def identify(
         strategy=search.strategy.name,
         seed=seed,
         descriptor=search.descriptor,
-        notes=notes,
+        notes=(*model.notes, *about_table),
     )
     # Take views until the search ends.
     kind = ViewsInMotion if search.in_motion else ViewsAtRest
@@ -440,3 +443,85 @@ def watch(
         with Turntable(bench) as table:
             if abs(table.rest_deg - home_deg) > bench.config.table.tolerance_deg:
                 yield moved(views, table.goto(home_deg))
+
+
+@dataclass(eq=False)
+class ResultRecorder:
+    """Records each answer of `identify` or `watch`, with the image of its first view.
+
+    An answer is never lost: show it before it is recorded. A catalog that cannot be written is a `Warned`.
+
+    Parameters
+    ----------
+    place
+        Place of the catalog.
+    bench
+        The bench that takes the views.
+    clock
+        Clock for the civil time of the results.
+    catalog_version
+        Returns `Catalog.version` of the views that the search has loaded.
+    operator
+        None for the user's account.
+    with_image
+        Whether to store images.
+
+    Attributes
+    ----------
+    sample
+        The sample on the table, None if it has no name. It is for one object: give it before each answer.
+    """
+
+    place: CatalogPlace | Path
+    bench: Bench
+    clock: Clock
+    catalog_version: Callable[[], str]
+    operator: str | None = None
+    with_image: bool = True
+    sample: str | None = field(default=None, init=False)
+    _image: NDArray[np.uint8] | None = field(default=None, init=False)
+    _azimuths_deg: list[float] = field(default_factory=list, init=False)
+
+    def add(self, event: Event) -> Recorded | Warned | None:
+        """Take the next event; record an answer, and return the event about it."""
+        match event:
+            case Started():
+                self._image, self._azimuths_deg = None, []
+            case Accepted():
+                if self.with_image and self._image is None:
+                    self._image = event.image_bgr
+                self._azimuths_deg.append(event.azimuth_deg)
+            case Identified():
+                recorded = self._record(event)
+                self.sample = None
+                return recorded
+            case Failed():
+                self.sample = None
+            case _:
+                pass
+        return None
+
+    def _record(self, answer: Identified) -> Recorded | Warned:
+        try:
+            new = NewResult(
+                Answer(Outcome(answer.outcome.value), next(iter(answer.possible), None), self.sample),
+                event_dict(answer),
+                tuple(self._azimuths_deg),
+                Provenance(self.bench.name, self.bench.devices(), self.bench.conditions),
+                self.catalog_version(),
+                self.operator,
+            )
+            try:
+                with Catalog.open(self.place, clock=self.clock, create=False) as catalog:
+                    return Recorded(record(catalog, new, self._image), self.sample)
+            except CatalogUnavailable:
+                with open_for_enrollment(CatalogPlace.of(self.place), self.clock) as journal:
+                    return Recorded(record(journal, new, self._image), self.sample)
+        except RigError as error:
+            return Warned(
+                None,
+                Note(
+                    NoteCode.NOT_RECORDED,
+                    {"what": error.what, "next_step": error.next_step, "steps": steps_as_json(error.steps)},
+                ),
+            )

@@ -21,7 +21,7 @@ from rig.events.events import (
 from rig.search.model import begin_search
 from rig.search.saved_run import SavedRun
 from rig.search.session import Search, saved_enrolled_views
-from rig.search.strategies import AnyStrategy, Finish
+from rig.search.strategies import Finish
 from rig.views.description import SearchDescriber
 
 TOLERANCE: Final = 1e-9
@@ -63,22 +63,16 @@ class Check:
     differences: list[Difference] = field(default_factory=list)
 
 
-def check(run: SavedRun, *, by: AnyStrategy | None = None) -> Check:
+def check(run: SavedRun) -> Check:
     """Describe every frame, search and decide again, and compare with what was saved.
-
-    Parameters
-    ----------
-    run
-        The run.
-    by
-        The strategy, if its name is not known to this program.
 
     Raises `UsageError`: the run cannot be read, or its strategy is not known.
     """
     started = run.started
     found = Check(is_complete=run.error is not None and not run.is_cut)
-    strategy = by or started.strategy
-    search = begin_search(run.model, run.config, strategy, seed=started.seed or 0, top=len(run.views.object_names))
+    search = begin_search(
+        run.model, run.config, started.strategy, seed=started.seed or 0, top=len(run.views.object_names)
+    )
     revise = not search.in_motion
     describe = SearchDescriber(run.config.view, run.views.descriptor, run.empty_table, revise=revise)
     table_deg = 0.0

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import hbr
-from hbr.core.validation import MIN_SIDE_PX
+from hbr.core.arrays import MIN_SIDE_PX
 from hbr.descriptors import PREFIX, Descriptor, descriptor, loaded_models
 from rig.bench import Bench
 from rig.config import RigConfig

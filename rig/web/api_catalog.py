@@ -22,7 +22,7 @@ from rig.catalog.results import Result, ResultFilter, correct, find_result, find
 from rig.catalog.transfer import CatalogSource, Conflict, Transferred, transfer
 from rig.core.errors import CatalogDamaged, CatalogError, JobNotFound
 from rig.core.json_form import plain
-from rig.plans.similar_objects import similar_objects
+from rig.plans.enroll import similar_objects
 from rig.views.description import BENCH_DESCRIPTOR, DESCRIPTORS
 from rig.web.answers import (
     Bundle,

@@ -168,11 +168,6 @@ def test_objects_are_scaled_to_the_same_size() -> None:
         assert len(columns) == pytest.approx(CROP_PX / 1.1 * 6 / 11, rel=0.15)
 
 
-def test_given_box_is_used() -> None:
-    seen = segment(with_object(table(5, patterned=True)), box=BOX)
-    assert (seen.box, seen.method, seen.gains, seen.issues) == (BOX, Method.GIVEN_BOX, None, ())
-
-
 def test_evidence_is_json() -> None:
     empty = table(0)
     seen = segment(with_object(empty), empty_table=empty)
@@ -188,8 +183,6 @@ def test_invalid_arguments_are_rejected() -> None:
     image = with_object(table(0))
     with pytest.raises(ValueError, match="the empty-table image has 100 x 80 pixels, the frame 320 x 240"):
         segment(image, empty_table=np.zeros((80, 100, 3), np.uint8))
-    with pytest.raises(ValueError, match=r"box \(300, 0, 40, 20\) is not within the frame"):
-        segment(image, box=(300, 0, 40, 20))
     with pytest.raises(TypeError, match="imread returns None"):
         segment(None)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="the frame has 300 x 15 pixels"):
@@ -216,8 +209,6 @@ def test_describe_segments_for_descriptors_of_the_object() -> None:
     again = hbr.descriptor("edges+colours").describe(segment(image, empty_table=Background(empty)))
     np.testing.assert_array_equal(levels, again)
     np.testing.assert_array_equal(hbr.describe(image), hbr.descriptor("cedd").describe(image))
-    with pytest.raises(ValueError, match="size is"):
-        hbr.describe(image, descriptor="edges", size=(80, 80))
 
 
 def test_bench_descriptor_is_robust_to_illumination_and_background() -> None:

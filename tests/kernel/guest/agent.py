@@ -30,8 +30,8 @@ IMPORTED = (
     *("rig.bench.hardware", "rig.catalog", "rig.catalog.results", "rig.cli.main", "rig.cli.ui.live"),
     *("rig.cli.ui.prompts", "rig.cli.ui.present", "rig.doctor.checks", "rig.doctor.device_scan"),
     *("rig.doctor.single_servo", "rig.motion.stop_request", "rig.plans.enroll", "rig.plans.identify"),
-    *("rig.plans.photograph_table", "rig.plans.record", "rig.plans.similar_objects", "rig.plans.tray"),
-    *("rig.plans.watch", "rig.report.pictures", "rig.search.model", "dynamixel_easy_sdk"),
+    *("rig.plans.photograph_table", "rig.plans.tray"),
+    *("rig.report.pictures", "rig.search.model", "dynamixel_easy_sdk"),
     *("rich._emoji_codes", "typer._adapters"),
 )
 """Modules that are imported once for all programs, because an emulated processor takes seconds for it."""

@@ -70,9 +70,7 @@ def test_results_are_filtered(catalog: Catalog) -> None:
     assert numbers(catalog, sample="S-2") == [2]
     assert numbers(catalog, object_name="mug") == [1]
     assert numbers(catalog, outcome=Outcome.UNKNOWN) == [3]
-    assert numbers(catalog, bench="another") == []
     assert numbers(catalog, since=times[1], before=times[2]) == [2]
-    assert numbers(catalog, corrected=True) == []
 
 
 def test_correction_keeps_the_answer_and_is_in_the_log(catalog: Catalog) -> None:

@@ -114,7 +114,6 @@ class TestLog:
         assert (log[2].object_name, log[2].details) == ("cup", {"before": "mug"})
         assert log[4].details == {"to_deg": 90.0}
         assert [e.action for e in catalog.log(since=begun + timedelta(minutes=1))] == ["renamed", "deleted", "moved"]
-        assert [e.action for e in catalog.log(object_name="mug")] == ["enrollment started", "enrolled"]
 
         with closing(sqlite3.connect(catalog.path / "catalog.sqlite", isolation_level=None)) as connection:
             for change in ("DELETE FROM log", "UPDATE log SET user = 'nobody'"):

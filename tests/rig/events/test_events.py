@@ -35,11 +35,9 @@ from rig.events.events import (
     event_of,
 )
 from rig.motion.scan_speed import SpeedLimit
-from rig.plans.enroll import enroll
-from rig.plans.identify import identify
+from rig.plans.enroll import enroll, similar_objects
+from rig.plans.identify import ResultRecorder, identify
 from rig.plans.photograph_table import photograph_table
-from rig.plans.record import ResultRecorder
-from rig.plans.similar_objects import similar_objects
 from rig.plans.tray import TrayItem, enroll_tray
 from rig.safety.gyro_rotation import Stillness
 from rig.search.model import load_model, model_of

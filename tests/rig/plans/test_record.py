@@ -12,7 +12,7 @@ from rig.catalog.results import find_results
 from rig.core.next_steps import Do
 from rig.events.events import Accepted, Identified, NoteCode, Recorded, Warned
 from rig.events.wording import note_steps
-from rig.plans.record import ResultRecorder
+from rig.plans.identify import ResultRecorder
 from tests.rig.report.report_samples import identifying
 
 

@@ -1,5 +1,7 @@
 """The dense search on the simulated bench, with and without an empty-table image."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -28,6 +30,11 @@ def shelf(tmp_path_factory):
         for name in ("lamp", "dice", "teapot"):
             list(enroll(bench, catalog, name, views=8))
         return load_model(catalog)
+
+
+def with_table(model, image_bgr):
+    """Return the model as if its objects had been enrolled with this empty-table image."""
+    return replace(model, with_empty_table=True, empty_table=image_bgr)
 
 
 def codes(started):
@@ -84,7 +91,7 @@ def test_image_of_today_comes_before_the_image_of_the_enrollment(simulated, tmp_
 @pytest.mark.parametrize("shape", [(10, 10, 3), (480, 640, 3)])
 def test_image_of_another_size_is_rejected_and_the_search_continues(simulated, shelf, shape):
     s = simulated()
-    events, answer = search(s, shelf, "lamp", empty_table=np.full(shape, 90, np.uint8))
+    events, answer = search(s, with_table(shelf, np.full(shape, 90, np.uint8)), "lamp")
     assert answer.name == "lamp"
     issue = {"code": "empty-table-size", "table_px": [shape[1], shape[0]], "frame_px": [320, 240]}
     assert all(issue in e.segmentation["issues"] for e in events if isinstance(e, Accepted))
@@ -93,7 +100,7 @@ def test_image_of_another_size_is_rejected_and_the_search_continues(simulated, s
 def test_image_of_another_bench_is_reported_once_and_not_used(simulated, shelf):
     s = simulated("identify.max_views=5")
     other = np.random.default_rng(0).integers(0, 256, (240, 320, 3), np.uint8)
-    events, answer = search(s, shelf, "radio", empty_table=other)
+    events, answer = search(s, with_table(shelf, other), "radio")
     (warned,) = [e for e in events if isinstance(e, Warned)]
     assert warned.index == 2
     assert warned.note.code is NoteCode.EMPTY_TABLE_CHANGED
