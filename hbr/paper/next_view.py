@@ -93,7 +93,7 @@ def next_view(ranking: Ranking, *, side: Side | None = None, sectors: int = SECT
         candidates = np.sort(ranking.object_index[:_BEST])
     pose_of = dict(zip(ranking.object_index.tolist(), ranking.pose_deg.tolist(), strict=True))
     poses = np.array([pose_of[j] for j in candidates.tolist()])
-    centres_deg: FloatArray = (np.arange(sectors) + 0.5) * (360 / sectors)
+    centres_deg = (np.arange(sectors, dtype=np.float64) + 0.5) * (360 / sectors)
     s_left = _side_similarity(ranking.views, candidates, _next_sector(poses, +1, centres_deg)[0], centres_deg)
     s_right = _side_similarity(ranking.views, candidates, _next_sector(poses, -1, centres_deg)[0], centres_deg)
 

@@ -25,6 +25,7 @@ def test_views_are_found_sorted_and_the_missing_counted(tmp_path: Path) -> None:
     assert dataset.objects[0].azimuth_deg.tolist() == [0, 90.5, 180, 270]
     assert (dataset.views, dataset.spacing_deg, dataset.missing, dataset.ignored) == (9, 90, 3, 1)
     assert [item.name for item in dataset.subset(2, 3).objects] == ["obj3", "obj10"]
+    assert dataset.every(2).objects[0].azimuth_deg.tolist() == [0, 180]
     with pytest.raises(DatasetError, match="3-4"):
         dataset.subset(3, 4)
 

@@ -6,7 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hbr.evaluation.condition import Condition, Noise, gaussian, motion_kernel
+import hbr
+from hbr.evaluation.condition import Condition, EvaluationImage, Noise, _levels, gaussian, motion_kernel
 from hbr.evaluation.photographs import object_mask
 from tests.fuzzing import examples
 
@@ -131,3 +132,38 @@ def test_mask_excludes_the_dark_surroundings_of_a_photograph(
     mask = object_mask(image)  # type: ignore[arg-type]
     assert low < mask.mean() < high
     assert not mask[[2, 2, -3, -3], [2, -3, 2, -3]].any()  # the outermost pixel of some is bright
+
+
+def disc(size: int = 96) -> np.ndarray:
+    image = np.zeros((size, size, 3), np.uint8)
+    cv2.circle(image, (size // 2, size // 2), size // 4, (40, 160, 220), -1)
+    return image
+
+
+@pytest.mark.parametrize("background", ["uniform", "textured"])
+def test_enrolled_views_get_a_background_of_their_own(background: str) -> None:
+    condition = Condition(enrolled_background=background)  # type: ignore[arg-type]
+    shown = [condition.enrolled(disc(), np.random.default_rng(seed)).image for seed in (1, 2)]
+    for image in shown:
+        np.testing.assert_array_equal(image[48, 48], [40, 160, 220])
+    assert np.abs(shown[0][:8].astype(int) - shown[1][:8]).mean() > 10
+
+
+def test_cut_out_object_is_described_before_an_even_grey() -> None:
+    image = np.where(disc() > 0, disc(), np.uint8(200))
+    (levels,) = _levels([EvaluationImage(image)], Condition(cut_out=True))
+    np.testing.assert_array_equal(levels, hbr.describe(hbr.segment(image).alone))
+    assert (levels != hbr.describe(image)).any()
+
+
+@pytest.mark.parametrize(
+    ("keys", "words"),
+    [
+        ({"background": "bench", "enrolled_background": "uniform"}, "leave enrolled_background out"),
+        ({"enrolled_background": "striped"}, "use same, uniform or textured"),
+        ({"descriptor": "edges+colours", "cut_out": True}, "leave cut_out out"),
+    ],
+)
+def test_conditions_that_exclude_each_other_are_rejected(keys: dict[str, object], words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        Condition(**keys)  # type: ignore[arg-type]

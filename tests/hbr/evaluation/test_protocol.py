@@ -206,3 +206,18 @@ def test_methods_are_chosen_by_name_and_group() -> None:
         choose_methods(["best"])
     with pytest.raises(ValueError, match="no method"):
         choose_methods([])
+
+
+def test_measured_errors_of_rotations_add_up() -> None:
+    """With one error of 3 degrees, the measured orientation of view n is 3 (n + 1) degrees too large."""
+    protocol = replace(PROTOCOL, rotation_errors_deg=(3.0,))
+    trials = _Trials(0, QUERIES[VIEWS.of(0)], VIEWS, protocol, None, lambda: 0)
+    other = _Trials(0, QUERIES[VIEWS.of(0)], VIEWS, PROTOCOL, None, lambda: 0)
+    np.testing.assert_allclose(trials.draw(0).error_deg, [3, 6, 9, 12, 15])
+    np.testing.assert_array_equal(trials.draw(0).order, other.draw(0).order)
+    np.testing.assert_array_equal(trials.draw(0).coins, other.draw(0).coins)
+
+
+def test_error_that_is_no_number_is_rejected() -> None:
+    with pytest.raises(ValueError, match="not a finite number"):
+        Protocol(rotation_errors_deg=(0.1, float("nan")))

@@ -136,3 +136,24 @@ def test_given_side_replaces_the_decision_and_keeps_the_step() -> None:
     assert (forced.s_left, forced.s_right) == (decided.s_left, decided.s_right)
     with pytest.raises(ValueError, match="left or right"):
         next_view(ranking, side="up")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("sectors", [2, 3, 4, 8, 16])
+def test_rotation_ends_at_a_centre_of_the_sectors(sectors: int) -> None:
+    """The only candidate was seen at 7 and 50 degrees, which are no centres."""
+    views = Views.of_object("one", np.ones((72, 144), np.uint8), np.arange(72) * 5.0)
+    ranking = retrieve(np.ones((2, 144), np.uint8), [7.0, 50.0], ViewIndex(views))
+    width_deg = 360 / sectors
+    for side in ("left", "right"):
+        decision = next_view(ranking, side=side, sectors=sectors)
+        ends_deg = ranking.pose_deg[0] + decision.rotation_deg
+        assert (ends_deg / width_deg) % 1 == pytest.approx(0.5)
+        assert 0 < abs(decision.rotation_deg) - decision.detour_deg <= width_deg
+
+
+@pytest.mark.parametrize("sectors", [1, 17])
+def test_impossible_numbers_of_sectors_are_rejected(sectors: int) -> None:
+    views = Views.of_object("one", np.ones((8, 144), np.uint8), np.arange(8) * 45.0)
+    ranking = retrieve(np.ones((2, 144), np.uint8), [0.0, 90.0], ViewIndex(views))
+    with pytest.raises(ValueError, match="2 to 16"):
+        next_view(ranking, sectors=sectors)

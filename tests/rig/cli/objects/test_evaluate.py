@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 from rig.catalog import Catalog, Provenance, View
 from rig.cli.objects.evaluate import evaluate
 from rig.core.clock import SystemClock
-from rig.evaluation.experiments import load_experiment, shipped
+from rig.evaluation.experiments import load_experiment, rotation_errors, shipped
 from tests.programs import server
 
 app = typer.Typer()
@@ -254,6 +254,25 @@ def test_other_settings_have_other_folders(photographs: Path, tmp_path: Path, mo
     names = sorted(path.name for path in Path("rig-eval").iterdir())
     assert [name.split("-", 2)[2][:-9].split("-", 1)[-1] for name in names] != []
     assert len(names) == 2
+
+
+def test_orientation_errors_come_from_a_calibration(tmp_path: Path) -> None:
+    """The errors are the gyro's rotations minus the encoder's, without the moves that were not valid."""
+    legs = [(60.0, 60.5, ""), (-60.0, 59.75, ""), (60.0, 90.0, "stopped")]
+    moves = [{"leg": {"encoder_deg": a, "gyro_deg": b, "invalid": why}} for a, b, why in legs]
+    file = tmp_path / "imu.rotation.json"
+    file.write_text(json.dumps({"evidence": {"moves": moves}}))
+    assert rotation_errors(str(file)) == (0.5, -0.25)
+    shipped_errors = load_experiment("orientation-mpu6050").protocol.rotation_errors_deg
+    assert np.std(shipped_errors) == pytest.approx(0.044, abs=0.001)
+
+
+@pytest.mark.parametrize("content", ["", "[]", "{}", '{"rotation_errors_deg": []}', '{"rotation_errors_deg": ["x"]}'])
+def test_unusable_orientation_errors_are_rejected(tmp_path: Path, content: str) -> None:
+    file = tmp_path / "errors.json"
+    file.write_text(content)
+    with pytest.raises(ValueError, match=r"rig calibrate imu"):
+        rotation_errors(str(file))
 
 
 def test_experiments_of_the_results_are_shipped(tmp_path: Path) -> None:
