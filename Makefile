@@ -53,7 +53,7 @@ test-web: $(READY) $(LIBRARY)
 	@sh .ci/install .ci/browser.lock
 	@$(BIN)/python -m pytest -rs -m "" --timeout 300 tests/browser
 
-# This installs nothing. docs/how-to/test-with-real-drivers.md explains how to get the kernel (docs/decisions/0043).
+# This installs nothing. docs/how-to/test-with-real-drivers.md explains how to get the kernel (docs/decisions/0001).
 KERNEL_FOLDER := $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/hbr-rig/kernel
 kernel-test: export RIG_TEST_KERNEL ?= $(KERNEL_FOLDER)
 kernel-test: $(READY) $(LIBRARY)
@@ -91,8 +91,7 @@ bench: $(READY) $(LIBRARY)
 
 # Locked versions with their hashes, for every platform and Python that the project supports. No address of an index is in
 # the files, so that uv and pip install the same from any. requirements.lock is for development, .ci/core.lock for the program
-# and its build; what runs outside of .venv has lock files of its own
-# (docs/decisions/0006).
+# and its build; what runs outside of .venv has lock files of its own.
 lock:
 	uv pip compile --universal --python-version 3.11 --generate-hashes --extra dev --upgrade \
 	    --no-header --no-emit-index-url pyproject.toml -o requirements.lock
@@ -111,7 +110,7 @@ $(CORE): .ci/core.lock pyproject.toml
 	@sh .ci/setup "$(PYTHON)" .ci/core.lock
 	@touch $@
 
-# Compile the kernels if there is a C compiler. Without one, NumPy is used instead (docs/decisions/0040).
+# Compile the kernels if there is a C compiler. Without one, NumPy is used instead (docs/decisions/0021).
 # The library contains a digest of its sources, which shows whether it is current. File times do not show a removed file.
 $(LIBRARY): FORCE | $(CORE)
 	@$(BIN)/python hbr/kernels/compile.py

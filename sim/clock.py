@@ -1,6 +1,6 @@
 """Virtual time: integer nanoseconds that pass only while a program sleeps.
 
-Decision: docs/decisions/0003.
+Decision: docs/decisions/0001.
 """
 
 import heapq

@@ -8,7 +8,7 @@ The search decides each time the frames have covered another step of the circle.
 after the first view. It also decides which objects are unknown, from a few frames that are far apart. The confidence
 that ends a search later comes from leave-one-out searches along such arcs, with as many decisions and the same weights.
 
-Decisions: docs/decisions/0047, docs/decisions/0055.
+Decision: docs/decisions/0019.
 """
 
 from collections.abc import Sequence

@@ -9,7 +9,7 @@ that 68 % and 95 % of the true azimuths lie within one and two standard uncertai
 parts, the object looks the same every 360° / n. If it is spread over most azimuths, the object looks the same from all
 sides. Coverage: docs/results.md; `python -m benchmarks.pose_coverage`.
 
-Decision: docs/decisions/0025.
+Decision: docs/decisions/0014.
 """
 
 from dataclasses import dataclass

@@ -6,7 +6,7 @@ several segmentations. Both evaluate each search twice: among all objects, and a
 `rule_from_searches` sets the thresholds from these searches, and `fit_open_set` fits the open-set score to changes of
 the bench.
 
-Decisions: docs/decisions/0026, docs/decisions/0049, docs/decisions/0059, docs/decisions/0060.
+Decision: docs/decisions/0015.
 """
 
 from collections.abc import Callable, Iterable, Sequence

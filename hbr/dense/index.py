@@ -12,7 +12,7 @@ Whitened descriptions, in which the properties that distinguish the enrolled vie
 score. Source: B. Hariharan, J. Malik and D. Ramanan, "Discriminative decorrelation for clustering and classification",
 ECCV 2012.
 
-Decision: docs/decisions/0025.
+Decision: docs/decisions/0014.
 """
 
 from collections.abc import Callable

@@ -11,11 +11,11 @@ for enrolled views in place of the views of the search; each is left out of the 
 scores show whether the objects can be distinguished from these sides, and how much a score scatters. Cantelli's
 inequality bounds the error rate.
 
-Decision: docs/decisions/0057.
+Decision: docs/decisions/0016.
 
 `fit` compares a view with an enrolled one, after registration, in any light: logarithms of the brightness and of two
 ratios of the colours, minus their medians. Another exposure or another colour of the light only adds a constant to them
-(docs/decisions/0059).
+(docs/decisions/0016).
 """
 
 from collections.abc import Sequence

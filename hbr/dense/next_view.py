@@ -1,6 +1,6 @@
 """The next best view: the rotation after which the strongest hypotheses of the belief are least similar.
 
-Decision: docs/decisions/0032.
+Decision: docs/decisions/0014.
 """
 
 from dataclasses import dataclass

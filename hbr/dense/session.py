@@ -12,7 +12,7 @@ views (`NeedEnrolledViews`); its driver brings them. `DenseSession.end` is the d
 
 The comparisons themselves are in `hbr.dense.local_difference`.
 
-Decisions: docs/decisions/0054, docs/decisions/0057, docs/decisions/0059, docs/decisions/0060, docs/decisions/0064.
+Decisions: docs/decisions/0013, docs/decisions/0016, docs/decisions/0015, docs/decisions/0017.
 """
 
 from collections.abc import Callable, Generator, Sequence

@@ -14,7 +14,7 @@ Sources: B. Hariharan, J. Malik and D. Ramanan, "Discriminative decorrelation fo
 2012 (whitening); R. Auckenthaler, M. Carey and H. Lloyd-Thomas, "Score normalization for text-independent speaker
 verification systems", Digital Signal Processing 10, 2000 (comparison with a cohort).
 
-Decisions: docs/decisions/0026, docs/decisions/0049, docs/decisions/0059, docs/decisions/0060.
+Decision: docs/decisions/0015.
 """
 
 from collections.abc import Callable, Sequence

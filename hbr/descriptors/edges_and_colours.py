@@ -3,7 +3,7 @@
 - `Edges`: a coarse histogram of oriented gradients, in 128 bytes.
 - `Colours`: the distribution of colours, in 32 bytes.
 
-Decision: docs/decisions/0023.
+Decision: docs/decisions/0012.
 """
 
 from dataclasses import dataclass

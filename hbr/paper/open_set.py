@@ -1,6 +1,6 @@
 """Unknown objects in the paper's retrieval: the margin over all enrolled objects, and a threshold of the score.
 
-Decision: docs/decisions/0007.
+Decision: docs/decisions/0018.
 """
 
 from typing import Final

@@ -5,7 +5,7 @@ images and the logarithm of the grey levels. There a change of exposure, of whit
 plane to each channel, and a shadow subtracts the same amount from all three channels. `plain_difference` needs no
 image: the background is plain.
 
-Decision: docs/decisions/0024.
+Decision: docs/decisions/0012.
 """
 
 from collections.abc import Mapping, Sequence

@@ -5,7 +5,7 @@ is known, the frame's difference from it. The background is known from the empty
 table rotated. The weights are in the wheel. The model card says how they were made:
 docs/explanation/segmentation-network.md.
 
-Decision: docs/decisions/0048.
+Decision: docs/decisions/0013.
 """
 
 from functools import cache, lru_cache

@@ -3,7 +3,7 @@
 Everything is read from Linux files (sysfs, /proc, /etc) below a root folder, so that a simulated bench or a test can
 provide its own computer. Devices are opened by the same functions as for a bench.
 
-Decision: docs/decisions/0013.
+Decision: docs/decisions/0008.
 """
 
 import grp

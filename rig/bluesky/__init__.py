@@ -1,6 +1,6 @@
 """The bench for bluesky (extra ``bluesky``): devices for a RunEngine, and enroll and identify as plans.
 
-Decision: docs/decisions/0052.
+Decision: docs/decisions/0020.
 """
 
 from rig.bluesky.devices import BenchDevices, CameraDevice, ImuDevice, TableDevice

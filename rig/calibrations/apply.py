@@ -1,6 +1,6 @@
 """Apply the settings of calibration results to the configuration.
 
-Decision: docs/decisions/0027.
+Decision: docs/decisions/0022.
 """
 
 from collections.abc import Iterable

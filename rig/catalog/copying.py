@@ -3,7 +3,7 @@
 A whole copy, between SQLite and PostgreSQL, has the id and the digest of every row. The local copy has the log without
 answers, the enrollments that searches use, and their descriptions: searches read it while the server does not answer.
 
-Decision: docs/decisions/0051.
+Decision: docs/decisions/0011.
 """
 
 import json

@@ -1,6 +1,6 @@
 """The database of a catalog: SQLite in a file, or PostgreSQL for several benches.
 
-Decision: docs/decisions/0050.
+Decision: docs/decisions/0011.
 """
 
 import uuid

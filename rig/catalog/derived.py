@@ -4,7 +4,7 @@ The views of an enrollment are segmented and described together, once, when it e
 result is kept in the catalog's table ``derived``. It names the enrollment by its seal, and the versions that made it. A
 missing, old or damaged result is computed again, so the table can be emptied at any time.
 
-Decisions: docs/decisions/0042, docs/decisions/0053.
+Decision: docs/decisions/0010.
 """
 
 import re

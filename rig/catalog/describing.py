@@ -1,6 +1,6 @@
 """Segmentation and description of the views of an enrollment, together, and how the result is stored.
 
-Decisions: docs/decisions/0042, docs/decisions/0053.
+Decision: docs/decisions/0010.
 """
 
 import hashlib

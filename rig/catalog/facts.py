@@ -3,7 +3,7 @@
 What is true now follows from the rows (`rig.catalog.state`). Each row has a digest of its values, and each line of the
 log also covers the digest of the line before it, so a change that this program did not make is found.
 
-Decision: docs/decisions/0034.
+Decision: docs/decisions/0009.
 """
 
 import hashlib

@@ -2,7 +2,7 @@
 
 Commands and the web server open their catalogs here, so that each of them works while the server does not answer.
 
-Decision: docs/decisions/0051.
+Decision: docs/decisions/0011.
 """
 
 import fcntl

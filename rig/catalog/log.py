@@ -1,6 +1,6 @@
 """The log: who did what and when. Lines are only added, in the transaction of the change itself, as a chain of digests.
 
-Decision: docs/decisions/0016.
+Decision: docs/decisions/0009.
 """
 
 import os

@@ -1,6 +1,6 @@
 """A catalog in a PostgreSQL database, for several benches at once.
 
-Decision: docs/decisions/0050.
+Decision: docs/decisions/0011.
 """
 
 from collections.abc import Iterator

@@ -2,7 +2,7 @@
 
 An answer and a correction are lines of the log. Results are numbered from 1.
 
-Decision: docs/decisions/0036.
+Decision: docs/decisions/0009.
 """
 
 import secrets

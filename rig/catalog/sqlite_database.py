@@ -1,6 +1,6 @@
 """The SQLite file of a catalog, and its transactions.
 
-Decision: docs/decisions/0014.
+Decision: docs/decisions/0009.
 """
 
 import os

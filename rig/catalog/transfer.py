@@ -3,7 +3,7 @@
 Everything is checked first. The images are stored next, which does no harm if nothing follows: an image has its SHA-256
 as its name. At last, one transaction adds all rows and lines of the log.
 
-Decision: docs/decisions/0015.
+Decision: docs/decisions/0011.
 """
 
 import secrets

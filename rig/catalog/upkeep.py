@@ -1,6 +1,6 @@
 """Statistics of a catalog, and the final removal of deleted data.
 
-Decision: docs/decisions/0016.
+Decision: docs/decisions/0009.
 """
 
 from collections.abc import Collection

@@ -1,6 +1,6 @@
 """Check whether a catalog is as it was stored. Only digests are compared: everything that is stored has one.
 
-Decision: docs/decisions/0034.
+Decision: docs/decisions/0009.
 """
 
 import threading

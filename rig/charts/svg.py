@@ -1,7 +1,7 @@
 """SVG elements for all charts: escaped text, and equal bytes for equal numbers.
 
 Shapes have classes. One style sheet, `chart.css`, gives them their colours in light and dark mode.
-Decision: docs/decisions/0035.
+Decision: docs/decisions/0023.
 """
 
 from collections.abc import Iterable

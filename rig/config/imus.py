@@ -3,7 +3,7 @@
 `rig.config` takes the names and addresses from it, `rig.devices.imu` the driver, the search and the doctor the
 identities, and the simulator the simulated sensor. A package adds rows by entry points of the group ``rig.imus``.
 
-Decision: docs/decisions/0041.
+Decision: docs/decisions/0007.
 """
 
 from dataclasses import dataclass

@@ -3,7 +3,7 @@
 A next step is a list of sentences, for what only hands can do, and of actions of the rig with their parameters. This
 module words it for a terminal. The page `rig.web.pages` words it as buttons and links.
 
-Decision: docs/decisions/0066.
+Decision: docs/decisions/0002.
 """
 
 import re

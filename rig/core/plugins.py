@@ -1,6 +1,6 @@
 """Objects that other packages name in their entry points.
 
-Decision: docs/decisions/0041.
+Decision: docs/decisions/0007.
 """
 
 from collections.abc import Iterator

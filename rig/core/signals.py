@@ -1,6 +1,6 @@
 """Signals that end the program. They unwind the stack once, and do not interrupt a clean-up that has begun.
 
-Decision: docs/decisions/0033.
+Decision: docs/decisions/0003.
 """
 
 import atexit

@@ -4,7 +4,7 @@ Registers and times: BST-BNO055-DS000. It runs in its IMU mode (gyro and acceler
 and steel distort the magnetic field). It has no FIFO. The rotation between two readings comes from the orientation that
 it integrates itself, if that is less than half a revolution.
 
-Decision: docs/decisions/0011.
+Decision: docs/decisions/0007.
 """
 
 from dataclasses import dataclass

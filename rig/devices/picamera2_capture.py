@@ -4,7 +4,7 @@ libcamera, which develops the images of these sensors, cannot be reached through
 interface of `cv2.VideoCapture`, so that `rig.devices.opencv_camera.OpenCvCamera` locks and reads back its settings as
 those of any camera. picamera2 is imported only when such a camera is opened.
 
-Decision: docs/decisions/0045.
+Decision: docs/decisions/0007.
 """
 
 import importlib

@@ -1,6 +1,6 @@
 """Run the checks of a bench, each in a thread: a check that hangs or fails becomes a finding.
 
-Decision: docs/decisions/0013.
+Decision: docs/decisions/0008.
 """
 
 from collections.abc import Callable, Iterable, Iterator

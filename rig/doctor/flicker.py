@@ -108,7 +108,7 @@ def standing_flicker(
 
     One exposure time does not separate bands from the scene. An exposure of whole periods of the lamp has no bands:
     the quotient of both is the bands, and a smooth function of the level if the camera's response is not linear.
-    Decision: docs/decisions/0056.
+    Decision: docs/decisions/0008.
 
     Parameters
     ----------

@@ -3,7 +3,7 @@
 They are also the schema of their JSON: of `--json`, of saved runs, of the REST interface and of its documents. Names,
 types and descriptions of the fields are only here.
 
-Decision: docs/decisions/0063.
+Decision: docs/decisions/0002.
 """
 
 from collections.abc import Mapping

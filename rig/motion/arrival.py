@@ -1,6 +1,6 @@
 """The end of a motion: whether the table has arrived, why a motion failed, and how a moving table stops.
 
-Decision: docs/decisions/0044.
+Decision: docs/decisions/0005.
 """
 
 from collections import deque

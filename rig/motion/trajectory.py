@@ -13,7 +13,7 @@ motion. Prior knowledge enters as further readings: the bias that was measured a
 scale. The platter's angle is the same sum without c·α and o. Angles are those that the encoder shows when the platter
 is driven upwards. Views at rest are taken in this state, because the table approaches each angle from below.
 
-Decision: docs/decisions/0046.
+Decision: docs/decisions/0019.
 """
 
 from dataclasses import dataclass, field

@@ -1,6 +1,6 @@
 """The table: rotates to an angle, always from the same side, waits for rest, and measures the rotation.
 
-Decision: docs/decisions/0004.
+Decision: docs/decisions/0005.
 """
 
 from collections.abc import Callable, Iterator

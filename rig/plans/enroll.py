@@ -5,7 +5,7 @@ revolution. For each planned angle the plan holds the nearest frame in memory. A
 the platter gives each frame its angle, and each frame is checked like a view at rest. Nothing is stored before that, so
 an interrupted revolution leaves no view. Views that fail or are missing are then taken at rest.
 
-Decisions: docs/decisions/0002, docs/decisions/0047.
+Decisions: docs/decisions/0002, docs/decisions/0019.
 """
 
 from collections.abc import Generator, Mapping

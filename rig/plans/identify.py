@@ -5,7 +5,7 @@ along an arc; each frame is checked, described and added to the belief. Each tim
 of the circle, the search decides: it ends during the rotation, continues, or gives the table another goal without a
 stop. If the table arrives first, the next view is taken at rest. `ResultRecorder` records the answers in a catalog.
 
-Decisions: docs/decisions/0002, docs/decisions/0047.
+Decisions: docs/decisions/0002, docs/decisions/0019.
 """
 
 from collections.abc import Callable, Generator, Sequence

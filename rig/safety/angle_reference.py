@@ -3,7 +3,7 @@
 The servo counts its own revolutions, but only as long as it has its supply. `TableRecord` is the stored state: angle,
 revolutions of the cable, latched fault.
 
-Decision: docs/decisions/0009.
+Decision: docs/decisions/0004.
 """
 
 from dataclasses import dataclass, replace

@@ -2,7 +2,7 @@
 
 `BenchLock` reserves the bench for one program.
 
-Decision: docs/decisions/0009.
+Decision: docs/decisions/0004.
 """
 
 import errno

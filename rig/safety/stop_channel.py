@@ -4,7 +4,7 @@ A connection is a request. It waits in the kernel until the program looks, so a 
 thread, and a program that dies answers at once: its connections close. The permissions of the folder and of the socket
 decide who may stop the bench.
 
-Decision: docs/decisions/0062.
+Decision: docs/decisions/0003.
 """
 
 import os

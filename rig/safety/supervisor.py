@@ -10,7 +10,7 @@ A state cannot be set: it changes only by an event in the table of transitions. 
 end by arriving, by a stop or by a latched fault. A fault outlives the process and an unplugged cable. It ends when its
 cause is removed and the operator acknowledges it.
 
-Decision: docs/decisions/0008.
+Decision: docs/decisions/0003.
 """
 
 from collections.abc import Callable, Iterator, Mapping

@@ -2,7 +2,7 @@
 
 `CurrentModel` is that of a catalog, loaded again when the catalog has changed.
 
-Decision: docs/decisions/0030.
+Decision: docs/decisions/0017.
 """
 
 from collections.abc import Callable, Mapping

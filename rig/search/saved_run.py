@@ -5,7 +5,7 @@
 a dense search also contains the stopping rule (``search_rules.json``) and the empty-table image (``empty_table.png``).
 ``leaders/`` has the enrolled views of two candidates that were compared pixel by pixel, as crop and mask.
 
-Decision: docs/decisions/0018.
+Decision: docs/decisions/0017.
 """
 
 import json

@@ -4,7 +4,7 @@ A search does no I/O. It takes views (`Search.add`) and says what it needs next:
 its end (`Search.last_steps`) it asks for enrolled views, and then it answers. The bench at rest and in motion
 (`rig.plans.identify`) and the replay (`rig.search.replay`) drive it; `rig eval` drives the same `hbr.DenseSession`.
 
-Decision: docs/decisions/0064.
+Decision: docs/decisions/0017.
 """
 
 from abc import ABC, abstractmethod

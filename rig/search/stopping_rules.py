@@ -1,6 +1,6 @@
 """The stopping rule of a catalog: stored beside it, and fitted again when the catalog changes.
 
-See docs/decisions/0031-store-the-stopping-rule-beside-the-catalog.md.
+See docs/decisions/0010-keep-what-is-derived-in-a-cache.md.
 """
 
 import json

@@ -1,6 +1,6 @@
 """Description of views: the levels of several descriptors, and the evidence of the segmentation with its summary.
 
-Decision: docs/decisions/0029.
+Decision: docs/decisions/0010.
 """
 
 from collections import Counter

@@ -1,6 +1,6 @@
 """The empty-table image of a bench: stored beside the bench's state, and checked before it is used.
 
-Decision: docs/decisions/0028.
+Decision: docs/decisions/0012.
 """
 
 from contextlib import suppress

@@ -2,7 +2,7 @@
 
 libjpeg fills missing rows with grey and reports them only as a line on stderr.
 
-Decision: docs/decisions/0005.
+Decision: docs/decisions/0009.
 """
 
 import hashlib

@@ -1,6 +1,6 @@
 """Detects by the camera whether an object is on the table, and when the next one is there.
 
-Decision: docs/decisions/0019.
+Decision: docs/decisions/0002.
 """
 
 from collections.abc import Iterator

@@ -1,6 +1,6 @@
 """Access to the server: tokens, logins, and the lease of the one operator.
 
-Decision: docs/decisions/0039.
+Decision: docs/decisions/0020.
 """
 
 import hashlib

@@ -4,7 +4,7 @@ The web process shares neither the interpreter nor the threads of the control lo
 the job pauses, and another web process starts. If this process ends, the web process ends too, and the servo's watchdog
 stops the table.
 
-Decision: docs/decisions/0062.
+Decision: docs/decisions/0020.
 """
 
 import os

@@ -73,7 +73,11 @@ UNKNOWN_OBJECTS = ("radio", "clock")  # objects that are put on the table but no
 COUNT_OF_FOLDER = 20  # default number of objects of a folder to enroll
 
 VIEWS = 36
-"""Views of each object, unless they are configured. Decision: docs/decisions/0058."""
+"""Views of each object, unless they are configured.
+
+The demo finds the same objects as with the 72 of rig enroll, in half of the time; the median pose error is 1.9 instead
+of 1.4 degrees.
+"""
 
 GOOD_SHARE = 0.8
 """Share of right answers below which the demo fails; of two very similar objects, an answer can be wrong."""

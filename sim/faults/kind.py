@@ -1,6 +1,6 @@
 """A kind of simulated fault: its name, description, parameters, beginning and end.
 
-Decision: docs/decisions/0012.
+Decision: docs/decisions/0001.
 """
 
 from collections.abc import Callable, Mapping

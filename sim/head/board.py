@@ -4,7 +4,7 @@ The board runs up to the virtual clock's time whenever its state is read, and ev
 its requests, such as reading a register over I2C, for the board's own time. So the result does not depend on how often
 the board runs.
 
-Decision: docs/decisions/0021.
+Decision: docs/decisions/0001.
 """
 
 import ctypes

@@ -99,7 +99,6 @@ def test_decisions_have_numbers_without_gaps_and_are_listed():
         text = path.read_text(encoding="utf-8")
         assert text.startswith(f"# {number:04} ")
         assert f"({path.name})" in index
-        assert "**Status:**" in text
         assert re.findall(r"^## (.*)$", text, re.MULTILINE) == ["Decision", "Reasons", "Consequences"]
 
 

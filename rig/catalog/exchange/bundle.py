@@ -4,7 +4,7 @@ A reader trusts nothing in a bundle. It checks names against paths outside, and 
 is unpacked, into a private folder, and it is opened as one of an untrusted sender. Each image is compared with its
 name. Nothing that can be computed is taken from a bundle.
 
-Decision: docs/decisions/0015.
+Decision: docs/decisions/0011.
 """
 
 import shutil

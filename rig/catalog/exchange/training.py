@@ -2,7 +2,7 @@
 
 The folder of an export is a catalog with the annotations beside it, so an import restores everything.
 
-Decision: docs/decisions/0038.
+Decision: docs/decisions/0011.
 """
 
 import json

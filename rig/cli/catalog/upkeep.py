@@ -1,6 +1,6 @@
 """`rig catalog verify`, `redescribe`, `gc`, `copy`, `deliver` and `fit`: the catalog as a whole.
 
-Decision: docs/decisions/0061.
+Decision: docs/decisions/0010.
 """
 
 import os

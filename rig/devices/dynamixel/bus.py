@@ -1,6 +1,6 @@
 """Registers by name on a Dynamixel bus; each reply is matched to its request.
 
-Decision: docs/decisions/0010.
+Decision: docs/decisions/0006.
 """
 
 import math

@@ -2,7 +2,7 @@
 
 One class drives all of them. What differs is a row (`ServoSeries`), or follows from the registers that a model lacks.
 
-Decision: docs/decisions/0011.
+Decision: docs/decisions/0007.
 """
 
 from collections.abc import Callable

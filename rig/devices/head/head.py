@@ -3,7 +3,7 @@
 The head sends samples by itself, dated by its clock. A heartbeat in the background keeps its outputs on and compares
 the clocks. When the program dies, the heartbeat ends and the head switches its outputs off.
 
-Decision: docs/decisions/0020.
+Decision: docs/decisions/0003.
 """
 
 from collections.abc import Callable, Iterator

@@ -6,7 +6,7 @@ directions, the head's time u = (u1 + u2)/2 is the bench's time t = (t0 + t3)/2.
 by which the round trip d = (t3 − t0) − (u2 − u1) exceeds the transmission time of the bytes. Delayed heartbeats have
 less weight. The drift of a ceramic resonator is up to 0.5 %.
 
-Decision: docs/decisions/0022.
+Decision: docs/decisions/0005.
 """
 
 from collections import deque
