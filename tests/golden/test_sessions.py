@@ -7,6 +7,7 @@ import pytest
 from tests.golden.sessions import differences, expected, played, sessions
 
 
+@pytest.mark.timeout(600)  # a session in motion computes half a minute, and several on a busy computer
 @pytest.mark.parametrize("name", sessions())
 def test_session_prints_what_is_stored(name: str, tmp_path: Path) -> None:
     if any("job" in step for step in sessions()[name]["steps"]):
