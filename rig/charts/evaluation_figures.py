@@ -41,6 +41,7 @@ def figures(results: dict[str, Any]) -> dict[str, Chart]:
     for prefix, x_label, file in (
         ("omega-", "weight of the orientation, ω", "omega-sweep"),
         ("list-", "length of the retrieval lists", "list-sweep"),
+        ("sectors-", "average views of an object, N~M", "sector-sweep"),
     ):
         swept = [method for method in methods if method["name"].startswith(prefix)]
         if len(swept) > 1:
