@@ -114,16 +114,17 @@ def collect_garbage(catalog: Catalog, *, old: bool = False, dry_run: bool = Fals
     # An object store may need minutes: its files are listed outside of a transaction, so that no bench waits. They are
     # listed before the rows: an image whose row is committed in the meantime is named.
     with database.catalog_errors():
-        lost = store.names(before_s=catalog.clock.utc().timestamp() - YOUNG_S)
+        listed = store.names(before_s=catalog.clock.utc().timestamp() - YOUNG_S)
     with database.read() as transaction:
         found = transaction.execute(rows.order_by(Enrollment.object_id)).all()
         images = transaction.execute(select(NAMED_IMAGES)).all()
     ids = {row.id for row in found}
     deleted = tuple({row.object_id: str(row.object_name) for row in found if row.deleted}.values())
     named = {row.image for row in images if row.enrollment_id not in ids}
-    lost |= {row.image for row in images if row.enrollment_id in ids}
+    lost = (listed | {row.image for row in images if row.enrollment_id in ids}) - named
     with database.catalog_errors():
-        sizes = {name: size for name in sorted(lost - named) if (size := store.size(name))}
+        # a program that is killed as it begins to write leaves an empty file
+        sizes = {name: size for name in sorted(lost) if (size := store.size(name)) or name in listed}
     views = sum(row.view_id is not None for row in images if row.enrollment_id in ids)
     collected = GarbageReport(deleted, len(ids), views, len(sizes), sum(sizes.values()))
     if dry_run or not (ids or sizes):

@@ -261,7 +261,10 @@ class BackgroundCheck(AbstractContextManager["BackgroundCheck"]):
                             raise _error(finding)
                     now_ns = self._clock.now_ns()
                     spent_s += seconds_between(begun_ns, now_ns)
-                    if self._ended.wait((spent_s - BURST_S) / SHARE - seconds_between(start_ns, now_ns)):
+                    pause_s = (spent_s - BURST_S) / SHARE - seconds_between(start_ns, now_ns)
+                    if pause_s > 0 and self._ended.wait(
+                        pause_s
+                    ):  # a command that is short still gets its first portion
                         return
                     begun_ns = self._clock.now_ns()
         except CatalogDamaged as damage:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from rig.catalog import Action, Catalog, derived, log
+from rig.catalog import Action, Catalog, derived, log, verify
 from rig.catalog.images import name_of
 from rig.catalog.verify import BackgroundCheck
 from rig.core.clock import SystemClock
@@ -52,6 +52,12 @@ def flip(root: Path, text: bytes) -> None:
     for found in re.finditer(re.escape(text), content):
         content[found.end() - 1] ^= 1
     (root / "catalog.sqlite").write_bytes(content)
+
+
+@pytest.fixture
+def enough_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the check of a command compare everything, however slow the computer is."""
+    monkeypatch.setattr(verify, "BURST_S", 600.0)
 
 
 def found(root: Path) -> list[RigError]:
@@ -111,6 +117,7 @@ def test_check_reports_no_change_by_the_program(root: Path) -> None:
     assert reported == []
 
 
+@pytest.mark.usefixtures("enough_time")
 def test_enrollment_reports_a_flipped_byte_of_another_object(rig, root: Path) -> None:
     flip(root, name_of(encode(image(90))).encode())
     done = rig("enroll", "lamp", "--views", "4", "--yes")
@@ -120,6 +127,7 @@ def test_enrollment_reports_a_flipped_byte_of_another_object(rig, root: Path) ->
     assert "'gone'" not in rig("catalog", "show", "lamp").stderr
 
 
+@pytest.mark.usefixtures("enough_time")
 def test_watch_reports_a_flipped_byte_of_an_object_that_it_does_not_load(rig, root: Path) -> None:
     flip(root, name_of(encode(image(90))).encode())
     words = ["identify", "--watch", "--scan", "--strategy", "sweep", "--set", "identify.max_views=2"]

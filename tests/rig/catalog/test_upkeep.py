@@ -175,6 +175,17 @@ class TestGarbage:
         assert finished(verify(catalog)).findings == ()
         assert [entry.action for entry in catalog.log()][-1] == "collected garbage"
 
+    @pytest.mark.sqlite
+    @pytest.mark.parametrize("content", [b"", b"half of"])
+    def test_file_that_a_killed_program_left_is_removed(self, catalog: Catalog, content: bytes) -> None:
+        fill(catalog, "mug", 1)
+        path = catalog.image_path(catalog.object("mug").views[0].image)
+        part = path.with_name(f"{path.name}.0123456789abcdef.part")
+        part.write_bytes(content)
+        os.utime(part, (0, 0))
+        assert collect_garbage(catalog).files == 1
+        assert not part.exists()
+
     def test_image_that_was_stored_again_is_young(self, catalog: Catalog, clock: VirtualClock) -> None:
         content = encode(image(7))
         name = catalog.database.images.put(content)
