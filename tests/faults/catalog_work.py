@@ -13,8 +13,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import sqlalchemy
+
 from rig.catalog import Catalog, derived
 from rig.catalog.copying import copy_catalog
+from rig.catalog.facts import Derived
 from rig.catalog.jobs import finished
 from rig.catalog.results import correct, find_results
 from rig.catalog.results import record as record_result
@@ -135,7 +138,9 @@ def put_right(catalog: Catalog, _: Report) -> None:
 
 
 def describe(catalog: Catalog, _: Report) -> None:
-    finished(derived.redescribe(catalog, again=True, jobs=1))
+    with catalog.database.write() as transaction:
+        transaction.execute(sqlalchemy.delete(Derived))  # nothing of it is a fact: all of it is computed again
+    finished(derived.redescribe(catalog, jobs=1))
 
 
 WORK: dict[str, Callable[[Catalog, Report], None]] = {
