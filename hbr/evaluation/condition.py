@@ -18,7 +18,8 @@ from hbr.evaluation.photographs import Dataset, object_mask
 from hbr.evaluation.protocol import generator
 from hbr.segmentation import segment
 
-Background = Literal["same", "uniform", "textured", "bench", "other-bench"]
+EnrolledBackground = Literal["same", "uniform", "textured"]
+Background = Literal[EnrolledBackground, "bench", "other-bench"]
 Reference = Literal["own", "enrollment", "none"]
 _T = TypeVar("_T", np.uint8, np.float32)
 
@@ -201,7 +202,7 @@ class Condition:
     descriptor: str = "cedd"
     reference: Reference = "own"
     enrolled_noise: Noise = field(default_factory=Noise)
-    enrolled_background: Literal["same", "uniform", "textured"] = "same"
+    enrolled_background: EnrolledBackground = "same"
     cut_out: bool = False
 
     def __post_init__(self) -> None:
@@ -215,9 +216,10 @@ class Condition:
             raise ValueError(f"background {self.background!r} is unknown; use one of {', '.join(get_args(Background))}")
         if self.reference not in get_args(Reference):
             raise ValueError(f"reference {self.reference!r} is unknown; use one of {', '.join(get_args(Reference))}")
-        if self.enrolled_background not in ("same", "uniform", "textured"):
+        if self.enrolled_background not in get_args(EnrolledBackground):
             raise ValueError(
-                f"enrolled_background {self.enrolled_background!r} is unknown; use same, uniform or textured"
+                f"enrolled_background {self.enrolled_background!r} is unknown; "
+                f"use one of {', '.join(get_args(EnrolledBackground))}"
             )
         if self.on_bench and self.enrolled_background != "same":
             raise ValueError("on a bench, enrolled views have its background; leave enrolled_background out")

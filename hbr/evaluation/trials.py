@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from hbr.core.angles import wrap180
 from hbr.core.arrays import FloatArray, IndexArray, LevelArray
@@ -139,7 +139,7 @@ def run_object(
     same_bench : bool, optional
         Whether a search of the dense filter knows that the bench is that of the enrollment; None: it does not know.
     segmented_by : sequence of str, optional
-        How each query was segmented (`hbr.evaluation.condition.segmented_queries`).
+        How each query was segmented (`hbr.evaluation.condition.query_levels`).
     now_ns : callable
         Monotonic time, for `Runs.step_ns`.
 
@@ -440,22 +440,21 @@ def _similar_views(similar: FloatArray, ring: IndexArray) -> NDArray[np.bool_]:
     return found
 
 
-def most_informative_rotation(belief: Belief, *, beta: float = BETA, rotations_deg: ArrayLike | None = None) -> float:
+def most_informative_rotation(belief: Belief, *, beta: float = BETA) -> float:
     """Choose the rotation whose view is expected to leave the least entropy: a baseline for `hbr.next_best_view`.
 
     If hypothesis h is true, the view after a rotation is the one that was enrolled there. The likelihood of hypothesis
     h' is then exp(β T(view_h, view_h')^p). Arguments as for `hbr.next_best_view`.
     """
-    angles_deg = ALL_ROTATIONS_DEG if rotations_deg is None else np.asarray(rotations_deg, np.float64)
     probability, place, bin_of = strongest(belief.posterior(beta))
-    rows, _ = expected_views(belief, place, bin_of, angles_deg)
+    rows, _ = expected_views(belief, place, bin_of, ALL_ROTATIONS_DEG)
     similar = belief.index.compared.among(rows)
     weights = probability * np.exp(beta / np.sqrt(belief.queries + 1) * (np.maximum(similar, 0) ** POWER - 1))
     weights /= weights.sum(axis=2, keepdims=True)
     objects = (place[:, None] == np.unique(place)).astype(np.float64)
     shares = weights @ objects
     entropy = -(shares * np.log(np.maximum(shares, 1e-300))).sum(axis=2)
-    return float(angles_deg[int((entropy @ probability).argmin())])
+    return float(ALL_ROTATIONS_DEG[int((entropy @ probability).argmin())])
 
 
 def enroll(experiment: Experiment, dataset: Dataset, j: int) -> LevelArray:

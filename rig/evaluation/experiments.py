@@ -84,9 +84,9 @@ def rotation_errors(name: str) -> tuple[float, ...]:
     ValueError
         The file cannot be read, or it has no such errors.
     """
-    path = files("rig.evaluation").joinpath("mpu6050.json") if name == "mpu6050" else Path(name)
+    path = Path(str(files("rig.evaluation").joinpath("mpu6050.json"))) if name == "mpu6050" else Path(name)
     try:
-        values = own_files.json_values(path.read_bytes()[:_MAX_BYTES])
+        values = own_files.json_values(own_files.read(path, max_bytes=_MAX_BYTES))
         if "rotation_errors_deg" in values:
             found = [float(value) for value in values["rotation_errors_deg"]]
         else:

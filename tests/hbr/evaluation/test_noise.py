@@ -160,7 +160,7 @@ def test_cut_out_object_is_described_before_an_even_grey() -> None:
     ("keys", "words"),
     [
         ({"background": "bench", "enrolled_background": "uniform"}, "leave enrolled_background out"),
-        ({"enrolled_background": "striped"}, "use same, uniform or textured"),
+        ({"enrolled_background": "striped"}, "use one of same, uniform, textured"),
         ({"descriptor": "edges+colours", "cut_out": True}, "leave cut_out out"),
     ],
 )

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import os
 import re
 import shutil
 from hashlib import sha256
@@ -273,6 +274,12 @@ def test_unusable_orientation_errors_are_rejected(tmp_path: Path, content: str) 
     file.write_text(content)
     with pytest.raises(ValueError, match=r"rig calibrate imu"):
         rotation_errors(str(file))
+
+
+def test_a_pipe_with_orientation_errors_is_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(ValueError, match="not a regular file"):
+        rotation_errors(str(tmp_path / "pipe"))
 
 
 def test_experiments_of_the_results_are_shipped(tmp_path: Path) -> None:
