@@ -66,7 +66,7 @@ def sim_catalog(sim_bench: "Bench", tmp_path: "Path") -> "Iterator[Catalog]":
 def running_sim_bench(tmp_path: "Path") -> "Iterator[Path]":
     """Return the folder of a simulated bench that another process runs in real time, as `rig sim-bench` does.
 
-    Programs under test use it with ``--config FOLDER/rig.toml``; `sim.realtime.wire.tell` changes its world.
+    Programs under test use it with ``--config FOLDER/rig.toml``; `sim.realtime.wire.send_command` changes its world.
     """
     import json
     import subprocess

@@ -1,7 +1,9 @@
 """The documentation site: complete generated pages, a navigation that reaches every page, links that exist."""
 
+import importlib
 import re
 import shlex
+import tomllib
 from types import SimpleNamespace
 from typing import Any
 
@@ -10,6 +12,7 @@ import yaml
 
 from docs import architecture, generate
 from rig.config import RigConfig
+from rig.core.errors import ExtraMissing
 from tests.docs.pages import DOCS
 
 ROOT = DOCS.parent
@@ -143,3 +146,35 @@ def test_every_download_has_a_hash(file):
         assert "--no-isolation" in command or "--no-build-isolation" in command or not builds, command
         downloads = "-m build" not in command and "--no-deps" not in command
         assert "--require-hashes" in command or "--no-index" in command or not downloads, command
+
+
+def test_names_of_the_code_in_the_pages_exist():
+    """Each `hbr.…`, `rig.…`, `sim.…` or `calibration.…` in backticks is a module, or is defined in one."""
+    groups = set(tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["entry-points"])
+    others = {"rig.toml", "rig.py", "rig.local", "rig.imus", "rig.servos", "rig.simulated_servos"} | groups
+    pattern = r"`((?:hbr|rig|sim|calibration)(?:\.[A-Za-z_]\w*)+)"
+    found = {
+        (path.name, name)
+        for path in [*DOCS.rglob("*.md"), ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "SECURITY.md"]
+        for name in re.findall(pattern, path.read_text(encoding="utf-8"))
+        if name not in others
+    }
+    assert not [one for one in sorted(found) if not _exists(one[1].split("."))]
+
+
+def _exists(parts):
+    for count in range(len(parts), 0, -1):
+        try:
+            value = importlib.import_module(".".join(parts[:count]))
+        except ModuleNotFoundError:
+            continue
+        except ExtraMissing:  # the module is there; the packages that it needs are not
+            return True
+        for name in parts[count:]:
+            if name in getattr(value, "__dataclass_fields__", {}) or name in getattr(value, "__annotations__", {}):
+                return True
+            if not hasattr(value, name):
+                return False
+            value = getattr(value, name)
+        return True
+    return False
