@@ -61,7 +61,7 @@ def _loaded() -> ctypes.CDLL | None:
 
 def load(path: Path) -> ctypes.CDLL | None:
     """Load a library; None if it is missing, of another machine, or not compiled from the sources beside it."""
-    if not path.exists():
+    if ctypes.sizeof(_POINTER) != 8 or not path.exists():  # NumPy's indices have 64 bits, as in C, only there
         return None
     try:
         found = ctypes.CDLL(str(path))

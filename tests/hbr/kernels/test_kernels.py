@@ -1,5 +1,6 @@
 """The compiled kernels have the bits of their references, on every processor, and are used only if they fit."""
 
+import ctypes
 import os
 import subprocess
 import sys
@@ -285,6 +286,11 @@ def test_library_is_used_and_kept_only_if_it_fits(state: str, tmp_path: Path) ->
     fits = state == "intact" and load(compiling.LIBRARY) is not None
     assert (load(path) is not None) == fits
     assert compiling.is_current(path) == fits
+
+
+def test_a_processor_of_32_bits_uses_numpy(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(load.__globals__, "_POINTER", ctypes.c_uint32)
+    assert load(compiling.LIBRARY) is None
 
 
 def test_environment_switches_the_library_off() -> None:
