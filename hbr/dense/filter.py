@@ -24,13 +24,15 @@ from hbr.dense.index import BIN_DEG, BINS, POWER, DenseIndex, Floats
 from hbr.descriptors import descriptor
 
 #: As for `Belief.posterior`: fits the similarities of the bench's own descriptor.
+# with the first power of similarities, fewer objects are found; another descriptor needs its own value (decision 0014)
 BETA: Final = 30.0
 #: Number of objects that are considered after the first view.
-KEPT: Final = 500
+KEPT: Final = 500  # more: each view takes longer; fewer: the bound adds objects again more often (decision 0010)
 #: Rate at which a bin's weight in the mean azimuth falls with its support.
 _POSE_SHARPNESS: Final = 60.0
 #: Largest correction of an azimuth from the bins beside it, in degrees, and smallest fall of the support for it.
 _FARTHEST_LEAN_DEG: Final = 90.0
+# with a smaller fall on both sides, the azimuth is undetermined, and the quotient would be noise
 _LEAST_FALL: Final = 1e-6
 #: Largest error of a sum of float32.
 _ROUNDING: Final = 1e-6
@@ -253,21 +255,24 @@ def _between(support: FloatArray, bins: FloatArray) -> FloatArray:
 
 
 #: κ, and the uncertainty as a share of the posterior's half-width, because azimuths are estimated finer than its bins.
+# with these two, about 68 % of the true rotations of COIL-100 are within one uncertainty (docs/results.md)
 SHARPNESS: Final = 120.0
 WIDTH: Final = 0.68
 #: A pose with a larger uncertainty is not determined.
+# larger: a rotation is stated that an operator cannot use; smaller: fewer answers have one
 LARGEST_SIGMA_DEG: Final = 30.0
 #: The largest uncertainty with an n-fold symmetry, as a share of the period.
 _LARGEST_SHARE: Final = 1 / 9
 #: Each equivalent pose has at least this share of the probability of an equal one.
 _LEAST_PART: Final = 0.25
 #: An object looks the same from all sides if the likeliest azimuths, 95 % together, are at least this share of all.
-_FREE_SHARE: Final = 0.5
+_FREE_SHARE: Final = 0.5  # a symmetry of two, three or more parts leaves most azimuths unlikely
 #: Poses of an object that a comparison tries: those of at least this probability, relative to the likeliest one.
+# more poses, or less likely ones: the right one is missed less often; each is registered again, which takes time
 _MOST_POSES: Final = 3
 _LEAST_POSE: Final = 0.02
 _POSES_APART_DEG: Final = 25.0
-_ORDERS: Final = range(2, 13)
+_ORDERS: Final = range(2, 13)  # up to 30°, five bins: with finer symmetries the bins hardly separate two maxima
 _ONE_SIGMA, _TWO_SIGMA = 0.683, 0.954
 
 

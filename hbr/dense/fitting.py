@@ -39,8 +39,9 @@ from hbr.descriptors import descriptor
 from hbr.descriptors.base import Shift
 
 #: Distances of queries from their enrolled views, as shares of a step: the multiples of this number, modulo 1.
-_GOLDEN: Final = 0.618034
+_GOLDEN: Final = 0.618034  # the golden ratio: its multiples are evenly spread for every number of them
 #: Distance between the views of a search.
+# as the sweep of a search at rest; views that are nearer are too alike to be counted as several
 _STEP_DEG: Final = 90.0
 #: Numbers of each view of a leave-one-out search: what `leader` returns among all objects and among the others, the
 #: probability of the likeliest object, and whether that is the searched one.
@@ -54,7 +55,7 @@ _WORSE: Final = 1.6
 _LEAST_WORSE: Final = 0.7
 #: With more views, the whitened descriptions of all of them would take too much memory.
 _MOST_VIEWS: Final = 20_000
-_SEED: Final = 20
+_SEED: Final = 20  # any number: the same catalog must give the same rule
 
 Task = tuple[int, float]
 """The place of a searched object in the index, and the distance of the queries in the search before it."""
@@ -312,6 +313,7 @@ def _numbers(
 
 
 #: No search ends at a smaller confidence, even if all leave-one-out searches were right: real views may be less clear.
+# lower: fewer views, and wrong answers where real views are less clear than enrolled ones
 SMALLEST_MIN_CONFIDENCE: Final = 0.9
 #: Confidence that ends a search if the catalog has too little data for the error rate that was asked for.
 UNFITTED_MIN_CONFIDENCE: Final = 0.98
@@ -322,6 +324,7 @@ FEWEST_OBJECTS_SHIFTED: Final = 50
 #: Largest share of objects that are not enrolled, and are accepted under changes of the bench.
 FALSE_ACCEPT: Final = 0.02
 #: Largest share of them that is accepted before the last view.
+# an eighth of `FALSE_ACCEPT`: most of the errors are left to the last view, which knows most
 _EARLY_ACCEPT: Final = 0.0025
 #: Changes of the bench up to this strength are mild: enrolled objects must be accepted at the rate that was asked for.
 _MILD: Final = 0.5
@@ -329,7 +332,7 @@ _MILD: Final = 0.5
 _SAME: Final = 0.25
 #: Views of a leave-one-out search, if most objects have enough; searches of a fit.
 FITTED_VIEWS: Final = 4
-MOST_SEARCHES: Final = 400
+MOST_SEARCHES: Final = 400  # more: the rate is known better; the time of `rig catalog fit` grows in proportion
 #: Largest number of objects that a fit searches for: it then measures a rate of 1 % to a third of its value.
 MOST_OBJECTS: Final = 1000
 

@@ -29,7 +29,7 @@ from hbr.kernels import calls
 from hbr.model.views import Views
 
 #: Share of the mean variance that is added to all variances before whitening.
-_SHRINKAGE: Final = 0.3
+_SHRINKAGE: Final = 0.3  # smaller: directions with little variance, which are mostly noise, count as much as all others
 #: Largest number of views from which the whitening is computed.
 _MOST: Final = 4096
 #: Largest number of descriptions that are remembered, 18 MB.
@@ -112,7 +112,7 @@ def unit_rows(white: FloatArray) -> FloatArray:
 BINS: Final = 72
 BIN_DEG: Final = 360 / BINS
 #: p, of the similarities.
-POWER: Final = 4.0
+POWER: Final = 4.0  # the eighth is equally good, the second worse (decision 0014)
 #: An angle in degrees that is larger than every azimuth.
 _FAR_DEG: Final = 2000.0
 

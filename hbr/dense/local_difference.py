@@ -33,25 +33,27 @@ from hbr.core.arrays import ImageArray
 #: Side of the compared images.
 SIDE_PX: Final = 128
 #: Enrolled views that a view is compared with, at most; one more is needed where one is left out.
-NEAREST: Final = 2
+NEAREST: Final = 2  # a view lies between two enrolled ones; further ones show other sides
 #: Views of a search that are compared, at most, and how far apart they are at least.
 MOST_VIEWS: Final = 8
-APART_DEG: Final = 20.0
+APART_DEG: Final = 20.0  # nearer views show nearly the same pixels: they take time and add little evidence
 #: Score above which the difference decides.
-MIN_SCORE: Final = 0.5
+MIN_SCORE: Final = 0.5  # the right twin of ten pairs scored between 0.8 and 1 (decision 0016); 0 favours neither
 #: Smallest sum of the weights, grey levels times pixels: about a spot of 6 x 6 pixels in another colour.
 MIN_WEIGHT: Final = 2000.0
 #: Largest difference that the found object leaves unexplained: as a share of the weights, and in grey levels per pixel.
-MAX_UNEXPLAINED: Final = 0.5
+MAX_UNEXPLAINED: Final = 0.5  # with more, a third object explains the view as well as the leader does
+# larger: an unknown object that resembles one twin is found; smaller: a noisy camera never decides
 MAX_MISFIT: Final = 2.0
 #: Two objects whose enrolled views differ by less, in grey levels of a pixel, are near twins.
 TWINS_APART: Final = 20.0
 #: Largest displacement of a detail after the registration, by parallax and by views between two enrolled ones.
-_REACH_PX: Final = 3
+_REACH_PX: Final = 3  # larger: a small sticker matches a shade beside it; smaller: parallax looks like a difference
 #: Differences of grey levels that noise and sharpness explain.
 _FLOOR: Final = 10.0
 #: A view with less weight than this does not show a difference.
 _LEAST_WEIGHT: Final = 300.0
+# more or smaller steps: a better registration of flat images, at more time for each pair
 _CRITERIA: Final = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 25, 1e-4)
 Mask = NDArray[np.uint8]
 Map = NDArray[np.float32]
@@ -351,19 +353,20 @@ def _square(side: int) -> Mask:
 
 #: Side of the compared images, and their largest movement in the first step.
 FIT_PX: Final = 64
-_FIT_REACH_PX: Final = 10
+_FIT_REACH_PX: Final = 10  # a sixth of the side: a larger displacement is an error of the pose, and not of the box
 #: Scales of width and height in the first step.
 _SCALES: Final = ((0.88, 0.88), (0.88, 1.0), (1.0, 0.88), (1.0, 1.0), (1.0, 1.13), (1.13, 1.0), (1.13, 1.13))
 #: Smallest gain of correlation that justifies a change of a scale, and a movement by a pixel of the reduced image.
 _SCALE_COST: Final = 0.02
 _PIXEL_COST: Final = 0.002
+# coarser than `_CRITERIA`: every candidate is registered, and the fit needs no single pixels
 _FIT_CRITERIA: Final = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 1e-3)
 #: A registration with a larger change than this is not used.
 _MOST_SHEAR: Final = 0.4
-_AREAS: Final = (0.55, 1.8)
+_AREAS: Final = (0.55, 1.8)  # outside, the two boxes cannot be of one object, or the registration went astray
 #: Units of a logarithm, and grey levels that keep it finite.
 _UNITS: Final = 40.0
-_DARK: Final = (9.0, 12.0)
+_DARK: Final = (9.0, 12.0)  # larger: less noise of dark pixels, and less of their contrast
 #: Smallest number of common pixels for a comparison.
 _FEWEST: Final = 60
 

@@ -34,8 +34,8 @@ from hbr.descriptors import descriptor
 from hbr.descriptors.together import like_enrollment
 
 #: Numbers of compared candidates beside the leader, and of segmentations of each view.
-_OTHERS: Final = 3
-_SEGMENTATIONS: Final = 2
+_OTHERS: Final = 3  # more: a surer lead; each needs the enrolled images of one more object
+_SEGMENTATIONS: Final = 2  # more: a wrong box does less harm; each costs a registration of every candidate
 #: Weights of the open-set score, of the leader's fit, and of its difference from that of other candidates; an offset.
 #: Fitted like `hbr.dense.stopping.fitted_before`: the result is a log-odds.
 _WEIGHTS: Final = (0.714, 9.438, 4.995)
@@ -49,7 +49,7 @@ UNKNOWN_BELOW: Final = -1.3
 #: With a smaller open-set score, an object is unknown at any fit.
 _HOPELESS: Final = -7.0
 #: Share of the probability that the two leaders have together.
-LEADERS: Final = 0.9
+LEADERS: Final = 0.9  # with less, a third object is likely, and a difference of two decides nothing
 #: Near twins score nearly the same: with a larger margin, an unknown object is not compared with the two leaders.
 TWIN_MARGIN: Final = 0.02
 

@@ -31,15 +31,16 @@ from hbr.dense.filter import Belief
 from hbr.dense.index import BIN_DEG
 
 #: Weight of the margin in the open-set score without fitted weights, and of the leader's usual score.
+# score or margin alone accept 4 to 21 % of unknown objects, both together about 2 % (decision 0015)
 _MARGIN_WEIGHT: Final = 0.5
 _USUAL_WEIGHT: Final = 1.0
 #: Candidates that the leader is compared with.
-COHORT: Final = 10
+COHORT: Final = 10  # more: less noise, and less similar objects, whose scores say less about the leader
 #: Enrolled views next to the estimated pose that are compared.
 _NEXT: Final = 3
 #: Strength of the regularisation, which draws weights to 0.
 _RIDGE: Final = 1e-3
-_STEPS: Final = 60
+_STEPS: Final = 60  # far more than Newton's method needs: only a bound, so that data without a minimum end too
 
 #: The numbers that the score weighs: score of the leader, its margin, its lead over the cohort; the same of whitened
 #: descriptions, and the cohort's mean.

@@ -29,7 +29,7 @@ _CONTRAST: Final = 0.12
 _STAIN: Final = 0.05
 #: Probability of a holder, and its width in cells.
 _HOLDER: Final = 0.5
-_HOLDER_CELLS: Final = 0.8
+_HOLDER_CELLS: Final = 0.8  # a rod or a clip, a tenth of the box's width
 
 
 @dataclass(frozen=True, eq=False)

@@ -103,6 +103,7 @@ GRID: Final = 80
 #: Longest side to which `describe` scales an image.
 LONGEST_SIDE: Final = 640
 
+# The thresholds of the reference implementation. With any other value, the result is not CEDD.
 _EDGE_THRESHOLD: Final = 14.0
 _CLASS_THRESHOLDS: Final = np.array([[0.68], [0.98], [0.98], [0.98], [0.98]])
 #: Weights of B, G, R in the luminance of a pixel, in thousandths.
@@ -377,7 +378,7 @@ def _colour_outputs(colours: RealArray) -> tuple[IndexArray, FloatArray]:
     return hue, cv2.transpose(outputs).astype(np.float64, copy=False)
 
 
-BITS: Final = 3
+BITS: Final = 3  # CEDD quantises each bin to 8 levels
 PACKED_BYTES: Final = BINS * BITS // 8
 
 

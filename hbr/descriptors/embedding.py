@@ -20,7 +20,7 @@ PREFIX: Final = "onnx:"
 MODEL_NAME: Final = re.compile(PREFIX + "[0-9a-f]{64}")
 #: Reading and running a larger model would need more than 1 GiB.
 MAX_MODEL_BYTES: Final = 256_000_000
-_SIDE_PX: Final = 224
+_SIDE_PX: Final = 224  # the usual input of networks that were trained with ImageNet
 #: Mean and standard deviation of R, G, B in ImageNet, with which most models were trained.
 _MEAN: Final = (0.485 * 255, 0.456 * 255, 0.406 * 255)
 _DEVIATION: Final = np.array([0.229, 0.224, 0.225], np.float32).reshape(1, 3, 1, 1)

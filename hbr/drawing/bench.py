@@ -17,6 +17,7 @@ from hbr.core.arrays import ImageArray
 Picture = NDArray[np.float32]
 """BGR, not clipped, so that the illumination can be changed later."""
 
+# a quarter of a camera's pixels: an experiment draws thousands of frames, and no descriptor sees finer detail
 WIDTH: Final = 320
 HEIGHT: Final = 240
 #: Position of the middle of an object's foot, and side of an object's photograph, in pixels.
@@ -24,6 +25,7 @@ FOOT_PX: Final = (160, 196)
 SIDE_PX: Final = 150
 #: Half axes of the platter in pixels.
 _PLATTER_PX: Final = (96.0, 27.0)
+# cells of noise across the surface, from large stains to fine grain; the coarser ones are stronger
 _GRAINS: Final = (3, 6, 12, 24, 48, 96)
 #: Elevation of the camera at the enrollment.
 _ELEVATION_DEG: Final = 15.0
@@ -79,7 +81,9 @@ class Change:
 
 
 ENROLLMENT: Final = Change()
+# the same bench after some time: the same camera and place, slightly other light
 MILD: Final = Change(gain=0.1, colour=0.04, gradient=0.1, placement=0.03, scale=0.03, shadow=0.4, specular=30, noise=2)
+# another bench: another camera and lamp, and another hand that places the object
 HARD: Final = Change(
     gain=0.3, colour=0.2, gradient=0.3, gamma=0.2, placement=0.08, scale=0.15, elevation_deg=6.0, shadow=0.6,
     specular=140.0, defocus_px=1.6, holder=0.6, noise=3.0,

@@ -306,7 +306,7 @@ class ByteRows:
         Squared lengths of the first rows, if they are known.
     """
 
-    LONGEST: Final = 4096
+    LONGEST: Final = 4096  # as in tanimoto.c: the sum of so many products of two bytes is below 2**31
 
     def __init__(self, rows: LevelArray, squares: NDArray[np.int32] | None = None) -> None:
         found = library()

@@ -41,6 +41,7 @@ _SIGNATURES: Final[dict[str, tuple[Any, ...]]] = {
     ),
 }  # fmt: skip
 
+# those that this process may use: in a container, fewer than the computer has
 _CORES: Final = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 THREADS: Final = min(_CORES, 4)

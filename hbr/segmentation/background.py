@@ -25,7 +25,7 @@ Mask = NDArray[np.bool_]
 Floats = NDArray[np.float32]
 
 #: Longer side of the images that are compared.
-SIDE_PX: Final = 128
+SIDE_PX: Final = 128  # larger: thinner objects are seen, and the time of each frame grows with the square
 #: Step between the pixels that a plane is fitted to.
 _EVERY: Final = 5
 #: Number that is added to grey levels before the logarithm, because noise dominates below it.
@@ -36,19 +36,20 @@ _NOISE: Final = (0.35 * 8.0 / (np.arange(256) + _FLOOR)).astype(np.float32)
 #: Small regularisation that makes the least squares solvable.
 _RIDGE: Final = 1e-9 * np.eye(3)
 #: Largest residual of a pixel that agrees, in logarithms: about 15 % more or less light.
-_AGREES: Final = 0.15
+_AGREES: Final = 0.15  # larger: another bench passes as this one; smaller: a lamp that moved makes the image useless
 #: Cells of a 4 x 4 grid at the frame's border; the object is in the middle.
 _BORDER: Final = tuple((y, x) for y in range(4) for x in range(4) if y in (0, 3) or x in (0, 3))
 #: A cell agrees if this share of its pixels agree.
 _CELL_SHARE: Final = 0.6
 #: The empty-table image is used if at least this share of the border cells agree.
+# the right image agrees with 83 % or more of the border, one of another bench with 42 % or less (decision 0012)
 MIN_AGREEMENT: Final = 0.65
 #: Largest difference between the border cells of a plain backdrop, and its largest distance from grey, in logarithms.
-_PLAIN: Final = 0.12
-_NEAR_GREY: Final = 0.35
+_PLAIN: Final = 0.12  # larger: a coloured wall counts as plain, and its colour is corrected away
+_NEAR_GREY: Final = 0.35  # a factor of 1.4 between two channels: with more, the backdrop itself is coloured
 #: Grey level that a plain backdrop is corrected to, and the largest correction of the exposure, as a logarithm.
 _BACKDROP_LEVEL: Final = 128.0
-_MAX_EXPOSURE: Final = np.log(1.7)
+_MAX_EXPOSURE: Final = np.log(1.7)  # with more, the backdrop is dark or bright, and not badly exposed (decision 0012)
 
 
 class Method(StrEnum):
@@ -378,11 +379,11 @@ def _fit(small: ImageArray, useful: Mask, table_log: Floats) -> FloatArray:
 
 #: A pixel differs from the background by at least this many grey levels, and by this share of the object's contrast.
 _LEAST_LEVELS: Final = 12.0
-_SHARE: Final = 0.25
+_SHARE: Final = 0.25  # larger: dim parts of the object are lost; smaller: its shadow becomes part of it
 #: A backdrop is plain if three corners of the frame have the same colour within this many grey levels (two corners are
 #: enough if they are darker than `_DARK`),
 _ONE_COLOUR: Final = 12.0
-_DARK: Final = 40.0
+_DARK: Final = 40.0  # below this, noise and stray light differ from corner to corner
 #: and if the smoothest corner differs from the background by at most this, plus its noise.
 _SMOOTH: Final = 3.0
 _GRAIN: Final = 1.5

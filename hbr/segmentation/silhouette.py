@@ -127,6 +127,7 @@ def _disc(radius: int) -> Binary:
 _WITHIN: Final = (0.2, 0.12, 0.8, 0.9)
 #: Where an object usually is in the image of a turntable: middle and widths of a bell-shaped weight (x, y).
 _MIDDLE: Final = (0.5, 0.56)
+# wider: clutter at the sides counts as the object; narrower: wide objects lose their sides
 _SPREAD: Final = (0.16, 0.22)
 #: GrabCut starts from the pixels whose weight is higher than this. If it returns nothing or everything, it starts again
 #: with the next value.
@@ -137,8 +138,8 @@ _GUESS_LEAST, _GUESS_MOST = 0.015, 0.45
 _BRIDGE: Final = 0.024
 #: Another part belongs to the object if it has this share of the main part's area, and this mean weight.
 _GUESS_PART: Final = 0.08
-_PART_WEIGHT: Final = 0.35
-_GUESS_NEAR_PX: Final = 3
+_PART_WEIGHT: Final = 0.35  # less: most of the part is away from the usual place of an object, where clutter is
+_GUESS_NEAR_PX: Final = 3  # a part as near as this, such as a handle, was cut off by `_BRIDGE`
 
 
 def guess_object(small: ImageArray) -> Mask | None:
@@ -204,11 +205,11 @@ def _prior(height: int, width: int) -> NDArray[np.float32]:
 
 #: Size of the network's input.
 WIDTH: Final = 128
-HEIGHT: Final = 96
+HEIGHT: Final = 96  # a change of the size needs another training of the network
 WEIGHTS: Final = "network.onnx"
 #: Scales of the difference, in logarithms: brightness, and colour.
 EVENLY: Final = 1.0
-COLOURED: Final = 0.7
+COLOURED: Final = 0.7  # smaller than `EVENLY`, because shadows change the brightness more than the colour
 #: Trust in a background that was learned from other views; 1 for an empty-table image.
 LEARNED: Final = 0.5
 #: A network of OpenCV runs in one thread at a time, so there are as many as threads that needed one at the same time.
