@@ -72,6 +72,8 @@ def plot(result: CalibrationResult) -> Chart | None:
         return None
     match result.name:
         case "camera.noise":
+            # Shot noise grows with the light, read noise does not: a straight line, with 1/12 for the rounding to
+            # levels.
             mean, variance = np.array(evidence["mean_variance"]).T
             gain = 255 / result.estimates["full_well_e"].value
             floor = (gain * result.estimates["read_noise_e"].value) ** 2 + 1 / 12
@@ -86,6 +88,7 @@ def plot(result: CalibrationResult) -> Chart | None:
                 ],
             )
         case "camera.flat_field":
+            # Lenses lose light with the square of the distance from the middle, nearly.
             square, _, _ = _shading(np.array(evidence["mean"]).shape)
             share = np.array(evidence["mean"]) / np.array(evidence["mean"]).max()
             rings = np.round(square * 20) / 20
@@ -272,6 +275,7 @@ def drift(card: CardFrames, before: CameraLocks, after: CameraLocks) -> Evaluati
     if card.levels.min() < 1.0:
         return found.reject(RejectionCode.CARD_BLACK)
     grey = card.levels.mean(axis=1)
+    # A straight line through the brightness is the drift; what is left over is the flicker.
     relative = grey / grey.mean()
     minutes = card.seconds / 60
     design = np.column_stack([np.ones_like(minutes), minutes - minutes.mean()])
@@ -281,12 +285,14 @@ def drift(card: CardFrames, before: CameraLocks, after: CameraLocks) -> Evaluati
     n = len(grey)
     found.estimate("drift", 100 * float(slope), 100 * slope_sigma, "% a minute")
     found.estimate("flicker", flicker, flicker / sqrt(2 * (n - 2)), "of the light")
+    # The card is grey: unequal channels are the colour of the light.
     for name, channel in (("red_green", 2), ("blue_green", 0)):
         ratio = card.levels[:, channel] / card.levels[:, 1]
         found.estimate(name, ratio.mean(), float(ratio.std(ddof=1)) / sqrt(n))
 
     blue, green, red = card.levels.mean(axis=0).tolist()
     span = float(minutes[-1] - minutes[0])
+    # Reject only a drift that exceeds the limit by more than its own uncertainty explains.
     drifted = 100 * abs(float(slope)) * span
     found.residual, found.limit, found.residual_unit = drifted, MAX_DRIFT_PERCENT, "% in the time of the test"
     found.reject_if(before != after, RejectionCode.LOCKS_CHANGED, before=plain(before), after=plain(after))

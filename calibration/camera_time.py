@@ -93,6 +93,7 @@ class CameraTime(Procedure):
         )
         bench.place(self.thing)
         cruise_dps = config.table.velocity_dps
+        # Several speeds separate the time (an angle that grows with the speed) from an error of the angle.
         speeds_dps = sorted({*(speed for speed in SPEEDS if speed < cruise_dps), cruise_dps})
         passes: list[Pass] = []
         lost = frames = 0
@@ -105,6 +106,7 @@ class CameraTime(Procedure):
                 half_deg = ARC_DEG / 2 + _ramp_deg(speed, bench)
                 ends_deg = middle_deg - half_deg, middle_deg + half_deg
                 goto(ends_deg[0])
+                # Both directions, because backlash and an off-centre object look like a time in one of them.
                 for way in (1, -1):
                     taken = _take_pass(table, flights, bench, ends_deg, speed, way)
                     if taken is None:
@@ -114,6 +116,7 @@ class CameraTime(Procedure):
                     worst_deg, lost, frames = max(worst_deg, residual_deg), lost + missing, frames + len(one.angle_deg)
                     passes.append(one)
                 yield Progress((number + 1) / len(speeds_dps), f"{speed:.0f} °/s in both directions")
+        # Check what the fit itself does not see: a slip, and lost frames.
         share = lost / max(lost + frames, 1)
         found = evaluate(passes, exposure_ms=config.camera.exposure_us * 1e-3, fastest_dps=max(speeds_dps), bench=bench)
         found.reject_if(worst_deg > SLIP_DEG, RejectionCode.PLATTER_SLIPPED, residual_deg=worst_deg)
@@ -195,6 +198,7 @@ def evaluate(passes: Sequence[Pass], *, exposure_ms: float, fastest_dps: float, 
         return found.reject(RejectionCode.TOO_FEW_FRAMES, used=used, needed=FEWEST_FRAMES)
     middle_s, readout_s, scatter_deg = times.middle_s, times.readout_s, times.scatter_deg
     jitter_s, jitter_sigma_s, readout_sigma_s = times.jitter_s, times.jitter_sigma_s, times.readout_sigma_s
+    # The scatter of the passes does not show errors that all of them share.
     sigma_s = hypot(times.middle_sigma_s, COMMON_S)
     found.residual = scatter_deg
     found.estimate("offset", middle_s * 1e3, sigma_s * 1e3, "ms")
@@ -214,6 +218,7 @@ def evaluate(passes: Sequence[Pass], *, exposure_ms: float, fastest_dps: float, 
         "rows_ms": [round(value * 1e3, 3) for value in times.rows_s],
         "exposure_ms": exposure_ms,
     }
+    # Reject: first too little texture, then what a view in motion would suffer from.
     limit_deg = bench.config.view.max_angle_sigma_deg
     found.reject_if(
         scatter_deg > MAX_ANGLE_DEG,

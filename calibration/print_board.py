@@ -87,6 +87,7 @@ def _pdf(board: Board) -> bytes:
         f"{w * cell_mm * POINTS_MM:.4f} {h * cell_mm * POINTS_MM:.4f} re"
         for x, y, w, h in _rectangles(black)
     ]
+    # A ruler below the board shows whether the printer scaled the page.
     ruler_y = top - board.size_mm[1] - board.margin_mm - 6
     ruler_x = (PAGE_MM[0] - RULER_MM) / 2
     words = (
@@ -103,6 +104,7 @@ def _pdf(board: Board) -> bytes:
             f"BT /F1 9 Tf {ruler_x * POINTS_MM:.4f} {(ruler_y - 5) * POINTS_MM:.4f} Td ({words}) Tj ET",
         ]
     ).encode("ascii")
+    # The file: five objects, a table of their places, and the trailer.
     packed = zlib.compress(stream)
     objects = [
         b"<< /Type /Catalog /Pages 2 0 R >>",

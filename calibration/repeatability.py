@@ -90,6 +90,7 @@ class Repeatability(Procedure):
                     "Or give a larger error rate.",
                 ),
             )
+        # The operator places the object again each time: views of one placement share its errors.
         viewer = Viewer(bench.camera, bench.config)
         describe = ViewDescriber(bench.config.view, (PAPER_DESCRIPTOR,))
         placements: list[Placement] = []
@@ -104,6 +105,7 @@ class Repeatability(Procedure):
             bench.place(self.name)
             rounds = []
             with Turntable(bench) as table:
+                # Two rounds of each placement show the noise without the placement.
                 for _round in range(ROUNDS):
                     views = []
                     for step in range(AZIMUTHS):

@@ -32,7 +32,7 @@ _COMPUTERS_OWN = re.compile(r"smbus|i915|nvidia|amdgpu|radeon|gmbus|aux|ddc|hdmi
 """I2C buses of memory, monitors and clock chips, which must not be scanned."""
 _CONVERTERS = re.compile(r"bcm2835-(isp|codec)|pispbe|hevc", re.IGNORECASE)
 """Video devices of a Raspberry Pi that convert images; some claim to capture."""
-_USUAL_I2C_HZ = 100_000
+_USUAL_I2C_HZ = 100_000  # Linux's default where the device tree states no rate
 _RAW_RECEIVERS = re.compile(r"unicam|rp1-cfe", re.IGNORECASE)
 """Receivers of ribbon cables: they deliver raw values of the sensor, which OpenCV cannot develop."""
 _SENSORS = re.compile(r"((?:imx|ov|gc|s5k|hm|arducam)[\w-]*) \d+-[0-9a-f]{4}")

@@ -22,6 +22,7 @@ from rig.core.errors import ConfigError, UsageError, os_errors_as
 from rig.core.files import read, write
 from rig.core.phrases import filled, in_unit, number
 
+# far above a result with all its evidence; a larger file is another one, and is not read into memory
 MAX_FILE_BYTES = 10_000_000
 
 

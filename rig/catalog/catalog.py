@@ -248,6 +248,7 @@ class Catalog(AbstractContextManager["Catalog"]):
                 state.end_current(transaction, self.clock, known, EnrollmentStatus.IN_PROGRESS)
             object_id = log.head(transaction)[0] + 1 if known is None else known.object_id
             assert object_id is not None
+            # The enrollment, its digest, and the line of the log are one fact: all are written, or none.
             enrollment = Enrollment(
                 key=secrets.token_hex(32), object_id=object_id, started_utc=now, planned_azimuth_deg=plan
             )

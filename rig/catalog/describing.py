@@ -164,9 +164,11 @@ def describe(pixels: _Pixels, task: Task, *, threads: int = 1) -> Described:
             levels[name][place] = found.levels[name]
         evidence[place] = found.segmentation or {}
 
+    # Descriptors of the whole image need no other view.
     steps: list[tuple[int, Callable[[], None]]] = []
     if len(alone) < len(task.names):
         steps += [(place, partial(whole, place)) for place in range(count)]
+    # The background is learned from the views of one session; from all of the region if it has too few.
     for session, places in (
         groupby(sorted(range(count), key=partial(_group, task)), partial(_group, task)) if alone else ()
     ):
@@ -188,6 +190,7 @@ def describe(pixels: _Pixels, task: Task, *, threads: int = 1) -> Described:
         with _reasons(task, step[0]):
             step[1]()
 
+    # The steps are independent, so their order and the number of threads do not change the result.
     if threads == 1:
         for step in steps:
             run(step)

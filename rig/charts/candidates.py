@@ -11,7 +11,7 @@ from rig.events.events import Candidate, Ranked
 
 SHOWN: Final = 5
 """Candidates of a chart: more lines cannot be told from each other."""
-_COLOURS: Final = 8
+_COLOURS: Final = 8  # more colours cannot be told from each other, also by people who see fewer; later ones are dashed
 _LETTERS: Final = 36
 """Letters of a name; the tables of a page have all of them."""
 _WIDTH, _BAR_PX, _ROW_PX = 400.0, 336.0, 34.0

@@ -10,7 +10,7 @@ from rig.charts.svg import Point
 from rig.core.phrases import azimuth_words, filled
 from rig.events.events import Weighed
 
-SIZE: Final = 400.0
+SIZE: Final = 400.0  # units of the drawing: a page scales it to its place
 CENTRE: Final = (SIZE / 2, SIZE / 2)
 RIM: Final = 160.0
 
@@ -19,7 +19,7 @@ _INNERMOST, _OUTERMOST = 60.0, 145.0
 _STOP_PX: Final = 8.0
 _SEEN_PX: Final = 3.0
 _ARROW_PX: Final = 9.0
-_ARC_STEP_DEG: Final = 4.0
+_ARC_STEP_DEG: Final = 4.0  # a chord leaves the largest circle by 0.1 px, less than a line is wide
 _MOST_ARC_STEPS: Final = 5_000
 """A damaged record can have any rotation."""
 

@@ -20,13 +20,13 @@ _WIDTH, _WIDE = 400.0, 760.0
 _PLOT_HEIGHT, _SQUARE_HEIGHT, _WIDE_HEIGHT = 190.0, 340.0, 320.0
 _LETTER_PX, _TITLE_LETTER_PX = 7.6, 8.6
 """Widths of a letter at the size of a phone, estimated: nothing here knows the font."""
-_ROW_PX: Final = 17.0
+_ROW_PX: Final = 17.0  # rows of text at the size of a phone, and the line before a label
 _KEY_PX: Final = 22.0
 _MARGIN: Final = 0.04
 """Share of an axis between its ends and the data."""
 _MANY: Final = 100
 """More points than these are smaller, because they would hide each other."""
-_TICKS: Final = 8
+_TICKS: Final = 8  # more labels overlap on a phone
 
 
 @dataclass(frozen=True)

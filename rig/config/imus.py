@@ -49,7 +49,7 @@ class ImuKind:
     note: str = ""
 
 
-_AT: Final = (0x68, 0x69)
+_AT: Final = (0x68, 0x69)  # AD0 low or high
 _MPU: Final = ("range_dps", "rate_hz", "bandwidth_hz")
 _CLONE: Final = (
     "a clone of the MPU-6050 without a datasheet: it passed a test of its samples and of gravity; "
@@ -89,11 +89,13 @@ _BUILT_IN: Final = {
         ImuKind("lsm6dsox", "LSM6DSOX", (0x6A, 0x6B), 0x0F, (0x6C,)),
     )
 }
+# What broken wires return: an undriven bus reads as all ones.
 _NO_DEVICE: Final = {
     0x00: "no device: SDA is held low, or ground is missing",
     0xFF: "no device: SDA is not connected",
     0xFB: "a BNO055 whose registers are read at a wrong position: the bus loses clock pulses",
 }
+# Usual reasons for an answer from another chip.
 _ALSO_AT: Final = {
     0x68: "the clocks DS1307 and DS3231 also have address 0x68",
     0x28: "a BNO080 or BNO085 uses another protocol at similar addresses",

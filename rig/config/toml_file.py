@@ -21,7 +21,7 @@ from rig.core.next_steps import Do
 
 Key = tuple[str, ...]
 
-MAX_FILE_BYTES: Final = 100_000
+MAX_FILE_BYTES: Final = 100_000  # a hundred times a real configuration: a larger file is another one, named by mistake
 MAX_DEPTH: Final = 16
 """Largest depth of tables and lists in a value; the configuration itself needs 5."""
 MAX_DOTS: Final = 1000

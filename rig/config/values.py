@@ -20,8 +20,8 @@ M = TypeVar("M", bound=BaseModel)
 
 APP = "hbr-rig"
 FILE_NAME = "rig.toml"
-MAX_VALUE_LENGTH = 2000
-SHOWN = 60
+MAX_VALUE_LENGTH = 2000  # longer than any path or list of the configuration
+SHOWN = 60  # a longer value fills the terminal, and its start shows which one it is
 
 _PATHS: tuple[Key, ...] = (("catalog", "path"), ("state_dir",), ("calibration_dir",))
 

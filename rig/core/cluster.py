@@ -17,7 +17,7 @@ _Item = TypeVar("_Item")
 _T = TypeVar("_T")
 
 LOCAL: Final = "local"
-START_S: Final = 30
+START_S: Final = 30  # a busy computer starts a worker process in seconds; longer: a wrong address is noticed late
 
 _LOCAL: dict[int, Any] = {}
 """The clusters that this program started, by their number of workers. Dask ends them with the program."""

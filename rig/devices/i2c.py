@@ -18,7 +18,7 @@ NO_DEVICE = (ENXIO, EREMOTEIO, ENODEV)
 """Errors by which the kernel's bus drivers report that no device acknowledges an address."""
 STUCK = (ETIMEDOUT, EAGAIN)
 
-_SMBUS_BLOCK = 32
+_SMBUS_BLOCK = 32  # I2C_SMBUS_BLOCK_MAX: longer reads need I2C_RDWR, which not every adapter has
 _REASONS = {
     **dict.fromkeys(NO_DEVICE, "it does not acknowledge"),
     **dict.fromkeys(STUCK, "the bus is stuck: something holds SDA or SCL low"),

@@ -28,7 +28,7 @@ _RESET_S, _START_S = 0.1, 0.05
 _BYTE_NS = 35_000  # a byte at 400 kHz with its acknowledge takes 22.5 µs
 _FRAME = 6  # bytes of a sample in the FIFO: three words
 
-NOISE_DPS_RTHZ = 0.005
+NOISE_DPS_RTHZ = 0.005  # PS-MPU-6000A, 6.1; LSB by the full scale
 LSB_PER_G = 16384.0
 LSB_PER_DPS = {250: 131.0, 500: 65.5, 1000: 32.8, 2000: 16.4}
 _FILTERS = {188: 1, 98: 2, 42: 3, 20: 4, 10: 5, 5: 6}

@@ -28,7 +28,7 @@ from rig.devices.camera import CameraIdentity, CameraLocks, Frame
 from rig.devices.opencv_capture import Capture, modes_of, waiter_of
 from rig.devices.v4l2 import choose_mode
 
-V4L2_EXPOSURE_MANUAL = 1
+V4L2_EXPOSURE_MANUAL = 1  # V4L2_EXPOSURE_MANUAL of linux/v4l2-controls.h
 _V4L2_EXPOSURE_AUTO = (0, 3)  # fully automatic, and aperture priority: the camera sets the time
 _EXPOSURE_UNIT_US = 100.0  # V4L2_CID_EXPOSURE_ABSOLUTE
 

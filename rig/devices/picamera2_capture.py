@@ -31,10 +31,10 @@ REPAIR: Final = (
     "that does not help: `sudo apt install --reinstall -y python3-picamera2 python3-libcamera python3-simplejpeg`."
 )
 _SOURCE: Final = re.compile(r"picamera2(?::(\d+))?")
-_FRAME_WAIT_S: Final = 3.0
+_FRAME_WAIT_S: Final = 3.0  # longer: an unplugged camera is noticed late; shorter: a long exposure looks like one
 _SETTLE_FRAMES: Final = 12
 """Frames after which changed settings are certainly in force: sensor and image processor delay them by several."""
-_NOMINAL_FPS: Final = 30.0
+_NOMINAL_FPS: Final = 30.0  # until the frame durations of the sensor's mode are known
 _MANUAL_FOCUS, _CONTINUOUS_FOCUS = 0, 2  # libcamera's AfMode
 
 

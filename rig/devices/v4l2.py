@@ -9,7 +9,7 @@ from pathlib import Path
 
 CAPTURE, CAPTURE_MPLANE = 0x0000_0001, 0x0000_1000
 M2M_MPLANE, M2M = 0x0000_4000, 0x0000_8000
-_DEVICE_CAPS = 0x8000_0000
+_DEVICE_CAPS = 0x8000_0000  # linux/videodev2.h and v4l2-controls.h, like all numbers below
 
 POWER_LINE_FREQUENCY = 0x0098_0918
 EXPOSURE_DYNAMIC_FRAMERATE = 0x009A_0903
@@ -23,7 +23,7 @@ _FORMAT = struct.Struct("III32s4s4I")  # index, type, flags, description, pixel 
 _SIZE = struct.Struct("I4sI6I2I")  # index, pixel format, type, then width and height, or ranges with steps; reserved
 _INTERVAL = struct.Struct("I4sIII6I2I")  # index, pixel format, width, height, type, fractions of a second; reserved
 _VIDEO_CAPTURE, _DISCRETE = 1, 1
-_MOST_ENTRIES = 64
+_MOST_ENTRIES = 64  # a driver that never answers EINVAL must not hold the program
 _G_CTRL, _S_CTRL = 0xC008_561B, 0xC008_561C
 _CONTROL = struct.Struct("Ii")
 _CAPABILITY = struct.Struct("16s32s32s6I")  # driver, card, bus; version, capabilities of the driver and of this node

@@ -26,7 +26,8 @@ BAUD_RATES_1 = (1_000_000, 115_200, 57_600, 500_000, 250_000, 200_000, 19_200, 9
 
 _ANSWER_1_S = 0.02  # time for an answer of a servo of Protocol 1.0 and its adapter; each id is asked separately
 _PING_ANSWER = 14
-_LISTEN_S = 0.05
+_LISTEN_S = 0.05  # longer than an answer at the lowest rate; only a device that talks by itself sends in this time
+# two servos with one id collide in most readings, a bad cable in few: more than half of these tells them apart
 _STATUS_READS = 8
 _STATUS = (120, 27)  # realtime Tick to Present Temperature: two servos with the same id soon differ in these
 

@@ -176,6 +176,7 @@ def _frames(context: DoctorContext, source: OpenCvCamera) -> Iterator[Finding]:
     frames: list[NDArray[np.uint8]] = []
     times_ns = []
     ages = []
+    # First frames as fast as they come, for the rate; then frames apart, for changes of the light.
     after_ns = start_ns = clock.now_ns()
     rate = 0.0
     for number in range(QUICK + SPACED):
@@ -186,6 +187,7 @@ def _frames(context: DoctorContext, source: OpenCvCamera) -> Iterator[Finding]:
         if number == QUICK - 1:
             rate = QUICK / max(seconds_between(start_ns, clock.now_ns()), 1e-9)
         after_ns = frame.exposed_ns + (1 if number < QUICK else round(SPACING_S * 1e9))
+    # A black or frozen camera explains all other findings, so it is the only one.
     seen = [ImageQuality.of(frame, context.config.view) for frame in frames]
     levels = [each.mean_level for each in seen]
     evidence: dict[str, Any] = {"frame_age_ms": 1e3 * max(ages), "frames_per_s": rate, "mean_levels": levels}
@@ -204,6 +206,7 @@ def _frames(context: DoctorContext, source: OpenCvCamera) -> Iterator[Finding]:
     else:
         yield fine("camera", FindingCode.FRAMES, **evidence)
     yield from _flicker(source, frames, np.array(times_ns), evidence)
+    # Would an enrollment accept this view?
     quality = asdict(seen[-1])
     if reasons := seen[-1].reasons(context.config.view):
         fix = (

@@ -17,7 +17,8 @@ VIEW_BYTES = 500_000  # an image of 640x480 with a sensor's noise, lossless
 LITTLE_ROOM, TOO_LITTLE_ROOM = 2_000_000_000, 200_000_000
 
 _PAUSE_S, _PAUSE_ERROR_S = 0.02, 0.25
-_STEP_S = 0.5
+_STEP_S = 0.5  # more than NTP corrects without a step
+# older than this program: a computer without a clock chip starts in 1970 or at its last shutdown
 _OLDEST_UTC = datetime(2025, 1, 1, tzinfo=UTC)
 
 PORT_GRABBERS = {

@@ -8,12 +8,12 @@ from numpy.typing import NDArray
 MAINS_HZ = (50.0, 60.0)
 MIN_DEPTH = 0.01
 """Smallest amplitude, as a share of the mean level, that counts."""
-_MIN_EXPLAINED = 0.6
+_MIN_EXPLAINED = 0.6  # less: something else changes the light, such as a person who passes
 _STANDS = 0.1
 """Variance of the lamp's phase from image to image below which bands stand still; 1 if all phases occur."""
 _CYCLES = np.arange(0.0, 8.01, 0.125)
 """Bands in an image: at most 8, for a readout of 67 ms at 120 Hz."""
-_BLOCKS = 48
+_BLOCKS = 48  # six for each band at most; more blocks are noisier
 _STANDING_CYCLES = _CYCLES[_CYCLES >= 0.75]
 """Smallest number of bands; fewer look like a change of the scene from its top to its bottom."""
 

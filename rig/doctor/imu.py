@@ -33,6 +33,7 @@ def imu(context: DoctorContext) -> Iterator[Finding]:
         yield warning("imu", FindingCode.NOT_CHECKED, Do.STOP())
         return
     config, clock = context.config, context.computer.clock
+    # The sensor of a rig head is not on a bus of this computer.
     if config.imu.connection == "head":
         head = open_head(config, lambda: context.computer.open_serial(config.head.port, BAUD), clock)
         with closing(head):
@@ -43,6 +44,8 @@ def imu(context: DoctorContext) -> Iterator[Finding]:
                 yield of_error("imu", fault, Do.ACKNOWLEDGE())
             yield from _at_rest(context, head)
         return
+    # A Raspberry Pi's controller corrupts bytes of a sensor that stretches the clock: warn before the cause is in
+    # doubt.
     khz = context.computer.cannot_stretch_khz(config.imu.bus)
     if config.imu.model == "bno055" and khz is not None and khz > STRETCH_KHZ:
         bus = context.computer.i2c_name(config.imu.bus)

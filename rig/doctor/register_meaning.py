@@ -8,6 +8,7 @@ BAUD_CODES = {9_600: 0, 57_600: 1, 115_200: 2, 1_000_000: 3, 2_000_000: 4, 3_000
 """Values of Baud Rate, Protocol 2.0."""
 AX_BAUD = 2_000_000  # protocol 1.0: the value of Baud Rate is this number divided by the rate, minus one
 
+# All values and bits: e-manual, control tables of the X series and the AX-12A.
 _OPERATING_MODES = {
     0: "current",
     1: "velocity",

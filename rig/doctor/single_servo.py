@@ -15,7 +15,7 @@ from rig.doctor.bus_scan import BAUD_RATES, BAUD_RATES_1, BaudScan, FoundServo, 
 from rig.doctor.context import DoctorContext
 from rig.doctor.register_meaning import baud_codes
 
-MAX_ID = 252
+MAX_ID = 252  # 253 is reserved, and 254 is the broadcast
 _SETTLE_S = 0.05  # time that a servo needs before it answers at a new rate
 
 

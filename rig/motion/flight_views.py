@@ -20,8 +20,8 @@ READINGS: Final = 8
 """Readings of the encoder from which the angle of a frame is estimated during a flight."""
 GRID_MS: Final = 1.5
 """Smallest tolerance for the distance of a stamp from the camera's regular rhythm."""
-GRID_SIGMAS: Final = 5.0
-FEWEST_STAMPS: Final = 4
+GRID_SIGMAS: Final = 5.0  # of a second of frames, none is so far off by chance
+FEWEST_STAMPS: Final = 4  # fewer have no majority that shows the rhythm
 
 
 @dataclass(eq=False)

@@ -18,7 +18,7 @@ REACTION_S = 2.0
 """How long a program may take to notice the request: many rounds of its control loop, and a long exposure."""
 END_S = 5.0
 """Longest time that the program may then take to close its devices."""
-POLL_S = 0.02
+POLL_S = 0.02  # shorter than a person notices
 
 
 @dataclass(frozen=True, slots=True)

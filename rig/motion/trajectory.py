@@ -37,10 +37,11 @@ ACCELERATION_DPS2: Final = 400.0
 """Largest acceleration of the platter that is expected where no sample was taken."""
 OUTLIER: Final = 4.0
 """Readings that deviate by more standard uncertainties weigh less."""
+# larger: a slip is stored in the azimuths of views; smaller: encoder noise and backlash end good motions
 SLIP_DEG: Final = 0.25
 SLIP_READINGS: Final = 5
 """Number of successive readings with a large deviation that shows a slip of the platter or a wrong sensor."""
-FEWEST_READINGS: Final = 4
+FEWEST_READINGS: Final = 4  # the fit has four unknown parameters: angle, bias, scale, delay
 
 
 @dataclass(frozen=True, slots=True)

@@ -38,7 +38,7 @@ from rig.report.records import Correctness, EnrollmentRecord, IdentificationReco
 from rig.report.summary import enrollment_items, totals
 from rig.search.saved_run import SavedRun
 
-_STAMP: Final = (56, 56)
+_STAMP: Final = (56, 56)  # px: it only helps to recognise the object; every picture makes the file of the report larger
 _LEADING: Final = 3
 """Candidates in the table of a view."""
 _REASONS: Final = 3

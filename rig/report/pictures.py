@@ -14,8 +14,8 @@ from rig.core.phrases import azimuth_words
 Image = NDArray[np.uint8]
 Region = tuple[int, int, int, int]
 
-_JPEG_QUALITY: Final = 84
-_COLUMNS: Final = 12
+_JPEG_QUALITY: Final = 84  # lower: blocks hide grain and edges; higher: a report of many views becomes a large file
+_COLUMNS: Final = 12  # more: the views are too small to compare by eye
 _CAPTION_PX: Final = 17
 _PAPER: Final = 24
 _OUTLINE: Final = (60, 170, 230)

@@ -27,7 +27,7 @@ from rig.core.masking import masked
 from rig.core.next_steps import Do, NextSteps, in_words, steps_as_json
 from rig.safety.stop_channel import StopAnswer, StopListener, StopRequest, listen
 
-VERSION = 1
+VERSION = 1  # a state of another version counts as damaged, because it may have contained a fault
 LATCH_BYTES = 8192
 """Size of the file of the latched fault. It is written again in place, which needs no room on the disk."""
 SESSION = "session.json"
@@ -402,7 +402,7 @@ def storing(path: Path) -> AbstractContextManager[None]:
     return os_errors_as(StateNotStored, what, next_step=_MAKE_ROOM)
 
 
-LOCK_ATTEMPTS = 3
+LOCK_ATTEMPTS = 3  # a reader of the holder locks for a moment; with more attempts, a busy bench is reported later
 
 
 class BenchLock:

@@ -24,10 +24,10 @@ from rig.core.errors import StateNotStored, os_errors_as
 from rig.core.next_steps import Do
 
 NAME: Final = "stop"
-BACKLOG: Final = 64
+BACKLOG: Final = 64  # requests to stop wait in the kernel until the control loop looks; the next one would be rejected
 MAX_PATH_BYTES: Final = 100
 """The address of a socket has at most 103 (macOS) or 107 bytes."""
-POLL_S: Final = 0.02
+POLL_S: Final = 0.02  # shorter than a person notices
 
 
 class StopAnswer(StrEnum):

@@ -23,14 +23,16 @@ from rig.core.errors import UsageError
 
 IMAGE_FOLDER: Final = "images"
 
+# a frame of `MAX_PIXELS` without compression nearly fits; a larger file is not read into memory
 MAX_FILE_BYTES: Final = 256_000_000
-MAX_SIDE: Final = 20_000
+MAX_SIDE: Final = 20_000  # a strip of `MAX_PIXELS` is no frame; cv2.remap fails from 32,767 on
 MAX_PIXELS: Final = 100_000_000
 """Largest image: more pixels than any camera of such a bench has, and 300 MB decoded."""
 
 _PNG: Final = b"\x89PNG\r\n\x1a\n"
 _JPEG: Final = b"\xff\xd8\xff"
 
+# JPEG markers (ITU T.81, table B.1): DHT, JPG and DAC lie between the frame headers SOF0 to SOF15
 _NO_FRAME: Final = (0xC4, 0xC8, 0xCC)
 _END: Final = 0xD9
 _SCAN: Final = 0xDA

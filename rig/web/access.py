@@ -23,14 +23,14 @@ from rig.core.files import read, write
 from rig.core.next_steps import Do
 
 TOKENS: Final = "tokens.json"
-MAX_NAME: Final = 50
-MAX_BYTES: Final = 1_000_000
+MAX_NAME: Final = 50  # a line of the list of tokens
+MAX_BYTES: Final = 1_000_000  # far above a file of all tokens of a laboratory
 SESSION_S: Final = 12 * 3600.0
 """Time for which a login is valid: a working day."""
-MAX_SESSIONS: Final = 1000
+MAX_SESSIONS: Final = 1000  # a script that logs in for each request must not fill the memory; the oldest session ends
 LEASE_S: Final = 45.0
 """Time after which a lease that is not renewed is free, because the operator's browser was closed."""
-MAX_ASKED: Final = 100
+MAX_ASKED: Final = 100  # persons who asked for the lease and are remembered
 
 
 def new_token() -> str:

@@ -27,7 +27,7 @@ from rig.web.problems import problem
 from rig.web.requests import AnswerBody, HandOverBody, Job, JobRequest, LeaseBody, LoginBody
 from rig.web.server import API, COOKIE, OperatorPerson, Page, Routes, Server, Watcher, require_operate
 
-MAX_VIEWERS: Final = 50
+MAX_VIEWERS: Final = 50  # each loads the network and the process that receives STOP
 _LOCATION: Final[dict[int | str, dict[str, Any]]] = {
     201: {"headers": {"Location": {"description": "the job", "schema": {"type": "string"}}}}
 }

@@ -40,7 +40,7 @@ from rig.web.picture import jpeg
 from rig.web.requests import CorrectionBody, NameBody, ObjectBody
 from rig.web.server import API, OperatorPerson, Page, Routes, Server, cached, long_work
 
-THUMB_PX: Final = 256
+THUMB_PX: Final = 256  # larger: a long list loads slowly; smaller: blurred on dense screens
 UPLOAD: Final = f"{API}/import"
 CHUNK_BYTES: Final = 65_536
 BYTES_PER_S: Final = 30_000_000

@@ -41,6 +41,7 @@ def create_app(server: Server) -> FastAPI:
         generate_unique_id_function=lambda route: route.name,
     )
     app.state.server = server
+    # Three groups of routes by what a person may do: no login, watch, operate.
     routes = Routes()
     for add in (add_access, add_bench, add_jobs, add_objects, add_results, add_bundles, add_records):
         add(routes, server)
@@ -55,6 +56,7 @@ def create_app(server: Server) -> FastAPI:
         registry.register(_Numbers(server))
         return Response(generate_latest(registry), media_type="text/plain; version=0.0.4")
 
+    # Every error has the same body: code, evidence and next step.
     @app.exception_handler(RigError)
     async def rig_error(_request: Request, error: RigError) -> Response:
         return ProblemResponse.of(error)

@@ -32,13 +32,14 @@ from rig.web.remote_bench import RemoteBench
 from rig.web.server import Server
 from rig.web.setup import WEB_NICE, BenchCatalog, Listening, Setup, print_note, set_priority, shorten_pauses
 
+# each connection is a file; the usual limit of 1,024 is reached by a script that does not close them
 MAX_FILES: Final = 65_536
 THREADS: Final = 8
 """Threads for short requests. With more, STOP would wait longer for its turn of the interpreter."""
 SWITCH_S: Final = 0.001
 """Time after which a thread hands the interpreter to the next one: a fifth of the usual time, for the same reason."""
-SIGN_OF_LIFE_S: Final = 1.0
-END_S: Final = 4.0
+SIGN_OF_LIFE_S: Final = 1.0  # thirty may be late before `rig.web.run` ends this process
+END_S: Final = 4.0  # longer: `rig serve` ends later; shorter: requests that are nearly done are cut off
 
 
 def make_server(setup: Setup, clock: SystemClock) -> Server:

@@ -23,7 +23,7 @@ HEARTBEAT_S: Final = 10.0
 """A comment is sent after this time without messages, so that both ends notice a lost connection."""
 CHECK_S: Final = 1.0
 """Time between two checks whether a listener may still listen."""
-MAX_LISTENERS: Final = 200
+MAX_LISTENERS: Final = 200  # each keeps a connection open and gets every event
 
 
 @dataclass(frozen=True, slots=True)

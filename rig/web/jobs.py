@@ -22,7 +22,7 @@ STORED: Final = 200
 """Largest number of stored jobs."""
 STORED_BYTES: Final = 2_000_000
 """Largest size of the stored jobs that have ended; the oldest are dropped."""
-MAX_QUEUED: Final = 50
+MAX_QUEUED: Final = 50  # a script that queues without an end is noticed early
 MAX_QUEUED_BYTES: Final = 4_000_000
 MAX_BYTES: Final = 20_000_000
 """Largest size of the file: the waiting jobs and their continuations, a running one, and those that have ended."""

@@ -20,9 +20,10 @@ from rig.core import errors
 from rig.core.errors import BenchBusy, RigError
 from rig.core.next_steps import Do, steps_as_json, steps_from_json
 
-MAX_BYTES: Final = 64_000_000
+MAX_BYTES: Final = 64_000_000  # a longer line is no message of the other end
 MAX_UNSENT: Final = 20_000
 """Messages that wait for a web process that does not read. Then the oldest is dropped: a bench must not wait."""
+# longer: a request of a browser hangs with the bench; shorter: a busy computer looks like a dead one
 ANSWER_S: Final = 10.0
 
 Functions = Mapping[str, Callable[..., Any]]

@@ -13,8 +13,8 @@ from rig.core.errors import RigError
 from rig.views.description import ViewDescriber, within
 from rig.views.empty_table import empty_table_status
 
-JPEG_QUALITY: Final = 80
-MAX_SIDE_PX: Final = 1280
+JPEG_QUALITY: Final = 80  # for the eye only; no descriptor sees it
+MAX_SIDE_PX: Final = 1280  # the width of a page; more loads a slow network
 TOLERANCE_PX: Final = 1.0
 """Points that change an outline by less are left out."""
 

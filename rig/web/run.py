@@ -36,12 +36,13 @@ from rig.web.setup import BENCH_NICE, BenchCatalog, Listening, Setup, print_note
 from rig.web.work import ServedDesk
 from rig.web.worker import BenchWorker
 
+# longer: a failed start is noticed late; shorter: a busy small computer imports the web packages in vain
 START_S: Final = 30.0
 END_S: Final = 6.0
 """Longer than `rig.web.front.END_S`, after which a web process ends itself."""
 SILENT_S: Final = 30.0
 """Time without a sign of life after which a web process counts as hanging, and is ended."""
-MAX_STARTS: Final = 3
+MAX_STARTS: Final = 3  # a process that ends again and again has a defect that another start does not fix
 STARTS_WITHIN_S: Final = 60.0
 """After `MAX_STARTS` web processes within this time, the server ends."""
 

@@ -20,7 +20,7 @@ from rig.web.access import new_token
 
 BENCH_NICE: Final = -10
 """The process that owns the bench. Without root, a priority is raised only if the system permits it (`LimitNICE=`)."""
-WEB_NICE: Final = -5
+WEB_NICE: Final = -5  # before other programs, because it receives STOP; after the bench, which obeys it
 
 
 class Listening(BaseModel):

@@ -27,11 +27,11 @@ IDLE_S: Final = 0.05
 """Time between two checks of the queue."""
 STATUS_S: Final = 0.25
 """Time between two messages about the state of the table."""
-IDLE_STATUS_S: Final = 1.0
+IDLE_STATUS_S: Final = 1.0  # at rest, the state changes by hand or supply only, and each reading occupies the bus
 REOPEN_S: Final = 5.0
 """Time after which a bench that could not be opened is opened again."""
-INTERVALS: Final = 20_000
-JOBS_WITH_PICTURES: Final = 10
+INTERVALS: Final = 20_000  # of the control loop, for /metrics: some minutes of motion
+JOBS_WITH_PICTURES: Final = 10  # older jobs keep their events, without pictures
 _LOST: Final = (DeviceNotFound, DeviceMismatch, DeviceSilent)
 """After these errors the bench is opened again: a device was unplugged or replaced."""
 

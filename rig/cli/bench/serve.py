@@ -13,7 +13,7 @@ from rig.core.clock import SystemClock
 from rig.core.errors import UsageError
 from rig.core.next_steps import Do
 
-DEFAULT_PORT = 8420
+DEFAULT_PORT = 8420  # any number that few other services use
 
 
 @command
@@ -66,6 +66,7 @@ def serve(
     from rig.web.run import run_server
     from rig.web.setup import Listening, Setup
 
+    # Tokens: these options change the stored ones, and start no server.
     folder = settings.load().state_path(settings.bench_name) / SERVER_FOLDER
     tokens = Tokens(folder, SystemClock())
     if new_token is not None:
@@ -82,6 +83,7 @@ def serve(
         return
     if (certfile is None) != (keyfile is None):
         raise UsageError("TLS needs a certificate and its key.", next_step="Give --certfile and --keyfile.")
+    # Every user of the network could move the table, so only this computer may do without tokens.
     needs_login = login or not is_loopback(host)
     if needs_login and not tokens.stored():
         raise UsageError(
@@ -98,6 +100,7 @@ def serve(
     )
     if settings.bench_name == "sim" and "speed" not in settings.load().bench.get("sim", {}):
         settings = settings.merged(overrides=["bench.sim.speed=1"])  # people watch it
+    # The web process runs with the same settings.
     arguments = tuple(settings.arguments())
     settings.opened.append(settings.bench_name)
 

@@ -132,6 +132,7 @@ def acknowledge(
     desk.run(acknowledge_job(desk, reboot=reboot))
 
 
+# longer: the shown angle is behind the table; shorter: the servo is asked more often than the eye needs
 _WAIT_S: Final = 0.2
 _KEYS: Final = {
     b"\x1b[C": "forward",

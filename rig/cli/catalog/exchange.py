@@ -195,6 +195,7 @@ def export(
         )
     words, values = "", {}
     with settings.open_catalog(read_only=True) as catalog:
+        # Which objects: names, a label, or both.
         wanted = list(names or [])
         if label is not None:
             labelled = [item.name for item in catalog.objects() if item.label == label]

@@ -71,6 +71,7 @@ def evaluate(
 
     if data is None and Path(experiment).is_dir():
         experiment, data = DEFAULT, Path(experiment)
+    # The experiment, with what the options replace.
     rule = settings.load().identify
     try:
         asked = load_experiment(
@@ -100,6 +101,7 @@ def evaluate(
             results = run_experiment(asked, dataset, jobs_of(jobs, cluster) or os.cpu_count() or 1, advance)
     except ValueError as error:
         raise UsageError(str(error), next_step="Correct the experiment, the options or the data set.") from error
+    # The files first: they are the result, the tables below only show it.
     write_results(results, folder)
     if settings.json:
         settings.print_json({"event": "finished", **results})

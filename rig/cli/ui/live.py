@@ -366,6 +366,7 @@ class IdentifyView(LiveView):
         for heading in ("score", "behind", "pose"):
             table.add_column(heading, justify="right")
         candidates = self._ranked.candidates if self._ranked else ()
+        # The paper's search has no probabilities, and a narrow terminal no room for bars.
         shares = [self._share(one) for one in candidates]
         likely = any(shares)
         if likely:
@@ -391,6 +392,7 @@ class IdentifyView(LiveView):
             table.add_row(*cells)
         if self._ended:
             return table if candidates else Group()
+        # Below the table: where the search is, and its last decision.
         where = f", azimuth {azimuth_words(self._azimuth_deg)}°" if self._taken else ""
         lead = f", margin {signed(self._ranked.margin, 3)}" if self._ranked else ""
         taken = f"view {self._taken} of {self._of} at most{where}{lead}"

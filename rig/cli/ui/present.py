@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from rig.catalog.jobs import JobProgress
     from rig.plans.estimate import DryRun
 
-_PIPE_COLUMNS: Final = 240
+_PIPE_COLUMNS: Final = 240  # no row of a table is cut for a program that reads it
 
 
 class _Screen(Console):

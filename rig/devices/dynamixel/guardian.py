@@ -18,7 +18,7 @@ from rig.devices.dynamixel.bus import DynamixelBus
 from rig.devices.dynamixel.port import GUARDIAN, GUARDIAN_S, ClockedPort, open_serial
 from rig.devices.dynamixel.registers import control_table, protocol_of
 
-_RETRY_S: Final = 0.05
+_RETRY_S: Final = 0.05  # longer: the torque stays on longer; shorter: the waiting takes a whole core
 _ON, _OFF = b"1", b"0"
 
 

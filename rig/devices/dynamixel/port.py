@@ -48,7 +48,7 @@ GUARDIAN = "rig.devices.dynamixel.guardian"
 GUARDIAN_S = 5.0
 """How long the guardian of a killed program tries to switch the torque off."""
 _BUSY = (errno.EBUSY, errno.EAGAIN, errno.EWOULDBLOCK)
-_BUSY_RETRY_S = 0.05
+_BUSY_RETRY_S = 0.05  # the guardian needs a few transactions of the bus to end; shorter: the waiting takes a core
 
 
 def open_serial(path: str, baud: int, device: str = "servo", clock: Clock | None = None) -> SerialConnection:

@@ -85,6 +85,7 @@ _AX_12A_TABLE = (
     (48, 2, "Punch"),
 )
 """No value is signed: speed and load have their direction in bit 10."""
+# Its table is here because the SDK has no .model file of it.
 AX_12A = DynamixelModel("ax_12a", 12, 1, _AX_12A_TABLE, ram_start=24)
 
 _LETTERS = {1: "b", 2: "h", 4: "i"}  # formats of the module struct, signed

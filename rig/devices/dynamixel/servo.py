@@ -35,19 +35,21 @@ BOOT_ALLOWANCE_S = 3.0
 TORQUE_OFF_ATTEMPTS = 3
 """Largest number of attempts to switch the torque off and read it back before it counts as on."""
 
-COUNTS_PER_REVOLUTION = 4096
+COUNTS_PER_REVOLUTION = 4096  # encoder of the X and MX series: 0.088° for each count
 DEG_PER_COUNT = 360.0 / COUNTS_PER_REVOLUTION
 DPS_PER_UNIT = 0.229 * 6.0  # Velocity registers: 0.229 rev/min
+# e-manual, Goal Position in extended position mode: 256 revolutions in each direction
 EXTENDED_RANGE_COUNTS = 1_048_575
-WATCHDOG_TRIPPED = 0xFF
+WATCHDOG_TRIPPED = 0xFF  # e-manual, Bus Watchdog: reads as −1; goals are read-only until 0 is written
 
-TICK_MODULUS_MS = 32768
+TICK_MODULUS_MS = 32768  # e-manual, Realtime Tick: wraps after 32,767 ms
 TICK_TOLERANCE_MS, TICK_DRIFT = 20.0, 0.03
 """How much the servo's clock (Realtime Tick) may differ from the computer's between two readings."""
 TICK_MEMORY_S = 10.0
 """After a longer pause, two readings must agree with each other instead."""
 _FRESH_ATTEMPTS, _RESTARTED = 8, 3
 
+# e-manual, Hardware Error Status: by bit
 _HARDWARE_ERRORS = {0: "input voltage", 2: "overheating", 3: "motor encoder", 4: "electrical shock", 5: "overload"}
 _AX_ARRIVED_COUNTS = 2  # largest distance from the goal at rest: the compliance margin of 1 count, and 1 count of noise
 

@@ -25,12 +25,14 @@ class SettingDifference:
         return f"{self.register}: {self.found} → {self.wanted} ({self.reason})"
 
 
+# e-manual, Operating Mode. Velocity, PWM and current modes do not hold an angle.
 _OPERATING_MODES: Final = {
     "turntable": (4, "extended position: the table rotates beyond one revolution"),
     "pan": (3, "position: the arm stays within one revolution"),
 }
 _DRIVE_MODE_BITS = 0b1101
 """Drive Mode bits that must be 0: reverse direction, time-based profile, and torque on by goal update."""
+# e-manual, Shutdown: the factory settings, with the bits of Hardware Error Status
 _SHUTDOWN = 0b110100, "overload, short circuit and overheating switch the torque off"
 _AX_SHUTDOWN = 0b100100, "overload and overheating switch the torque off"
 

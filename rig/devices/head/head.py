@@ -44,7 +44,7 @@ from rig.devices.imu import ImuSamples
 
 POWER_UP_S = 0.6
 """Time from closing the relay of the servo's supply until the servo answers."""
-HEARTBEATS_PER_DEADMAN = 4
+HEARTBEATS_PER_DEADMAN = 4  # three may be lost or late before the head switches off; more: more traffic on its port
 FIRST_HEARTBEATS = 8
 """Heartbeats that compare the clocks before the first sample is dated."""
 RECOVERY_S = 0.5

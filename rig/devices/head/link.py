@@ -50,7 +50,7 @@ LONGEST = MAX_BODY + OVERHEAD
 
 REPLY_S = 0.06
 """How long a reply may take: 6 ms behind a full transmitter, plus twice a USB adapter's latency timer."""
-ATTEMPTS = 3
+ATTEMPTS = 3  # a corrupt frame is sent again; with more attempts, a dead connection is noticed later
 GREETING_S = 3.0
 """How long the first answer may take: opening its port restarts an Arduino, and its boot loader waits."""
 

@@ -36,7 +36,7 @@ ROUND_TRIPS = 48
 """Heartbeats that the estimate uses: a few seconds, in which the temperature of a resonator is constant."""
 BAUD_TOLERANCE = 0.95
 """The baud rates at the two ends of a working connection differ by up to 5 %."""
-_WRAP = 1 << 32
+_WRAP = 1 << 32  # the head counts microseconds in 32 bits: 71 minutes
 
 
 @dataclass(frozen=True, slots=True)
