@@ -33,13 +33,14 @@ from rig.plans.capture import moved
 
 NAME = "servo.backlash"
 
+# The short legs are mostly backlash, the long ones mostly ratio: together they separate both.
 SHORT_DEG, LONG_DEG = 6.0, 60.0
-MIN_REVERSALS = 6
+MIN_REVERSALS = 6  # three in each direction: fewer do not show a scatter
 RATIO = (0.9, 1.1)
 """Range of ratios of a sound gyro and the right gear ratio (see `calibration.gyro_scale.PLAUSIBLE`)."""
 MAX_BACKLASH_DEG = 2.0
 """Eight times the backlash of an XL430's gears: more is a loose horn or coupling."""
-MAX_UNCERTAINTY_DEG = 0.03
+MAX_UNCERTAINTY_DEG = 0.03  # a third of an encoder count: less is not seen in the table's angle
 
 
 def plot(result: CalibrationResult) -> Chart | None:

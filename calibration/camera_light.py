@@ -34,16 +34,23 @@ PAIRS = 24
 """Frames of the scene at rest."""
 HANDS_S = 1.0
 """Time from the operator's answer to the first frame: the bench is quiet again, and no frame shows the former scene."""
+# a lamp that warms up drifts over minutes; more frames only make the operator wait
 CARD_FRAMES, CARD_SECONDS = 40, 240.0
+# Photon transfer: bins of brightness, in each region of the frame, because a lens darkens the corners. More bins and
+# regions have fewer pixels each.
 BINS = 24
 MIN_PIXELS = 50
 REGIONS = (3, 4)
+# Leaving out groups of frames gives the uncertainty: regions alone had given a too small one
+# (docs/explanation/calibration.md).
 FRAME_GROUPS = 6
 LEVELS = (8.0, 235.0)
 """Grey levels between which a pixel is neither black nor saturated."""
 MIN_SPAN = 80.0
 """Grey levels that the scene must span to separate noise that grows with light from noise that does not."""
-BLOCK = 16
+BLOCK = 16  # px: averages the noise; vignetting changes slowly over the frame
+# Limits of a scene that is a grey card in steady, white light. Larger: a shadow on the card is measured as the lens;
+# smaller: lamps of a laboratory fail.
 MAX_UNEVEN = 0.05
 MAX_DRIFT_PERCENT = 1.0
 MAX_FLICKER = 0.02

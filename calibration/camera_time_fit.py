@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 NEAR_DEG = 2.0
 """Largest distance, in degrees, of the reference frames that are compared with a frame."""
-FEWEST_FRAMES = 40
-BANDS = 4
+FEWEST_FRAMES = 40  # fewer leave the scatter, and so the uncertainty, to chance
+BANDS = 4  # more bands show the read-out better and have less texture each
 TEXTURE_SHARE = 0.1
 """Rows with less than this share of the texture of the best row are left out."""
 READOUT_S = 0.03

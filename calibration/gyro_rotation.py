@@ -40,8 +40,8 @@ NAME = "imu.rotation"
 
 SPEEDS = {"fast": 1.0, "medium": 0.3, "slow": 0.08}
 """Shares of table.velocity_dps."""
-DISTANCE_DEG = 60.0
-MIN_REPEATS = 4
+DISTANCE_DEG = 60.0  # longer: more noise of the gyro to check; shorter: less cable is needed
+MIN_REPEATS = 4  # with fewer, the limits by `CHANCE` are so wide that they reject nothing
 CHANCE = 1e-4
 """Probability that a true σ is rejected, at each duration and in either direction."""
 CAUTION = 2.0

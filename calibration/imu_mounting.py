@@ -24,19 +24,19 @@ from rig.plans.capture import moved
 
 NAME = "imu.mounting"
 
-STEPS = 8
-READINGS = 60
+STEPS = 8  # a first harmonic needs three angles; eight also average the second one
+READINGS = 60  # a rest takes 1.5 s; more average more of the noise
 SPACING_S = 0.025
 """Time between readings of the accelerometer, in which the memory of its low-pass filter of about 40 Hz decays."""
 MAX_TILT_DEG = 10.0
 """Largest tilt; the cosine of this angle reduces the rate by 1.5 %, more than the gyro's own scale error."""
-MAX_LEVEL_DEG = 5.0
+MAX_LEVEL_DEG = 5.0  # more is a bench on a slope: the views would show leaning objects
 AXIS_GAIN_SIGMA = 0.015
 """Difference of the scales of two of the gyro's axes, from part to part."""
 MIN_RATE_DPS = 5.0
 """Rate from which readings during a rotation count; the shaft has run through the backlash before."""
 
-REST_IN_BACKLASH_DEG = 0.04
+REST_IN_BACKLASH_DEG = 0.04  # a sixth of the backlash of an XL430's gears, 0.25°
 
 
 @dataclass(frozen=True, slots=True)

@@ -34,11 +34,12 @@ from rig.plans.capture import moved
 
 NAME = "servo.motion"
 
+# short ones give the delay, middle ones the ramps, long ones the speed
 DISTANCES_DEG = (2.0, 5.0, 10.0, 20.0, 45.0, 90.0, 180.0)
-MIN_ROUNDS = 2
+MIN_ROUNDS = 2  # one round has no scatter
 TYPICAL_S = 0.04
 """Scatter of a settling time: the period of the control loop."""
-NOMINAL_TRUST = 0.3
+NOMINAL_TRUST = 0.3  # smaller: the fit returns the configuration; larger: ramp and delay cannot be separated
 MAX_RESIDUAL_S = 0.25
 """Largest residual of a rotation that nothing obstructed: six periods of the control loop."""
 PARAMETERS = {"pace": "s/°", "wind_up": "s", "delay": "s"}

@@ -15,7 +15,7 @@ from rig.views.charuco_board import Board
 
 PNG_PX_MM: Final = 12
 """About 305 dots an inch."""
-POINTS_MM: Final = 72 / 25.4
+POINTS_MM: Final = 72 / 25.4  # PDF's unit is 1/72 inch; the page is A4, landscape
 PAGE_MM: Final = (297.0, 210.0)
 RULER_MM: Final = 100.0
 

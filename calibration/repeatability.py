@@ -37,10 +37,10 @@ from rig.views.description import PAPER_DESCRIPTOR, ViewDescriber
 
 NAME = "noise.repeatability"
 
-AZIMUTHS = 12
+AZIMUTHS = 12  # every 30°; more make each of the placements longer, and placements are what shows the scatter
 ROUNDS = 2
 MIN_PLACEMENTS = 2
-BOOTSTRAPS = 200
+BOOTSTRAPS = 200  # gives an uncertainty to 5 %
 MAX_DRIFT = 0.02
 """Largest loss of similarity between the first and the last placement, compared with consecutive placements."""
 MIN_SIMILARITY = 0.7

@@ -37,17 +37,18 @@ from rig.views.charuco_board import Board
 NAME = "table.axis"
 
 STANDS = ("calibration-board upright", "calibration-board back")
+# wider: the axis is known better; from beyond 60° the board's corners are hardly found
 ANGLES_DEG = tuple(float(angle) for angle in range(-60, 61, 10))
-MIN_VIEWS = 8
+MIN_VIEWS = 8  # each view adds six unknown numbers; fewer than eight over 60° leave the axis' tilt uncertain
 MIN_SPAN_DEG = 60.0
-MAX_RMS_PX = 0.4
-MAX_WOBBLE_DEG = 0.5
-MAX_UNCERTAINTY_PX = 0.3
+MAX_RMS_PX = 0.4  # as for `calibration.camera_model`, and the table's wobble
+MAX_WOBBLE_DEG = 0.5  # more is a bent horn, or a board that moved
+MAX_UNCERTAINTY_PX = 0.3  # the region is set in whole pixels
 MAX_LENS_OFF = 0.06
 """Relative error of a distance from lens to axis that is measured by hand."""
 MAX_CUT = 0.1
 """Largest share of the object space that the frame may cut off on a side, because objects seldom fill its corners."""
-ROBUST_PX = 0.3
+ROBUST_PX = 0.3  # three times the scatter of a good corner: larger residuals are wrong corners and count less
 CORNER_PX = 0.1
 """Uncertainty of a corner: it weighs the corners against the known camera parameters."""
 PIVOT_MM = 80.0
