@@ -13,7 +13,7 @@ from sim.objects.projection import HEIGHT, WIDTH, Floats, Image
 from sim.optics import SUPERSAMPLING, Optics
 from sim.world import SimObject
 
-TEXTURE_PX_MM = 10
+TEXTURE_PX_MM = 10  # five texels for a pixel of the frame; fewer: corners are rounded; more: a board takes more memory
 _FAR = 1e4  # texels: outside every texture
 
 

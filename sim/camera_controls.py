@@ -10,6 +10,7 @@ from sim.sensor import Gains, white_balance
 
 NOMINAL_EXPOSURE = 100  # exposure at which the frame has the scene's grey levels, in V4L2's unit of 100 µs
 V4L2_EXPOSURE_MANUAL, V4L2_EXPOSURE_APERTURE_PRIORITY = 1, 3
+# The ranges and defaults of a usual UVC webcam. The longest exposure is the time between two frames.
 EXPOSURE_RANGE = (1, 10_000 // FPS)
 _GAIN_RANGE_DB = (0, 24)
 KELVIN_RANGE = (2800, 6500)

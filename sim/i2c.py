@@ -34,7 +34,7 @@ FUNCTIONS = (
 ) & ~smbus.I2cFunc.SMBUS_PEC
 """Capabilities of the adapter, for the ioctl I2C_FUNCS."""
 
-_MAX_MESSAGES = 42
+_MAX_MESSAGES = 42  # I2C_RDWR_IOCTL_MAX_MSGS and the kernel's largest message: i2c-dev rejects more, so this bus does
 _MAX_MESSAGE_LENGTH = 8192
 
 

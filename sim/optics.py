@@ -15,7 +15,7 @@ from sim.world import World
 FOCAL_PX = 1000.0
 DISTANCE_MM = 500.0
 """From the lens to the centre of the platter's top; with the focal length 2 px/mm, as in `sim.objects.projection`."""
-SUPERSAMPLING = 2
+SUPERSAMPLING = 2  # more: less aliasing of fine strokes; each frame takes four times as long at twice the number
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,10 @@ from sim.objects.projection import HEIGHT, WIDTH, Image
 Gains = tuple[float, float, float]
 """Factors of B, G, R."""
 
-NOMINAL_KELVIN = 5000.0
-_WAVELENGTHS_NM = (465.0, 540.0, 610.0)
+NOMINAL_KELVIN = 5000.0  # the light in which the frame has the scene's colours
+_WAVELENGTHS_NM = (465.0, 540.0, 610.0)  # middles of the bands of usual filters, B, G, R
+# Noise is drawn once, because it takes longer than a frame; each frame takes another part of the tile. Larger: frames
+# are less alike, and the start takes longer.
 _TILE_MARGIN = 128
 _STRIP = 32  # rows that are computed together: they stay in the processor's cache
 

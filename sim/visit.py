@@ -8,7 +8,7 @@ import numpy as np
 from hbr.drawing.bench import Visit
 from sim.objects.projection import CENTRE_PX, HEIGHT, WIDTH, Image
 
-_GROUNDS = (24, 232)
+_GROUNDS = (24, 232)  # dark and bright, but not clipped: a shadow still changes both
 _OPAQUE = 104  # an object's pixels differ by less on the two grounds; those of its soft shadow by more
 
 

@@ -32,6 +32,7 @@ TEMP, CALIB_STAT, ST_RESULT, SYS_STATUS, SYS_ERR, UNIT_SEL = 0x34, 0x35, 0x36, 0
 OPR_MODE, PWR_MODE, SYS_TRIGGER = 0x3D, 0x3E, 0x3F
 
 CONFIG_MODE, IMU_MODE, NDOF_MODE = 0x00, 0x08, 0x0C
+# BST-BNO055-DS000, table 3-5: IMU, COMPASS, M4G, NDOF_FMC_OFF, NDOF
 FUSION_MODES = frozenset({IMU_MODE, 0x09, 0x0A, 0x0B, NDOF_MODE})
 IDLE, SYSTEM_ERROR, FUSION_RUNNING = 0, 1, 5  # values of SYS_STATUS
 RST_SYS = 0x20
@@ -45,10 +46,12 @@ GYRO_NOISIER, GYRO_TRUER = 2.8, 0.2
 REST_TICKS, CHECK_TICKS = 100, 20  # time at rest before the sensor measures its bias, and period of the check
 REST_DPS, REST_SPREAD_DPS = 3.0, 0.5
 
+# BST-BNO055-DS000, 4.2.1: registers that the sensor only reports
 _IDENTITY = {CHIP_ID: 0xA0, 0x01: 0xFB, 0x02: 0x32, 0x03: 0x0F, 0x04: 0x11, 0x05: 0x03, 0x06: 0x15}
+# bits that stay when they are written; the others are read-only or fixed
 _WRITABLE = {PAGE_ID: 0x01, UNIT_SEL: 0x97, PWR_MODE: 0x03, OPR_MODE: 0x0F}
 _ONLY_IN_CONFIG = frozenset({UNIT_SEL, PWR_MODE})
-_G = 9.80665
+_G = 9.80665  # BST-BNO055-DS000, 3.6.1: 100 LSB for 1 m/s²
 
 
 class SimBno055:

@@ -28,7 +28,7 @@ DATA_RDY, FIFO_OFLOW = 0x01, 0x10
 DEVICE_RESET, SLEEP = 0x80, 0x40
 FIFO_ENABLED, FIFO_RESET, SIG_COND_RESET = 0x40, 0x04, 0x01
 
-LSB_PER_DPS = (131.0, 65.5, 32.8, 16.4)
+LSB_PER_DPS = (131.0, 65.5, 32.8, 16.4)  # RM-MPU-6000A, 4.19 and 4.17: by FS_SEL and AFS_SEL
 LSB_PER_G = (16384.0, 8192.0, 4096.0, 2048.0)
 BANDWIDTH_HZ = (256.0, 188.0, 98.0, 42.0, 20.0, 10.0, 5.0, 256.0)
 """Bandwidth of the gyro by DLPF_CFG; 7 is reserved and treated as 0."""
@@ -60,11 +60,11 @@ class SimMpu6050:
     """
 
     IDENTITY: ClassVar[int] = 0x68
-    FIFO_SIZE: ClassVar[int] = 1024
+    FIFO_SIZE: ClassVar[int] = 1024  # bytes
     AFTER_RESET: ClassVar[int] = SLEEP
     """Value of PWR_MGMT_1."""
     BANDWIDTH_HZ: ClassVar[tuple[float, ...]] = BANDWIDTH_HZ
-    LSB_PER_C: ClassVar[float] = 340.0
+    LSB_PER_C: ClassVar[float] = 340.0  # RM-MPU-6000A, 4.18
     ZERO_C: ClassVar[float] = 36.53
     SELF_TEST_DPS: ClassVar[tuple[float, float, float]] = (58.0, -58.0, 58.0)
     """Change of the gyro's reading during its self-test (PS 6.1, RM 4.1: 25 to 101 °/s by the factory trim)."""

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Curve = tuple[tuple[float, ...], ...]
-_ROUNDS = 4
+_ROUNDS = 4  # each round doubles the points: 16 for each corner
 
 
 def smooth(*corners: tuple[float, ...]) -> Curve:

@@ -15,7 +15,7 @@ from sim.objects.projection import Colour, Image, Paint
 
 Stroke = Sequence[Any]
 
-_SHIFT = 4
+_SHIFT = 4  # fractional bits of OpenCV's drawing coordinates
 
 
 class Sheet:

@@ -12,7 +12,7 @@ import numpy as np
 from sim.objects.layers import blend
 from sim.objects.projection import Colour, Drawing, Floats, Image, Paint, Pose, nearness, shade
 
-TEXELS_PER_MM = 2.0
+TEXELS_PER_MM = 2.0  # as `PX_PER_MM`: finer textures would only be blurred
 _EDGE_ON = 0.004  # a face at a smaller angle is less than half a pixel wide
 _SHIFT = 4  # fractional bits of OpenCV's drawing coordinates
 

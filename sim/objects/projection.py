@@ -22,6 +22,7 @@ Paint = Callable[[tuple[int, int]], Image]
 """Returns a texture, uint8 (rows, columns, 3), for its (rows, columns)."""
 
 WIDTH, HEIGHT = 640, 480
+# A camera on a tripod, which sees the top of the platter as an ellipse; `CENTRE_PX` leaves room for objects of 200 mm.
 ELEVATION_DEG = 15.0
 PX_PER_MM = 2.0
 CENTRE_PX = (320, 398)  # where the image shows the centre of the platter's top

@@ -19,8 +19,8 @@ from sim.objects.layers import place
 from sim.objects.projection import COS, PX_PER_MM, SIN, Colour, Drawing, Floats, Image, Paint, Pose, gloss, shade
 
 TEXELS_PER_MM = 2.0
-_STEP_MM = 0.25
-_SUBROWS = 4
+_STEP_MM = 0.25  # half a pixel along the outline
+_SUBROWS = 4  # more: smoother upper and lower edges, at more time for each frame
 _LINING_ROWS = 4
 
 

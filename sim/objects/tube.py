@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from sim.objects.curves import Curve, evenly
 from sim.objects.projection import COS, PX_PER_MM, SIN, TO_LIGHT, Colour, Drawing, Floats, Image, Pose, nearness
 
-_SHIFT = 4
-_STEP_MM = 4.0
+_SHIFT = 4  # fractional bits of OpenCV's drawing coordinates
+_STEP_MM = 4.0  # eight pixels: shorter pieces are not seen on a bent wire
 _FAR_MM, _EDGE_ON_MM = 1e6, 1e-6
 _RINGS = ((1.0, 0.60), (0.84, 0.76), (0.66, 0.88), (0.46, 0.97), (0.24, 1.05))
 """(radius, brightness) of the discs that shade a sphere, from its edge to the side of the light."""

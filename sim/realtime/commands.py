@@ -28,8 +28,8 @@ faults              List the simulated faults.
 status              Show the world as it really is.
 quit                End the simulated bench."""
 
-MAX_LIGHT: Final = 10.0
-MAX_DEG: Final = 3600.0
+MAX_LIGHT: Final = 10.0  # brighter than any lamp that a simulated bench needs
+MAX_DEG: Final = 3600.0  # ten revolutions: more only takes long
 _OF_ONE_PROGRAM: Final = ("disk_full", "clock_jump")
 
 

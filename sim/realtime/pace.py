@@ -14,8 +14,9 @@ STEP_NS: Final = 20_000_000
 """Longest step of the world. After a pause of this program, requests are answered between the steps that catch up."""
 ACTIVE_NS: Final = 100_000_000
 """Time after the last byte during which a port is checked every `ACTIVE_WAIT_S`."""
+# shorter than a USB adapter's latency; longer waits would slow the control loop of the program
 ACTIVE_WAIT_S: Final = 0.001
-LONGEST_WAIT_S: Final = 0.1
+LONGEST_WAIT_S: Final = 0.1  # how late a program that connects is noticed
 
 
 class Port(Protocol):

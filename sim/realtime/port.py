@@ -9,7 +9,7 @@ from pathlib import Path
 from rig.core.errors import DeviceNotFound
 from rig.devices.dynamixel.port import SerialConnection
 
-_READ_BYTES = 4096
+_READ_BYTES = 4096  # the size of a pseudo-terminal's buffer
 
 
 class PtyPort:

@@ -26,9 +26,9 @@ from sim.realtime.commands import Commands, run
 from sim.realtime.pace import RealTime
 from sim.realtime.wire import SOCKET, short_path
 
-MAX_LINE: Final = 100_000
+MAX_LINE: Final = 100_000  # longer than all commands: a program that sends something else must not fill the memory
 MAX_MESSAGES, MAX_MESSAGE_BYTES = 42, 8192
-MAX_CONNECTIONS: Final = 64
+MAX_CONNECTIONS: Final = 64  # each has a thread; a program that never closes its connections is noticed
 _POLL_S: Final = 0.05
 """Period with which the wait for a frame checks whether the camera was unplugged."""
 _LAST_ANSWERS_S: Final = 2.0

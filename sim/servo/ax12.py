@@ -15,9 +15,9 @@ from sim.servo.protocol1 import Error
 from sim.servo.protocol2 import BROADCAST_ID, Instruction, InstructionPacket, Status
 from sim.servo.shaft import Shaft
 
-DEG_PER_COUNT = 300.0 / 1023.0
+DEG_PER_COUNT = 300.0 / 1023.0  # e-manual, AX-12A: 300° in 1,023 steps, 0.111 rev/min for each unit
 DPS_PER_UNIT = 0.111 * 6.0
-CENTER_COUNTS = 512
+CENTER_COUNTS = 512  # 150°, the middle of its range
 BAUD_RATES = {
     1: 1_000_000,
     3: 500_000,
@@ -35,7 +35,7 @@ _COUNTS = range(1024)
 _BYTE = range(256)
 _DIRECTION = 0x400  # bit 10 of speed and load: clockwise
 _ARRIVED_COUNTS = 2
-_MOVING_DPS = 1.0
+_MOVING_DPS = 1.0  # the e-manual states no threshold of Moving
 
 AX_12A = ServoModel(
     name="ax_12a",
@@ -57,6 +57,7 @@ class Entry:
     allowed: range | None
 
 
+# e-manual, AX-12A, control table: address, size, initial value, range
 ENTRIES: dict[str, Entry] = {
     "Model Number": Entry(0, 2, 12, None),
     "Firmware Version": Entry(2, 1, 24, None),
@@ -93,7 +94,7 @@ ENTRIES: dict[str, Entry] = {
 }
 SIZE = 50
 RAM_START = 24
-_LIVE = slice(36, 47)
+_LIVE = slice(36, 47)  # Present Position to Moving: what changes by itself
 
 
 class Image:

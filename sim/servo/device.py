@@ -11,12 +11,13 @@ from sim.servo.protocol2 import ALERT, BROADCAST_ID, Instruction, InstructionPac
 from sim.servo.requests import CHAINED_READS, chained_reads, group_writes, word
 from sim.servo.shaft import Shaft
 
-WATCHDOG_UNIT_NS = 20_000_000
+WATCHDOG_UNIT_NS = 20_000_000  # 20 ms; the e-manual's page of the XM430 prints µs
 WATCHDOG_TRIPPED = 0xFF
 EXTENDED_RANGE_COUNTS = 1_048_575
 
 _TORQUE_BY_GOAL = 0x08  # bit of Drive Mode
 _GOALS = frozenset({"Goal PWM", "Goal Current", "Goal Velocity", "Goal Position"})
+# e-manual, Protocol 2.0, Clear: 0x01, and four bytes that no other packet has by chance
 _CLEAR_MULTI_TURN = bytes((0x01, 0x44, 0x58, 0x4C, 0x22))
 
 

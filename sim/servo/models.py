@@ -28,6 +28,7 @@ GAINS = (
     *("Feedforward 2nd Gain", "Feedforward 1st Gain"),
 )
 
+# e-manual, control tables of the X series: what a new servo has, if `_MODELS` says nothing else
 _INITIAL = {
     "ID": 1,
     "Baud Rate": 1,

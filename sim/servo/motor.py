@@ -14,14 +14,14 @@ _ERROR_AT_STALL_DEG = PWM_FULL / PWM_PER_COUNT * DEG_PER_COUNT
 """Error at which the position controller pushes with the stall torque."""
 SUPPLY_DROP_V = 0.4  # voltage lost in the supply's cable at stall
 
-AMBIENT_C = 25.0
+AMBIENT_C = 25.0  # a laboratory
 STANDBY_RISE_C = 8.0  # rise of the temperature by the electronics alone
 STALL_RISE_C = 90.0  # final rise at stall torque; proportional to the square of the load
 THERMAL_TIME_S = 400.0  # time constant of the case
 
 HAND_DPS = 90.0  # speed of a rotation by hand
 
-OVERLOAD = 0.99
+OVERLOAD = 0.99  # just below 1, because the load is a rounded number
 OVERLOAD_S = 2.0
 """Time at full torque after which the servo reports an overload; the e-manual states no value."""
 
