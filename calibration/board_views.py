@@ -85,6 +85,7 @@ def take_views(
                 move = table.goto(angle_deg)
                 yield moved(index, move)
                 captured = yield from capture(index, viewer, table, move.settled_ns)
+                # Remember markers of another board, and frames in which the layout does not fit.
                 seen = detect_board(board, captured.image_bgr)
                 foreign |= set(seen.marker_ids.tolist()) - known
                 elsewhere += seen.marker_ids.size >= MIN_MARKERS and not seen.ids.size

@@ -117,6 +117,7 @@ def evaluate(moves: Sequence[TimedLeg], *, resolution_deg: float) -> Evaluation:
     rows: list[dict[str, Any]] = []
     for speed in dict.fromkeys(move.speed for move in moves):
         used = [move for move in moves if move.speed == speed and not move.leg.invalid]
+        # Each direction has its own mean: backlash and a scale error are no scatter.
         ways = [[m for m in used if (m.leg.encoder_deg > 0) == up] for up in (True, False)]
         if min(map(len, ways)) < MIN_REPEATS:
             why = reasons([move.leg for move in moves])
@@ -130,6 +131,7 @@ def evaluate(moves: Sequence[TimedLeg], *, resolution_deg: float) -> Evaluation:
         square, sigma = np.concatenate(squares), np.concatenate(stated)
         freedom = len(used) - 2
         ratio = sqrt(float((square / sigma**2).sum()) / freedom)
+        # The scatter of so few moves varies by chance: the limits are quantiles of χ².
         low, high = (sqrt(2 * float(gammaincinv(freedom / 2, p)) / freedom) for p in (CHANCE, 1 - CHANCE))
         low /= CAUTION
         seconds, measured_deg = float(np.mean([m.seconds for m in used])), sqrt(float(square.sum()) / freedom)
@@ -142,6 +144,7 @@ def evaluate(moves: Sequence[TimedLeg], *, resolution_deg: float) -> Evaluation:
         found.reject_if(not low < ratio < high, code, **row, ratio=ratio)
     found.evidence = {"by_duration": rows, "moves": plain(list(moves))}
     if rows:
+        # The residual is that of the duration nearest to its limit.
         worst = max(rows, key=lambda row: row["measured_deg"] / row["stated_deg"] / row["ratio_may_be"][1])
         found.residual = found.estimates[f"ratio_{worst['speed']}"].value
         found.limit = worst["ratio_may_be"][1]

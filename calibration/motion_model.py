@@ -117,6 +117,7 @@ def evaluate(moves: Sequence[TimedMove], nominal: MotionProfile) -> Evaluation:
         loss="soft_l1",
         f_scale=TYPICAL_S,
     )
+    # Uncertainties from the scatter of the moves themselves; one that something hindered is rejected.
     residuals = seconds - seconds_of(fit.x, distance)
     scatter = sqrt(float((residuals**2).sum()) / (len(moves) - 3))
     covariance = np.linalg.inv(fit.jac.T @ fit.jac) * scatter**2

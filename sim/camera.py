@@ -51,7 +51,7 @@ _METER_FRAMES = 5  # number of frames between two changes of the automatic setti
 _METER_TARGET = 70.0
 _EDGE_PX_PER_DEG = radians(1.0) * 80 * PX_PER_MM  # motion in the image of a point 80 mm from the axis
 _STILL_PX = 0.25
-_MAX_SUBFRAMES = 16
+_MAX_SUBFRAMES = 16  # more: smoother smear of fast motion, at one drawn image each
 
 
 class SimCapture:

@@ -271,7 +271,7 @@ def _margin(scores: FloatArray, probability: FloatArray) -> float:
     return float(scores[best] - np.delete(scores, best).max(initial=0.0))
 
 
-_WORTH_REDUCING: Final = 2
+_WORTH_REDUCING: Final = 2  # of a smaller catalog, a reduced index saves less time than its making takes
 
 
 class DenseSession:

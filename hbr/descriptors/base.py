@@ -18,8 +18,9 @@ from hbr.kernels import library
 from hbr.kernels.calls import Measure, PackedRows, Segments
 from hbr.segmentation import Segmentation
 
-#: At strength 1: standard deviations of the box's scale and shift (shares of its side), of the exponent of edges, of
-#: the share of false edges, of the light's colour and of the contrast in logarithms, and of other changes of colours.
+#: At strength 1, a hard change of the bench: standard deviations of the box's scale and shift (shares of its side), of
+#: the exponent of edges, of the share of false edges, of the light's colour and of the contrast in logarithms, and of
+#: other changes of colours.
 _SCALE: Final = 0.07
 _MOVE: Final = 0.045
 _EXPONENT: Final = 0.15

@@ -30,8 +30,8 @@ from hbr.segmentation import Background
 #: Largest number of views of a search, and the step between them.
 VIEWS: Final = 4
 _STEP_DEG: Final = 90.0
-_BENCHES: Final = 12
-_NEVER_ENROLLED: Final = 9
+_BENCHES: Final = 12  # more: the result depends less on one drawing; each process draws them once
+_NEVER_ENROLLED: Final = 9  # every ninth object, so that rates of unknown objects have a number of cases, too
 #: Objects whose enrolled views each process remembers for the last steps of searches, 4 MB each with 36 views.
 _REMEMBERED: Final = 128
 

@@ -23,12 +23,12 @@ Background = Literal[EnrolledBackground, "bench", "other-bench"]
 Reference = Literal["own", "enrollment", "none"]
 _T = TypeVar("_T", np.uint8, np.float32)
 
-_TEXTURE_OCTAVES: Final = (4, 8, 16, 32)
+_TEXTURE_OCTAVES: Final = (4, 8, 16, 32)  # coarse to fine; each octave is weaker, as in photographs of surfaces
 
 
 GN_VARIANCE: Final = 0.012
 """Variance of ``gn``, as `imnoise` takes it. The paper calls 0.012 a standard deviation: that is ``gn:0.000144``."""
-MB_LENGTH_PX: Final = 15.0
+MB_LENGTH_PX: Final = 15.0  # the paper's motion blur: `fspecial` with len = 15 and θ = 20°
 MB_ANGLE_DEG: Final = 20.0
 
 

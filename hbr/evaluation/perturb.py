@@ -17,7 +17,7 @@ from hbr.evaluation.photographs import without_specks
 
 #: Half axes of the platter in pixels, and the grain of the surfaces.
 _PLATTER_PX: Final = (105, 27)
-_GRAINS: Final = (3, 6, 12, 24, 48)
+_GRAINS: Final = (3, 6, 12, 24, 48)  # cells of noise across the surface; the coarser ones are stronger
 #: Magnitudes at the strengths 1, 2 and 3.
 STRENGTHS: Final[Mapping[str, tuple[float, float, float]]] = {
     "shift": (0.03, 0.06, 0.09),  # largest shift, relative to the photograph's side

@@ -90,7 +90,7 @@ _LISTED: Final = (
     Method("sweep-45", "sweep 45°", strategy="sweep-45"),
     Method("sweep-90", "sweep 90°", strategy="sweep-90"),
 )
-_OMEGA: Final = 2.0
+_OMEGA: Final = 2.0  # of the dense filter; from 0.25 to 8 no hit rate changes by more than a point (decision 0014)
 _DENSE: Final = (
     Method("dense", "dense filter, next best view", "next-best-view", _OMEGA, dense=True),
     Method("dense-coin", "dense filter, coin flip", "next-best-view-coin", _OMEGA, dense=True),
@@ -100,7 +100,7 @@ _DENSE: Final = (
     Method("dense-mutual", "dense filter, mutual information", "mutual", _OMEGA, dense=True),
     Method("dense-oracle", "dense filter, oracle", "oracle", _OMEGA, dense=True),
 )
-_OMEGAS: Final = (0.0, 0.125, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
+_OMEGAS: Final = (0.0, 0.125, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)  # the sweeps around the paper's values: 0.5, 10 and 4.
 _LENGTHS: Final = (1, 2, 4, 5, 6, 8, 10, 20, 50, 100)
 _SECTORS: Final = (2, 3, 4, 6, 8, 12, 16)
 _OMEGA_SWEEP: Final = tuple(Method(f"omega-{omega:g}", f"HBR ω = {omega:g}", omega=omega) for omega in _OMEGAS)
@@ -290,6 +290,7 @@ def views_of_trial(views: Views, protocol: Protocol) -> NDArray[np.bool_]:
     return mask
 
 
+# never renumber: the numbers are a part of each seed, and so of every published figure
 _PURPOSES: Final = {"trial": 0, "photograph": 1, "bootstrap": 2, "enrolled": 3}
 
 

@@ -12,7 +12,7 @@ from hbr.dense.stopping import Outcome
 from hbr.evaluation.protocol import COMPARED, OUTCOMES, Method, Runs
 from hbr.evaluation.statistics import bootstrap_difference, mcnemar_exact, wilson
 
-_BEST: int = 10
+_BEST: int = 10  # the paper's "Best 10"
 
 
 @dataclass(frozen=True)
@@ -225,11 +225,13 @@ def _stopping(runs: Runs, method: int, least_margin: float, min_views: int) -> S
         part[method][..., seen].reshape(-1, len(seen))
         for part in (runs.margin, runs.outcome, runs.compared, runs.rank, runs.travelled_deg)
     )
+    # The dense search has an outcome at each view; the paper's ends by its margin.
     dense = bool((outcome >= 0).all())
     ends = outcome != OUTCOMES.index(Outcome.CONTINUE) if dense else (margin >= least_margin) & (seen + 1 >= min_views)
     end = np.where(ends.any(axis=1), ends.argmax(axis=1), len(seen) - 1)
     trial = np.arange(len(end))
     step = compared[trial, end]
+    # A comparison of pixels at the end replaces the ranking.
     is_right, is_wrong, is_twin = (step == COMPARED.index(one) for one in ("right", "wrong", "ambiguous"))
     changed = is_right | is_wrong | is_twin
     unknown, ambiguous = (

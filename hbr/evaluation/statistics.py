@@ -11,7 +11,7 @@ from hbr.core.arrays import FloatArray
 
 Hits = NDArray[np.bool_]
 
-_CONFIDENCE: Final = 0.95
+_CONFIDENCE: Final = 0.95  # usual in the literature
 _RESAMPLES: Final = 2000
 """Draws of all objects with replacement."""
 

@@ -191,6 +191,7 @@ class _Trials:
             raise ValueError(
                 f"{name} has {len(self._free)} views; for {protocol.max_views} queries it needs more that are free"
             )
+        # All similarities are computed once: every method and trial of this object uses them.
         self._ring = np.argsort(self._azimuth_deg, kind="stable")
         own = views.descriptors[self._rows]
         compared = descriptor(views.descriptor)

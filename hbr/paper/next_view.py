@@ -18,7 +18,7 @@ Side = Literal["left", "right"]
 
 #: Average views of an object, N~M of Eq. 5: the paper's number.
 SECTORS: Final = 4
-_BEST: Final = 10
+_BEST: Final = 10  # the length of the paper's lists
 #: A rotation that ends as close as this to a visited orientation is extended.
 _REVISIT_DEG: Final = 10.0
 

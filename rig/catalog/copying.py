@@ -34,7 +34,7 @@ _RULES: Final = "search_rules.json"
 """The stopping rule beside a catalog (`rig.search.stopping_rules`)."""
 _COPY: Final = "copy"
 """Property of a local copy: of which catalog, up to which line of its log, and when."""
-_PATIENCE: Final = 20
+_PATIENCE: Final = 20  # a server that is away costs one wait in twenty-one times that long
 _AT_ONCE: Final = 100
 """Enrollments, and lines of the log, that are read from the server at once."""
 
@@ -83,6 +83,7 @@ def copy_catalog(source: Catalog, target: Catalog) -> Generator[JobProgress, Non
         yield JobProgress(len(wanted), len(wanted))
         with target.database.catalog_errors():
             target.database.images.settle(wanted)
+        # Images first: a row of a catalog never names an image that is not there.
         with target.database.write() as writing:
             _check_empty(writing, target)
             for table in (Entry, Enrollment, Session, View, Derived):

@@ -72,7 +72,7 @@ _READ_ERRORS: Final = (
     KeyError,
     zlib.error,
 )
-_NO_PIXELS: Final = np.empty((0, 0, 3), np.uint8)
+_NO_PIXELS: Final = np.empty((0, 0, 3), np.uint8)  # for images that are stored without being decoded
 
 
 @dataclass(frozen=True)

@@ -47,6 +47,8 @@ LOST_BENCH_S: Final = 30
 LOST_READER_S: Final = 12 * 3600
 """The same for a transaction without locks: longer, because exports and copies read images and rows in turn."""
 
+# A bench that loses its network is noticed after 10 + 3 x 5 s. A commit waits for the disk, because a view must survive
+# a power cut.
 _SETTINGS: Final = {
     "lock_timeout": "{busy_ms}",
     "idle_in_transaction_session_timeout": str(1000 * LOST_READER_S),

@@ -14,7 +14,7 @@ from rig.core.control_characters import has_control_characters
 from rig.core.errors import UsageError
 from rig.core.next_steps import Do
 
-MAX_NAME_LENGTH: Final = 100
+MAX_NAME_LENGTH: Final = 100  # longer: names do not fit tables and file names
 MAX_VIEWS: Final = 10_000
 """Most views of one enrollment: one every 0.036°."""
 

@@ -27,7 +27,7 @@ from rig.core.errors import CatalogDamaged, CatalogError, UsageError
 from rig.core.next_steps import Do
 from rig.views import image_files as images
 
-MAX_TEXT_LENGTH: Final = 1000
+MAX_TEXT_LENGTH: Final = 1000  # a reason or a barcode, and not a document
 
 
 class Answer(NamedTuple):

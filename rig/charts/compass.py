@@ -12,7 +12,7 @@ from rig.events.events import Weighed
 
 SIZE: Final = 400.0  # units of the drawing: a page scales it to its place
 CENTRE: Final = (SIZE / 2, SIZE / 2)
-RIM: Final = 160.0
+RIM: Final = 160.0  # leaves room for the labels around it
 
 # Rings of the chart of a path.
 _INNERMOST, _OUTERMOST = 60.0, 145.0

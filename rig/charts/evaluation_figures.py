@@ -38,6 +38,7 @@ def figures(results: dict[str, Any]) -> dict[str, Chart]:
             [series for method, style in preferred for series in _pose_errors(method, style)],
         ),
     }
+    # Sweeps of one parameter, if the experiment has several of its values.
     for prefix, x_label, file in (
         ("omega-", "weight of the orientation, ω", "omega-sweep"),
         ("list-", "length of the retrieval lists", "list-sweep"),

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-MAINS_HZ = (50.0, 60.0)
+MAINS_HZ = (50.0, 60.0)  # a lamp flickers at twice this rate
 MIN_DEPTH = 0.01
 """Smallest amplitude, as a share of the mean level, that counts."""
 _MIN_EXPLAINED = 0.6  # less: something else changes the light, such as a person who passes

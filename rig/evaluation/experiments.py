@@ -18,7 +18,7 @@ from rig.catalog import Catalog
 from rig.core import files as own_files
 
 DEFAULT: Final = "paper"
-_MAX_BYTES: Final = 1_000_000
+_MAX_BYTES: Final = 1_000_000  # far above an experiment and its orientation errors; a larger file is another one
 
 
 def shipped() -> dict[str, dict[str, Any]]:

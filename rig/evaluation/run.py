@@ -32,7 +32,7 @@ _KINDS: Final[Mapping[str, Kind]] = {
     "unknown-objects": UNKNOWN_OBJECTS,
     "bench-change": BENCH_CHANGE,
 }
-_MAX_NAME: Final = 60
+_MAX_NAME: Final = 60  # the end of a name distinguishes runs, and file systems end names at 255 bytes
 _T = TypeVar("_T")
 
 

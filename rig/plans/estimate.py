@@ -18,7 +18,7 @@ from rig.motion.move import MotionTimes
 from rig.motion.scan_speed import takes_in_motion
 from rig.motion.turntable import Turntable
 
-_FLOAT_DEG: Final = 1e-6
+_FLOAT_DEG: Final = 1e-6  # a limit that a float misses by rounding still counts as reached
 
 
 def even_azimuths(views: int, limits_deg: tuple[float, float], sign: int = -1) -> list[float]:
@@ -136,6 +136,7 @@ def dry_run(
     for given, own_views in names.items():
         name = clean_name(given)
         summary = known.get(name)
+        # What the enrollment would take, from where the object before it leaves the table.
         action, obstacle = planned_action(summary, resume=resume, replace=replace, tray=len(names) > 1)
         planned: Sequence[float] = ()
         if action in ("enroll", "replace"):

@@ -64,10 +64,11 @@ FIRST_REST_IN_MOTION_S: Final = 0.15
 """Time over which the gyro is averaged before a search in motion; the fit of the trajectory corrects the bias later."""
 STAMPS: Final = 30
 """Time stamps that are compared with each other: a second of frames."""
+# as many as a search at rest has views: a camera that loses frames must not keep the table in motion
 MOST_FLIGHTS: Final = 8
 MOST_REJECTED: Final = 15
 """Number of successive rejected frames after which the table stops and the next view is taken at rest."""
-NEW_GOAL_DEG: Final = 10.0
+NEW_GOAL_DEG: Final = 10.0  # smaller: the table changes its speed for goals that show nearly the same side
 
 
 @dataclass(eq=False)

@@ -22,7 +22,7 @@ from rig.views.object_presence import GRID, changed_cells, shrunk
 
 ROTATION_DEG: Final = 25.0
 """The table rotates by this angle between two images, so that an object shows another side or moves in the image."""
-MIN_ROTATION_DEG: Final = 5.0
+MIN_ROTATION_DEG: Final = 5.0  # less: an object in the middle of the table hardly changes the image
 MAX_CHANGED_SHARE: Final = 0.004
 """If a larger share of the image changes with the rotation, something is on the table: 2 cm in an image of 24 cm."""
 

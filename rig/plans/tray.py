@@ -28,7 +28,7 @@ from rig.plans.estimate import planned_action
 from rig.plans.operator import Choice, Operator, Question, Subject, Unattended
 
 COLUMNS: Final = ("name", "label", "note", "views")
-MAX_FILE_BYTES: Final = 1_000_000
+MAX_FILE_BYTES: Final = 1_000_000  # ten thousand objects; a larger file is not a tray
 MIN_VIEWS, MAX_VIEWS = 4, 720
 """Limits of the number of views, as for `enroll.views` of the configuration."""
 
@@ -64,6 +64,7 @@ def read_tray(path: Path) -> tuple[TrayItem, ...]:
             next_step='Save it as "CSV UTF-8".',
             evidence={"mistakes": [f"line {line}: byte 0x{error.object[error.start]:02x}"]},
         ) from error
+    # All mistakes are reported at once, so that the list is corrected once.
     mistakes: list[str] = []
     items: list[TrayItem] = []
     try:
@@ -144,6 +145,7 @@ def enroll_tray(
             if action == "skip":
                 yield Item(number, len(items), item.name, "skip", SkipReason.ALREADY_ENROLLED)
                 break
+            # The operator places the next object, skips it, or ends the tray.
             decision = operator.choose(next_object(item, number, len(items), known if action == "resume" else None))
             if decision is Choice.STOP:
                 return
@@ -165,6 +167,7 @@ def enroll_tray(
                     replace=action == "replace",
                     fly=takes_in_motion(bench.config, fly, tray=True),
                 )
+            # A problem of one object ends this object only; a fault of the bench ends the tray.
             except OBJECT_ERRORS as error:
                 decision = operator.choose(after_error(error, item))
                 if decision is Choice.STOP:

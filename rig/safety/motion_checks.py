@@ -68,6 +68,7 @@ def find_servo_fault(
         "voltage_limits_v": [round(v, 1) for v in limits.voltage_v],
         "load_percent": round(state.load_percent, 1),
     }
+    # In the order of trust: impossible readings make all others doubtful.
     if nonsense := implausible_readings(state):
         return DeviceFault(
             f"The servo's readings are impossible: {nonsense[0]}.",
@@ -80,6 +81,7 @@ def find_servo_fault(
             next_step=("Remove the cause (jam, heat, supply).", Do.ACKNOWLEDGE(reboot=True)),
             evidence={"hardware_errors": list(state.hardware_errors), **evidence},
         )
+    # Before the servo's own shutdown, which would release a loaded table.
     hottest_c = limits.temperature_c - config.temperature_margin_c
     if state.temperature_c >= hottest_c - (COOLER_C if again else 0.0):
         return Overheated(

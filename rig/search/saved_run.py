@@ -38,14 +38,14 @@ from rig.search.stopping_rules import read_stopping_rule, write_stopping_rule
 from rig.views import image_files as images
 
 FORMAT: Final = "hbr-rig run"
-VERSION: Final = 1
+VERSION: Final = 1  # a run of another version is not checked, because its decisions come from another program
 EMPTY_TABLE: Final = "empty_table.png"
 LEADERS: Final = "leaders"
 DIFFERS_HERE: Final = f"{LEADERS}/differs_here.png"
 
 MAX_FRAME_PIXELS: Final = 64_000_000
 """8000 x 8000, the largest frame of the configuration."""
-MAX_REASON: Final = 300
+MAX_REASON: Final = 300  # a reason can contain the whole damaged value
 _MAX_BYTES: Final = {"run.json": 1_000_000, "model.jsonl": 32_000_000, "events.jsonl": 10_000_000}
 """Larger than the files of all real runs. Values of JSON can need twenty times as much memory as their text."""
 _DAMAGE: Final = (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError, cv2.error)
@@ -251,12 +251,14 @@ def load_run(folder: Path) -> SavedRun:
             raise TypeError("bench, software or started_utc in run.json is not text")
         if not isinstance(about["devices"], dict):
             raise TypeError("devices in run.json is not an object")
+        # The model: enrolled views and stopping rule of the day.
         kind = _descriptor(folder, about["descriptor"])
         config = validate(RigConfig, about["config"], where=str(folder / "run.json"))
         views = _views((_object(line) for line in _lines(_bytes(folder, "model.jsonl"))), kind.name)
         stored = read_stopping_rule(folder)
         model = model_of(views, rule=None if stored is None else stored.adapted(views))
         empty_table = _image(folder, EMPTY_TABLE) if (folder / EMPTY_TABLE).exists() else None
+        # The events: a power cut may have cut off the last line.
         content = _bytes(folder, "events.jsonl")
         is_cut = bool(content) and not content.endswith(b"\n")
         lines = [_object(line) for line in _lines(content)[: -1 if is_cut else None]]

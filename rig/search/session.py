@@ -39,7 +39,7 @@ from rig.search.strategies import (
 )
 from rig.views.description import DescribedView
 
-SHOWN_VIEWS: Final = 3
+SHOWN_VIEWS: Final = 3  # the most telling ones; more make the page of a report longer
 TILE_PX: Final = 160
 
 EnrolledViews = Callable[[str, Sequence[float]], Sequence[LocalView]]

@@ -27,8 +27,10 @@ from rig.events.events import Note, NoteCode
 FILE: Final = "search_rules.json"
 """Beside ``catalog.sqlite``."""
 FORMAT: Final = "hbr-rig search rules"
-MAX_FILE_BYTES: Final = 16_000_000
+MAX_FILE_BYTES: Final = 16_000_000  # usual scores of some 100,000 objects; a larger file is not read into memory
 VERSION: Final = 1
+# The options of `rig catalog fit`. Smaller rates need more views for each answer, and more enrolled objects to be
+# guaranteed.
 ERROR_RATE: Final = 0.01
 FALSE_REJECT: Final = 0.02
 THRESHOLDS: Final = (
@@ -42,7 +44,7 @@ THRESHOLDS: Final = (
 
 _CHUNK: Final = 16_384
 """Views whose digest is computed at once."""
-_KNOWN_SHARE: Final = 0.5
+_KNOWN_SHARE: Final = 0.5  # with less, most objects have no usual score, and the rule is one of another catalog
 _QUICK_S: Final = 0.4
 _LEAST_QUICK_S: Final = 0.08
 _LOADED_S: Final = 5e-6
@@ -209,6 +211,7 @@ def read_stopping_rule(folder: Path) -> StoredRule | None:
                 f"another version of the program wrote it: its format is {values['format']} {values['version']}, "
                 f"this program reads {FORMAT} {VERSION}"
             )
+        # The file may be damaged or from others: every value is converted and checked.
         usual = {str(name): [float(score) for score in scores] for name, scores in values["usual_scores"].items()}
         numbers: dict[str, Any] = {name: float(values[name]) for name in ("beta", "error_rate", "false_reject")}
         thresholds: dict[str, Any] = {name: tuple(_value_or(one, -inf) for one in values[name]) for name in THRESHOLDS}
@@ -225,6 +228,7 @@ def read_stopping_rule(folder: Path) -> StoredRule | None:
             open_set=_open_set(values["open_set"]),
             rates=tuple(ShiftRates(**one) for one in values["rates"]),
         )
+        # What the types do not show: the same number of views everywhere.
         views = len(rule.open_set_thresholds)
         if not {len(several) for several in thresholds.values()} <= {0, views}:
             raise ValueError("it does not have one threshold for each number of views")

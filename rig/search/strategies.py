@@ -32,8 +32,8 @@ ROTATION_STEP_DEG: Final = 5.0
 ALONE: Final = 0.95
 """Probability of the leading candidate from which no second object is likely."""
 
-_REVISIT_DEG: Final = 10.0
-_DRAWS: Final = 20
+_REVISIT_DEG: Final = 10.0  # as in the paper's search (`hbr.paper.next_view`): a nearer view shows nothing new
+_DRAWS: Final = 20  # with views on all sides, no azimuth is free; then the last one is as good as any
 
 State = TypeVar("State", contravariant=True)
 

@@ -34,7 +34,7 @@ _JPEG: Final = b"\xff\xd8\xff"
 
 # JPEG markers (ITU T.81, table B.1): DHT, JPG and DAC lie between the frame headers SOF0 to SOF15
 _NO_FRAME: Final = (0xC4, 0xC8, 0xCC)
-_END: Final = 0xD9
+_END: Final = 0xD9  # EOI and SOS
 _SCAN: Final = 0xDA
 _MORE: Final = bytes(range(254, 0, -5)) * 3
 """Data that no decoder needs after the last block of a complete image."""

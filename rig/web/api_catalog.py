@@ -42,6 +42,7 @@ from rig.web.server import API, OperatorPerson, Page, Routes, Server, cached, lo
 
 THUMB_PX: Final = 256  # larger: a long list loads slowly; smaller: blurred on dense screens
 UPLOAD: Final = f"{API}/import"
+# smaller: more overhead; larger: STOP waits longer for a chunk. The rate leaves room in a network of 1 Gbit/s.
 CHUNK_BYTES: Final = 65_536
 BYTES_PER_S: Final = 30_000_000
 Number = Annotated[int, Field(ge=0, lt=2**62)]

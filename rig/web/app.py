@@ -22,7 +22,7 @@ from rig.web.problems import Problem, ProblemResponse
 from rig.web.requests import JobState
 from rig.web.server import API, Routes, Server, Watcher
 
-QUANTILES: Final = (0.5, 0.99, 0.999)
+QUANTILES: Final = (0.5, 0.99, 0.999)  # the usual interval, and the rare ones that endanger the control loop
 _ERRORS: Final[dict[int | str, dict[str, Any]]] = {
     "4XX": {"model": Problem, "description": "The request cannot be carried out; `code` and `next_step` say why"},
     "5XX": {"model": Problem, "description": "The bench or the catalog is not available"},

@@ -11,6 +11,7 @@ from rig.core import errors
 from rig.core.errors import RigError
 from rig.core.next_steps import NextSteps, SomeSteps, as_steps, in_words, steps_as_json
 
+# Errors about a request; all others get their status from the hundred of their code.
 _STATUS: Final = {
     errors.LoginRequired.code: 401,
     errors.Forbidden.code: 403,

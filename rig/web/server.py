@@ -22,7 +22,7 @@ from rig.web.setup import BenchCatalog, Setup
 
 COOKIE: Final = "rig-session"
 API: Final = "/api/v1"
-MAX_PAGE: Final = 500
+MAX_PAGE: Final = 500  # larger: a list holds the process that receives STOP for longer
 
 
 @dataclass(slots=True)

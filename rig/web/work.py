@@ -36,7 +36,7 @@ from rig.web.requests import Job, JobState, TrayObject
 from rig.web.setup import BenchCatalog, Setup
 from rig.web.worker import BenchWorker
 
-VIEW_PX: Final = 480
+VIEW_PX: Final = 480  # a tile on the page of the job; the full image comes from the catalog
 CALIBRATIONS: Final = "rig.calibrations"
 """Entry-point group of the calibrations."""
 

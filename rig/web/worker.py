@@ -271,6 +271,7 @@ class BenchWorker:
                 "camera": plain(bench.camera.identity),
                 "region": list(config.view.roi) if config.view.roi else None,
             }
+        # An angle in doubt is not shown as one.
         if bench is not None and state is not None:
             known = bench.safety.doubt is None
             table_deg = bench.safety.angle_reference.to_table(state.position_deg) if known else None

@@ -27,8 +27,8 @@ BYTE_NS = 10 * 1_000_000_000 // BAUD
 QUANTUM_S = 0.005  # longest time between two runs of the board: limits how late its outputs change the world
 RECEIVER_BYTES = 4096  # size of the host's receive buffer (N_TTY); later bytes are lost
 ABI = 1
-_NEVER = 2**64 - 1
-_ROOM = 1024
+_NEVER = 2**64 - 1  # later than every time of the board
+_ROOM = 1024  # changes of outputs that are taken at once; more remain on the board for the next call
 
 _START_WRITE, _START_READ, _WRITE, _READ, _STOP = range(5)
 _BYTE, _LIGHT, _RELAY, _TRIGGER, _RESET = range(5)
@@ -147,6 +147,7 @@ class SimHead:
         self._failure: BaseException | None = None
         self._running = False
 
+        # The firmware runs as a library: the core itself, or the emulated binary.
         self._library = _load(library or (build.avr_library() if kind == "avr" else build.host_library()))
         flash = image if image is not None else build.avr_image() if kind == "avr" else b""
         self._environment = _Environment(_I2c(self._i2c), _Edge(self._edge))

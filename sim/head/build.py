@@ -17,7 +17,7 @@ HERE = Path(__file__).resolve().parent
 FIRMWARE = HERE.parent.parent / "firmware"
 EMULATOR_HEADERS = (Path("/usr/include/simavr"), Path("/usr/local/include/simavr"))
 
-COMPILE_S = 120
+COMPILE_S = 120  # a slow computer compiles for seconds; only a compiler that hangs takes longer
 
 
 def missing(kind: str) -> str:

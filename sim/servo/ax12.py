@@ -248,6 +248,7 @@ class Ax12Servo(SimulatedServoBase):
             case Instruction.FACTORY_RESET:
                 self.memory.restore(0)
                 self.power_cycle()
+            # Each servo takes its part of the packet.
             case Instruction.SYNC_WRITE if packet.bus_id == BROADCAST_ID and len(parameters) > 2:
                 address, size = parameters[0], parameters[1]
                 for i in range(2, len(parameters) - size, size + 1):

@@ -139,6 +139,7 @@ class XSeriesServo(SimulatedServoBase):
                 self.power_cycle()
             case Instruction.FACTORY_RESET if parameters in (b"\xff", b"\x01", b"\x02"):
                 self._factory_reset(parameters[0], everyones)
+            # A moving servo rejects this, as the e-manual says.
             case Instruction.CLEAR if parameters == _CLEAR_MULTI_TURN:
                 if self.motor.state().speed_dps:
                     raise Rejection(StatusError.RESULT_FAIL)

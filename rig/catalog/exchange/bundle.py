@@ -33,12 +33,13 @@ from rig.core.files import open_new
 from rig.core.next_steps import Do
 from rig.views import image_files as images
 
+# more than a shared catalog has images; a bundle is from others, and must not fill memory or disk
 MAX_MEMBERS: Final = 2_000_000
 MAX_DATABASE_BYTES: Final = 2_000_000_000
 MAX_RATIO: Final = 250
 """Largest ratio of the sizes unpacked and packed. A database of such records reaches 40."""
 
-_DATE: Final = (1980, 1, 1, 0, 0, 0)
+_DATE: Final = (1980, 1, 1, 0, 0, 0)  # ZIP's earliest: the same objects give the same bytes
 
 
 def write_bundle(path: Path, source: CatalogSource) -> int:

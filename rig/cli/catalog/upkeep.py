@@ -269,6 +269,7 @@ def fit(
             raise CatalogError("The catalog is empty.", next_step=Do.ENROLL())
         path = catalog.path / FILE
     print(f"Searching for {len(views.object_names)} objects among each other ...", file=sys.stderr)
+    # Processes take their time to start: a small catalog is faster in one.
     index = DenseIndex(views)
     where = jobs_of(None, cluster) or ((os.cpu_count() or 1) if len(views) >= _SEVERAL_PROCESSES else 1)
     with interruptible("Interrupted; nothing changed."), Progress("Searching") as progress:
