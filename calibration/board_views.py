@@ -22,7 +22,7 @@ from rig.plans.capture import capture, moved
 from rig.views.capture import Viewer
 from rig.views.charuco_board import Board, BoardDetection, detect_board
 
-MIN_CORNERS = 12
+MIN_CORNERS = 12  # a pose has six numbers; of twelve corners a wrong one is noticed
 """Corners that a view needs to determine the board's pose."""
 MIN_MARKERS = 6
 """Markers that show that a board is there, even if its corners are not found."""

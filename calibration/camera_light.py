@@ -30,7 +30,7 @@ NOISE, FLAT_FIELD, DRIFT, SHARPNESS = "camera.noise", "camera.flat_field", "came
 
 CARD = "grey-card"
 BOARD = "calibration-board upright"
-PAIRS = 24
+PAIRS = 24  # more: smaller uncertainty of the noise, at a frame each
 """Frames of the scene at rest."""
 HANDS_S = 1.0
 """Time from the operator's answer to the first frame: the bench is quiet again, and no frame shows the former scene."""

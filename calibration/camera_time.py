@@ -43,9 +43,9 @@ NAME = "camera.time"
 ARC_DEG = 50.0  # longer: more frames of each pass; shorter: more benches have room for it within the cable budget
 RAMP_S = 0.25
 """Time after the table has reached its speed in which frames are left out, because the platter vibrates."""
-SPEEDS = (12.0, 45.0, 90.0)
+SPEEDS = (12.0, 45.0, 90.0)  # the slowest gives sharp references; the time is the slope over the others
 """Speeds of the passes in °/s; the first is that of the reference frames."""
-SMALL_PX = 6
+SMALL_PX = 6  # larger: less noise; smaller: fine texture counts, too
 """Side of the squares that frames are averaged over before they are compared."""
 MAX_UNCERTAINTY_MS = 1.0  # 0.09° at 90 °/s
 MAX_LOST = 0.2  # with more, the computer or the USB port is too slow for views in motion

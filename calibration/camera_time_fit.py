@@ -17,7 +17,7 @@ FEWEST_FRAMES = 40  # fewer leave the scatter, and so the uncertainty, to chance
 BANDS = 4  # more bands show the read-out better and have less texture each
 TEXTURE_SHARE = 0.1
 """Rows with less than this share of the texture of the best row are left out."""
-READOUT_S = 0.03
+READOUT_S = 0.03  # as long as a frame: it may be anything
 """Standard uncertainty of the read-out time before it is measured."""
 
 

@@ -38,6 +38,7 @@ from rig.plans.capture import moved
 
 NAME = "imu.rotation"
 
+# noise grows with the duration, a scale error does not: moves of 1.7, 3.0 and 9.8 s separate them
 SPEEDS = {"fast": 1.0, "medium": 0.3, "slow": 0.08}
 """Shares of table.velocity_dps."""
 DISTANCE_DEG = 60.0  # longer: more noise of the gyro to check; shorter: less cable is needed

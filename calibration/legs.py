@@ -15,7 +15,7 @@ from rig.motion.move import Move
 COVERAGE = 4.0
 """Largest residual, in standard uncertainties, that is due to chance (1 in 16 000)."""
 
-STATED_WEIGHT = 4.0
+STATED_WEIGHT = 4.0  # larger: few legs trust the data sheet; smaller: they trust a scatter that may be small by chance
 """The stated noise weighs as much as this many degrees of freedom of the legs' scatter."""
 
 

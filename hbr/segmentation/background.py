@@ -27,7 +27,7 @@ Floats = NDArray[np.float32]
 #: Longer side of the images that are compared.
 SIDE_PX: Final = 128  # larger: thinner objects are seen, and the time of each frame grows with the square
 #: Step between the pixels that a plane is fitted to.
-_EVERY: Final = 5
+_EVERY: Final = 5  # a plane has three parameters: a pixel in 25 is enough, and 25 times as fast
 #: Number that is added to grey levels before the logarithm, because noise dominates below it.
 _FLOOR: Final = 6.0
 _LOG: Final = np.log(np.arange(256) + _FLOOR).astype(np.float32)
@@ -48,7 +48,7 @@ MIN_AGREEMENT: Final = 0.65
 _PLAIN: Final = 0.12  # larger: a coloured wall counts as plain, and its colour is corrected away
 _NEAR_GREY: Final = 0.35  # a factor of 1.4 between two channels: with more, the backdrop itself is coloured
 #: Grey level that a plain backdrop is corrected to, and the largest correction of the exposure, as a logarithm.
-_BACKDROP_LEVEL: Final = 128.0
+_BACKDROP_LEVEL: Final = 128.0  # the middle of the range of grey levels
 _MAX_EXPOSURE: Final = np.log(1.7)  # with more, the backdrop is dark or bright, and not badly exposed (decision 0012)
 
 
@@ -378,7 +378,7 @@ def _fit(small: ImageArray, useful: Mask, table_log: Floats) -> FloatArray:
 
 
 #: A pixel differs from the background by at least this many grey levels, and by this share of the object's contrast.
-_LEAST_LEVELS: Final = 12.0
+_LEAST_LEVELS: Final = 12.0  # above noise and compression
 _SHARE: Final = 0.25  # larger: dim parts of the object are lost; smaller: its shadow becomes part of it
 #: A backdrop is plain if three corners of the frame have the same colour within this many grey levels (two corners are
 #: enough if they are darker than `_DARK`),

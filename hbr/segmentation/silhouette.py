@@ -135,7 +135,7 @@ _STARTS: Final = (0.5, 0.3, 0.7, 0.15)
 #: Smallest and largest share of the frame that an object takes.
 _GUESS_LEAST, _GUESS_MOST = 0.015, 0.45
 #: Connections to clutter behind the object are cut if thinner than this radius, a share of the longer side.
-_BRIDGE: Final = 0.024
+_BRIDGE: Final = 0.024  # larger: thin parts such as handles are cut off; smaller: clutter stays connected
 #: Another part belongs to the object if it has this share of the main part's area, and this mean weight.
 _GUESS_PART: Final = 0.08
 _PART_WEIGHT: Final = 0.35  # less: most of the part is away from the usual place of an object, where clutter is
@@ -211,7 +211,7 @@ WEIGHTS: Final = "network.onnx"
 EVENLY: Final = 1.0
 COLOURED: Final = 0.7  # smaller than `EVENLY`, because shadows change the brightness more than the colour
 #: Trust in a background that was learned from other views; 1 for an empty-table image.
-LEARNED: Final = 0.5
+LEARNED: Final = 0.5  # less than an image that was taken for this purpose, more than none
 #: A network of OpenCV runs in one thread at a time, so there are as many as threads that needed one at the same time.
 _IDLE: Final[list[cv2.dnn.Net]] = []
 

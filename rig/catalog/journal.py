@@ -49,9 +49,10 @@ T = TypeVar("T")
 
 CHECK_S: Final = 2.0
 """Time between two checks of the journal."""
+# shorter: a server that starts again is asked by all benches at once; longer: deliveries are late
 RETRY_S: Final = 15.0
 """Time until the next attempt, if the server did not answer or a person has to decide about a name."""
-END_S: Final = 5.0
+END_S: Final = 5.0  # longer: Ctrl+C seems to hang
 """How long the end of a program waits for a delivery; the next program continues it."""
 
 _LOCK: Final = "delivering"

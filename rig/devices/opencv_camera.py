@@ -32,7 +32,7 @@ V4L2_EXPOSURE_MANUAL = 1  # V4L2_EXPOSURE_MANUAL of linux/v4l2-controls.h
 _V4L2_EXPOSURE_AUTO = (0, 3)  # fully automatic, and aperture priority: the camera sets the time
 _EXPOSURE_UNIT_US = 100.0  # V4L2_CID_EXPOSURE_ABSOLUTE
 
-TIMEOUT_S = 3.0
+TIMEOUT_S = 3.0  # longer: an unplugged camera is noticed late; shorter: exposures of a dark bench time out
 """How long `OpenCvCamera.capture` waits for a new frame, and for a camera that was unplugged."""
 LATENCY_FRAMES = 3
 """For a paced source: longest time from the start of the exposure until `grab` returns, in periods."""

@@ -20,6 +20,7 @@ from rig.devices.dynamixel.registers import model_of, obstacle
 from rig.devices.i2c import NO_DEVICE, STUCK, unbind_command
 from rig.doctor.finding import Finding, FindingCode, bad
 
+# a scan of all takes long, so the usual ones come first
 BAUD_RATES = (57_600, 1_000_000, 115_200, 2_000_000, 3_000_000, 4_000_000, 4_500_000, 9_600)
 """Baud rates of Protocol 2.0: the factory setting first, then in order of frequency."""
 BAUD_RATES_1 = (1_000_000, 115_200, 57_600, 500_000, 250_000, 200_000, 19_200, 9_600)  # the same for Protocol 1.0

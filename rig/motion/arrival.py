@@ -32,14 +32,15 @@ from rig.safety.motion_checks import find_servo_fault, implausible_readings
 
 QUIET_COUNTS = 3
 """Encoder counts by which readings at rest may differ: one of quantisation, the others of noise."""
-STILL_S = 0.01
+STILL_S = 0.01  # shorter: a slow table seems to rest; longer: each start waits
 """Time between two readings that show whether the table moves at all."""
-STALE_S = 0.05
+STALE_S = 0.05  # just more than a period of the control loop, 0.04 s
 """Age at which a reading is too old for a goal: the computer paused after it."""
-READINGS = 8
+READINGS = 8  # more: a bad bus is tolerated for longer; each takes a transaction
 """Number of readings that are taken to find two that agree."""
 AGREEMENTS = 3
 """Number of successive readings that must agree if the table cannot have reached them since the last trusted one."""
+# longer: a table that does not obey rotates on; shorter: a stop of a heavy table ends with its torque off
 STOP_ALLOWANCE_S = 0.5
 """Time for a stop in addition to its ramp; then the torque goes off in any case."""
 

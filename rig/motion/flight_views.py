@@ -16,7 +16,7 @@ from rig.motion.turntable import Flight, Turntable
 from rig.views.capture import Attempt, MotionEvidence, checked
 from rig.views.stream import FrameStream, after_middle_row_ns, middle_ns
 
-READINGS: Final = 8
+READINGS: Final = 8  # a third of a second: more average the noise, but the speed changes meanwhile
 """Readings of the encoder from which the angle of a frame is estimated during a flight."""
 GRID_MS: Final = 1.5
 """Smallest tolerance for the distance of a stamp from the camera's regular rhythm."""

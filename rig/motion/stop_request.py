@@ -16,7 +16,7 @@ from rig.safety.stop_channel import StopAnswer, StopRequest
 
 REACTION_S = 2.0
 """How long a program may take to notice the request: many rounds of its control loop, and a long exposure."""
-END_S = 5.0
+END_S = 5.0  # the operator waits for this; closing a camera alone can take seconds
 """Longest time that the program may then take to close its devices."""
 POLL_S = 0.02  # shorter than a person notices
 

@@ -35,11 +35,11 @@ READ_TIME_S: Final = 0.0004
 """Standard uncertainty of the time of an encoder reading: it is taken somewhere within its transaction."""
 ACCELERATION_DPS2: Final = 400.0
 """Largest acceleration of the platter that is expected where no sample was taken."""
-OUTLIER: Final = 4.0
+OUTLIER: Final = 4.0  # as `rig.safety.gyro_rotation.AGREED_SIGMAS`
 """Readings that deviate by more standard uncertainties weigh less."""
 # larger: a slip is stored in the azimuths of views; smaller: encoder noise and backlash end good motions
 SLIP_DEG: Final = 0.25
-SLIP_READINGS: Final = 5
+SLIP_READINGS: Final = 5  # one wrong reading is noise of the bus; more of them: a short slip goes unnoticed
 """Number of successive readings with a large deviation that shows a slip of the platter or a wrong sensor."""
 FEWEST_READINGS: Final = 4  # the fit has four unknown parameters: angle, bias, scale, delay
 

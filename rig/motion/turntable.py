@@ -24,7 +24,7 @@ from rig.safety.gyro_rotation import GyroRotationMeter, Stillness, compare
 from rig.safety.motion_checks import MotionMonitor, SlipMonitor
 from rig.safety.supervisor import Motion, TableState
 
-SETTLE_ALLOWANCE_S = 2.5
+SETTLE_ALLOWANCE_S = 2.5  # larger: a table that shakes is reported late; smaller: a heavy object never rests in time
 """Time for ringing to die down and for a slow bus, in addition to the motion."""
 
 

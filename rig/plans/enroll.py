@@ -45,6 +45,7 @@ from rig.views.image_files import encode
 
 SAME_SIMILARITY: Final = 0.97
 """Two images of an object at one angle are more similar; after a shift by a centimetre they are less similar."""
+# more than half a step, because frames are lost; nearer to the next view, both would be nearly one
 NEAR_SHARE: Final = 0.6
 """Largest distance of a frame from its planned angle, as a share of the step."""
 SHOWN_SIMILAR: Final = 3

@@ -66,7 +66,7 @@ STAMPS: Final = 30
 """Time stamps that are compared with each other: a second of frames."""
 # as many as a search at rest has views: a camera that loses frames must not keep the table in motion
 MOST_FLIGHTS: Final = 8
-MOST_REJECTED: Final = 15
+MOST_REJECTED: Final = 15  # half a second at 30 frames/s: what spoils so many does not pass by itself
 """Number of successive rejected frames after which the table stops and the next view is taken at rest."""
 NEW_GOAL_DEG: Final = 10.0  # smaller: the table changes its speed for goals that show nearly the same side
 

@@ -17,7 +17,7 @@ from rig.core.phrases import Worded, filled
 from rig.devices.servo import Servo, ServoCondition, ServoIdentity
 from rig.safety.saved_state import BenchState, LatchedFault, SavedTable, StateStore
 
-TOLERANCE_DEG = 2.0
+TOLERANCE_DEG = 2.0  # larger: a small slip is trusted; smaller: a usual rest needs the operator
 """How far a shaft may relax when its torque goes off, including the encoder's noise."""
 HAND_DEG = 180.0
 """Largest change that counts as a rotation by hand; after a larger one, the servo has probably lost its count."""

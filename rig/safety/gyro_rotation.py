@@ -35,7 +35,7 @@ FINE_DPS = 550.0
 """Up to this range, a sensor's steps are small enough to show its noise."""
 REST_PEAK_DPS = 0.5
 """Largest deviation from the mean rate at rest: eight sigma of the sensor's noise, a ringing of 0.01°."""
-AGREED_SIGMAS = 4.0
+AGREED_SIGMAS = 4.0  # 1 in 16,000 moves exceeds it by chance; smaller: good enrollments end; larger: small slips pass
 """Largest difference of encoder and gyro that agrees, in standard deviations, apart from the backlash."""
 MAX_BIAS_DPS = 25.0
 """Largest bias of a gyro: ±20 °/s (PS-MPU-6000A, 6.1), and a margin for temperature."""

@@ -28,17 +28,17 @@ STANDING_DPS = 3.0
 """Speed below which the shaft counts as standing still: two units of the servo's velocity reading."""
 HELD_DEG = 2.0
 """Distance from the goal up to which friction holds the table, because the servo's position controller is too weak."""
-STALL_S = 0.25
+STALL_S = 0.25  # six readings; longer: what blocks the table, perhaps a hand, is pressed for longer
 """How long the servo may push without rotating."""
-OVERLOAD_S = 0.8
+OVERLOAD_S = 0.8  # a start takes 0.4 s with the default profile
 """How long the servo may rotate with overload: longer than a start takes."""
 LAG_S = OVERLOAD_S / 2
 """How long the shaft may lag behind the servo's profile."""
-NO_PROGRESS_S = 1.0
+NO_PROGRESS_S = 1.0  # longer than stick-slip friction holds the table; shorter than an operator waits
 """How long the servo may stand still before its goal."""
 VOLTAGE_S = 0.1
 """How long a bad voltage must last: starting motors make it dip."""
-COOLER_C = 5.0
+COOLER_C = 5.0  # smaller: a servo that has just cooled down is too hot again after a few moves
 """Difference between its limit and the temperature at which a servo may work again."""
 
 

@@ -23,7 +23,7 @@ NOISE_GAIN = 20
 """Factor by which the Laplacian (-4 and four times 1) increases the variance of independent pixels."""
 MAX_NOISE = 0.3
 """Largest share of such variance in an image. Half a frame of random bytes has more."""
-MOST_REPEATED = 10
+MOST_REPEATED = 10  # a camera that only repeats frames must still be reported
 """Repeated frames of one view that do not count as retakes: a camera on a busy bus sends some frames twice."""
 SMEAR_MARGIN = 1.1
 """Allowed excess of the smear, because the speed varies about the chosen one."""

@@ -24,7 +24,7 @@ BODY_TIMEOUT_S: Final = 20.0
 """Time that a body may take in addition to its size at `MIN_RATE`; then the client is disconnected."""
 MIN_RATE: Final = 20_000
 """Slowest speed at which a body may come, in bytes a second."""
-HEADER_TIMEOUT_S: Final = 10.0
+HEADER_TIMEOUT_S: Final = 10.0  # a client that sends byte by byte must not hold a connection
 """Time after which a client that has not sent a whole request head is disconnected."""
 MAX_CONNECTIONS: Final = 400
 """Open connections: 200 listeners and as many other requests."""

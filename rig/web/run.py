@@ -40,6 +40,7 @@ from rig.web.worker import BenchWorker
 START_S: Final = 30.0
 END_S: Final = 6.0
 """Longer than `rig.web.front.END_S`, after which a web process ends itself."""
+# a long import or report may hold the interpreter for seconds; longer: STOP of a page is dead for longer
 SILENT_S: Final = 30.0
 """Time without a sign of life after which a web process counts as hanging, and is ended."""
 MAX_STARTS: Final = 3  # a process that ends again and again has a defect that another start does not fix

@@ -25,7 +25,7 @@ from rig.web.requests import Job, JobState
 
 IDLE_S: Final = 0.05
 """Time between two checks of the queue."""
-STATUS_S: Final = 0.25
+STATUS_S: Final = 0.25  # a page that shows the angle looks smooth enough; more messages load the bus and the network
 """Time between two messages about the state of the table."""
 IDLE_STATUS_S: Final = 1.0  # at rest, the state changes by hand or supply only, and each reading occupies the bus
 REOPEN_S: Final = 5.0

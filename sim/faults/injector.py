@@ -9,7 +9,7 @@ from sim.faults.kind import End
 from sim.faults.schedule import Fault, Trigger
 from sim.world import Activity
 
-DURING_S = 0.1
+DURING_S = 0.1  # within the ramp of every move
 """A fault "during" a move begins this long after the shaft has started; a step of 5° takes 0.3 s."""
 
 

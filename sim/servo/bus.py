@@ -16,7 +16,7 @@ ABANDON_S = 0.05  # silence after which a device drops an incomplete packet; the
 PING_SLOT_S = 0.003
 PING_STATUS_BYTES = 14
 """Broadcast Ping: each id has a slot of one status packet and 3 ms, as in the SDK's timeout."""
-COLLISION_SHIFT_BITS = 3
+COLLISION_SHIFT_BITS = 3  # any small number: what matters is that the bytes overlap and differ
 """Delay of the second of two devices with one id, because they never answer at exactly the same time."""
 
 

@@ -21,10 +21,11 @@ from rig.devices.dynamixel.registers import Register
 OUTSTANDING_S = 2.0
 """How long a missing reply may still arrive: longer than any buffer can delay it."""
 
+# longer: reading is slow after one late reply; shorter: an adapter that repeats replies is trusted too early
 DOUBT_S = 60.0
 """How long a bus counts as one that repeats replies, after one arrived that belongs to no request."""
 
-CONFIRM_ATTEMPTS = 16
+CONFIRM_ATTEMPTS = 16  # more: a bus that repeats everything holds the control loop for longer
 """Largest number of repetitions of a reading until only its reply arrives."""
 
 _BITS = 10  # a byte with its start and stop bit

@@ -17,10 +17,10 @@ from rig.core.clock import Clock
 from rig.core.errors import DeviceNotFound
 from rig.core.next_steps import Do, SomeSteps
 
-READ_SLICE_S = 0.005
+READ_SLICE_S = 0.005  # an eighth of a period of the control loop
 """Longest time that one read blocks. It limits the delay of a timeout, and keeps the CPU idle."""
 
-BABBLE_GRACE_MS = 50.0
+BABBLE_GRACE_MS = 50.0  # longer than a long packet at 57,600 bit/s needs
 """How long a packet may exceed its timeout while bytes keep arriving; the SDK itself has no limit."""
 
 QUIET_S, DRAIN_S = 0.005, 0.25
@@ -45,7 +45,7 @@ class BusBabble(Exception):
 
 
 GUARDIAN = "rig.devices.dynamixel.guardian"
-GUARDIAN_S = 5.0
+GUARDIAN_S = 5.0  # longer than a dying program holds the port; without supply the guardian must end, too
 """How long the guardian of a killed program tries to switch the torque off."""
 _BUSY = (errno.EBUSY, errno.EAGAIN, errno.EWOULDBLOCK)
 _BUSY_RETRY_S = 0.05  # the guardian needs a few transactions of the bus to end; shorter: the waiting takes a core

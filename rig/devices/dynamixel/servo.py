@@ -45,7 +45,7 @@ WATCHDOG_TRIPPED = 0xFF  # e-manual, Bus Watchdog: reads as −1; goals are read
 TICK_MODULUS_MS = 32768  # e-manual, Realtime Tick: wraps after 32,767 ms
 TICK_TOLERANCE_MS, TICK_DRIFT = 20.0, 0.03
 """How much the servo's clock (Realtime Tick) may differ from the computer's between two readings."""
-TICK_MEMORY_S = 10.0
+TICK_MEMORY_S = 10.0  # the tick wraps after 33 s, and both clocks drift
 """After a longer pause, two readings must agree with each other instead."""
 _FRESH_ATTEMPTS, _RESTARTED = 8, 3
 

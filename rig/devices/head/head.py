@@ -47,7 +47,7 @@ POWER_UP_S = 0.6
 HEARTBEATS_PER_DEADMAN = 4  # three may be lost or late before the head switches off; more: more traffic on its port
 FIRST_HEARTBEATS = 8
 """Heartbeats that compare the clocks before the first sample is dated."""
-RECOVERY_S = 0.5
+RECOVERY_S = 0.5  # the head tries every 0.1 s
 """Longest time that the head may take to set its sensor up again."""
 
 

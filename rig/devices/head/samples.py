@@ -26,9 +26,9 @@ from rig.devices.head.link import HeadStatistics
 from rig.devices.head.protocol import Imu, ImuModel, Sample, SampleFlag
 from rig.devices.imu import ImuSamples
 
-MEMORY_S = 2.0
+MEMORY_S = 2.0  # a reader that pauses for longer reports lost samples
 """Time for which samples are kept for a reader; older ones are lost."""
-DRIFT_SIGMA = 3e-3
+DRIFT_SIGMA = 3e-3  # a ceramic resonator has 0.5 %, a crystal far less
 """Standard uncertainty of the drift before it is measured."""
 STEP_SIGMA_NS = 4_000.0
 """Uncertainty of one heartbeat without delay: the head's clock has steps of 1 µs, on some boards 4 µs."""
