@@ -110,6 +110,7 @@ def evaluate(legs: Sequence[Leg], *, resolution_deg: float) -> Evaluation:
         )
     encoder = np.array([leg.encoder_deg for leg in used])
     gyro = np.array([leg.gyro_deg for leg in used])
+    # Encoder = ratio · gyro + backlash · direction: one linear fit to short and long legs.
     fitted = fit(used, np.column_stack([gyro, np.sign(encoder)]), resolution_deg)
     (ratio, backlash), (ratio_sigma, backlash_sigma), worst = fitted.values, fitted.sigma, fitted.worst
     found.residual = abs(float(fitted.residuals_deg[worst]))
@@ -120,6 +121,7 @@ def evaluate(legs: Sequence[Leg], *, resolution_deg: float) -> Evaluation:
     margin_deg = max(float(backlash), 0.0) + COVERAGE * float(backlash_sigma)
     found.proposed = {"table.backlash_deg": round(margin_deg, 3)}
 
+    # The gear first, then single legs, then what the backlash itself must keep.
     if ratio < 0:
         found.reject(RejectionCode.WRONG_DIRECTION, ratio=ratio)
     else:

@@ -154,12 +154,14 @@ def _take_pass(
     trajectory = flights.recorder.fit()
     if not usable or trajectory is None:
         return None
+    # Use frames at constant speed only, after the platter has stopped vibrating, with stamps in rhythm.
     motion = trajectory.at(stamps)
     steady = np.abs(np.abs(motion.rate_dps) - speed_dps) < 0.1 * speed_dps + 1.0
     begun = np.flatnonzero(steady)
     if len(begun):
         steady &= np.array(stamps) > np.array(stamps)[begun[0]] + round(RAMP_S * 1e9)
     used = np.flatnonzero(steady & ~np.isin(stamps, list(flights.irregular_ns())))
+    # Gaps of whole periods between the used frames are lost frames.
     steps = np.diff(np.array(stamps)[used]) * 1e-9 / flights.stream.period_s if len(used) > 1 else np.zeros(0)
     missing = int((np.rint(steps) - 1).clip(0).sum())
     shape = (0, 1, 1) if not len(used) else (len(used), *images[0].shape)

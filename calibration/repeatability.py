@@ -159,10 +159,12 @@ def evaluate(
         error_rate=error_rate,
         needed=needed,
     )
+    # A search decides after several views: average the similarities at the azimuths that it visits.
     shift = round(first_step_deg * AZIMUTHS / 360.0)
     decided = np.mean([np.roll(between, -shift * view, axis=1) for view in range(views)], axis=0)
     low = float(np.median(between))
     found.reject_if(low < MIN_SIMILARITY, RejectionCode.SIMILARITY_TOO_LOW, similarity=low, needed=MIN_SIMILARITY)
+    # Light that drifts makes distant placements less similar than consecutive ones.
     last = len(placements) - 1
     apart = {(i, j): row for (i, j), row in zip(combinations(range(len(placements)), 2), between, strict=True)}
     neighbours = float(np.median([apart[i, i + 1] for i in range(last)]))
@@ -177,6 +179,7 @@ def evaluate(
         scatter = float(np.sqrt(some_between.var(axis=0, ddof=min(1, len(between) - 1)).mean()))
         return float(np.median(some_within)), float(np.median(some_between)), quantile, scatter
 
+    # The uncertainty from drawing azimuths again: those of one object are the independent data.
     values = figures(np.arange(AZIMUTHS))
     rng = np.random.default_rng(seed)
     drawn = np.array([figures(rng.integers(0, AZIMUTHS, AZIMUTHS)) for _ in range(BOOTSTRAPS)])

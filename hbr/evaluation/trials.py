@@ -236,6 +236,7 @@ class _Trials:
             # a new index for each method: lists of another method would shorten the measured time
             model = models[key]
             index = ViewIndex(model.views)
+            # Only the first repetition is timed; the others may share lists.
             is_measured = at[2] == 0
             if not is_measured:
                 self._share_lists(index, model, seen, method.list_length)
@@ -297,6 +298,7 @@ class _Trials:
             runs.step_ns[*at, n] = self._now_ns() - start_ns
             ranking = session.belief.ranking()
             self._record(ranking.object_index, ranking.pose_deg, seen, runs, (*at, n))
+            # The numbers after this view; at the first end, also the last steps.
             runs.score[*at, n] = ranking.scores[0]
             runs.margin[*at, n] = ranking.scores[0] - (ranking.scores[1] if len(ranking.scores) > 1 else 0.0)
             runs.outcome[*at, n] = OUTCOMES.index(decision.outcome)

@@ -253,6 +253,7 @@ def summaries(transaction: Transaction, *, deleted: bool = False, object_id: int
         *(Named.created_utc, Named.time_utc, Named.deleted),
     )
     states = transaction.execute(select(*columns).where(*conditions).order_by(Named.object_id)).all()
+    # Two statements for all objects together, and not one for each object.
     planned = func.json_array_length(Enrollment.planned_azimuth_deg)
     wanted = (
         select(Ended.object_id, Ended.status, Ended.finished_utc, count, planned, Ended.id)
@@ -275,6 +276,7 @@ def summaries(transaction: Transaction, *, deleted: bool = False, object_id: int
     for one in states:
         enrolled_utc, views, planned_views, _ = current.get((one.object_id, EnrollmentStatus.COMPLETE), (None, 0, 0, 0))
         _, unfinished, _, _ = current.get((one.object_id, EnrollmentStatus.IN_PROGRESS), (None, None, None, None))
+        # A complete enrollment whose views are gone was changed from outside.
         if views != planned_views:
             raise changed([str(one.object_name)])
         found.append(

@@ -125,6 +125,7 @@ class Chart:
         x = _Scale(self.x, *x_range, left, right)
         y = _Scale(self.y, *y_range, *((top, bottom) if self.y.falling else (bottom, top)))
 
+        # From below to above: title and axes, then the curves; the key is outside the plot.
         parts = [svg.text(words, (0, 13 + _ROW_PX * row), "title", anchor="start") for row, words in enumerate(title)]
         parts.append(svg.text(self.y.label, (0, top - 9), "small", anchor="start"))
         for value, words in _ticks(self.y, *y_range):

@@ -92,6 +92,7 @@ def map_on_cluster(work: Callable[[_Item], _T], items: Iterable[_Item], cluster:
                 ),
                 evidence={"error": str(error)},
             ) from error
+        # The work is sent once, with the networks that its workers must load.
         models = tuple(str(model.path) for model in loaded_models())
         content = pickle.dumps(work)
         digest = sha256(content).hexdigest()

@@ -65,6 +65,7 @@ def imu(context: DoctorContext) -> Iterator[Finding]:
         yield fine("imu", FindingCode.IMU, bus=bus, **parts)
         if here.note:
             yield fine("imu", FindingCode.IMU_NOTE, note=here.note)
+        # The sensor works: now its samples and its bus.
         yield from _at_rest(context, sensor)
         corrupt = getattr(getattr(sensor, "statistics", None), "corrupt", 0)
         if corrupt:

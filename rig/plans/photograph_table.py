@@ -61,6 +61,7 @@ def photograph_table(bench: Bench, *, anyway: bool = False) -> Generator[Event, 
         raise UsageError(
             "The object on this bench cannot be taken away.", next_step="Continue without an empty-table image."
         )
+    # Two frames with a rotation between them, if the cable leaves room for it.
     viewer = Viewer(bench.camera, bench.config)
     started_ns = bench.clock.now_ns()
     rotated = None

@@ -170,6 +170,7 @@ def _retrieval(number: int, record: IdentificationRecord, styles: Styles, *, unf
     if len(views) > 1:
         start_deg = _report_azimuth_deg(record, views[0].azimuth_deg)
         path = Markup(polar_path(start_deg, record.steps, named={view.index + 1 for view in shown}))
+    # The chart of the candidates; the path above needs two views.
     rotated_deg, enough = record.rotated_deg, record.enough
     known = [event for event in record.ranked if event.index in rotated_deg]  # all, except in a damaged run
     if known:

@@ -167,6 +167,7 @@ def check_saved_angle(
     same_within_revolution = abs(moved_deg - revolution_deg * revolutions) <= TOLERANCE_DEG
     lost = 0
     finding = AngleFinding.UNCHANGED
+    # Another servo first: then no number of the saved one counts.
     if (identity.model_number, identity.bus_id) != (saved.model_number, saved.bus_id):
         finding = AngleFinding.OTHER_SERVO
     elif identity.firmware != saved.firmware:
@@ -184,6 +185,7 @@ def check_saved_angle(
             finding = AngleFinding.ROTATED_WITHOUT_POWER
         elif revolutions:
             finding, lost = AngleFinding.REVOLUTIONS_RESTORED, revolutions
+    # The supply was kept, at rest: the servo's own count is trusted.
     elif abs(moved_deg) > min(HAND_DEG, revolution_deg / 2):
         finding = AngleFinding.POSITION_CHANGED
     elif abs(moved_deg) > TOLERANCE_DEG:

@@ -73,6 +73,7 @@ def check(run: SavedRun) -> Check:
     search = begin_search(
         run.model, run.config, started.strategy, seed=started.seed or 0, top=len(run.views.object_names)
     )
+    # A search in motion has too many frames to segment the earlier ones again.
     revise = not search.in_motion
     describe = SearchDescriber(run.config.view, run.views.descriptor, run.empty_table, revise=revise)
     table_deg = 0.0
@@ -113,6 +114,7 @@ def check(run: SavedRun) -> Check:
                 found.is_complete = not run.is_cut
             case _:
                 pass
+        # Compare what the events of the run say with what the same search says now.
         if computed is not None:
             saved = event_dict(event)
             again = {"event": event.event, **computed} if isinstance(computed, dict) else event_dict(computed)

@@ -67,6 +67,7 @@ class Guard:
             else:
                 await self._app(scope, receive, send)
             return
+        # Reject by the headers before the body is read: a large one costs nothing then.
         limit = self._max_upload_bytes if scope["path"] == self._upload_path else MAX_BODY_BYTES
         rejection = self._rejection(scope["method"], scope["path"], headers)
         if (size := whole(headers.get("content-length", "0"))) is None or size > limit:
@@ -93,6 +94,7 @@ class Guard:
                     raise HTTPException(413, f"The request is larger than {limit} bytes.")
             return message
 
+        # Every answer has the headers of security, also an error.
         async def guarded(message: Message) -> None:
             if message["type"] == "http.response.start":
                 message["headers"] = [*message.get("headers", []), *_HEADERS]
