@@ -81,7 +81,7 @@ class IdentifyConfig(Section):
 
     strategy: str | None = Field(
         None,
-        description="strategy that chooses the next view; none: dense if the catalog has its descriptors, else ahbr",
+        description="strategy that chooses the next view; none: dense; ahbr is the paper's",
     )
     mode: Mode = Field(
         "auto",

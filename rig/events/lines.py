@@ -53,6 +53,7 @@ from rig.events.wording import (
     wait_words,
 )
 from rig.views.capture import rejection_text
+from rig.views.description import BENCH_DESCRIPTOR
 
 SHOWN = 3
 """Candidates in the line of a ranking."""
@@ -84,8 +85,10 @@ def line(event: Event) -> str:
     """Return the text of an event for a terminal; empty if it has none."""
     match event:
         case Started():
+            paper = " (the paper's AHBR by CEDD: --strategy ahbr)" if event.descriptor == BENCH_DESCRIPTOR else ""
+            method = [f"{_method(event)}{paper}"] if event.strategy else []
             notes = [(f"Note: {note_words(note)}.", in_words(note_steps(note))) for note in event.notes]
-            return "\n".join(" ".join(filter(None, note)) for note in notes)
+            return "\n".join([*method, *(" ".join(filter(None, note)) for note in notes)])
         case Waiting():
             return f"{page_line(event)[:-1]}; Ctrl+C ends."
         case Warned() | Failed():
@@ -94,11 +97,16 @@ def line(event: Event) -> str:
             return page_line(event)
 
 
+def _method(event: Started) -> str:
+    return f"Method: {event.strategy}, by {event.descriptor}"
+
+
 def page_line(event: Event) -> str:
     """Return the text of an event for a page or a file, which show its next steps in their own way."""
     match event:
         case Started():
-            return "\n".join(f"Note: {note_words(note)}." for note in event.notes)
+            method = [_method(event)] if event.strategy else []
+            return "\n".join([*method, *(f"Note: {note_words(note)}." for note in event.notes)])
         case Moved():
             encoder, asked = (angle_words(angle, 2) for angle in (event.encoder_deg, event.commanded_deg))
             return f"  table at {encoder} (asked {asked}): {move_words(event)}"

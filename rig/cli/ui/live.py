@@ -25,7 +25,6 @@ from rig.events.events import (
     FrameUsed,
     Identified,
     Moved,
-    Note,
     Ranked,
     Rejected,
     SimilarObjects,
@@ -294,7 +293,7 @@ class IdentifyView(LiveView):
 
     def __init__(self, console: Console, *, keys: bool = True) -> None:
         super().__init__(console, keys=keys)
-        self._notes: tuple[Note, ...] = ()
+        self._begun: str | None = None
         self._ranked: Ranked | None = None
         self._used: FrameUsed | None = None
         self._taken = 0
@@ -328,10 +327,10 @@ class IdentifyView(LiveView):
         """Return the lines about an event that stay on the screen."""
         plain = not self._console.is_terminal
         match event:
-            case Started() if event.notes == self._notes:  # of one search after the other, once
+            case Started() if line(event) == self._begun:  # of one search after the other, once
                 return []
             case Started():
-                self._notes = event.notes
+                self._begun = line(event)
             case Accepted() if plain and event.evidence.motion is not None:  # a frame in motion has its own line
                 return []
             case Decided() if plain:

@@ -327,6 +327,17 @@ def test_local_views_are_cut_by_the_stored_silhouettes(catalog: Catalog) -> None
     assert all(np.array_equal(one.mask, other.mask) for one, other in zip(near, again, strict=True))
 
 
+def test_one_object_without_a_description_does_not_change_the_method(catalog: Catalog) -> None:
+    before = load_model(catalog)
+    seal, _ = next(iter(rows(catalog)))
+    with catalog.database.write() as transaction:
+        transaction.execute(delete(Derived).where(Derived.seal == seal))
+    after = load_model(catalog)
+    assert after.descriptor == before.descriptor == BENCH_DESCRIPTOR
+    assert equal(before.views, after.views)
+    assert after.rule is not None
+
+
 def test_search_compares_the_bench_with_the_newest_enrollment(open_catalog: OpenCatalog) -> None:
     catalog = open_catalog("new")
     enroll(catalog, "box", empty_table=False)

@@ -179,10 +179,11 @@ def test_frames_are_shown_while_the_table_rotates(terminal: bool) -> None:
 def test_dense_search_in_a_pipe_is_printed_as_lines():
     console = screen(80, terminal=False)
     lines = shown(console, IdentifyView(console), list(searching_densely())).splitlines()
-    assert lines[0].startswith("Note: 24 leave-one-out searches")
-    assert "  candidates: mug-white 0.900 (60.0 %) at 330.0°, mug-star 0.800 (40.0 %) at 330.0°" in lines[3]
-    assert lines[4] == "  not confident yet: 60.0 %, and 95.0 % ends the search"
-    assert lines[5].startswith("  left 80.0°: distinguishes mug-white from mug-star")
+    assert lines[0].startswith("Method: dense, by ")
+    assert lines[1].startswith("Note: 24 leave-one-out searches")
+    assert "  candidates: mug-white 0.900 (60.0 %) at 330.0°, mug-star 0.800 (40.0 %) at 330.0°" in lines[4]
+    assert lines[5] == "  not confident yet: 60.0 %, and 95.0 % ends the search"
+    assert lines[6].startswith("  left 80.0°: distinguishes mug-white from mug-star")
 
 
 @pytest.mark.parametrize("width", [40, 100])
