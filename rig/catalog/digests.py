@@ -1,11 +1,12 @@
 """Comparison of the digests of many rows, as the database stores them: without making objects of them."""
 
 from collections.abc import Collection, Iterator, Mapping
+from functools import lru_cache
 from itertools import groupby
 from operator import itemgetter
 from typing import Any, Final
 
-from sqlalchemy import ColumnElement, Integer, Text, cast, func, select, type_coerce
+from sqlalchemy import ColumnElement, Integer, Select, Text, bindparam, cast, func, select, type_coerce
 from sqlalchemy.orm import Session as Transaction
 from sqlalchemy.orm import aliased
 from sqlalchemy.types import NullType
@@ -20,25 +21,33 @@ AT_ONCE: Final = 100
 
 def wrong_lines(transaction: Transaction, ids: Collection[int]) -> list[int]:
     """Return which of these lines of the log are not as they were written after the line before each."""
-    before, wrong = aliased(Entry, name="before"), []
+    wrong: list[int] = []
+    statement = _lines(_is_postgres(transaction))
     for part in portions(sorted(ids), 500):
-        rows = transaction.execute(
-            select(Entry.id, Entry.digest, func.coalesce(before.digest, ""), *_raw(transaction, Entry))
-            .outerjoin(before, before.id == Entry.id - 1)
-            .where(Entry.id.in_(part))
-        )
+        rows = transaction.execute(statement, {"ids": part})
         wrong += [row[0] for row in rows if row[1] != sha256_of(row[2:])]
     return wrong
+
+
+@lru_cache(maxsize=2)  # each view that is enrolled asks it, and to build the statement takes longer than to execute it
+def _lines(is_postgres: bool) -> Select[Any]:
+    before = aliased(Entry, name="before")
+    return (
+        select(Entry.id, Entry.digest, func.coalesce(before.digest, ""), *_raw(is_postgres, Entry))
+        .outerjoin(before, before.id == Entry.id - 1)
+        .where(Entry.id.in_(bindparam("ids", expanding=True)))
+    )
 
 
 def damaged_enrollments(transaction: Transaction, seals: Mapping[int, str | None]) -> Iterator[int]:
     """Yield which of these enrollments, by their ids and seals, are not as they were written."""
     enrollments, views = Enrollment.__table__.c, View.__table__.c
+    is_postgres = _is_postgres(transaction)
     for part in portions(sorted(seals), AT_ONCE):
         own = {
             row[0]: row[1:]
             for row in transaction.execute(
-                select(Enrollment.id, Enrollment.digest, Enrollment.key, *_raw(transaction, Enrollment)).where(
+                select(Enrollment.id, Enrollment.digest, Enrollment.key, *_raw(is_postgres, Enrollment)).where(
                     enrollments.id.in_(part)
                 )
             )
@@ -48,7 +57,7 @@ def damaged_enrollments(transaction: Transaction, seals: Mapping[int, str | None
         wrong = {number for number, row in own.items() if row[0] != sha256_of((keys[number], *row[2:]))}
         for table, order in ((Session, Session.number), (View, views.view_index)):
             rows = transaction.execute(
-                select(table.enrollment_id, table.digest, *_raw(transaction, table))
+                select(table.enrollment_id, table.digest, *_raw(is_postgres, table))
                 .where(table.enrollment_id.in_(part))
                 .order_by(table.enrollment_id, order)
             )
@@ -61,9 +70,12 @@ def damaged_enrollments(transaction: Transaction, seals: Mapping[int, str | None
         yield from sorted(wrong)
 
 
-def _raw(transaction: Transaction, table: type[Row]) -> list[ColumnElement[Any]]:
+def _is_postgres(transaction: Transaction) -> bool:
+    return transaction.get_bind().dialect.name == "postgresql"
+
+
+def _raw(is_postgres: bool, table: type[Row]) -> list[ColumnElement[Any]]:
     """Return the digested columns, with equal values for equal rows on both databases."""
-    is_postgres = transaction.get_bind().dialect.name == "postgresql"
     return [_as_stored(column, is_postgres).label(f"raw_{name}") for name, column in digested(table)]
 
 

@@ -12,7 +12,7 @@ from difflib import get_close_matches
 from hashlib import sha256
 from typing import Any, Final
 
-from sqlalchemy import ColumnElement, and_, exists, false, func, or_, select, true, union
+from sqlalchemy import ColumnElement, and_, bindparam, exists, false, func, or_, select, true, union
 from sqlalchemy.orm import Session as Transaction
 from sqlalchemy.orm import aliased, selectinload
 
@@ -50,6 +50,7 @@ CURRENT: Final = {
 IS_STATE = _is_last(Named, "object_id", "deleted")
 IS_STATUS = _is_last(Ended, "enrollment_id", "status")
 IN_USE = and_(IS_STATE, Named.deleted == false())
+_BY_ID = select(Named).where(IS_STATE, Named.object_id == bindparam("object_id"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -212,7 +213,7 @@ def state_of(transaction: Transaction, name: str) -> Entry | None:
 
 def by_id(transaction: Transaction, object_id: int | None) -> Entry:
     """Return the state of an object, in use or deleted."""
-    found = transaction.scalar(select(Named).where(IS_STATE, Named.object_id == object_id))
+    found = transaction.scalar(_BY_ID, {"object_id": object_id})
     if found is None:
         raise damaged("the owner of an enrollment", object_id)
     check_lines(transaction, [found.id])
