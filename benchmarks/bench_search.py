@@ -129,7 +129,7 @@ def main() -> None:
     )
     tree = parser.parse_args().tree
     print(f"{'views':>9} {'call':<44} {'median ms':>9} {'ratio':>6}")
-    every: tuple[Method, ...] = ("flat", "kdtree")
+    every: tuple[Method, ...] = ("flat", "tree")
     for objects, repeats in ((100, 200), (1_389, 60), (10_000, 30)):
         views = model(objects)
         bench_search(views, every if objects < 10_000 or tree else every[:1], repeats)

@@ -195,6 +195,11 @@ class Descriptor(Protocol):
         self.check_rows(a)
         return self.prepared(b).similarity(a)
 
+    def similarity_of_means(self, means: FloatArray) -> FloatArray:
+        """Return the similarity of average views, (n, length), to each other, as float64 (n, n); they are rounded."""
+        levels = np.rint(means).astype(np.uint8)
+        return self.similarity(levels, levels)
+
     def pack(self, levels: LevelArray) -> bytes:
         """Pack the levels of one view, (length,), into `size_bytes` bytes.
 

@@ -8,6 +8,7 @@ Vectors over the blocks have the shape ``(k, blocks)``, so that every operation 
 bits are packed into 54 bytes, bin 0 first, most significant bit first.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final, NamedTuple
@@ -17,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hbr.core.arrays import BoolArray, FloatArray, ImageArray, IndexArray, LevelArray, RealArray, check_image
-from hbr.descriptors.base import Descriptor
+from hbr.descriptors.base import Comparison, Descriptor
 from hbr.descriptors.similarity import squares, tanimoto, tanimoto_of_dots
 from hbr.kernels import calls
 from hbr.segmentation import Segmentation
@@ -466,12 +467,15 @@ class Cedd(Descriptor):
         blurred = cv2.GaussianBlur(image, (0, 0), sigma[1], sigmaY=sigma[0], borderType=cv2.BORDER_REPLICATE)
         return cedd(blurred.astype(np.uint8, copy=False))
 
-    def prepared(self, rows: LevelArray, /) -> "_Tanimoto":
+    def prepared(self, rows: LevelArray, /) -> Comparison:
         self.check_rows(rows)
         return _Tanimoto(rows.astype(np.float32))  # float32 represents products of levels 0..7 exactly
 
     def similarity(self, a: LevelArray, b: LevelArray) -> FloatArray:
         return tanimoto(a, b)
+
+    def similarity_of_means(self, means: FloatArray) -> FloatArray:
+        return tanimoto(means, means)
 
     def pack_rows(self, rows: LevelArray) -> LevelArray:
         self.check_levels(rows)
@@ -488,6 +492,46 @@ class Cedd(Descriptor):
 
 
 _CEDD: Final = Cedd()
+#: Rotated by 45° counter-clockwise, a horizontal edge is one of 45°, then vertical, then of 135°.
+_NEXT_DIRECTION: Final = {2: 4, 4: 3, 3: 5, 5: 2}
+
+
+def _rotation_tables() -> tuple[IndexArray, ...]:
+    """Return the bins that the bins get their levels from in rotations of the image by 0°, 45°, 90° and 135°."""
+    once = np.arange(BINS).reshape(6, 24)
+    once[list(_NEXT_DIRECTION.values())] = once[list(_NEXT_DIRECTION)]
+    found = [np.arange(BINS)]
+    for _ in range(3):
+        found.append(once.ravel()[found[-1]])
+    return tuple(found)
+
+
+_ROTATIONS: Final = _rotation_tables()
+
+
+@dataclass(frozen=True)
+class RotatedCedd(Cedd):
+    """CEDD with a similarity for objects that are rotated in the image plane: the largest over rotations by 45°.
+
+    The four classes of directed edges change places. Colours, no edge and non-directional edges stay.
+    """
+
+    name: str = "cedd-rotated"
+
+    def prepared(self, rows: LevelArray, /) -> Comparison:
+        self.check_rows(rows)
+        return _Rotated(_Tanimoto(rows.astype(np.float32)))
+
+    def similarity(self, a: LevelArray, b: LevelArray) -> FloatArray:
+        return _largest([tanimoto(a[..., places], b) for places in _ROTATIONS])
+
+    def similarity_of_means(self, means: FloatArray) -> FloatArray:
+        return _largest([tanimoto(means[:, places], means) for places in _ROTATIONS])
+
+
+def _largest(similar: list[FloatArray]) -> FloatArray:
+    largest: FloatArray = np.maximum.reduce(similar)
+    return largest
 
 
 class _Tanimoto:
@@ -503,6 +547,25 @@ class _Tanimoto:
         return _Tanimoto(self._rows[rows])
 
     def among(self, rows: IndexArray, /) -> FloatArray:
+        return self.rotated_among(rows, (np.arange(BINS),))
+
+    def rotated_among(self, rows: IndexArray, rotations: Sequence[IndexArray]) -> FloatArray:
+        """Return the largest similarity of rows within groups, over rotations of the first row, (g, k, k)."""
         part, lengths = self._rows[rows], self._squares[rows]
-        dots = (part @ part.transpose(0, 2, 1)).astype(np.float64)
+        columns = part.transpose(0, 2, 1)
+        dots = np.maximum.reduce([part[:, :, places] @ columns for places in rotations]).astype(np.float64)
         return tanimoto_of_dots(dots, lengths[:, :, None], lengths[:, None, :])
+
+
+class _Rotated:
+    def __init__(self, plain: _Tanimoto) -> None:
+        self._plain = plain
+
+    def similarity(self, queries: LevelArray, /) -> FloatArray:
+        return _largest([self._plain.similarity(queries[:, places]) for places in _ROTATIONS])
+
+    def only(self, rows: IndexArray, /) -> "_Rotated":
+        return _Rotated(self._plain.only(rows))
+
+    def among(self, rows: IndexArray, /) -> FloatArray:
+        return self._plain.rotated_among(rows, _ROTATIONS)

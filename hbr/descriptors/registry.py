@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Final
 
@@ -9,7 +10,7 @@ import numpy as np
 
 from hbr.core.arrays import FloatArray, ImageArray, IndexArray, LevelArray
 from hbr.descriptors.base import Comparison, CompiledDescriptor, Descriptor, Shift
-from hbr.descriptors.cedd import Cedd
+from hbr.descriptors.cedd import Cedd, RotatedCedd
 from hbr.descriptors.edges_and_colours import Colours, Edges
 from hbr.descriptors.embedding import MODEL_NAME, PREFIX, Embedding
 from hbr.kernels.calls import Measure
@@ -66,6 +67,12 @@ class Joined(CompiledDescriptor):
         parts = zip(self.parts, self._columns(), strict=True)
         return np.concatenate([part.shifted(levels[own], shift) for part, own in parts])
 
+    def similarity_of_means(self, means: FloatArray) -> FloatArray:
+        similar = [
+            part.similarity_of_means(means[:, own]) for part, own in zip(self.parts, self._columns(), strict=True)
+        ]
+        return _weighted(self.weights, similar)
+
     def pack_rows(self, rows: LevelArray) -> LevelArray:
         columns = zip(self.parts, self._columns(), strict=True)
         return np.concatenate([part.pack_rows(rows[:, own]) for part, own in columns], axis=1)
@@ -83,26 +90,42 @@ class Joined(CompiledDescriptor):
         return _slices([part.length for part in self.parts])
 
 
+@dataclass(frozen=True)
+class Weighted(Joined):
+    """Descriptors with weights, for Eq. 4 with several descriptors: each describes a view as it does alone."""
+
+    @property
+    def whole_image(self) -> bool:
+        return any(part.whole_image for part in self.parts)
+
+    def describe(self, view: ImageArray | Segmentation, /) -> LevelArray:
+        return np.concatenate([part.describe(view) for part in self.parts])
+
+    def measure(self) -> Measure | None:
+        """Return None: the kernels know only the registered pair of edges and colours."""
+        return None
+
+
 class _Average:
     def __init__(self, parts: Sequence[Comparison], weights: Sequence[float], columns: Sequence[slice]) -> None:
         self._parts, self._weights, self._columns = parts, weights, columns
 
     def similarity(self, queries: LevelArray, /) -> FloatArray:
-        return self._weighted(
-            [p.similarity(queries[:, own]) for p, own in zip(self._parts, self._columns, strict=True)]
-        )
+        similar = [p.similarity(queries[:, own]) for p, own in zip(self._parts, self._columns, strict=True)]
+        return _weighted(self._weights, similar)
 
     def only(self, rows: IndexArray, /) -> "_Average":
         return _Average([part.only(rows) for part in self._parts], self._weights, self._columns)
 
     def among(self, rows: IndexArray, /) -> FloatArray:
-        return self._weighted([part.among(rows) for part in self._parts])
+        return _weighted(self._weights, [part.among(rows) for part in self._parts])
 
-    def _weighted(self, similar: Sequence[FloatArray]) -> FloatArray:
-        total = self._weights[0] * similar[0]
-        for weight, part in zip(self._weights[1:], similar[1:], strict=True):
-            total += weight * part
-        return total
+
+def _weighted(weights: Sequence[float], similar: Sequence[FloatArray]) -> FloatArray:
+    total = weights[0] * similar[0]
+    for weight, part in zip(weights[1:], similar[1:], strict=True):
+        total += weight * part
+    return total
 
 
 def _slices(lengths: list[int]) -> list[slice]:
@@ -118,6 +141,7 @@ _KNOWN: Final[dict[str, Descriptor]] = {
     for known in (
         _CEDD,
         Cedd(name="cedd-blurred", blur=0.9),
+        RotatedCedd(),
         _COLOURS,
         _EDGES,
         Joined("cedd+colours", 1, (_CEDD, _COLOURS), (0.5, 0.5)),
@@ -125,23 +149,47 @@ _KNOWN: Final[dict[str, Descriptor]] = {
     )
 }
 
+#: Weights such as 0.1 do not add up to exactly 1.
+_ROUNDING: Final = 1e-9
 _MODELS: Final[dict[str, Embedding]] = {}
 
 
 def descriptor(name: str) -> Descriptor:
     """Return the descriptor of this name. Opens no file: names come from saved runs and from other users' catalogs.
 
+    ``cedd=0.5,edges+colours=0.5`` is several descriptors with weights. The similarity is the sum of theirs.
+
     Raises
     ------
     ValueError
-        The name is unknown (the message lists the known ones), or it names a model that is not loaded.
+        The name is unknown (the message lists the known ones), it names a model that is not loaded, or the weights do
+        not add up to 1.
     """
+    if "=" in name:
+        return _with_weights(name)
     known = _KNOWN.get(name) or _MODELS.get(name)
     if known is None and name.startswith(PREFIX):
         raise ValueError(f"the model of descriptor {name!r} is not loaded; load its file first")
     if known is None:
         raise ValueError(f"descriptor {name!r} is unknown; use one of {', '.join(names())}, or {PREFIX}FILE")
     return known
+
+
+@lru_cache(maxsize=16)
+def _with_weights(name: str) -> Descriptor:
+    parts = [part.strip().rpartition("=") for part in name.split(",")]
+    try:
+        weights = tuple(float(weight) for _, _, weight in parts)
+    except ValueError:
+        weights = ()
+    # weights that add up to 1 keep the meaning of ω
+    if not weights or min(weights) <= 0 or abs(sum(weights) - 1) > _ROUNDING:
+        raise ValueError(
+            f"descriptors {name!r}: give each a weight above 0, and all together 1, e.g. cedd=0.5,edges+colours=0.5"
+        )
+    kinds = tuple(descriptor(kind) for kind, _, _ in parts)
+    version = int("".join(str(kind.version) for kind in kinds))
+    return kinds[0] if len(kinds) == 1 else Weighted(name, version, kinds, weights)
 
 
 def register(added: Descriptor) -> None:

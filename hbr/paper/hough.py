@@ -12,10 +12,9 @@ from numpy.typing import ArrayLike
 
 from hbr.core.angles import revolutions_between
 from hbr.core.arrays import FloatArray, IndexArray, LevelArray, first_maximum, lengths, ranges
-from hbr.descriptors.similarity import tanimoto
 from hbr.kernels import calls
 from hbr.model.views import Views
-from hbr.paper.index import ViewIndex, check_queries
+from hbr.paper.index import ViewIndex
 
 Extension = Literal["visual", "orient", "orient_all"]
 #: Indices of views for each query.
@@ -84,8 +83,8 @@ def retrieve(
 
     Parameters
     ----------
-    queries : uint8 array (N, 144)
-        Descriptors of the views so far, in their order. N is at least 1.
+    queries : uint8 array (N, length)
+        Descriptors of the views so far, in their order, as those of the enrolled views. N is at least 1.
     orientation_deg : array (N,)
         Orientation of the camera around the object at each query, in degrees, with any zero (e.g. the first query).
     index : ViewIndex
@@ -117,12 +116,12 @@ def retrieve(
     lists = [index.search(query, list_length)[0] for query in queries]
     match extension:
         case "visual":
-            extended = _extend_visual(lists, queries, views)
+            extended = _extend_visual(lists, queries, index)
         case "orient":
             extended = _extend_orient(lists, orientations, views)
         case "orient_all":
             extended = _extend_orient_all(lists, orientations, views)
-    scores, paths = _best_paths(extended, queries, orientations, views, omega)
+    scores, paths = _best_paths(extended, queries, orientations, index, omega)
 
     order = np.argsort(-scores, kind="stable")
     paths = paths[order]
@@ -143,9 +142,9 @@ def _check(
 ) -> None:
     if queries.ndim != 2 or not len(queries):
         raise ValueError(
-            f"queries have shape {queries.shape}; stack one descriptor for each view, at least one: (N, 144)"
+            f"queries have shape {queries.shape}; stack one descriptor for each view, at least one: (N, {index.descriptor.length})"
         )
-    check_queries(queries)
+    index.check_queries(queries)
     if orientations.shape != (len(queries),) or not np.isfinite(orientations).all():
         raise ValueError(
             f"orientation_deg is {orientations}; one finite angle for each of {len(queries)} queries is needed"
@@ -160,14 +159,15 @@ def _check(
         raise ValueError(f"extension {extension!r} is unknown; use one of {', '.join(get_args(Extension))}")
 
 
-def _extend_visual(lists: _Columns, queries: LevelArray, views: Views) -> _Columns:
+def _extend_visual(lists: _Columns, queries: LevelArray, index: ViewIndex) -> _Columns:
     """Add each missing object to a list by its view most similar to the query."""
+    views, kind = index.views, index.descriptor
     candidates = np.unique(views.object_index[np.concatenate(lists)])
     extended = []
     for rows, query in zip(lists, queries, strict=True):
         missing, begin = views.of_each(np.setdiff1d(candidates, views.object_index[rows]))
         if len(missing):
-            best = first_maximum(tanimoto(query, views.descriptors[missing])[0], begin)
+            best = first_maximum(kind.similarity(query[None], views.levels(missing))[0], begin)
             rows = np.concatenate([rows, missing[best]])
         extended.append(rows)
     return extended
@@ -213,16 +213,19 @@ def _by_object(rows: IndexArray, views: Views) -> IndexArray:
 
 
 def _best_paths(
-    extended: _Columns, queries: LevelArray, orientations: FloatArray, views: Views, omega: float
+    extended: _Columns, queries: LevelArray, orientations: FloatArray, index: ViewIndex, omega: float
 ) -> tuple[FloatArray, IndexArray]:
     """Return score (C,) and path (C, N) of every object, by rising object. Every object is in every list."""
+    views, kind = index.views, index.descriptor
     azimuth_deg = views.azimuth_deg
-    compiled = calls.paths(extended, queries, orientations, views.descriptors, views.object_index, azimuth_deg, omega)
-    if compiled is not None:
-        return compiled
+    if index.is_plain:
+        of_views = views.descriptors, views.object_index, azimuth_deg
+        compiled = calls.paths(extended, queries, orientations, *of_views, omega)
+        if compiled is not None:
+            return compiled
     columns = [_by_object(rows, views) for rows in extended]
     # forward: the best value of a path that ends at each view, and its predecessor on that path
-    value = tanimoto(queries[0], views.descriptors[columns[0]])[0]
+    value = kind.similarity(queries[:1], views.levels(columns[0]))[0]
     predecessors = []
     for i in range(1, len(columns)):
         before, here = columns[i - 1], columns[i]
@@ -234,7 +237,7 @@ def _best_paths(
         penalty = omega * revolutions_between(rotated_deg, orientations[i - 1] - orientations[i])
         through = value[tails] - penalty
         best = first_maximum(through, begin)
-        value = through[best] + tanimoto(queries[i], views.descriptors[here])[0]
+        value = through[best] + kind.similarity(queries[i : i + 1], views.levels(here))[0]
         predecessors.append(tails[best])
 
     # backward: follow the predecessors from the best last view of each object

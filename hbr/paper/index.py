@@ -6,56 +6,69 @@ from typing import Final, Literal, get_args
 
 import numpy as np
 
-from hbr.core.arrays import FloatArray, IndexArray, LevelArray
-from hbr.descriptors.cedd import BINS
+from hbr.core.arrays import FloatArray, IndexArray, LevelArray, ranges
+from hbr.descriptors import Comparison, descriptor
+from hbr.descriptors.cedd import Cedd, RotatedCedd
 from hbr.descriptors.similarity import squares, tanimoto, tanimoto_of_dots
 from hbr.kernels import library
 from hbr.kernels.calls import ByteRows
 from hbr.model.views import Views
 
-Method = Literal["flat", "kdtree"]
+Method = Literal["flat", "tree"]
 
 #: Rows that share one maximum in the search for the first candidates.
 _GROUP: Final = 64
+#: Rows of a leaf of the tree that is not split.
+_LEAF: Final = 32
 #: Number of searches whose results are cached; then the cache is cleared.
 _REMEMBERED: Final = 64
 
 
 class ViewIndex:
-    """Exact search for the most similar views, by the Tanimoto coefficient.
+    """Exact search for the most similar views, by the similarity of their descriptor.
 
     Parameters
     ----------
     views : Views
         The model set; it is not copied.
-    method : {"flat", "kdtree"}
-        ``flat`` compares with every view. ``kdtree``, the paper's index, finds the k nearest views by Euclidean
-        distance in a KD-tree, then all views in the ball that contains every view as similar as those. It needs eight
-        times the memory of the descriptors, and is slower. Both return the same result.
+    method : {"flat", "tree"}
+        ``flat`` compares with every view. ``tree``, the paper's index, compares with the views in some leaves of a
+        KD-tree, for views that Tanimoto compares. Both return the same result.
+
+    Raises
+    ------
+    ValueError
+        There is no such method, or the tree cannot compare the views.
     """
 
     def __init__(self, views: Views, method: Method = "flat") -> None:
         if method not in get_args(Method):
             raise ValueError(f"method {method!r} is unknown; use one of {', '.join(get_args(Method))}")
-        if views.descriptors.shape[1] != BINS:
-            raise ValueError(
-                f"the views are of {views.descriptor}; this search compares CEDD alone, use hbr.DenseIndex"
-            )
         self.views = views
-        self._method = method
+        self.method = method
+        self.descriptor = descriptor(views.descriptor)
+        if method == "tree" and not self.is_plain:
+            raise ValueError(f"the tree compares plain CEDD, not {views.descriptor}; use flat")
         self._remembered: dict[tuple[bytes, int], tuple[IndexArray, FloatArray]] = {}
 
     def __len__(self) -> int:
         return len(self.views)
 
+    @property
+    def is_plain(self) -> bool:
+        """Whether the similarity is the Tanimoto coefficient of the levels, without rotations and other descriptors."""
+        return isinstance(self.descriptor, Cedd) and not isinstance(self.descriptor, RotatedCedd)
+
     @cached_property
-    def _searcher(self) -> "_Flat | _Tree":
-        return _Tree(self.views.descriptors) if self._method == "kdtree" else _Flat(self.views.descriptors)
+    def _searcher(self) -> "_Flat | _Tree | _Compared":
+        if not self.is_plain:
+            return _Compared(self.views.prepared())
+        return _Tree(self.views.descriptors) if self.method == "tree" else _Flat(self.views.descriptors)
 
     def extended(self, more: Views) -> "ViewIndex":
         """Return an index of these views followed by more; this index does not change.
 
-        The new index reuses what was computed for these views, except with ``kdtree``.
+        The new index reuses what ``flat`` computed for views of CEDD.
 
         Parameters
         ----------
@@ -65,8 +78,11 @@ class ViewIndex:
         views = Views.concatenate([self.views, more])
         grown = copy(self)
         grown.views = views
-        known = self._searcher
-        grown._searcher = _Tree(views.descriptors) if isinstance(known, _Tree) else _Flat(views.descriptors, known)
+        grown.__dict__.pop("_searcher", None)
+        if self.method == "flat" and self.is_plain:
+            known = self._searcher
+            assert isinstance(known, _Flat)
+            grown._searcher = _Flat(views.descriptors, known)
         grown._remembered = {}
         return grown
 
@@ -75,8 +91,8 @@ class ViewIndex:
 
         Parameters
         ----------
-        query : uint8 array (144,)
-            Levels 0..7.
+        query : uint8 array (length,)
+            Levels of the descriptor of the views; for CEDD, 144 levels 0..7.
         k : int
             At least 1; all views are returned if there are fewer.
 
@@ -85,14 +101,14 @@ class ViewIndex:
         view_indices : integer array (min(k, n),)
             Best first; equal similarities by rising index.
         similarities : float64 array (min(k, n),)
-            As `hbr.tanimoto` computes them.
+            As the descriptor computes them, for CEDD by `hbr.tanimoto`.
 
         Raises
         ------
         TypeError, ValueError
-            The query is not a uint8 array of shape (144,) with levels 0..7, or `k` is below 1.
+            The query has no levels of this descriptor, or `k` is below 1.
         """
-        check_queries(np.asarray(query)[None])
+        self.check_queries(np.asarray(query)[None])
         if k < 1:
             raise ValueError(f"k is {k}; ask for at least 1 view")
         k = min(k, len(self.views))
@@ -113,28 +129,25 @@ class ViewIndex:
 
         Parameters
         ----------
-        query : uint8 array (144,)
+        query : uint8 array (length,)
             The query.
         view_indices, similarities : arrays (k,)
             What `search` returns for this query and k.
         """
         self._remembered[np.asarray(query).tobytes(), len(view_indices)] = view_indices, similarities
 
+    def check_queries(self, queries: LevelArray) -> None:
+        """Check that queries are levels of the descriptor of the views, uint8 (n, length).
 
-def check_queries(queries: LevelArray) -> None:
-    """Check that queries are a uint8 array (n, 144) of levels 0..7.
-
-    Raises
-    ------
-    TypeError, ValueError
-        They are not.
-    """
-    if queries.dtype != np.uint8:
-        raise TypeError(f"the query is of {queries.dtype}; pass the uint8 levels that cedd or describe returns")
-    if queries.ndim != 2 or queries.shape[1] != BINS:
-        raise ValueError(f"the query has {queries.shape[1:]} levels, not ({BINS},); describe the image first")
-    if queries.size and queries.max() > 7:
-        raise ValueError(f"the query has a level of {queries.max()}; CEDD levels are 0..7, unpack packed bytes first")
+        Raises
+        ------
+        TypeError, ValueError
+            They are not.
+        """
+        if queries.ndim != 2:
+            raise ValueError(f"queries have shape {queries.shape}; one row for each query is needed")
+        self.descriptor.check_rows(queries)
+        self.descriptor.check_levels(queries)
 
 
 class _Flat:
@@ -158,32 +171,69 @@ class _Flat:
         return largest(tanimoto_of_dots(dots, squares(q[None]), self._squares), k)
 
 
-class _Tree:
-    """A KD-tree of Euclidean distances, and a ball that makes the result exact for the Tanimoto coefficient.
+class _Compared:
+    """Compares with every view, by any descriptor."""
 
-    With α = (1 + t) / 2t, T(q, c) >= t is equivalent to |c - αq| <= |q| √(α² - 1): complete the square.
+    def __init__(self, compared: Comparison) -> None:
+        self._compared = compared
+
+    def top(self, query: LevelArray, k: int) -> tuple[IndexArray, FloatArray]:
+        return largest(self._compared.similarity(query[None])[0], k)
+
+
+class _Tree:
+    """A KD-tree, split at the mean of the level with the largest variance (Bentley 1975, as the paper says).
+
+    A search is exact for the Tanimoto coefficient. With α = (1 + t) / 2t, T(q, c) >= t is equivalent to
+    |c - αq| <= |q| √(α² - 1): complete the square. Only leaves whose box meets that ball can have views as similar as
+    t, which is the k-th similarity in the leaves that are nearest to the query.
     """
 
     def __init__(self, descriptors: LevelArray) -> None:
-        from scipy.spatial import cKDTree
-
-        self._descriptors = descriptors
-        self._tree = cKDTree(descriptors.astype(np.float64)) if len(descriptors) else None
+        leaves = []
+        todo = [np.arange(len(descriptors))]
+        while todo:
+            rows = todo.pop()
+            levels = descriptors[rows]
+            mean = levels.mean(axis=0)
+            variance = np.square(levels).mean(axis=0) - mean * mean  # squares of levels 0..7 fit into a byte
+            split = int(variance.argmax())
+            below = levels[:, split] <= mean[split]
+            if len(rows) <= _LEAF or below.all():
+                leaves.append(rows)
+            else:
+                todo += [rows[~below], rows[below]]
+        self._rows = np.concatenate(leaves)
+        self._begin = np.cumsum([0, *map(len, leaves)])
+        self._levels = descriptors[self._rows]
+        self._low = np.minimum.reduceat(self._levels, self._begin[:-1]).astype(np.float32)
+        self._high = np.maximum.reduceat(self._levels, self._begin[:-1]).astype(np.float32)
 
     def top(self, query: LevelArray, k: int) -> tuple[IndexArray, FloatArray]:
-        assert self._tree is not None
         q = query.astype(np.float64)
-        nearest = np.atleast_1d(self._tree.query(q, k)[1])
-        reached = float(tanimoto(query, self._descriptors[nearest])[0].min())
-        if reached == 0:
-            rows = np.arange(len(self._descriptors))
-        else:
+        order = np.argsort(self._squared_distance(q), kind="stable")
+        count = int(np.searchsorted(np.cumsum(np.diff(self._begin)[order]), k)) + 1
+        reached = float(largest(self._similar(query, order[:count])[1], k)[1][-1])
+        leaves = np.arange(len(order))
+        if reached > 0:
             alpha = (1 + reached) / (2 * reached)
             # slightly larger: a view on the border can be as similar as the k-th
-            radius = np.sqrt(q @ q * (alpha * alpha - 1)) * (1 + 1e-9) + 1e-6
-            rows = np.sort(np.array(self._tree.query_ball_point(alpha * q, radius), np.intp))
-        best, similarities = largest(tanimoto(query, self._descriptors[rows])[0], k)
-        return rows[best], similarities
+            radius = q @ q * (alpha * alpha - 1) * (1 + 1e-5) + 1e-3
+            leaves = np.flatnonzero(self._squared_distance(alpha * q) <= radius)
+        rows, similar = self._similar(query, leaves)
+        ascending = np.argsort(rows)
+        best, similarities = largest(similar[ascending], k)
+        return rows[ascending[best]], similarities
+
+    def _squared_distance(self, point: FloatArray) -> FloatArray:
+        """Return the squared Euclidean distance of a point to the box of each leaf."""
+        at = point.astype(np.float32)
+        away = np.maximum(np.maximum(self._low - at, at - self._high), 0)
+        return squares(away)
+
+    def _similar(self, query: LevelArray, leaves: IndexArray) -> tuple[IndexArray, FloatArray]:
+        places, _ = ranges(self._begin[leaves], np.diff(self._begin)[leaves])
+        return self._rows[places], tanimoto(query, self._levels[places])[0]
 
 
 def largest(values: FloatArray, k: int) -> tuple[IndexArray, FloatArray]:

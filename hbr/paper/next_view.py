@@ -10,7 +10,7 @@ import numpy as np
 
 from hbr.core.angles import wrap180, wrap360
 from hbr.core.arrays import FloatArray, IndexArray
-from hbr.descriptors.similarity import tanimoto
+from hbr.descriptors import descriptor
 from hbr.model.views import Views
 from hbr.paper.hough import Ranking
 
@@ -119,7 +119,7 @@ def _side_similarity(views: Views, candidates: IndexArray, places: IndexArray, c
     half_deg = 180 / len(centres_deg)
     own = zip(candidates.tolist(), centres_deg[places].tolist(), strict=True)
     averages = np.stack([_average_view(views, j, centre_deg, half_deg) for j, centre_deg in own])
-    return float(np.triu(tanimoto(averages, averages), k=1).sum())
+    return float(np.triu(descriptor(views.descriptor).similarity_of_means(averages), k=1).sum())
 
 
 def _average_view(views: Views, object_index: int, centre_deg: float, half_deg: float) -> FloatArray:

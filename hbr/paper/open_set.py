@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from hbr.core.arrays import FloatArray, LevelArray
-from hbr.descriptors.similarity import tanimoto
+from hbr.descriptors import descriptor
 from hbr.model.views import Views
 from hbr.paper.hough import Ranking
 
@@ -30,7 +30,7 @@ def score_margin(ranking: Ranking, queries: LevelArray | ArrayLike) -> float:
     ----------
     ranking : Ranking
         A result of `hbr.retrieve`.
-    queries : uint8 array (N, 144)
+    queries : uint8 array (N, length)
         The descriptors of that retrieval.
 
     Returns
@@ -55,9 +55,9 @@ def score_margin(ranking: Ranking, queries: LevelArray | ArrayLike) -> float:
     if not len(others):
         return best
     rows, begin = views.of_each(others)
-    reach = np.zeros(len(others))
+    kind, reach = descriptor(views.descriptor), np.zeros(len(others))
     for query in levels:  # one query at a time, so that a million views take 8 MB and not N times as much
-        reach += np.maximum.reduceat(tanimoto(query, views.descriptors)[0][rows], begin)
+        reach += np.maximum.reduceat(kind.similarity(query[None], views.descriptors)[0][rows], begin)
     return best - float(reach.max())
 
 

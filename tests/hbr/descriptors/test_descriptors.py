@@ -115,8 +115,8 @@ def test_views_of_different_descriptors_cannot_be_mixed() -> None:
         Views.concatenate(views)
     with pytest.raises(ValueError, match="edges needs the shape"):
         Views.of_object("a", views[0].descriptors, [0.0], "edges")
-    with pytest.raises(ValueError, match="compares CEDD alone"):
-        ViewIndex(views[1])
+    with pytest.raises(ValueError, match="the tree compares plain CEDD"):
+        ViewIndex(views[1], "tree")
 
 
 @pytest.mark.parametrize("name", [name for name in names() if not name.startswith("cedd")])

@@ -103,7 +103,7 @@ def test_large_k_returns_all_views_and_an_empty_index_none(method: Method) -> No
     empty = ViewIndex(Views.empty(), method)
     rows, similarities = empty.search(np.ones(144, np.uint8), 10)
     assert len(empty) == len(rows) == len(similarities) == 0
-    with pytest.raises(ValueError, match="flat, kdtree"):
+    with pytest.raises(ValueError, match="flat, tree"):
         ViewIndex(Views.empty(), "hash")  # type: ignore[arg-type]
 
 
