@@ -13,6 +13,7 @@ from hbr.core.arrays import FloatArray
 from hbr.dense.stopping import Outcome
 from hbr.model.views import Views
 from hbr.paper.hough import Extension
+from hbr.paper.index import Method as IndexMethod
 
 Removal = Literal["near", "paper79", "queries"]
 #: Codes of `Runs.outcome`.
@@ -172,6 +173,8 @@ class Protocol:
         views are enrolled, including the queries.
     absent : tuple of str
         Names of objects that are not enrolled, to measure unknown objects; only with the dense filter.
+    index : {"flat", "tree"}
+        Search for similar views (`hbr.ViewIndex`) in the first trial of each object, whose time is measured.
     """
 
     trials: int = 10
@@ -184,6 +187,7 @@ class Protocol:
     seed: int = 0
     enrolled: int | None = None
     absent: tuple[str, ...] = ()
+    index: IndexMethod = "flat"
 
     def __post_init__(self) -> None:
         if self.trials < 1 or self.max_views < 1:
@@ -197,6 +201,8 @@ class Protocol:
             )
         if not np.isfinite(self.rotation_errors_deg).all():
             raise ValueError("an error of a rotation is not a finite number; correct the file of the errors")
+        if self.index not in get_args(IndexMethod):
+            raise ValueError(f"index {self.index!r} is unknown; use one of {', '.join(get_args(IndexMethod))}")
         if self.seed < 0:
             raise ValueError(f"seed is {self.seed}; a whole number of at least 0 is needed")
         if self.enrolled is not None and self.enrolled < 1:

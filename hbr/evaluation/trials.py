@@ -235,9 +235,11 @@ class _Trials:
                 models[key] = self._model(keep)
             # a new index for each method: lists of another method would shorten the measured time
             model = models[key]
-            index = ViewIndex(model.views)
             # Only the first repetition is timed; the others may share lists.
             is_measured = at[2] == 0
+            index = ViewIndex(model.views, self._protocol.index if is_measured else "flat")
+            if is_measured and self._protocol.index == "tree":
+                index.build()
             if not is_measured:
                 self._share_lists(index, model, seen, method.list_length)
             measured_deg = self._azimuth_deg[seen] + draws.error_deg[: n + 1]

@@ -142,7 +142,8 @@ def _check(
 ) -> None:
     if queries.ndim != 2 or not len(queries):
         raise ValueError(
-            f"queries have shape {queries.shape}; stack one descriptor for each view, at least one: (N, {index.descriptor.length})"
+            f"queries have shape {queries.shape}; stack one descriptor for each view, at least one: "
+            f"(N, {index.descriptor.length})"
         )
     index.check_queries(queries)
     if orientations.shape != (len(queries),) or not np.isfinite(orientations).all():

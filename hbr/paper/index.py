@@ -65,6 +65,10 @@ class ViewIndex:
             return _Compared(self.views.prepared())
         return _Tree(self.views.descriptors) if self.method == "tree" else _Flat(self.views.descriptors)
 
+    def build(self) -> None:
+        """Build the index now, and not by the first search."""
+        _ = self._searcher
+
     def extended(self, more: Views) -> "ViewIndex":
         """Return an index of these views followed by more; this index does not change.
 

@@ -83,6 +83,7 @@ def model_of(views: hbr.Views, *, rule: hbr.StoppingRule | None = None) -> Model
     return Model(hbr.ViewIndex(views) if rule is None else hbr.DenseIndex(views), rule)
 
 
+_tree = lru_cache(maxsize=4)(partial(hbr.ViewIndex, method="tree"))  # built once for each model
 _arc_confidence = lru_cache(maxsize=4)(fit_arc_confidence)  # fitted once for each model
 
 
@@ -108,7 +109,8 @@ def begin_search(
             "strategy.",
         )
     if isinstance(model.index, hbr.ViewIndex):
-        return HoughSearch(model.index, config, chosen, seed=seed, top=top)
+        index = _tree(model.views) if config.identify.index == "tree" else model.index
+        return HoughSearch(index, config, chosen, seed=seed, top=top)
     assert model.rule is not None
     if is_in_motion(chosen):
         session: hbr.DenseSession = ArcSession(model.index, model.rule, _arc_confidence(model.index, model.rule))

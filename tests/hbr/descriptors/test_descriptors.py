@@ -139,3 +139,72 @@ def test_unpack_rows_equals_unpack_of_each_row(name: str) -> None:
     assert kind.unpack_rows(b"").shape == (0, kind.length)
     with pytest.raises(ValueError, match="no multiple"):
         kind.unpack_rows(packed[0][1:])
+
+
+def test_one_descriptor_with_weight_1_is_that_descriptor() -> None:
+    assert descriptor("cedd=1") is descriptor("cedd")
+
+
+def test_descriptors_with_weights_describe_a_view_as_each_does_alone() -> None:
+    both = descriptor("cedd=0.25,edges+colours=0.75")
+    parts = [descriptor(name) for name in ("cedd", "edges+colours")]
+    images = [photo(seed) for seed in range(4)]
+    rows = np.stack([both.describe(image) for image in images])
+    own = [np.stack([part.describe(image) for image in images]) for part in parts]
+    np.testing.assert_array_equal(rows, np.concatenate(own, axis=1))
+    similar = [part.similarity(levels, levels) for part, levels in zip(parts, own, strict=True)]
+    np.testing.assert_allclose(both.similarity(rows, rows), 0.25 * similar[0] + 0.75 * similar[1], atol=1e-12)
+    np.testing.assert_allclose(both.similarity_of_means(rows.astype(float)), both.similarity(rows, rows), atol=1e-12)
+    np.testing.assert_array_equal(both.unpack_rows(both.pack_rows(rows).tobytes()), rows)
+
+
+@pytest.mark.parametrize("name", ["cedd=0.5", "cedd=0.5,edges=0.6", "cedd=1.5,edges=-0.5", "cedd=a", "cedd=0.5,edges"])
+def test_weights_that_do_not_add_up_to_1_are_rejected(name: str) -> None:
+    with pytest.raises(ValueError, match="all together 1"):
+        descriptor(name)
+
+
+def plain_rotation(levels: np.ndarray, steps: int) -> list[int]:
+    """Return CEDD levels after rotations by 45°: horizontal, 45°, vertical, 135°, and horizontal again."""
+    directions = [2, 4, 3, 5]
+    found = levels.tolist()
+    for i, texture in enumerate(directions):
+        to = directions[(i + steps) % 4]
+        found[24 * to : 24 * to + 24] = levels[24 * texture : 24 * texture + 24].tolist()
+    return found
+
+
+def test_rotated_cedd_takes_the_most_similar_rotation() -> None:
+    rng = np.random.default_rng(0)
+    a, b = (rng.integers(0, 8, (n, 144), np.uint8) for n in (3, 5))
+    kind, plain = descriptor("cedd-rotated"), descriptor("cedd")
+    rotated = [np.array([plain_rotation(row, steps) for row in a], np.uint8) for steps in range(4)]
+    expected = np.max([plain.similarity(one, b) for one in rotated], axis=0)
+    np.testing.assert_array_equal(kind.similarity(a, b), expected)
+    np.testing.assert_allclose(kind.prepared(b).similarity(a), expected, atol=1e-12)
+    np.testing.assert_allclose(kind.similarity_of_means(b.astype(float)), kind.similarity(b, b), atol=1e-12)
+    groups = np.array([[0, 1, 2], [4, 3, 1]])
+    among = kind.prepared(b).among(groups)
+    for rows, similar in zip(groups, among, strict=True):
+        np.testing.assert_allclose(similar, kind.similarity(b[rows], b[rows]), atol=1e-12)
+
+
+def stripes(angle_deg: float) -> np.ndarray:
+    """Return stripes of two colours along a direction, counter-clockwise from the right."""
+    y, x = np.indices((480, 480))
+    across = x * np.sin(np.radians(angle_deg)) + y * np.cos(np.radians(angle_deg))
+    return np.where((across // 27 % 2 == 0)[:, :, None], [40, 40, 200], [200, 120, 40]).astype(np.uint8)
+
+
+@pytest.mark.parametrize(("angle_deg", "texture"), [(0, 2), (45, 4), (90, 3), (135, 5)])
+def test_a_rotation_moves_edges_to_the_next_class(angle_deg: float, texture: int) -> None:
+    levels = descriptor("cedd-rotated").describe(stripes(angle_deg)).reshape(6, 24).sum(axis=1)
+    assert 2 + levels[2:].argmax() == texture
+
+
+def test_an_image_that_is_rotated_by_90_degrees_is_the_same_for_rotated_cedd() -> None:
+    image = np.full((240, 240, 3), 30, np.uint8)
+    image[:, 40:120] = 90, 160, 220
+    image[60:90, 100:] = 200, 60, 40
+    rows = [descriptor("cedd").describe(one)[None] for one in (image, np.ascontiguousarray(np.rot90(image)))]
+    assert descriptor("cedd-rotated").similarity(*rows)[0, 0] == 1 > descriptor("cedd").similarity(*rows)[0, 0]

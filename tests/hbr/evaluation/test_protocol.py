@@ -101,6 +101,14 @@ def test_methods_have_the_same_trials_in_any_selection() -> None:
     assert (by_name["single"][..., 1:] == -1).all()
 
 
+def test_the_tree_gives_the_same_results() -> None:
+    flat, tree = (run(1, ALL, replace(PROTOCOL, index=index)) for index in ("flat", "tree"))
+    np.testing.assert_array_equal(flat.rank, tree.rank)
+    np.testing.assert_array_equal(flat.margin, tree.margin)
+    with pytest.raises(ValueError, match="flat, tree"):
+        replace(PROTOCOL, index="hash")
+
+
 def test_trials_of_an_object_do_not_depend_on_the_other_objects() -> None:
     order = np.concatenate([VIEWS.of(4), VIEWS.of(1)])
     few = Views.concatenate([VIEWS.select(VIEWS.of(j)) for j in (4, 1)])

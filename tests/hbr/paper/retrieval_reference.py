@@ -2,7 +2,7 @@
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -23,6 +23,13 @@ def similarity(a: Sequence[float], b: Sequence[float]) -> float:
     return dot / union if union else 0.0
 
 
+SEVERAL = "cedd=0.3,cedd-blurred=0.7"
+
+
+def similarity_of_several(a: Sequence[float], b: Sequence[float]) -> float:
+    return 0.3 * similarity(a[:144], b[:144]) + 0.7 * similarity(a[144:], b[144:])
+
+
 class Enumeration:
     """Return scores, poses and node sets of all candidates for some queries."""
 
@@ -34,6 +41,7 @@ class Enumeration:
         omega: float,
         length: int,
         extension: str,
+        alike: Callable[[Sequence[float], Sequence[float]], float] = similarity,
     ) -> None:
         self.rows = [row.tolist() for row in views.descriptors]
         self.azimuth = views.azimuth_deg.tolist()
@@ -41,7 +49,7 @@ class Enumeration:
         self.queries = [query.tolist() for query in queries]
         self.orientations, self.omega = orientations, omega
         self.steps = range(len(self.queries))
-        self.similar = [[similarity(query, row) for row in self.rows] for query in self.queries]
+        self.similar = [[alike(query, row) for row in self.rows] for query in self.queries]
         self.lists = [sorted(range(len(views)), key=lambda v: (-self.similar[i][v], v))[:length] for i in self.steps]
         self.candidates = sorted({self.object_of[v] for rows in self.lists for v in rows})
         self.nodes = {j: getattr(self, extension)(j) for j in self.candidates}
@@ -98,6 +106,7 @@ def next_view_reference(
     last_list: Sequence[int],
     here: float,
     visited: Sequence[float],
+    alike: Callable[[Sequence[float], Sequence[float]], float] = similarity,
 ) -> tuple[str, float, float, float]:
     """Return side, rotation, S_left and S_right from (object, pose) pairs, best first."""
     centres = [90 * s + 45 for s in range(4)]
@@ -108,7 +117,9 @@ def next_view_reference(
         inside = [v for v in own if 90 * s <= azimuth[v] < 90 * s + 90]
         if not inside:
             inside = [min(own, key=lambda v: abs(wrap(azimuth[v] - centres[s])))]
-        return [sum(int(views.descriptors[v][b]) for v in inside) / len(inside) for b in range(144)]
+        return [
+            sum(int(views.descriptors[v][b]) for v in inside) / len(inside) for b in range(views.descriptors.shape[1])
+        ]
 
     def step(pose: float, sign: int) -> tuple[int, float]:
         gaps = {s: (sign * (centres[s] - pose)) % 360 for s in range(4)}
@@ -120,7 +131,7 @@ def next_view_reference(
         compared = sorted(j for j, _ in ranked[:10])
     sums = {
         sign: math.fsum(
-            similarity(average(j, step(pose_of[j], sign)[0]), average(other, step(pose_of[other], sign)[0]))
+            alike(average(j, step(pose_of[j], sign)[0]), average(other, step(pose_of[other], sign)[0]))
             for j, other in itertools.combinations(compared, 2)
         )
         for sign in (1, -1)

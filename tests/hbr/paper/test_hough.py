@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from hbr import Extension, Ranking, ViewIndex, Views, retrieve
 from tests.fuzzing import examples
-from tests.hbr.paper.retrieval_reference import Enumeration
+from tests.hbr.paper.retrieval_reference import SEVERAL, Enumeration, similarity_of_several
 
 EXTENSIONS = get_args(Extension)
 
@@ -62,6 +62,26 @@ def test_equals_the_enumeration_of_all_paths(
         assert pose == views.azimuth_deg[path[-1]]
     order = list(zip(-ranking.scores, ranking.object_index, strict=True))
     assert order == sorted(order)
+
+
+@pytest.mark.parametrize("extension", EXTENSIONS)
+@examples(5)
+@given(small_cases(), st.integers(0, 2**32 - 1))
+def test_several_descriptors_add_up_with_their_weights(
+    extension: Extension, case: tuple[np.ndarray, list[float], Views, float, int], seed: int
+) -> None:
+    first_queries, orientations, first, omega, length = case
+    rng = np.random.default_rng(seed)
+
+    def both(levels: np.ndarray) -> np.ndarray:
+        return np.concatenate([levels, rng.integers(0, 8, levels.shape, np.uint8)], axis=1)
+
+    views = Views(both(first.descriptors), first.azimuth_deg, first.object_index, first.object_names, SEVERAL)
+    queries = both(first_queries)
+    expected = Enumeration(queries, orientations, views, omega, length, extension, similarity_of_several)
+    ranking = retrieve(queries, orientations, ViewIndex(views), omega=omega, list_length=length, extension=extension)
+    scores = dict(zip(ranking.object_index.tolist(), ranking.scores.tolist(), strict=True))
+    assert scores == pytest.approx(expected.scores, abs=1e-12)
 
 
 @examples(6)

@@ -5,20 +5,22 @@ from hypothesis import strategies as st
 
 from hbr import Ranking, ViewIndex, Views, next_view, retrieve
 from tests.fuzzing import examples
-from tests.hbr.paper.retrieval_reference import next_view_reference
+from tests.hbr.paper.retrieval_reference import SEVERAL, next_view_reference, similarity, similarity_of_several
 
 
 @examples(14)
-@given(st.integers(0, 2**32 - 1), st.integers(2, 5), st.integers(1, 12), st.integers(1, 12))
-def test_equals_the_literal_definition(seed: int, steps: int, objects: int, list_length: int) -> None:
+@given(st.integers(0, 2**32 - 1), st.integers(2, 5), st.integers(1, 12), st.integers(1, 12), st.booleans())
+def test_equals_the_literal_definition(seed: int, steps: int, objects: int, list_length: int, several: bool) -> None:
     rng = np.random.default_rng(seed)
     count = int(rng.integers(objects, 6 * objects + 1))
     owner = np.concatenate([np.arange(objects), rng.integers(0, objects, count - objects)])
     azimuth = (5 * rng.integers(0, 72, count)).astype(np.float64)
     if seed % 2:
         azimuth = rng.uniform(0, 360, count)
-    views = Views(rng.integers(0, 8, (count, 144), dtype=np.uint8), azimuth, owner, tuple(map(str, range(objects))))
-    queries = rng.integers(0, 8, (steps, 144), dtype=np.uint8)
+    kind, length, alike = (SEVERAL, 288, similarity_of_several) if several else ("cedd", 144, similarity)
+    levels = rng.integers(0, 8, (count, length), dtype=np.uint8)
+    views = Views(levels, azimuth, owner, tuple(map(str, range(objects))), kind)
+    queries = rng.integers(0, 8, (steps, length), dtype=np.uint8)
     ranking = retrieve(queries, rng.integers(-72, 72, steps) * 5.0, ViewIndex(views), list_length=list_length)
 
     decision = next_view(ranking)
@@ -29,12 +31,13 @@ def test_equals_the_literal_definition(seed: int, steps: int, objects: int, list
         ranking.lists[-1].tolist(),
         here,
         ranking.orientation_deg.tolist(),
+        alike,
     )
-    assert decision.s_left == pytest.approx(s_left, abs=1e-9)
-    assert decision.s_right == pytest.approx(s_right, abs=1e-9)
-    if abs(s_left - s_right) > 1e-9:
+    assert decision.s_left == pytest.approx(s_left, abs=1e-12)
+    assert decision.s_right == pytest.approx(s_right, abs=1e-12)
+    if abs(s_left - s_right) > 1e-12:
         assert decision.side == side
-        assert decision.rotation_deg == pytest.approx(rotation_deg, abs=1e-9)
+        assert decision.rotation_deg == pytest.approx(rotation_deg, abs=1e-12)
     assert 0 < abs(decision.rotation_deg) - decision.detour_deg <= 90
     assert (decision.rotation_deg > 0) == (decision.side == "left")
     assert 0 <= decision.orientation_deg < 360

@@ -101,6 +101,17 @@ def test_top_limits_the_named_candidates():
         assert len(ranked.candidates) == top
 
 
+def test_the_tree_gives_the_same_answers():
+    known = model(objects=9)
+    for row in known.descriptors[::7]:
+        found = []
+        for index in ("flat", "tree"):
+            search = searching(known, "ahbr", index=index)
+            found.append(search.add(seen(row), 0.0, table_deg=0.0)[0])
+            assert search._index.method == index
+        assert found[0] == found[1]
+
+
 def test_empty_catalog_and_an_unknown_strategy_are_rejected():
     with pytest.raises(CatalogError, match="empty"):
         searching(hbr.Views.empty(), "ahbr")
