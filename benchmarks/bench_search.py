@@ -124,9 +124,7 @@ def bench_step(views: Views, repeats: int) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument(
-        "--tree", action="store_true", help="Also measure the KD-tree with 720,000 views."
-    )
+    parser.add_argument("--tree", action="store_true", help="Also measure the KD-tree with 720,000 views.")
     tree = parser.parse_args().tree
     print(f"{'views':>9} {'call':<44} {'median ms':>9} {'ratio':>6}")
     every: tuple[Method, ...] = ("flat", "tree")
