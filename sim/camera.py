@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hbr.drawing.bench import Visit
+from hbr.drawing.noise import Noise
 from rig.devices import v4l2
 from sim.calibration_board import BoardOnPlatter
 from sim.camera_controls import BUFFERS_RANGE, EXPOSURE_RANGE, KELVIN_RANGE, NOMINAL_EXPOSURE, SHARP_AT, Controls
@@ -82,6 +83,8 @@ class SimCapture:
         Whether the table moves the camera around the object instead of rotating the object.
     blur_px
         Sigma of an additional blur.
+    noise
+        The paper's motion blur and Gaussian noise of each frame, in addition to the sensor's own noise.
     times
         The errors of its time.
     stamp_shift_ns
@@ -106,6 +109,7 @@ class SimCapture:
         self.hangs = False
         self.orbits = False
         self.blur_px = 0.0
+        self.noise = Noise(world.noise.gaussian_variance, world.noise.motion_px)
         self.lamp: tuple[float, float] | None = None
         self.visit: Visit | None = None
         self.filters: list[Callable[[Image, int], Image]] = []
@@ -328,13 +332,15 @@ class SimCapture:
             seen = np.asarray(
                 seen * bands(*self.lamp, start, controls.exposure_ns, self.times.readout_ns), dtype=np.float32
             )
-        return _sensor(self._noise, self._world.seed, self._binning, get_ident()).expose(
+        rng = np.random.default_rng([self._world.seed, crc32(b"camera frame"), frame])
+        image = _sensor(self._noise, self._world.seed, self._binning, get_ident()).expose(
             seen,
             light=scene.light,
             exposure=controls.exposure / NOMINAL_EXPOSURE,
             gains=controls.gains,
-            rng=np.random.default_rng([self._world.seed, crc32(b"camera frame"), frame]),
+            rng=rng,
         )
+        return self.noise.apply(image, rng)
 
     def _exposed(self, scene: Scene, start: int, exposure: int) -> NDArray[np.uint8] | NDArray[np.float32]:
         """Return the light that the rows collect: all are exposed equally long, the last `FrameTimes.readout_ns` later.

@@ -10,6 +10,7 @@ import numpy as np
 
 from hbr.drawing.bench import HARD, Bench, Visit
 from hbr.drawing.bench import Change as HardChange
+from hbr.drawing.noise import GN_STANDARD_DEVIATION, GN_VARIANCE, MB_LENGTH_PX, Noise
 from rig.core.errors import UsageError
 from sim.devices import SimDevices
 from sim.objects.projection import CENTRE_PX, HEIGHT, PX_PER_MM, SIN, WIDTH, Image
@@ -40,6 +41,9 @@ class Change:
     """Strength of what `rig eval hard-change` changes (`hbr.drawing.bench.HARD`): another bench with
     patterns and clutter, a holder in front, cast shadows, highlights, coloured light with a gradient, gamma, placement,
     scale, elevation and defocus. The light, the camera and the placement change for each object."""
+    gaussian_variance: float = 0.0
+    motion_px: float = 0.0
+    """The paper's noise of queries, as in `sim.noise.NoiseModel`; enrolled views do not have it."""
 
     @classmethod
     def named(cls, names: Iterable[str]) -> Self | None:
@@ -85,6 +89,8 @@ class Change:
             exposure=camera.exposure * (1 + self.exposure * exposure),
             kelvin=camera.kelvin + self.white_balance_k * kelvin,
         )
+        if self.gaussian_variance or self.motion_px:
+            camera.noise = Noise(self.gaussian_variance, self.motion_px)
         if self.background:
             other = another_bench(rng)
             camera.backdrop = cv2.addWeighted(camera.backdrop, 1 - self.background, other, self.background, 0.0).astype(
@@ -100,10 +106,14 @@ CHANGES: Mapping[str, Change] = MappingProxyType(
             brightness=0.3, colour=0.1, exposure=0.25, white_balance_k=900.0, placement_mm=14.0, background=1.0
         ),
         "hard": Change(hard=1.0),
+        "gn": Change(gaussian_variance=GN_VARIANCE),
+        "gn-sd": Change(gaussian_variance=GN_STANDARD_DEVIATION**2),
+        "mb": Change(motion_px=MB_LENGTH_PX),
     }
 )
 """By name: light, exposure and white balance; placement; both together with another table and wall; all that
-`rig eval hard-change` changes."""
+`rig eval hard-change` changes; the paper's Gaussian noise, with 0.012 as its variance or its standard deviation; its
+motion blur."""
 
 
 def another_bench(rng: np.random.Generator) -> Image:

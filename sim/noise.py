@@ -63,6 +63,11 @@ class NoiseModel:
     light_flicker: float = 0.004
     """Standard deviation of the relative brightness from frame to frame."""
 
+    gaussian_variance: float = 0.0
+    """Variance of further white noise of intensities in 0..1, as the paper's GN has it (`hbr.drawing.noise`): 0.012, or
+    0.000144 by the letter of the paper."""
+    motion_px: float = 0.0
+    """Length in pixels of a motion blur to 20°: the paper's MB has 15."""
     camera_readout_ms: float = 11.1
     """Time from the exposure of the first row to that of the last row (rolling shutter). OV5647: 640x480 at 90
     frames/s, so that a frame is read in at most 11.1 ms."""
@@ -98,6 +103,8 @@ class NoiseModel:
             )
         if self.vignetting > 1:
             raise ValueError(f"vignetting = {self.vignetting!r}: give a share of the light, at most 1")
+        if 0 < self.motion_px < 1:
+            raise ValueError(f"motion_px = {self.motion_px!r}: give a length of at least 1, or 0 for no blur")
         if self.lost_frames >= 1:
             raise ValueError(f"lost_frames = {self.lost_frames!r}: give a share below 1")
 

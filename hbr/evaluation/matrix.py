@@ -11,7 +11,8 @@ from hbr.core.arrays import BoolArray, LevelArray
 from hbr.dense.filter import Belief, update_belief
 from hbr.dense.index import DenseIndex
 from hbr.descriptors.registry import describe
-from hbr.evaluation.condition import Condition, Noise, enrolled_levels
+from hbr.drawing.noise import Noise
+from hbr.evaluation.condition import Condition, enrolled_levels
 from hbr.evaluation.experiment import Experiment, Kind
 from hbr.evaluation.perturb import STRENGTHS, Perturbations
 from hbr.evaluation.photographs import Dataset

@@ -30,6 +30,12 @@ class ViewConfig(Section):
     max_dark: Fraction = Field(0.95, description="largest part of pixels below level 8")
     max_saturated: Fraction = Field(0.25, description="largest part of pixels at level 255")
     min_mean: float = Field(4.0, ge=0, le=255, description="smallest mean level")
+    max_noise: float = Field(  # half a frame of random bytes has more
+        0.3,
+        ge=0,
+        le=10,
+        description="largest share of noise in the differences of neighbouring pixels; 1 accepts even a frame of noise",
+    )
     retakes: int = Field(3, ge=0, le=20, description="further frames before a view fails; repeated ones do not count")
     max_smear_px: float = Field(
         4.0,

@@ -9,7 +9,8 @@ from typing import Any, Final
 from pydantic import TypeAdapter, ValidationError
 
 from hbr.descriptors import descriptor
-from hbr.evaluation.condition import Condition, Noise
+from hbr.drawing.noise import Noise
+from hbr.evaluation.condition import Condition
 from hbr.evaluation.experiment import Experiment
 from hbr.evaluation.perturb import Perturbations
 from hbr.evaluation.photographs import Dataset, Photograph, PhotographedObject

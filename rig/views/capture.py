@@ -21,8 +21,6 @@ DARK_LEVEL = 8
 """Pixels below this grey level carry no detail in an 8-bit frame."""
 NOISE_GAIN = 20
 """Factor by which the Laplacian (-4 and four times 1) increases the variance of independent pixels."""
-MAX_NOISE = 0.3
-"""Largest share of such variance in an image. Half a frame of random bytes has more."""
 MOST_REPEATED = 10  # a camera that only repeats frames must still be reported
 """Repeated frames of one view that do not count as retakes: a camera on a busy bus sends some frames twice."""
 SMEAR_MARGIN = 1.1
@@ -162,7 +160,7 @@ class ImageQuality:
             RejectReason.TOO_DARK: self.mean_level < config.min_mean or self.dark_share > config.max_dark,
             RejectReason.OVEREXPOSED: self.saturated_share > config.max_saturated,
             RejectReason.BLURRED: blurred,
-            RejectReason.NOISE: not blurred and self.noise_share > MAX_NOISE,
+            RejectReason.NOISE: not blurred and self.noise_share > config.max_noise,
         }
         return [reason for reason, holds in exceeded.items() if holds]
 

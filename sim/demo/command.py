@@ -37,8 +37,9 @@ def demo(
             "--change",
             metavar="NAME",
             help="Change the bench between enrollment and search: light (with exposure and white balance), placement, "
-            "bench (both, with another table and wall), or hard (all that rig eval hard-change changes). "
-            "Repeatable.",
+            "bench (both, with another table and wall), hard (all that rig eval hard-change changes), or the "
+            "paper's noise: gn (variance 0.012), gn-sd (standard deviation 0.012), mb (motion blur; it needs --set "
+            "view.min_sharpness=0). Repeatable.",
         ),
     ] = None,
     strategy: Annotated[

@@ -4,7 +4,7 @@ import re
 
 import pytest
 
-from hbr.evaluation.condition import GN_VARIANCE, Noise
+from hbr.drawing.noise import GN_VARIANCE, Noise
 from tests.docs.pages import DOCS
 
 PAGE = (DOCS / "results.md").read_text(encoding="utf-8")

@@ -7,7 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import hbr
-from hbr.evaluation.condition import Condition, EvaluationImage, Noise, _levels, gaussian, motion_kernel
+from hbr.drawing.noise import Noise, gaussian, motion_kernel
+from hbr.evaluation.condition import Condition, EvaluationImage, _levels
 from hbr.evaluation.photographs import object_mask
 from tests.fuzzing import examples
 

@@ -5,7 +5,8 @@ import pytest
 
 from hbr import describe, descriptor
 from hbr.drawing.bench import HEIGHT, WIDTH
-from hbr.evaluation.condition import Condition, Noise
+from hbr.drawing.noise import Noise
+from hbr.evaluation.condition import Condition
 from hbr.evaluation.perturb import STRENGTHS, Perturbations, other_bench, plain_bench
 from hbr.evaluation.photographs import object_mask
 
