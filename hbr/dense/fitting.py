@@ -321,6 +321,10 @@ UNFITTED_MIN_CONFIDENCE: Final = 0.98
 FEWEST_OBJECTS: Final = 3
 #: With fewer objects, the open-set score is not fitted to changes of the bench: a share of 2 % needs this many objects.
 FEWEST_OBJECTS_SHIFTED: Final = 50
+#: The error rates that are allowed by default: wrong objects among those named, and enrolled objects called unknown.
+# Smaller rates need more views for each answer, and more enrolled objects to be guaranteed.
+ERROR_RATE: Final = 0.01
+FALSE_REJECT: Final = 0.02
 #: Largest share of objects that are not enrolled, and are accepted under changes of the bench.
 FALSE_ACCEPT: Final = 0.02
 #: Largest share of them that is accepted before the last view.
@@ -371,7 +375,11 @@ def min_confidence_for(confidence: FloatArray, correct: NDArray[np.bool_], error
 
 
 def rule_from_searches(
-    searches: LeaveOneOut, *, error_rate: float = 0.01, false_reject: float = 0.02, objects: int | None = None
+    searches: LeaveOneOut,
+    *,
+    error_rate: float = ERROR_RATE,
+    false_reject: float = FALSE_REJECT,
+    objects: int | None = None,
 ) -> StoppingRule:
     """Fit the rule that keeps the error rates in leave-one-out searches.
 
@@ -545,8 +553,8 @@ class FittedRule:
 def fit_stopping_rule(
     index: DenseIndex,
     *,
-    error_rate: float = 0.01,
-    false_reject: float = 0.02,
+    error_rate: float = ERROR_RATE,
+    false_reject: float = FALSE_REJECT,
     most_searches: int = MOST_SEARCHES,
     most_shifted_searches: int = MOST_SEARCHES,
     sample: int | None = None,

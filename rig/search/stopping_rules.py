@@ -15,6 +15,7 @@ import numpy as np
 
 import hbr
 from hbr.dense.filter import BETA
+from hbr.dense.fitting import ERROR_RATE, FALSE_REJECT
 from hbr.dense.index import POWER
 from hbr.dense.stopping import NUMBERS, Limitation, LimitationCode, OpenSetModel, ShiftRates
 from hbr.descriptors import descriptor
@@ -29,10 +30,6 @@ FILE: Final = "search_rules.json"
 FORMAT: Final = "hbr-rig search rules"
 MAX_FILE_BYTES: Final = 16_000_000  # usual scores of some 100,000 objects; a larger file is not read into memory
 VERSION: Final = 1
-# The options of `rig catalog fit`. Smaller rates need more views for each answer, and more enrolled objects to be
-# guaranteed.
-ERROR_RATE: Final = 0.01
-FALSE_REJECT: Final = 0.02
 THRESHOLDS: Final = (
     "open_set_thresholds",
     "unknown_thresholds",

@@ -236,11 +236,13 @@ def deliver(
 def fit(
     settings: Settings,
     error_rate: Annotated[
-        float, typer.Option(min=0.0001, max=0.5, help="Largest share of wrong objects among those named.")
-    ] = 0.01,
+        float | None,
+        typer.Option(min=0.0001, max=0.5, help="Largest share of wrong objects among those named (default: 1 %)."),
+    ] = None,
     false_reject: Annotated[
-        float, typer.Option(min=0.0001, max=0.5, help="Largest share of enrolled objects called unknown.")
-    ] = 0.02,
+        float | None,
+        typer.Option(min=0.0001, max=0.5, help="Largest share of enrolled objects called unknown (default: 2 %)."),
+    ] = None,
     cluster: ClusterOption = None,
 ) -> None:
     """Fit the stopping rule, which decides when rig identify ends a search, to the catalog.
@@ -253,6 +255,7 @@ def fit(
     Example: rig catalog fit --bench sim --error-rate 0.005
     """
     from hbr import DenseIndex, fit_stopping_rule
+    from hbr.dense.fitting import ERROR_RATE, FALSE_REJECT
     from rig.catalog.derived import views as enrolled_views
     from rig.catalog.jobs import JobProgress
     from rig.cli.ui.present import Progress
@@ -281,7 +284,9 @@ def fit(
                 progress(JobProgress(done, len(tasks)))
                 yield one
 
-        found = fit_stopping_rule(index, error_rate=error_rate, false_reject=false_reject, tasks=searched)
+        found = fit_stopping_rule(
+            index, error_rate=error_rate or ERROR_RATE, false_reject=false_reject or FALSE_REJECT, tasks=searched
+        )
     made_utc = f"{clock.utc():%Y-%m-%dT%H:%M:%SZ}"
     write_stopping_rule(path, found.rule, index, made_utc=made_utc)
     outcome = {key: value for key, value in plain(found).items() if key != "rule"}
