@@ -6,7 +6,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, fields
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from pydantic import BaseModel, Field, field_validator
 
@@ -46,11 +46,6 @@ class SimOptions(Section):
         None, gt=0, le=1000, description="simulated seconds per second; default: as fast as the computer can"
     )
     noise: dict[str, float] = Field(default_factory=dict, description="noise model: values to change")
-    head: Literal["memory", "avr"] = Field(
-        "memory",
-        description="rig head if imu.connection = head: memory, the firmware built for this computer, or avr, the AVR "
-        "binary in an emulated ATmega328P",
-    )
     faults: list[Any] = Field(
         default_factory=list, description='simulated faults, e.g. ["jam@move3+2s"]; rig faults lists them'
     )

@@ -118,9 +118,8 @@ def _head(config: RigConfig, world: World, servo: SimulatedServo) -> SimHead:
 
     Raises `ConfigError` if the firmware cannot be built on this computer.
     """
-    kind = str(config.bench.get("sim", {}).get("head", "memory"))
     error = world.noise.head_clock_error * float(world.rng("head").standard_normal())
-    head = SimHead(world, kind, clock_error=error)
+    head = SimHead(world, clock_error=error)
     level = config.head.light
 
     def act(change: PinChange) -> None:

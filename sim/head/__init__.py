@@ -1,1 +1,1 @@
-"""The simulated rig head: the firmware itself, on this computer or in an emulated microcontroller."""
+"""The simulated rig head: the firmware itself, built for this computer."""

@@ -86,14 +86,14 @@ class SimHead:
     ----------
     world
         The simulated world.
-    kind
-        ``memory``: the portable core on this computer; ``avr``: the flashed binary in an emulated ATmega328P.
     clock_error
         Relative error of its clock; positive is too fast.
     serial
         The serial number in its flash.
-    image
-        Flash to run instead of the built one (``avr``).
+    library
+        Another board with the interface of ``firmware/boards/host/board.h``; default: the core on this computer.
+    flash
+        Program for a library that emulates a microcontroller.
 
     Attributes
     ----------
@@ -116,15 +116,13 @@ class SimHead:
     def __init__(
         self,
         world: World,
-        kind: str = "memory",
         *,
         clock_error: float = 0.0,
         serial: int = 1,
-        image: bytes | None = None,
         library: Path | None = None,
+        flash: bytes = b"",
     ) -> None:
         self.clock: VirtualClock = world.clock
-        self.kind = kind
         self.world_at_board_time = cast(World, _WorldAtBoardTime(self, world))
         self.light = 0.0
         self.relay_closed = False
@@ -147,9 +145,7 @@ class SimHead:
         self._failure: BaseException | None = None
         self._running = False
 
-        # The firmware runs as a library: the core itself, or the emulated binary.
-        self._library = _load(library or (build.avr_library() if kind == "avr" else build.host_library()))
-        flash = image if image is not None else build.avr_image() if kind == "avr" else b""
+        self._library = _load(library or build.host_library())
         self._environment = _Environment(_I2c(self._i2c), _Edge(self._edge))
         self._outputs = ctypes.create_string_buffer(_ROOM * _OUTPUT.itemsize)
         self._board = self._library.board_open(self._environment, flash, len(flash), serial)

@@ -15,78 +15,46 @@ from rig.core.errors import ConfigError
 
 HERE = Path(__file__).resolve().parent
 FIRMWARE = HERE.parent.parent / "firmware"
-EMULATOR_HEADERS = (Path("/usr/include/simavr"), Path("/usr/local/include/simavr"))
 
 COMPILE_S = 120  # a slow computer compiles for seconds; only a compiler that hangs takes longer
 
 
-def missing(kind: str) -> str:
-    """Return what a build of a ``memory`` or ``avr`` head lacks, and how to install it; empty if nothing is missing."""
+def missing() -> str:
+    """Return what a build of a head lacks, and how to install it; empty if nothing is missing."""
     if not (FIRMWARE / "Makefile").is_file():
         return "the firmware's sources are not installed: use a clone of the repository"
     if not (shutil.which("make") and compiler()):
         return "a C compiler and make are not installed: apt-get install gcc make"
-    if kind == "avr":
-        if not shutil.which("avr-gcc"):
-            return "the AVR compiler is not installed: apt-get install gcc-avr avr-libc"
-        if not any(path.is_dir() for path in EMULATOR_HEADERS):
-            return "the AVR emulator is not installed: apt-get install simavr libsimavr-dev"
     return ""
 
 
 def host_library(flags: str = "") -> Path:
     """Return the portable core as a shared library (``boards/host``), compiled with further ``flags``."""
-    return _built("memory", "libhead.so", flags)
+    return made("libhead.so", flags)
 
 
 def pty_program() -> Path:
     """Return the program that simulates a head on a pseudo-terminal."""
-    return _built("memory", "head-pty")
+    return made("head-pty")
 
 
-def avr_image() -> bytes:
-    """Return the flash of an ATmega328P: the bytes that `make flash` writes."""
-    return (avr_folder() / "head.bin").read_bytes()
+def made(product: str, flags: str = "") -> Path:
+    """Return a product of the firmware's Makefile; the core for this computer is compiled with further ``flags``.
 
-
-def avr_folder() -> Path:
-    """Return the folder with what `make` has built for an ATmega328P: ``head.elf`` and ``head.bin``."""
-    return _built("avr", "head.bin").parent
-
-
-def avr_library() -> Path:
-    """Return the emulated microcontroller, with the interface of ``boards/host/board.h``."""
-    _require("avr")
-    source = HERE / "avr.c"
-    key = _key([source, FIRMWARE / "boards" / "host" / "board.h"], "")
-    headers = next(path for path in EMULATOR_HEADERS if path.is_dir())
-
-    def compile_to(folder: Path) -> list[str]:
-        out = folder / "libavrhead.so"
-        warnings = ["-std=gnu11", "-Wall", "-Wextra", "-Werror", "-O2", "-fPIC", "-shared"]
-        places = ["-isystem", str(headers), "-I", str(FIRMWARE / "boards" / "host"), "-I", str(FIRMWARE / "core")]
-        return [compiler(), *warnings, *places, "-o", str(out), str(source), "-lsimavr"]
-
-    return _cached(key, "libavrhead.so", compile_to)
-
-
-def _built(kind: str, product: str, flags: str = "") -> Path:
-    _require(kind)
+    Raises `ConfigError` if this computer lacks a compiler, or the sources are wrong.
+    """
+    if lacking := missing():
+        what, _, how = lacking.partition(": ")
+        raise ConfigError(
+            f"The simulated rig head cannot be built: {what}.",
+            next_step=f"{how[:1].upper()}{how[1:]}; or leave the head out: imu.connection=i2c.",
+        )
     sources = [p for p in sorted(FIRMWARE.rglob("*")) if p.suffix in (".c", ".h") or p.name == "Makefile"]
 
     def make(folder: Path) -> list[str]:
         return ["make", "-s", "-C", str(FIRMWARE), f"OUT={folder}", f"HOST_FLAGS={flags}", str(folder / product)]
 
-    return _cached(_key(sources, f"{product} {flags}"), product, make)
-
-
-def _require(kind: str) -> None:
-    if lacking := missing(kind):
-        raise ConfigError(
-            f"The simulated rig head cannot be built: {lacking.partition(':')[0]}.",
-            next_step=f"{lacking.partition(': ')[2][:1].upper()}{lacking.partition(': ')[2][1:]}; or leave the head "
-            "out: imu.connection=i2c.",
-        )
+    return compiled(sources, f"{product} {flags}", product, make)
 
 
 def compiler() -> str:
@@ -94,15 +62,15 @@ def compiler() -> str:
     return os.environ.get("CC") or next((c for c in ("cc", "gcc", "clang") if shutil.which(c)), "")
 
 
-def _key(sources: list[Path], how: str) -> str:
+def compiled(sources: list[Path], how: str, product: str, command_for: Callable[[Path], list[str]]) -> Path:
+    """Return a product from the cache; if its ``sources``, the compiler or ``how`` changed, build it first.
+
+    Several programs may do so at the same time. Raises `ConfigError` if the sources do not compile.
+    """
     digest = sha256(f"{compiler()} {how}".encode())
     for source in sources:
         digest.update(source.name.encode() + b"\0" + source.read_bytes())
-    return digest.hexdigest()[:16]
-
-
-def _cached(key: str, product: str, command_for: Callable[[Path], list[str]]) -> Path:
-    """Return a product from the cache, built first if needed; several programs may do so at the same time."""
+    key = digest.hexdigest()[:16]
     root = Path(platformdirs.user_cache_dir(APP)) / "head"
     done = root / key / product
     if done.is_file():

@@ -1,7 +1,7 @@
 """`rig sim-bench`, `rig sim-servo` and `rig sim-head`: simulated devices in real time, for other programs."""
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import typer
 
@@ -69,12 +69,6 @@ def sim_servo(
 @command
 def sim_head(
     settings: Settings,
-    kind: Annotated[
-        Literal["memory", "avr"],
-        typer.Option(
-            help="memory: the firmware built for this computer; avr: the AVR binary in an emulated ATmega328P."
-        ),
-    ] = "memory",
     spin: Annotated[
         float, typer.Option(metavar="DPS", help="Rotate the platter at this speed, in degrees per second.")
     ] = 0.0,
@@ -89,4 +83,4 @@ def sim_head(
     """
     from sim.realtime.run import run_head
 
-    run_head(settings, kind, spin, link, seconds)
+    run_head(settings, spin, link, seconds)

@@ -102,11 +102,10 @@ def run_servos(settings: Settings, ids: Sequence[int] | None, link: Path | None,
         RealTime(bus.clock, [port]).run(seconds)
 
 
-def run_head(settings: Settings, kind: str, spin_dps: float, link: Path | None, seconds: float | None) -> None:
+def run_head(settings: Settings, spin_dps: float, link: Path | None, seconds: float | None) -> None:
     """Run a rig head with its IMU on a platter that rotates at ``spin_dps``."""
     config = settings.load()
-    imu = config.imu.model_copy(update={"connection": "head"})
-    config = config.model_copy(update={"imu": imu, "bench": {**config.bench, "sim": {"head": kind}}})
+    config = config.model_copy(update={"imu": config.imu.model_copy(update={"connection": "head"})})
     world = World(seed=settings.seed or 0)
     with ExitStack() as ends:
         devices = ends.enter_context(SimDevices.connected(config, world))
@@ -118,7 +117,7 @@ def run_head(settings: Settings, kind: str, spin_dps: float, link: Path | None, 
             world.drive(to_velocity(0.0, 0.0, spin_dps, abs(spin_dps), 100.0))
         port = _port(devices.head_port, link, ends)
         if settings.json:
-            settings.print_json({"port": port.path, "kind": kind, "imu": config.imu.model})
+            settings.print_json({"port": port.path, "imu": config.imu.model})
         else:
             print(port.path, flush=True)
             where = f"--set imu.connection=head --set head.port={port.path}"

@@ -24,6 +24,7 @@ from sim.imu.mpu6050 import SimMpu6050
 from sim.noise import NoiseModel
 from sim.realtime.port import PtyPort
 from sim.world import World
+from tests.firmware import avr
 
 CLOCK_ERROR = 2e-3
 """A ceramic resonator's."""
@@ -42,9 +43,15 @@ class Head:
 
 
 def needs(kind: str) -> None:
-    """Skip the test if this computer cannot build a head of this kind."""
-    if lacking := missing(kind):
+    """Skip the test if this computer cannot build a head: ``memory``, the core, or ``avr``, the emulated binary."""
+    if lacking := avr.missing() if kind == "avr" else missing():
         pytest.skip(lacking)
+
+
+def head_of(kind: str, world: World, *, clock_error: float = 0.0, serial: int = 1) -> SimHead:
+    """Return a head of a kind, and skip the test if this computer cannot build it."""
+    needs(kind)
+    return (avr.emulated_head if kind == "avr" else SimHead)(world, clock_error=clock_error, serial=serial)
 
 
 def mpu6050() -> HeadSensor:
@@ -60,9 +67,8 @@ def simulated_head(
     kind: str = "memory", noise: NoiseModel | None = None, *, clock_error: float = CLOCK_ERROR
 ) -> Iterator[tuple[SimHead, World]]:
     """Yield a head with nothing on its bus."""
-    needs(kind)
     world = World(noise=noise, seed=1)
-    head = SimHead(world, kind, clock_error=clock_error)
+    head = head_of(kind, world, clock_error=clock_error)
     try:
         yield head, world
     finally:

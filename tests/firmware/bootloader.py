@@ -11,6 +11,7 @@ from typing import Final
 from sim.head.board import SimHead
 from sim.head.serial_port import HeadSerial
 from sim.world import World
+from tests.firmware.avr import emulated_head
 
 FLASH_BYTES: Final = 32_768
 EEPROM_BYTES: Final = 1024
@@ -132,7 +133,7 @@ class Arduino:
 
     def _start(self) -> None:
         stored = int.from_bytes(self.eeprom[:4], "little")
-        self.program = SimHead(self._world, "avr", serial=stored, image=bytes(self.flash))
+        self.program = emulated_head(self._world, serial=stored, flash=bytes(self.flash))
         self._serial = HeadSerial(self.program)
 
     def _converse(self) -> Generator[None, int, None]:

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from sim.head import build
+from tests.firmware import avr
 
 FIRMWARE = build.FIRMWARE
 
@@ -25,7 +26,7 @@ def make(tmp_path: Path, *targets: str) -> str:
 
 @pytest.fixture
 def compiler():
-    if lacking := build.missing("memory"):
+    if lacking := build.missing():
         pytest.skip(lacking)
 
 
@@ -52,7 +53,7 @@ def test_core_builds_without_a_warning_on_this_machine(compiler, tmp_path):
 
 
 def test_avr_build_fits_its_limits(tmp_path):
-    if lacking := build.missing("avr"):
+    if lacking := avr.missing():
         pytest.skip(lacking)
     reported = make(tmp_path, "avr", "size")
     sizes = re.search(r"flash (\d+) of (\d+) bytes, RAM (\d+) of (\d+) bytes", reported)
@@ -61,11 +62,11 @@ def test_avr_build_fits_its_limits(tmp_path):
     assert (flash_limit, ram_limit) == (8192, 1024)
     assert 0 < flash <= flash_limit
     assert 0 < ram <= ram_limit
-    assert build.avr_image() == (tmp_path / "head.bin").read_bytes()  # the emulator runs the same bytes
+    assert avr.image() == (tmp_path / "head.bin").read_bytes()  # the emulator runs the same bytes
 
 
 def test_core_needs_no_heap_and_no_floating_point(tmp_path):
-    if lacking := build.missing("avr"):
+    if lacking := avr.missing():
         pytest.skip(lacking)
     make(tmp_path, "avr")
     symbols = subprocess.run(
@@ -87,7 +88,7 @@ def test_core_needs_no_heap_and_no_floating_point(tmp_path):
 def test_missing_compiler_is_reported_with_the_packages_to_install(monkeypatch):
     monkeypatch.setattr(shutil, "which", lambda _name: None)
     monkeypatch.delenv("CC", raising=False)
-    assert "apt-get install" in build.missing("memory")
+    assert "apt-get install" in build.missing()
     with pytest.raises(Exception, match="cannot be built") as caught:
         build.host_library()
     assert "imu.connection=i2c" in caught.value.next_step

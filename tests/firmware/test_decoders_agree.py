@@ -66,7 +66,7 @@ print(frames, errors)
 
 @pytest.fixture
 def compiler():
-    if lacking := build.missing("memory"):
+    if lacking := build.missing():
         pytest.skip(lacking)
 
 

@@ -16,6 +16,7 @@ from sim.head import build
 from sim.realtime.pace import RealTime
 from sim.realtime.port import PtyPort
 from sim.world import World
+from tests.firmware import avr
 from tests.firmware.bootloader import ATMEGABOOT, OPTIBOOT, PAGE_BYTES, Arduino, Kind
 
 SPEEDS = {getattr(termios, f"B{baud}"): baud for baud in (57_600, 115_200)} | {termios.B38400: 0}
@@ -28,7 +29,7 @@ def connected(kind: Kind) -> Iterator[tuple[Arduino, str, RealTime]]:
     """Connect a board to a pseudo-terminal; yield it, the port and its time."""
     if shutil.which("avrdude") is None:
         pytest.skip("avrdude is not installed (apt-get install avrdude)")
-    if lacking := build.missing("avr"):
+    if lacking := avr.missing():
         pytest.skip(lacking)
     world = World()
     ports: list[PtyPort] = []
@@ -47,7 +48,7 @@ def connected(kind: Kind) -> Iterator[tuple[Arduino, str, RealTime]]:
 
 def make(folder: Path, port: str, *options: str) -> subprocess.CompletedProcess[str]:
     """Run `make flash` with what is built already."""
-    built = build.avr_folder()
+    built = avr.folder()
     folder.mkdir()
     for name in ("head.elf", "head.bin"):
         shutil.copyfile(built / name, folder / name)
@@ -56,7 +57,7 @@ def make(folder: Path, port: str, *options: str) -> subprocess.CompletedProcess[
 
 
 def check_flash(board: Arduino) -> bytes:
-    image = build.avr_image()
+    image = avr.image()
     assert board.flash[: len(image)] == image
     assert set(board.flash[len(image) :]) == {0xFF}
     assert set(board.eeprom) == {0xFF}

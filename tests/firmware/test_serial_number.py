@@ -12,7 +12,7 @@ from sim.head import build
 from sim.head.board import SimHead
 from sim.head.serial_port import HeadSerial
 from sim.world import World
-from tests.contract.heads import needs
+from tests.contract.heads import head_of, needs
 
 
 def greeted(head: SimHead) -> HeadLink:
@@ -30,8 +30,7 @@ def stored(head: SimHead, serial: int) -> int:
 
 @pytest.fixture(params=["memory", "avr"])
 def head(request):
-    needs(request.param)
-    head = SimHead(World(), request.param, serial=SERIAL_UNSET)
+    head = head_of(request.param, World(), serial=SERIAL_UNSET)
     yield head
     head.close()
 
@@ -58,7 +57,7 @@ def test_number_is_not_stored_while_a_program_uses_the_head(head):
 
 def test_worn_out_memory_and_missing_head_are_reported(monkeypatch):
     needs("memory")
-    head = SimHead(World(), "memory", serial=9)
+    head = SimHead(World(), serial=9)
     monkeypatch.setattr("rig.devices.head.link.SetSerial", lambda _: Shutdown())
     with pytest.raises(DeviceFault, match="did not store"):
         stored(head, 17)

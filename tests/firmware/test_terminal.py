@@ -65,7 +65,7 @@ class Terminal:
 
 @pytest.fixture
 def terminal() -> Iterator[Terminal]:
-    if lacking := build.missing("memory"):
+    if lacking := build.missing():
         pytest.skip(lacking)
     program = subprocess.Popen(
         [str(build.pty_program())], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1

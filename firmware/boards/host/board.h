@@ -1,4 +1,4 @@
-/* A rig head in memory, for programs that simulate its surroundings. The emulated microcontroller (sim/head/avr.c)
+/* A rig head in memory, for programs that simulate its surroundings. The emulated microcontroller (tests/firmware/avr.c)
  * has the same interface, so that the same tests run with both.
  *
  * Times are nanoseconds of the board's own clock since its power came on. A board runs only within `board_run`. */

@@ -40,10 +40,10 @@ MS = 1_000_000
 # -- opening -----------------------------------------------------------------------------------------------------
 
 
-def test_opening_reads_the_identity_and_leaves_outputs_off(opened):
+def test_opening_reads_the_identity_and_leaves_outputs_off(opened, request):
     who = opened.imu.identity
     assert (who.model, who.who_am_i, who.bus_address) == ("MPU-6050", 0x68, 0x68)
-    board = {"memory": "host", "avr": "atmega328p"}[opened.head.kind]
+    board = {"memory": "host", "avr": "atmega328p"}[request.node.callspec.params["opened"]]
     assert (who.board, who.protocol, who.serial) == (board, PROTOCOL_VERSION, 1)
     assert not opened.head.relay_closed
     assert opened.head.light == 0

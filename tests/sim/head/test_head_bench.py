@@ -19,17 +19,20 @@ from sim.devices import SimDevices
 from sim.objects.shelf import shelf
 from sim.world import World
 from tests.contract.heads import needs
+from tests.firmware.avr import emulated_head
 
 WIRED = ("imu.connection=head", "head.power=true", "head.light=0.8", "table.orientation=imu")
 
 
 @pytest.fixture
-def on_head(simulated):
+def on_head(simulated, monkeypatch):
     """Return a function that opens a simulated bench on a head of a kind."""
 
     def open_one(kind: str = "memory", *settings: str):
         needs(kind)
-        return simulated(*WIRED, f"bench.sim.head={kind}", *settings, seed=4)
+        if kind == "avr":
+            monkeypatch.setattr("sim.devices.SimHead", emulated_head)
+        return simulated(*WIRED, *settings, seed=4)
 
     return open_one
 

@@ -182,5 +182,5 @@ class Head(RuleBasedStateMachine):
             assert reply.state != HeadState.IDLE
 
 
-TestHead = pytest.mark.skipif(bool(missing("memory")), reason=missing("memory"))(Head.TestCase)
+TestHead = pytest.mark.skipif(bool(missing()), reason=missing())(Head.TestCase)
 TestHead.settings = settings(examples(6), stateful_step_count=30)

@@ -11,7 +11,7 @@ from sim.head.board import SimHead
 from sim.head.serial_port import HeadSerial
 from sim.noise import NoiseModel
 from sim.world import World
-from tests.contract.heads import mpu6050, needs
+from tests.contract.heads import head_of, mpu6050
 
 MINUTES, RATE_HZ = 10, 200
 INT_ENABLE, USER_CTRL, PWR_MGMT_1, FIFO_COUNTH, FIFO_R_W, WHO_AM_I = 0x38, 0x6A, 0x6B, 0x72, 0x74, 0x75
@@ -77,9 +77,8 @@ def stream(kind: str, seconds: float, error: float = 0.01) -> tuple[int, int, fl
 
     ``error`` is that of the sensor's rate; the product specification allows 1 %.
     """
-    needs(kind)
     world = World(noise=NoiseModel.none())
-    head = SimHead(world, kind, clock_error=-2.5e-3)
+    head = head_of(kind, world, clock_error=-2.5e-3)
     sensor = CountingSensor(head, error)
     head.attach(0x68, sensor)
     imu = RigHead(HeadSerial(head), world.clock, mpu6050())
