@@ -56,14 +56,14 @@ STEP_WEIGHT: Final = STEP_DEG / FRAME_DEG * frame_weight(FRAME_DEG)
 """Sum of the weights of the frames between two decisions."""
 
 
-def fit_arc_confidence(index: DenseIndex, rest: StoppingRule, *, most_searches: int = MOST_SEARCHES) -> float:
+def fit_arc_confidence(index: DenseIndex, rest: StoppingRule) -> float:
     """Return the confidence that ends a search in motion, from leave-one-out searches along arcs of `ARC_DEG`.
 
     Searches that end with the first view count, too, because ``rest.error_rate`` is the error rate of all named
     objects. If there are more objects than searches, a sample of the objects is searched for among each other. A
     catalog without candidates or with single views has the confidence of searches at rest, ``rest.min_confidence``.
     """
-    chosen = searched_objects(index, most_searches, most_searches if len(index) > most_searches else None)
+    chosen = searched_objects(index, MOST_SEARCHES, MOST_SEARCHES if len(index) > MOST_SEARCHES else None)
     if chosen is None:
         return rest.min_confidence
     some, each, _ = chosen

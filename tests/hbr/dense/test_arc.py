@@ -50,8 +50,11 @@ def test_evidence_of_an_arc_does_not_depend_on_the_number_of_its_frames() -> Non
     assert frame_weight(0.0) == 0.0
 
 
-def test_first_view_is_decided_as_at_rest(index: DenseIndex, rest: StoppingRule) -> None:
-    confidence = fit_arc_confidence(index, rest, most_searches=24)
+def test_first_view_is_decided_as_at_rest(
+    index: DenseIndex, rest: StoppingRule, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("hbr.dense.arc.MOST_SEARCHES", 24)
+    confidence = fit_arc_confidence(index, rest)
     for row in range(0, len(index.views), 9):
         levels = index.views.levels(np.array([row]))[0]
         at_rest, moving = DenseSession(index, rest), ArcSession(index, rest, confidence)
@@ -121,9 +124,12 @@ def test_error_rate_counts_only_decisions_that_can_end_a_search(index: DenseInde
     assert wrong == UNFITTED_MIN_CONFIDENCE
 
 
-def test_confidence_of_a_large_catalog_is_fitted_to_a_part(index: DenseIndex, rest: StoppingRule) -> None:
-    assert fit_arc_confidence(index, rest, most_searches=4) == max(UNFITTED_MIN_CONFIDENCE, rest.min_confidence)
+def test_confidence_of_a_large_catalog_is_fitted_to_a_part(
+    index: DenseIndex, rest: StoppingRule, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("hbr.dense.arc.MOST_SEARCHES", 4)
+    assert fit_arc_confidence(index, rest) == max(UNFITTED_MIN_CONFIDENCE, rest.min_confidence)
     strict = replace(rest, min_confidence=0.9999)
-    assert fit_arc_confidence(index, strict, most_searches=4) == 0.9999
+    assert fit_arc_confidence(index, strict) == 0.9999
     single = DenseIndex(catalog(objects=1))
     assert fit_arc_confidence(single, rest) == rest.min_confidence

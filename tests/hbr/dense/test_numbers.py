@@ -41,7 +41,9 @@ def numbers(index: hbr.DenseIndex, session: hbr.DenseSession, angles: list[float
     ]  # fmt: skip
 
 
-def test_numbers_of_a_fitted_rule(index: hbr.DenseIndex, found: hbr.FittedRule) -> None:
+def test_numbers_of_a_fitted_rule(
+    index: hbr.DenseIndex, found: hbr.FittedRule, monkeypatch: pytest.MonkeyPatch
+) -> None:
     rule = found.rule
     assert (found.ended, found.wrong, found.mean_views, found.rejected, found.accepted) == (100, 0, 1.0, 0, 4)
     assert (rule.min_confidence, rule.false_accept, rule.limitations) == (0.9, 0.08, ())
@@ -57,7 +59,8 @@ def test_numbers_of_a_fitted_rule(index: hbr.DenseIndex, found: hbr.FittedRule) 
     assert rule.unknown_thresholds == pytest.approx((-16.3811509719, -13.3541501645, -12.6590924979, -12.0743723601))
     assert rule.leave_one_out_thresholds == pytest.approx((1.0837565127, 1.0701975000, 1.1046153613, 1.0849816831))
     assert rule.usual_scores.mean() == pytest.approx(0.9570251157)
-    assert fit_arc_confidence(index, rule, most_searches=20) == 0.98
+    monkeypatch.setattr("hbr.dense.arc.MOST_SEARCHES", 20)
+    assert fit_arc_confidence(index, rule) == 0.98
 
 
 def test_numbers_of_searches(index: hbr.DenseIndex, found: hbr.FittedRule) -> None:
