@@ -36,14 +36,11 @@ class ImuSamples:
         Angular rate about the sensor's x, y, z.
     lost : int
         Samples that were lost before these (FIFO overflow); an integral across them is not valid.
-    time_uncertainty_ns : int or None
-        Largest standard uncertainty of ``time_ns``; None if it is not known.
     """
 
     time_ns: NDArray[np.int64]
     gyro_dps: NDArray[np.float64]
     lost: int = 0
-    time_uncertainty_ns: int | None = None
 
 
 class Imu(Protocol):

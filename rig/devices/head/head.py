@@ -198,7 +198,7 @@ class RigHead:
         """Send one pulse to the camera; return when it begins, on the bench's clock (ns)."""
         with self._in_use():
             answer = self._link.request(Trigger(round(1e6 * width_s)), Triggered)
-            time_ns, _ = self._timing.to_host(np.array([self._timing.unwrap(answer.time_us)]))
+            time_ns = self._timing.to_host(np.array([self._timing.unwrap(answer.time_us)]))
             return int(time_ns[0])
 
     # -- status and faults ------------------------------------------------------------------------------------------

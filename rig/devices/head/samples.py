@@ -23,7 +23,7 @@ from rig.core.clock import Clock, seconds_between
 from rig.core.errors import ConfigError
 from rig.devices import bno055, mpu6050
 from rig.devices.head.link import HeadStatistics
-from rig.devices.head.protocol import Imu, ImuModel, Sample, SampleFlag
+from rig.devices.head.protocol import Imu, ImuModel, Sample
 from rig.devices.imu import ImuSamples
 
 MEMORY_S = 2.0  # a reader that pauses for longer reports lost samples
@@ -128,7 +128,7 @@ class HeadClock:
     @property
     def uncertainty_ns(self) -> float:
         """Standard uncertainty of a time at the newest heartbeat."""
-        return self._sigma_ns(0.0)
+        return hypot(sqrt(self._covariance[0, 0]), self._asymmetry_ns / sqrt(3))
 
     def unwrap(self, head_us: int) -> int:
         """Return a time of the head without wrapping, counted from the newest known time."""
@@ -161,16 +161,11 @@ class HeadClock:
         self._fit = self._covariance @ np.array([weight @ y, weight @ (x * y)])
         self._asymmetry_ns = float(delay_ns_beyond.min()) / 2  # the delay of the best round trip may be in all of them
 
-    def to_host(self, head_us: NDArray[np.int64]) -> tuple[NDArray[np.int64], float]:
-        """Return the bench's times (ns) of unwrapped times of the head, and their largest standard uncertainty."""
+    def to_host(self, head_us: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the bench's times (ns) of unwrapped times of the head."""
         ahead_ns = (head_us - self._origin_us) * 1e3
         offset, drift = self._fit
-        time_ns = round(self._origin_ns) + np.rint(ahead_ns * (1 + drift) + offset).astype(np.int64)
-        return time_ns, self._sigma_ns(float(np.abs(ahead_ns).max(initial=0.0)))
-
-    def _sigma_ns(self, ahead_ns: float) -> float:
-        a = np.array([1.0, ahead_ns])
-        return hypot(sqrt(float(a @ self._covariance @ a)), self._asymmetry_ns / sqrt(3))
+        return round(self._origin_ns) + np.rint(ahead_ns * (1 + drift) + offset).astype(np.int64)
 
 
 class SampleStream:
@@ -216,12 +211,9 @@ class SampleStream:
         taken = list(self._samples)
         self._samples.clear()
         lost, self._lost = self._lost, 0
-        time_ns, sigma_ns = self._timing.to_host(np.array([time_us for time_us, _ in taken], np.int64))
+        time_ns = self._timing.to_host(np.array([time_us for time_us, _ in taken], np.int64))
         gyro = np.array([(s.gyro_x, s.gyro_y, s.gyro_z) for _, s in taken], float).reshape(-1, 3)
-        if not all(s.flags & SampleFlag.EDGE for _, s in taken):
-            # Without the data-ready edge the head polled the sensor: the sample may be from any time within a period.
-            sigma_ns = hypot(sigma_ns, 1e9 / self._sensor.rate_hz / sqrt(12))
-        return ImuSamples(time_ns, gyro / self._sensor.lsb_per_dps, lost, round(sigma_ns))
+        return ImuSamples(time_ns, gyro / self._sensor.lsb_per_dps, lost)
 
     def _miss(self, count: int) -> None:
         self._lost += count

@@ -16,6 +16,7 @@ from rig.devices.head.protocol import (
     BAUD,
     HeadState,
     Light,
+    SampleFlag,
     Trigger,
     Triggered,
 )
@@ -238,7 +239,7 @@ def test_unacknowledged_addresses_cost_no_sample(opened):
 
 
 @AVR_NIGHTLY
-def test_samples_without_data_ready_have_a_larger_time_uncertainty(opened):
+def test_samples_without_data_ready_are_polled(opened):
     opened.sensor.next_edge_ns = lambda _after_ns: None  # INT is not wired
     opened.clock.sleep(0.3)
     opened.imu.read_samples()
@@ -246,4 +247,5 @@ def test_samples_without_data_ready_have_a_larger_time_uncertainty(opened):
     samples = opened.imu.read_samples()
     assert samples.lost == 0
     assert len(samples.time_ns) == pytest.approx(200, abs=4)
-    assert samples.time_uncertainty_ns > 1 * MS
+    assert all(np.diff(samples.time_ns) > 0)
+    assert not opened.imu._stream.newest.flags & SampleFlag.EDGE

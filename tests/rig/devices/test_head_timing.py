@@ -35,9 +35,9 @@ class Line:
         return float(self._rng.exponential(typical_ns))
 
     def error_ns(self, at_ns: int) -> tuple[float, float]:
-        """Return the error of a time, and its stated uncertainty."""
-        time_ns, sigma_ns = self.clock.to_host(np.array([self.clock.unwrap(self.head_us(at_ns) % 2**32)]))
-        return float(time_ns[0]) - at_ns, sigma_ns
+        """Return the error of a time, and the stated uncertainty."""
+        time_ns = self.clock.to_host(np.array([self.clock.unwrap(self.head_us(at_ns) % 2**32)]))
+        return float(time_ns[0]) - at_ns, self.clock.uncertainty_ns
 
 
 @given(drift=st.floats(-5e-3, 5e-3), start_us=st.integers(0, 2**32 - 1))
