@@ -1,7 +1,6 @@
 """A register-true BNO055 for the simulated I2C bus: fusion, calibration status, start-up and mode switch times.
 
-The behaviour follows the data sheet BST-BNO055-DS000. The driver has its own copy of the register numbers, so that
-tests find an error in one of them.
+The behaviour follows the data sheet BST-BNO055-DS000. The register numbers are not the driver's (decision 0001).
 
 Not simulated: the magnetometer (its modes run like the IMU mode, without north), page 1, interrupts, axis remapping,
 self test, low-power modes, UART, and stretching of the clock. The fusion is the integral of the gyro about the

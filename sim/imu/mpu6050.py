@@ -1,8 +1,8 @@
 """A register-true MPU-6050 for the simulated I2C bus, and the sensors with its registers.
 
 The behaviour follows the register map RM-MPU-6000A rev 4.2 and the product specification PS-MPU-6000A rev 3.4; for the
-MPU-6500 and the MPU-9250, RM-MPU-6500A, PS-MPU-6500A, RM-MPU-9250A and PS-MPU-9250A. The driver has its own copy of the
-register numbers, so that tests find an error in one of them.
+MPU-6500 and the MPU-9250, RM-MPU-6500A, PS-MPU-6500A, RM-MPU-9250A and PS-MPU-9250A. The register
+numbers are not the driver's (decision 0001).
 
 Not simulated: the auxiliary bus, motion detection, self test, the cycle and single-axis standby modes, interrupts
 except that of a new sample, the signal paths' reset, the motion processor, and start-up times; the bypass of the

@@ -1,7 +1,7 @@
 """A simulated AX-12A: its control table, its answers in Protocol 1.0, and methods for tests.
 
-Source: e-manual page "AX-12+, AX-12A". The driver has its own copy of the addresses, so that tests find an error in one
-of them. LEDs, compliance, punch and Max Torque are stored but have no effect.
+Source: e-manual page "AX-12+, AX-12A". The addresses are not the driver's (decision 0001). LEDs, compliance, punch and
+Max Torque are stored but have no effect.
 """
 
 from collections.abc import Callable
