@@ -14,7 +14,7 @@ from rig.devices.dynamixel.port import READ_SLICE_S, ClockedPort
 from rig.devices.dynamixel.registers import control_table
 from rig.devices.dynamixel.servo import DynamixelServo, open_servo
 from sim.noise import NoiseModel
-from sim.servo import Frame, ServoBus, SimSerial, Source, XSeriesServo
+from sim.servo import Sender, SentBytes, ServoBus, SimSerial, XSeriesServo
 from sim.world import World
 
 BAUD = 1_000_000
@@ -68,13 +68,13 @@ def opened() -> tuple[DynamixelServo, RepeatingSerial, ServoBus]:
 
 def answers_of(bus: ServoBus, calls: list[Callable[[], object]]) -> dict[bytes, bytes]:
     """Return the servo's answer to each request of these calls. The driver alternates between two requests."""
-    frames: list[Frame] = []
+    frames: list[SentBytes] = []
     bus.taps.append(frames.append)
     for call in calls * 4:
         call()
     bus.taps.clear()
-    requests = [frame.data for frame in frames if frame.source is Source.HOST]
-    answers = [frame.data for frame in frames if frame.source is Source.DEVICE]
+    requests = [frame.data for frame in frames if frame.source is Sender.HOST]
+    answers = [frame.data for frame in frames if frame.source is Sender.DEVICE]
     return dict(zip(requests, answers, strict=True))
 
 

@@ -18,8 +18,8 @@ import numpy as np
 from benchmarks.record import record
 from hbr import Background, Segmentation, ViewsTogether, descriptor, segment
 from hbr.core.arrays import ImageArray
-from hbr.drawing.bench import HARD, Bench, Visit
-from hbr.segmentation import Method
+from hbr.drawing.bench import HARD, DrawnBench, Visit
+from hbr.segmentation import BoxMethod
 from hbr.segmentation.background import shrunk
 from hbr.segmentation.silhouette import guess_object, shares
 
@@ -42,7 +42,7 @@ def printed_box(visit: Visit, side: int) -> ImageArray:
 
 def frames(seed: int) -> tuple[list[ImageArray], ImageArray]:
     """Return views of a printed box on a textured bench, and the empty table."""
-    visit = Visit(Bench.drawn(np.random.default_rng(1000 + seed)), HARD, np.random.default_rng(seed))
+    visit = Visit(DrawnBench.drawn(np.random.default_rng(1000 + seed)), HARD, np.random.default_rng(seed))
     return [printed_box(visit, side) for side in range(VIEWS)], visit.empty()
 
 
@@ -64,7 +64,7 @@ def one_view(size: tuple[int, int]) -> None:
     table = Background(table_bgr)
     kinds = [descriptor(name) for name in DESCRIPTORS]
     small, found = shrunk(image), segment(image, empty_table=table)
-    if found.method is not Method.EMPTY_TABLE:
+    if found.method is not BoxMethod.EMPTY_TABLE:
         raise RuntimeError("the object was not found by the empty-table image")
 
     def described(view: Segmentation) -> None:

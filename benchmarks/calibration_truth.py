@@ -34,7 +34,7 @@ from rig.calibrations import CalibrationResult
 from rig.config import load_config
 from rig.core.phrases import in_unit
 from rig.motion.turntable import Turntable
-from rig.views.charuco_board import Board
+from rig.views.charuco_board import CharucoBoard
 from sim.bench import ShelfOperator, open_sim_bench
 from sim.calibration_board import boards
 from sim.noise import NoiseModel
@@ -163,7 +163,7 @@ def axis(seed: int) -> tuple[CalibrationResult, Truth]:
     optics = operator.optics
     up, origin = np.array(optics.rotation).reshape(3, 3)[:, 2], np.array(optics.translation_mm)
     rotation, translation = boards(optics)[table_axis.STANDS[0]].pose(0.0)
-    middle = rotation @ Board().points_mm().mean(axis=0) + translation
+    middle = rotation @ CharucoBoard().points_mm().mean(axis=0) + translation
     beside = origin + up * ((middle - origin) @ up)
     seen = cv2.projectPoints(beside[None], np.zeros(3), np.zeros(3), optics.matrix, np.array(optics.distortion))[0]
     names = ("x", "y", "z", "ux", "uy", "uz", "px", "py")

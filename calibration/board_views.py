@@ -20,7 +20,7 @@ from rig.jobs.desk import Progress
 from rig.motion.turntable import Turntable
 from rig.plans.capture import capture, moved
 from rig.views.capture import Viewer
-from rig.views.charuco_board import Board, BoardDetection, detect_board
+from rig.views.charuco_board import BoardDetection, CharucoBoard, detect_board
 
 MIN_CORNERS = 12  # a pose has six numbers; of twelve corners a wrong one is noticed
 """Corners that a view needs to determine the board's pose."""
@@ -59,7 +59,7 @@ class BoardView:
 
 
 def take_views(
-    bench: Bench, board: Board, stands: Mapping[str, str], angles_deg: Sequence[float], found: Evaluation
+    bench: Bench, board: CharucoBoard, stands: Mapping[str, str], angles_deg: Sequence[float], found: Evaluation
 ) -> Generator[Event | Ask | Progress, None, list[BoardView]]:
     """Ask for the board in each of the positions ``stands``, rotate to each of the ``angles_deg``, return the views.
 
@@ -140,7 +140,7 @@ def span_deg(views: Sequence[BoardView]) -> float:
     return max((v.table_deg for v in views), default=0.0) - min((v.table_deg for v in views), default=0.0)
 
 
-def points(board: Board, view: BoardView) -> NDArray[np.float64]:
+def points(board: CharucoBoard, view: BoardView) -> NDArray[np.float64]:
     """Return the points of the board in a view, float64 (n, 3), mm."""
     return board.points_mm()[view.ids]
 
@@ -192,7 +192,7 @@ def plot_views(result: CalibrationResult, limit_px: float) -> Chart | None:
     )
 
 
-def _words(seen: BoardDetection, board: Board, views: Sequence[BoardView], bench: Bench) -> str:
+def _words(seen: BoardDetection, board: CharucoBoard, views: Sequence[BoardView], bench: Bench) -> str:
     identity = bench.camera.identity
     cells = coverage(views, (identity.width, identity.height)) if views else np.zeros(GRID)
     covered = float((cells > 0).mean())

@@ -28,7 +28,7 @@ from rig.bench import Bench
 from rig.calibrations import CalibrationResult, RejectionCode
 from rig.charts.xy import Axis, Chart, Series
 from rig.core.phrases import percent
-from rig.views.charuco_board import Board
+from rig.views.charuco_board import CharucoBoard
 
 NAME = "camera.intrinsics"
 
@@ -77,7 +77,7 @@ def plot_residuals(result: CalibrationResult) -> Chart | None:
     if not views or not result.estimates:
         return None
     matrix, distortion = matrix_of(result)
-    board = Board(**result.evidence["board"])
+    board = CharucoBoard(**result.evidence["board"])
     vectors = []
     for name, colour, of_stand in by_stand(views):
         for view in of_stand:
@@ -103,7 +103,7 @@ class CameraModel(Procedure):
 
     names, title, devices, valid_days = (NAME,), "lens of the camera", ("camera",), 365
     plots = (plot, plot_residuals, partial(plot_views, limit_px=MAX_RMS_PX))
-    board: Board = field(default_factory=Board)
+    board: CharucoBoard = field(default_factory=CharucoBoard)
 
     def measure(self, bench: Bench, *_: CalibrationResult) -> Measured:
         found = Evaluation(name=NAME)
@@ -113,7 +113,7 @@ class CameraModel(Procedure):
 
 
 def evaluate(
-    views: Sequence[BoardView], board: Board, size: tuple[int, int], found: Evaluation | None = None
+    views: Sequence[BoardView], board: CharucoBoard, size: tuple[int, int], found: Evaluation | None = None
 ) -> Evaluation:
     """Fit the camera to ``views`` of the board.
 

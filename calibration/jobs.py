@@ -18,7 +18,7 @@ from rig.core.errors import UsageError
 if TYPE_CHECKING:
     from calibration.procedure import Procedure
     from rig.jobs.desk import Desk, Steps
-    from rig.views.charuco_board import Board
+    from rig.views.charuco_board import CharucoBoard
 
 MARKER_SHARE = 11 / 15
 """Side of a marker over that of its square, on every printed board."""
@@ -239,7 +239,7 @@ CALIBRATIONS = {
 """The calibrations by the names of their commands, in the order of the help."""
 
 
-def _board(columns: int, rows: int, square_mm: float) -> "Board":
-    from rig.views.charuco_board import Board
+def _board(columns: int, rows: int, square_mm: float) -> "CharucoBoard":
+    from rig.views.charuco_board import CharucoBoard
 
-    return Board(columns, rows, square_mm, square_mm * MARKER_SHARE)
+    return CharucoBoard(columns, rows, square_mm, square_mm * MARKER_SHARE)

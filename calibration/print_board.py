@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from rig.core.errors import UsageError, os_errors_as
 from rig.core.files import write
-from rig.views.charuco_board import Board
+from rig.views.charuco_board import CharucoBoard
 
 PNG_PX_MM: Final = 12
 """About 305 dots an inch."""
@@ -20,7 +20,7 @@ PAGE_MM: Final = (297.0, 210.0)
 RULER_MM: Final = 100.0
 
 
-def write_board(board: Board, path: Path) -> str:
+def write_board(board: CharucoBoard, path: Path) -> str:
     """Write the board to a file, and return instructions for the operator.
 
     Raises `UsageError` if the file is neither .pdf nor .png, the board is larger than the page, or the file cannot be
@@ -51,7 +51,7 @@ def write_board(board: Board, path: Path) -> str:
     )
 
 
-def _modules(board: Board) -> tuple[NDArray[np.bool_], float]:
+def _modules(board: CharucoBoard) -> tuple[NDArray[np.bool_], float]:
     """Return the black cells of the finest grid of the print, bool (rows, columns), and the side of a cell in mm.
 
     The grid is fine enough for the squares and for the bits of the markers (six per side, with the border).
@@ -77,7 +77,7 @@ def _rectangles(black: NDArray[np.bool_]) -> list[tuple[int, int, int, int]]:
     return found
 
 
-def _pdf(board: Board) -> bytes:
+def _pdf(board: CharucoBoard) -> bytes:
     """Return one A4 page in landscape, with the board in its middle and a ruler of 100 mm below it."""
     black, cell_mm = _modules(board)
     left = (PAGE_MM[0] - board.size_mm[0]) / 2
@@ -125,7 +125,7 @@ def _pdf(board: Board) -> bytes:
     return out + b"trailer << /Size %d /Root 1 0 R >>\nstartxref\n%d\n%%%%EOF\n" % (len(objects) + 1, table)
 
 
-def _png(board: Board) -> bytes:
+def _png(board: CharucoBoard) -> bytes:
     """Return the board as a PNG with its resolution (chunk pHYs) in it."""
     _, data = cv2.imencode(".png", board.picture(PNG_PX_MM))
     png = data.tobytes()

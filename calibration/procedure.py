@@ -13,12 +13,12 @@ from typing import Any, ClassVar, Self
 
 from calibration.outcome import as_json, in_force, outcome_text
 from rig.bench import Bench, calibrate
-from rig.calibrations import CalibrationResult, CalibrationStore, Estimate, Rejection, RejectionCode
+from rig.calibrations import CalibrationRejection, CalibrationResult, CalibrationStore, Estimate, RejectionCode
 from rig.calibrations.rejection import rejection
 from rig.charts.xy import Chart
 from rig.core.errors import LimitExceeded, UsageError
 from rig.events.events import Event
-from rig.jobs.desk import Desk, Progress, Remark, Result, Steps
+from rig.jobs.desk import Desk, JobResult, Progress, Remark, Steps
 from rig.jobs.regions import warn_of_other_regions
 from rig.motion.move import Move
 from rig.motion.turntable import Turntable
@@ -50,7 +50,7 @@ class Evaluation:
     proposed: dict[str, Any] = field(default_factory=dict)
     """Settings to apply if the calibration passes."""
     evidence: dict[str, Any] = field(default_factory=dict)
-    rejections: list[Rejection] = field(default_factory=list)
+    rejections: list[CalibrationRejection] = field(default_factory=list)
 
     @property
     def passed(self) -> bool:
@@ -180,7 +180,7 @@ def _measured(desk: Desk, bench: Bench, store: CalibrationStore, procedure: Proc
                 path = store.add(step)
                 then = ", in force from now on." if step.passed else "; earlier results stay in force."
                 outcome = {"event": "calibrated", "passed": step.passed, "id": step.id, "file": str(path)}
-                yield Result({**outcome, **as_json(step)}, f"{outcome_text(step)}\nStored in {path}{then}")
+                yield JobResult({**outcome, **as_json(step)}, f"{outcome_text(step)}\nStored in {path}{then}")
                 if not step.passed:
                     return False
             elif isinstance(step, Ask):

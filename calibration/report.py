@@ -35,7 +35,7 @@ _HIDDEN: Final = ("model_number", "who_am_i", "gyro_noise_dps_rthz")
 """How the values of a device are written, and values that its model implies."""
 
 
-class _Shown(NamedTuple):
+class _ShownResult(NamedTuple):
     result: CalibrationResult
     good: bool
     status: str
@@ -102,10 +102,10 @@ def write_page(
         write(path, page.encode())
 
 
-def _shown(calibration: BenchCalibration, history: Sequence[CalibrationResult]) -> _Shown:
+def _shown(calibration: BenchCalibration, history: Sequence[CalibrationResult]) -> _ShownResult:
     result = calibration.result
     latest = [stored for stored in history if stored.name == result.name][-1]
-    return _Shown(
+    return _ShownResult(
         result,
         calibration.status is CalibrationStatus.IN_FORCE,
         str(calibration.status),

@@ -32,7 +32,7 @@ from rig.bench import Bench
 from rig.calibrations import CalibrationResult, Estimate, RejectionCode
 from rig.charts.xy import LIMIT, MODEL, Axis, Chart, Series
 from rig.jobs.desk import Progress
-from rig.views.charuco_board import Board
+from rig.views.charuco_board import CharucoBoard
 
 NAME = "table.axis"
 
@@ -136,7 +136,7 @@ class TableAxis(Procedure):
 
     names, title, devices, valid_days = (NAME,), "axis of the table", ("camera", "servo"), 365
     requires, plots = (camera_model.NAME,), (plot, partial(plot_views, limit_px=MAX_RMS_PX))
-    board: Board = field(default_factory=Board)
+    board: CharucoBoard = field(default_factory=CharucoBoard)
     space: ObjectSpace = field(default_factory=ObjectSpace)
 
     def measure(self, bench: Bench, *required: CalibrationResult) -> Measured:
@@ -159,7 +159,7 @@ class TableAxis(Procedure):
 
 def evaluate(
     views: Sequence[BoardView],
-    board: Board,
+    board: CharucoBoard,
     intrinsics: CalibrationResult,
     space: ObjectSpace = ObjectSpace(),
     found: Evaluation | None = None,
@@ -210,7 +210,7 @@ class _Axis:
     def __init__(
         self,
         views: Sequence[BoardView],
-        board: Board,
+        board: CharucoBoard,
         intrinsics: CalibrationResult,
         poses: Sequence[tuple[Floats, Floats]],
     ) -> None:
@@ -324,7 +324,7 @@ class _Axis:
         return np.concatenate([corners, CORNER_PX * (p[6:FIRST_POSE] - self._known) / self._known_sigma])
 
 
-def _pose(board: Board, view: BoardView, matrix: Floats, distortion: Sequence[float]) -> tuple[Floats, Floats]:
+def _pose(board: CharucoBoard, view: BoardView, matrix: Floats, distortion: Sequence[float]) -> tuple[Floats, Floats]:
     """Return rotation vector and translation (mm) of the board in the camera's frame."""
     _, rotation, translation = cv2.solvePnP(points(board, view), view.corners_px, matrix, np.array(distortion))
     return np.asarray(rotation, dtype=np.float64), np.asarray(translation, dtype=np.float64)
@@ -363,7 +363,7 @@ def _from_lens(estimates: Mapping[str, Estimate]) -> float:
     return float(np.linalg.norm([estimates[name].value for name in ("x", "y", "z")]))
 
 
-def _check(found: Evaluation, board: Board, space: ObjectSpace) -> None:
+def _check(found: Evaluation, board: CharucoBoard, space: ObjectSpace) -> None:
     """Reject a poor fit, a wobbling axis, and a board whose size contradicts the measured distance."""
     found.reject_if(
         (found.residual or 0.0) > MAX_RMS_PX, RejectionCode.CIRCLES_OFF, rms_px=found.residual, limit_px=MAX_RMS_PX

@@ -183,7 +183,9 @@ def module(table: Table) -> str:
             )
     for direction, title in (("host", "Request"), ("head", "Answer")):
         names = [camel(m["name"]) for m in table["message"] if m["from"] == direction]
-        lines += ["", "", f"{title} = {' | '.join(names)}"][direction == "head" :]
+        union = " | ".join(names)
+        one = f"{title} = {union}"  # laid out as ruff does
+        lines += ["", "", *([one] if len(one) <= 120 else [f"{title} = (", f"    {union}", ")"])][direction == "head" :]
     lines += ["", "MESSAGES: dict[int, type[Request] | type[Answer]] = {"]
     lines += ["    message.ID: message for message in (*get_args(Request), *get_args(Answer))", "}"]
     lines += ["", "REPLIES: dict[type[Request], type[Answer]] = {"]

@@ -28,7 +28,7 @@ from sim.faults import Fault, Faults
 from sim.faults.injector import Occurrence
 from sim.faults.schedule import read_faults
 from sim.noise import NoiseModel
-from sim.objects.photographs import PhotographedObject, photographs
+from sim.objects.photographs import PhotographsOnTable, photographs
 from sim.objects.shelf import shelf
 from sim.optics import Optics
 from sim.world import SimObject, World
@@ -149,7 +149,7 @@ class ShelfOperator:
 
     def clear(self) -> bool:
         """Clear the table and return whether that is possible: a photograph always shows its own table."""
-        if any(isinstance(thing, PhotographedObject) for thing in self.objects.values()):
+        if any(isinstance(thing, PhotographsOnTable) for thing in self.objects.values()):
             return False
         self.world.put(None)
         return True

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.views.charuco_board import Board
+from rig.views.charuco_board import CharucoBoard
 from sim.objects.projection import HEIGHT, WIDTH, Floats, Image
 from sim.optics import SUPERSAMPLING, Optics
 from sim.world import SimObject
@@ -37,7 +37,7 @@ class BoardOnPlatter:
         Largest rotation about the vertical after the table has moved, for a loose stand.
     """
 
-    board: Board = field(default_factory=Board)
+    board: CharucoBoard = field(default_factory=CharucoBoard)
     optics: Optics = field(default_factory=Optics)
     tilt_deg: float = 15.0
     swing_deg: float = 0.0
@@ -129,7 +129,7 @@ class BoardOnPlatter:
 
 
 @lru_cache(maxsize=4)
-def _texture(board: Board) -> NDArray[np.uint8]:
+def _texture(board: CharucoBoard) -> NDArray[np.uint8]:
     grey = board.picture(TEXTURE_PX_MM)
     paper = np.clip(grey.astype(np.float32) * (215 - 25) / 255 + 25, 0, 255).astype(np.uint8)
     return np.dstack([paper, np.full_like(paper, 255)])
@@ -154,7 +154,7 @@ def calibration_targets(optics: Optics) -> dict[str, SimObject]:
 
 def boards(optics: Optics) -> dict[str, BoardOnPlatter]:
     """Return the board in each position that calibrations need, by name."""
-    layout = Board()
+    layout = CharucoBoard()
     return {
         "calibration-board upright": BoardOnPlatter(layout, optics, tilt_deg=4.0),
         "calibration-board back": BoardOnPlatter(layout, optics, tilt_deg=31.0, centre_mm=(0.0, 10.0, 70.0)),

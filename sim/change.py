@@ -8,8 +8,7 @@ from typing import Self
 import cv2
 import numpy as np
 
-from hbr.drawing.bench import HARD, Bench, Visit
-from hbr.drawing.bench import Change as HardChange
+from hbr.drawing.bench import HARD, DrawnBench, Visit, VisitChange
 from hbr.drawing.noise import GN_STANDARD_DEVIATION, GN_VARIANCE, MB_LENGTH_PX, Noise
 from rig.core.errors import UsageError
 from sim.devices import SimDevices
@@ -78,8 +77,8 @@ class Change:
         if not self.hard:
             return
         factors = {f.name: self.hard * getattr(HARD, f.name) for f in fields(HARD)} | {"noise": 0.0}
-        bench = Bench.drawn(devices.world.rng("hard bench"))
-        devices.camera.visit = Visit(bench, HardChange(**factors), rng)  # the sensor adds the noise
+        bench = DrawnBench.drawn(devices.world.rng("hard bench"))
+        devices.camera.visit = Visit(bench, VisitChange(**factors), rng)  # the sensor adds the noise
 
     def apply_to(self, devices: SimDevices) -> None:
         """Change the camera's settings and the surroundings from now on."""

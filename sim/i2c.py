@@ -63,7 +63,7 @@ def acknowledging(
 
 
 @dataclass(frozen=True, slots=True)
-class Message:
+class I2cMessage:
     """The bytes on the wire between a start and the next start or stop; ``time_ns`` is its end."""
 
     time_ns: int
@@ -97,7 +97,7 @@ class SimI2cBus(AbstractContextManager["SimI2cBus"]):
         self.kernel_drivers: set[int] = set()
         self.errors: dict[int, int] = {}
         self.nack_conditions: list[Callable[[int], bool]] = []
-        self.wire: deque[Message] = deque(maxlen=1000)
+        self.wire: deque[I2cMessage] = deque(maxlen=1000)
         self._file = RoutedFile(self)
         self.path = self._file.path
 
@@ -261,7 +261,7 @@ class SimI2cBus(AbstractContextManager["SimI2cBus"]):
         device = self._start(address, reading=False)
         self._pass(len(data))
         acknowledged = device.write(data)
-        self.wire.append(Message(self._clock.now_ns(), address, False, data[:acknowledged]))
+        self.wire.append(I2cMessage(self._clock.now_ns(), address, False, data[:acknowledged]))
         if acknowledged < len(data):
             raise _os_error(EREMOTEIO)
 
@@ -279,7 +279,7 @@ class SimI2cBus(AbstractContextManager["SimI2cBus"]):
         self._pass(moved)
         if moved < count:
             raise _os_error(EIO)
-        self.wire.append(Message(self._clock.now_ns(), address, True, data))
+        self.wire.append(I2cMessage(self._clock.now_ns(), address, True, data))
         return data
 
     def _pass(self, byte_count: int) -> None:

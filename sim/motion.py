@@ -14,7 +14,7 @@ Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
-class Trajectory:
+class PiecewiseMotion:
     """Motion with piecewise constant acceleration.
 
     Attributes
@@ -57,7 +57,9 @@ class Trajectory:
         return x + v * tau + 0.5 * a * (tau * tau), v + a * tau, a
 
 
-def _from_pieces(start_s: float, position: float, velocity: float, pieces: list[tuple[float, float]]) -> Trajectory:
+def _from_pieces(
+    start_s: float, position: float, velocity: float, pieces: list[tuple[float, float]]
+) -> PiecewiseMotion:
     """Chain (duration, acceleration) pieces; one that reverses is cut at its standstill, so that each is monotone."""
     rows: list[tuple[float, float, float, float]] = []
     t, x, v = start_s, position, velocity
@@ -73,17 +75,17 @@ def _from_pieces(start_s: float, position: float, velocity: float, pieces: list[
         t, x, v = t + duration, x + v * duration + 0.5 * a * duration * duration, v + a * duration
     rows.append((t, x, v, 0.0))
     columns = np.array(rows, dtype=np.float64).T
-    return Trajectory(*(np.ascontiguousarray(c) for c in columns))
+    return PiecewiseMotion(*(np.ascontiguousarray(c) for c in columns))
 
 
-def rest(start_s: float, position_deg: float) -> Trajectory:
+def rest(start_s: float, position_deg: float) -> PiecewiseMotion:
     """Return a standstill."""
     return _from_pieces(start_s, position_deg, 0.0, [])
 
 
 def to_position(
     start_s: float, position_deg: float, velocity_dps: float, goal_deg: float, v_max: float, a_max: float
-) -> Trajectory:
+) -> PiecewiseMotion:
     """Return the trapezoid (or triangle) profile from a moving start to a standstill at ``goal_deg``.
 
     ``v_max`` in °/s and ``a_max`` in °/s², both positive. A start that is too fast to stop in time overshoots and
@@ -108,7 +110,9 @@ def to_position(
     return path
 
 
-def to_velocity(start_s: float, position_deg: float, velocity_dps: float, goal_dps: float, a_max: float) -> Trajectory:
+def to_velocity(
+    start_s: float, position_deg: float, velocity_dps: float, goal_dps: float, a_max: float
+) -> PiecewiseMotion:
     """Return a ramp from ``velocity_dps`` to ``goal_dps``, followed by that speed without end."""
     change = goal_dps - velocity_dps
     path = _from_pieces(
@@ -118,7 +122,7 @@ def to_velocity(start_s: float, position_deg: float, velocity_dps: float, goal_d
     return path
 
 
-def dragged(path: Trajectory, start_deg: float, half_deg: float, offset_deg: float) -> Trajectory:
+def dragged(path: PiecewiseMotion, start_deg: float, half_deg: float, offset_deg: float) -> PiecewiseMotion:
     """Return the motion of a shaft that friction and a steady load hold behind its commanded ``path``.
 
     A position controller without an integral part pushes in proportion to its error. So the shaft stands until the
@@ -156,7 +160,7 @@ def dragged(path: Trajectory, start_deg: float, half_deg: float, offset_deg: flo
         rows.append((t + wait, begun + offset_deg - direction * half_deg, v + a * wait, a))
         if duration < float("inf"):
             shaft = x + v * duration + 0.5 * a * duration * duration + offset_deg - direction * half_deg
-    return Trajectory(*(np.ascontiguousarray(c) for c in np.array(rows, dtype=np.float64).T))
+    return PiecewiseMotion(*(np.ascontiguousarray(c) for c in np.array(rows, dtype=np.float64).T))
 
 
 class Ripple:
@@ -202,7 +206,7 @@ class Platter:
         self._platter = np.zeros(1)
         self._shake = np.zeros((1, 2))  # deflection and its rate at each knot
 
-    def follow(self, path: Trajectory, previous: "Platter | None") -> None:
+    def follow(self, path: PiecewiseMotion, previous: "Platter | None") -> None:
         """Use ``path`` as the shaft's motion; at its start the platter is where ``previous`` leaves it."""
         if previous is None:
             platter, shake = float(path.position_deg[0]), (0.0, 0.0)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sim.clock import VirtualClock
-from sim.motion import Floats, Platter, Ripple, Trajectory, rest
+from sim.motion import Floats, PiecewiseMotion, Platter, Ripple, rest
 from sim.noise import NoiseModel
 
 HISTORY_S = 12.0  # time for which the past is stored: longer than the IMU's FIFO and the camera's buffers
@@ -89,7 +89,7 @@ class World:
 
     # -- the table ------------------------------------------------------------------------------------------------
 
-    def drive(self, shaft: Trajectory) -> None:
+    def drive(self, shaft: PiecewiseMotion) -> None:
         """Make the servo's shaft follow ``shaft`` from now on."""
         now_ns = self.clock.now_ns()
         standing = self.shaft()[1] == 0

@@ -236,8 +236,8 @@ static uint8_t length_of(uint8_t id) {
     static const uint8_t sizes[] = {
         [MESSAGE_HELLO] = SIZE_HELLO, [MESSAGE_HEARTBEAT] = SIZE_HEARTBEAT,   [MESSAGE_SHUTDOWN] = SIZE_SHUTDOWN,
         [MESSAGE_LIGHT] = SIZE_LIGHT, [MESSAGE_RELAY] = SIZE_RELAY, [MESSAGE_TRIGGER] = SIZE_TRIGGER,
-        [MESSAGE_IMU] = SIZE_IMU,     [MESSAGE_READ_COUNTERS] = SIZE_READ_COUNTERS, [MESSAGE_ACKNOWLEDGE] = SIZE_ACKNOWLEDGE,
-        [MESSAGE_STREAM] = SIZE_STREAM, [MESSAGE_SET_SERIAL] = SIZE_SET_SERIAL,
+        [MESSAGE_SET_IMU] = SIZE_SET_IMU, [MESSAGE_READ_COUNTERS] = SIZE_READ_COUNTERS,
+        [MESSAGE_ACKNOWLEDGE] = SIZE_ACKNOWLEDGE, [MESSAGE_STREAM] = SIZE_STREAM, [MESSAGE_SET_SERIAL] = SIZE_SET_SERIAL,
     };
     return id >= MESSAGE_HELLO && id < sizeof sizes ? sizes[id] : UINT8_MAX;
 }
@@ -279,9 +279,9 @@ static uint8_t execute(struct head *head, uint8_t id, const uint8_t *body, uint8
             *reply = MESSAGE_TRIGGERED;
             answer = SIZE_TRIGGERED;
             break;
-        case MESSAGE_IMU:
-            rejection = imu_setup(&head->imu, body[IMU_MODEL], body[IMU_ADDRESS], body[IMU_DIVIDER], body[IMU_FILTER],
-                                body[IMU_RANGE]);
+        case MESSAGE_SET_IMU:
+            rejection = imu_setup(&head->imu, body[SET_IMU_MODEL], body[SET_IMU_ADDRESS], body[SET_IMU_DIVIDER],
+                                body[SET_IMU_FILTER], body[SET_IMU_RANGE]);
             break;
         case MESSAGE_STREAM:
             rejection = body[STREAM_ON] > 1 ? REJECTION_OUT_OF_RANGE : REJECTION_NONE;

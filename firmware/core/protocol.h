@@ -98,8 +98,8 @@
 #define SIZE_RELAY 1
 #define MESSAGE_TRIGGER 0x07
 #define SIZE_TRIGGER 2
-#define MESSAGE_IMU 0x08
-#define SIZE_IMU 5
+#define MESSAGE_SET_IMU 0x08
+#define SIZE_SET_IMU 5
 #define MESSAGE_STREAM 0x09
 #define SIZE_STREAM 1
 #define MESSAGE_READ_COUNTERS 0x0A
@@ -303,11 +303,11 @@ static inline uint8_t put_status_changed(uint8_t *out, const struct status_chang
 #define LIGHT_LEVEL 0
 #define RELAY_CLOSED 0
 #define TRIGGER_WIDTH_US 0
-#define IMU_MODEL 0
-#define IMU_ADDRESS 1
-#define IMU_DIVIDER 2
-#define IMU_FILTER 3
-#define IMU_RANGE 4
+#define SET_IMU_MODEL 0
+#define SET_IMU_ADDRESS 1
+#define SET_IMU_DIVIDER 2
+#define SET_IMU_FILTER 3
+#define SET_IMU_RANGE 4
 #define STREAM_ON 0
 #define SET_SERIAL_SERIAL 0
 

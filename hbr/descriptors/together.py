@@ -15,8 +15,8 @@ import numpy as np
 from hbr.core.arrays import ImageArray, LevelArray
 from hbr.descriptors.base import Descriptor
 from hbr.descriptors.registry import descriptor as descriptor_of
-from hbr.segmentation import Method, Segmentation, hypotheses
-from hbr.segmentation.background import Background, Frame, shrunk
+from hbr.segmentation import BoxMethod, Segmentation, hypotheses
+from hbr.segmentation.background import Background, SegmentedFrame, shrunk
 from hbr.segmentation.cut_out import Found
 from hbr.segmentation.segment import MOST_HYPOTHESES, without_background
 
@@ -77,9 +77,9 @@ def median(images: Sequence[ImageArray]) -> ImageArray:
 
 
 #: Methods whose segmentations are as good as those of enrolled views.
-_EXACT: Final = (Method.PLAIN_BACKGROUND, Method.EMPTY_TABLE)
+_EXACT: Final = (BoxMethod.PLAIN_BACKGROUND, BoxMethod.EMPTY_TABLE)
 #: Methods that use a known background.
-RELIABLE: Final = (*_EXACT, Method.ROTATION)
+RELIABLE: Final = (*_EXACT, BoxMethod.ROTATION)
 
 
 def like_enrollment(method: str, same_bench: bool | None) -> bool | None:
@@ -88,7 +88,7 @@ def like_enrollment(method: str, same_bench: bool | None) -> bool | None:
     Parameters
     ----------
     method : str
-        A `Method`. A segmentation by rotation changes a description as much as another bench does.
+        A `BoxMethod`. A segmentation by rotation changes a description as much as another bench does.
     same_bench : bool or None
         Whether the bench is that of the enrollment; None: not known.
     """
@@ -133,7 +133,7 @@ class ViewsTogether:
         self._descriptor = descriptor_of(descriptor) if isinstance(descriptor, str) else descriptor
         self._table = Background(empty_table) if isinstance(empty_table, np.ndarray) else empty_table
         self._several = several
-        self._frames: list[Frame | None] = []
+        self._frames: list[SegmentedFrame | None] = []
         self._learned = LearnedBackground()
         self.segmentations: list[tuple[Segmentation, ...]] = []
         self.levels: list[LevelArray] = []
@@ -157,7 +157,7 @@ class ViewsTogether:
 
     def learn(self, image_bgr: ImageArray) -> None:
         """Add a view that `revise` segments and describes together with the others; errors as for `add`."""
-        frame = Frame(image_bgr)
+        frame = SegmentedFrame(image_bgr)
         self._learned.add(image_bgr, frame.small)
         self._frames.append(frame)
         self.segmentations.append(())
@@ -189,7 +189,7 @@ class ViewsTogether:
         self.segmentations[view] = found
         self.levels[view] = np.stack(levels)
 
-    def _without_background(self, view: int, frame: Frame) -> tuple[Segmentation | Found, ...]:
+    def _without_background(self, view: int, frame: SegmentedFrame) -> tuple[Segmentation | Found, ...]:
         """Return the segmentations of a view that no other view changes."""
         known = self.segmentations[view]
-        return known if known and known[0].method is Method.GUESS else without_background(frame)
+        return known if known and known[0].method is BoxMethod.GUESS else without_background(frame)

@@ -1,6 +1,6 @@
 """Drawn benches after a change of table, wall, light, lens, placement and holder, all at once.
 
-A `Bench` is a wall, a table, a platter and clutter. A `Visit` is one search on it: light, camera and placement are
+A `DrawnBench` is a wall, a table, a platter and clutter. A `Visit` is one search on it: light, camera and placement are
 drawn once and hold for all its views. The table rotates between the views: the object and the platter's pattern rotate
 with it, everything else stands still. Pictures are 320 x 240.
 """
@@ -31,7 +31,7 @@ _GRAINS: Final = (3, 6, 12, 24, 48, 96)
 _ELEVATION_DEG: Final = 15.0
 
 
-class Frame(NamedTuple):
+class DrawnFrame(NamedTuple):
     """A frame with the object's visible pixels, bool (240, 320)."""
 
     image: ImageArray
@@ -39,7 +39,7 @@ class Frame(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Change:
+class VisitChange:
     """Largest changes of a visit.
 
     Attributes
@@ -80,18 +80,20 @@ class Change:
     noise: float = 1.5
 
 
-ENROLLMENT: Final = Change()
+ENROLLMENT: Final = VisitChange()
 # the same bench after some time: the same camera and place, slightly other light
-MILD: Final = Change(gain=0.1, colour=0.04, gradient=0.1, placement=0.03, scale=0.03, shadow=0.4, specular=30, noise=2)
+MILD: Final = VisitChange(
+    gain=0.1, colour=0.04, gradient=0.1, placement=0.03, scale=0.03, shadow=0.4, specular=30, noise=2
+)
 # another bench: another camera and lamp, and another hand that places the object
-HARD: Final = Change(
+HARD: Final = VisitChange(
     gain=0.3, colour=0.2, gradient=0.3, gamma=0.2, placement=0.08, scale=0.15, elevation_deg=6.0, shadow=0.6,
     specular=140.0, defocus_px=1.6, holder=0.6, noise=3.0,
 )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
-class Bench:
+class DrawnBench:
     """A bench without an object.
 
     Attributes
@@ -106,7 +108,7 @@ class Bench:
     top: Picture
 
     @classmethod
-    def drawn(cls, rng: np.random.Generator, *, textured: float = 1.0, clutter: int = 6) -> "Bench":
+    def drawn(cls, rng: np.random.Generator, *, textured: float = 1.0, clutter: int = 6) -> "DrawnBench":
         """Draw a bench; ``textured`` is the contrast of its patterns, ``clutter`` the largest number of objects."""
         horizon = int(rng.integers(110, 175))
         still = _surface(rng, textured)
@@ -162,7 +164,7 @@ class Visit:
         Equal states give equal visits.
     """
 
-    def __init__(self, bench: Bench, change: Change, rng: np.random.Generator) -> None:
+    def __init__(self, bench: DrawnBench, change: VisitChange, rng: np.random.Generator) -> None:
         self._bench, self._change, self._rng = bench, change, rng
         self._scale = 1 + rng.uniform(-1, 1) * change.scale
         tilt_deg = _ELEVATION_DEG + rng.uniform(-1, 1) * change.elevation_deg
@@ -194,7 +196,7 @@ class Visit:
         *,
         foot_px: tuple[float, float] | None = None,
         px_per_px: float | None = None,
-    ) -> Frame:
+    ) -> DrawnFrame:
         """Return the frame of an object at a table angle.
 
         Parameters
@@ -215,7 +217,7 @@ class Visit:
         picture = ground * (1 - cover[:, :, None]) + seen * cover[:, :, None]
         draw_highlights(picture, cover, self._change.specular, self._rng)
         image, hidden = self._photographed(picture, False)
-        return Frame(image, (cover > 0.5) & ~hidden)
+        return DrawnFrame(image, (cover > 0.5) & ~hidden)
 
     def _placed(
         self,

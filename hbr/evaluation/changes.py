@@ -20,7 +20,7 @@ from hbr.dense.local_difference import LocalView
 from hbr.dense.session import DenseSession, answered, near
 from hbr.dense.stopping import Outcome, StoppingRule
 from hbr.descriptors.together import ViewsTogether
-from hbr.drawing.bench import ENROLLMENT, HARD, MILD, Bench, Visit
+from hbr.drawing.bench import ENROLLMENT, HARD, MILD, DrawnBench, Visit
 from hbr.evaluation.experiment import Experiment, Kind
 from hbr.evaluation.photographs import Dataset, PhotographedObject, object_mask, read_photograph, without_specks
 from hbr.evaluation.protocol import generator
@@ -283,13 +283,13 @@ def _enrollment_visit() -> Visit:
 
 
 @cache
-def _enrollment_bench() -> Bench:
-    return Bench.drawn(np.random.default_rng(7), textured=0.35, clutter=3)
+def _enrollment_bench() -> DrawnBench:
+    return DrawnBench.drawn(np.random.default_rng(7), textured=0.35, clutter=3)
 
 
 @cache
-def _benches() -> tuple[Bench, ...]:
-    return tuple(Bench.drawn(np.random.default_rng(1000 + k)) for k in range(_BENCHES))
+def _benches() -> tuple[DrawnBench, ...]:
+    return tuple(DrawnBench.drawn(np.random.default_rng(1000 + k)) for k in range(_BENCHES))
 
 
 def _enroll(experiment: Experiment, dataset: Dataset, j: int) -> tuple[LevelArray, NDArray[np.float64]] | None:

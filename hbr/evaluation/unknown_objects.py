@@ -105,7 +105,7 @@ def _leaders(runs: Runs, objects: BoolArray, trials: slice) -> Leaders:
     return Leaders(*(part.reshape(-1, part.shape[-1]) for part in parts))
 
 
-class _Model(NamedTuple):
+class _FittedModel(NamedTuple):
     """All views, and for each draw its protocol, and the fitted rules by nominal rate."""
 
     views: Views
@@ -113,12 +113,12 @@ class _Model(NamedTuple):
     rules: dict[float, list[StoppingRule]]
 
 
-def _model(experiment: Experiment, dataset: Dataset, enrolled: list[Any]) -> _Model:
+def _model(experiment: Experiment, dataset: Dataset, enrolled: list[Any]) -> _FittedModel:
     views = all_views(experiment, dataset, enrolled)
     protocols = left_out(experiment.protocol, views.object_names, experiment.left_out, _DRAWS)
     searches = [_searches(views, protocol) for protocol in protocols]
     rules = {rate: [rule_from_searches(one, false_reject=rate) for one in searches] for rate in _NOMINAL}
-    return _Model(views, protocols, rules)
+    return _FittedModel(views, protocols, rules)
 
 
 def _searches(views: Views, protocol: Protocol) -> LeaveOneOut:
@@ -130,13 +130,15 @@ def _searches(views: Views, protocol: Protocol) -> LeaveOneOut:
     return searches
 
 
-def _search(experiment: Experiment, dataset: Dataset, model: _Model, _now_ns: Callable[[], int], j: int) -> list[Runs]:
+def _search(
+    experiment: Experiment, dataset: Dataset, model: _FittedModel, _now_ns: Callable[[], int], j: int
+) -> list[Runs]:
     queries = query_levels(dataset, j, experiment.condition, experiment.protocol.seed).levels
     draws = zip(model.protocols, model.rules[_NOMINAL[0]], strict=True)
     return [run_object(j, queries, model.views, (METHODS["dense"],), one, rule=rule) for one, rule in draws]
 
 
-def _results(experiment: Experiment, dataset: Dataset, model: _Model, found: list[list[Runs]]) -> dict[str, Any]:
+def _results(experiment: Experiment, dataset: Dataset, model: _FittedModel, found: list[list[Runs]]) -> dict[str, Any]:
     names = np.array(model.views.object_names)
     parts = [
         (Runs.concatenate([runs[draw] for runs in found]), np.isin(names, protocol.absent))

@@ -42,7 +42,7 @@ class Symmetry:
 
 
 @dataclass(frozen=True, slots=True)
-class SimilarObject:
+class ConfusableObject:
     """An object that another one can be confused with, seen from some sides.
 
     Attributes
@@ -112,7 +112,7 @@ def symmetry(views: Views, object_index: int) -> Symmetry | None:
     return Symmetry(360.0, neighbours, float(mean[int(mean.argmin()) :].max()))
 
 
-def similar_objects(views: Views, object_index: int, most: int) -> tuple[SimilarObject, ...]:
+def similar_objects(views: Views, object_index: int, most: int) -> tuple[ConfusableObject, ...]:
     """Find the objects that an object can be confused with, and from which sides.
 
     A view looks like another object if one of that object's views is as similar to it as the more similar one of its
@@ -120,7 +120,7 @@ def similar_objects(views: Views, object_index: int, most: int) -> tuple[Similar
 
     Returns
     -------
-    tuple of SimilarObject
+    tuple of ConfusableObject
         At most ``most``, the object with the largest share first. Empty if the object has fewer than three views.
     """
     descriptors, azimuth_deg = _ring(views, object_index)
@@ -139,7 +139,7 @@ def similar_objects(views: Views, object_index: int, most: int) -> tuple[Similar
     for column in np.lexsort((others, -similarity, -share))[: min(most, int((share > 0).sum()))].tolist():
         theirs, their_azimuth_deg = _ring(views, int(others[column]))
         unlike = kind.similarity(theirs, descriptors).max(axis=1) < _enough(kind, theirs)
-        one = SimilarObject(
+        one = ConfusableObject(
             object_index=int(others[column]),
             arcs_deg=_arcs(azimuth_deg, confused[:, column]),
             differs_deg=_arcs(azimuth_deg, ~confused[:, column]),

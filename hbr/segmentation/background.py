@@ -52,7 +52,7 @@ _BACKDROP_LEVEL: Final = 128.0  # the middle of the range of grey levels
 _MAX_EXPOSURE: Final = np.log(1.7)  # with more, the backdrop is dark or bright, and not badly exposed (decision 0012)
 
 
-class Method(StrEnum):
+class BoxMethod(StrEnum):
     """The methods of finding the object's box."""
 
     EMPTY_TABLE = "empty-table"
@@ -448,7 +448,7 @@ def _smooth(corners: list[tuple[slice, slice]], away: cv2.typing.MatLike, noise:
     return difference <= _SMOOTH + _GRAIN * grain
 
 
-class Frame:
+class SegmentedFrame:
     """A frame, uint8 (H, W, 3), and its small image.
 
     Raises `TypeError`, `ValueError`: the array is no such image.
@@ -461,9 +461,9 @@ class Frame:
         self._compared: tuple[Background, Difference] | None = None
 
     @classmethod
-    def of(cls, image_bgr: "ImageArray | Frame") -> "Frame":
+    def of(cls, image_bgr: "ImageArray | SegmentedFrame") -> "SegmentedFrame":
         """Return the frame of an image, or the frame itself."""
-        return image_bgr if isinstance(image_bgr, Frame) else cls(image_bgr)
+        return image_bgr if isinstance(image_bgr, SegmentedFrame) else cls(image_bgr)
 
     def difference(self, background: Background) -> Difference:
         """Return the difference from a background. The last one is cached for further segmentations of the frame."""

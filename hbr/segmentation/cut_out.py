@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from hbr.core.arrays import ImageArray
 from hbr.kernels import calls
-from hbr.segmentation.background import Illumination, Issue, Method
+from hbr.segmentation.background import BoxMethod, Illumination, Issue
 
 #: Side of the square crop around an object.
 CROP_PX: Final = 160
@@ -53,7 +53,7 @@ class Segmentation:
     box: Box | None
     gains: tuple[float, float, float] | None
     agreement: float | None
-    method: Method
+    method: BoxMethod
     issues: tuple[Issue, ...] = ()
     correction: Illumination | None = field(default=None, repr=False)
     silhouette: NDArray[np.bool_] | None = field(default=None, repr=False)
@@ -104,7 +104,7 @@ class Found:
     silhouette: NDArray[np.bool_] | None
     correction: Illumination | None
     agreement: float | None
-    method: Method
+    method: BoxMethod
     issues: tuple[Issue, ...]
 
     @cached_property

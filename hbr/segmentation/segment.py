@@ -14,7 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hbr.core.arrays import ImageArray
-from hbr.segmentation.background import Background, Difference, Frame, Illumination, Issue, IssueCode, Mask, Method
+from hbr.segmentation.background import (
+    Background,
+    BoxMethod,
+    Difference,
+    Illumination,
+    Issue,
+    IssueCode,
+    Mask,
+    SegmentedFrame,
+)
 from hbr.segmentation.cut_out import Box, Found, Segmentation
 from hbr.segmentation.silhouette import guess_object, shares, silhouette
 
@@ -30,7 +39,7 @@ MOST_HYPOTHESES: Final = 5
 
 
 def segment(
-    image_bgr: ImageArray | Frame,
+    image_bgr: ImageArray | SegmentedFrame,
     *,
     empty_table: Background | ImageArray | None = None,
 ) -> Segmentation:
@@ -47,7 +56,7 @@ def segment(
     Parameters
     ----------
     image_bgr : uint8 array (H, W, 3)
-        The frame; or a `hbr.segmentation.background.Frame`, if the frame is segmented more than once.
+        The frame; or a `hbr.segmentation.background.SegmentedFrame`, if the frame is segmented more than once.
     empty_table : Background, or uint8 array (H, W, 3), optional
         The empty-table image. For many frames, pass a `Background`: it is prepared only once.
 
@@ -61,12 +70,14 @@ def segment(
     TypeError, ValueError
         The frame is no such image, or the empty-table image has another size.
     """
-    frame = Frame.of(image_bgr)
+    frame = SegmentedFrame.of(image_bgr)
     background, difference = compared(frame, empty_table)
     return _found(frame, background, difference).cut_out()
 
 
-def compared(frame: Frame, empty_table: Background | ImageArray | None) -> tuple[Background | None, Difference | None]:
+def compared(
+    frame: SegmentedFrame, empty_table: Background | ImageArray | None
+) -> tuple[Background | None, Difference | None]:
     """Return the prepared empty-table image, and the frame's difference from it."""
     if empty_table is None:
         return None, None
@@ -80,11 +91,11 @@ def compared(frame: Frame, empty_table: Background | ImageArray | None) -> tuple
     return background, frame.difference(background)
 
 
-def _found(frame: Frame, background: Background | None, difference: Difference | None) -> Found:
+def _found(frame: SegmentedFrame, background: Background | None, difference: Difference | None) -> Found:
     issues: list[Issue] = []
     correction: Illumination | None = None
     found: Mask | None = None
-    method = Method.EMPTY_TABLE
+    method = BoxMethod.EMPTY_TABLE
     if background is not None and difference is not None:
         if difference.reliable:
             found = silhouette(difference.certain, difference.possible, framed=True)
@@ -95,25 +106,25 @@ def _found(frame: Frame, background: Background | None, difference: Difference |
             issues.append(Issue(IssueCode.TABLE_DIFFERS, {"agreement": round(difference.agreement, 3)}))
     if found is None:
         if frame.differs is not None:
-            method = Method.PLAIN_BACKGROUND
+            method = BoxMethod.PLAIN_BACKGROUND
             found = silhouette(frame.differs, framed=False)
             if found is None:
                 issues.append(Issue(IssueCode.NO_DIFFERENCE))
         else:
-            method = Method.GUESS
+            method = BoxMethod.GUESS
             issues.append(Issue(IssueCode.BACKGROUND_NOT_PLAIN))
             cut = guess_object(frame.small)
             found = None if cut is None else silhouette(cut, framed=False)
             if found is None:
                 issues.append(Issue(IssueCode.NO_GUESS))
     if found is None:
-        method = Method.NONE
+        method = BoxMethod.NONE
     agreement = None if difference is None else difference.agreement
     return Found(frame.image, found, correction, agreement, method, tuple(issues))
 
 
 def hypotheses(
-    image_bgr: ImageArray | Frame,
+    image_bgr: ImageArray | SegmentedFrame,
     *,
     empty_table: Background | ImageArray | None = None,
     learned: Background | None = None,
@@ -128,7 +139,7 @@ def hypotheses(
     Parameters
     ----------
     image_bgr, empty_table
-        As for `segment`; or a `hbr.segmentation.background.Frame`, if the frame is segmented more than once.
+        As for `segment`; or a `hbr.segmentation.background.SegmentedFrame`, if the frame is segmented more than once.
     learned : Background, optional
         The background that the other views of the search show (`hbr.descriptors.together.LearnedBackground.of`). The
         object is not guessed then.
@@ -143,33 +154,33 @@ def hypotheses(
     TypeError, ValueError
         As for `segment`.
     """
-    frame = Frame.of(image_bgr)
+    frame = SegmentedFrame.of(image_bgr)
     background, difference = compared(frame, empty_table)
     by_picture = difference is not None and difference.reliable
     found: list[Segmentation | Found]
     if learned is None or by_picture or frame.differs is not None:
         like = _found(frame, background, difference)
-        if like.method is Method.PLAIN_BACKGROUND or (most == 1 and not by_picture):
+        if like.method is BoxMethod.PLAIN_BACKGROUND or (most == 1 and not by_picture):
             return (like.cut_out(),)
         share = shares(frame.small, difference if by_picture else None).object
         if by_picture:
-            found = [like, *_by_network(share, Method.EMPTY_TABLE, like)]
+            found = [like, *_by_network(share, BoxMethod.EMPTY_TABLE, like)]
             if most == 1 and not _same(like, found[-1]):  # an enrollment: the network's box is right more often
                 found.reverse()
         else:
-            found = [like, *_by_network(share, Method.NETWORK, like)]
+            found = [like, *_by_network(share, BoxMethod.NETWORK, like)]
     else:
         issues = [Issue(IssueCode.BACKGROUND_NOT_PLAIN)]
         if difference is not None:
             issues.insert(0, Issue(IssueCode.TABLE_DIFFERS, {"agreement": round(difference.agreement, 3)}))
         agreement = None if difference is None else difference.agreement
-        like = Found(frame.image, None, None, agreement, Method.NONE, tuple(issues))
+        like = Found(frame.image, None, None, agreement, BoxMethod.NONE, tuple(issues))
         share = shares(frame.small, learned.difference(frame.small), learned=True).object
         levels = _LEVELS if most > 1 else (_ENROLLED_LEVEL,)
-        found = [*_by_network(share, Method.ROTATION, like, levels=levels)]
+        found = [*_by_network(share, BoxMethod.ROTATION, like, levels=levels)]
         if most > 1:
             by_itself = None if alone is None else alone()
-            found += by_itself or _by_network(shares(frame.small).object, Method.NETWORK, like)
+            found += by_itself or _by_network(shares(frame.small).object, BoxMethod.NETWORK, like)
         found = found or [replace(like, issues=(*issues, Issue(IssueCode.NO_OBJECT)))]
     several: list[Segmentation | Found] = []
     for one in found:
@@ -182,17 +193,17 @@ def _cut_out(found: Segmentation | Found) -> Segmentation:
     return found.cut_out() if isinstance(found, Found) else found
 
 
-def without_background(frame: Frame) -> tuple[Found, ...]:
+def without_background(frame: SegmentedFrame) -> tuple[Found, ...]:
     """Return the guess and the network's silhouette of a frame, if they found an object."""
     guess = _found(frame, None, None)
     return (
         *([] if guess.box is None else [guess]),
-        *_by_network(shares(frame.small).object, Method.NETWORK, guess),
+        *_by_network(shares(frame.small).object, BoxMethod.NETWORK, guess),
     )
 
 
 def _by_network(
-    share: NDArray[np.float32], method: Method, like: Found, levels: tuple[float, ...] = _LEVELS[:1]
+    share: NDArray[np.float32], method: BoxMethod, like: Found, levels: tuple[float, ...] = _LEVELS[:1]
 ) -> list[Found]:
     """Return the silhouettes at these probabilities, with the illumination and the evidence of another one."""
     masks = [mask for level in levels if (mask := _object_in(share, level)) is not None]
@@ -231,7 +242,7 @@ def evidence_together(found: Segmentation, views: int) -> dict[str, Any]:
 
 
 def stored_segmentation(
-    image_bgr: ImageArray | Frame,
+    image_bgr: ImageArray | SegmentedFrame,
     evidence: Mapping[str, Any] | None,
     *,
     empty_table: Background | ImageArray | None = None,
@@ -249,7 +260,7 @@ def stored_segmentation(
     """
     if evidence is None or TOGETHER not in evidence:
         return segment(image_bgr, empty_table=empty_table)
-    frame = Frame.of(image_bgr)
+    frame = SegmentedFrame.of(image_bgr)
     background, difference = compared(frame, empty_table)
     correction = None
     if background is not None and difference is not None and difference.reliable:
@@ -257,7 +268,7 @@ def stored_segmentation(
     found = mask_from(evidence[MASK], frame.small.shape[:2]) if MASK in evidence else None
     issues = tuple(_issue(one) for one in evidence.get("issues", ()))
     agreement = None if difference is None else difference.agreement
-    return Found(frame.image, found, correction, agreement, Method(evidence["method"]), issues).cut_out()
+    return Found(frame.image, found, correction, agreement, BoxMethod(evidence["method"]), issues).cut_out()
 
 
 def mask_text(found: Mask) -> str:

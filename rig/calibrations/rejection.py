@@ -261,7 +261,7 @@ def _known(code: RejectionCode | str) -> RejectionCode:
 
 
 @dataclass(frozen=True, slots=True)
-class Rejection:
+class CalibrationRejection:
     """One reason why a calibration did not pass.
 
     Attributes
@@ -282,6 +282,8 @@ class Rejection:
         return filled(self.code.value, **shown)
 
 
-def rejection(code: RejectionCode, values: Mapping[str, Any]) -> Rejection:
+def rejection(code: RejectionCode, values: Mapping[str, Any]) -> CalibrationRejection:
     """Return a rejection whose values are plain Python numbers."""
-    return Rejection(code, {key: value.item() if hasattr(value, "item") else value for key, value in values.items()})
+    return CalibrationRejection(
+        code, {key: value.item() if hasattr(value, "item") else value for key, value in values.items()}
+    )

@@ -17,7 +17,7 @@ from pydantic import (
     ValidationError,
 )
 
-from rig.calibrations.rejection import Rejection
+from rig.calibrations.rejection import CalibrationRejection
 from rig.core.errors import ConfigError, UsageError, os_errors_as
 from rig.core.files import read, write
 from rig.core.phrases import filled, in_unit, number
@@ -81,7 +81,7 @@ class CalibrationResult:
     residual: FiniteFloat | None
     limit: FiniteFloat | None
     residual_unit: str
-    rejections: tuple[Rejection, ...]
+    rejections: tuple[CalibrationRejection, ...]
     when_utc: AwareDatetime
     device: Mapping[str, Any]
     evidence: Mapping[str, Any]

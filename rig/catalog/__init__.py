@@ -3,7 +3,7 @@
 from rig.catalog.catalog import Catalog
 from rig.catalog.enrolling import OpenEnrollment
 from rig.catalog.facts import Action, Enrollment, Entry, Session, View
-from rig.catalog.records import EnrollmentStatus, Outcome, Provenance, clean_name
+from rig.catalog.records import EnrollmentStatus, Provenance, RecordedOutcome, clean_name
 from rig.catalog.state import EnrollmentState, ObjectDetails, ObjectSummary
 
 __all__ = [
@@ -16,8 +16,8 @@ __all__ = [
     "ObjectDetails",
     "ObjectSummary",
     "OpenEnrollment",
-    "Outcome",
     "Provenance",
+    "RecordedOutcome",
     "Session",
     "View",
     "clean_name",

@@ -104,7 +104,7 @@ class Name(Words):
     impl = String
 
 
-class Status(_Checked):
+class StatusColumn(_Checked):
     """An `EnrollmentStatus`."""
 
     impl = Text
@@ -150,7 +150,7 @@ class Nanoseconds(Count):
     impl = BigInteger
 
 
-class Truth(_Checked):
+class TruthColumn(_Checked):
     """True or false."""
 
     impl = Boolean

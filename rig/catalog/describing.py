@@ -44,7 +44,7 @@ MOST_HELD_BYTES: Final = 256_000_000
 Levels = NDArray[np.uint8]
 
 
-class _Image(NamedTuple):
+class _DescribedImage(NamedTuple):
     """The image of a view, its session, and the part of it that is described."""
 
     image: str
@@ -60,7 +60,7 @@ class Task(NamedTuple):
     name: str
     names: tuple[str, ...]
     region: tuple[Region | None] | None
-    views: tuple[_Image, ...]
+    views: tuple[_DescribedImage, ...]
     empty_tables: tuple[str | None, ...]
 
 
@@ -108,7 +108,7 @@ def task_of(
 ) -> Task:
     """Return the task to describe an enrollment; ``region`` is the one that was chosen later."""
     views = tuple(
-        _Image(view.image, view.session, view.region if region is None else region[0], view.azimuth_deg)
+        _DescribedImage(view.image, view.session, view.region if region is None else region[0], view.azimuth_deg)
         for view in enrollment.views
     )
     return Task(seal, name, names, region, views, tuple(session.empty_table for session in enrollment.sessions))

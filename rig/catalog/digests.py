@@ -11,7 +11,7 @@ from sqlalchemy.orm import Session as Transaction
 from sqlalchemy.orm import aliased
 from sqlalchemy.types import NullType
 
-from rig.catalog.columns import JsonText, Number, Truth, Utc
+from rig.catalog.columns import JsonText, Number, TruthColumn, Utc
 from rig.catalog.facts import Enrollment, Entry, Row, Session, View, digested, sha256_of
 from rig.catalog.jobs import portions
 
@@ -82,7 +82,7 @@ def _raw(is_postgres: bool, table: type[Row]) -> list[ColumnElement[Any]]:
 def _as_stored(column: ColumnElement[Any], is_postgres: bool) -> ColumnElement[Any]:
     if is_postgres and isinstance(column.type, Utc):
         return func.to_char(column, "YYYY-MM-DD HH24:MI:SS.US")
-    if is_postgres and isinstance(column.type, JsonText | Truth):
+    if is_postgres and isinstance(column.type, JsonText | TruthColumn):
         return cast(column, Text if isinstance(column.type, JsonText) else Integer)
     if isinstance(column.type, Number):
         return type_coerce(column, NullType()) + 0.0 if is_postgres else type_coerce(column, NullType())

@@ -39,8 +39,8 @@ from rig.catalog.columns import (
     Nanoseconds,
     Number,
     RegionOfImage,
-    Status,
-    Truth,
+    StatusColumn,
+    TruthColumn,
     Utc,
     Words,
     damaged,
@@ -130,10 +130,10 @@ class Entry(Row):
     object_id: Mapped[int | None] = mapped_column(Count, default=None)
     label: Mapped[str | None] = mapped_column(Words, default=None)
     note: Mapped[str | None] = mapped_column(Words, default=None)
-    deleted: Mapped[bool | None] = mapped_column(Truth, default=None)
+    deleted: Mapped[bool | None] = mapped_column(TruthColumn, default=None)
     created_utc: Mapped[datetime | None] = mapped_column(Utc, default=None)
     enrollment_id: Mapped[int | None] = mapped_column(Count, default=None)
-    status: Mapped[EnrollmentStatus | None] = mapped_column(Status, default=None)
+    status: Mapped[EnrollmentStatus | None] = mapped_column(StatusColumn, default=None)
     finished_utc: Mapped[datetime | None] = mapped_column(Utc, default=None)
     seal: Mapped[str | None] = mapped_column(Name(64), default=None)
     result: Mapped[int | None] = mapped_column(Count, default=None, index=True)

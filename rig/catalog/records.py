@@ -43,7 +43,7 @@ class EnrollmentStatus(StrEnum):
     SUPERSEDED = "superseded"
 
 
-class Outcome(StrEnum):
+class RecordedOutcome(StrEnum):
     """Outcome of an identification."""
 
     FOUND = "found"

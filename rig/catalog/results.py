@@ -22,7 +22,7 @@ from rig.catalog.catalog import Catalog
 from rig.catalog.columns import ImageName, damaged
 from rig.catalog.facts import Action, Entry
 from rig.catalog.images import path_of
-from rig.catalog.records import JsonObject, Outcome, Provenance, as_json
+from rig.catalog.records import JsonObject, Provenance, RecordedOutcome, as_json
 from rig.core.errors import CatalogDamaged, CatalogError, UsageError
 from rig.core.next_steps import Do
 from rig.views import image_files as images
@@ -33,7 +33,7 @@ MAX_TEXT_LENGTH: Final = 1000  # a reason or a barcode, and not a document
 class Answer(NamedTuple):
     """The object of a sample: ``object_name`` is None for an unknown object, the likeliest for an ambiguous one."""
 
-    outcome: Outcome
+    outcome: RecordedOutcome
     object_name: str | None
     sample: str | None
 
@@ -146,7 +146,7 @@ class ResultFilter:
 
     sample: str | None = None
     object_name: str | None = None
-    outcome: Outcome | None = None
+    outcome: RecordedOutcome | None = None
     since: datetime | None = None
     before: datetime | None = None
 
@@ -248,9 +248,9 @@ def correct(
         now = before = _find(transaction, result_id).current
         if object_name is not None:
             right = state.find(transaction, object_name).object_name
-            now = now._replace(outcome=Outcome.FOUND, object_name=right)
+            now = now._replace(outcome=RecordedOutcome.FOUND, object_name=right)
         if unknown:
-            now = now._replace(outcome=Outcome.UNKNOWN, object_name=None)
+            now = now._replace(outcome=RecordedOutcome.UNKNOWN, object_name=None)
         if sample is not None:
             now = now._replace(sample=clean_text(sample, "sample"))
         if now == before:
@@ -332,7 +332,7 @@ def _load(transaction: Transaction, wanted: ColumnElement[bool]) -> list[Result]
 
 def _answer(found: Mapping[str, Any]) -> Answer:
     name, sample = (None if found[key] is None else str(found[key]) for key in ("object", "sample"))
-    return Answer(Outcome(found["outcome"]), name, sample)
+    return Answer(RecordedOutcome(found["outcome"]), name, sample)
 
 
 def _number(details: Mapping[str, Any], name: str) -> float | None:

@@ -53,7 +53,7 @@ class Conflict(StrEnum):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Item:
+class TransferItem:
     """An object with its enrollments, oldest first."""
 
     name: str
@@ -67,7 +67,7 @@ class Item:
         return {one.enrollment.key for one in self.enrollments}
 
 
-class Source(Protocol):
+class TransferSource(Protocol):
     """Objects that can be transferred."""
 
     @property
@@ -82,7 +82,7 @@ class Source(Protocol):
     def content(self) -> Callable[[str], bytes]:
         """Function that returns the bytes of an image, unchecked. It can be sent to other processes."""
 
-    def items(self) -> Iterator[Item]:
+    def items(self) -> Iterator[TransferItem]:
         """Yield the objects."""
 
 
@@ -111,7 +111,7 @@ class CatalogSource:
         self.origin = str(catalog.place)
         self.content: Callable[[str], bytes] = catalog.database.images.read
 
-    def items(self) -> Iterator[Item]:
+    def items(self) -> Iterator[TransferItem]:
         """Yield the objects in the order in which they were added.
 
         Raises `ObjectNotFound`: there is no object of one of the names.
@@ -129,7 +129,7 @@ class CatalogSource:
                 conditions = [state.of_object(known.object_id)]
                 conditions += [Ended.status == EnrollmentStatus.COMPLETE] if self.used_only else []
                 found = state.enrollments(transaction, *conditions)
-                item = Item(
+                item = TransferItem(
                     *(str(known.object_name), known.label or "", known.note or "", known.created_utc or known.time_utc),
                     tuple(reversed(found)),
                 )
@@ -141,7 +141,7 @@ class CatalogSource:
                     yield item
 
 
-def _check(item: Item) -> None:
+def _check(item: TransferItem) -> None:
     """Raise `CatalogDamaged` if this program would not have stored an object. Its digests are those of its rows."""
     sessions = [session.provenance for one in item.enrollments for session in one.enrollment.sessions]
     try:
@@ -169,7 +169,7 @@ class Transferred:
 
 
 def transfer(
-    source: Source,
+    source: TransferSource,
     target: Catalog,
     *,
     conflict: Conflict = Conflict.REJECT,
@@ -262,7 +262,7 @@ def transfer(
     return Transferred(*counts, plan.skipped, plan.replaced, rejected)
 
 
-def _rejection(source: Source, rejected: Sequence[RejectedFile]) -> RigError:
+def _rejection(source: TransferSource, rejected: Sequence[RejectedFile]) -> RigError:
     evidence = {"rejected": [f"{file.path}: {file.reason}" for file in rejected[:20]]}
     if isinstance(source, CatalogSource) and source.own:
         return CatalogDamaged(
@@ -277,7 +277,7 @@ def _rejection(source: Source, rejected: Sequence[RejectedFile]) -> RigError:
     )
 
 
-def _kept(items: Sequence[Item], found: ReadImages, *, are_photographs: bool) -> tuple[Item, ...]:
+def _kept(items: Sequence[TransferItem], found: ReadImages, *, are_photographs: bool) -> tuple[TransferItem, ...]:
     """Return new rows of objects with the stored images, without the views whose images were rejected."""
     kept = []
     for item in items:
@@ -337,7 +337,7 @@ class _Plan:
     ``known`` are enrollments of the target by their keys.
     """
 
-    wanted: tuple[Item, ...]
+    wanted: tuple[TransferItem, ...]
     skipped: tuple[str, ...] = ()
     replaced: tuple[str, ...] = ()
     known: Mapping[str, _Known] = field(default_factory=dict)
@@ -404,7 +404,7 @@ def _ids(transaction: Transaction, names: Sequence[str]) -> dict[str, int]:
     return found
 
 
-def _is_there(item: Item, object_id: int | None, known: Mapping[str, _Known], *, once: bool) -> bool:
+def _is_there(item: TransferItem, object_id: int | None, known: Mapping[str, _Known], *, once: bool) -> bool:
     """Return whether the target has the enrollments of an object, and an object of its name has them in use alike."""
     if not item.enrollments or not item.keys <= known.keys():
         return False
@@ -484,7 +484,7 @@ def _store(transaction: Transaction, enrollment: Enrollment, object_id: int) -> 
 
 
 def _computed(
-    source: Source, new: Mapping[str, Enrollment], contents: Mapping[str, Mapping[str, bytes]], *, copied: bool
+    source: TransferSource, new: Mapping[str, Enrollment], contents: Mapping[str, Mapping[str, bytes]], *, copied: bool
 ) -> list[dict[str, Any]]:
     """Return the rows of what was computed from new enrollments, here or by their catalog."""
     rows = [

@@ -36,7 +36,7 @@ _OWNS: Final = and_(Named.object_id == Enrollment.object_id, state.IS_STATE)
 _STATUS: Final = and_(Ended.enrollment_id == Enrollment.id, state.IS_STATUS)
 
 
-class Problem(StrEnum):
+class CatalogProblem(StrEnum):
     """Kind of a problem."""
 
     DAMAGED_DATABASE = "database damaged"
@@ -52,25 +52,25 @@ _BACKUP: Final = "restore it from a backup"
 _IMAGE_BACKUP: Final = f"{_BACKUP}, or enroll the object again"
 _ENROLLMENT_BACKUP: Final = "restore the catalog from a backup, or delete the object and enroll it again"
 _WORDS: Final = {
-    Problem.DAMAGED_DATABASE: ("{message}", _BACKUP),
-    Problem.LOG_CHANGED: ("entry {entry_id} is not the one that was written, or one before is missing", _BACKUP),
-    Problem.ENROLLMENT_CHANGED: ("something in enrollment {enrollment_id} changed", _ENROLLMENT_BACKUP),
-    Problem.MISSING_ENROLLMENT: ("this program did not remove enrollment {enrollment_id}", _ENROLLMENT_BACKUP),
-    Problem.MISSING_IMAGE: ("{reason}", _IMAGE_BACKUP),
-    Problem.CHANGED_IMAGE: ("{bytes} bytes now, {stored_bytes} when it was stored", _IMAGE_BACKUP),
-    Problem.DESCRIPTION_DAMAGED: (
+    CatalogProblem.DAMAGED_DATABASE: ("{message}", _BACKUP),
+    CatalogProblem.LOG_CHANGED: ("entry {entry_id} is not the one that was written, or one before is missing", _BACKUP),
+    CatalogProblem.ENROLLMENT_CHANGED: ("something in enrollment {enrollment_id} changed", _ENROLLMENT_BACKUP),
+    CatalogProblem.MISSING_ENROLLMENT: ("this program did not remove enrollment {enrollment_id}", _ENROLLMENT_BACKUP),
+    CatalogProblem.MISSING_IMAGE: ("{reason}", _IMAGE_BACKUP),
+    CatalogProblem.CHANGED_IMAGE: ("{bytes} bytes now, {stored_bytes} when it was stored", _IMAGE_BACKUP),
+    CatalogProblem.DESCRIPTION_DAMAGED: (
         "the stored {descriptor} is not the one that was computed",
         "it is computed again when it is needed",
     ),
 }
-"""The evidence, with the keys of `Finding.details`, and what to do."""
+"""The evidence, with the keys of `CatalogFinding.details`, and what to do."""
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class CatalogFinding:
     """A problem of a catalog, the object and the file that it concerns, and its evidence."""
 
-    problem: Problem
+    problem: CatalogProblem
     object_name: str | None = None
     view_id: int | None = None
     path: str | None = None
@@ -85,17 +85,17 @@ class Finding:
 
 
 @dataclass(frozen=True, slots=True)
-class Verification:
+class CatalogVerification:
     """Numbers of what was checked, and everything that was found."""
 
     objects: int
     views: int
     results: int
     image_bytes: int
-    findings: tuple[Finding, ...]
+    findings: tuple[CatalogFinding, ...]
 
 
-class _Image(NamedTuple):
+class _RequiredImage(NamedTuple):
     """An image that must exist. That of a session or a result belongs to no view, that of a result to no object."""
 
     object_name: str | None
@@ -104,9 +104,9 @@ class _Image(NamedTuple):
     stored_bytes: int
 
 
-def verify(catalog: Catalog, *, jobs: Jobs | None = None) -> Generator[JobProgress, None, Verification]:
+def verify(catalog: Catalog, *, jobs: Jobs | None = None) -> Generator[JobProgress, None, CatalogVerification]:
     """Compare every row and every image with its digest; change nothing. ``jobs`` None is one process per core."""
-    findings, of_images = list[Finding](), list[Finding]()
+    findings, of_images = list[CatalogFinding](), list[CatalogFinding]()
     with catalog.database.read() as transaction:
         objects = transaction.scalar(select(func.count(Enrollment.object_id.distinct()))) or 0
         views = transaction.scalar(select(func.count(View.id))) or 0
@@ -118,7 +118,7 @@ def verify(catalog: Catalog, *, jobs: Jobs | None = None) -> Generator[JobProgre
                 findings += check(transaction)
             except CatalogDamaged as damage:  # a row that cannot be read
                 damages[damage.what] = None
-    changed = {one.details["enrollment_id"] for one in findings if one.problem is Problem.ENROLLMENT_CHANGED}
+    changed = {one.details["enrollment_id"] for one in findings if one.problem is CatalogProblem.ENROLLMENT_CHANGED}
     yield JobProgress(0, images)
     done, image_bytes, work = 0, 0, partial(_check_images, catalog.database.images)
     try:
@@ -128,12 +128,12 @@ def verify(catalog: Catalog, *, jobs: Jobs | None = None) -> Generator[JobProgre
             yield JobProgress(done := done + len(portion), images)
     except CatalogDamaged as damage:
         damages[damage.what] = None
-    damaged = [Finding(Problem.DAMAGED_DATABASE, details={"message": message}) for message in damages]
+    damaged = [CatalogFinding(CatalogProblem.DAMAGED_DATABASE, details={"message": message}) for message in damages]
     of_images.sort(key=lambda one: (one.view_id is None, one.view_id or 0, one.path))
-    return Verification(objects, views, results, image_bytes, (*damaged, *findings, *of_images))
+    return CatalogVerification(objects, views, results, image_bytes, (*damaged, *findings, *of_images))
 
 
-def row_checks(transaction: Transaction) -> Iterator[Callable[[Transaction], Iterator[Finding]]]:
+def row_checks(transaction: Transaction) -> Iterator[Callable[[Transaction], Iterator[CatalogFinding]]]:
     """Yield the checks of portions of the log and of the enrollments. Each may have a transaction of its own."""
     last = transaction.scalar(select(func.max(Entry.id))) or 0
     ids = transaction.scalars(select(Enrollment.id).order_by(Enrollment.id)).all()
@@ -144,18 +144,18 @@ def row_checks(transaction: Transaction) -> Iterator[Callable[[Transaction], Ite
     yield from (partial(_enrollments, part) for part in portions(ids, _ENROLLMENTS))
 
 
-def _lines(first: int, last: int | None, transaction: Transaction) -> Iterator[Finding]:
+def _lines(first: int, last: int | None, transaction: Transaction) -> Iterator[CatalogFinding]:
     for number in log.wrong_lines(transaction, first, last):
         name = transaction.scalar(select(Entry.object_name).where(Entry.id == number))
-        yield Finding(Problem.LOG_CHANGED, name, details={"entry_id": number})
+        yield CatalogFinding(CatalogProblem.LOG_CHANGED, name, details={"entry_id": number})
 
 
-def _end(transaction: Transaction) -> Iterator[Finding]:
+def _end(transaction: Transaction) -> Iterator[CatalogFinding]:
     log.check_complete(transaction)
     yield from ()
 
 
-def _missing(transaction: Transaction) -> Iterator[Finding]:
+def _missing(transaction: Transaction) -> Iterator[CatalogFinding]:
     """Yield the enrollments that are in the log and not in the catalog, although this program did not remove them."""
     lines = transaction.execute(select(Entry.enrollment_id, Entry.object_name).where(Entry.status.is_not(None)))
     names = {number: name for number, name in lines if number is not None}
@@ -166,30 +166,30 @@ def _missing(transaction: Transaction) -> Iterator[Finding]:
         present |= {one for one in collected if isinstance(one, int)} if isinstance(collected, list) else set()
         present |= {line.enrollment_id or 0}
     for number in sorted(names.keys() - present):
-        yield Finding(Problem.MISSING_ENROLLMENT, names[number], details={"enrollment_id": number})
+        yield CatalogFinding(CatalogProblem.MISSING_ENROLLMENT, names[number], details={"enrollment_id": number})
 
 
-def _enrollments(ids: Sequence[int], transaction: Transaction) -> Iterator[Finding]:
+def _enrollments(ids: Sequence[int], transaction: Transaction) -> Iterator[CatalogFinding]:
     columns = (Enrollment.id, Enrollment.object_id, Named.object_name, Ended.object_id, Ended.seal)
     found = select(*columns).select_from(Enrollment).outerjoin(Named, _OWNS).outerjoin(Ended, _STATUS)
     rows = transaction.execute(found.where(Enrollment.id.in_(ids)).order_by(Enrollment.id)).all()
     wrong = set(digests.damaged_enrollments(transaction, {number: seal for number, *_, seal in rows}))
     for number, owner, name, owner_in_log, _ in rows:
         if number in wrong or owner != owner_in_log:
-            yield Finding(Problem.ENROLLMENT_CHANGED, name, details={"enrollment_id": number})
+            yield CatalogFinding(CatalogProblem.ENROLLMENT_CHANGED, name, details={"enrollment_id": number})
 
 
-def _derived(transaction: Transaction) -> Iterator[Finding]:
+def _derived(transaction: Transaction) -> Iterator[CatalogFinding]:
     columns = select(Derived.seal, Derived.what, Derived.made_by, Derived.content, Derived.sha256)
     rows = transaction.execute(columns.order_by(Derived.seal, Derived.what).execution_options(yield_per=100))
     wrong = [row[:2] for row in rows if None in row or describing.digest_of(*row[:4]) != row[4]]
     owners = select(Ended.seal, Named.object_name).join(Named, Named.object_id == Ended.object_id)
     names = dict(transaction.execute(owners.where(state.IS_STATUS, state.IS_STATE)).all()) if wrong else {}
     for seal, what in sorted(wrong, key=lambda one: names.get(one[0]) or ""):
-        yield Finding(Problem.DESCRIPTION_DAMAGED, names.get(seal), details={"descriptor": what})
+        yield CatalogFinding(CatalogProblem.DESCRIPTION_DAMAGED, names.get(seal), details={"descriptor": what})
 
 
-def _images(catalog: Catalog, changed: Collection[int]) -> Iterator[_Image]:
+def _images(catalog: Catalog, changed: Collection[int]) -> Iterator[_RequiredImage]:
     """Yield the images of the enrollments that are not ``changed``, and of the results."""
     with catalog.database.read() as transaction:
         ids = transaction.scalars(select(Enrollment.id).order_by(Enrollment.id)).all()
@@ -199,22 +199,22 @@ def _images(catalog: Catalog, changed: Collection[int]) -> Iterator[_Image]:
         of_these = _IMAGE.enrollment_id.is_(None) if part is None else _IMAGE.enrollment_id.in_(part)
         with catalog.database.read() as transaction:
             found = transaction.execute(named.where(of_these, _IMAGE.image.is_not(None))).all()
-        yield from (_Image(*one) for one in found)
+        yield from (_RequiredImage(*one) for one in found)
 
 
-def _check_images(store: Images, portion: Sequence[_Image]) -> list[Finding]:
+def _check_images(store: Images, portion: Sequence[_RequiredImage]) -> list[CatalogFinding]:
     findings = []
     for name, view_id, image, stored_bytes in portion:
-        found = partial(Finding, object_name=name, view_id=view_id, path=path_of(image))
+        found = partial(CatalogFinding, object_name=name, view_id=view_id, path=path_of(image))
         try:
             content = store.read(image)
         except (OSError, CatalogDamaged) as error:
             reason = error.what if isinstance(error, CatalogDamaged) else error.strerror or str(error)
-            findings.append(found(Problem.MISSING_IMAGE, details={"reason": reason}))
+            findings.append(found(CatalogProblem.MISSING_IMAGE, details={"reason": reason}))
         else:
             if not image.startswith(files.digest(content)):
                 sizes = {"bytes": len(content), "stored_bytes": stored_bytes}
-                findings.append(found(Problem.CHANGED_IMAGE, details=sizes))
+                findings.append(found(CatalogProblem.CHANGED_IMAGE, details=sizes))
     return findings
 
 
@@ -273,8 +273,8 @@ class BackgroundCheck(AbstractContextManager["BackgroundCheck"]):
             pass  # the catalog was moved or is locked: the work itself reports it
 
 
-def _error(finding: Finding) -> CatalogDamaged:
-    if finding.problem is not Problem.LOG_CHANGED:
+def _error(finding: CatalogFinding) -> CatalogDamaged:
+    if finding.problem is not CatalogProblem.LOG_CHANGED:
         return state.changed([str(finding.object_name)])
     line = finding.details["entry_id"]
     return CatalogDamaged(

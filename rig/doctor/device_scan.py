@@ -51,7 +51,7 @@ class FoundCamera:
 
 
 @dataclass(frozen=True, slots=True)
-class Candidate:
+class DeviceCandidate:
     """A device that may be the servo, the IMU or the camera of the table, in words, and its settings by key.
 
     ``file`` is its own device file, if it disappears when the device is unplugged.
@@ -94,10 +94,10 @@ class DeviceScan:
         return wanted
 
     @property
-    def candidates(self) -> dict[str, list[Candidate]]:
+    def candidates(self) -> dict[str, list[DeviceCandidate]]:
         """The devices found that the rig can use, by what they may be."""
         servos = [
-            Candidate(
+            DeviceCandidate(
                 f"{port.path}: {found}",
                 {
                     ("servo", "port"): port.stable or port.path,
@@ -110,7 +110,7 @@ class DeviceScan:
             for port, found in self.servos
         ]
         imus = [
-            Candidate(
+            DeviceCandidate(
                 str(found),
                 {
                     ("imu", "model"): found.driver,
@@ -121,18 +121,18 @@ class DeviceScan:
             for found in self.imus
         ]
         heads = [
-            Candidate(
+            DeviceCandidate(
                 f"on the rig head at {port.path}",
                 {("imu", "connection"): "head", ("head", "port"): port.stable or port.path},
             )
             for port in self.heads
         ]
         cameras = [
-            Candidate(f"{c.node.path}: {c.node.name}, {c.width}x{c.height}", camera_settings(c), c.node)
+            DeviceCandidate(f"{c.node.path}: {c.node.name}, {c.width}x{c.height}", camera_settings(c), c.node)
             for c in self.cameras
         ]
         ribbons = [
-            Candidate(f"on ribbon cable {number}", {("camera", "source"): f"picamera2:{number}"})
+            DeviceCandidate(f"on ribbon cable {number}", {("camera", "source"): f"picamera2:{number}"})
             for number in self.ribbons
         ]
         return {"servo": servos, "IMU": imus + heads, "camera": cameras + ribbons}

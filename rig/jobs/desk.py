@@ -36,7 +36,7 @@ class Remark:
 
 
 @dataclass(frozen=True, slots=True)
-class Result:
+class JobResult:
     """The result of a job that ends without an event: its JSON values, and a sentence."""
 
     values: dict[str, Any]
@@ -52,7 +52,7 @@ class Progress:
 
 
 T = TypeVar("T")
-Step = Event | Remark | Result | Progress | Finding
+Step = Event | Remark | JobResult | Progress | Finding
 Steps = Generator[Step, None, T]
 
 

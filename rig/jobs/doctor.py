@@ -24,7 +24,7 @@ from rig.doctor import examination
 from rig.doctor.checks import CHECKS
 from rig.doctor.context import DoctorContext
 from rig.doctor.finding import Finding, FindingCode, Severity, bad, fine, of_error
-from rig.jobs.desk import Result, Steps
+from rig.jobs.desk import JobResult, Steps
 from rig.safety.saved_state import FileStore
 from rig.views.image_files import encode
 
@@ -85,7 +85,7 @@ def examine(
         "exit_code": next((finding.exit_code for finding in findings if finding.level is Severity.BAD), 0),
         "findings": [finding.as_dict() for finding in findings],
     }
-    yield Result(
+    yield JobResult(
         values,
         f"{problems or 'No'} problem{'s' * (problems != 1)}, {warnings or 'no'} warning{'s' * (warnings != 1)}, "
         f"{count[Severity.FINE]} fine.",

@@ -9,7 +9,7 @@ from rig.catalog import Action
 from rig.config import MAX_LIMIT_DEG
 from rig.core.errors import RigError, UsageError
 from rig.core.phrases import angle_words, signed
-from rig.jobs.desk import Desk, Remark, Result, Steps
+from rig.jobs.desk import Desk, JobResult, Remark, Steps
 from rig.motion.turntable import Turntable
 from rig.plans.capture import announced, moved
 from rig.plans.jog import JogKey
@@ -91,7 +91,7 @@ def refer(desk: Desk, *, revolutions: int | None = None, here: bool = False) -> 
             bench.safety.set_revolutions(revolutions)
         table_deg = bench.safety.angle_reference.to_table(bench.servo.read_state().position_deg)
     text = "The present angle is home now." if here else "The table's angle is set."
-    yield Result({"table_deg": 0.0 if here else table_deg}, text)
+    yield JobResult({"table_deg": 0.0 if here else table_deg}, text)
 
 
 def acknowledge(desk: Desk, *, reboot: bool = False) -> Steps[None]:
@@ -105,4 +105,4 @@ def acknowledge(desk: Desk, *, reboot: bool = False) -> Steps[None]:
         "state": str(state),
         "doubt": str(doubt) if doubt else None,
     }
-    yield Result(values, f"{text}\nThe table is {state}{f': {doubt}' if doubt else ''}.")
+    yield JobResult(values, f"{text}\nThe table is {state}{f': {doubt}' if doubt else ''}.")

@@ -55,7 +55,7 @@ HELD_DEG: Final = 15.0
 
 
 @dataclass(frozen=True, eq=False)
-class _Seen:
+class _SeenView:
     """An image at rest, with the index of its view and its table angle."""
 
     index: int
@@ -79,7 +79,7 @@ class EnrollmentViews:
     table: Turntable
     viewer: Viewer
     retakes: int = 0
-    _first: _Seen | None = None
+    _first: _SeenView | None = None
 
     def take(self, angles_deg: Mapping[int, float], *, in_motion: bool) -> Generator[Event, None, None]:
         """Take and store the views at these table angles; check that the object was not moved; return to 0.
@@ -108,7 +108,7 @@ class EnrollmentViews:
         if first is last or first.angle_deg != 0.0:
             yield from announced(last.index, self.table, 0.0)
 
-    def _step(self, angles_deg: Mapping[int, float]) -> Generator[Event, None, _Seen]:
+    def _step(self, angles_deg: Mapping[int, float]) -> Generator[Event, None, _SeenView]:
         """Take and store the views at these table angles at rest; return the last one."""
         imu_deg, imu_sigma_deg = None, 0.0
         for index, angle_deg in angles_deg.items():
@@ -140,7 +140,7 @@ class EnrollmentViews:
                 imu_deg=imu_deg,
                 imu_sigma_deg=imu_sigma_deg,
             )
-            last = _Seen(index, angle_deg, attempt.image_bgr)
+            last = _SeenView(index, angle_deg, attempt.image_bgr)
             self._first = self._first or last
         return last
 
@@ -165,7 +165,7 @@ class EnrollmentViews:
             yield moved(0, (yield from announced(0, table, start_deg)))
         before = yield from capture(0, self.viewer, table, self.bench.clock.now_ns())
         check_object(self.bench, before.image_bgr, self.segment.empty_table)
-        self._first = _Seen(0, start_deg, before.image_bgr)
+        self._first = _SeenView(0, start_deg, before.image_bgr)
         yield ScanStarted(speed.dps, speed.limit, speed.value, start_deg, end_deg)
         frames = FlightFrames(self.bench, table)
         nearest: dict[int, tuple[float, Frame]] = {}
@@ -241,7 +241,7 @@ class EnrollmentViews:
         yield accepted(index, view.azimuth_deg, attempt, segmented)
         yield from warn_of_table(self.bench, index, segmented)
 
-    def _require_not_moved(self, first: _Seen, again: Attempt) -> None:
+    def _require_not_moved(self, first: _SeenView, again: Attempt) -> None:
         """Compare two frames of one angle; abandon the enrollment and raise `ObjectMoved` if the object moved."""
         alike = image_similarity(first.image_bgr, again.image_bgr, self.bench.config.view)
         if alike < SAME_SIMILARITY:

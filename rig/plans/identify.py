@@ -23,7 +23,7 @@ from hbr.dense.session import answered
 from rig.bench import Bench, Placer
 from rig.catalog import Catalog, Provenance
 from rig.catalog.journal import open_for_enrollment
-from rig.catalog.records import Outcome
+from rig.catalog.records import RecordedOutcome
 from rig.catalog.results import Answer, NewResult, record
 from rig.config import RigConfig
 from rig.config.catalog_place import CatalogPlace
@@ -505,7 +505,7 @@ class ResultRecorder:
     def _record(self, answer: Identified) -> Recorded | Warned:
         try:
             new = NewResult(
-                Answer(Outcome(answer.outcome.value), next(iter(answer.possible), None), self.sample),
+                Answer(RecordedOutcome(answer.outcome.value), next(iter(answer.possible), None), self.sample),
                 event_dict(answer),
                 tuple(self._azimuths_deg),
                 Provenance(self.bench.name, self.bench.devices(), self.bench.conditions),

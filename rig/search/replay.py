@@ -32,7 +32,7 @@ SHOWN_CHARACTERS: Final = 60
 
 
 @dataclass(frozen=True, slots=True)
-class Difference:
+class ReplayDifference:
     """Something that was computed differently; ``view`` counts from 1."""
 
     view: int
@@ -54,22 +54,22 @@ def _cut(value: Any) -> str:
 
 
 @dataclass(slots=True)
-class Check:
+class ReplayCheck:
     """The result of checking a run; a complete one ends with an answer or an error."""
 
     views: int = 0
     decisions: int = 0
     is_complete: bool = False
-    differences: list[Difference] = field(default_factory=list)
+    differences: list[ReplayDifference] = field(default_factory=list)
 
 
-def check(run: SavedRun) -> Check:
+def check(run: SavedRun) -> ReplayCheck:
     """Describe every frame, search and decide again, and compare with what was saved.
 
     Raises `UsageError`: the run cannot be read, or its strategy is not known.
     """
     started = run.started
-    found = Check(is_complete=run.error is not None and not run.is_cut)
+    found = ReplayCheck(is_complete=run.error is not None and not run.is_cut)
     search = begin_search(
         run.model, run.config, started.strategy, seed=started.seed or 0, top=len(run.views.object_names)
     )
@@ -130,7 +130,7 @@ def _decided(search: Search, saved: Decided) -> Decided | dict[str, Any]:
     return replace(computed, candidates=computed.candidates[: len(saved.candidates)])
 
 
-def _compare(view: int, where: str, saved: Any, computed: Any) -> Iterator[Difference]:
+def _compare(view: int, where: str, saved: Any, computed: Any) -> Iterator[ReplayDifference]:
     """Yield the differences, field by field."""
     if isinstance(saved, dict) and isinstance(computed, dict):
         for key in {**saved, **computed}:
@@ -140,6 +140,6 @@ def _compare(view: int, where: str, saved: Any, computed: Any) -> Iterator[Diffe
             yield from _compare(view, f"{where} {number}", a, b)
     elif isinstance(saved, float) and isinstance(computed, float):
         if not isclose(saved, computed, rel_tol=TOLERANCE, abs_tol=TOLERANCE):
-            yield Difference(view, where, saved, computed)
+            yield ReplayDifference(view, where, saved, computed)
     elif saved != computed:
-        yield Difference(view, where, saved, computed)
+        yield ReplayDifference(view, where, saved, computed)

@@ -11,7 +11,7 @@ DICTIONARY: Final = cv2.aruco.DICT_4X4_50
 
 
 @dataclass(frozen=True, slots=True)
-class Board:
+class CharucoBoard:
     """A ChArUco board: a chessboard with a marker in each white square, which identifies the corners.
 
     ``columns`` and ``rows`` count the squares; around them is a white margin.
@@ -62,7 +62,7 @@ class BoardDetection:
     marker_ids: NDArray[np.int64]
 
 
-def detect_board(board: Board, image_bgr: NDArray[np.uint8]) -> BoardDetection:
+def detect_board(board: CharucoBoard, image_bgr: NDArray[np.uint8]) -> BoardDetection:
     """Find the board in an image, uint8 (H, W, 3). The result has no corners if the board is not visible.
 
     The shapes of OpenCV's results differ between versions from 4.7 on.

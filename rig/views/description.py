@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 import hbr
 from hbr.descriptors.together import LearnedBackground
-from hbr.segmentation import MIN_AGREEMENT, Issue, IssueCode, Method
-from hbr.segmentation.background import Frame
+from hbr.segmentation import MIN_AGREEMENT, BoxMethod, Issue, IssueCode
+from hbr.segmentation.background import SegmentedFrame
 from hbr.segmentation.segment import evidence_together, stored_segmentation
 from rig.config import ViewConfig
 from rig.core.errors import UsageError
@@ -182,7 +182,7 @@ class EnrollmentDescriber(ViewDescriber):
 
     def describe(self, view: int, image_bgr: NDArray[np.uint8]) -> DescribedView:
         """Describe the image that `learn` got as the view of this number."""
-        frame = Frame(within(image_bgr, self.region))
+        frame = SegmentedFrame(within(image_bgr, self.region))
         background, issues = self._prepared_table(image_bgr)
         (found,) = hbr.hypotheses(frame, empty_table=background, learned=self._learned.of(view), most=1)
         if found.box is None:
@@ -261,7 +261,7 @@ class SegmentationSummary:
         """Summarise the stored evidence of views; None is a view without segmentation."""
         views = [one for one in evidence if one is not None]
         boxes = [one for one in views if one.get("box_px") is not None]
-        guessed = sum(one.get("method") == Method.GUESS for one in boxes)
+        guessed = sum(one.get("method") == BoxMethod.GUESS for one in boxes)
         codes = Counter(code for one in views for code in {issue["code"]: None for issue in one.get("issues", ())})
         return cls(
             views=len(views),

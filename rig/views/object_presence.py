@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import hbr
-from hbr.segmentation.background import Frame
+from hbr.segmentation.background import SegmentedFrame
 from rig.bench import Bench
 from rig.config import ViewConfig
 from rig.core.clock import seconds_between
@@ -107,7 +107,7 @@ def is_empty_table(image_bgr: NDArray[np.uint8], empty_table_bgr: NDArray[np.uin
     if empty_table_bgr is None or empty_table_bgr.shape != image_bgr.shape:
         cells = shrunk(image_bgr, config)
         return changed_cells(np.zeros_like(cells), cells) == 0
-    frame, empty = (Frame(within(one, config.roi)) for one in (image_bgr, empty_table_bgr))
+    frame, empty = (SegmentedFrame(within(one, config.roi)) for one in (image_bgr, empty_table_bgr))
     found = frame.difference(hbr.Background(empty.image))
     if not found.reliable or cv2.erode((found.certain | found.possible).astype(np.uint8), SPECK).any():
         return False

@@ -44,7 +44,7 @@ class Login(BaseModel):
     role: Role
 
 
-class Operator(BaseModel):
+class LeaseHolder(BaseModel):
     """A person at a browser or program, which ``client`` distinguishes."""
 
     name: str
@@ -56,7 +56,7 @@ class LeaseState(BaseModel):
 
     holder: str | None
     client: str | None
-    taken_from: Operator | None
+    taken_from: LeaseHolder | None
     seconds: float
 
 

@@ -17,7 +17,7 @@ from rig.catalog.exchange.bundle import read_bundle, write_bundle
 from rig.catalog.exchange.tables import plain_row
 from rig.catalog.jobs import finished
 from rig.catalog.log import shown
-from rig.catalog.records import Outcome
+from rig.catalog.records import RecordedOutcome
 from rig.catalog.results import Result, ResultFilter, correct, find_result, find_results
 from rig.catalog.transfer import CatalogSource, Conflict, Transferred, transfer
 from rig.core.errors import CatalogDamaged, CatalogError, JobNotFound
@@ -155,7 +155,7 @@ def add_results(routes: Routes, server: Server) -> None:
         page: Page,
         sample: Annotated[str | None, Query(max_length=100)] = None,
         object_name: Annotated[str | None, Query(alias="object", max_length=100)] = None,
-        outcome: Outcome | None = None,
+        outcome: RecordedOutcome | None = None,
     ) -> Response:
         """List the recorded answers, the newest first. Filters use the corrected values."""
         with server.catalog.open_to_read() as catalog:

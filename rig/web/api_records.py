@@ -11,7 +11,7 @@ from rig.core.errors import JobNotFound
 from rig.core.json_form import plain
 from rig.core.masking import masked
 from rig.events.events import event_dict
-from rig.search.replay import Check, check
+from rig.search.replay import ReplayCheck, check
 from rig.search.saved_run import SavedRun, load_run
 from rig.web.answers import ListOf, RunName, SavedRunBody, time_text
 from rig.web.server import Page, Routes, Server, long_work
@@ -54,7 +54,7 @@ def add_records(routes: Routes, server: Server) -> None:
     async def check_run(name: str) -> dict[str, Any]:
         """Compute every decision of a saved run again from its images."""
 
-        def checked() -> Check:
+        def checked() -> ReplayCheck:
             saved = load(name)
             with saved.damage():
                 return check(saved)

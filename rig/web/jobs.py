@@ -15,7 +15,7 @@ from rig.core.errors import JobNotFound, JobRejected, ObjectExists, RigError, St
 from rig.core.files import read, write
 from rig.core.next_steps import Do, NextStep
 from rig.plans.operator import Choice
-from rig.web.requests import EnrollRequest, IdentifyRequest, Job, JobRequest, JobState, Question, TrayRequest
+from rig.web.requests import EnrollRequest, IdentifyRequest, Job, JobQuestion, JobRequest, JobState, TrayRequest
 
 FILE: Final = "jobs.json"
 STORED: Final = 200
@@ -177,7 +177,7 @@ class JobQueue:
     def is_paused(self, job: Job) -> bool:
         return job.id in self._pausing
 
-    def ask(self, job: Job, question: Question | None) -> None:
+    def ask(self, job: Job, question: JobQuestion | None) -> None:
         """Show a question, or with None remove it."""
         with self._lock:
             self._answers.pop(job.id, None)

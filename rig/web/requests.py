@@ -147,7 +147,7 @@ JobRequest = Annotated[
 ]
 
 
-class Question(_Request):
+class JobQuestion(_Request):
     """What a job asks the operator."""
 
     text: str
@@ -172,7 +172,7 @@ class JobState(StrEnum):
         return self in (JobState.DONE, JobState.FAILED, JobState.CANCELLED, JobState.INTERRUPTED)
 
 
-class Progress(_Request):
+class StepsDone(_Request):
     """Progress of a job: steps done of all steps, and the expected time left."""
 
     done: int
@@ -197,8 +197,8 @@ class Job(BaseModel):
     operator: str
     started_utc: str | None = None
     ended_utc: str | None = None
-    progress: Progress | None = None
-    question: Question | None = None
+    progress: StepsDone | None = None
+    question: JobQuestion | None = None
     result: dict[str, Any] | None = None
     result_text: str = ""
     error: dict[str, Any] | None = None

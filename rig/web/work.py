@@ -20,7 +20,7 @@ from rig.doctor.context import open_context
 from rig.doctor.finding import Finding, finding_words
 from rig.events.events import Accepted, Decided, Enrolled, Event, Identified, Ranked, Started, event_dict
 from rig.events.lines import next_steps, page_line
-from rig.jobs.desk import Desk, Progress, Remark, Result, Step, Steps
+from rig.jobs.desk import Desk, JobResult, Progress, Remark, Step, Steps
 from rig.jobs.doctor import examine
 from rig.jobs.enroll import enroll, enroll_list, plan
 from rig.jobs.identify import identify
@@ -41,7 +41,7 @@ CALIBRATIONS: Final = "rig.calibrations"
 """Entry-point group of the calibrations."""
 
 
-class Calibration(Protocol):
+class ServedCalibration(Protocol):
     """A calibration that a job can run, if necessary with an object that the request names."""
 
     @property
@@ -50,7 +50,7 @@ class Calibration(Protocol):
     def __call__(self, desk: Desk, thing: str | None) -> Steps[bool]: ...
 
 
-def calibrations() -> dict[str, Calibration]:
+def calibrations() -> dict[str, ServedCalibration]:
     """Return the installed calibrations by name."""
     return dict(sorted(plugins(CALIBRATIONS)))
 
@@ -100,7 +100,7 @@ class ServedDesk(Desk):
     def choose(self, question: Question) -> Choice:
         queue, job = self._worker.queue, self.job
         steps = steps_as_json(as_steps(question.steps))
-        queue.ask(job, requests.Question(text=question.text, choices=tuple(question.choices), steps=steps))
+        queue.ask(job, requests.JobQuestion(text=question.text, choices=tuple(question.choices), steps=steps))
         while (choice := queue.answered(job)) is None:
             self._worker.wait(job)
         queue.ask(job, None)
@@ -126,7 +126,7 @@ class ServedDesk(Desk):
                 self._note(text)
             case Finding(topic=topic):
                 self._note(f"{topic}: {finding_words(step)}")
-            case Result():
+            case JobResult():
                 self.job.result, self.job.result_text = step.values, step.text
             case _:
                 self.show(step)
@@ -147,7 +147,7 @@ class ServedDesk(Desk):
         job, values, text = self.job, event_dict(event), page_line(event)
         if isinstance(event, Started):
             bench = self._worker.bench()
-            job.progress = requests.Progress(done=0, total=event.views)
+            job.progress = requests.StepsDone(done=0, total=event.views)
             self._outline = Outliner(bench)
             left = TimeLeft(MotionTimes(bench.config), event.angles_deg, in_motion=event.in_motion)
             self._left = left if event.angles_deg else None
@@ -202,7 +202,7 @@ def _tray(desk: ServedDesk, objects: list[TrayObject], **parameters: Any) -> Ste
 def _dry_run(desk: ServedDesk, objects: list[TrayObject], **parameters: Any) -> Steps[None]:
     found = plan(desk, {one.name: one.views for one in objects}, **parameters)
     views, seconds = sum(one.views for one in found), sum(one.seconds for one in found)
-    yield Result(
+    yield JobResult(
         {"dry_run": plain(found)},
         f"{counted(len(found), 'object')}, {counted(views, 'view')}, about {duration_words(seconds)}. "
         "Nothing was moved or stored.",
@@ -232,16 +232,16 @@ def _calibrate(desk: ServedDesk, name: str, object: str | None) -> Steps[None]:
     found = calibrations()
     if name not in found:
         raise UsageError(f"There is no calibration {name!r}.", next_step=f"Choose one of {', '.join(found)}.")
-    results: list[Result] = []
+    results: list[JobResult] = []
     with closing(found[name](desk, object)) as steps:
         for step in steps:
-            if isinstance(step, Result):
+            if isinstance(step, JobResult):
                 results.append(step)
                 yield Remark(step.text)
             else:
                 yield step
     values = [{"name": one.values["name"], "passed": one.values["passed"], "text": one.text} for one in results]
-    yield Result({"calibrations": values}, "\n".join(one.text for one in results))
+    yield JobResult({"calibrations": values}, "\n".join(one.text for one in results))
 
 
 JOBS: Final[dict[type[BaseModel], Callable[..., Steps[object]]]] = {

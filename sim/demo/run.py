@@ -18,7 +18,7 @@ from hbr import Outcome
 from rig.bench import Bench
 from rig.catalog import Catalog
 from rig.catalog.jobs import JobProgress
-from rig.cli.ui.present import Progress, console
+from rig.cli.ui.present import ProgressBar, console
 from rig.cli.ui.settings import Settings
 from rig.config.values import validate
 from rig.core.clock import SystemClock, seconds_between
@@ -48,7 +48,7 @@ from sim.demo.lines import MoveLines
 from sim.faults.injector import Occurrence
 from sim.faults.schedule import Fault, read_faults
 from sim.noise import NoiseModel
-from sim.objects.photographs import PhotographedObject, photographs
+from sim.objects.photographs import PhotographsOnTable, photographs
 from sim.objects.shelf import shelf
 from sim.objects.solid import Solid
 from sim.world import World
@@ -82,7 +82,7 @@ of 1.4 degrees.
 GOOD_SHARE = 0.8
 """Share of right answers below which the demo fails; of two very similar objects, an answer can be wrong."""
 
-SimObject = Solid | PhotographedObject
+SimObject = Solid | PhotographsOnTable
 
 
 @dataclass(frozen=True, slots=True)
@@ -259,7 +259,7 @@ def _enroll_all(
     bench: Bench, catalog: Catalog, names: Sequence[str], views: int, *, say: bool
 ) -> list[EnrollmentRecord]:
     records, done = [], 0
-    with Progress("enrolling") as progress:
+    with ProgressBar("enrolling") as progress:
         for name in names:
             record = EnrollmentRecord(region=bench.config.view.roi)
             for event in enroll(bench, catalog, name, views=views):

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from sim.clock import Timer
 from sim.devices import SimDevices
 from sim.faults.kind import End
-from sim.faults.schedule import Fault, Trigger
+from sim.faults.schedule import Fault, FaultTrigger
 from sim.world import Activity
 
 DURING_S = 0.1  # within the ramp of every move
@@ -53,7 +53,7 @@ class Faults:
     def schedule(self, *faults: Fault) -> None:
         """Schedule faults for their times; a time that has passed means now."""
         for fault in faults:
-            if fault.trigger is not Trigger.AT:
+            if fault.trigger is not FaultTrigger.AT:
                 self._waiting.append(fault)
             elif (at_ns := round(fault.mark * 1e9)) <= self._clock.now_ns():
                 self._begin(fault)
@@ -88,13 +88,13 @@ class Faults:
             if self._set_off_for == self._views:
                 return  # the same move in several steps
             self._set_off_for = self._views
-            self._due(Trigger.MOVE, self._views, now_ns + round(DURING_S * 1e9))
+            self._due(FaultTrigger.MOVE, self._views, now_ns + round(DURING_S * 1e9))
         elif self._moved:  # the first frame of this view, not a repeated one
             self._moved = False
-            self._due(Trigger.VIEW, self._views, now_ns + 1)
+            self._due(FaultTrigger.VIEW, self._views, now_ns + 1)
             self._views += 1
 
-    def _due(self, trigger: Trigger, number: int, at_ns: int) -> None:
+    def _due(self, trigger: FaultTrigger, number: int, at_ns: int) -> None:
         due = [fault for fault in self._waiting if fault.trigger is trigger and fault.mark == number]
         for fault in due:
             self._waiting.remove(fault)

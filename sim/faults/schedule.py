@@ -21,7 +21,7 @@ _WHEN = re.compile(r"(?:(?P<at>[\d.]+)s|move(?P<move>\d+)|view(?P<view>\d+))(?:\
 _KEYS = ("name", "at_s", "during_move", "after_view", "for_s")
 
 
-class Trigger(Enum):
+class FaultTrigger(Enum):
     """The events that start a fault."""
 
     AT = "at_s"
@@ -48,7 +48,7 @@ class Fault:
 
     kind: FaultKind
     values: Mapping[str, float] = field(default_factory=dict)
-    trigger: Trigger = Trigger.AT
+    trigger: FaultTrigger = FaultTrigger.AT
     mark: float = 0.0
     for_s: float | None = None
 
@@ -56,7 +56,11 @@ class Fault:
         given = "".join(
             f":{name}={value:g}" for name, value in self.values.items() if value != self.kind.parameters[name].default
         )
-        when = {Trigger.AT: f"{self.mark:g}s", Trigger.MOVE: f"move{self.mark:g}", Trigger.VIEW: f"view{self.mark:g}"}
+        when = {
+            FaultTrigger.AT: f"{self.mark:g}s",
+            FaultTrigger.MOVE: f"move{self.mark:g}",
+            FaultTrigger.VIEW: f"view{self.mark:g}",
+        }
         length = "" if self.for_s is None else f"+{self.for_s:g}s"
         return f"{self.kind.name}{given}@{when[self.trigger]}{length}"
 
@@ -95,7 +99,7 @@ class Fault:
                 "A fault has no name.", next_step=('Add a name, for example name = "jam".', Do.LIST_FAULTS())
             )
         kind = find_fault(name)
-        triggers = [trigger for trigger in Trigger if trigger.value in table]
+        triggers = [trigger for trigger in FaultTrigger if trigger.value in table]
         if len(triggers) > 1:
             raise UsageError(
                 f"The fault {name} has more than one time.",
@@ -103,11 +107,11 @@ class Fault:
             )
         numbers = {key: _number(name, key, value) for key, value in table.items() if key != "name"}
         for_s = numbers.pop("for_s", None)
-        trigger = triggers[0] if triggers else Trigger.AT
+        trigger = triggers[0] if triggers else FaultTrigger.AT
         mark = numbers.pop(trigger.value, 0.0)
         if mark < 0 or (for_s is not None and for_s <= 0):
             raise UsageError(f"The time of the fault {name} is negative.", next_step="Give a time of 0 or later.")
-        if trigger is not Trigger.AT and mark != int(mark):
+        if trigger is not FaultTrigger.AT and mark != int(mark):
             raise UsageError(
                 f"{trigger.value} = {mark:g} of the fault {name} is not a whole number.",
                 next_step="Give a whole number.",

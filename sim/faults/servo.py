@@ -7,7 +7,7 @@ import numpy as np
 
 from sim.devices import SimDevices
 from sim.faults.kind import Delay, End, Parameter, repeatedly, share, simulated_fault
-from sim.servo import Ax12Servo, Frame, XSeriesServo
+from sim.servo import Ax12Servo, SentBytes, XSeriesServo
 from sim.servo.base import OVERLOAD_ERROR
 from sim.servo.configured import SimulatedServo
 from sim.servo.control_table import Memory
@@ -20,7 +20,7 @@ _OTHER_MODEL = 1020  # model Number of an XM430-W350
 _XL430_MODEL = 1060
 
 
-def _filter(devices: SimDevices, change: Callable[[Frame], Frame | None]) -> End:
+def _filter(devices: SimDevices, change: Callable[[SentBytes], SentBytes | None]) -> End:
     devices.servo_bus.filters.append(change)
     return lambda: devices.servo_bus.filters.remove(change)
 
@@ -30,7 +30,7 @@ def _distort(devices: SimDevices, change: Callable[[Memory], None]) -> End:
     return lambda: devices.servo.distortions.remove(change)
 
 
-def _later(frame: Frame, seconds: float) -> Frame:
+def _later(frame: SentBytes, seconds: float) -> SentBytes:
     return replace(frame, start_ns=frame.start_ns + round(seconds * 1e9))
 
 
@@ -96,7 +96,7 @@ def _intermittent(devices: SimDevices, values: Values, rng: np.random.Generator)
 
 @simulated_fault("crc_flip", "Single bits of some answers flip on the servo bus.", rate=share(0.1, "answers"))
 def _crc_flip(devices: SimDevices, values: Values, rng: np.random.Generator) -> End:
-    def flip(frame: Frame) -> Frame:
+    def flip(frame: SentBytes) -> SentBytes:
         if rng.random() >= values["rate"]:
             return frame
         data = bytearray(frame.data)
@@ -125,7 +125,7 @@ def _late_reply(devices: SimDevices, values: Values, rng: np.random.Generator) -
 def _duplicate_reply(devices: SimDevices, values: Values, rng: np.random.Generator) -> End:
     bus, clock = devices.servo_bus, devices.world.clock
 
-    def repeat(frame: Frame) -> Frame:
+    def repeat(frame: SentBytes) -> SentBytes:
         if rng.random() < values["rate"]:
             at_ns = frame.start_ns + round(values["seconds"] * 1e9)
             clock.call_at(max(at_ns, clock.now_ns()), lambda: bus.disturb(frame.data, frame.baudrate))

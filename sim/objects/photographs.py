@@ -23,7 +23,7 @@ _KEPT = 96  # decoded photographs, 0.9 MB each
 
 
 @dataclass(frozen=True)
-class PhotographedObject:
+class PhotographsOnTable:
     """One object of a folder.
 
     Attributes
@@ -50,7 +50,7 @@ class PhotographedObject:
         return int(apart.argmin())
 
 
-def photographs(folder: str | Path) -> Mapping[str, PhotographedObject]:
+def photographs(folder: str | Path) -> Mapping[str, PhotographsOnTable]:
     """Return the objects of a folder by name, ``obj2`` before ``obj10``; photographs are read when they are drawn.
 
     Raises `UsageError` if the folder does not exist, contains no photograph in this layout, or contains two photographs
@@ -79,9 +79,9 @@ def photographs(folder: str | Path) -> Mapping[str, PhotographedObject]:
     return MappingProxyType({f"obj{number}": _object(f"obj{number}", views[number]) for number in sorted(views)})
 
 
-def _object(name: str, views: Mapping[float, Path]) -> PhotographedObject:
+def _object(name: str, views: Mapping[float, Path]) -> PhotographsOnTable:
     azimuths = sorted(views)
-    return PhotographedObject(name, np.array(azimuths), tuple(views[a] for a in azimuths))
+    return PhotographsOnTable(name, np.array(azimuths), tuple(views[a] for a in azimuths))
 
 
 @lru_cache(maxsize=_KEPT)

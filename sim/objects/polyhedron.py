@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from sim.objects.layers import blend
-from sim.objects.projection import Colour, Drawing, Floats, Image, Paint, Pose, nearness, shade
+from sim.objects.projection import Colour, Drawing, Floats, Image, ObjectPose, Paint, nearness, shade
 
 TEXELS_PER_MM = 2.0  # as `PX_PER_MM`: finer textures would only be blurred
 _EDGE_ON = 0.004  # a face at a smaller angle is less than half a pixel wide
@@ -76,7 +76,7 @@ class Polyhedron:
         outline = cv2.convexHull(np.concatenate([face.corners[:, :2] for face in self.faces]).astype(np.float32))
         return sqrt(cv2.contourArea(outline) / pi)
 
-    def drawings(self, pose: Pose) -> list[Drawing]:
+    def drawings(self, pose: ObjectPose) -> list[Drawing]:
         return [Drawing((self.layer, pose.depth(*self._depth_at)), partial(self._draw, pose))]
 
     @cached_property
@@ -95,7 +95,7 @@ class Polyhedron:
         slices = [slice(int(end) - len(face.corners), int(end)) for face, end in zip(self.faces, ends, strict=True)]
         return corners, slices, frames, np.array([face.normal for face in self.faces])
 
-    def _draw(self, pose: Pose, image: Image) -> None:
+    def _draw(self, pose: ObjectPose, image: Image) -> None:
         corners_mm, slices, frames_mm, normals = self._geometry
         corners, normals = pose.to_image(corners_mm), pose.rotate(normals)
         left, top = np.maximum(np.floor(corners.min(axis=0)).astype(int) - 2, 0).tolist()
@@ -231,7 +231,7 @@ def roof(
 
 def moved(solid: Polyhedron, at: tuple[float, float, float], rotation_deg: float) -> Polyhedron:
     """Return ``solid`` rotated about its own axis and moved to ``at`` in the object's frame."""
-    pose = Pose(rotation_deg)
+    pose = ObjectPose(rotation_deg)
 
     def placed(points: Floats) -> Floats:
         return np.asarray(pose.rotate(points) + np.array(at))

@@ -56,7 +56,7 @@ class Drawing(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Pose:
+class ObjectPose:
     """Position of an object: rotated by ``azimuth_deg``, its axis at (``x_mm``, ``y_mm``) in the room."""
 
     azimuth_deg: float = 0.0

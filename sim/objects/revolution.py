@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from sim.objects.curves import Curve, evenly
 from sim.objects.layers import place
-from sim.objects.projection import COS, PX_PER_MM, SIN, Colour, Drawing, Floats, Image, Paint, Pose, gloss, shade
+from sim.objects.projection import COS, PX_PER_MM, SIN, Colour, Drawing, Floats, Image, ObjectPose, Paint, gloss, shade
 
 TEXELS_PER_MM = 2.0
 _STEP_MM = 0.25  # half a pixel along the outline
@@ -56,7 +56,7 @@ class Revolution:
     shine: float = 0.0
     layer: int = 0
 
-    def drawings(self, pose: Pose) -> list[Drawing]:
+    def drawings(self, pose: ObjectPose) -> list[Drawing]:
         foot_px = pose.to_image(np.array([[*self.at, 0.0]]))[0]
         return [Drawing((self.layer, pose.depth(*self.at)), partial(self._draw, pose.azimuth_deg, foot_px))]
 
@@ -90,14 +90,14 @@ class Revolution:
         return np.ascontiguousarray(np.hstack([texture, texture, texture[:, :2]]))
 
     @cached_property
-    def _at_azimuth_0(self) -> "_Seen":
+    def _at_azimuth_0(self) -> "_SeenPoints":
         inside = evenly(self.inside, _STEP_MM, dimensions=2) if self.inside else None
         rows, width, _ = self._texture.shape
         return _trace(self._outside, inside, rows - _LINING_ROWS, (width - 2) // 2, self.shine)
 
 
 @dataclass(frozen=True, slots=True)
-class _Seen:
+class _SeenPoints:
     """The points that the pixels of a body show at azimuth 0, (h, w); `foot_px` is where its axis meets z = 0."""
 
     column: NDArray[np.float32]
@@ -109,7 +109,7 @@ class _Seen:
     columns: int  # once around the texture
 
 
-def _trace(outside: Floats, inside: Floats | None, rows: int, columns: int, shine: float) -> _Seen:
+def _trace(outside: Floats, inside: Floats | None, rows: int, columns: int, shine: float) -> _SeenPoints:
     half = int(np.ceil(outside[:, 0].max() * PX_PER_MM)) + 2
     top = int(np.ceil(outside[:, 1].max() * PX_PER_MM * COS + half * SIN)) + 2
     up = np.arange(top, -int(np.ceil(half * SIN)) - 3, -1, dtype=np.float64)
@@ -131,7 +131,7 @@ def _trace(outside: Floats, inside: Floats | None, rows: int, columns: int, shin
     column = ((azimuth / (2 * np.pi) + 0.75) * columns - 0.5) % columns
     normals = np.stack([radial * np.cos(azimuth), radial * np.sin(azimuth), rising], axis=-1)
     light = shade(normals) * np.where(hollow, 0.85, 1.0)  # the inside gets less ambient light
-    return _Seen(
+    return _SeenPoints(
         column=column.astype(np.float32),
         row=row.astype(np.float32),
         light=_three(light * cover * 255),

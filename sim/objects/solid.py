@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from sim.objects.layers import place
-from sim.objects.projection import CENTRE_PX, COS, HEIGHT, PX_PER_MM, SIN, WIDTH, Drawing, Floats, Image, Pose
+from sim.objects.projection import CENTRE_PX, COS, HEIGHT, PX_PER_MM, SIN, WIDTH, Drawing, Floats, Image, ObjectPose
 
 
 class Part(Protocol):
@@ -18,7 +18,7 @@ class Part(Protocol):
     def reach_mm(self) -> float:
         """Radius of its shadow on the platter."""
 
-    def drawings(self, pose: Pose) -> list[Drawing]: ...
+    def drawings(self, pose: ObjectPose) -> list[Drawing]: ...
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Solid:
 
     def draw(self, image: Image, azimuth_deg: float, offset_mm: tuple[float, float] = (0.0, 0.0)) -> None:
         """Draw the object into ``image`` as `sim.objects.projection.Visible` describes."""
-        pose = Pose(azimuth_deg, *offset_mm)
+        pose = ObjectPose(azimuth_deg, *offset_mm)
         clear, foot = self._shadow
         place(image, np.zeros_like(clear), clear, pose.to_image(np.zeros((1, 3)))[0] - foot)
         drawings = [drawing for part in self.parts for drawing in part.drawings(pose)]

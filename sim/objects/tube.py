@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.objects.curves import Curve, evenly
-from sim.objects.projection import COS, PX_PER_MM, SIN, TO_LIGHT, Colour, Drawing, Floats, Image, Pose, nearness
+from sim.objects.projection import COS, PX_PER_MM, SIN, TO_LIGHT, Colour, Drawing, Floats, Image, ObjectPose, nearness
 
 _SHIFT = 4  # fractional bits of OpenCV's drawing coordinates
 _STEP_MM = 4.0  # eight pixels: shorter pieces are not seen on a bent wire
@@ -47,7 +47,7 @@ class Tube:
 
     reach_mm = 0.0
 
-    def drawings(self, pose: Pose) -> list[Drawing]:
+    def drawings(self, pose: ObjectPose) -> list[Drawing]:
         points, length = self._points
         segments = np.arange(len(points) - 1)
         if self.joints == 0:
@@ -73,7 +73,7 @@ class Tube:
         steps = np.linalg.norm(np.diff(points[:, :3], axis=0), axis=1)
         return points, np.concatenate([[0.0], np.cumsum(steps)])
 
-    def _draw(self, pose: Pose, points: Floats, segments: NDArray[np.intp], image: Image) -> None:
+    def _draw(self, pose: ObjectPose, points: Floats, segments: NDArray[np.intp], image: Image) -> None:
         near = nearness(pose.to_room(points[:, :3]))
         order = segments[np.argsort(near[segments] + near[segments + 1])]
         pixels = pose.to_image(points[:, :3])

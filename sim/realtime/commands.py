@@ -11,7 +11,7 @@ from sim.bench import ShelfOperator
 from sim.calibration_board import calibration_targets
 from sim.devices import SimDevices
 from sim.faults import Fault, Faults, fault_kinds
-from sim.faults.schedule import Trigger
+from sim.faults.schedule import FaultTrigger
 
 HELP: Final = """\
 put NAME [DEGREES]  Put an object on the table, rotated by so many degrees (default: at random). Clears the table first.
@@ -163,7 +163,7 @@ class Commands:
                 f"{name} happens to the computer of one program, not to this bench.",
                 next_step=f"Use it on the bench sim: rig demo --fault {name}",
             )
-        if fault.trigger is not Trigger.AT:
+        if fault.trigger is not FaultTrigger.AT:
             step = f"Give the time from now on: {name}@5s"
             raise UsageError("Programs, not this bench, count their moves and views.", next_step=step)
         if any(active.kind is fault.kind for active in self._faults.active):

@@ -26,7 +26,7 @@ from sim.realtime.bench import RunningSimBench
 from sim.realtime.commands import Commands, run
 from sim.realtime.pace import RealTime
 from sim.realtime.port import PtyPort
-from sim.realtime.server import Server
+from sim.realtime.server import BenchServer
 from sim.realtime.wire import COMPUTER, HEAD, SERVO
 from sim.servo import ServoBus, SimSerial
 from sim.servo.base import BOOT_S
@@ -64,7 +64,7 @@ def run_bench(settings: Settings, folder: Path | None, seconds: float | None) ->
         time = RealTime(world.clock, ports)
         operator = ShelfOperator(world, photographs(options.objects) if options.objects else shelf())
         commands = Commands(operator, devices, faults, quit=lambda: setattr(time, "over", True))
-        server = ends.enter_context(Server(folder, devices, time, commands))
+        server = ends.enter_context(BenchServer(folder, devices, time, commands))
         inputs: dict[int, Callable[[], bool]] = {server.fileno(): server.accept}
         if (keyboard := _Keyboard(settings, time, commands)).usable():
             inputs[sys.stdin.fileno()] = keyboard.read

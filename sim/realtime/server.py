@@ -41,10 +41,10 @@ class InvalidRequest(ValueError):
     """The line is no request."""
 
 
-class Session:
+class ClientSession:
     """Answers the requests of one connection."""
 
-    def __init__(self, bench: "Server") -> None:
+    def __init__(self, bench: "BenchServer") -> None:
         self._bench = bench
         self._devices, self._time = bench.devices, bench.time
 
@@ -189,8 +189,8 @@ class _Handler(socketserver.StreamRequestHandler):
     """Answers one connection in its own thread."""
 
     def handle(self) -> None:
-        assert isinstance(self.server, Server)
-        session = Session(self.server)
+        assert isinstance(self.server, BenchServer)
+        session = ClientSession(self.server)
         try:
             while line := self.rfile.readline(MAX_LINE):
                 answer, payload = session.answer(json_values(line))
@@ -205,7 +205,7 @@ class _Handler(socketserver.StreamRequestHandler):
             super().finish()
 
 
-class Server(socketserver.ThreadingMixIn, socketserver.UnixStreamServer):
+class BenchServer(socketserver.ThreadingMixIn, socketserver.UnixStreamServer):
     """Listens at a socket in ``folder``.
 
     Parameters
@@ -220,7 +220,7 @@ class Server(socketserver.ThreadingMixIn, socketserver.UnixStreamServer):
 
     def __init__(self, folder: Path, devices: SimDevices, time: RealTime, commands: Commands) -> None:
         self.devices, self.time, self.commands = devices, time, commands
-        self.camera_user: Session | None = None
+        self.camera_user: ClientSession | None = None
         self._path = folder / SOCKET
         self._connections: dict[socket.socket, threading.Thread] = {}
         self._path.unlink(missing_ok=True)

@@ -12,7 +12,7 @@ from rig.devices.dynamixel.registers import number_of
 from sim.servo.base import SimulatedServoBase
 from sim.servo.models import ServoModel
 from sim.servo.protocol1 import Error
-from sim.servo.protocol2 import BROADCAST_ID, Instruction, InstructionPacket, Status
+from sim.servo.protocol2 import BROADCAST_ID, Instruction, InstructionPacket, StatusPacket
 from sim.servo.shaft import Shaft
 
 DEG_PER_COUNT = 300.0 / 1023.0  # e-manual, AX-12A: 300° in 1,023 steps, 0.111 rev/min for each unit
@@ -48,7 +48,7 @@ AX_12A = ServoModel(
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
+class Ax12Register:
     """A register: its address, its initial value, and its valid values (none: it is read only)."""
 
     address: int
@@ -58,39 +58,39 @@ class Entry:
 
 
 # e-manual, AX-12A, control table: address, size, initial value, range
-ENTRIES: dict[str, Entry] = {
-    "Model Number": Entry(0, 2, 12, None),
-    "Firmware Version": Entry(2, 1, 24, None),
-    "ID": Entry(3, 1, 1, range(254)),
-    "Baud Rate": Entry(4, 1, 1, range(1, 255)),
-    "Return Delay Time": Entry(5, 1, 250, range(255)),
-    "CW Angle Limit": Entry(6, 2, 0, _COUNTS),
-    "CCW Angle Limit": Entry(8, 2, 1023, _COUNTS),
-    "Temperature Limit": Entry(11, 1, 70, range(100)),
-    "Min Voltage Limit": Entry(12, 1, 60, range(50, 161)),
-    "Max Voltage Limit": Entry(13, 1, 140, range(50, 161)),
-    "Max Torque": Entry(14, 2, 1023, _COUNTS),
-    "Status Return Level": Entry(16, 1, 2, range(3)),
-    "Alarm LED": Entry(17, 1, 36, range(128)),
-    "Shutdown": Entry(18, 1, 36, range(128)),
-    "Torque Enable": Entry(24, 1, 0, range(2)),
-    "LED": Entry(25, 1, 0, range(2)),
-    "CW Compliance Margin": Entry(26, 1, 1, _BYTE),
-    "CCW Compliance Margin": Entry(27, 1, 1, _BYTE),
-    "CW Compliance Slope": Entry(28, 1, 32, _BYTE),
-    "CCW Compliance Slope": Entry(29, 1, 32, _BYTE),
-    "Goal Position": Entry(30, 2, 0, _COUNTS),
-    "Moving Speed": Entry(32, 2, 0, range(2048)),
-    "Torque Limit": Entry(34, 2, 1023, _COUNTS),
-    "Present Position": Entry(36, 2, 0, None),
-    "Present Speed": Entry(38, 2, 0, None),
-    "Present Load": Entry(40, 2, 0, None),
-    "Present Voltage": Entry(42, 1, 0, None),
-    "Present Temperature": Entry(43, 1, 0, None),
-    "Registered": Entry(44, 1, 0, None),
-    "Moving": Entry(46, 1, 0, None),
-    "Lock": Entry(47, 1, 0, range(2)),
-    "Punch": Entry(48, 2, 32, _COUNTS),
+ENTRIES: dict[str, Ax12Register] = {
+    "Model Number": Ax12Register(0, 2, 12, None),
+    "Firmware Version": Ax12Register(2, 1, 24, None),
+    "ID": Ax12Register(3, 1, 1, range(254)),
+    "Baud Rate": Ax12Register(4, 1, 1, range(1, 255)),
+    "Return Delay Time": Ax12Register(5, 1, 250, range(255)),
+    "CW Angle Limit": Ax12Register(6, 2, 0, _COUNTS),
+    "CCW Angle Limit": Ax12Register(8, 2, 1023, _COUNTS),
+    "Temperature Limit": Ax12Register(11, 1, 70, range(100)),
+    "Min Voltage Limit": Ax12Register(12, 1, 60, range(50, 161)),
+    "Max Voltage Limit": Ax12Register(13, 1, 140, range(50, 161)),
+    "Max Torque": Ax12Register(14, 2, 1023, _COUNTS),
+    "Status Return Level": Ax12Register(16, 1, 2, range(3)),
+    "Alarm LED": Ax12Register(17, 1, 36, range(128)),
+    "Shutdown": Ax12Register(18, 1, 36, range(128)),
+    "Torque Enable": Ax12Register(24, 1, 0, range(2)),
+    "LED": Ax12Register(25, 1, 0, range(2)),
+    "CW Compliance Margin": Ax12Register(26, 1, 1, _BYTE),
+    "CCW Compliance Margin": Ax12Register(27, 1, 1, _BYTE),
+    "CW Compliance Slope": Ax12Register(28, 1, 32, _BYTE),
+    "CCW Compliance Slope": Ax12Register(29, 1, 32, _BYTE),
+    "Goal Position": Ax12Register(30, 2, 0, _COUNTS),
+    "Moving Speed": Ax12Register(32, 2, 0, range(2048)),
+    "Torque Limit": Ax12Register(34, 2, 1023, _COUNTS),
+    "Present Position": Ax12Register(36, 2, 0, None),
+    "Present Speed": Ax12Register(38, 2, 0, None),
+    "Present Load": Ax12Register(40, 2, 0, None),
+    "Present Voltage": Ax12Register(42, 1, 0, None),
+    "Present Temperature": Ax12Register(43, 1, 0, None),
+    "Registered": Ax12Register(44, 1, 0, None),
+    "Moving": Ax12Register(46, 1, 0, None),
+    "Lock": Ax12Register(47, 1, 0, range(2)),
+    "Punch": Ax12Register(48, 2, 32, _COUNTS),
 }
 SIZE = 50
 RAM_START = 24
@@ -210,18 +210,18 @@ class Ax12Servo(SimulatedServoBase):
         n = self.memory["Baud Rate"]
         return BAUD_RATES.get(n, 2_000_000 // (n + 1))
 
-    def execute(self, packet: InstructionPacket) -> Status | None:
+    def execute(self, packet: InstructionPacket) -> StatusPacket | None:
         """Execute ``packet`` if it is for this servo, and return the answer if there is one."""
         everyones = packet.bus_id == BROADCAST_ID
         if not self._powered or not (everyones or packet.bus_id == self.bus_id):
             return None
         level = self.memory["Status Return Level"]
         if not packet.intact:
-            return None if everyones else Status(self._hardware_errors() | Error.CHECKSUM)
+            return None if everyones else StatusPacket(self._hardware_errors() | Error.CHECKSUM)
         error, data = self._perform(packet)
         ping = packet.instruction == Instruction.PING
         answers = ping or (not everyones and level >= 2 - (packet.instruction == Instruction.READ))
-        return Status(self._hardware_errors() | error, data) if answers else None
+        return StatusPacket(self._hardware_errors() | error, data) if answers else None
 
     def _perform(self, packet: InstructionPacket) -> tuple[int, bytes]:
         parameters = packet.parameters

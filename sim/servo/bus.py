@@ -8,7 +8,14 @@ from typing import Protocol
 
 from sim.clock import VirtualClock
 from sim.servo.protocol1 import PacketParser1, status_packet1
-from sim.servo.protocol2 import BROADCAST_ID, InstructionPacket, PacketParser, Status, fast_status_parts, status_packet
+from sim.servo.protocol2 import (
+    BROADCAST_ID,
+    InstructionPacket,
+    PacketParser,
+    StatusPacket,
+    fast_status_parts,
+    status_packet,
+)
 from sim.servo.requests import CHAINED_READS, FAST_READS, chained_reads
 
 BITS_PER_BYTE = 10  # a start bit, 8 data bits, a stop bit
@@ -20,16 +27,16 @@ COLLISION_SHIFT_BITS = 3  # any small number: what matters is that the bytes ove
 """Delay of the second of two devices with one id, because they never answer at exactly the same time."""
 
 
-class Source(Enum):
+class Sender(Enum):
     HOST = "host"
     DEVICE = "device"
 
 
 @dataclass(frozen=True, slots=True)
-class Frame:
+class SentBytes:
     """Bytes that are sent without a gap; ``start_ns`` is the beginning of the first start bit."""
 
-    source: Source
+    source: Sender
     start_ns: int
     baudrate: int
     data: bytes
@@ -49,15 +56,15 @@ class Frame:
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class DeviceAnswer:
     """The answer of a device, with its id and its delay."""
 
     bus_id: int
     delay_ns: int
-    status: Status
+    status: StatusPacket
 
 
-class Device(Protocol):
+class BusDevice(Protocol):
     """The interface of a servo on the bus."""
 
     @property
@@ -72,7 +79,7 @@ class Device(Protocol):
     def powered(self) -> bool: ...
     @property
     def return_delay_ns(self) -> int: ...
-    def execute(self, packet: InstructionPacket) -> Status | None: ...
+    def execute(self, packet: InstructionPacket) -> StatusPacket | None: ...
 
 
 class ServoBus:
@@ -98,25 +105,25 @@ class ServoBus:
 
     def __init__(self, clock: VirtualClock) -> None:
         self.clock = clock
-        self.taps: list[Callable[[Frame], None]] = []
-        self.filters: list[Callable[[Frame], Frame | None]] = []
+        self.taps: list[Callable[[SentBytes], None]] = []
+        self.filters: list[Callable[[SentBytes], SentBytes | None]] = []
         self.echo = False
         self.deaf = False
-        self._devices: list[Device] = []
-        self._deliver: Callable[[Frame], None] | None = None
+        self._devices: list[BusDevice] = []
+        self._deliver: Callable[[SentBytes], None] | None = None
         self._sent_until_ns = 0
         self._parsers: dict[int, PacketParser] = {1: PacketParser1(), 2: PacketParser()}
-        self._last_frame = Frame(Source.HOST, 0, 1, b"")
+        self._last_frame = SentBytes(Sender.HOST, 0, 1, b"")
 
-    def attach(self, device: Device) -> None:
+    def attach(self, device: BusDevice) -> None:
         """Connect a servo to the bus."""
         self._devices.append(device)
 
-    def detach(self, device: Device) -> None:
+    def detach(self, device: BusDevice) -> None:
         """Disconnect a servo from the bus; ValueError if it is not connected."""
         self._devices.remove(device)
 
-    def connect(self, deliver: Callable[[Frame], None]) -> bool:
+    def connect(self, deliver: Callable[[SentBytes], None]) -> bool:
         """Connect the receiver of the host; return False if the bus already has a host."""
         if self._deliver is not None:
             return False
@@ -128,7 +135,7 @@ class ServoBus:
 
     def send(self, data: bytes, baudrate: int) -> int:
         """Send the host's bytes after those still being sent; return the time at which the last one arrives."""
-        frame = Frame(Source.HOST, max(self.clock.now_ns(), self._sent_until_ns), baudrate, data)
+        frame = SentBytes(Sender.HOST, max(self.clock.now_ns(), self._sent_until_ns), baudrate, data)
         self._sent_until_ns = frame.end_ns
         for tap in self.taps:
             tap(frame)
@@ -141,9 +148,9 @@ class ServoBus:
     def disturb(self, data: bytes, baudrate: int) -> None:
         """Send bytes to the host that no servo has sent."""
         if self._deliver is not None:
-            self._deliver(Frame(Source.DEVICE, self.clock.now_ns(), baudrate, data))
+            self._deliver(SentBytes(Sender.DEVICE, self.clock.now_ns(), baudrate, data))
 
-    def _receive(self, frame: Frame) -> None:
+    def _receive(self, frame: SentBytes) -> None:
         if frame.baudrate != self._last_frame.baudrate or frame.start_ns - self._last_frame.end_ns > ABANDON_S * 1e9:
             for parser in self._parsers.values():
                 parser.reset()
@@ -160,7 +167,7 @@ class ServoBus:
             if d.powered and d.baudrate == baudrate and d.protocol == protocol
         ]
         answers = [
-            Answer(bus_id, delay_ns, status)
+            DeviceAnswer(bus_id, delay_ns, status)
             for device, bus_id, delay_ns in called
             if (status := device.execute(packet)) is not None
         ]
@@ -171,13 +178,13 @@ class ServoBus:
             if protocol == 2 and packet.bus_id == BROADCAST_ID:  # only a ping is answered then
                 slot_ns = round((PING_SLOT_S + PING_STATUS_BYTES * BITS_PER_BYTE / baudrate) * 1e9)
             frames = [
-                Frame(Source.DEVICE, now_ns + a.delay_ns + a.bus_id * slot_ns, baudrate, packed(a.bus_id, a.status))
+                SentBytes(Sender.DEVICE, now_ns + a.delay_ns + a.bus_id * slot_ns, baudrate, packed(a.bus_id, a.status))
                 for a in answers
             ]
         for frame in superpose(frames):
             self._reply(frame)
 
-    def _chain(self, packet: InstructionPacket, answers: list[Answer], baudrate: int) -> list[Frame]:
+    def _chain(self, packet: InstructionPacket, answers: list[DeviceAnswer], baudrate: int) -> list[SentBytes]:
         """Return the answers to a chained read: one after the other; a fast read gives one packet."""
         requests = chained_reads(packet)
         links = ([answer for answer in answers if answer.bus_id == bus_id] for bus_id in requests)
@@ -187,17 +194,17 @@ class ServoBus:
         if fast:  # without parts, because they need more than one packet, the devices stay silent
             sizes = [size for _, size in requests.values()]
             parts = fast_status_parts(sizes, [(link[0].bus_id, link[0].status) for link in chain])
-        frames: list[Frame] = []
+        frames: list[SentBytes] = []
         free_ns = self.clock.now_ns()
         for link, part in zip(chain, parts, strict=False):
             for answer in link:
                 start_ns = free_ns if fast and frames else free_ns + answer.delay_ns
                 data = part if fast else status_packet(answer.bus_id, answer.status)
-                frames.append(Frame(Source.DEVICE, start_ns, baudrate, data))
+                frames.append(SentBytes(Sender.DEVICE, start_ns, baudrate, data))
             free_ns = max(frame.end_ns for frame in frames)
         return frames
 
-    def _reply(self, frame: Frame) -> None:
+    def _reply(self, frame: SentBytes) -> None:
         for change in self.filters:
             changed = change(frame)
             if changed is None:
@@ -209,9 +216,9 @@ class ServoBus:
             self._deliver(frame)
 
 
-def superpose(frames: list[Frame]) -> list[Frame]:
+def superpose(frames: list[SentBytes]) -> list[SentBytes]:
     """Return the bytes on the bus when ``frames`` are sent: frames that overlap in time collide."""
-    line: list[Frame] = []
+    line: list[SentBytes] = []
     for frame in sorted(frames, key=lambda f: f.start_ns):
         if line and frame.start_ns < line[-1].end_ns:
             line[-1] = _collide(line[-1], frame)
@@ -220,7 +227,7 @@ def superpose(frames: list[Frame]) -> list[Frame]:
     return line
 
 
-def _collide(first: Frame, second: Frame) -> Frame:
+def _collide(first: SentBytes, second: SentBytes) -> SentBytes:
     """Return the bytes received from two senders: a bus with a pull-up is low if one of them drives it low."""
     shift = COLLISION_SHIFT_BITS + (second.start_ns - first.start_ns) * first.baudrate // 1_000_000_000
     ones, others = _levels(first.data), _levels(second.data)

@@ -19,7 +19,7 @@ _READ_ONLY = frozenset(
 )
 
 
-class Rejection(Exception):
+class InstructionRejected(Exception):
     """The device rejects an instruction with an error."""
 
     def __init__(self, error: StatusError) -> None:
@@ -101,9 +101,9 @@ class Memory:
             DATA_LENGTH for no bytes, ACCESS if the range exceeds the table.
         """
         if size == 0:
-            raise Rejection(StatusError.DATA_LENGTH)
+            raise InstructionRejected(StatusError.DATA_LENGTH)
         if address + size > self._size:
-            raise Rejection(StatusError.ACCESS)
+            raise InstructionRejected(StatusError.ACCESS)
         data = bytes(self._image[address : address + size])
         if address + size > RAM_START and not self._indirect.keys().isdisjoint(range(address, address + size)):
             return bytes(self._image[self._resolve(a)] for a in range(address, address + size))
@@ -119,21 +119,23 @@ class Memory:
             DATA_RANGE for a value outside its range.
         """
         if not data:
-            raise Rejection(StatusError.DATA_LENGTH)
+            raise InstructionRejected(StatusError.DATA_LENGTH)
         targets = [self._resolve(address + i) for i in range(len(data))]
         entries = []
         i = 0
         while i < len(data):
             register = self._at.get(targets[i])
             if register is None:
-                raise Rejection(StatusError.DATA_LENGTH if self._within_register(targets[i]) else StatusError.ACCESS)
+                raise InstructionRejected(
+                    StatusError.DATA_LENGTH if self._within_register(targets[i]) else StatusError.ACCESS
+                )
             if register.name in _READ_ONLY:
-                raise Rejection(StatusError.ACCESS)
+                raise InstructionRejected(StatusError.ACCESS)
             if targets[i : i + register.size] != list(range(register.address, register.address + register.size)):
-                raise Rejection(StatusError.DATA_LENGTH)
+                raise InstructionRejected(StatusError.DATA_LENGTH)
             value = register.decode(data[i : i + register.size])
             if not self._takes(register, value):
-                raise Rejection(StatusError.DATA_RANGE)
+                raise InstructionRejected(StatusError.DATA_RANGE)
             entries.append((register, value))
             i += register.size
         return entries

@@ -4,10 +4,10 @@ from collections.abc import Callable
 
 from rig.devices.dynamixel.registers import Register
 from sim.servo.base import OVERLOAD_ERROR, SimulatedServoBase
-from sim.servo.control_table import FIRST_LIVE_REGISTER, RAM_START, Memory, Rejection
+from sim.servo.control_table import FIRST_LIVE_REGISTER, RAM_START, InstructionRejected, Memory
 from sim.servo.controller import Controller
 from sim.servo.models import BAUD_RATES, COUNTS_PER_REVOLUTION, POSITION_MODE, servo_model
-from sim.servo.protocol2 import ALERT, BROADCAST_ID, Instruction, InstructionPacket, Status, StatusError
+from sim.servo.protocol2 import ALERT, BROADCAST_ID, Instruction, InstructionPacket, StatusError, StatusPacket
 from sim.servo.requests import CHAINED_READS, chained_reads, group_writes, word
 from sim.servo.shaft import Shaft
 
@@ -89,7 +89,7 @@ class XSeriesServo(SimulatedServoBase):
     def baudrate(self) -> int:
         return BAUD_RATES[self.memory["Baud Rate"]]
 
-    def execute(self, packet: InstructionPacket) -> Status | None:
+    def execute(self, packet: InstructionPacket) -> StatusPacket | None:
         """Execute ``packet`` if it is for this servo, and return the answer if there is one."""
         if not self._powered:
             return None
@@ -110,7 +110,7 @@ class XSeriesServo(SimulatedServoBase):
                 ping, read = packet.instruction == Instruction.PING, packet.instruction == Instruction.READ
                 answers = (mine and level >= 2 - read) or (ping and not in_group)
                 data = self._perform(packet, everyones, in_group)
-        except Rejection as rejection:
+        except InstructionRejected as rejection:
             return self._status(rejection.error) if answers else None
         return self._status(StatusError.NONE, data) if answers else None
 
@@ -142,14 +142,14 @@ class XSeriesServo(SimulatedServoBase):
             # A moving servo rejects this, as the e-manual says.
             case Instruction.CLEAR if parameters == _CLEAR_MULTI_TURN:
                 if self.motor.state().speed_dps:
-                    raise Rejection(StatusError.RESULT_FAIL)
+                    raise InstructionRejected(StatusError.RESULT_FAIL)
                 self._controller.wrap_position()
             case _:
-                raise Rejection(StatusError.INSTRUCTION)
+                raise InstructionRejected(StatusError.INSTRUCTION)
         return b""
 
-    def _status(self, error: StatusError, data: bytes = b"") -> Status:
-        return Status(error | (ALERT if self.memory["Hardware Error Status"] else 0), data)
+    def _status(self, error: StatusError, data: bytes = b"") -> StatusPacket:
+        return StatusPacket(error | (ALERT if self.memory["Hardware Error Status"] else 0), data)
 
     def _read(self, address: int, size: int) -> bytes:
         if address + size > FIRST_LIVE_REGISTER:
@@ -172,12 +172,12 @@ class XSeriesServo(SimulatedServoBase):
         tripped = self.memory["Bus Watchdog"] == WATCHDOG_TRIPPED
         for register, value in entries:
             if register.address < RAM_START and locked:
-                raise Rejection(StatusError.ACCESS)
+                raise InstructionRejected(StatusError.ACCESS)
             if tripped and (register.name in _GOALS or (register.name == "Bus Watchdog" and value)):
-                raise Rejection(StatusError.DATA_RANGE)
+                raise InstructionRejected(StatusError.DATA_RANGE)
             low, high = self._limits(register.name, value)
             if not low <= value <= high:
-                raise Rejection(StatusError.DATA_LIMIT)
+                raise InstructionRejected(StatusError.DATA_LIMIT)
 
     def _limits(self, name: str, value: int) -> tuple[int, int]:
         """Return the limits of ``name`` from other registers; ``value`` itself if there are none."""

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from math import exp
 
-from sim.motion import Trajectory, dragged, rest, to_position, to_velocity
+from sim.motion import PiecewiseMotion, dragged, rest, to_position, to_velocity
 from sim.servo.models import DEG_PER_COUNT, PWM_FULL, ServoModel
 from sim.servo.shaft import Shaft
 
@@ -189,10 +189,10 @@ class Motor:
         self._follow(to_position(self._now_s(), angle, speed, angle + angle_deg, HAND_DPS, 4 * HAND_DPS))
         return self.commanded.end_s - self._now_s()
 
-    def _stop(self) -> Trajectory:
+    def _stop(self) -> PiecewiseMotion:
         return to_velocity(self._now_s(), *self._world.shaft(), 0.0, self.steepest_dps2)
 
-    def _follow(self, path: Trajectory, driven: bool | None = None) -> None:
+    def _follow(self, path: PiecewiseMotion, driven: bool | None = None) -> None:
         self.settle()
         self.commanded = path
         if driven is not None:

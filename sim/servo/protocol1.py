@@ -6,7 +6,7 @@ inverted sum of all bytes except the header; nothing is stuffed, and the sum has
 
 from enum import IntFlag
 
-from sim.servo.protocol2 import BROADCAST_ID, InstructionPacket, PacketParser, Status
+from sim.servo.protocol2 import BROADCAST_ID, InstructionPacket, PacketParser, StatusPacket
 
 _HEADER = b"\xff\xff"
 _FIXED = 4  # header, id, length
@@ -58,7 +58,7 @@ class PacketParser1(PacketParser):
         return packets
 
 
-def status_packet1(bus_id: int, status: Status) -> bytes:
+def status_packet1(bus_id: int, status: StatusPacket) -> bytes:
     """Return the status packet."""
     body = bytes((bus_id, len(status.data) + 2, status.error)) + status.data
     return _HEADER + body + bytes((checksum(body),))

@@ -58,7 +58,7 @@ class InstructionPacket:
 
 
 @dataclass(frozen=True, slots=True)
-class Status:
+class StatusPacket:
     """The answer of a device: the error byte and the parameters."""
 
     error: int
@@ -128,14 +128,14 @@ class PacketParser:
         return packets
 
 
-def status_packet(bus_id: int, status: Status) -> bytes:
+def status_packet(bus_id: int, status: StatusPacket) -> bytes:
     """Return the status packet, byte-stuffed."""
     body = bytes((_STATUS, status.error)) + status.data
     body = body.replace(_HEADER, _STUFFED)
     return with_crc(_HEADER + bytes((0, bus_id)) + (len(body) + 2).to_bytes(2, "little") + body)
 
 
-def fast_status_parts(sizes: list[int], answers: list[tuple[int, Status]]) -> list[bytes]:
+def fast_status_parts(sizes: list[int], answers: list[tuple[int, StatusPacket]]) -> list[bytes]:
     """Return the part of each device in the status packet of a Fast Sync Read or Fast Bulk Read.
 
     The packet's length includes all requested devices (``sizes``: requested bytes of each), also silent ones. The CRC

@@ -5,7 +5,7 @@ from bisect import insort
 
 import serial
 
-from sim.servo.bus import Frame, ServoBus
+from sim.servo.bus import SentBytes, ServoBus
 
 
 class SimSerial:
@@ -32,7 +32,7 @@ class SimSerial:
         self.timeout = timeout
         self._bus = bus
         self._received = bytearray()
-        self._coming: list[Frame] = []
+        self._coming: list[SentBytes] = []
         self._taken = 0  # bytes of the first coming frame that have been received
         self._sent_until_ns = 0
         self._unplugged = False
@@ -123,7 +123,7 @@ class SimSerial:
         if not self.is_open:
             raise serial.PortNotOpenError()
 
-    def _deliver(self, frame: Frame) -> None:
+    def _deliver(self, frame: SentBytes) -> None:
         insort(self._coming, frame, key=lambda f: f.start_ns)  # a frame may be delayed
 
     def _collect(self) -> None:

@@ -6,7 +6,7 @@ from typing import Protocol
 import numpy as np
 
 from sim.clock import VirtualClock
-from sim.motion import Trajectory
+from sim.motion import PiecewiseMotion
 from sim.noise import NoiseModel
 from sim.world import World
 
@@ -18,7 +18,7 @@ class Shaft(Protocol):
     noise: NoiseModel
 
     def rng(self, name: str) -> np.random.Generator: ...
-    def drive(self, shaft: Trajectory) -> None: ...
+    def drive(self, shaft: PiecewiseMotion) -> None: ...
     def shaft(self, time_ns: int | None = None) -> tuple[float, float]: ...
     def rippled_deg(self) -> float: ...
 
@@ -34,7 +34,7 @@ class Geared:
     def rng(self, name: str) -> np.random.Generator:
         return self._world.rng(name)
 
-    def drive(self, shaft: Trajectory) -> None:
+    def drive(self, shaft: PiecewiseMotion) -> None:
         """Make the servo follow ``shaft``, in degrees of the servo."""
         ratio = self._ratio
         self._world.drive(

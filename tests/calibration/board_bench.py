@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from calibration.board_views import MIN_CORNERS, BoardView
-from rig.views.charuco_board import Board, detect_board
+from rig.views.charuco_board import CharucoBoard, detect_board
 from sim.calibration_board import BoardOnPlatter, boards
 from sim.objects.solid import empty_platter
 from sim.optics import Optics
@@ -27,7 +27,7 @@ def seen(
     stands: tuple[str, ...],
     angles_deg: tuple[float, ...],
     *,
-    board: Board | None = None,
+    board: CharucoBoard | None = None,
     change: Callable[[BoardOnPlatter], BoardOnPlatter] = lambda board: board,
     spoil: Callable[[Picture], Picture] = lambda picture: picture,
     ratio: float = 1.0,

@@ -15,7 +15,7 @@ from calibration.report import plots
 from rig.calibrations import CalibrationResult, CalibrationStore, Estimate
 from rig.cli.main import app
 from rig.core.clock import SystemClock
-from rig.views.charuco_board import Board
+from rig.views.charuco_board import CharucoBoard
 from tests.calibration.drawn import measured, moves
 
 CONFIG = 'default_bench = "sim"\ncalibration_dir = "calibrations"\n[catalog]\npath = "catalog"\n'
@@ -188,7 +188,7 @@ def test_all_calibrates_the_bench_and_report_shows_it(rig, tmp_path, monkeypatch
 
 
 def test_person_at_a_terminal_is_asked_also_with_json(rig, monkeypatch):
-    nothing = camera_model.evaluate([], Board(), (640, 480)).result(when_utc=SystemClock().utc(), device={})
+    nothing = camera_model.evaluate([], CharucoBoard(), (640, 480)).result(when_utc=SystemClock().utc(), device={})
     monkeypatch.setattr("calibration.procedure.in_force", lambda *_: nothing)
     monkeypatch.setattr("rig.cli.ui.prompts.is_interactive", lambda: True)
     done = rig("calibrate", "table", "--json", input="q\n")
@@ -199,7 +199,7 @@ def test_person_at_a_terminal_is_asked_also_with_json(rig, monkeypatch):
 
 def test_json_omits_pictures(rig, monkeypatch):
     monkeypatch.setattr(table_axis, "ANGLES_DEG", (0.0,))
-    nothing = camera_model.evaluate([], Board(), (640, 480)).result(when_utc=SystemClock().utc(), device={})
+    nothing = camera_model.evaluate([], CharucoBoard(), (640, 480)).result(when_utc=SystemClock().utc(), device={})
     monkeypatch.setattr("calibration.procedure.in_force", lambda *_: nothing)
     done = rig("calibrate", "table", "--json")
     assert done.exit_code == 6, "views from one side are too few"

@@ -13,7 +13,7 @@ from calibration.board_views import STANDS, BoardView
 from calibration.procedure import Evaluation
 from calibration.table_axis import ObjectSpace
 from rig.calibrations import CalibrationResult, RejectionCode
-from rig.views.charuco_board import Board
+from rig.views.charuco_board import CharucoBoard
 from sim.calibration_board import boards
 from tests.calibration.board_bench import blurred, optics, seen
 from tests.calibration.rejected import codes
@@ -22,12 +22,12 @@ WHEN = datetime(2026, 3, 1, tzinfo=UTC)
 ALL = tuple(STANDS)
 
 
-def camera(views: list[BoardView], board: Board | None = None) -> CalibrationResult:
-    return camera_model.evaluate(views, board or Board(), (640, 480)).result(when_utc=WHEN, device={})
+def camera(views: list[BoardView], board: CharucoBoard | None = None) -> CalibrationResult:
+    return camera_model.evaluate(views, board or CharucoBoard(), (640, 480)).result(when_utc=WHEN, device={})
 
 
 def axis(views: list[BoardView], intrinsics: CalibrationResult) -> Evaluation:
-    return table_axis.evaluate(views, Board(), intrinsics)
+    return table_axis.evaluate(views, CharucoBoard(), intrinsics)
 
 
 @cache
@@ -58,7 +58,7 @@ def test_true_axis_lies_within_the_stated_uncertainty(seed, wobble_deg):
     assert result.passed, result.rejections
     up, origin = np.array(true.rotation).reshape(3, 3)[:, 2], np.array(true.translation_mm)
     rotation, translation = boards(true)[table_axis.STANDS[0]].pose(0.0)
-    middle = rotation @ Board().points_mm().mean(axis=0) + translation
+    middle = rotation @ CharucoBoard().points_mm().mean(axis=0) + translation
     beside = origin + up * ((middle - origin) @ up)
     px, py = cv2.projectPoints(beside[None], np.zeros(3), np.zeros(3), true.matrix, np.array(true.distortion))[
         0
@@ -75,7 +75,7 @@ def test_true_axis_lies_within_the_stated_uncertainty(seed, wobble_deg):
 def test_region_of_interest_holds_the_rotating_object():
     true, room = optics(0), ObjectSpace(radius_mm=40.0, height_mm=100.0)
     views = seen(true, table_axis.STANDS[:1], table_axis.ANGLES_DEG)
-    result = table_axis.evaluate(views, Board(), calibrated(0), space=room)
+    result = table_axis.evaluate(views, CharucoBoard(), calibrated(0), space=room)
     x, y, width, height = result.settings["view.roi"]
     rotation, translation = true.to_camera(0.0)
     around = np.linspace(0, 2 * np.pi, 100)
@@ -90,7 +90,7 @@ def test_region_of_interest_holds_the_rotating_object():
 def test_objects_cut_off_by_the_frame_are_rejected():
     views = seen(optics(0), table_axis.STANDS, table_axis.ANGLES_DEG[::3])
     room = ObjectSpace(height_mm=260.0)
-    result = table_axis.evaluate(views, Board(), calibrated(0), space=room)
+    result = table_axis.evaluate(views, CharucoBoard(), calibrated(0), space=room)
     (rejection,) = result.rejections
     assert rejection.code is RejectionCode.OBJECTS_CUT_OFF
     assert rejection.values["top_px"] > 0
@@ -101,7 +101,7 @@ def test_wrong_board_size_is_found_by_the_measured_distance():
     views = seen(optics(0), table_axis.STANDS, table_axis.ANGLES_DEG[::3])
 
     def measured(square_mm: float) -> Evaluation:
-        room, board = ObjectSpace(lens_mm=480.0), Board(square_mm=square_mm, marker_mm=square_mm * 11 / 15)
+        room, board = ObjectSpace(lens_mm=480.0), CharucoBoard(square_mm=square_mm, marker_mm=square_mm * 11 / 15)
         return table_axis.evaluate(views, board, calibrated(0), space=room)
 
     assert measured(15.0).passed
@@ -139,8 +139,8 @@ def test_wrong_gear_ratio_is_rejected():
 
 
 def test_wrong_board_is_rejected():
-    views = seen(optics(1), ALL, ANGLES, board=Board(columns=6, rows=8))
-    result = camera(views, Board(columns=6, rows=8))
+    views = seen(optics(1), ALL, ANGLES, board=CharucoBoard(columns=6, rows=8))
+    result = camera(views, CharucoBoard(columns=6, rows=8))
     assert not result.passed
     assert not result.settings
 

@@ -11,10 +11,10 @@ import pytest
 
 from calibration.print_board import write_board
 from rig.core.errors import UsageError
-from rig.views.charuco_board import Board, detect_board
+from rig.views.charuco_board import CharucoBoard, detect_board
 
 
-def px_per_mm(board: Board, picture) -> float:
+def px_per_mm(board: CharucoBoard, picture) -> float:
     found = detect_board(board, picture)
     assert found.ids.size == board.corners
     flat = np.column_stack([board.points_mm()[found.ids][:, :2], np.ones(found.ids.size)])
@@ -24,17 +24,17 @@ def px_per_mm(board: Board, picture) -> float:
 
 
 def test_png_has_its_resolution(tmp_path):
-    words = write_board(Board(), tmp_path / "board.png")
+    words = write_board(CharucoBoard(), tmp_path / "board.png")
     assert "8 squares must be 120 mm" in words
     data = (tmp_path / "board.png").read_bytes()
     at = data.index(b"pHYs") + 4
     assert int.from_bytes(data[at : at + 4], "big") == 12_000
-    assert px_per_mm(Board(), cv2.imread(str(tmp_path / "board.png"))) == pytest.approx(12.0, rel=1e-3)
+    assert px_per_mm(CharucoBoard(), cv2.imread(str(tmp_path / "board.png"))) == pytest.approx(12.0, rel=1e-3)
 
 
 def test_pdf_is_true_to_scale(tmp_path):
     """Painted from the page's own operators: PDF readers need not be installed."""
-    board = Board(columns=6, rows=5, square_mm=20.0, marker_mm=20.0 * 11 / 15)
+    board = CharucoBoard(columns=6, rows=5, square_mm=20.0, marker_mm=20.0 * 11 / 15)
     write_board(board, tmp_path / "board.pdf")
     data = (tmp_path / "board.pdf").read_bytes()
     stream = zlib.decompress(data[data.index(b"stream\n") + 7 : data.index(b"\nendstream")]).decode("ascii")
@@ -50,16 +50,16 @@ def test_pdf_is_true_to_scale(tmp_path):
 
 @pytest.mark.skipif(shutil.which("pdftoppm") is None, reason="pdftoppm (Debian: poppler-utils) is not installed")
 def test_pdf_reader_draws_the_board(tmp_path):
-    write_board(Board(), tmp_path / "board.pdf")
+    write_board(CharucoBoard(), tmp_path / "board.pdf")
     subprocess.run(["pdftoppm", "-r", "150", "-png", tmp_path / "board.pdf", tmp_path / "page"], check=True)
     (page,) = tmp_path.glob("page*.png")
-    assert px_per_mm(Board(), cv2.imread(str(page))) == pytest.approx(150 / 25.4, rel=1e-3)
+    assert px_per_mm(CharucoBoard(), cv2.imread(str(page))) == pytest.approx(150 / 25.4, rel=1e-3)
 
 
 def test_unprintable_boards_are_rejected(tmp_path):
     with pytest.raises(UsageError, match=r"neither .pdf nor .png"):
-        write_board(Board(), tmp_path / "board.jpg")
+        write_board(CharucoBoard(), tmp_path / "board.jpg")
     with pytest.raises(UsageError, match="does not fit"):
-        write_board(Board(square_mm=40.0, marker_mm=29.0), tmp_path / "board.pdf")
+        write_board(CharucoBoard(square_mm=40.0, marker_mm=29.0), tmp_path / "board.pdf")
     with pytest.raises(UsageError, match="Cannot write"):
-        write_board(Board(), tmp_path / "nowhere" / "board.pdf")
+        write_board(CharucoBoard(), tmp_path / "nowhere" / "board.pdf")

@@ -17,7 +17,7 @@ from sim.bench import SIM, ShelfOperator, SimOptions, open_sim_bench
 from sim.devices import SimDevices
 from sim.faults import Fault, Faults, fault_kinds, load_faults
 from sim.faults.injector import DURING_S
-from sim.faults.schedule import Trigger
+from sim.faults.schedule import FaultTrigger
 from sim.objects.shelf import shelf
 from sim.world import World
 from tests.faults.fault_runs import NOISE
@@ -65,7 +65,7 @@ def faults(draw):
         low, high = max(parameter.low, -1e6), min(parameter.high, 1e6)
         values[name] = float(f"{draw(st.floats(low, high)):g}")
         values[name] = min(max(values[name], parameter.low), parameter.high)
-    trigger = draw(st.sampled_from(Trigger))
+    trigger = draw(st.sampled_from(FaultTrigger))
     mark = float(draw(st.integers(0, 999)))
     for_s = draw(st.none() | st.sampled_from((0.5, 2.0, 31.0)))
     return Fault(kind, values, trigger, mark, for_s)
@@ -239,8 +239,8 @@ def test_moves_and_views_have_the_numbers_of_the_plan(tmp_path):
                 views[event.index] = event.evidence.exposed_ns
     for index in (0, 2):
         set_off_ns, arrived_ns = moves[index]
-        assert set_off_ns + DURING_S * 1e9 <= begun[Trigger.MOVE, index] <= arrived_ns
-    assert views[2] < begun[Trigger.VIEW, 2] < moves[3][1]
+        assert set_off_ns + DURING_S * 1e9 <= begun[FaultTrigger.MOVE, index] <= arrived_ns
+    assert views[2] < begun[FaultTrigger.VIEW, 2] < moves[3][1]
 
 
 # -- effects on the devices -------------------------------------------------------------------------------------

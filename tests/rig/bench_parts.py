@@ -16,7 +16,7 @@ from rig.safety.saved_state import MemoryStore, SessionEnd, StateStore
 from sim.i2c import SimI2cBus
 from sim.imu.mpu6050 import SimMpu6050
 from sim.noise import NoiseModel
-from sim.servo import Frame, ServoBus, SimSerial, Source, XSeriesServo
+from sim.servo import Sender, SentBytes, ServoBus, SimSerial, XSeriesServo
 from sim.world import World
 
 
@@ -28,13 +28,13 @@ class Wires:
     bus: ServoBus
     device: XSeriesServo
     serial: SimSerial
-    sent: list[Frame] = field(default_factory=list)
+    sent: list[SentBytes] = field(default_factory=list)
     i2c: SimI2cBus | None = None
 
     @property
     def instructions(self) -> list[bytes]:
         """What the host has sent."""
-        return [frame.data for frame in self.sent if frame.source is Source.HOST]
+        return [frame.data for frame in self.sent if frame.source is Sender.HOST]
 
 
 def servo_wires(noise: NoiseModel | None = None, seed: int = 0, **servo: Any) -> Wires:

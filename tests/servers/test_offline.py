@@ -19,7 +19,7 @@ from rig.catalog.jobs import finished
 from rig.catalog.journal import Journal, deliver, journal_folder, waiting
 from rig.catalog.results import correct, find_results
 from rig.catalog.results import record as record_result
-from rig.catalog.verify import Problem, verify
+from rig.catalog.verify import CatalogProblem, verify
 from rig.cli.ui.complete import object_names
 from rig.config.catalog_place import CatalogPlace
 from rig.core.clock import SystemClock
@@ -284,7 +284,7 @@ def test_damage_in_the_journal_stays_there_and_is_reported(place: CatalogPlace) 
         assert set(names(place)) == {"mug", "tin", "cone"}
         assert [one.name for one in journal.objects()] == ["star", "cube"]
         (finding,) = finished(verify(shared, jobs=1)).findings
-        assert finding.problem is Problem.MISSING_IMAGE  # of the answer, which is there all the same
+        assert finding.problem is CatalogProblem.MISSING_IMAGE  # of the answer, which is there all the same
 
 
 def test_wrong_password_and_absent_server_have_their_own_messages(

@@ -22,7 +22,7 @@ from rig.catalog.jobs import finished
 from rig.catalog.results import record as record_result
 from rig.catalog.transfer import CatalogSource, transfer
 from rig.catalog.upkeep import collect_garbage
-from rig.catalog.verify import Problem, verify
+from rig.catalog.verify import CatalogProblem, verify
 from rig.config.catalog_place import CatalogPlace
 from rig.core.clock import SystemClock
 from rig.core.errors import CatalogError, CatalogUnavailable
@@ -116,7 +116,7 @@ def test_catalog_with_images_in_s3_does_everything(postgres: PostgresServer, s3:
         store.remove([first.image])
         with pytest.raises(CatalogError, match="missing"):
             catalog.read_image(first.image)
-        assert [one.problem for one in finished(verify(catalog)).findings] == [Problem.MISSING_IMAGE]
+        assert [one.problem for one in finished(verify(catalog)).findings] == [CatalogProblem.MISSING_IMAGE]
         assert store.put(content) == first.image
         assert finished(verify(catalog)).findings == ()
         catalog.delete("tin")

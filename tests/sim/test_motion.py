@@ -7,7 +7,7 @@ import pytest
 from hypothesis import assume, example, given
 from hypothesis import strategies as st
 
-from sim.motion import Platter, Trajectory, dragged, rest, to_position, to_velocity
+from sim.motion import PiecewiseMotion, Platter, dragged, rest, to_position, to_velocity
 from tests.fuzzing import examples
 
 quick = examples(10)
@@ -19,7 +19,7 @@ starts = st.floats(0, 1_000)
 
 
 @st.composite
-def trajectories(draw: st.DrawFn) -> Trajectory:
+def trajectories(draw: st.DrawFn) -> PiecewiseMotion:
     """Draw the last of a few moves, each begun where the one before was interrupted."""
     t, x, v = 0.0, draw(angles), 0.0
     path = rest(t, x)
@@ -33,12 +33,12 @@ def trajectories(draw: st.DrawFn) -> Trajectory:
     return path
 
 
-def inner_knots(path: Trajectory, step_s: float) -> np.ndarray:
+def inner_knots(path: PiecewiseMotion, step_s: float) -> np.ndarray:
     """Return the times between pieces that are later than the beginning by a step; before it, nothing moves."""
     return path.start_s[1:][path.start_s[1:] - step_s >= path.start_s[0]]
 
 
-def samples(path: Trajectory, n: int = 400, beyond_s: float = 1.0) -> np.ndarray:
+def samples(path: PiecewiseMotion, n: int = 400, beyond_s: float = 1.0) -> np.ndarray:
     return np.unique(np.concatenate([np.linspace(path.start_s[0], path.end_s + beyond_s, n), path.start_s]))
 
 
@@ -85,7 +85,7 @@ def test_move_from_rest_takes_the_closed_forms_time(x: float, goal: float, v_max
 
 @quick
 @given(trajectories())
-def test_position_and_velocity_are_continuous_and_pieces_monotone(path: Trajectory) -> None:
+def test_position_and_velocity_are_continuous_and_pieces_monotone(path: PiecewiseMotion) -> None:
     step = 1e-7
     knots = inner_knots(path, step)
     before, after = path.at(knots - step), path.at(knots)
@@ -106,7 +106,7 @@ def test_goal_too_near_to_stop_at_is_overshot_without_a_jump() -> None:
 
 @quick
 @given(trajectories(), st.floats(-1.0, 30.0))
-def test_state_at_one_time_is_that_of_an_array_of_times(path: Trajectory, after_s: float) -> None:
+def test_state_at_one_time_is_that_of_an_array_of_times(path: PiecewiseMotion, after_s: float) -> None:
     time_s = float(path.start_s[0]) + after_s
     position, velocity = path.at([time_s])
     (piece,), _ = path.pieces(np.array([time_s]))
@@ -115,7 +115,7 @@ def test_state_at_one_time_is_that_of_an_array_of_times(path: Trajectory, after_
 
 @quick
 @given(trajectories())
-def test_velocity_is_the_derivative_of_position(path: Trajectory) -> None:
+def test_velocity_is_the_derivative_of_position(path: PiecewiseMotion) -> None:
     times = np.linspace(path.start_s[0], path.end_s + 1, 200)
     assume(path.end_s > path.start_s[0])
     h = 1e-6
@@ -162,7 +162,7 @@ def play_operator(shaft: np.ndarray, start: float, half_play: float) -> np.ndarr
 
 @quick
 @given(trajectories(), st.floats(0, 3))
-def test_backlash_follows_its_operator_and_stays_within_its_half(path: Trajectory, play_deg: float) -> None:
+def test_backlash_follows_its_operator_and_stays_within_its_half(path: PiecewiseMotion, play_deg: float) -> None:
     follower = Platter(play_deg, 0.0, 0.0)
     follower.follow(path, None)
     times = samples(path, 2_000)
@@ -190,7 +190,7 @@ def test_backlash_is_a_hysteresis(play_deg: float, there: float, back: float) ->
 
 @quick
 @given(trajectories(), st.floats(0, 2), st.sampled_from([0.0, 8.0, 30.0]), st.integers(0, 2**32 - 1))
-def test_platter_never_jumps(path: Trajectory, play_deg: float, structure_hz: float, seed: int) -> None:
+def test_platter_never_jumps(path: PiecewiseMotion, play_deg: float, structure_hz: float, seed: int) -> None:
     follower = Platter(play_deg, structure_hz, 0.15)
     follower.follow(path, None)
     h = 1e-5
@@ -203,7 +203,7 @@ def test_platter_never_jumps(path: Trajectory, play_deg: float, structure_hz: fl
 @quick
 @given(trajectories(), trajectories(), st.sampled_from([8.0, 30.0]))
 def test_vibration_continues_from_piece_to_piece_and_from_motion_to_motion(
-    path: Trajectory, other: Trajectory, structure_hz: float
+    path: PiecewiseMotion, other: PiecewiseMotion, structure_hz: float
 ) -> None:
     """Without backlash the platter's deflection from the shaft changes its speed nowhere at once."""
     h = 1e-5
@@ -270,7 +270,7 @@ def test_move_interrupted_by_another_leaves_no_jump(
 @given(trajectories(), st.floats(0, 3), st.floats(-1, 1), st.floats(-1, 1))
 @example(to_velocity(1.0, -0.9, -1.0, 15.0, 103.0), 1.0, 0.0, 0.0)  # its speed at the standstill is rounded
 def test_dragged_shaft_stays_within_the_error_that_overcomes_friction(
-    path: Trajectory, half: float, load: float, start: float
+    path: PiecewiseMotion, half: float, load: float, start: float
 ) -> None:
     offset = load * half
     begun = float(path.position_deg[0]) + offset + start * half

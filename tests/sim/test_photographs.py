@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rig.core.errors import UsageError
-from sim.objects.photographs import PhotographedObject, photographs
+from sim.objects.photographs import PhotographsOnTable, photographs
 from sim.objects.projection import Image, Visible
 
 
@@ -51,7 +51,7 @@ def test_nearest_photograph_is_shown_around_the_circle(tmp_path: Path) -> None:
 
 @given(st.lists(st.floats(0, 359.9), min_size=1, max_size=20, unique=True), st.floats(-1000, 1000))
 def test_no_photograph_is_nearer_than_the_one_shown(angles: list[float], azimuth: float) -> None:
-    solid = PhotographedObject("obj1", np.array(sorted(angles)), tuple(Path(str(a)) for a in sorted(angles)))
+    solid = PhotographsOnTable("obj1", np.array(sorted(angles)), tuple(Path(str(a)) for a in sorted(angles)))
     apart = [abs(np.angle(np.exp(1j * np.radians(a - azimuth)), deg=True)) for a in sorted(angles)]
     assert apart[solid.nearest(azimuth)] == pytest.approx(min(apart), abs=1e-6)
 

@@ -25,7 +25,7 @@ from rig.catalog.exchange.new_files import new_file
 from rig.catalog.facts import Session, View
 from rig.catalog.images import FolderImages, name_of, path_of
 from rig.catalog.jobs import finished
-from rig.catalog.transfer import CatalogSource, Item, transfer
+from rig.catalog.transfer import CatalogSource, TransferItem, transfer
 from rig.config.catalog_place import DATABASE_NAME
 from rig.core.clock import Clock
 from rig.core.errors import ExportFailed, ImportRejected, RigError
@@ -123,7 +123,7 @@ class _Bundled(CatalogSource):
         self.content = partial(_read_member, str(path), found.st_ino, found.st_mtime_ns)
         self._path, self._folder = path, folder
 
-    def items(self) -> Iterator[Item]:
+    def items(self) -> Iterator[TransferItem]:
         with _rejecting(self._path, self._folder):
             yield from super().items()
 

@@ -18,7 +18,7 @@ from rig.catalog.facts import Enrollment, Session, View
 from rig.catalog.incoming import ImportProblem, Reason, RejectedFile
 from rig.catalog.records import EnrollmentStatus, Provenance, check_text, clean_name, this_software
 from rig.catalog.state import EnrollmentState
-from rig.catalog.transfer import Item
+from rig.catalog.transfer import TransferItem
 from rig.core.errors import ImportRejected, UsageError
 from rig.core.next_steps import Do, NextStep
 from rig.views.image_files import read_file
@@ -34,7 +34,7 @@ _Row = Mapping[str, str]
 
 @dataclass(eq=False)
 class Photographs:
-    """Objects that are imported from image files: a `rig.catalog.transfer.Source`.
+    """Objects that are imported from image files: a `rig.catalog.transfer.TransferSource`.
 
     The name of an image is the path of its file. A file is not read before it is transferred. Each object has one
     complete enrollment, with views by ascending azimuth.
@@ -90,7 +90,7 @@ class Photographs:
         """Return the bytes of an image file; an `OSError` if it cannot be read."""
         return read_file(Path(image))
 
-    def items(self) -> Iterator[Item]:
+    def items(self) -> Iterator[TransferItem]:
         """Yield the objects in the order of the folder or the table."""
         software = this_software()
         for name, found in self._found.items():
@@ -109,7 +109,7 @@ class Photographs:
                 texts = {key: text or row.get(key, "") for key, text in texts.items()}
             enrollment.sessions.extend(sessions.values())
             state = EnrollmentState(enrollment, EnrollmentStatus.COMPLETE, self.now, None)
-            yield Item(name=name, **texts, created_utc=self.now, enrollments=(state,))
+            yield TransferItem(name=name, **texts, created_utc=self.now, enrollments=(state,))
 
 
 def read_folder(

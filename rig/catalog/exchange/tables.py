@@ -22,7 +22,7 @@ from rig.catalog.exchange.new_files import new_file, new_folder
 from rig.catalog.facts import Enrollment, View
 from rig.catalog.images import path_of
 from rig.catalog.records import EnrollmentStatus, Region
-from rig.catalog.transfer import CatalogSource, Item
+from rig.catalog.transfer import CatalogSource, TransferItem
 from rig.core.errors import ExportFailed, UsageError
 from rig.core.next_steps import Do
 from rig.views.description import PAPER_DESCRIPTOR
@@ -78,20 +78,20 @@ class TableFormat(StrEnum):
             raise UsageError(f"The format of {path} is unknown.", next_step=f"Give a file with {known}.") from error
 
 
-class Enrolled(NamedTuple):
+class ExportedObject(NamedTuple):
     """An object and its complete enrollment, with the part of the image that is described of each view."""
 
-    item: Item
+    item: TransferItem
     enrollment: Enrollment
     regions: tuple[Region | None, ...]
 
 
-def enrolled(source: CatalogSource) -> Iterator[Enrolled]:
+def enrolled(source: CatalogSource) -> Iterator[ExportedObject]:
     """Yield the objects that are completely enrolled, with the enrollment that searches use."""
     for item in source.items():
         for one in item.enrollments:
             if one.status is EnrollmentStatus.COMPLETE:
-                yield Enrolled(item, one.enrollment, regions_of(source.catalog, one.enrollment))
+                yield ExportedObject(item, one.enrollment, regions_of(source.catalog, one.enrollment))
 
 
 def write_folder(folder: Path, source: CatalogSource) -> int:
@@ -189,7 +189,7 @@ def parse_region(text: str) -> Region | None:
     return x, y, width, height
 
 
-def _rows(source: CatalogSource, one: Enrolled) -> Iterator[tuple[dict[str, Any], View]]:
+def _rows(source: CatalogSource, one: ExportedObject) -> Iterator[tuple[dict[str, Any], View]]:
     """Yield the views of an object, each with its row: the columns `VIEWS`."""
     kind = descriptor(PAPER_DESCRIPTOR)
     item, enrollment, regions = one

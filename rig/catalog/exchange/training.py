@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hbr.segmentation import Method
+from hbr.segmentation import BoxMethod
 from rig.catalog.catalog import Catalog
 from rig.catalog.derived import described
 from rig.catalog.exchange.new_files import new_folder
@@ -26,7 +26,7 @@ from rig.catalog.facts import Session, View
 from rig.catalog.images import FolderImages, path_of
 from rig.catalog.jobs import JobProgress, portions, processes
 from rig.catalog.records import Region, this_software
-from rig.catalog.transfer import CatalogSource, Item, transfer
+from rig.catalog.transfer import CatalogSource, TransferItem, transfer
 from rig.config import ViewConfig
 from rig.config.catalog_place import DATABASE_NAME
 from rig.core.errors import ExportFailed
@@ -150,7 +150,7 @@ def _mask(folder: Path, picture: _Picture) -> _Mask:
     part[:] = found.frame_mask(w, h)
     if found.box is None or not part.any():
         part[:] = True
-        return _Mask(width, height, Method.NONE.value, None, _counts(whole), [])
+        return _Mask(width, height, BoxMethod.NONE.value, None, _counts(whole), [])
     x, y, box_width, box_height = found.box
     polygon = [[px / width, py / height] for px, py in _outline(whole)]
     box = (x + x0, y + y0, box_width, box_height)
@@ -182,7 +182,7 @@ def _outline(mask: NDArray[np.bool_]) -> list[list[int]]:
 # Files
 
 
-def _write_coco(folder: Path, items: Sequence[Item], parts: _Parts) -> None:
+def _write_coco(folder: Path, items: Sequence[TransferItem], parts: _Parts) -> None:
     about = {
         "info": {
             "description": "Views of objects on a turntable. The masks were computed from the images. If no object was "
@@ -227,7 +227,7 @@ def _write_coco(folder: Path, items: Sequence[Item], parts: _Parts) -> None:
         (folder / "annotations" / f"instances_{part}.json").write_text(text, encoding="utf-8")
 
 
-def _write_yolo(folder: Path, items: Sequence[Item], parts: _Parts) -> None:
+def _write_yolo(folder: Path, items: Sequence[TransferItem], parts: _Parts) -> None:
     for part, own in parts.items():
         listed = ""
         for picture, mask in own:

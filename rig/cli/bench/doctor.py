@@ -84,7 +84,7 @@ def print_findings(settings: Settings) -> dict[str, Any]:
     from rig.config import RigConfig
     from rig.config.values import default_path
     from rig.doctor.finding import Finding
-    from rig.jobs.desk import Result
+    from rig.jobs.desk import JobResult
     from rig.jobs.doctor import check_configuration, examine
 
     screen = console()
@@ -94,7 +94,7 @@ def print_findings(settings: Settings) -> dict[str, Any]:
     for step in examine(bench, doctor_context(settings, default=config is None), known=known, progress=show_progress):
         if isinstance(step, Finding) and not settings.json:
             print_finding(screen, step)
-        elif isinstance(step, Result):
+        elif isinstance(step, JobResult):
             found = step.values
             settings.say(step.text, found)
     return found

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from rig.bench.computer import DeviceFile
     from rig.config.toml_file import Key
     from rig.doctor.context import DoctorContext
-    from rig.doctor.device_scan import Candidate, DeviceScan
+    from rig.doctor.device_scan import DeviceCandidate, DeviceScan
 
 MIN_BUDGET_DEG, MAX_BUDGET_DEG = 180.0, 90_000.0
 _PORT: Final = ("servo", "port")
@@ -129,7 +129,7 @@ class Dialogue:
         show_findings(console(stderr=self.out is sys.stderr), self.context, scan.checks)
         return scan
 
-    def _pick(self, what: str, found: "Sequence[Candidate]") -> "Candidate | None":
+    def _pick(self, what: str, found: "Sequence[DeviceCandidate]") -> "DeviceCandidate | None":
         """Return the only device, or the one that the operator chooses; None without a choice."""
         if len(found) <= 1:
             return found[0] if found else None

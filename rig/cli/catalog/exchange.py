@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from rig.catalog import Catalog
-    from rig.catalog.transfer import Source
+    from rig.catalog.transfer import TransferSource
 
 SHOWN: Final = 20
 """Number of rejected files and of objects that are listed. With --json all of them are."""
@@ -119,7 +119,7 @@ def _target(settings: Settings, dry_run: bool) -> "Iterator[Catalog]":
 
 
 @contextmanager
-def _source(source: Path, pattern: str | None, table_angles: bool) -> "Iterator[Source]":
+def _source(source: Path, pattern: str | None, table_angles: bool) -> "Iterator[TransferSource]":
     """Yield what is imported: a bundle, a catalog such as a training set, or photographs."""
     from rig.catalog import Catalog
     from rig.catalog.exchange.bundle import read_bundle

@@ -194,13 +194,13 @@ def _detail(key: str, value: Any) -> str:
 
 
 def _find(settings: Settings, filters: Filters) -> "list[Result]":
-    from rig.catalog.records import Outcome
+    from rig.catalog.records import RecordedOutcome
     from rig.catalog.results import ResultFilter, find_results
 
     wanted = ResultFilter(
         sample=filters["sample"],
         object_name=filters["name"],
-        outcome=Outcome(filters["outcome"]) if filters["outcome"] else None,
+        outcome=RecordedOutcome(filters["outcome"]) if filters["outcome"] else None,
         since=_time(filters["since"], "--since"),
         before=_time(filters["before"], "--before"),
     )

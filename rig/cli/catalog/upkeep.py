@@ -258,7 +258,7 @@ def fit(
     from hbr.dense.fitting import ERROR_RATE, FALSE_REJECT
     from rig.catalog.derived import views as enrolled_views
     from rig.catalog.jobs import JobProgress
-    from rig.cli.ui.present import Progress
+    from rig.cli.ui.present import ProgressBar
     from rig.core.json_form import plain
     from rig.core.processes import map_in_processes
     from rig.search.stopping_rules import FILE, stopping_rule_values, write_stopping_rule
@@ -266,7 +266,7 @@ def fit(
 
     clock = SystemClock()
     with settings.open_catalog(read_only=True) as catalog:
-        with Progress("Describing the enrolled views") as progress:
+        with ProgressBar("Describing the enrolled views") as progress:
             views = enrolled_views(catalog, BENCH_DESCRIPTOR, progress)
         if not len(views):
             raise CatalogError("The catalog is empty.", next_step=Do.ENROLL())
@@ -275,7 +275,7 @@ def fit(
     # Processes take their time to start: a small catalog is faster in one.
     index = DenseIndex(views)
     where = jobs_of(None, cluster) or ((os.cpu_count() or 1) if len(views) >= _SEVERAL_PROCESSES else 1)
-    with interruptible("Interrupted; nothing changed."), Progress("Searching") as progress:
+    with interruptible("Interrupted; nothing changed."), ProgressBar("Searching") as progress:
 
         def searched(
             work: "Callable[[Task], FloatArray]", tasks: "Sequence[Task]"

@@ -64,7 +64,7 @@ def evaluate(
     Example: rig eval paper --data coil-100 --noise mb
     """
     from rig.catalog.jobs import JobProgress
-    from rig.cli.ui.present import Progress, console
+    from rig.cli.ui.present import ProgressBar, console
     from rig.evaluation.experiments import DEFAULT, load_experiment
     from rig.evaluation.run import own_folder, run_experiment, write_results
     from rig.evaluation.tables import contest_sentences, tables
@@ -89,7 +89,7 @@ def evaluate(
         print(f"{note}, {dataset.ignored} other images" if dataset.ignored else note, file=sys.stderr)
         folder = out or own_folder(asked, dataset)
         done = 0
-        with Progress("enrolling, searching") as progress:
+        with ProgressBar("enrolling, searching") as progress:
 
             def advance(event: str, name: str) -> None:
                 nonlocal done

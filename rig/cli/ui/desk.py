@@ -12,7 +12,7 @@ from rig.catalog.jobs import JobProgress
 from rig.catalog.journal import BackgroundDelivery, waiting
 from rig.catalog.verify import BackgroundCheck
 from rig.cli.ui import prompts
-from rig.cli.ui.present import Progress as ProgressBar
+from rig.cli.ui.present import ProgressBar as ProgressBar
 from rig.cli.ui.settings import Settings
 from rig.core.clock import Clock, SystemClock
 from rig.core.errors import RigError
@@ -20,7 +20,7 @@ from rig.core.next_steps import in_words
 from rig.doctor.finding import Finding, finding_words
 from rig.events.events import Event, event_dict
 from rig.events.lines import line
-from rig.jobs.desk import Desk, Progress, Remark, Result, Steps
+from rig.jobs.desk import Desk, JobResult, Progress, Remark, Steps
 from rig.plans.operator import Operator, Unattended
 
 
@@ -111,7 +111,7 @@ class CommandDesk(Desk):
                 match next(steps):
                     case Remark() as remark:
                         self.note(remark)
-                    case Result() as result:
+                    case JobResult() as result:
                         self._settings.say(result.text, result.values)
                     case Progress() as progress:
                         values = {"event": "progress", "share": progress.share, "words": progress.words}

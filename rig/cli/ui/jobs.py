@@ -18,9 +18,9 @@ _T = TypeVar("_T")
 def run_job(title: str, job: "Generator[JobProgress, None, _T]", *, interrupted: str | Callable[[], str]) -> _T:
     """Run a job with a progress bar on stderr and return its result; Ctrl+C prints ``interrupted``."""
     from rig.catalog.jobs import finished
-    from rig.cli.ui.present import Progress
+    from rig.cli.ui.present import ProgressBar
 
-    with interruptible(interrupted), closing(job), Progress(title) as progress:
+    with interruptible(interrupted), closing(job), ProgressBar(title) as progress:
         return finished(job, progress)
 
 

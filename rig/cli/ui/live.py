@@ -125,7 +125,7 @@ WIDE, NARROW = 88, 60
 
 
 @dataclass(frozen=True, slots=True)
-class ViewRow:
+class ShownView:
     """An image of an enrollment, accepted or rejected."""
 
     number: int
@@ -158,7 +158,7 @@ class ViewRow:
         return "at rest" if motion is None else f"{motion.speed_dps:.0f} °/s, {motion.smear_px:.1f} px"
 
 
-Columns = tuple[tuple[str, int, Callable[[ViewRow], str]], ...]
+Columns = tuple[tuple[str, int, Callable[[ShownView], str]], ...]
 
 COLUMNS: Final[Columns] = (
     ("view", 0, lambda row: str(row.number)),
@@ -200,7 +200,7 @@ class EnrollView(LiveView):
         self._name = ""
         self._of = 0
         self._taken = 0
-        self._rows: list[ViewRow] = []
+        self._rows: list[ShownView] = []
         self._move: Moved | None = None
         self._left: TimeLeft | None = None
         self._findings: list[str] = []
@@ -247,7 +247,7 @@ class EnrollView(LiveView):
         return COLUMNS_IN_MOTION if any(row.evidence.motion for row in self._rows) else COLUMNS
 
     def _add(self, evidence: ViewEvidence, result: str, *, accepted: bool) -> None:
-        row = ViewRow(self._taken if accepted else self._taken + 1, self._move, evidence, result, accepted)
+        row = ShownView(self._taken if accepted else self._taken + 1, self._move, evidence, result, accepted)
         self._rows.append(row)
         del self._rows[:-ROWS]
         if not self._console.is_terminal:

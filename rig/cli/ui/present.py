@@ -115,7 +115,7 @@ def _beginning(table_deg: float, first_deg: float) -> str:
     return f"It first {verb} to {angle_words(first_deg)}"
 
 
-class Progress(AbstractContextManager["Progress"]):
+class ProgressBar(AbstractContextManager["ProgressBar"]):
     """A progress bar on stderr, shown from its first call on; only its notes if stderr is not a terminal."""
 
     def __init__(self, title: str) -> None:

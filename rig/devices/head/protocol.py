@@ -163,7 +163,7 @@ class Trigger(HeadMessage, number=0x07, layout="<H"):
 
 
 @dataclass(frozen=True, slots=True)
-class Imu(HeadMessage, number=0x08, layout="<BBBBB"):
+class SetImu(HeadMessage, number=0x08, layout="<BBBBB"):
     """Set up the sensor; `status_changed` and each `heartbeat_reply` report the result."""
 
     model: int  # Imu_model.
@@ -283,7 +283,9 @@ class StatusChanged(HeadMessage, number=0xC1, layout="<IBBBBBB"):
     reset_cause: int  # Reset.
 
 
-Request = Hello | Heartbeat | Shutdown | Acknowledge | Light | Relay | Trigger | Imu | Stream | ReadCounters | SetSerial
+Request = (
+    Hello | Heartbeat | Shutdown | Acknowledge | Light | Relay | Trigger | SetImu | Stream | ReadCounters | SetSerial
+)
 
 Answer = Done | Identity | HeartbeatReply | Triggered | Counters | Sample | StatusChanged
 

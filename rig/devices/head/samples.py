@@ -23,7 +23,7 @@ from rig.core.clock import Clock, seconds_between
 from rig.core.errors import ConfigError
 from rig.devices import bno055, mpu6050
 from rig.devices.head.link import HeadStatistics
-from rig.devices.head.protocol import Imu, ImuModel, Sample
+from rig.devices.head.protocol import ImuModel, Sample, SetImu
 from rig.devices.imu import ImuSamples
 
 MEMORY_S = 2.0  # a reader that pauses for longer reports lost samples
@@ -47,7 +47,7 @@ class HeadSensor:
     """
 
     kind: ImuKind
-    setup: Imu
+    setup: SetImu
     rate_hz: float
     range_dps: float
     noise_dps_rthz: float
@@ -65,7 +65,7 @@ def head_sensor(config: ImuConfig) -> HeadSensor:
     if config.model == "bno055":
         return HeadSensor(
             kind=bno055.KIND,
-            setup=Imu(ImuModel.BNO055, config.address, divider=0, filter=1, range=0),
+            setup=SetImu(ImuModel.BNO055, config.address, divider=0, filter=1, range=0),
             rate_hz=bno055.RATE_HZ,
             range_dps=bno055.RANGE_DPS,
             noise_dps_rthz=bno055.NOISE_DPS_RTHZ,
@@ -84,7 +84,7 @@ def head_sensor(config: ImuConfig) -> HeadSensor:
     lsb_per_dps = mpu6050.LSB_PER_DPS[config.range_dps]
     return HeadSensor(
         kind=mpu6050.Mpu6050.KIND,
-        setup=Imu(ImuModel.MPU6050, config.address, divider=divider, filter=dlpf, range=full_scale >> 3),
+        setup=SetImu(ImuModel.MPU6050, config.address, divider=divider, filter=dlpf, range=full_scale >> 3),
         rate_hz=1000.0 / (divider + 1),
         range_dps=32767 / lsb_per_dps,
         noise_dps_rthz=mpu6050.NOISE_DPS_RTHZ,

@@ -12,7 +12,7 @@ import pytest
 import hbr
 from hbr import Background, segment
 from hbr.evaluation.perturb import other_bench, plain_bench
-from hbr.segmentation import CROP_PX, Issue, IssueCode, Method
+from hbr.segmentation import CROP_PX, BoxMethod, Issue, IssueCode
 
 BOX = (130, 70, 60, 110)
 
@@ -83,7 +83,7 @@ def test_empty_table_image_of_another_bench_is_not_used(seed: int) -> None:
     assert seen.agreement < 0.5
     assert seen.gains is None
     assert seen.issues[0] == Issue(IssueCode.TABLE_DIFFERS, {"agreement": round(seen.agreement, 3)})
-    assert seen.method is not Method.EMPTY_TABLE
+    assert seen.method is not BoxMethod.EMPTY_TABLE
 
 
 def test_soft_shadow_does_not_belong_to_the_object() -> None:
@@ -116,21 +116,21 @@ def test_plain_background_needs_no_empty_table_image() -> None:
     seen = segment(image)
     assert seen.box is not None
     assert box_error(seen.box, (120, 40, 50, 100)) < 0.05
-    assert (seen.method, seen.issues) == (Method.PLAIN_BACKGROUND, ())
+    assert (seen.method, seen.issues) == (BoxMethod.PLAIN_BACKGROUND, ())
     assert seen.gains is None
 
 
 def test_empty_frame_has_no_object_and_a_full_mask() -> None:
     seen = segment(np.full((200, 320, 3), 90, np.uint8))
     assert seen.box is None
-    assert (seen.method, seen.issues) == (Method.NONE, (Issue(IssueCode.NO_DIFFERENCE),))
+    assert (seen.method, seen.issues) == (BoxMethod.NONE, (Issue(IssueCode.NO_DIFFERENCE),))
     assert (seen.mask == 255).all()
 
 
 def test_guess_before_a_pattern_is_reported_and_repeatable() -> None:
     image = with_object(table(4, patterned=True))
     first, second = segment(image), segment(image)
-    assert (first.method, first.issues) == (Method.GUESS, (Issue(IssueCode.BACKGROUND_NOT_PLAIN),))
+    assert (first.method, first.issues) == (BoxMethod.GUESS, (Issue(IssueCode.BACKGROUND_NOT_PLAIN),))
     np.testing.assert_array_equal(first.crop, second.crop)
 
 

@@ -10,15 +10,15 @@ from hbr.dense.fitting import can_shift
 from hbr.dense.index import Whitening
 from hbr.descriptors.base import Shift
 from hbr.descriptors.together import like_enrollment
-from hbr.drawing.bench import HARD, Bench, Visit
-from hbr.segmentation import Method
+from hbr.drawing.bench import HARD, DrawnBench, Visit
+from hbr.segmentation import BoxMethod
 
 NAMES = tuple("abcdefghij")
 
 
 def frames(count: int) -> tuple[list[np.ndarray], np.ndarray, list[tuple[int, int, int, int]]]:
     """Return frames of a striped box on a textured bench, its empty table, and the true boxes."""
-    visit = Visit(Bench.drawn(np.random.default_rng(1003)), HARD, np.random.default_rng(5))
+    visit = Visit(DrawnBench.drawn(np.random.default_rng(1003)), HARD, np.random.default_rng(5))
     found, boxes = [], []
     for n in range(count):
         photograph = np.zeros((128, 128, 3), np.uint8)
@@ -43,10 +43,10 @@ def test_further_views_revise_the_segmentation_of_earlier_ones() -> None:
     images, _, boxes = frames(3)
     views = hbr.ViewsTogether("edges+colours")
     views.add(images[0])
-    assert views.segmentations[0][0].method is Method.GUESS
+    assert views.segmentations[0][0].method is BoxMethod.GUESS
     for image in images[1:]:
         views.add(image)
-    assert [found[0].method for found in views.segmentations] == [Method.ROTATION] * 3
+    assert [found[0].method for found in views.segmentations] == [BoxMethod.ROTATION] * 3
     assert min(overlap(found[0].box, box) for found, box in zip(views.segmentations, boxes, strict=True)) > 0.55
     assert [len(levels) for levels in views.levels] == [len(found) for found in views.segmentations]
 
@@ -69,7 +69,7 @@ def test_the_guess_counts_beside_the_segmentations_with_a_learned_background() -
 def test_the_network_uses_the_empty_table_image() -> None:
     images, empty, boxes = frames(1)
     found = hbr.hypotheses(images[0], empty_table=empty, most=1)
-    assert found[0].method is Method.EMPTY_TABLE
+    assert found[0].method is BoxMethod.EMPTY_TABLE
     assert overlap(found[0].box, boxes[0]) > 0.8
     again = hbr.hypotheses(images[0], empty_table=empty, most=1)
     np.testing.assert_array_equal(found[0].mask, again[0].mask)
@@ -156,15 +156,15 @@ def test_whitening_without_an_object_is_that_of_the_other_views() -> None:
 @pytest.mark.parametrize(
     ("method", "same_bench", "expected"),
     [
-        (Method.EMPTY_TABLE, True, True),
-        (Method.PLAIN_BACKGROUND, True, True),
-        (Method.ROTATION, True, None),
-        (Method.GUESS, True, None),
-        (Method.ROTATION, False, False),
-        (Method.EMPTY_TABLE, None, None),
+        (BoxMethod.EMPTY_TABLE, True, True),
+        (BoxMethod.PLAIN_BACKGROUND, True, True),
+        (BoxMethod.ROTATION, True, None),
+        (BoxMethod.GUESS, True, None),
+        (BoxMethod.ROTATION, False, False),
+        (BoxMethod.EMPTY_TABLE, None, None),
     ],
 )
 def test_a_segmentation_by_rotation_is_not_like_the_enrollment(
-    method: Method, same_bench: bool | None, expected: bool | None
+    method: BoxMethod, same_bench: bool | None, expected: bool | None
 ) -> None:
     assert like_enrollment(method, same_bench) is expected

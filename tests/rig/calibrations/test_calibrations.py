@@ -9,11 +9,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from rig.calibrations import (
+    CalibrationRejection,
     CalibrationResult,
     CalibrationStatus,
     CalibrationStore,
     Estimate,
-    Rejection,
     RejectionCode,
     apply_results,
 )
@@ -33,7 +33,9 @@ RESULT = CalibrationResult(
     evidence={"legs": [{"encoder_deg": 360.0}]},
 )
 
-FEW = Rejection(RejectionCode.TOO_FEW_REVERSALS, {"used": 2, "needed": 6, "reasons": ["the sensor lost 3 samples"]})
+FEW = CalibrationRejection(
+    RejectionCode.TOO_FEW_REVERSALS, {"used": 2, "needed": 6, "reasons": ["the sensor lost 3 samples"]}
+)
 
 finite = st.floats(allow_nan=False, allow_infinity=False)
 
@@ -43,7 +45,9 @@ finite = st.floats(allow_nan=False, allow_infinity=False)
     value=finite,
     uncertainty=finite,
     residual=st.none() | finite,
-    rejections=st.lists(st.builds(Rejection, st.just(RejectionCode.SAMPLES_LOST), st.just({"lost": 7}))).map(tuple),
+    rejections=st.lists(st.builds(CalibrationRejection, st.just(RejectionCode.SAMPLES_LOST), st.just({"lost": 7}))).map(
+        tuple
+    ),
     when=st.datetimes(datetime(1971, 1, 1), datetime(2200, 1, 1)),
 )
 def test_written_result_is_read_again(tmp_path, value, uncertainty, residual, rejections, when):
@@ -200,4 +204,7 @@ def test_every_rejection_has_words(code):
 
 def test_rejection_states_its_numbers():
     assert str(FEW) == "Only 2 reversals can be used, 6 are needed (the sensor lost 3 samples)."
-    assert str(Rejection(FEW.code, {**FEW.values, "reasons": []})) == "Only 2 reversals can be used, 6 are needed."
+    assert (
+        str(CalibrationRejection(FEW.code, {**FEW.values, "reasons": []}))
+        == "Only 2 reversals can be used, 6 are needed."
+    )

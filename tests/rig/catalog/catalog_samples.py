@@ -23,7 +23,7 @@ from sqlalchemy import Engine, delete, event
 from rig.catalog import Catalog, Provenance, View
 from rig.catalog.facts import Derived
 from rig.catalog.jobs import finished as finished
-from rig.catalog.records import Outcome
+from rig.catalog.records import RecordedOutcome
 from rig.catalog.results import Answer, NewResult
 from rig.catalog.results import record as record_result
 from rig.core.clock import SystemClock
@@ -79,7 +79,7 @@ def new_result(
     outcome: str = "found", object_name: str | None = "mug", sample: str | None = None, **changes: Any
 ) -> NewResult:
     values: dict[str, Any] = {
-        "answered": Answer(Outcome(outcome), object_name, sample),
+        "answered": Answer(RecordedOutcome(outcome), object_name, sample),
         "details": {"event": "identified", "yaw_deg": 70.0, "yaw_sigma_deg": 1.5, "confidence": 0.99, "score": 0.9},
         "azimuths_deg": (0.0, 60.0),
         "provenance": PROVENANCE,

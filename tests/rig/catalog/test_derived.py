@@ -16,7 +16,7 @@ from rig.catalog import Catalog, Enrollment, derived, describing
 from rig.catalog.describing import SEGMENTATION
 from rig.catalog.facts import Derived, seal_of
 from rig.catalog.jobs import JobProgress, finished
-from rig.catalog.verify import Problem, verify
+from rig.catalog.verify import CatalogProblem, verify
 from rig.config import ViewConfig
 from rig.core.errors import CatalogBusy, CatalogDamaged, CatalogError, UsageError
 from rig.search.model import load_model
@@ -161,7 +161,7 @@ def test_a_flipped_byte_is_computed_again_and_found_by_verify(catalog: Catalog) 
     spoilt = content[:5] + bytes([content[5] ^ 1]) + content[6:]
     with catalog.database.write() as transaction:
         transaction.execute(update(Derived).where(Derived.seal == seal, Derived.what == what).values(content=spoilt))
-    assert [one.problem for one in finished(verify(catalog, jobs=1)).findings] == [Problem.DESCRIPTION_DAMAGED]
+    assert [one.problem for one in finished(verify(catalog, jobs=1)).findings] == [CatalogProblem.DESCRIPTION_DAMAGED]
     after, described = load(catalog)
     assert (described, equal(before, after)) == (1, True)
     assert finished(verify(catalog, jobs=1)).findings == ()
@@ -357,7 +357,7 @@ def test_a_changed_empty_table_image_is_found_and_not_used(catalog: Catalog) -> 
     path = catalog.image_path(image)
     path.write_bytes(path.read_bytes()[:-20])
     found = finished(verify(catalog, jobs=1)).findings
-    assert {finding.problem for finding in found} == {Problem.CHANGED_IMAGE}
+    assert {finding.problem for finding in found} == {CatalogProblem.CHANGED_IMAGE}
     forget(catalog)
     done = finished(derived.redescribe(catalog, BENCH_DESCRIPTOR, jobs=1))
     assert (done.described, len(done.failed)) == (0, len(NAMES))

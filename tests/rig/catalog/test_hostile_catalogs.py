@@ -25,7 +25,7 @@ from rig.catalog.results import correct, find_results
 from rig.catalog.results import record as record_result
 from rig.catalog.transfer import CatalogSource, transfer
 from rig.catalog.upkeep import collect_garbage, statistics
-from rig.catalog.verify import Problem, verify
+from rig.catalog.verify import CatalogProblem, verify
 from rig.core.errors import CatalogDamaged, RigError
 from rig.core.files import write
 from rig.core.next_steps import Do
@@ -769,7 +769,7 @@ def test_swapped_truncated_and_foreign_images_are_found(root: Path) -> None:
             second.write_bytes(spoilt[1])
             found = finished(verify(catalog, jobs=1)).findings
             wrong = sum(one != other for one, other in zip(spoilt, whole, strict=True))
-            assert [(one.problem, one.object_name) for one in found] == [(Problem.CHANGED_IMAGE, "mug")] * wrong
+            assert [(one.problem, one.object_name) for one in found] == [(CatalogProblem.CHANGED_IMAGE, "mug")] * wrong
             with pytest.raises(RigError, match="not the one that was stored"):
                 catalog.read_image(catalog.view(4).image)
 

@@ -15,11 +15,11 @@ import pytest
 
 from rig.catalog import Catalog
 from rig.catalog.exchange.tables import RESULTS, TableFormat, write_rows
-from rig.catalog.records import Outcome
+from rig.catalog.records import RecordedOutcome
 from rig.catalog.results import ResultFilter, correct, find_result, find_results, record
 from rig.catalog.transfer import CatalogSource, transfer
 from rig.catalog.upkeep import collect_garbage
-from rig.catalog.verify import Problem, verify
+from rig.catalog.verify import CatalogProblem, verify
 from rig.core.errors import CatalogDamaged, CatalogError, ExportFailed, ObjectNotFound, UsageError
 from sim.clock import VirtualClock
 from tests.rig.catalog.catalog_samples import fill, finished, image, new_result, other_program, sql, without_waiting
@@ -53,7 +53,7 @@ def numbers(catalog: Catalog, **wanted: object) -> list[int]:
 
 def test_result_has_everything_about_the_answer(catalog: Catalog) -> None:
     first, second, third = find_results(catalog)
-    assert second.answered == (Outcome.AMBIGUOUS, "tin", "S-2")
+    assert second.answered == (RecordedOutcome.AMBIGUOUS, "tin", "S-2")
     assert (second.operator, first.operator) == ("A. Silva", first.user)
     assert (second.time_utc - first.time_utc).total_seconds() == 3600
     assert (first.provenance.bench, first.catalog_version) == ("bench-1", "c" * 64)
@@ -69,7 +69,7 @@ def test_results_are_filtered(catalog: Catalog) -> None:
     times = [result.time_utc for result in find_results(catalog)]
     assert numbers(catalog, sample="S-2") == [2]
     assert numbers(catalog, object_name="mug") == [1]
-    assert numbers(catalog, outcome=Outcome.UNKNOWN) == [3]
+    assert numbers(catalog, outcome=RecordedOutcome.UNKNOWN) == [3]
     assert numbers(catalog, since=times[1], before=times[2]) == [2]
 
 
@@ -77,15 +77,15 @@ def test_correction_keeps_the_answer_and_is_in_the_log(catalog: Catalog) -> None
     correct(catalog, 1, object_name="tin", sample="S-9", reason="read the label", operator="B. Meyer")
     correct(catalog, 1, unknown=True, reason="it was neither")
     result = find_result(catalog, 1)
-    assert result.answered == (Outcome.FOUND, "mug", "S-1")
-    assert result.current == (Outcome.UNKNOWN, None, "S-9")
+    assert result.answered == (RecordedOutcome.FOUND, "mug", "S-1")
+    assert result.current == (RecordedOutcome.UNKNOWN, None, "S-9")
     assert [(one.operator, one.reason) for one in result.corrections] == [
         ("B. Meyer", "read the label"),
         (result.user, "it was neither"),
     ]
     row = result.as_row()
     assert (row["object"], row["answered_object"], row["yaw_deg"], row["confidence"]) == (None, "mug", None, None)
-    assert numbers(catalog, outcome=Outcome.UNKNOWN) == [1, 3]
+    assert numbers(catalog, outcome=RecordedOutcome.UNKNOWN) == [1, 3]
     entries = catalog.log()[-5:]
     assert [(entry.action, entry.object_name, entry.details["result"]) for entry in entries] == [
         ("identified", "mug", 1),
@@ -159,7 +159,7 @@ def test_lines_cannot_change_and_verify_finds_a_change_without_triggers(
         connection.execute(change)
     sql(catalog, change)
     found = finished(verify(catalog, jobs=1)).findings
-    assert (Problem.LOG_CHANGED, line) in [(one.problem, one.details.get("entry_id")) for one in found]
+    assert (CatalogProblem.LOG_CHANGED, line) in [(one.problem, one.details.get("entry_id")) for one in found]
     if change.startswith("UPDATE"):
         for read in (lambda: find_results(catalog), lambda: find_result(catalog, 1)):
             with pytest.raises(CatalogDamaged, match="Result 1 in the catalog changed after it was recorded"):
@@ -172,7 +172,7 @@ def test_verify_finds_a_changed_image(catalog: Catalog) -> None:
     assert path is not None
     (catalog.path / path).write_bytes(b"x")
     (finding,) = finished(verify(catalog, jobs=1)).findings
-    assert (finding.problem, finding.path) == (Problem.CHANGED_IMAGE, path)
+    assert (finding.problem, finding.path) == (CatalogProblem.CHANGED_IMAGE, path)
 
 
 @pytest.mark.parametrize("die_before", [*(pytest.param(n, marks=pytest.mark.nightly) for n in (1, 2, 3, 4, 5, 7)), 6])

@@ -12,7 +12,7 @@ from hbr.descriptors.cedd import Cedd
 from rig.catalog import Catalog, derived
 from rig.catalog.jobs import JobProgress
 from rig.catalog.upkeep import statistics
-from rig.catalog.verify import Finding, Problem, Verification, verify
+from rig.catalog.verify import CatalogFinding, CatalogProblem, CatalogVerification, verify
 from rig.core.errors import CatalogError, UsageError
 from rig.views.description import BENCH_DESCRIPTOR
 from sim.clock import VirtualClock
@@ -31,11 +31,11 @@ from tests.rig.catalog.catalog_samples import (
 REGION = (4, 0, 24, 24)
 
 
-def problems(found: Verification) -> list[str]:
+def problems(found: CatalogVerification) -> list[str]:
     return [finding.problem for finding in found.findings]
 
 
-def concerned(found: Verification) -> list[tuple[str, str | None]]:
+def concerned(found: CatalogVerification) -> list[tuple[str, str | None]]:
     return [(finding.problem, finding.object_name) for finding in found.findings]
 
 
@@ -58,7 +58,7 @@ class TestVerify:
         alone, together = finished(verify(catalog, jobs=1)), finished(verify(catalog, jobs=2))
         assert alone == together
         (finding,) = alone.findings
-        assert (finding.problem, finding.object_name) == (Problem.MISSING_IMAGE, "mug")
+        assert (finding.problem, finding.object_name) == (CatalogProblem.MISSING_IMAGE, "mug")
         assert finding.path == lost.relative_to(catalog.path).as_posix()
         assert finding.text == (
             f"image missing: 'mug': {finding.path}; No such file or directory; "
@@ -74,43 +74,45 @@ class TestVerify:
         third.symlink_to(tmp_path / "outside.png")
         found = finished(verify(catalog, jobs=1))
         assert concerned(found) == [
-            (Problem.CHANGED_IMAGE, "mug"),
-            (Problem.CHANGED_IMAGE, "mug"),
-            (Problem.MISSING_IMAGE, "mug"),
+            (CatalogProblem.CHANGED_IMAGE, "mug"),
+            (CatalogProblem.CHANGED_IMAGE, "mug"),
+            (CatalogProblem.MISSING_IMAGE, "mug"),
         ]
         assert "leads to another place" in found.findings[2].details["reason"]
 
     @pytest.mark.parametrize("damage", [b"", b"\x89PNG\r\n\x1a\n", b"x" * 5000])
     def test_damaged_image_is_found(self, catalog: Catalog, damage: bytes) -> None:
         self.images(catalog, "tin")[2].write_bytes(damage)
-        assert concerned(finished(verify(catalog))) == [(Problem.CHANGED_IMAGE, "tin")]
+        assert concerned(finished(verify(catalog))) == [(CatalogProblem.CHANGED_IMAGE, "tin")]
 
     @pytest.mark.sqlite
     @pytest.mark.parametrize(
         ("statement", "found"),
         [
-            ("UPDATE views SET azimuth_deg = 7 WHERE id = 2", (Problem.ENROLLMENT_CHANGED, "mug")),
-            ("UPDATE views SET image = 'x' WHERE id = 2", (Problem.ENROLLMENT_CHANGED, "mug")),
-            ("UPDATE views SET evidence = x'00' WHERE id = 5", (Problem.ENROLLMENT_CHANGED, "tin")),
-            ("DELETE FROM views WHERE id = 5", (Problem.ENROLLMENT_CHANGED, "tin")),
-            ("UPDATE sessions SET software = '?' WHERE enrollment_id = 1", (Problem.ENROLLMENT_CHANGED, "mug")),
-            ("UPDATE enrollments SET planned_azimuth_deg = '[0]'", (Problem.ENROLLMENT_CHANGED, "mug")),
-            ("UPDATE enrollments SET id = 7 WHERE id = 2", (Problem.MISSING_ENROLLMENT, "tin")),
-            ("UPDATE log SET label = 'x' WHERE id = 1", (Problem.LOG_CHANGED, "mug")),
-            ("UPDATE log SET user = 'x' WHERE id = 4", (Problem.LOG_CHANGED, "tin")),
-            ("DELETE FROM log WHERE id = 2", (Problem.LOG_CHANGED, None)),
-            ("DELETE FROM log WHERE id = 4", (Problem.LOG_CHANGED, None)),
-            ("UPDATE properties SET value = '4 x' WHERE key = 'head'", (Problem.DAMAGED_DATABASE, None)),
+            ("UPDATE views SET azimuth_deg = 7 WHERE id = 2", (CatalogProblem.ENROLLMENT_CHANGED, "mug")),
+            ("UPDATE views SET image = 'x' WHERE id = 2", (CatalogProblem.ENROLLMENT_CHANGED, "mug")),
+            ("UPDATE views SET evidence = x'00' WHERE id = 5", (CatalogProblem.ENROLLMENT_CHANGED, "tin")),
+            ("DELETE FROM views WHERE id = 5", (CatalogProblem.ENROLLMENT_CHANGED, "tin")),
+            ("UPDATE sessions SET software = '?' WHERE enrollment_id = 1", (CatalogProblem.ENROLLMENT_CHANGED, "mug")),
+            ("UPDATE enrollments SET planned_azimuth_deg = '[0]'", (CatalogProblem.ENROLLMENT_CHANGED, "mug")),
+            ("UPDATE enrollments SET id = 7 WHERE id = 2", (CatalogProblem.MISSING_ENROLLMENT, "tin")),
+            ("UPDATE log SET label = 'x' WHERE id = 1", (CatalogProblem.LOG_CHANGED, "mug")),
+            ("UPDATE log SET user = 'x' WHERE id = 4", (CatalogProblem.LOG_CHANGED, "tin")),
+            ("DELETE FROM log WHERE id = 2", (CatalogProblem.LOG_CHANGED, None)),
+            ("DELETE FROM log WHERE id = 4", (CatalogProblem.LOG_CHANGED, None)),
+            ("UPDATE properties SET value = '4 x' WHERE key = 'head'", (CatalogProblem.DAMAGED_DATABASE, None)),
             (
                 "UPDATE properties SET value = replace(value, (SELECT digest FROM log WHERE id = 4), "
                 "(SELECT digest FROM log WHERE id = 3)) WHERE key = 'head'",
-                (Problem.LOG_CHANGED, "tin"),
+                (CatalogProblem.LOG_CHANGED, "tin"),
             ),
-            ("UPDATE properties SET value = value || '7' WHERE key = 'head'", (Problem.DAMAGED_DATABASE, None)),
-            ("UPDATE log SET enrollment_id = 'x' WHERE id = 1", (Problem.DAMAGED_DATABASE, None)),
+            ("UPDATE properties SET value = value || '7' WHERE key = 'head'", (CatalogProblem.DAMAGED_DATABASE, None)),
+            ("UPDATE log SET enrollment_id = 'x' WHERE id = 1", (CatalogProblem.DAMAGED_DATABASE, None)),
         ],
     )
-    def test_changed_rows_are_found(self, catalog: Catalog, statement: str, found: tuple[Problem, str | None]) -> None:
+    def test_changed_rows_are_found(
+        self, catalog: Catalog, statement: str, found: tuple[CatalogProblem, str | None]
+    ) -> None:
         sql(catalog, statement)
         with Catalog.open(catalog.path, clock=VirtualClock(), read_only=True) as reader:
             assert found in concerned(finished(verify(reader, jobs=1)))
@@ -121,7 +123,11 @@ class TestVerify:
         sql(catalog, "UPDATE log SET user = 'x' WHERE id = 2", "DELETE FROM log WHERE id = 3")
         lost.unlink()
         found = concerned(finished(verify(catalog, jobs=1)))
-        assert {(Problem.LOG_CHANGED, "mug"), (Problem.LOG_CHANGED, None), (Problem.MISSING_IMAGE, None)} <= set(found)
+        assert {
+            (CatalogProblem.LOG_CHANGED, "mug"),
+            (CatalogProblem.LOG_CHANGED, None),
+            (CatalogProblem.MISSING_IMAGE, None),
+        } <= set(found)
 
     @pytest.mark.sqlite
     def test_removed_and_added_enrollments_are_found(self, catalog: Catalog) -> None:
@@ -133,8 +139,8 @@ class TestVerify:
         )
         found = finished(verify(catalog, jobs=1)).findings
         assert [(one.problem, one.details["enrollment_id"]) for one in found] == [
-            (Problem.MISSING_ENROLLMENT, 2),
-            (Problem.ENROLLMENT_CHANGED, 7),
+            (CatalogProblem.MISSING_ENROLLMENT, 2),
+            (CatalogProblem.ENROLLMENT_CHANGED, 7),
         ]
 
     @pytest.mark.sqlite
@@ -142,7 +148,7 @@ class TestVerify:
         before = derived.views(catalog, BENCH_DESCRIPTOR).descriptors
         sql(catalog, "UPDATE derived SET content = zeroblob(length(content)) WHERE what != 'cedd'")
         found = finished(verify(catalog, jobs=1))
-        assert concerned(found) == [(Problem.DESCRIPTION_DAMAGED, name) for name in ("mug", "mug", "tin", "tin")]
+        assert concerned(found) == [(CatalogProblem.DESCRIPTION_DAMAGED, name) for name in ("mug", "mug", "tin", "tin")]
         assert found.findings[0].text == (
             f"description damaged: 'mug'; the stored {BENCH_DESCRIPTOR} is not the one that was computed; "
             "it is computed again when it is needed"
@@ -154,23 +160,23 @@ class TestVerify:
         enrollment = catalog.begin("jar", planned_azimuth_deg=plan(2), provenance=PROVENANCE, empty_table=image(7))
         assert finished(verify(catalog)).findings == ()
         catalog.image_path(enrollment.session.empty_table or "").write_bytes(b"x")
-        assert concerned(finished(verify(catalog))) == [(Problem.CHANGED_IMAGE, "jar")]
+        assert concerned(finished(verify(catalog))) == [(CatalogProblem.CHANGED_IMAGE, "jar")]
 
     def test_check_changes_nothing_and_needs_no_image_that_no_row_names(self, catalog: Catalog) -> None:
         catalog.database.images.put(b"\x89PNG of a program that was killed")
         self.images(catalog, "mug")[1].unlink()
         before = (files(catalog), len(catalog.log()))
         with Catalog.open(catalog.path, clock=VirtualClock(), read_only=True) as reader:
-            assert problems(finished(verify(reader))) == [Problem.MISSING_IMAGE]
+            assert problems(finished(verify(reader))) == [CatalogProblem.MISSING_IMAGE]
         assert (files(catalog), len(catalog.log())) == before
 
 
-@pytest.mark.parametrize("problem", Problem)
-def test_every_problem_has_words_and_a_next_step(problem: Problem) -> None:
+@pytest.mark.parametrize("problem", CatalogProblem)
+def test_every_problem_has_words_and_a_next_step(problem: CatalogProblem) -> None:
     keys = ("message", "entry_id", "enrollment_id", "reason", "bytes", "stored_bytes", "descriptor")
     details = dict.fromkeys(keys, 1)
     for name in (None, "mug"):
-        words = Finding(problem, name, None, None, details).text
+        words = CatalogFinding(problem, name, None, None, details).text
         assert words.startswith(f"{problem}")
         assert words.count("; ") == 2
 

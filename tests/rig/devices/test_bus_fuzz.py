@@ -22,7 +22,7 @@ from sim.imu.bno055 import SimBno055
 from sim.imu.mpu6050 import SimMpu6050
 from sim.noise import NoiseModel
 from sim.servo.protocol1 import checksum, status_packet1
-from sim.servo.protocol2 import Status, crc16, status_packet
+from sim.servo.protocol2 import StatusPacket, crc16, status_packet
 from sim.world import World
 from tests.fuzzing import fuzz_settings
 from tests.rig.devices.scripted_serial import scripted_bus
@@ -33,7 +33,7 @@ ANSWER_S = 2.0
 """Longest time that a read with two retries may take, with any received bytes."""
 
 TABLES = {2: control_table("xl430_w250"), 1: control_table("ax_12a")}
-PACKETS: dict[int, Callable[[int, Status], bytes]] = {2: status_packet, 1: status_packet1}
+PACKETS: dict[int, Callable[[int, StatusPacket], bytes]] = {2: status_packet, 1: status_packet1}
 
 
 # -- what a line makes of an answer ------------------------------------------------------------------------------------
@@ -60,9 +60,9 @@ def spoiled(draw: st.DrawFn, packet: bytes, protocol: int) -> bytes:
                     + data
                 )
             case 5:
-                other = Status(draw(st.integers(0, 255)), draw(st.binary(max_size=6)))
+                other = StatusPacket(draw(st.integers(0, 255)), draw(st.binary(max_size=6)))
                 if protocol == 1:
-                    other = Status(other.error & 0x7F, other.data)
+                    other = StatusPacket(other.error & 0x7F, other.data)
                 data = bytearray(PACKETS[protocol](draw(st.integers(0, 252)), other)) + data
             case 6:
                 data += bytes(data)
@@ -101,7 +101,7 @@ def test_read_block_was_sent_by_the_device(protocol: int, data: st.DataObject, v
     block = value.to_bytes(4, "little")
     # The driver asks for one byte more each time an answer is owed, from one address lower.
     sent = [b"\x55" * extra + block for extra in range(3)]
-    answers = [data.draw(spoiled(PACKETS[protocol](1, Status(0, parameters)), protocol)) for parameters in sent]
+    answers = [data.draw(spoiled(PACKETS[protocol](1, StatusPacket(0, parameters)), protocol)) for parameters in sent]
     bus, wire = scripted_bus(*answers, retries=2, protocol=protocol)
     clock = bus.port.clock
     try:

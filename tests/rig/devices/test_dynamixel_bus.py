@@ -13,8 +13,8 @@ from rig.core.errors import DeviceSilent, RequestRejected
 from rig.devices.dynamixel.bus import DynamixelBus, watchdog_units
 from rig.devices.dynamixel.port import ClockedPort, open_serial
 from rig.devices.dynamixel.registers import control_table
-from sim.servo import Frame
-from sim.servo.bus import Source
+from sim.servo import SentBytes
+from sim.servo.bus import Sender
 from tests.fuzzing import examples
 from tests.rig.bench_parts import open_bus, servo_wires
 
@@ -39,7 +39,7 @@ def test_bytes_on_the_wire_match_the_sdk(wires):
 def test_crc_error_is_retried_and_counted(wires, bus):
     spoiled = []
 
-    def flip_once(frame: Frame) -> Frame:
+    def flip_once(frame: SentBytes) -> SentBytes:
         if spoiled:
             return frame
         spoiled.append(frame)
@@ -124,7 +124,7 @@ def test_reply_to_an_interrupted_request_never_answers_the_next_one(wires, bus):
     def interrupt() -> None:
         raise KeyboardInterrupt
 
-    def late_and_interrupted(frame: Frame) -> Frame:
+    def late_and_interrupted(frame: SentBytes) -> SentBytes:
         wires.bus.filters.clear()
         wires.world.clock.call_at(wires.world.clock.now_ns(), interrupt)
         return replace(frame, start_ns=frame.start_ns + 1_000_000)
@@ -137,7 +137,7 @@ def test_reply_to_an_interrupted_request_never_answers_the_next_one(wires, bus):
 
 def test_block_has_the_time_at_which_its_reply_began(wires, bus):
     begun = []
-    wires.bus.taps.append(lambda frame: begun.append(frame.start_ns) if frame.source is Source.DEVICE else None)
+    wires.bus.taps.append(lambda frame: begun.append(frame.start_ns) if frame.source is Sender.DEVICE else None)
     for number in range(8):  # replies of different lengths
         if number == 4:
             wires.device.memory["Goal Velocity"] = 0x00FDFFFF  # FF FF FD: another byte follows on the bus

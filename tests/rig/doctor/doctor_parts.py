@@ -18,7 +18,7 @@ from sim.clock import VirtualClock
 from sim.computer import ComputerFiles, SimComputer
 from sim.devices import SimDevices
 from sim.noise import NoiseModel
-from sim.servo import Frame, Source, XSeriesServo
+from sim.servo import Sender, SentBytes, XSeriesServo
 from sim.world import World
 
 
@@ -29,7 +29,7 @@ class Bench:
     computer: ComputerFiles
     devices: SimDevices
     context: DoctorContext
-    sent: list[Frame] = field(default_factory=list)
+    sent: list[SentBytes] = field(default_factory=list)
 
     def add_servo(self, bus_id: int, baud: int, model: str = "xl430_w250") -> XSeriesServo:
         """Connect another servo to the bus."""
@@ -53,7 +53,7 @@ class Bench:
     @property
     def instructions(self) -> set[int]:
         """The instructions that the host has sent (Protocol 2.0)."""
-        return {frame.data[7] for frame in self.sent if frame.source is Source.HOST and len(frame.data) > 7}
+        return {frame.data[7] for frame in self.sent if frame.source is Sender.HOST and len(frame.data) > 7}
 
 
 @contextmanager

@@ -14,7 +14,7 @@ from rig.motion.trajectory import TrajectoryRecorder
 from rig.motion.turntable import Flight, Turntable
 from rig.safety.supervisor import TableState
 from sim.noise import NoiseModel
-from sim.servo import Frame
+from sim.servo import SentBytes
 from tests.fuzzing import examples
 from tests.rig.bench_parts import motion_bench
 
@@ -263,7 +263,7 @@ def test_ctrl_c_during_torque_on_switches_it_off():
         def interrupt() -> None:
             raise KeyboardInterrupt
 
-        def when_on(frame: Frame) -> Frame:
+        def when_on(frame: SentBytes) -> SentBytes:
             if wires.device.memory["Torque Enable"]:
                 wires.bus.filters.clear()
                 wires.world.clock.call_at(wires.world.clock.now_ns(), interrupt)

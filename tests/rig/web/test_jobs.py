@@ -7,7 +7,7 @@ import pytest
 from rig.core.errors import JobRejected
 from rig.plans.operator import Choice
 from rig.web.jobs import MAX_BYTES, MAX_QUEUED, MAX_QUEUED_BYTES, STORED_BYTES, JobQueue
-from rig.web.requests import EnrollRequest, HomeRequest, JobState, Question, TrayObject, TrayRequest
+from rig.web.requests import EnrollRequest, HomeRequest, JobQuestion, JobState, TrayObject, TrayRequest
 from sim.clock import VirtualClock
 
 LARGE = TrayRequest(objects=[TrayObject(name=f"object-{k}", note="x" * 9000) for k in range(100)])
@@ -77,7 +77,7 @@ def test_only_the_answers_that_a_job_offers_are_accepted(queue):
     job = queue.submit(HomeRequest(), "anna")
     with pytest.raises(JobRejected, match="asks nothing"):
         queue.answer(job.id, Choice.CONTINUE)
-    queue.ask(running := queue.next(), Question(text="Is it on the table?", choices=(Choice.CONTINUE, Choice.SKIP)))
+    queue.ask(running := queue.next(), JobQuestion(text="Is it on the table?", choices=(Choice.CONTINUE, Choice.SKIP)))
     with pytest.raises(JobRejected, match="continue, skip"):
         queue.answer(job.id, Choice.RESTART)
     queue.answer(job.id, Choice.SKIP)

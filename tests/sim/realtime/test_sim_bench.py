@@ -33,7 +33,7 @@ from sim.realtime.client import RemoteCapture, RemoteI2c, camera_node
 from sim.realtime.commands import HELP, Commands
 from sim.realtime.pace import RealTime
 from sim.realtime.run import run_bench
-from sim.realtime.server import MAX_CONNECTIONS, MAX_LINE, Server, Session
+from sim.realtime.server import MAX_CONNECTIONS, MAX_LINE, BenchServer, ClientSession
 from sim.realtime.wire import SOCKET, Wire, send_command, short_path
 from sim.world import World
 from tests.contract.heads import needs
@@ -311,12 +311,12 @@ REQUESTS = st.one_of(
 
 
 @pytest.fixture(scope="module")
-def session(tmp_path_factory) -> Iterator[Session]:
+def session(tmp_path_factory) -> Iterator[ClientSession]:
     world = World()
     with SimDevices.connected(load_config(None, ()), world) as devices:
         commands = Commands(ShelfOperator(world, shelf()), devices, Faults(devices))
-        with Server(tmp_path_factory.mktemp("fuzz"), devices, RealTime(world.clock), commands) as server:
-            yield Session(server)
+        with BenchServer(tmp_path_factory.mktemp("fuzz"), devices, RealTime(world.clock), commands) as server:
+            yield ClientSession(server)
 
 
 @fuzz_settings(0.3)
@@ -335,7 +335,7 @@ def test_any_request_is_answered_or_rejected(session, request_):
 
 
 def test_bench_that_ends_answers_what_was_asked(session, tmp_path):
-    server = Server(tmp_path, session._devices, session._time, session._bench.commands)
+    server = BenchServer(tmp_path, session._devices, session._time, session._bench.commands)
     client = connected(tmp_path)
     client.sendall(b'{"ask": "do", "words": ["status"]}\n')
     server.accept()

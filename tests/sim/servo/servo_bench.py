@@ -8,7 +8,7 @@ from rig.devices.dynamixel.port import ClockedPort
 from rig.devices.dynamixel.registers import ControlTable, control_table
 from sim.clock import VirtualClock
 from sim.noise import NoiseModel
-from sim.servo import Frame, ServoBus, SimSerial, Source, XSeriesServo
+from sim.servo import Sender, SentBytes, ServoBus, SimSerial, XSeriesServo
 from sim.world import World
 
 ALERT = 0x80
@@ -20,7 +20,7 @@ class Line:
 
     baudrate: int = 1_000_000
     noise: NoiseModel = field(default_factory=NoiseModel.none)
-    frames: list[Frame] = field(default_factory=list)
+    frames: list[SentBytes] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self.clock = VirtualClock()
@@ -71,7 +71,7 @@ class Line:
     def shaft(self, bus_id: int = 1) -> float:
         return self.worlds[bus_id].shaft()[0]
 
-    def sent(self, source: Source) -> list[bytes]:
+    def sent(self, source: Sender) -> list[bytes]:
         return [frame.data for frame in self.frames if frame.source is source]
 
 

@@ -10,7 +10,7 @@ from dynamixel_sdk import COMM_RX_CORRUPT, COMM_RX_TIMEOUT, COMM_SUCCESS
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sim.servo import Frame, SimSerial, Source
+from sim.servo import Sender, SentBytes, SimSerial
 from sim.servo.bus import ABANDON_S, superpose
 from sim.servo.models import BAUD_RATES
 from tests.fuzzing import examples
@@ -37,7 +37,7 @@ def test_time_of_a_ping_is_that_of_its_bytes_and_the_return_delay(baudrate: int,
 @examples(10)
 @given(baudrate=st.sampled_from(BAUD_RATES), start_ns=st.integers(0, 10**15), now=st.integers(-10, 10**8))
 def test_byte_arrives_at_the_end_of_its_stop_bit(baudrate: int, start_ns: int, now: int) -> None:
-    frame = Frame(Source.DEVICE, start_ns, baudrate, bytes(50))
+    frame = SentBytes(Sender.DEVICE, start_ns, baudrate, bytes(50))
     arrived = frame.arrived(start_ns + now)
     assert arrived == sum(frame.arrival_ns(n) <= start_ns + now for n in range(1, 51))
 
@@ -59,7 +59,7 @@ def test_writes_follow_one_another_on_the_bus(line: Line) -> None:
     for part in (PING[:3], PING[3:8], PING[8:]):
         line.serial.write(part)
     assert line.serial.read(14)[:5] == PING[:5]
-    requests = [frame for frame in line.frames if frame.source is Source.HOST]
+    requests = [frame for frame in line.frames if frame.source is Sender.HOST]
     assert [frame.start_ns for frame in requests] == [0, 30_000, 80_000]
 
 
@@ -83,8 +83,8 @@ def test_read_returns_when_complete_or_at_the_timeout(line: Line) -> None:
 # -- disturbances ---------------------------------------------------------------------------------------------------
 
 
-def flip(index: int) -> Callable[[Frame], Frame]:
-    def tamper(frame: Frame) -> Frame:
+def flip(index: int) -> Callable[[SentBytes], SentBytes]:
+    def tamper(frame: SentBytes) -> SentBytes:
         data = bytearray(frame.data)
         data[index] ^= 0x10
         return replace(frame, data=bytes(data))
@@ -114,7 +114,7 @@ def test_late_reply_is_received_by_the_next_read(line: Line) -> None:
 def test_lost_or_delayed_reply_does_not_affect_the_next(line: Line) -> None:
     line.bus.filters.append(lambda _: None)
     assert line.sdk.ping(line.port, 1)[1] == COMM_RX_TIMEOUT
-    assert line.sent(Source.DEVICE) == []
+    assert line.sent(Sender.DEVICE) == []
     held_up = [0.2]
     line.bus.filters[:] = [
         lambda frame: replace(frame, start_ns=frame.start_ns + round(held_up.pop() * 1e9)) if held_up else frame
@@ -135,7 +135,7 @@ def test_incomplete_packet_is_dropped_and_does_not_damage_the_next(line: Line) -
 @examples(10)
 @given(st.binary(min_size=1, max_size=12), st.binary(min_size=1, max_size=12))
 def test_two_simultaneous_senders_can_only_pull_the_bus_low(one: bytes, other: bytes) -> None:
-    frames = [Frame(Source.DEVICE, 0, 1_000_000, one), Frame(Source.DEVICE, 0, 1_000_000, other)]
+    frames = [SentBytes(Sender.DEVICE, 0, 1_000_000, one), SentBytes(Sender.DEVICE, 0, 1_000_000, other)]
     (mixed,) = superpose(frames)
     assert len(mixed.data) <= len(one) + len(other) + 1
     assert superpose(frames[:1]) == frames[:1]

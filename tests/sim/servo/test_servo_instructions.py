@@ -12,7 +12,7 @@ from dynamixel_sdk import (
     GroupSyncWrite,
 )
 
-from sim.servo import Source
+from sim.servo import Sender
 from sim.servo.base import BOOT_S
 from sim.servo.models import MODELS
 from sim.servo.protocol2 import StatusError, with_crc
@@ -39,13 +39,13 @@ def three(line: Line) -> Line:
 
 def test_bytes_on_the_wire_equal_the_emanuals_and_the_sdks(line: Line) -> None:
     assert line.sdk.ping(line.port, 1) == (1060, COMM_SUCCESS, 0)
-    assert line.sent(Source.HOST) == [bytes.fromhex("FFFFFD000103000119 4E".replace(" ", ""))]
+    assert line.sent(Sender.HOST) == [bytes.fromhex("FFFFFD000103000119 4E".replace(" ", ""))]
     line.frames.clear()
     recorded = []
     write = line.port.writePort
     line.port.writePort = lambda packet: recorded.append(bytes(packet)) or write(packet)
     line.write("Goal Position", 512)
-    assert recorded == line.sent(Source.HOST) == [bytes.fromhex("FFFFFD00010900037400000200 00CA89".replace(" ", ""))]
+    assert recorded == line.sent(Sender.HOST) == [bytes.fromhex("FFFFFD00010900037400000200 00CA89".replace(" ", ""))]
 
 
 @pytest.mark.parametrize(
@@ -67,16 +67,16 @@ def test_broadcast_ping_finds_all_servos_in_order_of_id(three: Line) -> None:
     found, result = three.sdk.broadcastPing(three.port)
     assert result == COMM_SUCCESS
     assert found == {1: [1060, 46], 4: [1200, 52], 7: [1020, 46]}
-    assert [data[4] for data in three.sent(Source.DEVICE)] == [1, 4, 7]
+    assert [data[4] for data in three.sent(Sender.DEVICE)] == [1, 4, 7]
 
 
 def test_two_servos_with_one_id_collide(line: Line) -> None:
     line.sdk.ping(line.port, 1)
-    alone = line.sent(Source.DEVICE)[-1]
+    alone = line.sent(Sender.DEVICE)[-1]
     line.add(1)
     _, result, _ = line.sdk.ping(line.port, 1)
     assert result != COMM_SUCCESS
-    assert line.sent(Source.DEVICE)[-1] != alone
+    assert line.sent(Sender.DEVICE)[-1] != alone
 
 
 def test_registers_of_every_size_are_written_and_read(line: Line) -> None:
@@ -163,7 +163,7 @@ def test_sync_read_answers_in_the_requested_order(three: Line, fast: bool) -> No
     assert (group.fastSyncRead() if fast else group.txRxPacket()) == COMM_SUCCESS
     degrees = {bus_id: (group.getData(bus_id, 132, 4) - 2048) * 360 / 4096 for bus_id in (1, 7, 4)}
     assert degrees == pytest.approx({1: 10, 7: 20, 4: 30}, abs=0.05)
-    replies = [frame for frame in three.frames if frame.source is Source.DEVICE]
+    replies = [frame for frame in three.frames if frame.source is Sender.DEVICE]
     assert len(replies) == 3
     for earlier, later in pairwise(replies):
         assert later.start_ns >= earlier.end_ns
@@ -186,7 +186,7 @@ def test_read_of_more_than_a_packet_does_not_stop_the_servo(three: Line, instruc
     body = bytes([instruction, *request])
     three.bus.send(with_crc(b"\xff\xff\xfd\x00\xfe" + bytes(word(len(body) + 2)) + body), three.baudrate)
     three.sleep(2.0)
-    assert all(len(data) <= 7 + 65_535 for data in three.sent(Source.DEVICE))
+    assert all(len(data) <= 7 + 65_535 for data in three.sent(Sender.DEVICE))
     assert three.sdk.ping(three.port, 1)[:2] == (1060, COMM_SUCCESS)
 
 
@@ -196,7 +196,7 @@ def test_chain_ends_at_the_first_silent_servo(three: Line) -> None:
     for bus_id in (1, 7, 4):
         group.addParam(bus_id)
     assert group.txRxPacket() == COMM_RX_TIMEOUT
-    assert [data[4] for data in three.sent(Source.DEVICE)] == [1]
+    assert [data[4] for data in three.sent(Sender.DEVICE)] == [1]
 
 
 def test_sync_write_and_bulk_write_reach_each_servo_without_an_answer(three: Line) -> None:
@@ -213,7 +213,7 @@ def test_sync_write_and_bulk_write_reach_each_servo_without_an_answer(three: Lin
     three.sleep(0.01)
     assert (three.read("Profile Velocity", 7), three.read("LED", 1), three.read("LED", 4)) == (77, 0, 1)
     answers_to_reads = 6
-    assert len(three.sent(Source.DEVICE)) == answers_to_reads
+    assert len(three.sent(Sender.DEVICE)) == answers_to_reads
 
 
 def test_servos_obey_a_secondary_id_without_an_answer(three: Line) -> None:

@@ -13,7 +13,7 @@ from sim.servo.ax12 import BAUD_RATES, DEG_PER_COUNT, DPS_PER_UNIT, ENTRIES
 from sim.servo.base import BOOT_S
 from sim.servo.motor import OVERLOAD_S
 from sim.servo.protocol1 import Error, PacketParser1, checksum, status_packet1
-from sim.servo.protocol2 import InstructionPacket, Status
+from sim.servo.protocol2 import InstructionPacket, StatusPacket
 from sim.world import World
 from tests.fuzzing import examples
 
@@ -69,8 +69,8 @@ def test_emanual_instruction_packets_are_understood(frame: str, packet: Instruct
 
 
 def test_status_packets_equal_the_emanuals() -> None:
-    assert status_packet1(1, Status(0, b"\x20")) == bytes.fromhex("FF FF 01 03 00 20 DB")
-    assert status_packet1(1, Status(0)) == bytes.fromhex("FF FF 01 02 00 FC")
+    assert status_packet1(1, StatusPacket(0, b"\x20")) == bytes.fromhex("FF FF 01 03 00 20 DB")
+    assert status_packet1(1, StatusPacket(0)) == bytes.fromhex("FF FF 01 02 00 FC")
 
 
 @quick

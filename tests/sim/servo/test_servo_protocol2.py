@@ -10,7 +10,7 @@ from sim.servo.protocol2 import (
     BROADCAST_ID,
     InstructionPacket,
     PacketParser,
-    Status,
+    StatusPacket,
     crc16,
     fast_status_parts,
     status_packet,
@@ -65,22 +65,22 @@ def test_emanual_instruction_packets_are_understood(frame: str, packet: Instruct
 @pytest.mark.parametrize(
     ("bus_id", "status", "frame"),
     [
-        (1, Status(0, b"\x06\x04\x26"), "FF FF FD 00 01 07 00 55 00 06 04 26 65 5D"),
-        (2, Status(0, b"\x06\x04\x26"), "FF FF FD 00 02 07 00 55 00 06 04 26 6F 6D"),
-        (1, Status(0, b"\xa6\0\0\0"), "FF FF FD 00 01 08 00 55 00 A6 00 00 00 8C C0"),
-        (1, Status(0), "FF FF FD 00 01 04 00 55 00 A1 0C"),
-        (2, Status(0, b"\x24"), "FF FF FD 00 02 05 00 55 00 24 8B A9"),
+        (1, StatusPacket(0, b"\x06\x04\x26"), "FF FF FD 00 01 07 00 55 00 06 04 26 65 5D"),
+        (2, StatusPacket(0, b"\x06\x04\x26"), "FF FF FD 00 02 07 00 55 00 06 04 26 6F 6D"),
+        (1, StatusPacket(0, b"\xa6\0\0\0"), "FF FF FD 00 01 08 00 55 00 A6 00 00 00 8C C0"),
+        (1, StatusPacket(0), "FF FF FD 00 01 04 00 55 00 A1 0C"),
+        (2, StatusPacket(0, b"\x24"), "FF FF FD 00 02 05 00 55 00 24 8B A9"),
     ],
 )
-def test_status_packets_equal_the_emanuals(bus_id: int, status: Status, frame: str) -> None:
+def test_status_packets_equal_the_emanuals(bus_id: int, status: StatusPacket, frame: str) -> None:
     assert status_packet(bus_id, status) == bytes.fromhex(frame)
 
 
 def test_fast_sync_read_status_equals_the_emanuals() -> None:
     answers = [
-        (3, Status(0, (166).to_bytes(4, "little"))),
-        (7, Status(0, (2079).to_bytes(4, "little"))),
-        (4, Status(0, (1023).to_bytes(4, "little"))),
+        (3, StatusPacket(0, (166).to_bytes(4, "little"))),
+        (7, StatusPacket(0, (2079).to_bytes(4, "little"))),
+        (4, StatusPacket(0, (1023).to_bytes(4, "little"))),
     ]
     assert fast_status_parts([4, 4, 4], answers) == [
         bytes.fromhex("FF FF FD 00 FE 19 00 55 00 03 A6 00 00 00 84 08"),
@@ -110,7 +110,7 @@ def as_the_sdk_unstuffs(frame: bytes) -> bytes:
 @given(bus_id=st.integers(0, 252), error=st.integers(0, 255), data=payloads)
 @example(bus_id=1, error=0, data=b"\xff\xff\xfd\xff\xfd\xfd")
 def test_byte_stuffing_removes_headers_and_can_be_undone(bus_id: int, error: int, data: bytes) -> None:
-    frame = status_packet(bus_id, Status(error, data))
+    frame = status_packet(bus_id, StatusPacket(error, data))
     assert b"\xff\xff\xfd\x00" not in frame[4:-2]
     assert SDK.updateCRC(0, frame, len(frame) - 2) == frame[-2] | frame[-1] << 8
     assert unstuffed(frame[7:-2]) == bytes((0x55, error)) + data
@@ -123,7 +123,7 @@ def test_sdk_unstuffs_the_bytes_that_the_servo_stuffs(bus_id: int, error: int, d
     body = bytes((0x55, error)) + data
     # After one stuffed byte it takes FF FD FD for another: rig.devices.dynamixel has its own function.
     assume(b"\xff\xfd\xfd" not in body.partition(b"\xff\xff\xfd")[2])
-    assert as_the_sdk_unstuffs(status_packet(bus_id, Status(error, data))) == body
+    assert as_the_sdk_unstuffs(status_packet(bus_id, StatusPacket(error, data))) == body
 
 
 @quick

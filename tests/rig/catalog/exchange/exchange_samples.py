@@ -17,7 +17,7 @@ from rig.catalog import Catalog
 from rig.catalog.derived import views
 from rig.catalog.exchange.bundle import read_bundle
 from rig.catalog.facts import seal_of
-from rig.catalog.transfer import Conflict, Item, Source, Transferred, transfer
+from rig.catalog.transfer import Conflict, TransferItem, Transferred, TransferSource, transfer
 from rig.config.catalog_place import DATABASE_NAME
 from sim.clock import VirtualClock
 from tests.rig.catalog.catalog_samples import NOW, PROVENANCE, fill, finished, image, plan, record, sql
@@ -41,7 +41,9 @@ def fill_full(catalog: Catalog) -> None:
     tin.add(record(2, evidence={"sharpness": 12.5, "locks": {"gain": None}}), image(32))
 
 
-def run_import(catalog: Catalog, source: Source, conflict: Conflict = Conflict.REJECT, **options: Any) -> Transferred:
+def run_import(
+    catalog: Catalog, source: TransferSource, conflict: Conflict = Conflict.REJECT, **options: Any
+) -> Transferred:
     return finished(transfer(source, catalog, conflict=conflict, **{"jobs": 1, "descriptors": ["cedd"], **options}))
 
 
@@ -118,7 +120,7 @@ def changed_bundle(bundle: Path, target: Path, change: Callable[[Path], None], m
     return target
 
 
-def facts(item: Item) -> tuple[object, ...]:
+def facts(item: TransferItem) -> tuple[object, ...]:
     """Everything that a transfer keeps of an object."""
     enrollments = [
         (one.enrollment.key, seal_of(one.enrollment), one.status, one.finished_utc, one.seal)

@@ -4,7 +4,7 @@ import json
 import shutil
 from pathlib import Path
 
-from rig.search.replay import Difference
+from rig.search.replay import ReplayDifference
 
 
 def test_saved_run_is_replayed_checked_and_reported(rig, enrolled):
@@ -57,7 +57,7 @@ def test_replay_check_sums_differences_up(rig, tmp_path):
 
 
 def test_difference_of_long_values_is_cut():
-    one = Difference(2, "candidates", ["mug-white"] * 50, 1)
+    one = ReplayDifference(2, "candidates", ["mug-white"] * 50, 1)
     assert len(one.summary()) < 120
     assert str(one).count("mug-white") == 50
 
