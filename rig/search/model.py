@@ -79,7 +79,12 @@ class Model:
 
 
 def model_of(views: hbr.Views, *, rule: hbr.StoppingRule | None = None) -> Model:
-    """Return a model of views: for the dense search if there is a stopping rule, else for the paper's."""
+    """Return a model of views: for the dense search if there is a stopping rule, else for the paper's.
+
+    Raises `ValueError` for views by the bench's own descriptor without a stopping rule.
+    """
+    if rule is None and views.descriptor == BENCH_DESCRIPTOR:
+        raise ValueError(f"the stopping rule for views by {views.descriptor} is missing")
     return Model(hbr.ViewIndex(views) if rule is None else hbr.DenseIndex(views), rule)
 
 
