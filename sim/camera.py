@@ -25,6 +25,7 @@ from sim.objects.projection import HEIGHT, PX_PER_MM, WIDTH, Image, Visible
 from sim.objects.solid import empty_platter
 from sim.optics import Optics
 from sim.rolling_shutter import bands, row_weights
+from sim.room import relight, room
 from sim.sensor import Sensor
 from sim.visit import seen_on_visit
 from sim.world import HISTORY_S, Activity, Scene, World
@@ -80,7 +81,8 @@ class SimCapture:
     hangs
         Whether no frame arrives; `grab` fails after `SELECT_S`.
     orbits
-        Whether the table moves the camera around the object instead of rotating the object.
+        Whether the table moves the camera around the object instead of rotating the object. The camera then sees the
+        room around the object (`sim.room`), and the light stays in the room.
     blur_px
         Sigma of an additional blur.
     noise
@@ -366,7 +368,7 @@ class SimCapture:
     def _picture(self, scene: Scene, table_deg: float, rows: tuple[int, int] = (0, HEIGHT)) -> Image:
         """Return the image of a scene under nominal light; only the ``rows`` need to be right."""
         table_deg = -table_deg if self.orbits else table_deg
-        image = self.backdrop.copy()
+        image = room(self._world.seed, table_deg) if self.orbits else self.backdrop.copy()
         if scene.object is None:
             return self._as_mounted(image if self.visit is None else seen_on_visit(self.visit, None, table_deg))
         if not isinstance(scene.object, Visible):
@@ -380,7 +382,10 @@ class SimCapture:
         if isinstance(scene.object, BoardOnPlatter):
             scene.object.draw(image, table_deg + scene.yaw_deg, offset_mm, rows)
             return image
+        empty = image.copy() if self.orbits else None
         scene.object.draw(image, table_deg + scene.yaw_deg, offset_mm)
+        if empty is not None:
+            relight(image, empty, table_deg)
         return self._as_mounted(image)
 
     def _as_mounted(self, image: Image) -> Image:
