@@ -10,6 +10,7 @@ from zlib import crc32
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from sim.objects.paint import Sheet
 from sim.objects.projection import AMBIENT, CENTRE_PX, COS, HEIGHT, PX_PER_MM, SIN, TO_LIGHT, WIDTH, Floats, Image
@@ -35,18 +36,21 @@ def relight(image: Image, empty: Image, rotated_deg: float) -> None:
     An object is drawn under the lamp at the front left. Its columns are multiplied by the ratio of the light from both
     directions on an upright cylinder as wide as the object. ``empty`` is the image without the object.
     """
-    changed = (image != empty).any(axis=2)
-    columns = np.flatnonzero(changed.any(axis=0))
-    if not len(columns):
+    changed = cv2.inRange(cv2.absdiff(image, empty), (0, 0, 0), (0, 0, 0)) ^ 255
+    left, top, width, height = cv2.boundingRect(changed)
+    if not width:
         return
-    first, last = int(columns[0]), int(columns[-1]) + 1
-    across = np.linspace(-1.0, 1.0, last - first)
+    box = np.s_[top : top + height, left : left + width]
+    across = np.linspace(-1.0, 1.0, width)
     c, s = cos(radians(rotated_deg)), sin(radians(rotated_deg))
     x, y, _ = TO_LIGHT
     ratio = _on_cylinder(across, c * x - s * y, s * x + c * y) / _on_cylinder(across, x, y)
-    part = image[:, first:last]
-    lit = np.minimum(part * ratio[None, :, None].astype(np.float32), 255.0).astype(np.uint8)
-    np.copyto(part, lit, where=changed[:, first:last, None])
+    factors = np.broadcast_to(ratio[None, :, None], (height, width, 3)).astype(np.float32)
+    lit = cv2.multiply(image[box], factors, dtype=cv2.CV_8U)
+    # The shadow, and other pixels before the platter that are darker, do not become brighter than the platter.
+    darker = cv2.inRange(cv2.subtract(image[box], empty[box]), (0, 0, 0), (0, 0, 0)) & _platter()[1][box]
+    lit = cv2.copyTo(cv2.min(lit, empty[box]), darker, lit)
+    image[box] = cv2.copyTo(lit, changed[box], image[box].copy())
 
 
 def _on_cylinder(across: Floats, x: float, y: float) -> Floats:
@@ -66,37 +70,43 @@ def _room(seed: int, column: int) -> Image:
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     image = cv2.warpAffine(_table(seed), matrix, (WIDTH, HEIGHT), flags=flags, borderMode=cv2.BORDER_REFLECT)
     # The wall behind it: the visible part of its texture, on the cylinder.
-    u, v, on_wall = _wall_map()
-    margin = int(np.ceil(np.abs(u).max())) + 2
+    whole, fractions, margin, on_wall = _wall_map()
     middle = _COLUMNS // 4 - column  # the camera looks along +y
     seen = _wall(seed).take(np.arange(middle - margin, middle + margin + 1), axis=1, mode="wrap")
-    wall = cv2.remap(seen, u + margin, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    rows = len(wall)
-    np.copyto(image[:rows], wall, where=on_wall)
-    platter, is_platter = _platter()
-    np.copyto(image, platter, where=is_platter)
-    return np.asarray(image, dtype=np.uint8)
+    wall = cv2.remap(seen, whole, fractions, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    cv2.copyTo(wall, on_wall, image[: len(wall)])
+    return np.asarray(cv2.copyTo(*_platter(), image), dtype=np.uint8)
 
 
 @cache
-def _wall_map() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the wall's texture coordinates (columns from the middle, rows) and where the wall is, of the top rows."""
+def _wall_map() -> tuple[NDArray[np.int16], NDArray[np.uint16], int, Image]:
+    """Return the map of the top rows into the wall's texture, for `cv2.remap`, and where they show the wall.
+
+    The map consists of whole pixels and fractions. Its column 0 is as many columns from the middle as the third value.
+    """
     x = (np.arange(WIDTH) - CENTRE_PX[0]) / PX_PER_MM
     y = np.sqrt(_WALL_MM**2 - x**2)
     up = (CENTRE_PX[1] - np.arange(HEIGHT)[:, None]) / PX_PER_MM
     z = (up - y * SIN) / COS
-    rows = int(np.flatnonzero((z >= 0).any(axis=1))[-1]) + 1
-    z = z[:rows]
+    z = z[: int(np.flatnonzero((z >= 0).any(axis=1))[-1]) + 1]
     # A larger angle is further counter-clockwise, which is to the left.
     u = np.broadcast_to((np.arctan2(y, x) - np.pi / 2) * _COLUMNS / (2 * np.pi), z.shape)
     v = (1 - z / _WALL_HIGH_MM) * (_ROWS - 1)
-    return u.astype(np.float32), v.astype(np.float32), (z >= 0)[..., None]
+    margin = int(np.ceil(np.abs(u).max())) + 2
+    whole, fractions = cv2.convertMaps((u + margin).astype(np.float32), v.astype(np.float32), cv2.CV_16SC2)
+    return (
+        np.asarray(whole, dtype=np.int16),
+        np.asarray(fractions, dtype=np.uint16),
+        margin,
+        np.where(z >= 0, 255, 0).astype(np.uint8),
+    )
 
 
 @cache
-def _platter() -> tuple[Image, np.ndarray]:
+def _platter() -> tuple[Image, Image]:
+    """Return the empty platter and its mask."""
     empty = empty_platter()
-    return empty, (empty != empty[0, 0]).any(axis=2)[..., None]
+    return empty, np.where((empty != empty[0, 0]).any(axis=2), 255, 0).astype(np.uint8)
 
 
 @cache

@@ -249,8 +249,11 @@ def _folder_within(out: Path) -> "tempfile.TemporaryDirectory[str]":
 
 
 def _photograph(bench: Bench, operator: ShelfOperator, *, marked: bool = False) -> None:
-    """Take the empty-table image, if the operator can clear the table; a ``marked`` table may have rotating marks."""
-    if operator.clear():
+    """Take the empty-table image, if the table rotates and the operator can clear it.
+
+    A ``marked`` table may have rotating marks.
+    """
+    if bench.config.table.carries == "object" and operator.clear():
         for _ in photograph_table(bench, anyway=marked):
             pass
 
