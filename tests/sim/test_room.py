@@ -42,7 +42,7 @@ def shift_px(rows: slice) -> float:
 
 
 def test_wall_behind_the_axis_moves_against_the_front_of_the_object() -> None:
-    """A counter-clockwise rotation moves the front of an object to the right, and the wall 450 mm behind to the left."""
+    """A counter-clockwise rotation moves the front of an object to the right, and the wall behind to the left."""
     assert shift_px(slice(0, 100)) == pytest.approx(-450 * np.radians(1.0) * 2, abs=2.0)
 
 

@@ -14,7 +14,8 @@ from rig.plans.enroll import enroll
 from rig.plans.estimate import even_azimuths, table_angles
 from rig.plans.identify import identify
 from rig.search.model import load_model, model_of
-from rig.search.strategies import descriptor_for, strategy_named
+from rig.search.strategies import descriptor_for
+from rig.search.strategies import strategy as strategy_named
 from sim.objects.solid import empty_platter
 
 AX = (
