@@ -13,7 +13,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.objects.paint import Sheet
-from sim.objects.projection import AMBIENT, CENTRE_PX, COS, HEIGHT, PX_PER_MM, SIN, TO_LIGHT, WIDTH, Floats, Image
+from sim.objects.projection import (
+    AMBIENT,
+    CENTRE_PX,
+    COS,
+    HEIGHT,
+    PX_PER_MM,
+    SIN,
+    TO_LIGHT,
+    WIDTH,
+    Colour,
+    Floats,
+    Image,
+)
 from sim.objects.solid import empty_platter
 
 _WALL_MM = 450.0  # radius of the wall: the upper half of the image shows it
@@ -109,18 +121,22 @@ def _platter() -> tuple[Image, Image]:
     return empty, np.where((empty != empty[0, 0]).any(axis=2), 255, 0).astype(np.uint8)
 
 
+def _colour(rng: np.random.Generator, low: int, high: int) -> Colour:
+    b, g, r = rng.integers(low, high, 3).tolist()
+    return b, g, r
+
+
 @cache
 def _wall(seed: int) -> Image:
     """Return the wall, with paint that changes around the room, a bright window, and furniture."""
     rng = np.random.default_rng([seed, crc32(b"room")])
     sheet = Sheet((_ROWS, _COLUMNS), (120, 128, 132))
     for i in range(6):  # walls and curtains of other colours
-        colour = tuple(int(one) for one in rng.integers(60, 190, 3))
-        sheet.panel(i / 6, 0.0, (i + 1) / 6, 1.0, colour)
+        sheet.panel(i / 6, 0.0, (i + 1) / 6, 1.0, _colour(rng, 60, 190))
     for _ in range(28):  # furniture that stands on the table's level, and pictures
         left, wide, top = rng.random(), rng.uniform(0.008, 0.03), rng.uniform(0.1, 0.7)
         bottom = 1.0 if rng.random() < 0.6 else min(top + rng.uniform(0.15, 0.4), 1.0)
-        sheet.panel(left, top, left + wide, bottom, tuple(int(one) for one in rng.integers(25, 215, 3)))
+        sheet.panel(left, top, left + wide, bottom, _colour(rng, 25, 215))
     window = rng.random()
     sheet.panel(window, 0.0, window + 0.06, 0.75, (246, 240, 232))
     for bar in (0.0, 0.03, 0.06):
@@ -140,5 +156,5 @@ def _table(seed: int) -> Image:
     for angle in rng.uniform(0, 2 * np.pi, 9):
         u, v = 0.5 + 0.33 * np.cos(angle), 0.5 + 0.33 * np.sin(angle)
         w, h = rng.uniform(0.02, 0.06, 2)
-        sheet.panel(u - w, v - h, u + w, v + h, tuple(int(one) for one in rng.integers(40, 220, 3)))
+        sheet.panel(u - w, v - h, u + w, v + h, _colour(rng, 40, 220))
     return sheet.pixels
