@@ -48,7 +48,7 @@ def relight(image: Image, empty: Image, rotated_deg: float) -> None:
     An object is drawn under the lamp at the front left. Its columns are multiplied by the ratio of the light from both
     directions on an upright cylinder as wide as the object. ``empty`` is the image without the object.
     """
-    changed = cv2.inRange(cv2.absdiff(image, empty), (0, 0, 0), (0, 0, 0)) ^ 255
+    changed = cv2.bitwise_not(cv2.inRange(cv2.absdiff(image, empty), (0, 0, 0), (0, 0, 0)))
     left, top, width, height = cv2.boundingRect(changed)
     if not width:
         return
@@ -60,7 +60,8 @@ def relight(image: Image, empty: Image, rotated_deg: float) -> None:
     factors = np.broadcast_to(ratio[None, :, None], (height, width, 3)).astype(np.float32)
     lit = cv2.multiply(image[box], factors, dtype=cv2.CV_8U)
     # The shadow, and other pixels before the platter that are darker, do not become brighter than the platter.
-    darker = cv2.inRange(cv2.subtract(image[box], empty[box]), (0, 0, 0), (0, 0, 0)) & _platter()[1][box]
+    darker = cv2.inRange(cv2.subtract(image[box], empty[box]), (0, 0, 0), (0, 0, 0))
+    darker = cv2.bitwise_and(darker, _platter()[1][box])
     lit = cv2.copyTo(cv2.min(lit, empty[box]), darker, lit)
     image[box] = cv2.copyTo(lit, changed[box], image[box].copy())
 
