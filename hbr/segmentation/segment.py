@@ -142,7 +142,7 @@ def hypotheses(
         As for `segment`; or a `hbr.segmentation.background.SegmentedFrame`, if the frame is segmented more than once.
     learned : Background, optional
         The background that the other views of the search show (`hbr.descriptors.together.LearnedBackground.of`). The
-        object is not guessed then.
+        object is not guessed then. It is not used if the frame's border differs from it.
     alone : callable, optional
         Returns what `without_background` returns for this frame: segmentations that count besides those with the
         learned background. No other view changes them. By default the network's alone counts.
@@ -157,8 +157,10 @@ def hypotheses(
     frame = SegmentedFrame.of(image_bgr)
     background, difference = compared(frame, empty_table)
     by_picture = difference is not None and difference.reliable
+    rotated = None if learned is None or by_picture or frame.differs is not None else learned.difference(frame.small)
     found: list[Segmentation | Found]
-    if learned is None or by_picture or frame.differs is not None:
+    # A camera that moves around the object shows other surroundings in each view: then nothing is learned from them.
+    if rotated is None or not rotated.reliable:
         like = _found(frame, background, difference)
         if like.method is BoxMethod.PLAIN_BACKGROUND or (most == 1 and not by_picture):
             return (like.cut_out(),)
@@ -175,7 +177,7 @@ def hypotheses(
             issues.insert(0, Issue(IssueCode.TABLE_DIFFERS, {"agreement": round(difference.agreement, 3)}))
         agreement = None if difference is None else difference.agreement
         like = Found(frame.image, None, None, agreement, BoxMethod.NONE, tuple(issues))
-        share = shares(frame.small, learned.difference(frame.small), learned=True).object
+        share = shares(frame.small, rotated, learned=True).object
         levels = _LEVELS if most > 1 else (_ENROLLED_LEVEL,)
         found = [*_by_network(share, BoxMethod.ROTATION, like, levels=levels)]
         if most > 1:
