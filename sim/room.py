@@ -57,7 +57,7 @@ def relight(image: Image, empty: Image, rotated_deg: float) -> None:
     c, s = cos(radians(rotated_deg)), sin(radians(rotated_deg))
     x, y, _ = TO_LIGHT
     ratio = _on_cylinder(across, c * x - s * y, s * x + c * y) / _on_cylinder(across, x, y)
-    factors = np.broadcast_to(ratio[None, :, None], (height, width, 3)).astype(np.float32)
+    factors = np.broadcast_to(ratio[None, :, None], (height, width, 3)).astype(np.float32, order="C")
     lit = cv2.multiply(image[box], factors, dtype=cv2.CV_8U)
     # The shadow, and other pixels before the platter that are darker, do not become brighter than the platter.
     darker = cv2.inRange(cv2.subtract(image[box], empty[box]), (0, 0, 0), (0, 0, 0))
@@ -78,24 +78,27 @@ def _room(seed: int, column: int) -> Image:
     a = -2 * np.pi * column / _COLUMNS
     c, s, mm, half = np.cos(a), np.sin(a), 1 / PX_PER_MM, _WALL_MM
     from_image = np.array([[mm, 0.0, -mm * CENTRE_PX[0]], [0.0, -mm / SIN, mm / SIN * CENTRE_PX[1]]])
+    wall_map, margin, on_wall = _wall_map()
+    top = int(np.flatnonzero((on_wall == 0).any(axis=1))[0])  # the wall covers all rows above
+    from_image[:, 2] += from_image[:, 1] * top
     matrix = np.array([[c, -s], [s, c]]) @ from_image
     matrix[:, 2] += half
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    image = cv2.warpAffine(_table(seed), matrix, (WIDTH, HEIGHT), flags=flags, borderMode=cv2.BORDER_REFLECT)
+    image = np.empty((HEIGHT, WIDTH, 3), np.uint8)
+    cv2.warpAffine(_table(seed), matrix, (WIDTH, HEIGHT - top), image[top:], flags=flags, borderMode=cv2.BORDER_REFLECT)
     # The wall behind it: the visible part of its texture, on the cylinder.
-    whole, fractions, margin, on_wall = _wall_map()
-    middle = _COLUMNS // 4 - column  # the camera looks along +y
-    seen = _wall(seed).take(np.arange(middle - margin, middle + margin + 1), axis=1, mode="wrap")
-    wall = cv2.remap(seen, whole, fractions, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    left = (_COLUMNS // 4 - column - margin) % _COLUMNS  # the camera looks along +y
+    seen = _wall(seed)[:, left : left + 2 * margin + 1]
+    wall = cv2.remap(seen, wall_map, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
     cv2.copyTo(wall, on_wall, image[: len(wall)])
     return np.asarray(cv2.copyTo(*_platter(), image), dtype=np.uint8)
 
 
 @cache
-def _wall_map() -> tuple[NDArray[np.int16], NDArray[np.uint16], int, Image]:
+def _wall_map() -> tuple[NDArray[np.int16], int, Image]:
     """Return the map of the top rows into the wall's texture, for `cv2.remap`, and where they show the wall.
 
-    The map consists of whole pixels and fractions. Its column 0 is as many columns from the middle as the third value.
+    The map's column 0 is as many columns of the texture from the middle as the second value.
     """
     x = (np.arange(WIDTH) - CENTRE_PX[0]) / PX_PER_MM
     y = np.sqrt(_WALL_MM**2 - x**2)
@@ -106,13 +109,8 @@ def _wall_map() -> tuple[NDArray[np.int16], NDArray[np.uint16], int, Image]:
     u = np.broadcast_to((np.arctan2(y, x) - np.pi / 2) * _COLUMNS / (2 * np.pi), z.shape)
     v = (1 - z / _WALL_HIGH_MM) * (_ROWS - 1)
     margin = int(np.ceil(np.abs(u).max())) + 2
-    whole, fractions = cv2.convertMaps((u + margin).astype(np.float32), v.astype(np.float32), cv2.CV_16SC2)
-    return (
-        np.asarray(whole, dtype=np.int16),
-        np.asarray(fractions, dtype=np.uint16),
-        margin,
-        np.where(z >= 0, 255, 0).astype(np.uint8),
-    )
+    nearest = np.round(np.dstack([u + margin, v])).astype(np.int16)
+    return nearest, margin, np.where(z >= 0, 255, 0).astype(np.uint8)
 
 
 @cache
@@ -129,7 +127,10 @@ def _colour(rng: np.random.Generator, low: int, high: int) -> Colour:
 
 @cache
 def _wall(seed: int) -> Image:
-    """Return the wall, with paint that changes around the room, a bright window, and furniture."""
+    """Return the wall, with paint that changes around the room, a bright window, and furniture.
+
+    Its left part stands again at its right end, so that each view of the wall is one slice.
+    """
     rng = np.random.default_rng([seed, crc32(b"room")])
     sheet = Sheet((_ROWS, _COLUMNS), (120, 128, 132))
     for i in range(6):  # walls and curtains of other colours
@@ -142,7 +143,7 @@ def _wall(seed: int) -> Image:
     sheet.panel(window, 0.0, window + 0.06, 0.75, (246, 240, 232))
     for bar in (0.0, 0.03, 0.06):
         sheet.panel(window + bar - 0.001, 0.0, window + bar + 0.001, 0.77, (60, 70, 80))
-    return sheet.pixels
+    return np.hstack([sheet.pixels, sheet.pixels[:, : 2 * _wall_map()[1] + 1]])
 
 
 @cache

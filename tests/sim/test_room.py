@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from sim.camera import SimCapture
-from sim.objects.projection import Image
+from sim.objects.projection import TO_LIGHT
 from sim.objects.shelf import shelf
 from sim.objects.solid import empty_platter
-from sim.room import relight, room
+from sim.room import room
 from sim.world import World
 from tests.sim.drawn_camera import QUIET, camera, frame
 
@@ -43,7 +43,7 @@ def shift_px(rows: slice) -> float:
 
 def test_wall_behind_the_axis_moves_against_the_front_of_the_object() -> None:
     """A counter-clockwise rotation moves the front of an object to the right, and the wall behind to the left."""
-    assert shift_px(slice(0, 100)) == pytest.approx(-450 * np.radians(1.0) * 2, abs=2.0)
+    assert shift_px(slice(0, 100)) == pytest.approx(-450 * np.radians(1.0) * 2, abs=1.0)
 
 
 def test_platter_under_the_object_stands() -> None:
@@ -53,18 +53,37 @@ def test_platter_under_the_object_stands() -> None:
         np.testing.assert_array_equal(room(0, angle)[on_platter], empty[on_platter])
 
 
-def lit(rotated_deg: float) -> tuple[float, float]:
-    """Return the mean light on the left and the right half of a white card under the room's lamp."""
-    empty: Image = np.full((480, 640, 3), 40, dtype=np.uint8)
-    image = empty.copy()
-    image[100:300, 220:420] = 120
-    relight(image, empty, rotated_deg)
-    return float(image[100:300, 220:320].mean()), float(image[100:300, 320:420].mean())
+LAMP_DEG = float(np.degrees(np.arctan2(TO_LIGHT[1], TO_LIGHT[0]))) + 90  # azimuth of a camera below the lamp
+
+
+def lit(from_lamp_deg: float) -> tuple[float, float]:
+    """Return the mean light on the left and the right half of a vase that is the same from all sides.
+
+    The camera is ``from_lamp_deg`` counter-clockwise of the lamp.
+    """
+    world = World(noise=QUIET)
+    capture: SimCapture = camera(world)
+    capture.orbits = True
+    world.slip(LAMP_DEG + from_lamp_deg)
+    empty = frame(capture)
+    world.put(shelf()["vase-blue"])
+    seen = frame(capture)
+    rows = slice(0, seen.shape[0] // 2)  # above the platter and its shadow
+    vase = (np.abs(seen - empty).max(axis=2) > 8)[rows]
+    middle = round(float(np.flatnonzero(vase.any(axis=0)).mean()))
+    halves = ((seen[rows, part], vase[:, part]) for part in (slice(None, middle), slice(middle, None)))
+    left, right = (float(pixels[inside].mean()) for pixels, inside in halves)
+    return left, right
 
 
 def test_lamp_stays_in_the_room() -> None:
-    """It is at the front left of the first view; a quarter of a revolution moves it to the front right, half behind."""
-    assert lit(0.0) == pytest.approx((120.0, 120.0), abs=1.0)
-    left, right = lit(90.0)
-    assert right > left + 40
-    assert np.mean(lit(180.0)) < 90
+    """The vase is brightest from the lamp's side and darkest from the other; between them the lamp is at one side."""
+    front, behind = lit(0.0), lit(180.0)
+    assert front[0] == pytest.approx(front[1], rel=0.15)  # the highlight at the left is painted
+    assert behind[0] == pytest.approx(behind[1], rel=0.15)
+    from_right, from_left = lit(90.0), lit(-90.0)
+    assert from_right[0] > 1.2 * from_right[1]
+    assert from_left[1] > 1.2 * from_left[0]
+    means = [np.mean(halves) for halves in (front, from_right, from_left, behind)]
+    assert means[0] > 1.2 * max(means[1:3])
+    assert min(means[1:3]) > 1.1 * means[3]
