@@ -368,7 +368,8 @@ class SimCapture:
     def _picture(self, scene: Scene, table_deg: float, rows: tuple[int, int] = (0, HEIGHT)) -> Image:
         """Return the image of a scene under nominal light; only the ``rows`` need to be right."""
         table_deg = -table_deg if self.orbits else table_deg
-        image = room(self._world.seed, table_deg) if self.orbits else self.backdrop.copy()
+        empty = room(self._world.seed, table_deg) if self.orbits else self.backdrop
+        image = empty.copy()
         if scene.object is None:
             return self._as_mounted(image if self.visit is None else seen_on_visit(self.visit, None, table_deg))
         if not isinstance(scene.object, Visible):
@@ -382,9 +383,8 @@ class SimCapture:
         if isinstance(scene.object, BoardOnPlatter):
             scene.object.draw(image, table_deg + scene.yaw_deg, offset_mm, rows)
             return image
-        empty = image.copy() if self.orbits else None
         scene.object.draw(image, table_deg + scene.yaw_deg, offset_mm)
-        if empty is not None:
+        if self.orbits:
             relight(image, empty, table_deg)
         return self._as_mounted(image)
 

@@ -35,11 +35,11 @@ _ROWS = 240
 
 
 def room(seed: int, rotated_deg: float) -> Image:
-    """Return the room with the empty platter, uint8 (480, 640, 3).
+    """Return the room with the empty platter, uint8 (480, 640, 3), read-only.
 
     ``rotated_deg`` is the room's counter-clockwise rotation before the camera: the negative azimuth of the camera.
     """
-    return _room(seed, round(rotated_deg % 360 * _COLUMNS / 360)).copy()
+    return _room(seed, round(rotated_deg % 360 * _COLUMNS / 360))
 
 
 def relight(image: Image, empty: Image, rotated_deg: float) -> None:
@@ -91,7 +91,9 @@ def _room(seed: int, column: int) -> Image:
     seen = _wall(seed)[:, left : left + 2 * margin + 1]
     wall = cv2.remap(seen, wall_map, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
     cv2.copyTo(wall, on_wall, image[: len(wall)])
-    return np.asarray(cv2.copyTo(*_platter(), image), dtype=np.uint8)
+    cv2.copyTo(*_platter(), image)
+    image.flags.writeable = False
+    return image
 
 
 @cache

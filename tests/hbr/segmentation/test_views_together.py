@@ -12,6 +12,8 @@ from hbr.descriptors.base import Shift
 from hbr.descriptors.together import like_enrollment
 from hbr.drawing.bench import HARD, DrawnBench, Visit
 from hbr.segmentation import BoxMethod
+from sim.objects.shelf import shelf
+from sim.room import room
 
 NAMES = tuple("abcdefghij")
 
@@ -49,6 +51,20 @@ def test_further_views_revise_the_segmentation_of_earlier_ones() -> None:
     assert [found[0].method for found in views.segmentations] == [BoxMethod.ROTATION] * 3
     assert min(overlap(found[0].box, box) for found, box in zip(views.segmentations, boxes, strict=True)) > 0.55
     assert [len(levels) for levels in views.levels] == [len(found) for found in views.segmentations]
+
+
+def test_surroundings_that_change_with_the_view_are_not_learned() -> None:
+    """A camera that orbits the object sees other surroundings in each view: each view is segmented alone."""
+    views, again = hbr.ViewsTogether("edges+colours"), hbr.ViewsTogether("edges+colours", several=False)
+    for azimuth_deg in (0.0, 60.0, 120.0, 180.0):
+        image = room(0, -azimuth_deg).copy()
+        shelf()["teapot"].draw(image, -azimuth_deg, (0.0, 0.0))
+        views.add(image)
+        again.learn(image)
+    again.revise()
+    for view in (views, again):
+        assert [found[0].method for found in view.segmentations] == [BoxMethod.GUESS] * 4
+    assert not views.reliable
 
 
 def test_the_guess_counts_beside_the_segmentations_with_a_learned_background() -> None:
