@@ -89,7 +89,7 @@ def _room(seed: int, column: int) -> Image:
     # The wall behind it: the visible part of its texture, on the cylinder.
     left = (_COLUMNS // 4 - column - margin) % _COLUMNS  # the camera looks along +y
     seen = _wall(seed)[:, left : left + 2 * margin + 1]
-    wall = cv2.remap(seen, wall_map, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
+    wall = cv2.remap(seen, wall_map, np.empty(0), cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
     cv2.copyTo(wall, on_wall, image[: len(wall)])
     cv2.copyTo(*_platter(), image)
     image.flags.writeable = False
