@@ -46,38 +46,30 @@ class _Commands(TyperGroup):
         context.meta[_WANTS_JSON] = wants_json
         return context
 
-    def format_help(self, ctx: Any, formatter: Any) -> None:  # noqa: ARG002
-        """Print the commands in their panels, and then the options.
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        """Write the commands in their sections, and then the options.
 
-        The help of Typer begins with the options. It also imports a parser of Markdown, which takes longer than all
-        this.
+        The help of Typer begins with the options. It also imports Rich, which takes longer than all this.
         """
-        from rich.panel import Panel
-        from rich.table import Table
-        from rich.text import Text
-
-        from rig.cli.ui.present import console
-
         texts: dict[str, str] = {str(one.name): inspect.getdoc(one.callback) or "" for one in app.registered_commands}
         for group in app.registered_groups:
             texts[str(group.name)] = str(group.typer_instance.info.help) if group.typer_instance else ""
-        texts = {name: re.split(r"\.\s", text)[0].removesuffix(".") + "." for name, text in texts.items()}
-        named = {name for names in PANELS.values() for name in names}
-        panels = {title: {name: texts[name] for name in names if name in texts} for title, names in PANELS.items()}
-        panels["Plug-ins"] = {name: text for name, text in texts.items() if name not in named}
+        texts = {name: neutral(re.split(r"\.\s", text)[0].removesuffix(".")) + "." for name, text in texts.items()}
+        named = {name for names in SECTIONS.values() for name in names}
+        sections = {
+            title: [(name, texts[name]) for name in names if name in texts] for title, names in SECTIONS.items()
+        }
+        sections["Plug-ins"] = [(neutral(name), text) for name, text in texts.items() if name not in named]
         options: Any = self.get_params(ctx)
-        panels["Options"] = {f"{', '.join(one.opts)} {one.metavar or ''}".rstrip(): one.help for one in options}
-        screen = console()
-        screen.width = min(screen.width, 120)
-        screen.print(Text(f"\n {self.get_usage(ctx)}\n\n {self.help}\n"))
-        for title, rows in panels.items():
-            table = Table.grid(padding=(0, 2, 0, 0))
-            table.add_column(style="bold cyan", width=max(map(len, rows if title == "Options" else texts)))
-            for name, text in rows.items():
-                table.add_row(name, Text(text))
+        sections["Options"] = [
+            (f"{', '.join(sorted(one.opts))} {one.metavar or ''}".rstrip(), one.help) for one in options
+        ]
+        formatter.write(f"{self.get_usage(ctx)}\n\n{self.help}\n")
+        for title, rows in sections.items():
             if rows:
-                screen.print(Panel(table, title=title, title_align="left", border_style="dim"))
-        screen.print(Text(f"\n{self.epilog}\n"), soft_wrap=True)
+                with formatter.section(title):
+                    formatter.write_dl(rows)
+        formatter.write(f"\n{self.epilog}\n")
 
     def invoke(self, ctx: Any) -> Any:
         handle_signals()  # from here on, a signal unwinds the stack; until here the program was at its start
@@ -117,7 +109,7 @@ app = typer.Typer(
     epilog="\n".join(["Exit codes", "", *(f"{code:>3}  {meaning}" for code, meaning in EXIT_CODES.items())]),
     no_args_is_help=True,
     pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["-h", "--help"]},
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 120},
 )
 
 
@@ -144,7 +136,7 @@ common.__doc__ = None  # or it would replace the help of the app
 show_parameters(common, spread(common))
 app.callback()(common)
 
-PANELS: Final = {
+SECTIONS: Final = {
     "Start here": (
         *("doctor", "empty-table", "enroll", "identify", "results", "catalog"),
         *("status", "stop", "acknowledge", "serve"),
@@ -155,7 +147,7 @@ PANELS: Final = {
     "Devices and settings": ("setup", "find", "config", "calibrate", "snapshot", "servo", "head"),
     "Simulated bench": ("demo", "faults", "sim-bench", "sim-head", "sim-servo"),
 }
-"""The panels of the help, with their commands in order. The first one has the commands of a day."""
+"""The sections of the help, with their commands in order. The first one has the commands of a day."""
 
 app.command("enroll")(enroll.enroll)
 app.command("identify")(identify.identify)
