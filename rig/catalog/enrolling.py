@@ -6,7 +6,7 @@ from datetime import timedelta
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import delete, select
+from sqlalchemy import bindparam, delete, select
 from sqlalchemy.orm import Session as Transaction
 
 from rig.catalog import log, state
@@ -18,6 +18,14 @@ from rig.core.clock import Clock
 from rig.core.errors import CatalogError, UsageError
 from rig.core.next_steps import Do
 from rig.views import image_files as images
+
+# Each view asks these. To build a statement takes longer than to execute it.
+_STATUS = (
+    select(state.Ended.status)
+    .join(Enrollment, Enrollment.id == state.Ended.enrollment_id)
+    .where(state.IS_STATUS, Enrollment.id == bindparam("id"))
+)
+_PRESENT = select(View.index).where(View.enrollment_id == bindparam("id"))
 
 
 @dataclass(eq=False)
@@ -164,7 +172,7 @@ class OpenEnrollment:
             )
 
     def _missing(self, transaction: Transaction) -> tuple[int, ...]:
-        present = set(transaction.scalars(select(View.index).where(View.enrollment_id == self.id)))
+        present = set(transaction.scalars(_PRESENT, {"id": self.id}))
         return tuple(index for index in range(len(self.planned_azimuth_deg)) if index not in present)
 
     def _check_in_progress(self, transaction: Transaction) -> None:
@@ -173,11 +181,7 @@ class OpenEnrollment:
                 f"{self.object_name!r} was deleted during its enrollment.",
                 next_step=(Do.UNDELETE(name=self.object_name), Do.CONTINUE_ENROLLMENT(name=self.object_name)),
             )
-        status = transaction.scalar(
-            select(state.Ended.status).where(state.IS_STATUS, state.Ended.enrollment_id == self.id)
-        )
-        if transaction.scalar(select(Enrollment.id).where(Enrollment.id == self.id)) is None:
-            status = None
+        status = transaction.scalar(_STATUS, {"id": self.id})
         if status != EnrollmentStatus.IN_PROGRESS:
             raise CatalogError(
                 f"The enrollment of {self.object_name!r} is {status or 'gone'}, not in progress.",
