@@ -60,11 +60,14 @@ def cedd(image: ImageArray, grid: tuple[int, int, int, int], tables: Addresses) 
 
 
 def shrink(image: ImageArray, size: tuple[int, int]) -> ImageArray | None:
-    """Return an image averaged to (width, height), as cv2.INTER_AREA does, if one whole number above 2 divides it."""
+    """Return an image averaged to (width, height), as cv2.INTER_AREA does.
+
+    That is a square image, or one whose size is a whole multiple above 2.
+    """
     width, height = size
     factor = image.shape[1] // width
     if not 2 < factor <= _MOST_ROWS or image.shape[:2] != (height * factor, width * factor):
-        return None
+        return average(image, width) if width == height else None
     if image.strides[1:] != (3, 1):
         image = np.ascontiguousarray(image)
     sums, small = np.empty(3 * image.shape[1] + 1, np.uint16), np.empty((height, width, 3), np.uint8)

@@ -96,6 +96,9 @@ def test_squares_are_averaged_as_by_opencv(seed: int, size: int, left: int) -> N
     part = picture(np.random.default_rng(seed), size, size + 40)[:, left : left + size]
     expected = cv2.resize(part, (CROP_PX, CROP_PX), interpolation=cv2.INTER_AREA)
     np.testing.assert_array_equal(calls.average(part, CROP_PX), expected)
+    with without_library():
+        reference = shrunk(part)
+    np.testing.assert_array_equal(shrunk(part), reference)
 
 
 def rows_of(kind: str, count: int, rng: np.random.Generator) -> np.ndarray:
