@@ -26,6 +26,12 @@ from rig.core.next_steps import Do
 _HEAD: Final = re.compile(r"([0-9]{1,15}) ([0-9a-f]{64}|) ([0-9]{1,15}) ([0-9]{1,15}) ([0-9]{1,15})")
 _COUNTED: Final = (Entry.deleted, Entry.status, Entry.result)
 """A line counts for the state of an object, the status of an enrollment, or a result if it has a value here."""
+# Every list of objects asks these. To build a statement takes longer than to execute it.
+_STORED_HEAD: Final = select(Property.value).where(Property.key == "head")
+_ENDS: Final = (
+    select(func.max(Entry.id)),
+    *(select(func.count()).where(column.is_not(None)) for column in _COUNTED),
+)
 _COLUMNS: Final = tuple(column.name for column in Entry.__table__.columns)
 
 
@@ -74,7 +80,7 @@ class _End(NamedTuple):
 
 
 def _end(transaction: Transaction) -> _End:
-    found = transaction.scalar(select(Property.value).where(Property.key == "head"))
+    found = transaction.scalar(_STORED_HEAD)
     if (parts := _HEAD.fullmatch(str(found))) is None:
         raise damaged("the end of its log", found)
     return _End(int(parts[1]), parts[2], (int(parts[3]), int(parts[4]), int(parts[5])))
@@ -91,8 +97,7 @@ def check_complete(transaction: Transaction) -> None:
     The line before would count instead. A line that counts is compared with its digest where it is used.
     """
     end = _end(transaction)
-    found = [transaction.scalar(select(func.max(Entry.id))) or 0]
-    found += [transaction.scalar(select(func.count()).where(column.is_not(None))) or 0 for column in _COUNTED]
+    found = [transaction.scalar(one) or 0 for one in _ENDS]
     if found != [end.line, *end.counts]:
         raise CatalogDamaged(
             "Lines of the catalog's log are missing or were changed.",

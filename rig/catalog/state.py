@@ -50,7 +50,16 @@ CURRENT: Final = {
 IS_STATE = _is_last(Named, "object_id", "deleted")
 IS_STATUS = _is_last(Ended, "enrollment_id", "status")
 IN_USE = and_(IS_STATE, Named.deleted == false())
+# Statements that many others ask for: to build one takes longer than to execute it.
 _BY_ID = select(Named).where(IS_STATE, Named.object_id == bindparam("object_id"))
+_FOLD = select(Named.id).where(IS_STATE), select(Ended.id).where(IS_STATUS)
+_USED = (
+    select(Named.object_id, Named.object_name, Ended.enrollment_id, Enrollment.key, Ended.seal, Ended.id)
+    .join(Ended, Ended.object_id == Named.object_id)
+    .outerjoin(Enrollment, Enrollment.id == Ended.enrollment_id)
+    .where(IN_USE, IS_STATUS, Ended.status == EnrollmentStatus.COMPLETE)
+    .order_by(Named.object_id)
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,14 +122,7 @@ def used(transaction: Transaction, *, checked: bool = False) -> list[Used]:
 
     Raises `CatalogDamaged`: they are ``checked``, and the name or the seal of an object is not as it was written.
     """
-    wanted = (
-        select(Named.object_id, Named.object_name, Ended.enrollment_id, Enrollment.key, Ended.seal, Ended.id)
-        .join(Ended, Ended.object_id == Named.object_id)
-        .outerjoin(Enrollment, Enrollment.id == Ended.enrollment_id)
-        .where(IN_USE, IS_STATUS, Ended.status == EnrollmentStatus.COMPLETE)
-        .order_by(Named.object_id)
-    )
-    rows = transaction.execute(wanted).all()
+    rows = transaction.execute(_USED).all()
     if checked:
         check_fold(transaction)
     owners = Counter(row[0] for row in rows)
@@ -148,11 +150,7 @@ def version(transaction: Transaction) -> str:
 def check_fold(transaction: Transaction) -> None:
     """Raise `CatalogDamaged` if a line that gives a present state or status is missing or not as it was written."""
     log.check_complete(transaction)
-    lines = [
-        transaction.scalars(select(Named.id).where(IS_STATE)),
-        transaction.scalars(select(Ended.id).where(IS_STATUS)),
-    ]
-    check_lines(transaction, {line for found in lines for line in found})
+    check_lines(transaction, {line for lines in _FOLD for line in transaction.scalars(lines)})
 
 
 def check_lines(transaction: Transaction, ids: Collection[int]) -> None:
