@@ -10,6 +10,7 @@ import shutil
 import subprocess
 from hashlib import sha256
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Final
 
 FOLDER: Final = Path(__file__).resolve().parent
@@ -51,13 +52,18 @@ def compile_kernels(output: Path = LIBRARY) -> str | None:
     command = compiler()
     if command is None:
         return None
-    parts = [str(path) for path in sources() if path.suffix == ".c"]
+    parts = [path for path in sources() if path.suffix == ".c"]
     new = output.with_suffix(f".{os.getpid()}")
-    digest = f'-DHBR_SOURCES="{sources_digest()}"'
+    compiling = [*command, *FLAGS.split(), f'-DHBR_SOURCES="{sources_digest()}"']
     try:
-        done = subprocess.run([*command, *FLAGS.split(), digest, *parts, "-o", str(new)], check=False)
-        if done.returncode:
-            return None
+        with TemporaryDirectory() as folder:
+            # Each file in a process of its own, so that all cores work.
+            made = {str(path): str(Path(folder, f"{path.stem}.o")) for path in parts}
+            running = [subprocess.Popen([*compiling, "-c", part, "-o", to]) for part, to in made.items()]
+            if any([one.wait() for one in running]):  # noqa: C419 - all of them end before their folder goes
+                return None
+            if subprocess.run([*compiling, *made.values(), "-o", str(new)], check=False).returncode:
+                return None
         new.replace(output)  # a running program continues with the old library
         return target(command)
     except OSError:
