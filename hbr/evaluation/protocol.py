@@ -29,6 +29,7 @@ Strategy = Literal[
     "ahbr",
     "ahbr-90",
     "coin",
+    "least-risk",
     "next-best-view",
     "next-best-view-coin",
     "mutual",
@@ -49,7 +50,8 @@ class Method:
     strategy : str
         How the next view is chosen. ``random``; ``sweep-45``, ``sweep-90``: fixed steps; ``ahbr``: Eq. 5-7; ``coin``:
         the step of Eq. 5-7 to a random side. ``ahbr`` and ``coin`` begin with two random views, ``ahbr-90`` with a
-        step of 90° to the left, like the rig. With the dense filter only: ``next-best-view``: `hbr.next_best_view`;
+        step of 90° to the left, like the rig. With the hidden Markov model only: ``least-risk``.
+        With the dense filter only: ``next-best-view``: `hbr.next_best_view`;
         ``next-best-view-coin``: its rotation to a random side; ``mutual``: mutual information; ``oracle``: the
         photograph with the largest lead of the true object.
     omega, list_length, extension
@@ -60,6 +62,8 @@ class Method:
         Whether the dense filter ranks the objects, instead of the paper's voting.
     sectors : int
         Number of average views of an object (N~M of Eq. 5) that AHBR plans with.
+    hmm : bool
+        Whether the hidden Markov model over poses (`hbr.paper.hmm`) ranks the objects.
     """
 
     name: str
@@ -71,6 +75,7 @@ class Method:
     views: int | None = None
     dense: bool = False
     sectors: int = 4
+    hmm: bool = False
 
     @property
     def active(self) -> bool:
@@ -101,6 +106,10 @@ _DENSE: Final = (
     Method("dense-mutual", "dense filter, mutual information", "mutual", _OMEGA, dense=True),
     Method("dense-oracle", "dense filter, oracle", "oracle", _OMEGA, dense=True),
 )
+_HMM: Final = (
+    Method("hmm", "HMM, least risk", "least-risk", hmm=True),
+    Method("hmm-random", "HMM, random views", hmm=True),
+)
 _OMEGAS: Final = (0.0, 0.125, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)  # the sweeps around the paper's values: 0.5, 10 and 4.
 _LENGTHS: Final = (1, 2, 4, 5, 6, 8, 10, 20, 50, 100)
 _SECTORS: Final = (2, 3, 4, 6, 8, 12, 16)
@@ -111,7 +120,9 @@ _SECTOR_SWEEP: Final = tuple(
     Method(f"sectors-{n}", f"AHBR with {n} average views", "ahbr", sectors=n) for n in _SECTORS
 )
 
-METHODS: Final = {method.name: method for method in (*_LISTED, *_DENSE, *_OMEGA_SWEEP, *_LIST_SWEEP, *_SECTOR_SWEEP)}
+METHODS: Final = {
+    method.name: method for method in (*_LISTED, *_DENSE, *_HMM, *_OMEGA_SWEEP, *_LIST_SWEEP, *_SECTOR_SWEEP)
+}
 GROUPS: Final[dict[str, tuple[Method, ...]]] = {
     "all": _LISTED,
     "beyond": _DENSE[:-1],  # the oracle tries every view, which is slow
@@ -136,7 +147,7 @@ def choose_methods(names: Iterable[str]) -> tuple[Method, ...]:
         elif name in METHODS:
             chosen[name] = METHODS[name]
         else:
-            listed = ", ".join([*GROUPS, *(method.name for method in (*_LISTED, *_DENSE))])
+            listed = ", ".join([*GROUPS, *(method.name for method in (*_LISTED, *_DENSE, *_HMM))])
             raise ValueError(f"method {name!r} is unknown; use some of {listed}")
     if not chosen:
         raise ValueError("no method is given; use all for the whole comparison")

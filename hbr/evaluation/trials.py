@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from hbr.core.angles import wrap180
 from hbr.core.arrays import FloatArray, IndexArray, LevelArray
 from hbr.dense.filter import BETA, Belief, update_belief
-from hbr.dense.fitting import fit_stopping_rule
+from hbr.dense.fitting import UNFITTED_MIN_CONFIDENCE, fit_stopping_rule
 from hbr.dense.index import POWER, DenseIndex
 from hbr.dense.local_difference import LocalView
 from hbr.dense.next_view import ALL_ROTATIONS_DEG, expected_views, strongest
@@ -28,6 +28,7 @@ from hbr.evaluation.protocol import COMPARED, OUTCOMES, Method, Protocol, Runs, 
 from hbr.evaluation.results import results_of
 from hbr.model.symmetry import symmetry
 from hbr.model.views import Views
+from hbr.paper.hmm import pose_belief
 from hbr.paper.hough import Ranking, retrieve
 from hbr.paper.index import ViewIndex, largest
 from hbr.paper.next_view import Side, next_view
@@ -223,6 +224,9 @@ class _Trials:
         if method.dense:
             self._run_dense(method, draws, runs, at)
             return
+        if method.hmm:
+            self._run_hmm(method, draws, models, runs, at)
+            return
         if self._protocol.absent:
             raise ValueError(f"{method.label} cannot search for unknown objects; use methods of the dense filter")
         seen = [int(draws.order[0])]
@@ -269,6 +273,35 @@ class _Trials:
             nearest = self._nearest_views[i, list_length]
             rows = nearest[model.mask[nearest]][:list_length]
             index.remember(self._queries[i], model.place(rows), self._similar[i, rows])
+
+    def _run_hmm(
+        self, method: Method, draws: _Draws, models: dict[bytes, _Model], runs: Runs, at: tuple[int, int, int]
+    ) -> None:
+        seen = [int(draws.order[0])]
+        travelled_deg = 0.0
+        for n in range(self._protocol.max_views):
+            keep = self._keep(np.array(seen))
+            key = keep.tobytes()
+            if key not in models:
+                models[key] = self._model(keep)
+            model = models[key]
+            measured_deg = self._azimuth_deg[seen] + draws.error_deg[: n + 1]
+            start_ns = self._now_ns()
+            belief = pose_belief(self._similar[seen][:, model.mask], measured_deg, model.views)
+            following = int(draws.order[n + 1]) if n + 1 < self._protocol.max_views else seen[-1]
+            if method.strategy == "least-risk" and n + 1 < self._protocol.max_views:
+                following = self._nearest(seen, belief.next_rotation_deg())
+            runs.step_ns[*at, n] = self._now_ns() - start_ns
+            objects, log_probability, pose_deg = belief.ranking()
+            self._record(objects, pose_deg, seen, runs, (*at, n))
+            leading = np.exp(log_probability[:2])
+            runs.score[*at, n] = leading[0]
+            runs.margin[*at, n] = leading[0] - (leading[1] if len(leading) > 1 else 0.0)
+            is_certain = leading[0] >= UNFITTED_MIN_CONFIDENCE
+            runs.outcome[*at, n] = OUTCOMES.index(Outcome.FOUND if is_certain else Outcome.CONTINUE)
+            runs.travelled_deg[*at, n] = travelled_deg
+            travelled_deg += abs(float(wrap180(self._azimuth_deg[following] - self._azimuth_deg[seen[-1]])))
+            seen.append(following)
 
     def _run_dense(self, method: Method, draws: _Draws, runs: Runs, at: tuple[int, int, int]) -> None:
         assert self._rule is not None
