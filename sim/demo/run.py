@@ -44,7 +44,7 @@ from rig.search.strategies import AnyStrategy, descriptor_for, strategy_for
 from rig.search.strategies import strategy as strategy_named
 from sim.bench import ShelfOperator, SimOptions, open_sim_bench
 from sim.change import Change
-from sim.demo.lines import MoveLines
+from sim.demo.moves import MoveLines
 from sim.faults.injector import Occurrence
 from sim.faults.schedule import Fault, read_faults
 from sim.noise import NoiseModel

@@ -1,4 +1,4 @@
-"""A search as a growing table: one line for each view, with its measurements, candidates and decision."""
+"""The first search of the demo as a growing table: one line for each view, with measurements, candidates and decision."""
 
 from typing import ClassVar
 
