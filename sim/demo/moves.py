@@ -1,4 +1,4 @@
-"""The first search of the demo as a growing table: one line for each view, with measurements, candidates and decision."""
+"""The first search of the demo as a growing table: a line for each view, with measurements, candidates and decision."""
 
 from typing import ClassVar
 

@@ -28,8 +28,8 @@ def by_enumeration(similar, orientation_deg, views, sigma_deg, temperature):
             for i in range(1, len(path)):
                 rotation_deg = orientation_deg[i] - orientation_deg[i - 1]
                 off_deg = views.azimuth_deg[own] - views.azimuth_deg[path[i - 1]] - rotation_deg
-                turns = off_deg[:, None] + 360 * np.arange(-9, 10)
-                density = np.exp(-0.5 * (turns / sigma_deg) ** 2).sum(axis=1)
+                revolutions = off_deg[:, None] + 360 * np.arange(-9, 10)
+                density = np.exp(-0.5 * (revolutions / sigma_deg) ** 2).sum(axis=1)
                 p *= density[own.tolist().index(path[i])] / density.sum()
                 p *= np.exp(similar[i, path[i]] / temperature)
             total[path[-1]] += p
@@ -53,14 +53,14 @@ def test_belief_is_the_sum_over_all_paths(counts, queries, sigma_deg):
 def test_a_rotation_of_all_angles_changes_nothing():
     views, rng = shelf(6, 6, 5), np.random.default_rng(3)
     similar, orientation_deg = rng.random((3, len(views))), np.array([0.0, 80.0, -35.0])
-    turned = hbr.Views.concatenate(
+    rotated = hbr.Views.concatenate(
         [
             hbr.Views.of_object(name, views.descriptors[views.of(j)], (views.azimuth_deg[views.of(j)] + 77) % 360)
             for j, name in enumerate(views.object_names)
         ]
     )
     one = pose_belief(similar, orientation_deg, views)
-    for zero_deg, known in ((123.0, views), (0.0, turned)):
+    for zero_deg, known in ((123.0, views), (0.0, rotated)):
         other = pose_belief(similar, orientation_deg + zero_deg, known)
         np.testing.assert_allclose(other.log_state, one.log_state, atol=1e-6)
         assert other.next_rotation_deg() == one.next_rotation_deg()
@@ -101,6 +101,6 @@ def test_next_view_is_where_twins_differ():
         (np.zeros((1, 5)), [0.0], {"temperature": -1.0}),
     ],
 )
-def test_invalid_arguments_are_refused(similar, orientation_deg, settings):
+def test_invalid_arguments_are_errors(similar, orientation_deg, settings):
     with pytest.raises(ValueError, match=r"similarit|orientation|sigma_deg"):
         pose_belief(similar, orientation_deg, shelf(3, 2), **settings)
