@@ -51,11 +51,6 @@ class PoseBelief:
     orientation_deg: FloatArray
     temperature: float
 
-    def probability(self) -> FloatArray:
-        """Return the probability of every object, (objects,): the sum over its poses. 0 without a view."""
-        state = np.exp(self.log_state)
-        return np.bincount(self.views.object_index, state, len(self.views.object_names)).astype(np.float64)
-
     def ranking(self) -> tuple[IndexArray, FloatArray, FloatArray]:
         """Return the objects with a view, likeliest first, the logarithms of their probabilities, and their poses."""
         rows, begin = _by_object(self.views)
