@@ -18,7 +18,7 @@ from rig.core.phrases import angle_words, percent
 from rig.events.events import Event
 from rig.jobs.desk import Progress
 from rig.motion.turntable import Turntable
-from rig.plans.capture import capture, moved
+from rig.plans.steps import capture, moved
 from rig.views.capture import Viewer
 from rig.views.charuco_board import BoardDetection, CharucoBoard, detect_board
 

@@ -23,7 +23,7 @@ from rig.calibrations import CalibrationResult, RejectionCode
 from rig.charts.xy import MODEL, Axis, Chart, Series
 from rig.core.json_form import plain
 from rig.motion.turntable import Turntable
-from rig.plans.capture import moved
+from rig.plans.steps import moved
 
 NAME = "servo.encoder"
 

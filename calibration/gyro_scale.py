@@ -25,7 +25,7 @@ from rig.calibrations import CalibrationResult, RejectionCode
 from rig.charts.xy import MEASURED, MODEL, OTHER, Axis, Chart, Series
 from rig.core.json_form import plain
 from rig.motion.turntable import Turntable
-from rig.plans.capture import moved
+from rig.plans.steps import moved
 from rig.safety.gyro_rotation import DRAIN_S, MEMORY_S
 
 NAME = "imu.scale"

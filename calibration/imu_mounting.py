@@ -20,7 +20,7 @@ from rig.bench import Bench
 from rig.calibrations import CalibrationResult, Estimate, RejectionCode
 from rig.charts.xy import MEASURED, MODEL, OTHER, Axis, Chart, Series
 from rig.motion.turntable import Turntable
-from rig.plans.capture import moved
+from rig.plans.steps import moved
 
 NAME = "imu.mounting"
 

@@ -30,7 +30,7 @@ from rig.charts.xy import MODEL, Axis, Chart, Series
 from rig.core.json_form import plain
 from rig.devices.servo import MotionProfile
 from rig.motion.turntable import Turntable
-from rig.plans.capture import moved
+from rig.plans.steps import moved
 
 NAME = "servo.motion"
 

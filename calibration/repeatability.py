@@ -31,7 +31,7 @@ from rig.core.next_steps import Do
 from rig.core.phrases import percent
 from rig.events.events import Accepted
 from rig.motion.turntable import Turntable
-from rig.plans.capture import capture, moved
+from rig.plans.steps import capture, moved
 from rig.views.capture import Viewer
 from rig.views.description import PAPER_DESCRIPTOR, ViewDescriber
 

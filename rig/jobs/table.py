@@ -11,10 +11,10 @@ from rig.core.errors import RigError, UsageError
 from rig.core.phrases import angle_words, signed
 from rig.jobs.desk import Desk, JobResult, Remark, Steps
 from rig.motion.turntable import Turntable
-from rig.plans.capture import announced, moved
 from rig.plans.jog import JogKey
 from rig.plans.jog import jog as jog_table
 from rig.plans.operator import Choice, Question, Subject
+from rig.plans.steps import announced, moved
 
 DEVICES: Final = ("imu",)
 """The devices that a rotation needs besides the servo."""

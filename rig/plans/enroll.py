@@ -36,8 +36,8 @@ from rig.motion.flight_views import FlightFrames
 from rig.motion.move import Move
 from rig.motion.scan_speed import require_camera_time, scan_speed, takes_in_motion
 from rig.motion.turntable import Flight, Turntable
-from rig.plans.capture import accepted, announced, capture, check_camera, check_object, moved, warn_of_table
 from rig.plans.estimate import even_azimuths, table_angles
+from rig.plans.steps import accepted, announced, capture, check_camera, check_object, moved, warn_of_table
 from rig.views.capture import Attempt, Viewer, image_similarity
 from rig.views.description import DescribedView, ViewDescriber
 from rig.views.empty_table import empty_table_status

@@ -52,7 +52,7 @@ from rig.motion.flight_views import FlightFrames
 from rig.motion.move import FIRST_REST_S, Move
 from rig.motion.scan_speed import can_fly, require_camera_time, scan_speed
 from rig.motion.turntable import Turntable
-from rig.plans.capture import accepted, announced, capture, check_camera, check_object, moved, warn_of_table
+from rig.plans.steps import accepted, announced, capture, check_camera, check_object, moved, warn_of_table
 from rig.search.model import Model, begin_search, empty_table_for
 from rig.search.session import SHOWN, Hypotheses, Search
 from rig.search.strategies import AnyStrategy, Finish, Rotate
@@ -128,7 +128,7 @@ class ViewsAtRest:
         yield self._rested(move)
 
     def view(self) -> Generator[Event, None, None]:
-        """Add an acceptable frame at rest to the search; errors as for `rig.plans.capture.capture`."""
+        """Add an acceptable frame at rest to the search; errors as for `rig.plans.steps.capture`."""
         captured = yield from capture(self.number, self.viewer, self.table, self.settled_ns)
         described, azimuth_deg = self.describe(captured.image_bgr), self.azimuth_deg
         self.locks = captured.evidence.locks

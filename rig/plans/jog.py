@@ -7,7 +7,7 @@ from rig.bench import Bench
 from rig.core.errors import UsageError
 from rig.events.events import Event
 from rig.motion.turntable import Turntable
-from rig.plans.capture import announced, moved
+from rig.plans.steps import announced, moved
 
 STEPS_DEG = (0.5, 1.0, 5.0, 15.0, 45.0, 90.0)  # from seeing whether the table moves to a quarter of a revolution
 

@@ -13,8 +13,8 @@ from rig.core.next_steps import Do
 from rig.core.phrases import percent
 from rig.events.events import EmptyTableImage, Event, Note, NoteCode, Warned
 from rig.motion.turntable import Turntable
-from rig.plans.capture import announced, capture
 from rig.plans.enroll import SAME_SIMILARITY
+from rig.plans.steps import announced, capture
 from rig.views.capture import Viewer, image_similarity
 from rig.views.description import within
 from rig.views.empty_table import EmptyTable, empty_table_status, store_empty_table

@@ -46,7 +46,7 @@ def add_records(routes: Routes, server: Server) -> None:
     @routes.watch.get("/runs/{name}/report", tags=["runs"], response_class=HTMLResponse)
     async def get_run_report(name: str) -> HTMLResponse:
         """Return the report of a saved run as a page."""
-        from rig.report.page import run_report
+        from rig.report.report import run_report
 
         return HTMLResponse(await long_work(lambda: run_report(load(name))))
 

@@ -98,7 +98,7 @@ def stop(settings: Settings) -> None:
 
     Example: rig stop --bench sim
     """
-    from rig.motion.stop_request import stop as stop_bench
+    from rig.jobs.stop import stop as stop_bench
 
     done = stop_bench(settings.bench_name, settings.load(), SystemClock(), seed=settings.seed)
     who = done.holder

@@ -72,7 +72,7 @@ def report(
     Example: rig report runs/1 --out run-1.html
     """
     from rig.report import write_report
-    from rig.report.page import run_report
+    from rig.report.report import run_report
     from rig.search.saved_run import load_run
 
     load_model_file(model)

@@ -11,7 +11,7 @@ import pytest
 from rig.config import load_config
 from rig.core.clock import seconds_between
 from rig.core.errors import BenchBusy, DeviceSilent, TorqueStaysOn, UsageError
-from rig.motion.stop_request import stop
+from rig.jobs.stop import stop
 from rig.motion.turntable import Turntable
 from rig.safety.saved_state import BenchLock, Holder
 from rig.safety.stop_channel import listen

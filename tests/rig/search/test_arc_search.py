@@ -14,7 +14,7 @@ from rig import Catalog, enroll, identify, load_model
 from rig.bench import Bench
 from rig.core.errors import MotionStopped, RigError, Stalled, UsageError
 from rig.events.events import Accepted, Decided, FrameUsed, Identified, Moved, Ranked
-from rig.report.page import run_report
+from rig.report.report import run_report
 from rig.search.model import Model
 from rig.search.replay import check
 from rig.search.saved_run import RunWriter, load_run

@@ -11,7 +11,7 @@ from rig.cli.main import app
 from rig.config import load_config
 from rig.core.clock import SystemClock
 from rig.core.errors import Stalled
-from rig.motion.stop_request import stop
+from rig.jobs.stop import stop
 from rig.safety.saved_state import FileStore, LatchedFault, holder
 from tests.programs import Program
 
@@ -177,7 +177,7 @@ def test_bench_is_free_after_its_program_was_killed(rig, running):
 @pytest.mark.realtime
 @pytest.mark.parametrize(("handler", "number"), [("", signal.SIGINT), ("unwinding", signal.SIGTERM)])
 def test_stop_signals_a_program_outside_its_control_loop(tmp_path, monkeypatch, handler, number):
-    monkeypatch.setattr("rig.motion.stop_request.END_S", 60)  # a busy computer may need longer than a bench
+    monkeypatch.setattr("rig.jobs.stop.END_S", 60)  # a busy computer may need longer than a bench
     code = f"""
 import signal, sys, time
 from pathlib import Path
@@ -204,8 +204,8 @@ finally:
 
 
 def test_stop_reports_how_to_end_a_program_that_does_not_react(tmp_path, monkeypatch):
-    monkeypatch.setattr("rig.motion.stop_request.REACTION_S", 0.1)
-    monkeypatch.setattr("rig.motion.stop_request.END_S", 0.3)
+    monkeypatch.setattr("rig.jobs.stop.REACTION_S", 0.1)
+    monkeypatch.setattr("rig.jobs.stop.END_S", 0.3)
     code = f"""
 import signal, time
 from pathlib import Path

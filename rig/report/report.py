@@ -155,7 +155,7 @@ def write_report(path: Path, html: str) -> None:
 
 @cache
 def _template() -> Template:
-    return environment("rig.report", "rig.charts").get_template("page.html.j2")
+    return environment("rig.report", "rig.charts").get_template("report.html.j2")
 
 
 Shown = dict[str, Any]

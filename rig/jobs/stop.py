@@ -1,4 +1,4 @@
-"""Stops a bench from another process: through the program that uses it or, if there is none, at the servo."""
+"""The job of `rig stop`: through the program that uses the bench or, if there is none, at the servo itself."""
 
 import os
 import signal
