@@ -1,8 +1,9 @@
 """Retrieval: arrays in, decisions out."""
 
 from hbr.dense.filter import Belief, update_belief
-from hbr.dense.fitting import FittedRule, LeaveOneOut, fit_stopping_rule, leave_one_out, rule_from_searches
+from hbr.dense.fitting import FittedRule, fit_stopping_rule, rule_from_searches
 from hbr.dense.index import DenseIndex
+from hbr.dense.leave_one_out import LeaveOneOut, leave_one_out
 from hbr.dense.next_view import NextBestView, next_best_view
 from hbr.dense.session import DenseSession
 from hbr.dense.stopping import Outcome, StopDecision, StoppingRule, StopReason

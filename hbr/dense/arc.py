@@ -22,8 +22,9 @@ from numpy.typing import ArrayLike
 from hbr.core.angles import size_deg, wrap360
 from hbr.core.arrays import FloatArray, LevelArray
 from hbr.dense.filter import Belief, update_belief
-from hbr.dense.fitting import LeaveOneOut, fit_min_confidence, leave_one_out, searched_objects
+from hbr.dense.fitting import fit_min_confidence
 from hbr.dense.index import DenseIndex
+from hbr.dense.leave_one_out import LeaveOneOut, leave_one_out, searched_objects
 from hbr.dense.next_view import SHARPNESS, NextBestView, log_confusion, pairs_after
 from hbr.dense.session import DenseSession
 from hbr.dense.stopping import Outcome, StopDecision, StoppingRule, StopReason, by_confidence

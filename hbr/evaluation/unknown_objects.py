@@ -7,8 +7,9 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from hbr.core.arrays import BoolArray
-from hbr.dense.fitting import LeaveOneOut, conformal_threshold, fitting_searches, rule_from_searches
+from hbr.dense.fitting import conformal_threshold, rule_from_searches
 from hbr.dense.index import DenseIndex
+from hbr.dense.leave_one_out import LeaveOneOut, fitting_searches
 from hbr.dense.stopping import Leaders, StoppingRule, usual_scores
 from hbr.evaluation.condition import query_levels
 from hbr.evaluation.experiment import Experiment, Kind

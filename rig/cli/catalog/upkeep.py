@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     from hbr import FittedRule
     from hbr.core.arrays import FloatArray
-    from hbr.dense.fitting import Task
+    from hbr.dense.leave_one_out import Task
 
 _SEVERAL_PROCESSES: Final = 20_000
 """Views from which the searches of a fit take longer than the start of further processes."""

@@ -6,17 +6,8 @@ import numpy as np
 import pytest
 
 from hbr import DenseIndex, Outcome, Views
-from hbr.dense.fitting import (
-    FALSE_ACCEPT,
-    STRENGTHS,
-    LeaveOneOut,
-    ShiftedSearches,
-    fit_open_set,
-    fit_stopping_rule,
-    leave_one_out,
-    rule_from_searches,
-    with_false_accepts,
-)
+from hbr.dense.fitting import FALSE_ACCEPT, fit_open_set, fit_stopping_rule, rule_from_searches, with_false_accepts
+from hbr.dense.leave_one_out import STRENGTHS, LeaveOneOut, ShiftedSearches, leave_one_out
 from hbr.dense.stopping import NUMBERS, Leaders, LimitationCode, OpenSetModel, StoppingRule, StopReason
 from tests.hbr.dense.searches import belief_after
 from tests.hbr.dense.test_stopping import catalog

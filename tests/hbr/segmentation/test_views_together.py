@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import hbr
-from hbr.dense.fitting import can_shift
 from hbr.dense.index import Whitening
+from hbr.dense.leave_one_out import can_shift
 from hbr.descriptors.base import Shift
 from hbr.descriptors.together import like_enrollment
 from hbr.drawing.bench import HARD, DrawnBench, Visit

@@ -9,7 +9,8 @@ import pytest
 from sqlalchemy import delete
 
 import hbr
-from hbr.dense.fitting import UNFITTED_MIN_CONFIDENCE, leave_one_out
+from hbr.dense.fitting import UNFITTED_MIN_CONFIDENCE
+from hbr.dense.leave_one_out import leave_one_out
 from hbr.dense.stopping import LimitationCode
 from rig.catalog import Catalog
 from rig.catalog.facts import Derived
@@ -141,7 +142,7 @@ def test_confused_objects_are_named():
     searches = leave_one_out(hbr.DenseIndex(hbr.Views.concatenate(twins)))
     leading = replace(searches.known, object_index=searches.unknown.object_index)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("hbr.dense.fitting.leave_one_out", lambda *_, **__: replace(searches, known=leading))
+        patch.setattr("hbr.dense.leave_one_out.leave_one_out", lambda *_, **__: replace(searches, known=leading))
         again = hbr.fit_stopping_rule(hbr.DenseIndex(hbr.Views.concatenate(twins)), false_reject=0.4)
     assert again.confused
     assert all(one != other for one, other in again.confused)
