@@ -128,6 +128,8 @@ class Descriptor(Protocol):
         Largest level.
     whole_image : bool
         Whether the whole image is described, as the paper does, and not only the object.
+    is_plain_cedd : bool
+        Whether views are compared by the Tanimoto coefficient of CEDD's levels, for which the paper's index is faster.
     """
 
     @property
@@ -144,6 +146,10 @@ class Descriptor(Protocol):
 
     @property
     def whole_image(self) -> bool:
+        return False
+
+    @property
+    def is_plain_cedd(self) -> bool:
         return False
 
     def describe(self, view: ImageArray | Segmentation, /) -> LevelArray:

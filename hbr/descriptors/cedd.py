@@ -456,6 +456,7 @@ class Cedd(Descriptor):
     length: int = BINS
     max_level: int = 7
     whole_image: bool = True
+    is_plain_cedd: bool = True
     blur: float = 0.0
 
     def describe(self, view: ImageArray | Segmentation, /) -> LevelArray:
@@ -517,6 +518,7 @@ class RotatedCedd(Cedd):
     """
 
     name: str = "cedd-rotated"
+    is_plain_cedd: bool = False
 
     def prepared(self, rows: LevelArray, /) -> Comparison:
         self.check_rows(rows)

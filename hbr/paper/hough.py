@@ -219,7 +219,7 @@ def _best_paths(
     """Return score (C,) and path (C, N) of every object, by rising object. Every object is in every list."""
     views, kind = index.views, index.descriptor
     azimuth_deg = views.azimuth_deg
-    if index.is_plain:
+    if kind.is_plain_cedd:
         of_views = views.descriptors, views.object_index, azimuth_deg
         compiled = calls.paths(extended, queries, orientations, *of_views, omega)
         if compiled is not None:

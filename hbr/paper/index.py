@@ -8,7 +8,6 @@ import numpy as np
 
 from hbr.core.arrays import FloatArray, IndexArray, LevelArray, ranges
 from hbr.descriptors import Comparison, descriptor
-from hbr.descriptors.cedd import Cedd, RotatedCedd
 from hbr.descriptors.similarity import squares, tanimoto, tanimoto_of_dots
 from hbr.kernels import library
 from hbr.kernels.calls import ByteRows
@@ -47,21 +46,16 @@ class ViewIndex:
         self.views = views
         self.method = method
         self.descriptor = descriptor(views.descriptor)
-        if method == "tree" and not self.is_plain:
+        if method == "tree" and not self.descriptor.is_plain_cedd:
             raise ValueError(f"the tree compares plain CEDD, not {views.descriptor}; use flat")
         self._remembered: dict[tuple[bytes, int], tuple[IndexArray, FloatArray]] = {}
 
     def __len__(self) -> int:
         return len(self.views)
 
-    @property
-    def is_plain(self) -> bool:
-        """Whether the similarity is the Tanimoto coefficient of the levels, without rotations and other descriptors."""
-        return isinstance(self.descriptor, Cedd) and not isinstance(self.descriptor, RotatedCedd)
-
     @cached_property
     def _searcher(self) -> "_Flat | _Tree | _Compared":
-        if not self.is_plain:
+        if not self.descriptor.is_plain_cedd:
             return _Compared(self.views.prepared())
         return _Tree(self.views.descriptors) if self.method == "tree" else _Flat(self.views.descriptors)
 
@@ -83,7 +77,7 @@ class ViewIndex:
         grown = copy(self)
         grown.views = views
         grown.__dict__.pop("_searcher", None)
-        if self.method == "flat" and self.is_plain:
+        if self.method == "flat" and self.descriptor.is_plain_cedd:
             known = self._searcher
             assert isinstance(known, _Flat)
             grown._searcher = _Flat(views.descriptors, known)
