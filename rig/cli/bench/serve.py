@@ -39,7 +39,9 @@ def serve(
         str | None, typer.Option("--new-token", metavar="NAME", help="Make a token, print it once, and stop.")
     ] = None,
     role: Annotated[str, typer.Option(metavar="watch|operate", help="What the new token allows.")] = "watch",
-    days: Annotated[float | None, typer.Option(min=0.01, max=3650, help="How long the new token is valid.")] = None,
+    days: Annotated[
+        float | None, typer.Option(min=0.01, max=3650, help="How many days the new token is valid (default: always).")
+    ] = None,
     remove_token: Annotated[
         str | None, typer.Option("--remove-token", metavar="NAME", help="Remove a token, and stop.")
     ] = None,

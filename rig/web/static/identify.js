@@ -30,10 +30,10 @@ function chart(job, views, candidates) {
 }
 
 export function result(event) {
-  const lines = event.text.split("\n");
-  if (event.outcome === "found") answer(event.name, "found", lines[0]);
-  else if (event.outcome === "ambiguous") answer(event.possible.join(" or "), "ambiguous", lines[0]);
-  else answer("Unknown object", "unknown", lines[0]);
+  const lines = event.text.split("\n").map((text) => h("p", {}, text));
+  if (event.outcome === "found") answer(event.name, "found", ...lines);
+  else if (event.outcome === "ambiguous") answer(event.possible.join(" or "), "ambiguous", ...lines);
+  else answer("Unknown object", "unknown", ...lines);
   chart(event.job, event.views, event.candidates);
   $("shares").textContent = event.outcome === "unknown" ? "The object on the table is none of them." : "";
 }
@@ -43,10 +43,11 @@ on("shown-plan", (event) => {
   if (event.event === "started") clear();
   if (event.event === "waiting") answer(event.reason === "first-object" ? "Put an object on the table" : "Put the next object on the table", "", "");
   if (event.event === "ranked") chart(event.job, event.index + 1, event.candidates);
-  if (event.event === "identified") result(event);
+  if (event.event === "identified") return result(event);
   if (event.event === "failed") noAnswer(event);
   if (event.text) for (const words of event.text.split("\n")) $("steps").append(h("li", {}, words.trim()));
   if (event.steps?.length) $("steps").append(h("li", {}, "Next step: ", ...nextSteps(event.steps)));
+  return undefined;
 });
 followJobs(["identify"], (job, isOther) => {
   if (isOther) {
@@ -56,5 +57,6 @@ followJobs(["identify"], (job, isOther) => {
   if (job.result && job.result.event === "identified" && !job.request.watch) result({ ...job.result, job: job.id, text: job.result_text });
   if (job.state === "failed") noAnswer(job.error);
   if (["cancelled", "interrupted"].includes(job.state)) answer("Stopped", "", "");
-}, (event) => `view ${event.index + 1}, ${event.azimuth_deg.toFixed(0)}°`);
+}, (event) => `view ${event.index + 1}, ${event.azimuth_deg.toFixed(0)}°`,
+(job) => job.request.watch); // the wait for the next object replaces the answer above
 start();

@@ -335,8 +335,8 @@ export function duration(seconds) {
   return s < 3600 ? `${Math.floor(s / 60)} min ${two(s % 60)} s` : `${Math.floor(s / 3600)} h ${two(Math.floor((s % 3600) / 60))} min`;
 }
 
-/** Show a job in a box: progress, question, buttons, outcome. */
-function showJob(box, job) {
+/** Show a job in a box: progress, question, buttons and, unless the page shows it elsewhere, the outcome. */
+function showJob(box, job, withOutcome = true) {
   if (!job) return box.replaceChildren();
   const post = (what, body) => () => act(() => request("POST", `/jobs/${job.id}/${what}`, body));
   const parts = [h("p", {}, h("strong", {}, jobTitle(job)), ` – ${job.state}`)];
@@ -358,8 +358,8 @@ function showJob(box, job) {
         h("button", { class: "quiet", onclick: post("cancel") }, "Cancel")),
     );
   }
-  if (job.result_text) parts.push(...job.result_text.split("\n").map((text) => h("p", {}, text)));
-  if (job.error) parts.push(h("p", { class: "error" }, `Error ${job.error.code}: ${job.error.what}`), h("p", {}, "Next step: ", ...nextSteps(job.error.steps)));
+  if (withOutcome && job.result_text) parts.push(...job.result_text.split("\n").map((text) => h("p", {}, text)));
+  if (withOutcome && job.error) parts.push(h("p", { class: "error" }, `Error ${job.error.code}: ${job.error.what}`), h("p", {}, "Next step: ", ...nextSteps(job.error.steps)));
   if (job.resume) {
     parts.push(h("div", { class: "row" }, h("button", { onclick: () => submit(job.resume) }, "Continue")));
   }
@@ -370,8 +370,11 @@ function showJob(box, job) {
 const loadJobs = async () => (await request("GET", "/jobs?limit=50")).items;
 const newestOf = (jobs) => jobs.find((job) => ACTIVE.includes(job.state)) || jobs[0];
 
-/** Show the newest job of these kinds: its state, and its views. Call `changed` with it, and whether it is another one. */
-export function followJobs(kinds, changed = () => {}, viewWords = null) {
+/**
+ * Show the newest job of these kinds: its state, its views and, where `withOutcome` allows it, its outcome. Call `changed`
+ * with it, and whether it is another one.
+ */
+export function followJobs(kinds, changed = () => {}, viewWords = null, withOutcome = () => true) {
   let shown = null;
   const add = (number, words) => $("thumbs").append(h("li", {}, h("img", { src: `${API}/jobs/${shown.id}/views/${number}`, alt: "", loading: "lazy" }), words));
   const take = (job) => {
@@ -379,7 +382,7 @@ export function followJobs(kinds, changed = () => {}, viewWords = null) {
     if (!kinds.includes(job.request.kind)) return;
     if (shown && isOther && (job.created_utc < shown.created_utc || (job.state === "queued" && !ENDED.includes(shown.state)))) return;
     shown = job;
-    showJob($("job"), job);
+    showJob($("job"), job, withOutcome(job));
     if (isOther && viewWords) { // a page that was opened in the middle of a job shows the views so far
       $("thumbs").replaceChildren();
       for (let k = 0; k < job.views; k += 1) add(k, `view ${k + 1}`);
