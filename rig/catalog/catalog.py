@@ -116,10 +116,11 @@ class Catalog(AbstractContextManager["Catalog"]):
     def object(self, name: str) -> ObjectDetails:
         """Return an object with its enrollments and views.
 
-        Raises `ObjectNotFound`: there is no object of that name.
+        Raises `ObjectNotFound`: there is no object of that name. `CatalogDamaged`: an enrollment of it is missing.
         """
         with self.database.read() as transaction:
             found = state.find(transaction, name)
+            state.check_present(transaction, found.object_id)
             (summary,) = state.summaries(transaction, object_id=found.object_id)
             return ObjectDetails(summary, tuple(state.enrollments(transaction, state.of_object(found.object_id))))
 

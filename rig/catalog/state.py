@@ -26,6 +26,9 @@ from rig.core.clock import Clock
 from rig.core.errors import CatalogDamaged, CatalogError, ObjectExists, ObjectNotFound
 from rig.core.next_steps import Do
 
+COLLECTED: Final = "enrollments"
+"""Key of the record of a line `Action.GARBAGE_COLLECTED`: the ids of the removed enrollments."""
+
 Named = aliased(Entry, name="named")
 """The line that gives an object its present state."""
 Ended = aliased(Entry, name="ended")
@@ -321,6 +324,30 @@ def enrollments(transaction: Transaction, *conditions: ColumnElement[bool]) -> l
         for one, ended in rows
         if ended.status is not None
     ]
+
+
+def missing_enrollments(transaction: Transaction, object_id: int | None = None) -> dict[int, str | None]:
+    """Return the enrollments, of one object or of all, that are in the log only, although this program removed none.
+
+    By their ids, with the names of their objects.
+    """
+    lines = select(Entry.enrollment_id, Entry.object_name).where(Entry.status.is_not(None))
+    if object_id is not None:
+        lines = lines.where(Entry.object_id == object_id)
+    names = {number: name for number, name in transaction.execute(lines) if number is not None}
+    present = set(transaction.scalars(select(Enrollment.id)))
+    removals = select(Entry).where(Entry.action.in_((Action.ENROLLMENT_DISCARDED, Action.GARBAGE_COLLECTED)))
+    for line in transaction.scalars(removals):
+        collected = (line.record or {}).get(COLLECTED)
+        present |= {one for one in collected if isinstance(one, int)} if isinstance(collected, list) else set()
+        present |= {line.enrollment_id or 0}
+    return {number: names[number] for number in sorted(names.keys() - present)}
+
+
+def check_present(transaction: Transaction, object_id: int | None = None) -> None:
+    """Raise `CatalogDamaged` if an enrollment, of one object or of any, is missing."""
+    if names := missing_enrollments(transaction, object_id).values():
+        raise changed([str(name) for name in dict.fromkeys(names)])
 
 
 def is_possible(enrollment: Enrollment, ended: Entry) -> bool:

@@ -118,6 +118,8 @@ class CatalogSource:
         """
         with self.catalog.database.read() as transaction:
             state.used(transaction, checked=True)
+            if not self.used_only:
+                state.check_present(transaction)
             if self.names:
                 by_id = {one.id: one for one in (state.find(transaction, name) for name in self.names)}
                 wanted: Sequence[Entry] = sorted(by_id.values(), key=lambda one: one.object_id or 0)

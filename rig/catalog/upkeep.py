@@ -19,9 +19,6 @@ from rig.catalog.state import Ended, Named
 from rig.core.errors import CatalogBusy
 from rig.core.next_steps import Do
 
-COLLECTED: Final = "enrollments"
-"""Key of the record of a line `Action.GARBAGE_COLLECTED`: the ids of the removed enrollments."""
-
 _AT_ONCE: Final = 200
 """Images that are removed in one transaction: other benches wait for it."""
 
@@ -145,7 +142,7 @@ def collect_garbage(catalog: Catalog, *, old: bool = False, dry_run: bool = Fals
                 "views": views,
                 "freed_bytes": collected.bytes,
             },
-            record={COLLECTED: sorted(ids)},
+            record={state.COLLECTED: sorted(ids)},
         )
     # What another process names meanwhile stays. One that names an image later looks for it, and stores it again.
     for part in portions(sorted(sizes), _AT_ONCE):

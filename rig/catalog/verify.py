@@ -17,11 +17,11 @@ from sqlalchemy.orm import Session as Transaction
 
 from rig.catalog import describing, digests, log, state
 from rig.catalog.catalog import Catalog
-from rig.catalog.facts import Action, Derived, Enrollment, Entry, View
+from rig.catalog.facts import Derived, Enrollment, Entry, View
 from rig.catalog.images import Images, path_of
 from rig.catalog.jobs import JobProgress, portions, processes
 from rig.catalog.state import Ended, Named
-from rig.catalog.upkeep import COLLECTED, NAMED_IMAGES
+from rig.catalog.upkeep import NAMED_IMAGES
 from rig.config.catalog_place import CatalogPlace
 from rig.core.clock import Clock, seconds_between
 from rig.core.errors import CatalogDamaged, RigError
@@ -156,17 +156,8 @@ def _end(transaction: Transaction) -> Iterator[CatalogFinding]:
 
 
 def _missing(transaction: Transaction) -> Iterator[CatalogFinding]:
-    """Yield the enrollments that are in the log and not in the catalog, although this program did not remove them."""
-    lines = transaction.execute(select(Entry.enrollment_id, Entry.object_name).where(Entry.status.is_not(None)))
-    names = {number: name for number, name in lines if number is not None}
-    present = set(transaction.scalars(select(Enrollment.id)))
-    removals = select(Entry).where(Entry.action.in_((Action.ENROLLMENT_DISCARDED, Action.GARBAGE_COLLECTED)))
-    for line in transaction.scalars(removals):
-        collected = (line.record or {}).get(COLLECTED)
-        present |= {one for one in collected if isinstance(one, int)} if isinstance(collected, list) else set()
-        present |= {line.enrollment_id or 0}
-    for number in sorted(names.keys() - present):
-        yield CatalogFinding(CatalogProblem.MISSING_ENROLLMENT, names[number], details={"enrollment_id": number})
+    for number, name in state.missing_enrollments(transaction).items():
+        yield CatalogFinding(CatalogProblem.MISSING_ENROLLMENT, name, details={"enrollment_id": number})
 
 
 def _enrollments(ids: Sequence[int], transaction: Transaction) -> Iterator[CatalogFinding]:
