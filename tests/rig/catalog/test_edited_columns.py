@@ -55,7 +55,7 @@ def literal(value: object) -> str:
 
 
 @pytest.mark.parametrize("count", [24, pytest.param(200, marks=[pytest.mark.nightly, pytest.mark.timeout(1200)])])
-def test_no_edited_column_is_believed(sample: Path, tmp_path: Path, count: int) -> None:
+def test_no_edited_column_is_accepted(sample: Path, tmp_path: Path, count: int) -> None:
     intact = Path(shutil.copytree(sample, tmp_path / "intact"))
     with opened(intact) as catalog:
         shown = {reader: show(catalog) for reader, show in SHOWN.items()}
@@ -73,7 +73,7 @@ def test_no_edited_column_is_believed(sample: Path, tmp_path: Path, count: int) 
             try:
                 with opened(edited) as catalog:
                     if show(catalog) != shown[reader]:
-                        missed.append(f"{reader} believes {statement}")
+                        missed.append(f"{reader} accepts {statement}")
             except RigError:
                 pass
         try:
