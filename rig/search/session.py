@@ -429,11 +429,11 @@ class DenseSearch(Search):
         return tuple(self.names[one] for one in (found.leaders if found.winner is None else (found.winner,)))
 
     def _possible(self, decision: hbr.StopDecision) -> tuple[str, ...]:
-        """Return the possible objects: the likeliest, which together reach the confidence that ends a search."""
+        """Return the possible objects: of an ambiguous one the likeliest two, or those that reach the confidence."""
         if decision.outcome is hbr.Outcome.UNKNOWN:
             return ()
         probability, _, order = self._ordered()
         count = 1
         if decision.outcome is hbr.Outcome.AMBIGUOUS:
-            count += int((np.cumsum(probability[order]) < decision.min_confidence).sum())
+            count = max(2, 1 + int((np.cumsum(probability[order]) < decision.min_confidence).sum()))
         return tuple(self.names[j] for j in self._session.belief.index.object_index[order[:count]].tolist())

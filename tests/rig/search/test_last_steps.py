@@ -77,6 +77,7 @@ def doubtful(rule: hbr.StoppingRule, offset: float) -> hbr.StoppingRule:
     ("offset", "outcome", "answered"),
     [
         (2.0, hbr.Outcome.FOUND, hbr.Outcome.FOUND),
+        (-3.0, hbr.Outcome.AMBIGUOUS, hbr.Outcome.AMBIGUOUS),
         (-6.8, hbr.Outcome.UNKNOWN, hbr.Outcome.AMBIGUOUS),  # it fits one of two near twins up to noise
     ],
 )
@@ -101,6 +102,7 @@ def test_a_doubtful_leader_is_verified_and_the_run_replays(
     assert (found.name, found.outcome) == ("vase-blue", outcome)
     assert found.found_from == FOUND_FROM_SAME_BENCH  # the bench is that of the enrollment
     assert answer.outcome is answered
+    assert len(answer.possible) == (2 if answered is hbr.Outcome.AMBIGUOUS else 1)
     assert (answer.reason is hbr.StopReason.PIXEL_FIT) == (outcome is answered)
     assert 0.5 < found.fit <= 1
     again = check(load_run(tmp_path / "run"))
