@@ -12,9 +12,9 @@ from contextlib import AbstractContextManager, closing, contextmanager
 from functools import cache, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Final
+from typing import Any, Final
 
-from sqlalchemy import DDL, Connection, NullPool, QueuePool, StaticPool, create_engine, event
+from sqlalchemy import DDL, Connection, Dialect, Engine, NullPool, QueuePool, StaticPool, create_engine, event, make_url
 from sqlalchemy.orm import Session as Transaction
 
 from rig.catalog.columns import FIX
@@ -29,6 +29,10 @@ from rig.core.files import json_values, make_folder, sync_folder
 
 APPLICATION_ID: Final = 0x48425247
 """``HBRG``: marks the SQLite file as a catalog (`PRAGMA application_id`)."""
+
+_URL: Final = make_url("sqlite://")
+#: Compiled statements of all catalogs.
+_COMPILED: Final = dict[Any, Any]()
 
 for _fact in FACTS:  # a program that changes a fact in place fails
     _changes = ("UPDATE", "DELETE") if _fact is Entry else ("UPDATE",)
@@ -55,13 +59,8 @@ class SqliteDatabase(Database):
         self._file = place.database_file
         self.read_only = read_only
         self._busy_timeout_s = busy_timeout_s
-        self._engine = create_engine(
-            "sqlite://",
-            creator=self._connect,
-            poolclass=QueuePool,
-            json_serializer=json_text,
-            json_deserializer=json_values,
-        )
+        pool = QueuePool(self._connect, dialect=_dialect())  # type: ignore[arg-type] # typeshed: no DBAPIConnection
+        self._engine = Engine(pool, _dialect(), _URL, execution_options={"compiled_cache": _COMPILED})
         event.listen(self._engine, "begin", _begin)
         self._immediate = self._engine.execution_options(begin="BEGIN IMMEDIATE")
         try:
@@ -195,6 +194,14 @@ def connect(root: Path, mode: str, busy_timeout_s: float) -> sqlite3.Connection:
         connection.close()
         raise
     return connection
+
+
+@cache
+def _dialect() -> Dialect:
+    """Return the dialect of all catalogs: with one, SQLAlchemy does not compile the statements for each again."""
+    engine = create_engine(_URL, poolclass=NullPool, json_serializer=json_text, json_deserializer=json_values)
+    with engine.connect():  # asks SQLite for its version
+        return engine.dialect
 
 
 def database_exists(root: Path) -> bool:
