@@ -17,6 +17,10 @@ _SUFFIXES: Final = {".png", ".jpg", ".jpeg"}
 _COIL_NAME: Final = re.compile(r"obj(?P<number>\d+)__(?P<angle>\d+(?:\.\d+)?)")
 #: Largest level of COIL's black background, with sensor noise and glow.
 _DARK: Final = 45
+#: Largest distance of a regular step from a multiple of the median step, in median steps; encoders err by less.
+_REGULAR: Final = 0.25
+#: Share of other steps in a regular data set, such as those beside missing views.
+_IRREGULAR_SHARE: Final = 0.1
 #: The last bytes of a complete file. OpenCV does not reject a file that was cut off.
 _ENDS: Final = {".png": b"IEND\xaeB`\x82", ".jpg": b"\xff\xd9", ".jpeg": b"\xff\xd9"}
 
@@ -82,14 +86,20 @@ class Dataset:
         return sum(len(item.photographs) for item in self.objects)
 
     @property
-    def spacing_deg(self) -> float:
-        """The median step between neighbouring views of all objects."""
-        gaps = [np.diff(item.azimuth_deg, append=item.azimuth_deg[0] + 360) for item in self.objects]
-        return float(np.median(np.concatenate(gaps)))
+    def _steps_deg(self) -> FloatArray:
+        return np.concatenate([np.diff(item.azimuth_deg, append=item.azimuth_deg[0] + 360) for item in self.objects])
 
     @property
-    def missing(self) -> int:
-        """The number of views that are missing from complete revolutions at that step."""
+    def spacing_deg(self) -> float:
+        """The median step between neighbouring views of all objects."""
+        return float(np.median(self._steps_deg))
+
+    @property
+    def missing(self) -> int | None:
+        """The number of views that are missing from complete revolutions at that step; None if steps are irregular."""
+        steps = self._steps_deg / self.spacing_deg
+        if np.mean(np.abs(steps - np.rint(steps)) > _REGULAR) > _IRREGULAR_SHARE:
+            return None
         whole = round(360 / self.spacing_deg)
         return sum(max(0, whole - len(item.photographs)) for item in self.objects)
 

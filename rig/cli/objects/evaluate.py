@@ -85,7 +85,8 @@ def evaluate(
         )
         asked = replace(asked, margin=rule.margin, min_views=rule.min_views)
         dataset = _dataset(settings, data, asked)
-        note = f"{dataset.name}: {len(dataset.objects)} objects, {dataset.views} views, {dataset.missing} missing"
+        note = f"{dataset.name}: {len(dataset.objects)} objects, {dataset.views} views"
+        note += ", irregular steps" if dataset.missing is None else f", {dataset.missing} missing"
         print(f"{note}, {dataset.ignored} other images" if dataset.ignored else note, file=sys.stderr)
         folder = out or own_folder(asked, dataset)
         done = 0

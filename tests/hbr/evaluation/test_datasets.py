@@ -1,10 +1,11 @@
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from hbr.evaluation.photographs import DatasetError, load_coil, read_photograph
+from hbr.evaluation.photographs import Dataset, DatasetError, load_coil, read_photograph
 
 
 def picture(path: Path, size: int = 8) -> Path:
@@ -28,6 +29,16 @@ def test_views_are_found_sorted_and_the_missing_counted(tmp_path: Path) -> None:
     assert dataset.every(2).objects[0].azimuth_deg.tolist() == [0, 180]
     with pytest.raises(DatasetError, match="3-4"):
         dataset.subset(3, 4)
+
+
+def test_no_view_is_missing_from_irregular_steps(tmp_path: Path) -> None:
+    """Encoders err, views are lost, and both leave a step; a hand-held camera has none."""
+    for number, azimuths in enumerate(([0, 10.9, 20, 29.1], [0.4, 6.13, 47.83, 120.5, 121, 250, 359.999999])):
+        for azimuth in [*azimuths, *range(40, 340, 10)][: 34 if number == 0 else 7]:
+            picture(tmp_path / f"obj{number}__{azimuth}.png")
+    dataset = load_coil(tmp_path)
+    regular, irregular = (Dataset("one", (item, replace(item, name="again"))) for item in dataset.objects)
+    assert (regular.missing, irregular.missing, len(irregular.objects[0].photographs)) == (4, None, 7)
 
 
 def test_duplicate_view_is_named(tmp_path: Path) -> None:
