@@ -53,7 +53,7 @@ def test_views_of_figure_7_have_irregular_angles_that_the_gyro_measured(tmp_path
             assert 10 <= len(own.photographs) <= 12
             np.testing.assert_array_equal(own.azimuth_deg, copied.azimuth_deg)
         assert dataset.missing is None
-        experiment = load_experiment("figure-7", methods="hbr,ahbr", noise="mb")
+        experiment = load_experiment("figure-7", methods="hbr,ahbr", noise="mb", objects="1-2")
         assert experiment.protocol.sigma_deg == 0  # the angles have the gyro's own errors
         results = run_experiment(experiment, dataset, 1, lambda *_: None)
     assert results["settings"]["dataset"]["missing_views"] is None
