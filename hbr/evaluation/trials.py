@@ -4,7 +4,7 @@ All random values (first views, sensor errors, coins) are drawn once for each ob
 for all methods.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from hbr.core.angles import wrap180
 from hbr.core.arrays import FloatArray, IndexArray, LevelArray
 from hbr.dense.filter import BETA, Belief, update_belief
-from hbr.dense.fitting import UNFITTED_MIN_CONFIDENCE, fit_stopping_rule
+from hbr.dense.fitting import fit_stopping_rule
 from hbr.dense.index import POWER, DenseIndex
 from hbr.dense.local_difference import LocalView
 from hbr.dense.next_view import ALL_ROTATIONS_DEG, expected_views, strongest
@@ -28,7 +28,7 @@ from hbr.evaluation.protocol import COMPARED, OUTCOMES, Method, Protocol, Runs, 
 from hbr.evaluation.results import results_of
 from hbr.model.symmetry import symmetry
 from hbr.model.views import Views
-from hbr.paper.hmm import pose_belief
+from hbr.paper.hmm import CONFIDENT, PoseBelief, PoseModel, update_poses
 from hbr.paper.hough import Ranking, retrieve
 from hbr.paper.index import ViewIndex, largest
 from hbr.paper.next_view import Side, next_view
@@ -224,21 +224,15 @@ class _Trials:
         if method.dense:
             self._run_dense(method, draws, runs, at)
             return
+        if self._protocol.absent:
+            raise ValueError(f"{method.label} cannot search for unknown objects; use methods of the dense filter")
         if method.hmm:
             self._run_hmm(method, draws, models, runs, at)
             return
-        if self._protocol.absent:
-            raise ValueError(f"{method.label} cannot search for unknown objects; use methods of the dense filter")
-        seen = [int(draws.order[0])]
-        travelled_deg = 0.0
-        last = min(self._protocol.max_views, method.views or self._protocol.max_views)
-        for n in range(last):
-            keep = self._keep(np.array(seen))
-            key = keep.tobytes()
-            if key not in models:
-                models[key] = self._model(keep)
+        last = self._last(method)
+        for n, seen, keep, measured_deg in self._queries_of(draws, last, runs, at):
             # a new index for each method: lists of another method would shorten the measured time
-            model = models[key]
+            model = self._model(keep, models)
             # Only the first repetition is timed; the others may share lists.
             is_measured = at[2] == 0
             index = ViewIndex(model.views, self._protocol.index if is_measured else "flat")
@@ -246,7 +240,6 @@ class _Trials:
                 index.build()
             if not is_measured:
                 self._share_lists(index, model, seen, method.list_length)
-            measured_deg = self._azimuth_deg[seen] + draws.error_deg[: n + 1]
             start_ns = self._now_ns()
             ranking = retrieve(
                 self._queries[seen],
@@ -260,9 +253,24 @@ class _Trials:
             runs.step_ns[*at, n] = self._now_ns() - start_ns if is_measured else 0
             self._record(ranking.object_index, ranking.pose_deg, seen, runs, (*at, n))
             self._record_margin(ranking, seen, keep, runs, (*at, n))
-            runs.travelled_deg[*at, n] = travelled_deg
-            travelled_deg += abs(float(wrap180(self._azimuth_deg[following] - self._azimuth_deg[seen[-1]])))
             seen.append(following)
+
+    def _last(self, method: Method) -> int:
+        return min(self._protocol.max_views, method.views or self._protocol.max_views)
+
+    def _queries_of(
+        self, draws: _Draws, last: int, runs: Runs, at: tuple[int, int, int]
+    ) -> Iterator[tuple[int, list[int], NDArray[np.bool_], FloatArray]]:
+        """Yield after each query its number, all queries so far, which own views stay, and all measured orientations.
+
+        The caller appends the next query; the way to it is recorded here.
+        """
+        seen = [int(draws.order[0])]
+        travelled_deg = 0.0
+        for n in range(last):
+            runs.travelled_deg[*at, n] = travelled_deg
+            yield n, seen, self._keep(np.array(seen)), self._azimuth_deg[seen] + draws.error_deg[: n + 1]
+            travelled_deg += abs(float(wrap180(self._azimuth_deg[seen[-1]] - self._azimuth_deg[seen[-2]])))
 
     def _share_lists(self, index: ViewIndex, model: _Model, seen: list[int], list_length: int) -> None:
         """Store the retrieval lists in an index, from the similarities to all views, which are computed once."""
@@ -277,45 +285,43 @@ class _Trials:
     def _run_hmm(
         self, method: Method, draws: _Draws, models: dict[bytes, _Model], runs: Runs, at: tuple[int, int, int]
     ) -> None:
-        seen = [int(draws.order[0])]
-        travelled_deg = 0.0
-        for n in range(self._protocol.max_views):
-            keep = self._keep(np.array(seen))
-            key = keep.tobytes()
-            if key not in models:
-                models[key] = self._model(keep)
-            model = models[key]
-            measured_deg = self._azimuth_deg[seen] + draws.error_deg[: n + 1]
+        last = self._last(method)
+        for n, seen, keep, measured_deg in self._queries_of(draws, last, runs, at):
+            chosen = self._model(keep, models)
+            model = PoseModel(chosen.views)
+            _ = model.compared  # an index is not built in the measured time
+            similar = self._similar[seen][:, chosen.mask]
             start_ns = self._now_ns()
-            belief = pose_belief(self._similar[seen][:, model.mask], measured_deg, model.views)
-            following = int(draws.order[n + 1]) if n + 1 < self._protocol.max_views else seen[-1]
-            if method.strategy == "least-risk" and n + 1 < self._protocol.max_views:
-                following = self._nearest(seen, belief.next_rotation_deg())
+            # Views near the newest query leave the model for the earlier queries, too.
+            belief = update_poses(similar[0], measured_deg[0], model)
+            for i in range(1, n + 1):
+                belief = update_poses(similar[i], measured_deg[i], belief)
+            following = self._next_pose(method, draws, seen, belief) if n + 1 < last else seen[-1]
             runs.step_ns[*at, n] = self._now_ns() - start_ns
             objects, log_probability, pose_deg = belief.ranking()
             self._record(objects, pose_deg, seen, runs, (*at, n))
             leading = np.exp(log_probability[:2])
             runs.score[*at, n] = leading[0]
-            runs.margin[*at, n] = leading[0] - (leading[1] if len(leading) > 1 else 0.0)
-            is_certain = leading[0] >= UNFITTED_MIN_CONFIDENCE
-            runs.outcome[*at, n] = OUTCOMES.index(Outcome.FOUND if is_certain else Outcome.CONTINUE)
-            runs.travelled_deg[*at, n] = travelled_deg
-            travelled_deg += abs(float(wrap180(self._azimuth_deg[following] - self._azimuth_deg[seen[-1]])))
+            runs.margin[*at, n] = leading[0] - leading[1:].sum()
+            runs.outcome[*at, n] = OUTCOMES.index(Outcome.FOUND if leading[0] >= CONFIDENT else Outcome.CONTINUE)
             seen.append(following)
+
+    def _next_pose(self, method: Method, draws: _Draws, seen: list[int], belief: PoseBelief) -> int:
+        if method.strategy == "least-risk":
+            return self._nearest(seen, belief.next_view().rotation_deg)
+        return int(draws.order[len(seen)])
 
     def _run_dense(self, method: Method, draws: _Draws, runs: Runs, at: tuple[int, int, int]) -> None:
         assert self._rule is not None
         if self._index is None or self._index.omega != method.omega:
             self._index = DenseIndex(self._views.select(self._enrolled), omega=method.omega)
-        seen = [int(draws.order[0])]
-        travelled_deg = 0.0
-        last = min(self._protocol.max_views, method.views or self._protocol.max_views)
+        last = self._last(method)
         session = DenseSession(self._index, self._rule, max_views=last)
         ended = False
-        for n in range(last):
+        for n, seen, keep, measured in self._queries_of(draws, last, runs, at):
             # Views near the newest query leave the model for the earlier queries, too.
-            gone = self._rows[~self._keep(np.array(seen)) & self._enrolled[self._rows]]
-            measured_deg = (self._azimuth_deg[seen] + draws.error_deg[: n + 1]).tolist()
+            gone = self._rows[~keep & self._enrolled[self._rows]]
+            measured_deg = measured.tolist()
             if len(gone):
                 fewer = self._index.without(np.cumsum(self._enrolled)[gone] - 1)
                 session = DenseSession(fewer, self._rule, max_views=last)
@@ -341,8 +347,6 @@ class _Trials:
                 ended = True
                 end, runs.compared[*at, n] = self._end(session, seen, measured_deg)
                 runs.outcome[*at, n] = OUTCOMES.index(end)
-            runs.travelled_deg[*at, n] = travelled_deg
-            travelled_deg += abs(float(wrap180(self._azimuth_deg[following] - self._azimuth_deg[seen[-1]])))
             seen.append(following)
 
     def _end(self, session: DenseSession, seen: list[int], measured_deg: list[float]) -> tuple[Outcome, int]:
@@ -414,11 +418,14 @@ class _Trials:
             )
         return keep
 
-    def _model(self, keep: NDArray[np.bool_]) -> _Model:
+    def _model(self, keep: NDArray[np.bool_], models: dict[bytes, _Model]) -> _Model:
         """Return the enrolled views; of the searched object, only those that stay."""
-        mask = self._enrolled.copy()
-        mask[self._rows] = keep
-        return _Model(self._views.select(mask), mask, np.flatnonzero(~mask))
+        key = keep.tobytes()
+        if key not in models:
+            mask = self._enrolled.copy()
+            mask[self._rows] = keep
+            models[key] = _Model(self._views.select(mask), mask, np.flatnonzero(~mask))
+        return models[key]
 
     def _next(self, method: Method, draws: _Draws, seen: list[int], ranking: Ranking) -> int:
         """Return the next query: a photograph that was not a query yet."""
