@@ -64,6 +64,7 @@ class RotationReason(StrEnum):
     SEVERAL_POSES = "several-poses"
     EVEN_STEPS = "even-steps"
     RANDOM = "random"
+    LEAST_RISK = "least-risk"
     CUSTOM = "custom"
 
 
@@ -209,7 +210,7 @@ class Candidate:
     name: str
     """Name of the enrolled object."""
     score: float
-    """Score per view: the Hough score, or the support in the dense search."""
+    """Score per view: the Hough score, or the support in the dense search; with ``hmm`` the probability."""
     pose_deg: float
     """Azimuth of the camera around this object at the last view, with the 0° of the object's enrollment."""
     probability: float | None = None

@@ -78,6 +78,8 @@ def _rotation_words(decided: Decided) -> str:
             return "the views are taken in even steps"
         case RotationReason.RANDOM:
             return "the rotation is random"
+        case RotationReason.LEAST_RISK:
+            return "the expected risk of a wrong object is least there, or hardly more, and the side is new"
         case _:
             return decided.note
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 import hbr
 from hbr.dense.arc import ArcSession, fit_arc_confidence
+from hbr.paper.hmm import PoseModel
 from rig.bench import Bench
 from rig.catalog import Catalog, derived, sessions
 from rig.catalog.copying import Attempts, update_copy
@@ -24,9 +25,9 @@ from rig.config import RigConfig
 from rig.core.errors import CatalogError, CatalogUnavailable, RigError, UsageError
 from rig.core.next_steps import Do
 from rig.events.events import Note, NoteCode
-from rig.search.session import SHOWN, DenseSearch, EnrolledViews, HoughSearch, Search
+from rig.search.session import SHOWN, DenseSearch, EnrolledViews, HoughSearch, PoseSearch, Search
 from rig.search.stopping_rules import FILE, stopping_rule_of
-from rig.search.strategies import AnyStrategy, descriptor_for, is_in_motion, strategy_for
+from rig.search.strategies import AnyStrategy, descriptor_for, has_poses, is_in_motion, strategy_for
 from rig.search.strategies import strategy as strategy_named
 from rig.views.description import BENCH_DESCRIPTOR
 from rig.views.empty_table import empty_table_status
@@ -89,6 +90,7 @@ def model_of(views: hbr.Views, *, rule: hbr.StoppingRule | None = None) -> Model
 
 
 _tree = lru_cache(maxsize=4)(partial(hbr.ViewIndex, method="tree"))  # built once for each model
+_poses = lru_cache(maxsize=4)(PoseModel)
 _arc_confidence = lru_cache(maxsize=4)(fit_arc_confidence)  # fitted once for each model
 
 
@@ -114,6 +116,8 @@ def begin_search(
             "strategy.",
         )
     if isinstance(model.index, hbr.ViewIndex):
+        if has_poses(chosen):
+            return PoseSearch(_poses(model.views), config, chosen, seed=seed, top=top)
         index = _tree(model.views) if config.identify.index == "tree" else model.index
         return HoughSearch(index, config, chosen, seed=seed, top=top)
     assert model.rule is not None

@@ -25,12 +25,14 @@ from hbr.dense.filter import pose
 from hbr.dense.local_difference import LocalView, ViewDifference
 from hbr.dense.session import UNKNOWN_BELOW, Asking, LeaderComparison, Queries, Verification
 from hbr.model.symmetry import symmetry
+from hbr.paper.hmm import CONFIDENT, PoseBelief, PoseModel, update_poses
 from rig.config import RigConfig
 from rig.events.compared import Compared, ComparedView, Verified
 from rig.events.events import Candidate, Decided, FrameUsed, Identified, Ranked, RotationReason
 from rig.search.strategies import (
     DenseSearchState,
     Finish,
+    PoseSearchState,
     Rotate,
     SearchState,
     Strategy,
@@ -172,7 +174,7 @@ class Search(ABC):
     def _rank(self, view: DescribedView) -> Ranked: ...
 
     @abstractmethod
-    def _state(self, table_deg: float) -> SearchState | DenseSearchState: ...
+    def _state(self, table_deg: float) -> SearchState | PoseSearchState | DenseSearchState: ...
 
     def decided(self, number: int, target_deg: float) -> Decided:
         """Return the event of the last decision, a rotation of the table to ``target_deg``."""
@@ -233,6 +235,20 @@ def _no_step() -> Asking[None]:
     yield from ()
 
 
+def _with_symmetry(answer: Identified, views: hbr.Views, object_index: int) -> Identified:
+    """Return an answer with all rotations that look the same, by the symmetry that the enrollment measured."""
+    own = symmetry(views, object_index)
+    period_deg = own.period_deg if own else None
+    poses = round(360 / period_deg) if period_deg else 1 if period_deg is None else 0
+    yaw_deg = answer.yaw_set_deg[0]
+    return replace(
+        answer,
+        yaw_deg=yaw_deg if poses == 1 else None,
+        yaw_set_deg=tuple(wrap360(yaw_deg + k * 360 / poses) for k in range(poses)),
+        period_deg=period_deg,
+    )
+
+
 class HoughSearch(Search):
     """The paper's search: views vote by lists of the most similar enrolled views (`hbr.retrieve`)."""
 
@@ -289,20 +305,60 @@ class HoughSearch(Search):
             # Objects that share the best score; at least the second one, which is as likely by the margin.
             outcome, scores = hbr.Outcome.AMBIGUOUS, self._ranking.scores
             possible = self._ranking.names[: max(2, int((scores >= scores[0]).sum()))]
-        own = symmetry(self._index.views, int(self._ranking.object_index[0]))
-        period_deg = own.period_deg if own else None
-        poses = round(360 / period_deg) if period_deg else 1 if period_deg is None else 0
-        yaw_deg = answer.yaw_set_deg[0]
         return replace(
-            answer,
+            _with_symmetry(answer, self._index.views, int(self._ranking.object_index[0])),
             name=None if outcome is hbr.Outcome.UNKNOWN else answer.name,
-            yaw_deg=yaw_deg if poses == 1 else None,
-            yaw_set_deg=tuple(wrap360(yaw_deg + k * 360 / poses) for k in range(poses)),
-            period_deg=period_deg,
             outcome=outcome,
             possible=possible,
             min_score=self._min_score,
             min_margin=self._config.identify.margin,
+        )
+
+
+class PoseSearch(Search):
+    """The search of the paper's successor: a hidden Markov model over the poses of all objects (`hbr.paper.hmm`).
+
+    The probabilities are shares among the enrolled objects, so no object is unknown: an object that is not enrolled is
+    found as the most similar one, or is ambiguous.
+    """
+
+    _belief: PoseBelief
+
+    def __init__(self, model: PoseModel, config: RigConfig, strategy: Strategy[Any], *, seed: int, top: int) -> None:
+        super().__init__(model.views, config, strategy, seed=seed, top=top)
+        self._so_far: PoseModel | PoseBelief = model
+        self._compared = model.compared
+
+    def _rank(self, view: DescribedView) -> Ranked:
+        similar = self._compared.similarity(view.levels[self.descriptor][None])[0]
+        self._so_far = self._belief = update_poses(similar, self._orientations[-1], self._so_far)
+        self._objects, log_probability, poses_deg = self._belief.ranking()
+        self._probability = probability = np.exp(log_probability)
+        ranked = zip(self._objects.tolist(), probability.tolist(), poses_deg.tolist(), strict=True)
+        candidates = tuple(Candidate(self.names[j], p, pose_deg, p) for j, p, pose_deg in ranked)
+        margin = float(probability[0] - probability[1:2].sum())
+        return Ranked(len(self._orientations) - 1, candidates[: self._top], margin)
+
+    def _state(self, table_deg: float) -> PoseSearchState:
+        return PoseSearchState(
+            belief=self._belief,
+            probability=float(self._probability[0]),
+            rotations_deg=reachable_rotations(self._config, table_deg)[0],
+            table_deg=table_deg,
+            config=self._config.identify,
+            rng=self._rng,
+        )
+
+    def answer(self, *, travelled_deg: float = 0.0, seconds: float = 0.0) -> Identified:
+        answer = super().answer(travelled_deg=travelled_deg, seconds=seconds)
+        found = bool(self._probability[0] >= CONFIDENT)
+        possible = 1 + int((np.cumsum(self._probability) < CONFIDENT).sum())
+        return replace(
+            _with_symmetry(answer, self._belief.model.views, int(self._objects[0])),
+            outcome=hbr.Outcome.FOUND if found else hbr.Outcome.AMBIGUOUS,
+            possible=tuple(self.names[j] for j in self._objects[:possible].tolist()),
+            confidence=float(self._probability[0]) if found else None,
+            min_confidence=CONFIDENT,
         )
 
 

@@ -1,8 +1,8 @@
 """Strategies: after each view, rotate to the next view or finish.
 
-`identify` asks one strategy after every view. Six come with the rig; others are passed as an object. The attribute
-``descriptor`` of a strategy selects its search: without it, the paper's (`SearchState`); with the bench's own
-descriptor, the dense search (`DenseSearchState`).
+`identify` asks one strategy after every view. Seven come with the rig; others are passed as an object. Its attributes
+select its search: without any, the paper's (`SearchState`); with ``poses``, the hidden Markov model over poses
+(`PoseSearchState`); with the bench's own ``descriptor``, the dense search (`DenseSearchState`).
 
 Decision: docs/decisions/0017.
 """
@@ -10,7 +10,7 @@ Decision: docs/decisions/0017.
 from collections.abc import Callable
 from dataclasses import dataclass
 from difflib import get_close_matches
-from typing import ClassVar, Final, Protocol, TypeVar
+from typing import ClassVar, Final, Generic, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,7 @@ import hbr
 from hbr import Outcome, StopReason
 from hbr.core.angles import wrap180
 from hbr.dense.arc import ARC_DEG, STEP_DEG
+from hbr.paper.hmm import CONFIDENT, PoseBelief
 from rig.config import IdentifyConfig, RigConfig
 from rig.core.errors import UsageError
 from rig.events.events import RotationReason, Weighed
@@ -82,6 +83,30 @@ class SearchState(_AnyState):
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class PoseSearchState(_AnyState):
+    """The state of a search by the hidden Markov model after a view; also ``table_deg``, ``config`` and ``rng``.
+
+    Attributes
+    ----------
+    belief : hbr.paper.hmm.PoseBelief
+        The probabilities of all poses, with its method ``next_view``.
+    probability : float
+        That of the leading candidate.
+    rotations_deg : float64 array (a,)
+        Rotations of the camera around the object that the cable allows, every 5°.
+    """
+
+    belief: PoseBelief
+    probability: float
+    rotations_deg: NDArray[np.float64]
+
+    @property
+    def views(self) -> int:
+        """The number of views so far."""
+        return len(self.belief.orientation_deg)
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class DenseSearchState(_AnyState):
     """The state of the dense search after a view; also ``table_deg``, ``config`` and ``rng``.
 
@@ -136,7 +161,8 @@ class Strategy(Protocol[State]):
     """Decides after each view.
 
     A strategy of the dense search also has the attribute ``descriptor``: that of its views, ``edges+colours``. With the
-    attribute ``in_motion`` it chooses arcs, on which every frame is a view.
+    attribute ``in_motion`` it chooses arcs, on which every frame is a view. A strategy of the hidden Markov model has
+    the attribute ``poses``, which is true.
     """
 
     @property
@@ -149,7 +175,7 @@ class Strategy(Protocol[State]):
         ...
 
 
-AnyStrategy = Strategy[SearchState] | Strategy[DenseSearchState]
+AnyStrategy = Strategy[SearchState] | Strategy[PoseSearchState] | Strategy[DenseSearchState]
 
 
 def descriptor_for(strategy: AnyStrategy) -> str:
@@ -160,6 +186,11 @@ def descriptor_for(strategy: AnyStrategy) -> str:
 def is_in_motion(strategy: AnyStrategy) -> bool:
     """Return whether a strategy chooses arcs, on which every frame is a view."""
     return bool(getattr(strategy, "in_motion", False))
+
+
+def has_poses(strategy: AnyStrategy) -> bool:
+    """Return whether a strategy searches by the hidden Markov model over poses."""
+    return bool(getattr(strategy, "poses", False))
 
 
 def strategy_for(descriptor: str) -> AnyStrategy:
@@ -216,20 +247,31 @@ def end_by_margin(state: SearchState) -> Finish | None:
     return end_by_views(state)
 
 
-def end_by_views(state: SearchState) -> Finish | None:
+def end_by_views(state: SearchState | PoseSearchState) -> Finish | None:
     """Return the end if all allowed views were taken, or None."""
     return Finish(StopReason.MAX_VIEWS) if state.views >= state.config.max_views else None
 
 
+def end_by_probability(state: PoseSearchState) -> Finish | None:
+    """Return the end if one object is probable enough, if all allowed views were taken, or without a rotation."""
+    if state.probability >= CONFIDENT:
+        return Finish(StopReason.CONFIDENT)
+    return end_by_views(state) or (None if len(state.rotations_deg) else Finish(StopReason.NO_ROTATION_LEFT))
+
+
+PaperState = TypeVar("PaperState", SearchState, PoseSearchState)
+
+
 @dataclass(frozen=True)
-class PaperStrategy:
-    """A strategy of the paper's search: the rule that ends it, and the choice of the next rotation."""
+class PaperStrategy(Generic[PaperState]):
+    """A strategy of the paper or its successor: the rule that ends the search, and the choice of the next rotation."""
 
     name: str
-    end: Callable[[SearchState], Finish | None]
-    rotate: Callable[[SearchState], Rotate]
+    end: Callable[[PaperState], Finish | None]
+    rotate: Callable[[PaperState], Rotate]
+    poses: bool = False
 
-    def next(self, state: SearchState) -> Rotate | Finish:
+    def next(self, state: PaperState) -> Rotate | Finish:
         return self.end(state) or self.rotate(state)
 
 
@@ -262,6 +304,11 @@ def to_random_azimuth(state: SearchState) -> Rotate:
         if np.all(np.abs(wrap180(seen_deg[-1] + rotation_deg - seen_deg)) > _REVISIT_DEG):
             break
     return Rotate(rotation_deg, RotationReason.RANDOM)
+
+
+def to_least_risk(state: PoseSearchState) -> Rotate:
+    """Rotate to the view with the least risk of misclassification (`hbr.paper.hmm`); its time does not count."""
+    return Rotate(state.belief.next_view(state.rotations_deg).rotation_deg, RotationReason.LEAST_RISK)
 
 
 @dataclass(frozen=True)
@@ -307,6 +354,7 @@ _OWN: Final[tuple[AnyStrategy, ...]] = (
     PaperStrategy("hbr", end_by_views, to_random_azimuth),
     PaperStrategy("sweep", end_by_margin, by_even_steps),
     PaperStrategy("random", end_by_margin, to_random_azimuth),
+    PaperStrategy("hmm", end_by_probability, to_least_risk, poses=True),
 )
 BUILT_IN: Final = {strategy.name: strategy for strategy in _OWN}
 """The rig's own strategies. ``hbr`` takes all allowed views at random, as the paper measures HBR."""

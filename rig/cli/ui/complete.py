@@ -56,5 +56,5 @@ def config_keys(incomplete: str) -> list[str]:
 
 def strategy_names(incomplete: str) -> list[str]:
     """Return the names of the search strategies."""
-    names = ["dense", "arc", "ahbr", "hbr", "sweep", "random"]
+    names = ["dense", "arc", "ahbr", "hbr", "sweep", "random", "hmm"]
     return [name for name in names if name.startswith(incomplete)]
