@@ -87,7 +87,7 @@ class IdentifyConfig(Section):
 
     strategy: str | None = Field(
         None,
-        description="strategy that chooses the next view; none: dense; ahbr is the paper's",
+        description="strategy that chooses the next view; none: dense; ahbr is the paper's, hmm its successor",
     )
     mode: Mode = Field(
         "auto",
@@ -100,7 +100,7 @@ class IdentifyConfig(Section):
         ge=1,
         le=72,
         validate_default=True,
-        description="smallest number of views before a decision; dense uses its stopping rule instead",
+        description="smallest number of views before a decision; dense and hmm use their own rules instead",
     )
     first_step_deg: float = Field(
         90.0, ge=-180, le=180, description="rotation between the first two views; positive is counter-clockwise"
@@ -121,7 +121,7 @@ class IdentifyConfig(Section):
         0.02,
         ge=0,
         le=1,
-        description="stop when the best score is certain to lead by this margin for each view; not for dense",
+        description="stop when the best score is certain to lead by this margin for each view; not for dense and hmm",
     )
     repeatability: float = Field(
         0.97,

@@ -210,7 +210,7 @@ class Candidate:
     name: str
     """Name of the enrolled object."""
     score: float
-    """Score per view: the Hough score, or the support in the dense search; with ``hmm`` the probability."""
+    """Score per view: the Hough score, the support in the dense search, or with ``hmm`` the similarity."""
     pose_deg: float
     """Azimuth of the camera around this object at the last view, with the 0° of the object's enrollment."""
     probability: float | None = None
@@ -243,7 +243,7 @@ class Ranked:
     """Score per view of the first candidate minus the highest score of any other enrolled object. The paper's search
     uses an upper bound of that score. The margin can be negative."""
     decision: Annotated[StopDecision, _NullThreshold()] | None = None
-    """Decision of the stopping rule after this view; null in the paper's search."""
+    """Decision of the stopping rule after this view; null in the paper's search, and with ``hmm``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -312,7 +312,7 @@ class Decided:
     note: str = ""
     """Explanation by a custom strategy; otherwise empty."""
     weighed: Weighed | None = None
-    """All rotations that the dense search weighed; null in the paper's search."""
+    """All rotations that the dense search weighed; null in the paper's search, and with ``hmm``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -505,14 +505,14 @@ class Identified:
     note: str = ""
     """Explanation by a custom strategy; otherwise empty."""
     min_score: float | None = None
-    """Paper's search: score below which an object is unknown. Null in the dense search."""
+    """Paper's search, and ``hmm``: score below which an object is unknown. Null in the dense search."""
     min_margin: float | None = None
-    """Paper's search: margin at which the search ends. Null in the dense search."""
+    """Paper's search: margin at which the search ends. Null in the dense search, and with ``hmm``."""
     confidence: float | None = None
-    """Dense search: probability of the object among the enrolled objects. Null if the object is ambiguous or unknown,
-    and in the paper's search."""
+    """Dense search, and ``hmm``: probability of the object among the enrolled objects. Null if the object is ambiguous or
+    unknown, and in the paper's search."""
     min_confidence: float | None = None
-    """Dense search: confidence at which the search ends. Null in the paper's search."""
+    """Dense search, and ``hmm``: confidence at which the search ends. Null in the paper's search."""
     open_set_score: float | None = None
     """Dense search: how closely the views resemble an enrolled object. Null in the paper's search."""
     open_set_threshold: float | None = None

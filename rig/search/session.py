@@ -235,6 +235,12 @@ def _no_step() -> Asking[None]:
     yield from ()
 
 
+def _min_score(views: hbr.Views, config: RigConfig) -> float:
+    """Return the score per view below which an object is unknown in the paper's search and its successor's."""
+    given = config.identify.min_score
+    return hbr.open_set_threshold(views, repeatability=config.identify.repeatability) if given is None else given
+
+
 def _with_symmetry(answer: Identified, views: hbr.Views, object_index: int) -> Identified:
     """Return an answer with all rotations that look the same, by the symmetry that the enrollment measured."""
     own = symmetry(views, object_index)
@@ -256,10 +262,7 @@ class HoughSearch(Search):
         self, index: hbr.ViewIndex, config: RigConfig, strategy: Strategy[Any], *, seed: int, top: int
     ) -> None:
         super().__init__(index.views, config, strategy, seed=seed, top=top)
-        given = config.identify.min_score
-        self._min_score = (
-            hbr.open_set_threshold(index.views, repeatability=config.identify.repeatability) if given is None else given
-        )
+        self._min_score = _min_score(index.views, config)
         self._index = index
         self._descriptors: list[NDArray[np.uint8]] = []
 
@@ -318,8 +321,9 @@ class HoughSearch(Search):
 class PoseSearch(Search):
     """The search of the paper's successor: a hidden Markov model over the poses of all objects (`hbr.paper.hmm`).
 
-    The probabilities are shares among the enrolled objects, so no object is unknown: an object that is not enrolled is
-    found as the most similar one, or is ambiguous.
+    The probabilities are shares among the enrolled objects, because the model knows no other. Whether the object is
+    unknown is decided as in the paper's search, with the same threshold. The score is the one of that search without
+    orientations: the similarity to the most similar view of the object, averaged over the views so far.
     """
 
     _belief: PoseBelief
@@ -328,21 +332,32 @@ class PoseSearch(Search):
         super().__init__(model.views, config, strategy, seed=seed, top=top)
         self._so_far: PoseModel | PoseBelief = model
         self._compared = model.compared
+        self._rows, _ = model.views.by_object
+        self._begin = model.begin
+        self._with_views = model.views.object_index[self._rows[model.begin]]
+        self._min_score = _min_score(model.views, config)
+        self._reach = np.zeros(len(model.begin))
 
     def _rank(self, view: DescribedView) -> Ranked:
         similar = self._compared.similarity(view.levels[self.descriptor][None])[0]
         self._so_far = self._belief = update_poses(similar, self._orientations[-1], self._so_far)
         self._objects, log_probability, poses_deg = self._belief.ranking()
-        self._probability = probability = np.exp(log_probability)
-        ranked = zip(self._objects.tolist(), probability.tolist(), poses_deg.tolist(), strict=True)
-        candidates = tuple(Candidate(self.names[j], p, pose_deg, p) for j, p, pose_deg in ranked)
-        margin = float(probability[0] - probability[1:2].sum())
-        return Ranked(len(self._orientations) - 1, candidates[: self._top], margin)
+        self._probability = np.exp(log_probability)
+        # The scores, of the objects in the order of their probabilities.
+        self._reach += np.maximum.reduceat(similar[self._rows], self._begin)
+        views = len(self._orientations)
+        score = self._reach[np.searchsorted(self._with_views, self._objects)] / views
+        numbers = zip(*(each.tolist() for each in (self._objects, score, poses_deg, self._probability)), strict=True)
+        candidates = tuple(Candidate(self.names[j], *rest) for j, *rest in numbers)
+        margin = float(score[0] - score[1:].max(initial=0.0))
+        return Ranked(views - 1, candidates[: self._top], margin)
 
     def _state(self, table_deg: float) -> PoseSearchState:
         return PoseSearchState(
             belief=self._belief,
             probability=float(self._probability[0]),
+            score=self.ranked.candidates[0].score,
+            min_score=self._min_score,
             rotations_deg=reachable_rotations(self._config, table_deg)[0],
             table_deg=table_deg,
             config=self._config.identify,
@@ -351,14 +366,19 @@ class PoseSearch(Search):
 
     def answer(self, *, travelled_deg: float = 0.0, seconds: float = 0.0) -> Identified:
         answer = super().answer(travelled_deg=travelled_deg, seconds=seconds)
-        found = bool(self._probability[0] >= CONFIDENT)
-        possible = 1 + int((np.cumsum(self._probability) < CONFIDENT).sum())
+        outcome, possible = hbr.Outcome.FOUND, 1 + int((np.cumsum(self._probability) < CONFIDENT).sum())
+        if answer.score < self._min_score:
+            outcome, possible = hbr.Outcome.UNKNOWN, 0
+        elif possible > 1:
+            outcome = hbr.Outcome.AMBIGUOUS
         return replace(
             _with_symmetry(answer, self._belief.model.views, int(self._objects[0])),
-            outcome=hbr.Outcome.FOUND if found else hbr.Outcome.AMBIGUOUS,
+            name=None if outcome is hbr.Outcome.UNKNOWN else answer.name,
+            outcome=outcome,
             possible=tuple(self.names[j] for j in self._objects[:possible].tolist()),
-            confidence=float(self._probability[0]) if found else None,
+            confidence=float(self._probability[0]) if outcome is hbr.Outcome.FOUND else None,
             min_confidence=CONFIDENT,
+            min_score=self._min_score,
         )
 
 

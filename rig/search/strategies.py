@@ -90,14 +90,18 @@ class PoseSearchState(_AnyState):
     ----------
     belief : hbr.paper.hmm.PoseBelief
         The probabilities of all poses, with its method ``next_view``.
-    probability : float
-        That of the leading candidate.
+    probability, score : float
+        Those of the leading candidate; the score per view is the similarity to its most similar views.
+    min_score : float
+        Below this score per view the object is unknown.
     rotations_deg : float64 array (a,)
         Rotations of the camera around the object that the cable allows, every 5°.
     """
 
     belief: PoseBelief
     probability: float
+    score: float
+    min_score: float
     rotations_deg: NDArray[np.float64]
 
     @property
@@ -253,8 +257,8 @@ def end_by_views(state: SearchState | PoseSearchState) -> Finish | None:
 
 
 def end_by_probability(state: PoseSearchState) -> Finish | None:
-    """Return the end if one object is probable enough, if all allowed views were taken, or without a rotation."""
-    if state.probability >= CONFIDENT:
+    """Return the end if one object is probable and similar enough, after all allowed views, or without a rotation."""
+    if state.probability >= CONFIDENT and state.score >= state.min_score:
         return Finish(StopReason.CONFIDENT)
     return end_by_views(state) or (None if len(state.rotations_deg) else Finish(StopReason.NO_ROTATION_LEFT))
 

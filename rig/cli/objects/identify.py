@@ -24,7 +24,7 @@ def identify(
         str | None,
         typer.Option(
             metavar="NAME",
-            help="Search strategy: dense, arc (dense in motion), ahbr, hbr, sweep, random or that of a plug-in "
+            help="Search strategy: dense, arc (dense in motion), ahbr, hbr, sweep, random, hmm or that of a plug-in "
             "(default: identify.strategy).",
             autocompletion=strategy_names,
         ),
@@ -53,7 +53,7 @@ def identify(
     The exit code is 0 if it is found, 6 if the table is empty, 8 if it is unknown, 10 if it is ambiguous.
 
     Put the object on the table in any orientation. The default strategy, dense, compares views by edges and colours,
-    rotates to the next best view, and stops by the stopping rule (rig catalog fit). The paper's is ahbr, by CEDD.
+    rotates to the next best view, and stops by the stopping rule (rig catalog fit). The paper's is ahbr, by CEDD; its successor is hmm, a hidden Markov model.
 
     The catalog records each answer (rig results list).
 
