@@ -509,8 +509,8 @@ class Identified:
     min_margin: float | None = None
     """Paper's search: margin at which the search ends. Null in the dense search, and with ``hmm``."""
     confidence: float | None = None
-    """Dense search, and ``hmm``: probability of the object among the enrolled objects. Null if the object is ambiguous or
-    unknown, and in the paper's search."""
+    """Dense search, and ``hmm``: probability of the object among the enrolled objects. Null if the object is ambiguous
+    or unknown, and in the paper's search."""
     min_confidence: float | None = None
     """Dense search, and ``hmm``: confidence at which the search ends. Null in the paper's search."""
     open_set_score: float | None = None
