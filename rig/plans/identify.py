@@ -279,8 +279,8 @@ def identify(
     side on which the candidates look less similar (Eq. 5-7). The search ends when an enrolled object leads all others
     by ``identify.margin`` per view, or after ``identify.max_views``. The object is unknown if its score per view is
     below ``identify.min_score``; the default comes from the scores of the enrolled views among each other
-    (`hbr.open_set_threshold`). ``hmm``, the successor of the paper, ends when an object has a probability of 98 %, or after
-    ``identify.max_views``, and calls objects unknown like ``ahbr``. Closing the generator turns the torque off.
+    (`hbr.open_set_threshold`). ``hmm``, the successor of the paper, ends when an object has a probability of 98 %, or
+    after ``identify.max_views``, and calls objects unknown like ``ahbr``. Closing the generator turns the torque off.
 
     Parameters
     ----------

@@ -7,8 +7,9 @@ from hypothesis import strategies as st
 
 import hbr
 from hbr import ViewIndex, Views
-from hbr.evaluation.protocol import METHODS, Method, Protocol, Removal, Runs, choose_methods
+from hbr.evaluation.protocol import METHODS, OUTCOMES, Method, Protocol, Removal, Runs, choose_methods
 from hbr.evaluation.trials import _Trials, run_object
+from hbr.paper.hmm import CONFIDENT, PoseBelief, PoseModel, update_poses
 from tests.fuzzing import examples
 
 STEP = 15
@@ -84,6 +85,45 @@ def test_trial_equals_the_literal_protocol(name: str, removal: Removal) -> None:
                 wanted = draws.order[(n + 1) % protocol.max_views] * STEP
             left = [i for i in range(24) if i not in seen]
             following = min(left, key=lambda i: abs((i * STEP - wanted + 180) % 360 - 180)) if n < 4 else seen[0]
+            travelled += abs((following * STEP - angles[-1] + 180) % 360 - 180)
+            seen.append(following)
+
+
+@pytest.mark.parametrize("name", ["hmm", "hmm-random"])
+def test_trial_of_the_hidden_markov_model_equals_the_literal_protocol(name: str) -> None:
+    """Each expected number comes from `update_poses` and `next_view` on a model without the removed views."""
+    j, protocol = 2, replace(PROTOCOL, drift_deg=1.0)
+    own = VIEWS.of(j)
+    runs = run(j, (METHODS[name],), protocol)
+    trials = _Trials(j, QUERIES[own], VIEWS, protocol, None, lambda: 0)
+    for t in range(protocol.trials):
+        draws = trials.draw(t)
+        seen, travelled = [int(draws.order[0])], 0.0
+        for n in range(protocol.max_views):
+            angles = np.array(seen) * STEP
+            gone = [i for i in range(24) if min(abs((i * STEP - a + 180) % 360 - 180) for a in angles) < 20]
+            model = VIEWS.select(np.setdiff1d(np.arange(len(VIEWS)), own[gone]))
+            similar = hbr.tanimoto(QUERIES[own[seen]], model.descriptors)
+            belief: PoseModel | PoseBelief = PoseModel(model)
+            for query, measured in zip(similar, (angles + draws.error_deg[: n + 1]).tolist(), strict=True):
+                belief = update_poses(query, measured, belief)
+            assert isinstance(belief, PoseBelief)
+            objects, log_probability, pose_deg = belief.ranking()
+            probability = np.exp(log_probability)
+            place = objects.tolist().index(j)
+            assert runs.rank[0, 0, t, n] == place + 1
+            assert runs.pose_error_deg[0, 0, t, n] == abs((pose_deg[place] - angles[-1] + 180) % 360 - 180)
+            assert runs.score[0, 0, t, n] == pytest.approx(probability[0])
+            assert runs.margin[0, 0, t, n] == pytest.approx(probability[0] - probability[1])
+            assert runs.outcome[0, 0, t, n] == OUTCOMES.index(
+                hbr.Outcome.FOUND if probability[0] >= CONFIDENT else hbr.Outcome.CONTINUE
+            )
+            assert runs.travelled_deg[0, 0, t, n] == travelled
+            wanted = draws.order[(n + 1) % protocol.max_views] * STEP
+            if name == "hmm":
+                wanted = angles[-1] + belief.next_view().rotation_deg
+            left = [i for i in range(24) if i not in seen]
+            following = min(left, key=lambda i: abs((i * STEP - wanted + 180) % 360 - 180))
             travelled += abs((following * STEP - angles[-1] + 180) % 360 - 180)
             seen.append(following)
 

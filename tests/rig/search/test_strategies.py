@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 import hbr
 from hbr import StopReason
 from hbr.core.angles import wrap180
-from rig.config import IdentifyConfig, RigConfig
+from hbr.paper.hmm import CONFIDENT, PoseModel, update_poses
+from rig.config import IdentifyConfig, RigConfig, TableConfig
 from rig.core.errors import CatalogError, UsageError
 from rig.events.events import RotationReason
 from rig.search.model import begin_search, model_of
@@ -118,3 +119,65 @@ def test_empty_catalog_and_an_unknown_strategy_are_rejected():
     with pytest.raises(UsageError) as caught:
         strategy("swep")
     assert "sweep" in caught.value.next_step
+
+
+def test_hmm_ends_when_one_object_is_probable_enough():
+    known = model()
+    search = searching(known, "hmm", max_views=5)
+    ranked, step = search.add(seen(known.descriptors[0]), 0.0, table_deg=0.0)
+    assert step == Finish(StopReason.CONFIDENT)
+    answer = search.answer()
+    assert (answer.name, answer.outcome, answer.possible) == ("o0", hbr.Outcome.FOUND, ("o0",))
+    assert answer.confidence == ranked.candidates[0].probability
+    assert CONFIDENT <= answer.confidence <= 1
+    assert ranked.candidates[0].score == 1
+    assert sum(candidate.probability for candidate in ranked.candidates) == pytest.approx(1)
+
+
+def test_hmm_between_twins_takes_the_view_of_least_risk_and_ends_ambiguous():
+    one = model(objects=1)
+    names = ("one", "other", "far")
+    twins = [hbr.Views.of_object(name, one.descriptors, one.azimuth_deg) for name in names[:2]]
+    far = hbr.Views.of_object("far", 7 - one.descriptors, one.azimuth_deg)
+    known = hbr.Views.concatenate([*twins, far])
+    search = searching(known, "hmm", max_views=3)
+    belief = PoseModel(known)
+    for place in range(3):
+        levels, azimuth_deg = known.descriptors[3 * place], 90.0 * place
+        _, step = search.add(seen(levels), azimuth_deg, table_deg=-azimuth_deg)
+        belief = update_poses(hbr.tanimoto(levels[None], known.descriptors)[0], azimuth_deg, belief)
+        if place < 2:
+            assert step == Rotate(belief.next_view().rotation_deg, RotationReason.LEAST_RISK)
+    assert step == Finish(StopReason.MAX_VIEWS)
+    answer = search.answer()
+    assert (answer.outcome, answer.possible, answer.confidence) == (hbr.Outcome.AMBIGUOUS, ("one", "other"), None)
+    assert (answer.pose_deg, answer.yaw_deg) == (180, 0)
+
+
+def test_hmm_calls_an_object_unknown_by_the_threshold_of_the_paper():
+    known = model()
+    search = searching(known, "hmm", max_views=3, min_score=0.9)
+    other = np.random.default_rng(9).integers(0, 8, 144, np.uint8)
+    steps = [search.add(seen(other), 40.0 * n, table_deg=-40.0 * n)[1] for n in range(3)]
+    assert steps[-1] == Finish(StopReason.MAX_VIEWS)
+    assert all(isinstance(step, Rotate) for step in steps[:-1])  # a low score ends no search early
+    similar = hbr.tanimoto(other[None], known.descriptors)[0]
+    answer = search.answer()
+    assert answer.score == pytest.approx(
+        similar[known.object_index == known.object_names.index(answer.candidates[0].name)].max()
+    )
+    assert (answer.name, answer.outcome, answer.possible) == (None, hbr.Outcome.UNKNOWN, ())
+
+
+def test_hmm_rotates_only_as_far_as_the_cable_allows():
+    known = model(objects=1)
+    twin = hbr.Views.of_object("twin", known.descriptors, known.azimuth_deg)
+    config = RigConfig(table=TableConfig(mode="pan", limits_deg=(-10.0, 60.0)))
+    search = begin_search(model_of(hbr.Views.concatenate([known, twin])), config, "hmm")
+    _, step = search.add(seen(known.descriptors[0]), 0.0, table_deg=0.0)
+    target_deg = config.table.orientation_sign * step.rotation_deg
+    assert -10 <= target_deg <= 60
+    narrow = RigConfig(table=TableConfig(mode="pan", limits_deg=(-1.0, 1.0)))
+    search = begin_search(model_of(hbr.Views.concatenate([known, twin])), narrow, "hmm")
+    _, step = search.add(seen(known.descriptors[0]), 0.0, table_deg=0.0)
+    assert step == Finish(StopReason.NO_ROTATION_LEFT)
