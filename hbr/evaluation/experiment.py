@@ -12,7 +12,7 @@ from hbr.evaluation.protocol import Method, Protocol
 KindName = Literal["trials", "matrix", "unknown-objects", "bench-change"]
 Change = Literal["mild", "hard"]
 #: Increased if the same settings give other numbers.
-FORMAT: Final = 8
+FORMAT: Final = 9
 
 
 @dataclass(frozen=True)

@@ -163,7 +163,7 @@ def reason_words(answer: Identified) -> str:
             return "the views fit two enrolled objects up to noise, and do not tell which one it is"
         case StopReason.CUSTOM:
             return answer.note
-        case StopReason.MAX_VIEWS if answer.min_confidence is None or answer.min_score is not None:
+        case StopReason.MAX_VIEWS if answer.open_set_score is None:
             return f"the search took all {counted(answer.views, 'view')} that are allowed"
     share = answer.candidates[0].probability if answer.confidence is None else answer.confidence
     numbers = (share, answer.min_confidence, answer.open_set_score, answer.open_set_threshold)

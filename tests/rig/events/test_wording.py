@@ -60,7 +60,11 @@ def test_decisions_give_the_rotation_and_its_reason() -> None:
     tie = decided("left", 90.0, 0.5, 0.5, "a", "b")
     assert "equally similar on both sides: S_left 0.50 = S_right 0.50" in decision_words(tie)
     assert "there is no second candidate to compare with" in decision_words(decided("left", 90.0, 0.0, 0.0, "mug"))
-    for reason, words in ((RotationReason.RANDOM, "random"), (RotationReason.EVEN_STEPS, "even steps")):
+    for reason, words in (
+        (RotationReason.RANDOM, "random"),
+        (RotationReason.EVEN_STEPS, "even steps"),
+        (RotationReason.LEAST_RISK, "risk of a wrong object"),
+    ):
         assert words in decision_words(replace(first, reason=reason))
     custom = replace(first, reason=RotationReason.CUSTOM, note="the far side")
     assert decision_words(custom) == "left 90.0°: the far side."
@@ -138,6 +142,8 @@ def test_end_of_a_search_has_a_reason() -> None:
     known = identified("mug-white").answer
     assert isinstance(known, Identified)
     assert reason_words(replace(known, reason=StopReason.MAX_VIEWS)) == "the search took all 4 views that are allowed"
+    by_probability = replace(known, reason=StopReason.MAX_VIEWS, min_confidence=0.98)  # a hidden Markov model
+    assert reason_words(by_probability) == "the search took all 4 views that are allowed"
     assert reason_words(replace(known, reason=StopReason.NO_ROTATION_LEFT)) == "the cable allows no other view"
     assert reason_words(replace(known, reason=StopReason.CUSTOM, note="enough")) == "enough"
     dense = replace(known, confidence=0.6, min_confidence=0.95, open_set_score=1.0, open_set_threshold=None)
