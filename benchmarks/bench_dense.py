@@ -1,4 +1,4 @@
-"""Time of a step of the dense filter, compared with AHBR, and of every descriptor, compared with plain CEDD.
+"""Time of a step of each search, compared with AHBR, and of every descriptor, compared with plain CEDD.
 
 Times are processor times, minimum and median. Ratios are ratios of minima, because other programs disturb the caches.
 """
@@ -30,6 +30,7 @@ from hbr.core.arrays import ImageArray, IndexArray
 from hbr.dense.filter import Belief
 from hbr.descriptors import names
 from hbr.evaluation.perturb import plain_bench
+from hbr.paper.hmm import PoseBelief, PoseModel, update_poses
 
 #: The views of a search, as positions on an object's ring of 72.
 SEEN = (0, 18, 30, 45, 60, 66, 9, 51)
@@ -67,8 +68,12 @@ def bench_step(objects: int) -> None:
     index = ViewIndex(cedd)
     kinds = {kind: of_kind(cedd, kind) for kind in ("cedd", "edges+colours")}
     indices = {kind: DenseIndex(views) for kind, views in kinds.items()}
+    # On a bench, no two objects have the same azimuths, so that each has a transition of its own.
+    apart_deg = np.random.default_rng(4).uniform(0, 1, len(cedd))
+    poses = PoseModel(Views(cedd.descriptors, cedd.azimuth_deg + apart_deg, cedd.object_index, cedd.object_names))
     for n in (2, 8):
         ahbr: list[float] = []
+        hmm: list[float] = []
         dense: dict[str, list[float]] = {kind: [] for kind in kinds}
         for j in chosen.tolist():
             rows = cedd.of(j)[list(SEEN[:n])]
@@ -77,9 +82,11 @@ def bench_step(objects: int) -> None:
             retrieve(queries[:-1], angles[:-1], index)
             step = partial(lambda q, a: next_view(retrieve(q, a, index)), queries, angles)
             ahbr.append(timeit.timeit(step, timer=process_time, number=1) * 1e3)
+            hmm.append(_hmm_step_ms(poses, rows))
             for kind, views in kinds.items():
                 dense[kind].append(_step_ms(views, indices[kind], views.of(j)[list(SEEN[:n])]))
         row(len(cedd), f"AHBR, step {n} (= 1)", ahbr, ahbr)
+        row(len(cedd), f"hidden Markov model and view of least risk, step {n}", hmm, ahbr)
         for kind, took in dense.items():
             row(len(cedd), f"dense filter and next best view by {kind}, step {n}", took, ahbr)
 
@@ -93,6 +100,17 @@ def _step_ms(views: Views, index: DenseIndex, rows: IndexArray) -> float:
         lambda levels, deg, known: next_best_view(update_belief(levels, deg, known)), last, angle_deg, so_far
     )
     return timeit.timeit(step, timer=process_time, number=1) * 1e3
+
+
+def _hmm_step_ms(model: PoseModel, rows: IndexArray) -> float:
+    def after(row: int, so_far: PoseModel | PoseBelief) -> PoseBelief:
+        similar = model.compared.similarity(model.views.descriptors[row][None])[0]
+        return update_poses(similar, float(model.views.azimuth_deg[row]), so_far)
+
+    so_far: PoseModel | PoseBelief = model
+    for row in rows[:-1].tolist():
+        so_far = after(row, so_far)
+    return timeit.timeit(lambda: after(rows[-1], so_far).next_view(), timer=process_time, number=1) * 1e3
 
 
 def bench_describe(name: str, frame: ImageArray, empty: ImageArray | None) -> None:

@@ -117,6 +117,7 @@ QUESTIONS: tuple[tuple[str, int | None, str, int | None], ...] = (
     ("ahbr-90", 4, "sweep-45", 4),
     *(("dense", n, other, n) for n in (2, 3) for other in ("dense-90", "dense-45", "dense-coin", "dense-random")),
     *(("dense", n, other, n) for n in (2, 3) for other in ("dense-mutual", "dense-oracle")),
+    *(("hmm", n, other, n) for n in (2, 4, None) for other in ("hmm-random", "hbr", "ahbr")),
 )
 
 
