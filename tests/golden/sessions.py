@@ -64,9 +64,9 @@ def expected(name: str) -> Values:
 def played(name: str, folder: Path) -> Values:
     """Run a session in a folder; return what it prints: each command, its values, and its exit code."""
     session = sessions()[name]
-    if "after" in session:
-        shutil.copytree(_left(session["after"]), folder, dirs_exist_ok=True, ignore=shutil.ignore_patterns("stop"))
-    else:
+    for before in session.get("after", []):
+        shutil.copytree(left(before)[0], folder, dirs_exist_ok=True, ignore=shutil.ignore_patterns("stop"))
+    if "after" not in session:
         (folder / "rig.toml").write_text(CONFIG)
     for file, text in session.get("files", {}).items():
         (folder / file).write_text(text)
@@ -94,11 +94,10 @@ def _without_repetition(values: Values) -> Values:
 
 
 @cache
-def _left(name: str) -> Path:
-    """Return the folder that a session leaves."""
+def left(name: str) -> tuple[Path, Values]:
+    """Return the folder that a session leaves, and what the session prints."""
     folder = Path(tempfile.mkdtemp())
-    played(name, folder)
-    return folder
+    return folder, played(name, folder)
 
 
 @contextmanager

@@ -725,13 +725,15 @@ def without_constraints(root: Path) -> Path:
     "sealed", [pytest.param(False, marks=pytest.mark.nightly, id="edited"), pytest.param(True, id="sealed")]
 )
 @pytest.mark.parametrize("edit", VALUES)
-def test_invalid_values_end_in_an_error(without_constraints: Path, tmp_path: Path, edit: str, sealed: bool) -> None:
+def test_invalid_values_end_in_an_error(
+    without_constraints: Path, sample: Path, tmp_path: Path, edit: str, sealed: bool
+) -> None:
     """Values that no program stored end in an error, even if a sender gave them the right digests."""
     root, strange = without_constraints, ("properties", "derived", "log SET result", "log SET record")
     sql(root, "PRAGMA foreign_keys = OFF", "PRAGMA ignore_check_constraints = ON", f"UPDATE {edit}")
     if sealed and not edit.startswith("properties"):
         seal_as_the_sender(root)
-    restore_schema(root)
+    restore_schema(root, sample)
     if not edit.startswith(strange) and not sealed:
         with pytest.raises(RigError):
             reported(root)
@@ -746,12 +748,9 @@ def test_invalid_values_end_in_an_error(without_constraints: Path, tmp_path: Pat
             continue
 
 
-def restore_schema(root: Path) -> None:
+def restore_schema(root: Path, sample: Path) -> None:
     """Let the schema say again what this program makes."""
-    with (
-        Catalog.open(root.parent / "empty", clock=VirtualClock()),
-        closing(sqlite3.connect(root.parent / "empty" / "catalog.sqlite")) as connection,
-    ):
+    with closing(sqlite3.connect(sample / "catalog.sqlite")) as connection:
         expected = connection.execute("SELECT name, sql FROM sqlite_master WHERE type = 'table'").fetchall()
     with closing(sqlite3.connect(root / "catalog.sqlite", isolation_level=None)) as connection:
         connection.execute("PRAGMA writable_schema = ON")
