@@ -151,10 +151,11 @@ def test_risk_is_the_expected_probability_of_all_wrong_objects(counts, temperatu
 
 def test_of_hardly_different_risks_the_farthest_from_all_views_is_chosen():
     views = shelf(4, 4, 4)
-    sure = np.where(views.object_index == 0, 1.0, 0.0)
-    one = pose_belief([sure], [20.0], views)
+    sure = np.where(views.object_index == 0, 2.0, 0.0)
+    one = pose_belief([sure], [20.0], views, temperature=0.3)
     chosen = one.next_view()
-    assert chosen.risk.max() < 1 - CONFIDENT
+    assert 1e-6 < chosen.risk.max() < 1 - CONFIDENT
+    assert chosen.risk.min() < 0.9 * chosen.risk[chosen.rotations_deg == 180]
     assert chosen.rotation_deg == 180
     assert update_poses(sure, 200.0, one).next_view().rotation_deg == 90  # as far as -90: the one to the left
     third = update_poses(sure, 290.0, update_poses(sure, 200.0, one))
