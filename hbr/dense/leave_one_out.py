@@ -258,12 +258,14 @@ def shifted_searches(index: DenseIndex, *, views: int, searches: int) -> Shifted
         # a different strength in each round, and for neighbouring objects
         strength[n] = STRENGTHS[(n // len(places) + n) % len(STRENGTHS)]
         pairs = [index.views.levels(rows[[i, (i + 1) % len(rows)]]) for i in chosen]
-        queries = [_segmentations(index, pair, strength[n], rng) for pair in pairs]
+        queries = [_segmentations(index, pair, strength[n], rng, n) for pair in pairs]
         known[n], unknown[n], correct[n] = _numbers(index, place, queries, azimuth_deg[chosen], white)
     return ShiftedSearches(strength, known, unknown, correct)
 
 
-def _segmentations(index: DenseIndex, pair: LevelArray, strength: float, rng: np.random.Generator) -> LevelArray:
+def _segmentations(
+    index: DenseIndex, pair: LevelArray, strength: float, rng: np.random.Generator, bench: int
+) -> LevelArray:
     """Return a view between two enrolled ones, on a changed bench, by one to three segmentations, a row for each."""
     shifted = descriptor(index.views.descriptor).shifted
     more = int(rng.choice(len(_SEVERAL), p=_SEVERAL))
@@ -271,7 +273,7 @@ def _segmentations(index: DenseIndex, pair: LevelArray, strength: float, rng: np
     for one in [strength, *[max(_LEAST_WORSE, _WORSE * strength)] * more]:
         share = rng.uniform(0, 0.5)  # of the entries that come from the second view
         between = np.where(rng.random(pair.shape[1]) < share, pair[1], pair[0]).astype(np.uint8)
-        rows.append(shifted(between, Shift.drawn(rng, one)))
+        rows.append(shifted(between, Shift.drawn(rng, one, bench)))
     return np.stack(rows)
 
 

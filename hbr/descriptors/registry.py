@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -12,7 +11,7 @@ from hbr.core.arrays import FloatArray, ImageArray, IndexArray, LevelArray
 from hbr.descriptors.base import Comparison, CompiledDescriptor, Descriptor, Shift
 from hbr.descriptors.cedd import Cedd, RotatedCedd
 from hbr.descriptors.edges_and_colours import Colours, Edges
-from hbr.descriptors.embedding import MODEL_NAME, PREFIX, Embedding
+from hbr.descriptors.network import Network
 from hbr.kernels.calls import Measure
 from hbr.segmentation import Background, Segmentation, segment
 
@@ -33,6 +32,10 @@ class Joined(CompiledDescriptor):
     @property
     def length(self) -> int:
         return sum(part.length for part in self.parts)
+
+    @property
+    def can_describe(self) -> bool:
+        return all(part.can_describe for part in self.parts)
 
     def describe(self, view: ImageArray | Segmentation, /) -> LevelArray:
         found = view if isinstance(view, Segmentation) else segment(view)
@@ -136,6 +139,7 @@ def _slices(lengths: list[int]) -> list[slice]:
 _CEDD: Final = Cedd()
 _EDGES: Final = Edges()
 _COLOURS: Final = Colours()
+_NETWORK: Final = Network()
 _KNOWN: Final[dict[str, Descriptor]] = {
     known.name: known
     for known in (
@@ -144,14 +148,15 @@ _KNOWN: Final[dict[str, Descriptor]] = {
         RotatedCedd(),
         _COLOURS,
         _EDGES,
+        _NETWORK,
         Joined("cedd+colours", 1, (_CEDD, _COLOURS), (0.5, 0.5)),
         Joined("edges+colours", 1, (_EDGES, _COLOURS), (0.6, 0.4)),
+        Joined("edges+colours+network", 1, (_EDGES, _COLOURS, _NETWORK), (0.09, 0.06, 0.85)),
     )
 }
 
 #: Weights such as 0.1 do not add up to exactly 1.
 _ROUNDING: Final = 1e-9
-_MODELS: Final[dict[str, Embedding]] = {}
 
 
 def descriptor(name: str) -> Descriptor:
@@ -162,16 +167,13 @@ def descriptor(name: str) -> Descriptor:
     Raises
     ------
     ValueError
-        The name is unknown (the message lists the known ones), it names a model that is not loaded, or the weights do
-        not add up to 1.
+        The name is unknown (the message lists the known ones), or the weights do not add up to 1.
     """
     if "=" in name:
         return _with_weights(name)
-    known = _KNOWN.get(name) or _MODELS.get(name)
-    if known is None and name.startswith(PREFIX):
-        raise ValueError(f"the model of descriptor {name!r} is not loaded; load its file first")
+    known = _KNOWN.get(name)
     if known is None:
-        raise ValueError(f"descriptor {name!r} is unknown; use one of {', '.join(names())}, or {PREFIX}FILE")
+        raise ValueError(f"descriptor {name!r} is unknown; use one of {', '.join(names())}")
     return known
 
 
@@ -195,41 +197,14 @@ def _with_weights(name: str) -> Descriptor:
 def register(added: Descriptor) -> None:
     """Make a descriptor known by its name in this process.
 
-    Raises `ValueError`: the name belongs to another descriptor, or to networks.
+    Raises `ValueError`: the name belongs to another descriptor.
     """
-    if added.name.startswith(PREFIX) or _KNOWN.setdefault(added.name, added) != added:
+    if _KNOWN.setdefault(added.name, added) != added:
         raise ValueError(f"the name {added.name!r} is taken; choose another one")
 
 
-def load_descriptor(given: str) -> Descriptor:
-    """Return the descriptor that the user names: ``onnx:FILE`` loads a model, other names are those of `descriptor`.
-
-    Raises `ValueError`: the name is unknown, or the model file cannot be used.
-    """
-    if given.startswith(PREFIX) and not MODEL_NAME.fullmatch(given):
-        return load_model(Path(given.removeprefix(PREFIX)))
-    return descriptor(given)
-
-
-def load_model(path: Path) -> Embedding:
-    """Load a model file; `descriptor` knows it by its digest.
-
-    Raises
-    ------
-    ValueError
-        The model file cannot be used.
-    """
-    model = Embedding(path)
-    return _MODELS.setdefault(model.name, model)
-
-
-def loaded_models() -> tuple[Embedding, ...]:
-    """Return the models that were loaded."""
-    return tuple(_MODELS.values())
-
-
 def names() -> tuple[str, ...]:
-    """Return the names of all descriptors apart from networks, the paper's first."""
+    """Return the names of all descriptors, the paper's first."""
     return tuple(_KNOWN)
 
 

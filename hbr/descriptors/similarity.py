@@ -80,8 +80,11 @@ _CHUNK: Final = 256
 _AT_ONCE: Final = 65536
 
 
-class Cosine:
-    """A `Comparison` of rows of unit length, to 1e-6.
+class RootCosine:
+    """A `Comparison` of rows of unit length by the square root of the cosine, to 1e-6; 0 if that is negative.
+
+    The dense filter raises similarities to the fourth power. The root leaves the second one, so that also views count
+    whose cosine is small on another bench.
 
     A matrix product adds up float32 in one accumulator for each result. Levels take few values, so that equal products
     are rounded in the same direction many times: over 512 columns the error is up to 5e-6. Therefore the rows are
@@ -92,7 +95,7 @@ class Cosine:
         self._to_unit, self._blocks = to_unit, blocks
 
     @classmethod
-    def of(cls, rows: LevelArray, to_unit: Callable[[LevelArray], Rows]) -> "Cosine":
+    def of(cls, rows: LevelArray, to_unit: Callable[[LevelArray], Rows]) -> "RootCosine":
         """Prepare rows of levels, uint8 (n, length)."""
         return cls(to_unit, _blocks(rows, to_unit))
 
@@ -107,10 +110,10 @@ class Cosine:
             for query, rows in zip(own[1:], self._blocks[1:, part], strict=True):
                 total += query @ rows.T
             np.clip(total, 0, 1, out=cosine[:, part])
-        return cosine
+        return np.sqrt(cosine)
 
-    def only(self, rows: IndexArray, /) -> "Cosine":
-        return Cosine(self._to_unit, np.take(self._blocks, rows, axis=1))
+    def only(self, rows: IndexArray, /) -> "RootCosine":
+        return RootCosine(self._to_unit, np.take(self._blocks, rows, axis=1))
 
     def among(self, rows: IndexArray, /) -> FloatArray:
         part = np.take(self._blocks, rows, axis=1)
@@ -118,7 +121,7 @@ class Cosine:
         total = products[0]
         for product in products[1:]:  # in this order: a sum over an axis may add up in another one
             total += product
-        similar: FloatArray = np.clip(total, 0, 1, dtype=np.float64)
+        similar: FloatArray = np.sqrt(np.clip(total, 0, 1, dtype=np.float64))
         return similar
 
 

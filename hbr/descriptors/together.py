@@ -7,6 +7,7 @@ improves the segmentation of the first one. Further views hardly improve those t
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Final
 
@@ -153,6 +154,7 @@ class ViewsTogether:
             self._describe(len(self._frames) - 1)
         if not keep:
             self._frames[-1] = None
+            self.segmentations[-1] = tuple(replace(one, frame=None) for one in self.segmentations[-1])
         return self.segmentations[-1]
 
     def learn(self, image_bgr: ImageArray) -> None:

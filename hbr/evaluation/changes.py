@@ -96,12 +96,12 @@ def enroll_changed(item: PhotographedObject, experiment: Experiment) -> Enrolled
     """
     visit = _enrollment_visit()
     count = experiment.protocol.enrolled or 0
-    places = _places(item, np.arange(count) * 360 / count)
+    places = nearest_photographs(item, np.arange(count) * 360 / count)
     kind, picture = experiment.condition.descriptor, _has_picture(experiment)
     views = ViewsTogether(kind, empty_table=visit.empty() if picture else None, several=False)
     for place in places:
         azimuth_deg = item.photographs[place].azimuth_deg
-        views.learn(visit.photograph(*_cut_out(item, place), azimuth_deg).image)
+        views.learn(visit.photograph(*cut_out(item, place), azimuth_deg).image)
     views.revise()
     azimuths_deg = item.azimuth_deg[places]
     cuts = zip(views.segmentations, azimuths_deg.tolist(), strict=True)
@@ -147,9 +147,9 @@ def search_changed(
         search = _Search(index, rule, enrolled)
         without = None if left_out is None else _Search(left_out, rule, enrolled)
         same_bench: bool | None = None
-        for place in _places(item, first_deg + _STEP_DEG * np.arange(VIEWS, dtype=np.float64)):
+        for place in nearest_photographs(item, first_deg + _STEP_DEG * np.arange(VIEWS, dtype=np.float64)):
             azimuth_deg = item.photographs[place].azimuth_deg
-            frame = visit.photograph(*_cut_out(item, place), azimuth_deg).image
+            frame = visit.photograph(*cut_out(item, place), azimuth_deg).image
             if same_bench is None:
                 same_bench = before.shows_same_bench(frame)
             views.add(frame)
@@ -261,12 +261,12 @@ def _has_picture(experiment: Experiment) -> bool:
     return experiment.condition.reference != "none"
 
 
-def _cut_out(item: PhotographedObject, place: int) -> tuple[ImageArray, NDArray[np.bool_]]:
+def cut_out(item: PhotographedObject, place: int) -> tuple[ImageArray, NDArray[np.bool_]]:
     image = read_photograph(item.photographs[place].path)
     return image, without_specks(object_mask(image))
 
 
-def _places(item: PhotographedObject, azimuth_deg: NDArray[np.float64]) -> list[int]:
+def nearest_photographs(item: PhotographedObject, azimuth_deg: NDArray[np.float64]) -> list[int]:
     return [int(np.abs(wrap180(item.azimuth_deg - one)).argmin()) for one in azimuth_deg.tolist()]
 
 
@@ -275,7 +275,7 @@ def _bench_image(example: PhotographedObject | None) -> Background:
     visit = _enrollment_visit()
     if example is None:
         return Background(visit.empty())
-    return Background(visit.photograph(*_cut_out(example, 0), example.photographs[0].azimuth_deg).image)
+    return Background(visit.photograph(*cut_out(example, 0), example.photographs[0].azimuth_deg).image)
 
 
 def _enrollment_visit() -> Visit:

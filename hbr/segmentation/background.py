@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hbr.core.arrays import FloatArray, ImageArray, check_frame
+from hbr.core.arrays import FloatArray, ImageArray, LevelArray, check_frame
 from hbr.kernels import calls
 
 Mask = NDArray[np.bool_]
@@ -449,7 +449,7 @@ def _smooth(corners: list[tuple[slice, slice]], away: cv2.typing.MatLike, noise:
 
 
 class SegmentedFrame:
-    """A frame, uint8 (H, W, 3), and its small image.
+    """A frame, uint8 (H, W, 3), and its small image; ``described`` has its levels by descriptors of the whole frame.
 
     Raises `TypeError`, `ValueError`: the array is no such image.
     """
@@ -458,6 +458,7 @@ class SegmentedFrame:
         check_frame(image_bgr)
         self.image = image_bgr
         self.small = shrunk(image_bgr)
+        self.described: dict[str, LevelArray] = {}
         self._compared: tuple[Background, Difference] | None = None
 
     @classmethod

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from hbr.core.arrays import ImageArray
 from hbr.kernels import calls
-from hbr.segmentation.background import BoxMethod, Illumination, Issue
+from hbr.segmentation.background import BoxMethod, Illumination, Issue, SegmentedFrame
 
 #: Side of the square crop around an object.
 CROP_PX: Final = 160
@@ -46,6 +46,8 @@ class Segmentation:
         The illumination correction.
     silhouette : bool array (h, w) or None
         The object's pixels in the small image (`hbr.segmentation.background.shrunk`); None if they are not known.
+    frame : SegmentedFrame or None
+        The frame; None if it was dropped to save memory.
     """
 
     crop: ImageArray
@@ -57,6 +59,7 @@ class Segmentation:
     issues: tuple[Issue, ...] = ()
     correction: Illumination | None = field(default=None, repr=False)
     silhouette: NDArray[np.bool_] | None = field(default=None, repr=False)
+    frame: SegmentedFrame | None = field(default=None, repr=False)
 
     def evidence(self) -> dict[str, Any]:
         """Return method, box, gains, agreement and issues as JSON values, to be stored with the view."""
@@ -100,7 +103,7 @@ class Found:
     Its attributes are those of `Segmentation`.
     """
 
-    image: ImageArray
+    frame: SegmentedFrame
     silhouette: NDArray[np.bool_] | None
     correction: Illumination | None
     agreement: float | None
@@ -112,19 +115,19 @@ class Found:
         """The object's x, y, width and height in pixels of the frame; None if no object was found."""
         if self.silhouette is None:
             return None
-        height, width = self.image.shape[:2]
+        height, width = self.frame.image.shape[:2]
         return _box_of(self.silhouette, width, height)
 
     def cut_out(self) -> Segmentation:
         """Return the segmentation of the frame."""
-        height, width = self.image.shape[:2]
+        height, width = self.frame.image.shape[:2]
         box, found, correction = self.box, self.silhouette, self.correction
         if box is None:
             side = float(min(height, width))
             left, top = (width - side) / 2, (height - side) / 2
         else:
             left, top, side = _square_around(box)
-        crop = _square(self.image, left, top, side)
+        crop = _square(self.frame.image, left, top, side)
         if correction is not None:
             crop = _corrected(crop, correction, left, top, side, width, height)
         if found is not None:
@@ -133,7 +136,9 @@ class Found:
         else:
             mask = np.full((CROP_PX, CROP_PX), 255, np.uint8)
         gains = None if correction is None else correction.gains
-        return Segmentation(crop, mask, box, gains, self.agreement, self.method, self.issues, correction, found)
+        return Segmentation(
+            crop, mask, box, gains, self.agreement, self.method, self.issues, correction, found, self.frame
+        )
 
 
 def _square_around(box: Box) -> tuple[float, float, float]:

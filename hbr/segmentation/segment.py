@@ -120,7 +120,7 @@ def _found(frame: SegmentedFrame, background: Background | None, difference: Dif
     if found is None:
         method = BoxMethod.NONE
     agreement = None if difference is None else difference.agreement
-    return Found(frame.image, found, correction, agreement, method, tuple(issues))
+    return Found(frame, found, correction, agreement, method, tuple(issues))
 
 
 def hypotheses(
@@ -176,7 +176,7 @@ def hypotheses(
         if difference is not None:
             issues.insert(0, Issue(IssueCode.TABLE_DIFFERS, {"agreement": round(difference.agreement, 3)}))
         agreement = None if difference is None else difference.agreement
-        like = Found(frame.image, None, None, agreement, BoxMethod.NONE, tuple(issues))
+        like = Found(frame, None, None, agreement, BoxMethod.NONE, tuple(issues))
         share = shares(frame.small, rotated, learned=True).object
         levels = _LEVELS if most > 1 else (_ENROLLED_LEVEL,)
         found = [*_by_network(share, BoxMethod.ROTATION, like, levels=levels)]
@@ -270,7 +270,7 @@ def stored_segmentation(
     found = mask_from(evidence[MASK], frame.small.shape[:2]) if MASK in evidence else None
     issues = tuple(_issue(one) for one in evidence.get("issues", ()))
     agreement = None if difference is None else difference.agreement
-    return Found(frame.image, found, correction, agreement, BoxMethod(evidence["method"]), issues).cut_out()
+    return Found(frame, found, correction, agreement, BoxMethod(evidence["method"]), issues).cut_out()
 
 
 def mask_text(found: Mask) -> str:

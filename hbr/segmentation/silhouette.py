@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hbr.core.arrays import ImageArray
+from hbr.core.nets import Floats, SharedNet
 from hbr.segmentation.background import Difference, Mask
 
 Binary = NDArray[np.uint8]
@@ -212,10 +213,6 @@ EVENLY: Final = 1.0
 COLOURED: Final = 0.7  # smaller than `EVENLY`, because shadows change the brightness more than the colour
 #: Trust in a background that was learned from other views; 1 for an empty-table image.
 LEARNED: Final = 0.5  # less than an image that was taken for this purpose, more than none
-#: A network of OpenCV runs in one thread at a time, so there are as many as threads that needed one at the same time.
-_IDLE: Final[list[cv2.dnn.Net]] = []
-
-Floats = NDArray[np.float32]
 
 
 class Shares(NamedTuple):
@@ -247,7 +244,7 @@ def shares(small: ImageArray, difference: Difference | None = None, *, learned: 
         planes[0, 5] = np.clip(_sized(difference.evenly) * np.float32(1 / EVENLY), -1, 1)
         planes[0, 6] = np.clip(_sized(difference.coloured) * np.float32(1 / COLOURED), 0, 1)
         planes[0, 7] = LEARNED if learned else 1.0
-    logits = _logits(planes)
+    logits = _NET(planes)[0]
     found = [1 / (1 + cv2.exp(-plane)) for plane in logits]
     if (height, width) != (HEIGHT, WIDTH):
         found = [cv2.resize(share, (width, height), interpolation=cv2.INTER_LINEAR) for share in found]
@@ -267,18 +264,9 @@ def _places() -> Floats:
     return np.stack([x, y]).astype(np.float32)
 
 
-def _logits(planes: Floats) -> Floats:
-    """Return the network's answer to its input, float32 (2, HEIGHT, WIDTH)."""
-    try:
-        net = _IDLE.pop()
-    except IndexError:  # other threads use all others
-        net = cv2.dnn.readNetFromONNX(np.frombuffer(_weights(), np.uint8))
-    net.setInput(planes)
-    logits: Floats = np.array(net.forward(), np.float32)[0]
-    _IDLE.append(net)
-    return logits
-
-
 @cache
 def _weights() -> bytes:
     return files("hbr.segmentation").joinpath(WEIGHTS).read_bytes()
+
+
+_NET: Final = SharedNet(_weights)

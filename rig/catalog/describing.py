@@ -19,6 +19,7 @@ from sqlalchemy import delete, insert, select
 from sqlalchemy.orm import Session as Transaction
 
 from hbr.descriptors import Descriptor, descriptor, names
+from hbr.descriptors.network import PACKAGE
 from hbr.kernels.library import THREADS
 from rig.catalog.database import Database
 from rig.catalog.facts import Derived, Enrollment, seal_of
@@ -26,7 +27,7 @@ from rig.catalog.images import Images
 from rig.catalog.opening import open_database
 from rig.catalog.records import Region
 from rig.config import ViewConfig
-from rig.core.errors import CatalogError, RigError, UsageError
+from rig.core.errors import CatalogError, ExtraMissing, RigError, UsageError
 from rig.core.files import json_values
 from rig.core.next_steps import Do
 from rig.views.description import DESCRIPTORS, EnrollmentDescriber, check_evidence, within
@@ -77,13 +78,21 @@ class _Pixels(Protocol):
 
 
 def known_descriptor(name: str) -> Descriptor:
-    """Return the descriptor of this name. A `UsageError` lists the known ones."""
+    """Return the descriptor of this name.
+
+    Raises `UsageError`: there is none; it lists the known ones. `ExtraMissing`: its packages are not installed.
+    """
     try:
-        return descriptor(name)
+        kind = descriptor(name)
     except ValueError as error:
         raise UsageError(
-            f"There is no descriptor {name!r}.", next_step=f"Choose one of {', '.join(names())}."
+            f"There is no descriptor {name!r}.",
+            next_step=f"Choose one of {', '.join(names())}.",
+            evidence={"reason": str(error)},
         ) from error
+    if not kind.can_describe:
+        raise ExtraMissing.of("network", f"Descriptions by {name}", ImportError(name=PACKAGE))
+    return kind
 
 
 def describe_new(database: Database, enrollment: Enrollment, held: Mapping[str, NDArray[np.uint8]], name: str) -> str:

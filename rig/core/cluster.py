@@ -1,12 +1,11 @@
 """Applies a function to many items on a Dask cluster."""
 
 import pickle
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import lru_cache
 from hashlib import sha256
-from pathlib import Path
 from typing import Any, Final, TypeVar
 
 from rig.core.errors import ClusterFailed, ExtraMissing, UsageError
@@ -76,7 +75,6 @@ def map_on_cluster(work: Callable[[_Item], _T], items: Iterable[_Item], cluster:
         from distributed import Client, KilledWorker, as_completed
     except ImportError as error:
         raise ExtraMissing.of("cluster", "jobs on a cluster", error) from error
-    from hbr.descriptors import loaded_models
 
     with ExitStack() as ends:
         try:
@@ -92,14 +90,13 @@ def map_on_cluster(work: Callable[[_Item], _T], items: Iterable[_Item], cluster:
                 ),
                 evidence={"error": str(error)},
             ) from error
-        # The work is sent once, with the networks that its workers must load.
-        models = tuple(str(model.path) for model in loaded_models())
+        # The work is sent once.
         content = pickle.dumps(work)
         digest = sha256(content).hexdigest()
         # A task instead of data that is sent to workers: the scheduler repeats a task if its worker dies.
         shared = client.submit(bytes, content, key=f"rig-work-{digest}", pure=True)
         futures = {
-            client.submit(_call, shared, digest, models, item, pure=False, key=f"rig-{digest[:12]}-{number}"): item
+            client.submit(_call, shared, digest, item, pure=False, key=f"rig-{digest[:12]}-{number}"): item
             for number, item in enumerate(todo)
         }
         try:
@@ -130,8 +127,8 @@ def _local_cluster(count: int) -> Any:
     return running
 
 
-def _call(content: bytes, digest: str, models: Sequence[str], item: Any) -> Any:
-    return _loaded(_Content(content, digest), tuple(models))(item)
+def _call(content: bytes, digest: str, item: Any) -> Any:
+    return _loaded(_Content(content, digest))(item)
 
 
 @dataclass(frozen=True)
@@ -147,14 +144,10 @@ class _Content:
 
 
 @lru_cache(maxsize=2)
-def _loaded(content: _Content, models: tuple[str, ...]) -> Callable[[Any], Any]:
+def _loaded(content: _Content) -> Callable[[Any], Any]:
     """Return the function in this worker."""
     import cv2
 
-    from hbr.descriptors import load_model
-
-    for path in models:
-        load_model(Path(path))
     cv2.setNumThreads(1)
     found: Callable[[Any], Any] = pickle.loads(content.content)
     return found

@@ -2,13 +2,12 @@
 
 import os
 import signal
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from itertools import chain, islice
 from multiprocessing import get_context
-from pathlib import Path
 from typing import Any, Final, TypeVar
 
 from rig.core.cluster import Cluster, map_on_cluster
@@ -52,10 +51,7 @@ def map_in_processes(work: Callable[[_Item], _T], items: Iterable[_Item], jobs: 
     # and none may import from the working directory (PYTHONSAFEPATH)
     for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "PYTHONSAFEPATH"):
         os.environ.setdefault(variable, "1")
-    from hbr.descriptors import loaded_models
-
-    models = [model.path for model in loaded_models()]
-    pool = ProcessPoolExecutor(jobs, get_context("spawn"), _start_worker, (work, models))
+    pool = ProcessPoolExecutor(jobs, get_context("spawn"), _start_worker, (work,))
     futures: dict[Future[_T], _Item] = {}
     try:
         while True:
@@ -91,13 +87,9 @@ def _ignoring_interrupts() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _start_worker(work: Callable[[Any], object], models: Sequence[Path]) -> None:
+def _start_worker(work: Callable[[Any], object]) -> None:
     import cv2
 
-    from hbr.descriptors import load_model
-
-    for path in models:  # a new process knows their descriptors only by digests
-        load_model(path)
     global _work
     _work = work
     cv2.setNumThreads(1)

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 import hbr
 from hbr.core.arrays import MIN_SIDE_PX
-from hbr.descriptors import PREFIX, Descriptor, descriptor, loaded_models
+from hbr.descriptors import Descriptor, descriptor
 from rig.bench import Bench
 from rig.config import RigConfig
 from rig.config.values import validate
@@ -234,8 +234,7 @@ class SavedRun:
 def load_run(folder: Path) -> SavedRun:
     """Read a saved run; a last event that was cut off while it was written is left out.
 
-    Raises `UsageError`: the folder contains no run, a damaged run, or one of another version of the program; or the run
-    needs a model that is not loaded (`hbr.descriptors.load_model`).
+    Raises `UsageError`: the folder contains no run, a damaged run, or one of another version of the program.
     """
     try:
         about = _object(_bytes(folder, "run.json"), "run.json")
@@ -252,7 +251,7 @@ def load_run(folder: Path) -> SavedRun:
         if not isinstance(about["devices"], dict):
             raise TypeError("devices in run.json is not an object")
         # The model: enrolled views and stopping rule of the day.
-        kind = _descriptor(folder, about["descriptor"])
+        kind = _descriptor(about["descriptor"])
         config = validate(RigConfig, about["config"], where=str(folder / "run.json"))
         views = _views((_object(line) for line in _lines(_bytes(folder, "model.jsonl"))), kind.name)
         stored = read_stopping_rule(folder)
@@ -319,14 +318,8 @@ def _views(lines: Iterable[dict[str, Any]], kind: str) -> hbr.Views:
     return hbr.Views.concatenate(parts) if parts else hbr.Views.empty(kind)
 
 
-def _descriptor(folder: Path, used: dict[str, Any]) -> Descriptor:
-    """Return the descriptor of a run. A network is identified by its digest; the user gives the path of its file."""
+def _descriptor(used: dict[str, Any]) -> Descriptor:
     name, number = used["name"], used["version"]
-    if name.startswith(PREFIX) and name not in {model.name for model in loaded_models()}:
-        raise UsageError(
-            f"The run {folder} needs the model {name}.",
-            next_step=("Give the ONNX file with this SHA-256.", Do.RUN_AGAIN(model="FILE")),
-        )
     kind = descriptor(name)
     if number != kind.version:
         raise ValueError(f"it was described by {name} {number}, which this program does not have")

@@ -40,8 +40,7 @@ def test_new_descriptor_keeps_the_protocol(page):
 
 def test_name_of_another_descriptor_is_not_replaced(page):
     register(page["GREY"])
-    for name in ("cedd", "onnx:grey"):
-        with pytest.raises(ValueError, match="taken"):
-            register(page["GreyHistogram"](name=name))
+    with pytest.raises(ValueError, match="taken"):
+        register(page["GreyHistogram"](name="cedd"))
     assert names()[-1] == "grey"
     assert hbr.descriptor("cedd").length == 144

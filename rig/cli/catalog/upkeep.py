@@ -15,7 +15,7 @@ from rig.cli.catalog.catalog import app
 from rig.cli.ui.command import command
 from rig.cli.ui.exit_codes import EXIT_CATALOG
 from rig.cli.ui.jobs import interruptible, run_job, size_words
-from rig.cli.ui.options import ClusterOption, JobsOption, YesOption, descriptor_name, jobs_of
+from rig.cli.ui.options import ClusterOption, JobsOption, YesOption, jobs_of
 from rig.cli.ui.prompts import confirm
 from rig.cli.ui.settings import Settings
 from rig.core.clock import SystemClock
@@ -84,9 +84,10 @@ def redescribe(
     """
     from rig.catalog.derived import choose_region
     from rig.catalog.derived import redescribe as job
+    from rig.catalog.describing import known_descriptor
     from rig.catalog.exchange.tables import parse_region
 
-    name = descriptor_name(descriptor)
+    name = known_descriptor(descriptor).name
     try:
         part = None if region in (None, "whole") else parse_region(region)
     except ValueError as error:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rig.cli.ui.command import command
-from rig.cli.ui.options import ClusterOption, JobsOption, descriptor_name, jobs_of
+from rig.cli.ui.options import ClusterOption, JobsOption, jobs_of
 from rig.cli.ui.settings import Settings
 from rig.core.errors import UsageError
 
@@ -63,6 +63,7 @@ def evaluate(
 
     Example: rig eval paper --data coil-100 --noise mb
     """
+    from rig.catalog.describing import known_descriptor
     from rig.catalog.jobs import JobProgress
     from rig.cli.ui.present import ProgressBar, console
     from rig.evaluation.experiments import DEFAULT, load_experiment
@@ -79,7 +80,7 @@ def evaluate(
             objects=objects,
             noise=noise,
             methods=methods,
-            descriptor=None if descriptor is None else descriptor_name(descriptor),
+            descriptor=None if descriptor is None else known_descriptor(descriptor).name,
             orientation_errors=orientation_errors,
             seed=settings.seed,
         )

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 
 from rig.cli.ui.command import command
-from rig.cli.ui.options import ModelOption, load_model_file
 from rig.cli.ui.settings import Settings
 from rig.core.errors import ReplayMismatch, RunIncomplete
 from rig.core.phrases import counted
@@ -26,7 +25,6 @@ def replay(
     check: Annotated[
         bool, typer.Option("--check", help="Compute every decision again from the images; exit code 6 if one differs.")
     ] = False,
-    model: ModelOption = None,
 ) -> None:
     """Show a saved run again: each view, the candidates after it, and each decision.
 
@@ -34,7 +32,6 @@ def replay(
     """
     from rig.search.saved_run import load_run
 
-    load_model_file(model)
     saved = load_run(run)
     if check:
         _check(settings, saved)
@@ -65,7 +62,6 @@ def report(
     out: Annotated[
         Path | None, typer.Option(metavar="FILE", help="File to write (default: report.html in the run's folder).")
     ] = None,
-    model: ModelOption = None,
 ) -> None:
     """Write an HTML page about a saved run: the answer, the camera's path, the scores, the views and the decisions.
 
@@ -75,7 +71,6 @@ def report(
     from rig.report.report import run_report
     from rig.search.saved_run import load_run
 
-    load_model_file(model)
     page = run_report(load_run(run))
     path = out or run / "report.html"
     write_report(path, page)

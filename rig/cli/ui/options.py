@@ -63,13 +63,6 @@ ClusterOption = Annotated[
         help="Work on a Dask cluster: the address of its scheduler, or local, or local:WORKERS.",
     ),
 ]
-ModelOption = Annotated[
-    Path | None,
-    typer.Option(
-        metavar="FILE",
-        help="ONNX file of the run's descriptor, if it is a network. It must match the digest in the run.",
-    ),
-]
 
 
 def spread(function: Callable[..., Any]) -> list[inspect.Parameter]:
@@ -113,35 +106,3 @@ def jobs_of(jobs: int | None, cluster: str | None) -> "Jobs | None":
     if jobs is not None:
         raise UsageError("--jobs and --cluster are both given.", next_step="Give one of them; local:2 has 2 workers.")
     return Cluster(cluster)
-
-
-def descriptor_name(given: str) -> str:
-    """Return the name of the descriptor that the operator named; ``onnx:FILE`` loads the file.
-
-    Raises
-    ------
-    UsageError
-        There is no such descriptor, or the file is no model.
-    """
-    from hbr.descriptors import load_descriptor, names
-
-    try:
-        return load_descriptor(given).name
-    except ValueError as error:
-        raise UsageError(
-            f"The descriptor {given} cannot be used.",
-            next_step=f"Choose one of {', '.join(names())}, or onnx:FILE.",
-            evidence={"reason": str(error)},
-        ) from error
-
-
-def load_model_file(path: Path | None) -> None:
-    """Load the model that the operator gives for a saved run, if any: a saved run names a model by its digest only.
-
-    Raises
-    ------
-    UsageError
-        The file is no model.
-    """
-    if path is not None:
-        descriptor_name(f"onnx:{path}")
