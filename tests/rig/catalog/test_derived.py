@@ -12,13 +12,15 @@ from numpy.typing import NDArray
 from sqlalchemy import delete, insert, select, update
 
 import hbr
+from hbr.descriptors import network
 from rig.catalog import Catalog, Enrollment, derived, describing
 from rig.catalog.describing import SEGMENTATION
 from rig.catalog.facts import Derived, seal_of
 from rig.catalog.jobs import JobProgress, finished
 from rig.catalog.verify import CatalogProblem, verify
 from rig.config import ViewConfig
-from rig.core.errors import CatalogBusy, CatalogDamaged, CatalogError, UsageError
+from rig.core.errors import CatalogBusy, CatalogDamaged, CatalogError, ExtraMissing, UsageError
+from rig.core.next_steps import Do
 from rig.search.model import load_model
 from rig.views.description import (
     BENCH_DESCRIPTOR,
@@ -282,6 +284,25 @@ def test_an_object_whose_image_is_missing_is_named(catalog: Catalog) -> None:
     assert [name for name, _ in done.failed] == ["can"]
     with pytest.raises(UsageError, match="no descriptor 'edgy'"):
         load(catalog, "edgy")
+
+
+def test_a_catalog_with_learned_descriptions_is_searched_without_the_weights(
+    catalog: Catalog, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    learned = "edges+colours+network"
+    with monkeypatch.context() as patch:
+        patch.setattr(network, "weights_file", lambda: Path("weights"))
+        patch.setattr(network, "_NET", lambda planes: planes[:, :1, 105:119, 105:119].repeat(112, axis=1))
+        views, described = load(catalog, learned)
+    assert (len(views), described) == (len(NAMES) * VIEWS, len(NAMES))
+    monkeypatch.setattr(network, "weights_file", lambda: None)
+    model = load_model(catalog)
+    assert (model.descriptor, len(model.views)) == (BENCH_DESCRIPTOR, len(views))
+    with catalog.database.read() as transaction:
+        assert (learned, 1, len(views), True) in derived.counts(transaction)
+    with pytest.raises(ExtraMissing) as caught:
+        load(catalog, learned)
+    assert Do.INSTALL_EXTRA(extra="network") in caught.value.steps
 
 
 def test_describing_again_gives_the_same_levels(catalog: Catalog) -> None:
