@@ -2,10 +2,10 @@
 
     python -m benchmarks.fit_projection --data ../shared/data/coil-100
 
-Objects 1-50 of COIL-100 are seen from ten sides each: on drawn benches after mild and hard changes, with noise and
+Objects 1-50 of COIL-100 are seen from 20 sides each: on drawn benches after mild and hard changes, with noise and
 motion blur, 10° and 20° beside, and before black. Differences between these views of one object are what a search must
 ignore. The projection whitens them (linear discriminant analysis), and keeps the 256 directions in which the objects
-and their sides differ most. It takes three minutes on an idle core. The benches are others than those of `rig eval`.
+and their sides differ most. It takes five minutes on an idle core. The benches are others than those of `rig eval`.
 """
 
 import argparse
@@ -23,7 +23,7 @@ from hbr.evaluation.changes import cut_out, nearest_photographs
 from hbr.evaluation.photographs import PhotographedObject, load_coil
 
 _BENCHES: Final = [DrawnBench.drawn(np.random.default_rng(5000 + k)) for k in range(16)]
-_AZIMUTHS: Final = 10
+_AZIMUTHS: Final = 20
 _NOISE, _BLUR = Noise.parse("gn:0.012"), Noise.parse("mb:15")
 #: Pairs of views whose difference is to be ignored, by kind, and how much each kind counts.
 _KINDS: Final = (
