@@ -61,7 +61,7 @@ class Block(NamedTuple):
 
 
 #: The blocks up to the middle layer.
-# On real photographs, block 8 finds as many objects as block 11, and 24 points fewer under noise. Block 15 is as good
+# On real photographs, block 8 finds as many objects as block 11, and 23 points fewer under noise. Block 15 is as good
 # as block 11, three times as large, and a quarter slower (docs/results.md).
 BLOCKS: Final = (
     Block(1, 16, 1, 3),
