@@ -103,14 +103,15 @@ def main() -> None:
             kind.describe(segment(image))
             timed(PEER, start)
         table = Background(empty)
-        for name, views, revise in (
-            ("with the empty-table image", ViewsTogether(DESCRIPTOR, empty_table=table), True),
-            ("no image, at rest", ViewsTogether(DESCRIPTOR), True),
-            ("no image, in motion", ViewsTogether(DESCRIPTOR), False),
+        for name, known, revise in (
+            ("with the empty-table image", table, True),
+            ("no image, at rest", None, True),
+            ("no image, in motion", None, False),
         ):
+            views = ViewsTogether(DESCRIPTOR)
             for n, image in enumerate(images):
                 start = process_time()
-                views.add(image, revise=revise)
+                views.add(image, known, revise=revise)
                 timed(name, start)
                 if revise and name.startswith("no"):
                     timed(f"no image, view {n + 1}", start)

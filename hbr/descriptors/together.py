@@ -101,9 +101,9 @@ class ViewsTogether:
 
     ::
 
-        views = hbr.ViewsTogether("edges+colours", empty_table=table)  # or without an empty-table image
+        views = hbr.ViewsTogether("edges+colours")
         for frame, orientation_deg in frames:
-            views.add(frame)
+            views.add(frame, table)  # or without an empty-table image
             *earlier, levels = views.levels
             decision = session.add(levels, orientation_deg, earlier=earlier, reliable=views.reliable)
 
@@ -111,8 +111,6 @@ class ViewsTogether:
     ----------
     descriptor : str or Descriptor
         A descriptor of the object.
-    empty_table : Background, or uint8 array (H, W, 3), optional
-        As for `hbr.segment`.
     several : bool
         Whether each view has several segmentations, for a search; an enrollment has one.
 
@@ -124,30 +122,33 @@ class ViewsTogether:
         Levels of each view, a row for each segmentation.
     """
 
-    def __init__(
-        self,
-        descriptor: str | Descriptor,
-        *,
-        empty_table: Background | ImageArray | None = None,
-        several: bool = True,
-    ) -> None:
+    def __init__(self, descriptor: str | Descriptor, *, several: bool = True) -> None:
         self._descriptor = descriptor_of(descriptor) if isinstance(descriptor, str) else descriptor
-        self._table = Background(empty_table) if isinstance(empty_table, np.ndarray) else empty_table
         self._several = several
         self._frames: list[SegmentedFrame | None] = []
+        self._tables: list[Background | None] = []
         self._learned = LearnedBackground()
         self.segmentations: list[tuple[Segmentation, ...]] = []
         self.levels: list[LevelArray] = []
 
-    def add(self, image_bgr: ImageArray, *, revise: bool = True, keep: bool = True) -> tuple[Segmentation, ...]:
+    def add(
+        self,
+        image_bgr: ImageArray,
+        empty_table: Background | ImageArray | None = None,
+        *,
+        revise: bool = True,
+        keep: bool = True,
+    ) -> tuple[Segmentation, ...]:
         """Add a view, and revise the earlier ones if asked for; return the segmentations of the new view.
+
+        ``empty_table`` is the empty-table image for this view, as for `hbr.segment`.
 
         If many views are not revised, the object is guessed only in the first one. If the image is not stored, `revise`
         does not change the view's segmentations, and a long search needs less memory.
 
         Raises `TypeError`, `ValueError`: as for `hbr.segment`, or the view has another size than the others.
         """
-        self.learn(image_bgr)
+        self.learn(image_bgr, empty_table)
         if revise:
             self.revise()
         else:
@@ -157,11 +158,12 @@ class ViewsTogether:
             self.segmentations[-1] = tuple(replace(one, frame=None) for one in self.segmentations[-1])
         return self.segmentations[-1]
 
-    def learn(self, image_bgr: ImageArray) -> None:
+    def learn(self, image_bgr: ImageArray, empty_table: Background | ImageArray | None = None) -> None:
         """Add a view that `revise` segments and describes together with the others; errors as for `add`."""
         frame = SegmentedFrame(image_bgr)
         self._learned.add(image_bgr, frame.small)
         self._frames.append(frame)
+        self._tables.append(Background(empty_table) if isinstance(empty_table, np.ndarray) else empty_table)
         self.segmentations.append(())
         self.levels.append(np.empty((0, self._descriptor.length), np.uint8))
 
@@ -182,7 +184,7 @@ class ViewsTogether:
         known = dict(zip(map(id, self.segmentations[view]), self.levels[view], strict=True))
         found = hypotheses(
             frame,
-            empty_table=self._table,
+            empty_table=self._tables[view],
             learned=self._learned.of(view),
             alone=partial(self._without_background, view, frame) if guess else None,
             most=MOST_HYPOTHESES if self._several else 1,

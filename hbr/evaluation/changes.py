@@ -98,10 +98,10 @@ def enroll_changed(item: PhotographedObject, experiment: Experiment) -> Enrolled
     count = experiment.protocol.enrolled or 0
     places = nearest_photographs(item, np.arange(count) * 360 / count)
     kind, picture = experiment.condition.descriptor, _has_picture(experiment)
-    views = ViewsTogether(kind, empty_table=visit.empty() if picture else None, several=False)
+    views, empty = ViewsTogether(kind, several=False), Background(visit.empty()) if picture else None
     for place in places:
         azimuth_deg = item.photographs[place].azimuth_deg
-        views.learn(visit.photograph(*cut_out(item, place), azimuth_deg).image)
+        views.learn(visit.photograph(*cut_out(item, place), azimuth_deg).image, empty)
     views.revise()
     azimuths_deg = item.azimuth_deg[places]
     cuts = zip(views.segmentations, azimuths_deg.tolist(), strict=True)
@@ -143,7 +143,7 @@ def search_changed(
         visit = Visit(bench, HARD if hard else MILD, rng)
         first_deg = rng.uniform(0, 360)
         kind = experiment.condition.descriptor
-        views = ViewsTogether(kind, empty_table=visit.empty() if picture else None)
+        views, empty = ViewsTogether(kind), Background(visit.empty()) if picture else None
         search = _Search(index, rule, enrolled)
         without = None if left_out is None else _Search(left_out, rule, enrolled)
         same_bench: bool | None = None
@@ -152,7 +152,7 @@ def search_changed(
             frame = visit.photograph(*cut_out(item, place), azimuth_deg).image
             if same_bench is None:
                 same_bench = before.shows_same_bench(frame)
-            views.add(frame)
+            views.add(frame, empty)
             search.add(views, azimuth_deg, same_bench)
             if without is not None:
                 without.add(views, azimuth_deg, same_bench)

@@ -74,6 +74,8 @@ class IssueCode(StrEnum):
 
     TABLE_SIZE = "empty-table-size"
     """The empty-table image has another size: ``table_px`` and ``frame_px``, [width, height]."""
+    TABLE_AZIMUTH = "empty-table-azimuth"
+    """The camera moves around the object, and no empty-table image was taken near this azimuth: ``away_deg``."""
     TABLE_DIFFERS = "empty-table-differs"
     """The frame's border does not look like the empty-table image: ``agreement``, 0..1."""
     BACKDROP_EXPOSURE = "backdrop-exposure"

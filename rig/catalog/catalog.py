@@ -225,7 +225,7 @@ class Catalog(AbstractContextManager["Catalog"]):
             Enroll a known object again. Its complete enrollment stays in use until the new one is complete. An
             unfinished one is abandoned.
         empty_table : uint8 array (H, W, 3), optional
-            The empty-table image of the bench.
+            The sheet of the bench's empty-table images (`rig.views.table_sheet`).
 
         Raises `UsageError`: the name or the plan is not valid. `ObjectExists`: the object is enrolled already and
         ``replace`` is False. `CatalogError`: the object has an unfinished enrollment and ``replace`` is False, or

@@ -191,7 +191,7 @@ def local_views(catalog: Catalog, name: str, azimuths_deg: Sequence[float]) -> l
             empty = None if table is None else catalog.read_image(table)
             describers[region, table] = ViewDescriber(ViewConfig(roi=region), (BENCH_DESCRIPTOR,), empty)
         try:
-            cut = describers[region, table].segment(catalog.read_image(view.image), evidence[place])
+            cut = describers[region, table].segment(catalog.read_image(view.image), view.azimuth_deg, evidence[place])
         except ValueError as error:
             raise CatalogDamaged(
                 f"The view {view.id} cannot be segmented: {error}.", next_step=Do.VERIFY_CATALOG()

@@ -55,7 +55,7 @@ class _DescribedImage(NamedTuple):
 
 
 class Task(NamedTuple):
-    """An enrollment to be described: by these descriptors, with the empty-table image of each session."""
+    """An enrollment to be described: by these descriptors, with the empty-table images (a sheet) of each session."""
 
     seal: str
     name: str
@@ -168,7 +168,7 @@ def describe(pixels: _Pixels, task: Task, *, threads: int = 1) -> Described:
 
     def together(place: int, describer: EnrollmentDescriber, number: int) -> None:
         view = task.views[place]
-        found = describer.describe(number, pixels(view.image))
+        found = describer.describe(number, pixels(view.image), view.azimuth_deg)
         for name in alone:
             levels[name][place] = found.levels[name]
         evidence[place] = found.segmentation or {}

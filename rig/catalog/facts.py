@@ -173,8 +173,8 @@ class Enrollment(Row):
 class Session(Row):
     """An uninterrupted part of an enrollment, numbered from 0. Its views share one origin of the bench clock.
 
-    A resumed enrollment may use another bench, program or calibration. ``empty_table`` is the bench's empty-table image
-    of this session, if there is one.
+    A resumed enrollment may use another bench, program or calibration. ``empty_table`` is the sheet of the bench's
+    empty-table images in this session (`rig.views.table_sheet`), if there is one.
     """
 
     __tablename__ = "sessions"

@@ -406,11 +406,14 @@ class EmptyTableImage:
     """Width of the image in pixels."""
     height: int
     """Height of the image in pixels."""
+    images: int
+    """Number of images: 1, or one for each azimuth if the camera moves around the object; `image_bgr` is the first."""
     turning_share: float | None
-    """Share of the image, from 0 to 1, that changed when the table rotated; null if the table could not rotate."""
+    """Share of the image, from 0 to 1, that changed when the table rotated; null if the table could not rotate, or the
+    camera moves."""
     agreement: float | None
-    """Share of the image's border, from 0 to 1, that did not change when the table rotated; null if the table could not
-    rotate."""
+    """Share of the image's border, from 0 to 1, that did not change when the table rotated, or until the camera came
+    back; null if the table could not rotate."""
     evidence: ViewEvidence
     """Measurements of the image."""
     replaced: tuple[dict[str, Any], ...]

@@ -150,7 +150,8 @@ def page_line(event: Event) -> str:
             return "\n".join(f"  {words}" for words in similar_objects_words(event))
         case EmptyTableImage():
             share = "" if event.turning_share is None else f", {percent(event.turning_share)} rotates with the table"
-            return f"Empty-table image: {event.width} × {event.height} pixels{share}"
+            each = "" if event.images == 1 else f"{event.images} azimuths, each "
+            return f"Empty-table image: {each}{event.width} × {event.height} pixels{share}"
         case Warned():
             return f"Warning: {note_words(event.note)}."
         case Waiting():

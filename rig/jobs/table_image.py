@@ -14,13 +14,21 @@ from rig.plans.operator import Choice, Question, Subject
 from rig.plans.photograph_table import photograph_table
 from rig.views.empty_table import empty_table_status
 
+CLEAR: Final = "Take everything off the table."
 WITHOUT_IMAGE: Final = "without it, objects are found only before a plain background, and less well in other light"
 OLD_IMAGE: Final = "the old image is used for the frames that still match it"
 
 
 def take_table_image(desk: Desk, *, anyway: bool = False) -> Steps[None]:
-    """Take the empty-table image, as `rig.plans.photograph_table.photograph_table`."""
+    """Take the empty-table image, as `rig.plans.photograph_table.photograph_table`.
+
+    Before a camera goes around the table, the operator is asked to clear it, because no check finds a forgotten object.
+    """
     with desk.open_bench() as bench:
+        if bench.config.table.carries == "camera" and bench.placer is None and desk.operator.is_there:
+            choices = {Choice.CONTINUE: "take the images", Choice.STOP: "stop"}
+            if desk.operator.choose(Question(Subject.EMPTY_TABLE, CLEAR, choices)) is Choice.STOP:
+                return
         yield from photograph_table(bench, anyway=anyway)
         yield from desk.log(Action.TABLE_PHOTOGRAPHED, anyway=anyway)
 
@@ -35,7 +43,7 @@ def refresh_table_image(
     remark says that the work continues with the old image or without one.
     """
     status = empty_table_status(bench)
-    if (status.table is not None and not status.problems) or bench.config.table.carries == "camera":
+    if status.table is not None and not status.problems:
         return
     if placer is not None:
         if placer.clear():
@@ -49,7 +57,7 @@ def refresh_table_image(
         yield Remark(f"{status.text}; {consequence}.", steps=Do.EMPTY_TABLE())
         return
     # Ask until the image is taken, or the operator continues without it.
-    text = f"{sentence(status.text)} Take everything off the table."
+    text = f"{sentence(status.text)} {CLEAR}"
     steps: SomeSteps = ()
     skip = f"continue without\n  ({consequence})"
     keep: dict[Choice, str] = {}  # offered only after the check has failed

@@ -125,18 +125,20 @@ class EnrollmentViews:
             else:
                 imu_deg += move.gyro.angle_deg
                 imu_sigma_deg += move.gyro.sigma_deg  # added linearly: all moves share the same bias and scale error
+            table_deg = imu_deg if move.by_gyro else move.encoder_deg
+            azimuth_deg = self._azimuth_deg(table_deg)
             attempt = yield from capture(index, self.viewer, self.table, move.settled_ns)
             self.retakes += attempt.number - 1
             if self._first is None:
-                check_object(self.bench, attempt.image_bgr, self.segment.empty_table)
-            segmented = self.segment(attempt.image_bgr)
+                check_object(self.bench, attempt.image_bgr, azimuth_deg, self.segment.empty_table)
+            segmented = self.segment(attempt.image_bgr, azimuth_deg)
             yield from self._store(
                 index,
                 attempt,
                 segmented,
                 commanded_deg=move.commanded_deg,
                 encoder_deg=move.encoder_deg,
-                table_deg=imu_deg if move.by_gyro else move.encoder_deg,
+                table_deg=table_deg,
                 imu_deg=imu_deg,
                 imu_sigma_deg=imu_sigma_deg,
             )
@@ -164,7 +166,7 @@ class EnrollmentViews:
         if abs(table.rest_deg - start_deg) > config.table.tolerance_deg:
             yield moved(0, (yield from announced(0, table, start_deg)))
         before = yield from capture(0, self.viewer, table, self.bench.clock.now_ns())
-        check_object(self.bench, before.image_bgr, self.segment.empty_table)
+        check_object(self.bench, before.image_bgr, self._azimuth_deg(start_deg), self.segment.empty_table)
         self._first = _SeenView(0, start_deg, before.image_bgr)
         yield ScanStarted(speed.dps, speed.limit, speed.value, start_deg, end_deg)
         frames = FlightFrames(self.bench, table)
@@ -202,7 +204,7 @@ class EnrollmentViews:
                 yield Rejected(index, attempt.number, attempt.reasons, attempt.evidence)
                 continue
             attempt = replace(attempt, encoded=encoder.submit(encode, attempt.image_bgr))
-            segmented = self.segment(attempt.image_bgr)
+            segmented = self.segment(attempt.image_bgr, self._azimuth_deg(attempt.evidence.motion.angle_deg))
             attempt = frames.at_the_object(attempt, segmented.segmentation, trajectory)
             assert attempt.evidence.motion is not None
             measured_deg = attempt.evidence.motion.angle_deg
@@ -230,7 +232,7 @@ class EnrollmentViews:
             index=index,
             commanded_deg=commanded_deg,
             encoder_deg=encoder_deg,
-            azimuth_deg=float(wrap360(self.bench.config.table.orientation_sign * table_deg)),
+            azimuth_deg=self._azimuth_deg(table_deg),
             captured_ns=attempt.evidence.exposed_ns,
             imu_deg=imu_deg,
             imu_sigma_deg=imu_sigma_deg,
@@ -240,6 +242,9 @@ class EnrollmentViews:
         self.enrollment.add(view, attempt.image_bgr, attempt.encoded)
         yield accepted(index, view.azimuth_deg, attempt, segmented)
         yield from warn_of_table(self.bench, index, segmented)
+
+    def _azimuth_deg(self, table_deg: float) -> float:
+        return float(wrap360(self.bench.config.table.orientation_sign * table_deg))
 
     def _require_not_moved(self, first: _SeenView, again: Attempt) -> None:
         """Compare two frames of one angle; abandon the enrollment and raise `ObjectMoved` if the object moved."""

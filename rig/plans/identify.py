@@ -78,7 +78,7 @@ class ViewsAtRest:
     Attributes
     ----------
     check
-        Gets the image of the first view, and raises an error if it shows no object.
+        Gets image and azimuth of the first view, and raises an error if it shows no object.
     live
         Called with the event of each frame of a search in motion.
     number
@@ -93,7 +93,7 @@ class ViewsAtRest:
     search: Search
     viewer: Viewer
     describe: SearchDescriber
-    check: Callable[[NDArray[np.uint8]], None]
+    check: Callable[[NDArray[np.uint8], float], None]
     live: Callable[[FrameUsed], object]
     first_rest_s: float = FIRST_REST_S
     number: int = 0
@@ -130,11 +130,12 @@ class ViewsAtRest:
     def view(self) -> Generator[Event, None, None]:
         """Add an acceptable frame at rest to the search; errors as for `rig.plans.steps.capture`."""
         captured = yield from capture(self.number, self.viewer, self.table, self.settled_ns)
-        described, azimuth_deg = self.describe(captured.image_bgr), self.azimuth_deg
+        azimuth_deg = self.azimuth_deg
+        described = self.describe(captured.image_bgr, azimuth_deg)
         self.locks = captured.evidence.locks
         yield accepted(self.number, azimuth_deg, captured, described)
         if self.number == 0:
-            self.check(captured.image_bgr)
+            self.check(captured.image_bgr, azimuth_deg)
         yield from warn_of_table(self.bench, self.number, described)
         ranked, step = self.search.add(described, azimuth_deg, table_deg=self.table.rest_deg)
         self.ended_ns, self.is_over = self.bench.clock.now_ns(), isinstance(step, Finish)
@@ -142,8 +143,12 @@ class ViewsAtRest:
             yield ranked
 
     def rotate(self, step: Rotate) -> Generator[Event, None, None]:
-        """Rotate to the next view: within the cable budget, and use the measured rotation."""
-        asked_deg = self.table.rest_deg + self.sign * step.rotation_deg
+        """Rotate to the next view: within the cable budget, and use the measured rotation.
+
+        A camera that moves around the object goes to the nearest azimuth with an empty-table image.
+        """
+        rotation_deg = self.describe.rotation_deg(self.azimuth_deg, step.rotation_deg)
+        asked_deg = self.table.rest_deg + self.sign * rotation_deg
         target_deg = self.table.within_reach(asked_deg)
         yield self.search.decided(self.number, target_deg)
         move = yield from announced(self.number, self.table, target_deg, asked_deg=asked_deg)
@@ -231,7 +236,8 @@ class ViewsInMotion(ViewsAtRest):
         # Describe it, and add it to the search.
         self.rejected_in_a_row = 0
         self.number += 1
-        described = self.describe(attempt.image_bgr)
+        assert attempt.evidence.motion is not None
+        described = self.describe(attempt.image_bgr, float(wrap360(self.sign * attempt.evidence.motion.angle_deg)))
         attempt = self.frames.at_the_object(attempt, described.segmentation, trajectory)
         motion = attempt.evidence.motion
         assert motion is not None
@@ -331,7 +337,7 @@ def identify(
         empty_table,
         revise=not search.in_motion,
         # a camera that moves around the object sees another background in each view
-        bench_image=None if bench.config.table.carries == "camera" else model.bench_image,
+        bench_image=model.empty_table if bench.config.table.carries == "camera" else model.bench_image,
     )
     check = partial(check_object, bench, empty_table=empty_table if own is None else own.image_bgr)
     (placer or bench).place(None)

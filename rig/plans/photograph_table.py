@@ -1,7 +1,11 @@
-"""The plan that takes the empty-table image and checks that the table is empty."""
+"""The plan that takes the empty-table image, or one for each azimuth, and checks that the table is empty."""
 
 from collections.abc import Generator
+from dataclasses import dataclass
 from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
 
 import hbr
 from hbr.segmentation import MIN_AGREEMENT
@@ -14,11 +18,14 @@ from rig.core.phrases import percent
 from rig.events.events import EmptyTableImage, Event, Note, NoteCode, Warned
 from rig.motion.turntable import Turntable
 from rig.plans.enroll import SAME_SIMILARITY
-from rig.plans.steps import announced, capture
-from rig.views.capture import Viewer, image_similarity
+from rig.plans.estimate import even_azimuths, table_angles
+from rig.plans.steps import announced, capture, moved
+from rig.views.capture import Attempt, Viewer, ViewEvidence, image_similarity
 from rig.views.description import within
 from rig.views.empty_table import EmptyTable, empty_table_status, store_empty_table
+from rig.views.image_files import MAX_PIXELS
 from rig.views.object_presence import GRID, changed_cells, shrunk
+from rig.views.table_sheet import TableSheet
 
 ROTATION_DEG: Final = 25.0
 """The table rotates by this angle between two images, so that an object shows another side or moves in the image."""
@@ -27,12 +34,26 @@ MAX_CHANGED_SHARE: Final = 0.004
 """If a larger share of the image changes with the rotation, something is on the table: 2 cm in an image of 24 cm."""
 
 
-def photograph_table(bench: Bench, *, anyway: bool = False) -> Generator[Event, None, EmptyTableImage]:
-    """Take the empty-table image and store it beside the bench's state. Yields events and returns the last one.
+@dataclass(frozen=True, eq=False)
+class _Taken:
+    """The images at even steps from the azimuth 0, what was measured at the first one, and what the checks found."""
 
-    An operator that can clear the table does so; otherwise the table must be empty already. The plan takes two frames
-    and rotates the table a little between them. If something is on the table, the image changes. The frames are checked
-    like those of views. Closing the generator switches the torque off.
+    images: list[NDArray[np.uint8]]
+    evidence: ViewEvidence
+    share: float | None
+    agreement: float | None
+
+
+def photograph_table(
+    bench: Bench, *, anyway: bool = False, views: int | None = None
+) -> Generator[Event, None, EmptyTableImage]:
+    """Take the empty-table images and store them beside the bench's state. Yields events and returns the last one.
+
+    An operator that can clear the table does so; otherwise the table must be empty already. For a turntable the plan
+    takes two frames and rotates the table a little between them. If something is on the table, the image changes. If
+    the camera moves around the object, the plan takes an image at each azimuth of an enrollment with ``views`` views,
+    by default ``enroll.views``. Then each image shows another background, so an object that was forgotten is not
+    found. The frames are checked like those of views. Closing the generator switches the torque off.
 
     Parameters
     ----------
@@ -40,30 +61,65 @@ def photograph_table(bench: Bench, *, anyway: bool = False) -> Generator[Event, 
         An open bench.
     anyway
         Store the image although something rotates with the table: a pattern, or a screw that stays there.
+    views
+        The number of images in a revolution of the camera.
 
     Raises
     ------
     TableNotEmpty
-        Something rotates with the table, or the surroundings moved. The previous image stays.
+        Something rotates with the table, or the surroundings moved. The previous images stay.
     UsageError
-        The camera moves around the object, so every view has another background; or the object cannot be removed.
+        The object cannot be removed, or the images together are too large.
     StateNotStored
-        The image cannot be stored.
+        The images cannot be stored.
     ViewRejected, LimitExceeded, MotionTimeout, DeviceFault, DeviceSilent
         See `rig.views.capture` and `rig.motion.turntable`.
     """
-    if bench.config.table.carries == "camera":
-        raise UsageError(
-            "The camera moves around the object, so every view has another background.",
-            next_step="Use a plain background. This bench needs no empty-table image.",
-        )
     if bench.placer is not None and not bench.placer.clear():
         raise UsageError(
             "The object on this bench cannot be taken away.", next_step="Continue without an empty-table image."
         )
-    # Two frames with a rotation between them, if the cable leaves room for it.
-    viewer = Viewer(bench.camera, bench.config)
     started_ns = bench.clock.now_ns()
+    if bench.config.table.carries == "camera":
+        found = yield from _around(bench, views or bench.config.enroll.views, anyway=anyway)
+    else:
+        found = yield from _two_frames(bench, anyway=anyway)
+
+    # A round object does not change with the rotation, but the image differs from the previous one.
+    before, first_bgr = empty_table_status(bench), found.images[0]
+    height, width = first_bgr.shape[:2]
+    known = None if before.table is None else TableSheet.of(before.table.image_bgr, height, width)
+    if known and image_similarity(known[0], first_bgr, bench.config.view) < SAME_SIMILARITY:
+        assert before.table is not None
+        taken_utc = f"{before.table.taken_utc:%Y-%m-%d %H:%M} UTC"
+        yield Warned(None, Note(NoteCode.TABLE_DIFFERS, {"taken_utc": taken_utc}))
+    checks = {"turning_share": found.share, "agreement": found.agreement}
+    taken = EmptyTable(
+        image_bgr=TableSheet.joined(found.images).image_bgr,
+        taken_utc=bench.clock.utc(),
+        camera=bench.camera.identity,
+        locks=found.evidence.locks,
+        evidence={**plain(found.evidence), **checks},
+    )
+    store_empty_table(bench, taken)
+    done = EmptyTableImage(
+        taken_utc=f"{taken.taken_utc:%Y-%m-%dT%H:%M:%SZ}",
+        width=width,
+        height=height,
+        images=len(found.images),
+        **checks,
+        evidence=found.evidence,
+        replaced=tuple(problem.as_json() for problem in before.problems),
+        seconds=seconds_between(started_ns, bench.clock.now_ns()),
+        image_bgr=first_bgr,
+    )
+    yield done
+    return done
+
+
+def _two_frames(bench: Bench, *, anyway: bool) -> Generator[Event, None, _Taken]:
+    """Take the image of a turntable, and another one after a rotation, if the cable leaves room for it."""
+    viewer = Viewer(bench.camera, bench.config)
     rotated = None
     with Turntable(bench) as table:
         move = table.hold()
@@ -76,43 +132,53 @@ def photograph_table(bench: Bench, *, anyway: bool = False) -> Generator[Event, 
             yield from announced(1, table, start_deg)
 
     # Compare the two frames: the table must not have changed, the surroundings must not have moved.
-    config = bench.config.view
     share = agreement = None
     if rotated is not None:
         frames = [first.image_bgr, rotated.image_bgr]
-        share = changed_cells(*(shrunk(frame, config) for frame in frames)) / GRID**2
-        before_bgr, after_bgr = (within(frame, config.roi) for frame in frames)
-        agreement = hbr.segment(after_bgr, empty_table=hbr.Background(before_bgr)).agreement
+        share = changed_cells(*(shrunk(frame, bench.config.view) for frame in frames)) / GRID**2
+        agreement = _agreement(bench, *frames)
         if not anyway:
             _check(share, agreement)
+    return _Taken([first.image_bgr], first.evidence, share, agreement)
 
-    # A round object does not change with the rotation, but the image differs from the previous one.
-    before = empty_table_status(bench)
-    if before.table is not None and image_similarity(before.table.image_bgr, first.image_bgr, config) < SAME_SIMILARITY:
-        taken_utc = f"{before.table.taken_utc:%Y-%m-%d %H:%M} UTC"
-        yield Warned(None, Note(NoteCode.TABLE_DIFFERS, {"taken_utc": taken_utc}))
-    evidence = first.evidence
-    taken = EmptyTable(
-        image_bgr=first.image_bgr,
-        taken_utc=bench.clock.utc(),
-        camera=bench.camera.identity,
-        locks=evidence.locks,
-        evidence={**plain(evidence), "turning_share": share, "agreement": agreement},
-    )
-    store_empty_table(bench, taken)
-    done = EmptyTableImage(
-        taken_utc=f"{taken.taken_utc:%Y-%m-%dT%H:%M:%SZ}",
-        width=int(first.image_bgr.shape[1]),
-        height=int(first.image_bgr.shape[0]),
-        turning_share=share,
-        agreement=agreement,
-        evidence=evidence,
-        replaced=tuple(problem.as_json() for problem in before.problems),
-        seconds=seconds_between(started_ns, bench.clock.now_ns()),
-        image_bgr=first.image_bgr,
-    )
-    yield done
-    return done
+
+def _around(bench: Bench, views: int, *, anyway: bool) -> Generator[Event, None, _Taken]:
+    """Take an image at each azimuth that the camera reaches, and the one at the azimuth 0 again."""
+    limits_deg, sign = bench.config.table.limits_deg, bench.config.table.orientation_sign
+    camera = bench.camera.identity
+    if views * (camera.width + 1) * (camera.height + 1) > MAX_PIXELS:
+        raise UsageError(
+            f"{views} images of {camera.width} x {camera.height} pixels are too large together.",
+            next_step=(
+                "Use fewer views or smaller frames.",
+                Do.SET_KEY(key="enroll.views", value=str(views // 2)),
+            ),
+        )
+    azimuths_deg = even_azimuths(views, limits_deg, sign)
+    angles_deg = table_angles(azimuths_deg, limits_deg, sign)
+    viewer = Viewer(bench.camera, bench.config)
+    taken: dict[int, Attempt] = {}
+    with Turntable(bench) as table:
+        for index, (azimuth_deg, angle_deg) in enumerate(zip(azimuths_deg, angles_deg, strict=True)):
+            move = yield from announced(index, table, angle_deg)
+            yield moved(index, move)
+            taken[round(azimuth_deg * views / 360.0) % views] = yield from capture(
+                index, viewer, table, move.settled_ns
+            )
+        move = yield from announced(len(taken), table, 0.0)
+        again = yield from capture(len(taken), viewer, table, move.settled_ns)
+    first = taken[0]
+    agreement = _agreement(bench, first.image_bgr, again.image_bgr)
+    if not anyway:
+        _check(0.0, agreement)
+    missing = np.zeros_like(first.image_bgr)
+    images = [taken[number].image_bgr if number in taken else missing for number in range(views)]
+    return _Taken(images, first.evidence, None, agreement)
+
+
+def _agreement(bench: Bench, before_bgr: NDArray[np.uint8], after_bgr: NDArray[np.uint8]) -> float | None:
+    before, after = (within(frame, bench.config.view.roi) for frame in (before_bgr, after_bgr))
+    return hbr.segment(after, empty_table=hbr.Background(before)).agreement
 
 
 def _rotated_deg(start_deg: float, limits_deg: tuple[float, float]) -> float:

@@ -18,6 +18,7 @@ from rig.views.capture import Attempt, RejectReason, Viewer, rejection_text
 from rig.views.description import DescribedView
 from rig.views.empty_table import store_table_problem
 from rig.views.object_presence import is_empty_table
+from rig.views.table_sheet import table_image
 
 
 def moved(index: int, move: Move) -> Moved:
@@ -69,9 +70,14 @@ def check_camera(bench: Bench, settings: Collection[Mapping[str, Any]]) -> None:
     )
 
 
-def check_object(bench: Bench, image_bgr: NDArray[np.uint8], empty_table: NDArray[np.uint8] | None) -> None:
-    """Check that the first view shows more than the empty table; without an empty-table image, more than one colour."""
-    if is_empty_table(image_bgr, empty_table, bench.config.view):
+def check_object(
+    bench: Bench, image_bgr: NDArray[np.uint8], azimuth_deg: float, empty_table: NDArray[np.uint8] | None
+) -> None:
+    """Check that the first view shows more than the empty table; without an empty-table image, more than one colour.
+
+    ``empty_table`` is a sheet (`rig.views.table_sheet`).
+    """
+    if is_empty_table(image_bgr, table_image(empty_table, image_bgr, azimuth_deg), bench.config.view):
         raise NoObject(
             "No object is on the table: nothing in the image differs from the background.",
             next_step=(

@@ -51,7 +51,7 @@ class Model:
     camera
         The camera's settings of the enrollments, each combination once.
     empty_table : uint8 array (H, W, 3), optional
-        The newest empty-table image of the enrollments.
+        The newest sheet of empty-table images of the enrollments (`rig.views.table_sheet`).
     bench_image : uint8 array (H, W, 3), optional
         An image that shows the bench of the newest enrollment: its empty-table image, or one of its views.
     leader_views
@@ -174,7 +174,7 @@ def load_model(
 
 
 def empty_table_for(bench: Bench, model: Model) -> tuple[NDArray[np.uint8] | None, tuple[Note, ...]]:
-    """Return the empty-table image that a search uses, and notes for the operator about it.
+    """Return the sheet of empty-table images that a search uses, and notes for the operator about it.
 
     It is the bench's own of today, else the one of the enrollment. It is None if the objects were enrolled without an
     image, because views are compared only with views that were described in the same way.

@@ -83,7 +83,7 @@ def check(run: SavedRun) -> ReplayCheck:
             case Moved():
                 table_deg = event.encoder_deg
             case Accepted():
-                view = describe(event.image_bgr)
+                view = describe(event.image_bgr, event.azimuth_deg)
                 if event.evidence.motion is not None:
                     table_deg = event.evidence.motion.angle_deg
                 known = replace(view, segmentation=event.segmentation, same_bench=event.same_bench)

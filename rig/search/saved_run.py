@@ -157,7 +157,7 @@ class SavedRun:
     model : Model
         The enrolled views and the stopping rule of the search.
     empty_table : uint8 array (H, W, 3), or None
-        The empty-table image.
+        The sheet of empty-table images (`rig.views.table_sheet`).
     error
         The error that ended the search, as in `RigError.as_dict`.
     is_cut

@@ -19,6 +19,7 @@ from hbr.segmentation.segment import evidence_together, stored_segmentation
 from rig.config import ViewConfig
 from rig.core.errors import UsageError
 from rig.views.table_problems import TableProblem, TableProblemCode
+from rig.views.table_sheet import TableSheet, table_image
 
 PAPER_DESCRIPTOR: Final = "cedd"
 """The paper's descriptor. It describes the whole region of interest, with the background."""
@@ -31,6 +32,7 @@ IN_A_ROW: Final = 3
 
 _TEXT: Final = {
     IssueCode.TABLE_SIZE: "the empty-table image has another size than the frames",
+    IssueCode.TABLE_AZIMUTH: "the camera moves, and no empty-table image was taken near the azimuth",
     IssueCode.TABLE_DIFFERS: "the surroundings do not look like the empty-table image",
     IssueCode.BACKDROP_EXPOSURE: "the backdrop is too dark or overexposed to measure its colour",
     IssueCode.BACKDROP_COLOURS: "the backdrop has several colours, so none can be taken for grey",
@@ -91,8 +93,8 @@ class ViewDescriber:
     """Segments views of one bench, and describes them by several descriptors.
 
     The paper's descriptors describe the whole region of interest. All others describe only the object. Without any
-    descriptor, each view is only segmented; with the paper's alone, it is not. The empty-table image is a whole frame
-    of the same size as the views.
+    descriptor, each view is only segmented; with the paper's alone, it is not. The empty-table images are those of a
+    `TableSheet`, of the same size as the views; the one for the azimuth of a view counts.
 
     Raises `ValueError`: a descriptor is unknown.
     """
@@ -104,30 +106,33 @@ class ViewDescriber:
         self._descriptors = [hbr.descriptor(name) for name in names]
         self._segments = not names or any(not one.whole_image for one in self._descriptors)
         self.empty_table = empty_table if self._segments else None
-        self._background: hbr.Background | None = None
+        self._sheet: TableSheet | None = None
+        self._backgrounds: dict[int, hbr.Background] = {}
         self._low: list[float] = []
         self._reported = False
 
-    def __call__(self, image_bgr: NDArray[np.uint8]) -> DescribedView:
-        """Describe a frame, uint8 (H, W, 3).
+    def __call__(self, image_bgr: NDArray[np.uint8], azimuth_deg: float = 0.0) -> DescribedView:
+        """Describe a frame, uint8 (H, W, 3), that the camera took at an azimuth.
 
         Raises `UsageError`: the region does not lie within the frame. `ValueError`: the region is too small for a
         segmentation.
         """
         if not self._segments:
             return DescribedView(self._levels(within(image_bgr, self.region), None), None)
-        found = self.segment(image_bgr)
+        found = self.segment(image_bgr, azimuth_deg)
         levels = self._levels(within(image_bgr, self.region), found)
         return DescribedView(levels, found.evidence(), self._table_problem(found.agreement))
 
-    def segment(self, image_bgr: NDArray[np.uint8], stored: Mapping[str, Any] | None = None) -> hbr.Segmentation:
+    def segment(
+        self, image_bgr: NDArray[np.uint8], azimuth_deg: float = 0.0, stored: Mapping[str, Any] | None = None
+    ) -> hbr.Segmentation:
         """Return the segmentation of the region of interest in a frame, uint8 (H, W, 3).
 
         ``stored`` is the evidence of an enrolled view, which keeps its silhouette (`hbr.segmentation.segment`).
 
         Raises `UsageError`, `ValueError`: as for a call, or the stored evidence is damaged.
         """
-        background, issues = self._prepared_table(image_bgr)
+        background, issues = self._prepared_table(image_bgr, azimuth_deg)
         found = stored_segmentation(within(image_bgr, self.region), stored, empty_table=background)
         return replace(found, issues=(*issues, *(one for one in found.issues if one not in issues)))
 
@@ -147,16 +152,26 @@ class ViewDescriber:
         parameters = {"frames": IN_A_ROW, "agreement": round(max(self._low), 3)}
         return TableProblem(TableProblemCode.SURROUNDINGS, parameters)
 
-    def _prepared_table(self, image_bgr: NDArray[np.uint8]) -> tuple[hbr.Background | None, tuple[Issue, ...]]:
-        """Return the empty-table image of the region, and the issue if it has another size than the frame."""
+    def rotation_deg(self, azimuth_deg: float, rotation_deg: float) -> float:
+        """Return the rotation from the azimuth of the last view that ends where an empty-table image was taken."""
+        return rotation_deg if self._sheet is None else self._sheet.rotation_deg(azimuth_deg, rotation_deg)
+
+    def _prepared_table(
+        self, image_bgr: NDArray[np.uint8], azimuth_deg: float
+    ) -> tuple[hbr.Background | None, tuple[Issue, ...]]:
+        """Return the empty-table image of the region at an azimuth, or the issue why there is none."""
         if self.empty_table is None:
             return None, ()
-        if self.empty_table.shape != image_bgr.shape:
+        self._sheet = sheet = TableSheet.of(self.empty_table, *image_bgr.shape[:2])
+        if sheet is None:
             sizes = {"table_px": list(self.empty_table.shape[1::-1]), "frame_px": list(image_bgr.shape[1::-1])}
             return None, (Issue(IssueCode.TABLE_SIZE, sizes),)
-        if self._background is None:
-            self._background = hbr.Background(within(self.empty_table, self.region))
-        return self._background, ()
+        table_bgr, (number, away_deg) = sheet.at(azimuth_deg), sheet.nearest(azimuth_deg)
+        if table_bgr is None:
+            return None, (Issue(IssueCode.TABLE_AZIMUTH, {"away_deg": round(away_deg, 1)}),)
+        if number not in self._backgrounds:
+            self._backgrounds[number] = hbr.Background(within(table_bgr, self.region))
+        return self._backgrounds[number], ()
 
 
 class EnrollmentDescriber(ViewDescriber):
@@ -180,10 +195,10 @@ class EnrollmentDescriber(ViewDescriber):
         self._learned.add(within(image_bgr, self.region))
         return len(self._learned) - 1
 
-    def describe(self, view: int, image_bgr: NDArray[np.uint8]) -> DescribedView:
+    def describe(self, view: int, image_bgr: NDArray[np.uint8], azimuth_deg: float = 0.0) -> DescribedView:
         """Describe the image that `learn` got as the view of this number."""
         frame = SegmentedFrame(within(image_bgr, self.region))
-        background, issues = self._prepared_table(image_bgr)
+        background, issues = self._prepared_table(image_bgr, azimuth_deg)
         (found,) = hbr.hypotheses(frame, empty_table=background, learned=self._learned.of(view), most=1)
         if found.box is None:
             found = hbr.segment(frame, empty_table=background)
@@ -198,7 +213,7 @@ class SearchDescriber(ViewDescriber):
     (`hbr.ViewsTogether`). The levels have a row for each segmentation.
 
     With ``revise`` earlier views are segmented again with each new one; not in a search in motion, which has many
-    views. The first frame is compared with ``bench_image``, uint8 (H, W, 3), which shows the bench of the enrollment.
+    views. The first frame is compared with ``bench_image``, an image or a `TableSheet` of the bench of the enrollment.
     """
 
     def __init__(
@@ -222,17 +237,18 @@ class SearchDescriber(ViewDescriber):
         """All segmentations of each view so far, in the order of its levels; empty if the descriptor needs none."""
         return [] if self._views is None else self._views.segmentations
 
-    def __call__(self, image_bgr: NDArray[np.uint8]) -> DescribedView:
+    def __call__(self, image_bgr: NDArray[np.uint8], azimuth_deg: float = 0.0) -> DescribedView:
         """Describe the next frame of the search; errors as for `ViewDescriber`."""
         if not self._segments:
-            return super().__call__(image_bgr)
+            return super().__call__(image_bgr, azimuth_deg)
         part = within(image_bgr, self.region)
-        background, issues = self._prepared_table(image_bgr)
+        background, issues = self._prepared_table(image_bgr, azimuth_deg)
         if self._views is None:
-            self._views = hbr.ViewsTogether(self._name, empty_table=background)
-            if self._bench_image is not None and self._bench_image.shape == image_bgr.shape:
-                self._same_bench = hbr.Background(within(self._bench_image, self.region)).shows_same_bench(part)
-        found = self._views.add(part, revise=self._revise, keep=self._revise)[0]
+            self._views = hbr.ViewsTogether(self._name)
+            bench_bgr = table_image(self._bench_image, image_bgr, azimuth_deg)
+            if bench_bgr is not None:
+                self._same_bench = hbr.Background(within(bench_bgr, self.region)).shows_same_bench(part)
+        found = self._views.add(part, background, revise=self._revise, keep=self._revise)[0]
         found = replace(found, issues=(*issues, *found.issues))
         *earlier, levels = self._views.levels
         problem = self._table_problem(found.agreement)

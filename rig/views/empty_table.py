@@ -1,4 +1,4 @@
-"""The empty-table image of a bench: stored beside the bench's state, and checked before it is used.
+"""The empty-table images of a bench on their sheet (`rig.views.table_sheet`): stored beside the bench's state, and checked before it is used.
 
 Decision: docs/decisions/0012.
 """
@@ -25,6 +25,7 @@ from rig.core.errors import StateNotStored
 from rig.devices.camera import CameraIdentity, CameraLocks
 from rig.views import image_files as images
 from rig.views.table_problems import TableProblem, TableProblemCode
+from rig.views.table_sheet import TableSheet
 
 MAX_AGE_H: Final = 12.0
 """A working day. On another day the illumination is different."""
@@ -45,9 +46,9 @@ def _problem(values: object) -> TableProblem | None:
 
 
 class EmptyTable(BaseModel):
-    """An empty-table image, and how it was taken; without its pixels, the content of the JSON file beside it.
+    """A sheet of empty-table images, and how it was taken; without its pixels, the content of the JSON file beside it.
 
-    ``image_bgr`` is a whole frame, uint8 (H, W, 3). The image was accepted with the measurements ``evidence``. A search
+    ``image_bgr`` is the sheet, uint8 (H, W, 3). Its images are whole frames. The first one was accepted with the measurements ``evidence``. A search
     or an enrollment may have ``noticed`` a problem since then. The name of the file ``image`` contains the SHA-256 of
     its bytes.
     """
@@ -89,8 +90,6 @@ class EmptyTableStatus:
 
 def empty_table_status(bench: Bench) -> EmptyTableStatus:
     """Return the bench's empty-table image and its problems."""
-    if bench.config.table.carries == "camera":
-        return EmptyTableStatus(None, (TableProblem(TableProblemCode.CAMERA_MOVES),))
     try:
         table = _read(bench)
     except _Unreadable as error:
@@ -129,12 +128,15 @@ def _store(bench: Bench, table: EmptyTable) -> None:
 
 
 def _unusable(table: EmptyTable, bench: Bench) -> TableProblem | None:
-    now, before = bench.camera.identity, table.image_bgr.shape
-    if (now.height, now.width) != before[:2]:
-        sizes = {"image_px": (before[1], before[0]), "frame_px": (now.width, now.height)}
+    now, before = bench.camera.identity, table.camera
+    sheet = TableSheet.of(table.image_bgr, now.height, now.width)
+    if sheet is None:
+        sizes = {"image_px": (before.width, before.height), "frame_px": (now.width, now.height)}
         return TableProblem(TableProblemCode.OTHER_SIZE, sizes)
-    if not now.is_same_camera(table.camera):
-        shown = [camera.device or camera.name for camera in (table.camera, now)]
+    if (len(sheet) > 1) != (bench.config.table.carries == "camera"):
+        return TableProblem(TableProblemCode.OTHER_MOTION)
+    if not now.is_same_camera(before):
+        shown = [camera.device or camera.name for camera in (before, now)]
         return TableProblem(TableProblemCode.OTHER_CAMERA, {"image_camera": shown[0], "camera": shown[1]})
     return None
 

@@ -10,7 +10,7 @@ from rig.core.phrases import Worded, filled
 class TableProblemCode(Worded):
     """Problems of an empty-table image; the texts contain their parameters."""
 
-    CAMERA_MOVES = "camera-moves", "the camera moves around the object, so every view has another background"
+    OTHER_MOTION = "other-motion", "table.carries was changed after the empty-table image was taken"
     MISSING = "missing", "there is no empty-table image yet"
     UNREADABLE = "unreadable", "the empty-table image is not usable: {detail}"
     OTHER_SIZE = (

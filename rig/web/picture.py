@@ -86,10 +86,12 @@ class Outliner:
             bench.config.view, empty_table=None if status.table is None else status.table.image_bgr
         )
 
-    def __call__(self, image_bgr: NDArray[np.uint8]) -> dict[str, list[list[int]] | list[int]] | None:
+    def __call__(
+        self, image_bgr: NDArray[np.uint8], azimuth_deg: float
+    ) -> dict[str, list[list[int]] | list[int]] | None:
         """Return ``box`` (x, y, width, height) and ``points`` in pixels of the frame; None if no object is found."""
         try:
-            found = self._describer.segment(image_bgr)
+            found = self._describer.segment(image_bgr, azimuth_deg)
         except (RigError, ValueError):
             return None
         if found.box is None:

@@ -157,7 +157,7 @@ class ServedDesk(Desk):
         if isinstance(event, Accepted):
             self._worker.views[job.id].append(jpeg(event.image_bgr, VIEW_PX))
             values["picture"] = job.views
-            values["outline_px"] = None if self._outline is None else self._outline(event.image_bgr)
+            values["outline_px"] = None if self._outline is None else self._outline(event.image_bgr, event.azimuth_deg)
             job.views += 1
             if job.progress is not None:
                 left_s = None if self._left is None else self._left.seconds

@@ -175,14 +175,14 @@ def run_demo(
         open_sim_bench(config, operator, faults=[*read_faults(options.faults), *faults], on_fault=heard) as bench,
     ):
         # Enroll, then change the bench if asked for, then identify.
-        _photograph(bench, operator)
+        each = views or (config.enroll.views if "views" in config.enroll.model_fields_set else VIEWS)
+        _photograph(bench, operator, each)
         with Catalog.open(folder, clock=bench.clock) as catalog:
-            each = views or (config.enroll.views if "views" in config.enroll.model_fields_set else VIEWS)
             enrollments = _enroll_all(bench, catalog, list(enrolled), each, say=not settings.json)
             model = load_model(catalog, descriptor=None if chosen is None else descriptor_for(chosen))
         if change is not None:
             operator.change_bench(change)
-            _photograph(bench, operator, marked=True)
+            _photograph(bench, operator, each, marked=True)
             model = replace(model, camera=())  # a real bench rejects a search with other settings of the camera
         trials = [
             _identify(
@@ -248,13 +248,13 @@ def _folder_within(out: Path) -> "tempfile.TemporaryDirectory[str]":
         return tempfile.TemporaryDirectory(prefix=".catalog-", dir=out)
 
 
-def _photograph(bench: Bench, operator: ShelfOperator, *, marked: bool = False) -> None:
-    """Take the empty-table image, if the table rotates and the operator can clear it.
+def _photograph(bench: Bench, operator: ShelfOperator, views: int, *, marked: bool = False) -> None:
+    """Take the empty-table image, or with an orbiting camera ``views`` images, if the operator can clear the table.
 
     A ``marked`` table may have rotating marks.
     """
-    if bench.config.table.carries == "object" and operator.clear():
-        for _ in photograph_table(bench, anyway=marked):
+    if operator.clear():
+        for _ in photograph_table(bench, anyway=marked, views=views):
             pass
 
 

@@ -142,7 +142,7 @@ def _masks(folder: Path, portion: tuple[_Picture, ...]) -> list[_Mask]:
 def _mask(folder: Path, picture: _Picture) -> _Mask:
     image = FolderImages(folder).pixels(picture.view.image)
     describer = _describer(folder, picture.region, picture.session.empty_table)
-    found = describer.segment(image, json.loads(picture.segmentation))
+    found = describer.segment(image, picture.view.azimuth_deg, json.loads(picture.segmentation))
     height, width = image.shape[:2]
     x0, y0, w, h = picture.region or (0, 0, width, height)
     whole = np.zeros((height, width), np.bool_)

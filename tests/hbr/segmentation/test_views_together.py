@@ -132,8 +132,8 @@ def test_a_descriptor_without_shifts_keeps_the_earlier_score() -> None:
 
 def test_no_answer_on_a_guessed_view_while_another_one_is_possible() -> None:
     images, empty, _ = frames(2)
-    alone = hbr.ViewsTogether("edges+colours", empty_table=empty)
-    alone.add(images[0])
+    alone = hbr.ViewsTogether("edges+colours")
+    alone.add(images[0], empty)
     assert alone.reliable  # by the empty-table image
     views = hbr.ViewsTogether("edges+colours")
     views.add(images[0])
