@@ -407,7 +407,8 @@ class EmptyTableImage:
     height: int
     """Height of the image in pixels."""
     images: int
-    """Number of images: 1, or one for each azimuth if the camera moves around the object; `image_bgr` is the first."""
+    """Number of images: 1, or one for each azimuth if the camera moves around the object. The measurements are those of
+    the one at the table angle 0."""
     turning_share: float | None
     """Share of the image, from 0 to 1, that changed when the table rotated; null if the table could not rotate, or the
     camera moves."""

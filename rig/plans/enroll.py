@@ -204,6 +204,7 @@ class EnrollmentViews:
                 yield Rejected(index, attempt.number, attempt.reasons, attempt.evidence)
                 continue
             attempt = replace(attempt, encoded=encoder.submit(encode, attempt.image_bgr))
+            assert attempt.evidence.motion is not None
             segmented = self.segment(attempt.image_bgr, self._azimuth_deg(attempt.evidence.motion.angle_deg))
             attempt = frames.at_the_object(attempt, segmented.segmentation, trajectory)
             assert attempt.evidence.motion is not None

@@ -36,9 +36,10 @@ MAX_CHANGED_SHARE: Final = 0.004
 
 @dataclass(frozen=True, eq=False)
 class _Taken:
-    """The images at even steps from the azimuth 0, what was measured at the first one, and what the checks found."""
+    """The images at even steps from the azimuth 0, with the number and evidence of one, and what the checks found."""
 
     images: list[NDArray[np.uint8]]
+    number: int
     evidence: ViewEvidence
     share: float | None
     agreement: float | None
@@ -86,13 +87,15 @@ def photograph_table(
         found = yield from _two_frames(bench, anyway=anyway)
 
     # A round object does not change with the rotation, but the image differs from the previous one.
-    before, first_bgr = empty_table_status(bench), found.images[0]
-    height, width = first_bgr.shape[:2]
-    known = None if before.table is None else TableSheet.of(before.table.image_bgr, height, width)
-    if known and image_similarity(known[0], first_bgr, bench.config.view) < SAME_SIMILARITY:
-        assert before.table is not None
-        taken_utc = f"{before.table.taken_utc:%Y-%m-%d %H:%M} UTC"
-        yield Warned(None, Note(NoteCode.TABLE_DIFFERS, {"taken_utc": taken_utc}))
+    status, shown_bgr = empty_table_status(bench), found.images[found.number]
+    height, width = shown_bgr.shape[:2]
+    if (before := status.table) is not None:
+        known = TableSheet.of(before.image_bgr, height, width)
+        assert known is not None  # it is usable
+        same_grid = len(known) == len(found.images)
+        if same_grid and image_similarity(known[found.number], shown_bgr, bench.config.view) < SAME_SIMILARITY:
+            taken_utc = f"{before.taken_utc:%Y-%m-%d %H:%M} UTC"
+            yield Warned(None, Note(NoteCode.TABLE_DIFFERS, {"taken_utc": taken_utc}))
     checks = {"turning_share": found.share, "agreement": found.agreement}
     taken = EmptyTable(
         image_bgr=TableSheet.joined(found.images).image_bgr,
@@ -109,9 +112,9 @@ def photograph_table(
         images=len(found.images),
         **checks,
         evidence=found.evidence,
-        replaced=tuple(problem.as_json() for problem in before.problems),
+        replaced=tuple(problem.as_json() for problem in status.problems),
         seconds=seconds_between(started_ns, bench.clock.now_ns()),
-        image_bgr=first_bgr,
+        image_bgr=shown_bgr,
     )
     yield done
     return done
@@ -139,11 +142,11 @@ def _two_frames(bench: Bench, *, anyway: bool) -> Generator[Event, None, _Taken]
         agreement = _agreement(bench, *frames)
         if not anyway:
             _check(share, agreement)
-    return _Taken([first.image_bgr], first.evidence, share, agreement)
+    return _Taken([first.image_bgr], 0, first.evidence, share, agreement)
 
 
 def _around(bench: Bench, views: int, *, anyway: bool) -> Generator[Event, None, _Taken]:
-    """Take an image at each azimuth that the camera reaches, and the one at the azimuth 0 again."""
+    """Take an image at each azimuth that the camera reaches, and again the one nearest to the table angle 0."""
     limits_deg, sign = bench.config.table.limits_deg, bench.config.table.orientation_sign
     camera = bench.camera.identity
     if views * (camera.width + 1) * (camera.height + 1) > MAX_PIXELS:
@@ -157,23 +160,23 @@ def _around(bench: Bench, views: int, *, anyway: bool) -> Generator[Event, None,
     azimuths_deg = even_azimuths(views, limits_deg, sign)
     angles_deg = table_angles(azimuths_deg, limits_deg, sign)
     viewer = Viewer(bench.camera, bench.config)
-    taken: dict[int, Attempt] = {}
+    taken: list[Attempt] = []
     with Turntable(bench) as table:
-        for index, (azimuth_deg, angle_deg) in enumerate(zip(azimuths_deg, angles_deg, strict=True)):
+        for index, angle_deg in enumerate(angles_deg):
             move = yield from announced(index, table, angle_deg)
             yield moved(index, move)
-            taken[round(azimuth_deg * views / 360.0) % views] = yield from capture(
-                index, viewer, table, move.settled_ns
-            )
-        move = yield from announced(len(taken), table, 0.0)
+            taken.append((yield from capture(index, viewer, table, move.settled_ns)))
+        front = min(range(len(taken)), key=lambda index: abs(angles_deg[index]))
+        move = yield from announced(len(taken), table, angles_deg[front])
         again = yield from capture(len(taken), viewer, table, move.settled_ns)
-    first = taken[0]
-    agreement = _agreement(bench, first.image_bgr, again.image_bgr)
+    agreement = _agreement(bench, taken[front].image_bgr, again.image_bgr)
     if not anyway:
         _check(0.0, agreement)
-    missing = np.zeros_like(first.image_bgr)
-    images = [taken[number].image_bgr if number in taken else missing for number in range(views)]
-    return _Taken(images, first.evidence, None, agreement)
+    numbers = [round(azimuth_deg * views / 360.0) % views for azimuth_deg in azimuths_deg]
+    images = [np.zeros_like(again.image_bgr)] * views  # black: not taken
+    for number, one in zip(numbers, taken, strict=True):
+        images[number] = one.image_bgr
+    return _Taken(images, numbers[front], taken[front].evidence, None, agreement)
 
 
 def _agreement(bench: Bench, before_bgr: NDArray[np.uint8], after_bgr: NDArray[np.uint8]) -> float | None:

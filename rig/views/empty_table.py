@@ -1,4 +1,6 @@
-"""The empty-table images of a bench on their sheet (`rig.views.table_sheet`): stored beside the bench's state, and checked before it is used.
+"""The empty-table images of a bench: stored beside the bench's state, and checked before they are used.
+
+A turntable has one, a camera that moves around the object one for each azimuth (`rig.views.table_sheet`).
 
 Decision: docs/decisions/0012.
 """
@@ -48,9 +50,9 @@ def _problem(values: object) -> TableProblem | None:
 class EmptyTable(BaseModel):
     """A sheet of empty-table images, and how it was taken; without its pixels, the content of the JSON file beside it.
 
-    ``image_bgr`` is the sheet, uint8 (H, W, 3). Its images are whole frames. The first one was accepted with the measurements ``evidence``. A search
-    or an enrollment may have ``noticed`` a problem since then. The name of the file ``image`` contains the SHA-256 of
-    its bytes.
+    ``image_bgr`` is the sheet, uint8 (H, W, 3). Its images are whole frames. The one at the table angle 0 was accepted
+    with the measurements ``evidence``. A search or an enrollment may have ``noticed`` a problem since then. The name of
+    the file ``image`` contains the SHA-256 of its bytes.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", arbitrary_types_allowed=True)

@@ -57,6 +57,9 @@ def demo(
     faults: Annotated[
         Path | None, typer.Option("--faults", metavar="FILE", help="Inject the faults of a TOML file.")
     ] = None,
+    no_empty_table: Annotated[
+        bool, typer.Option("--no-empty-table", help="Take no empty-table images before the enrollment.")
+    ] = False,
     out: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder for report.html.")] = Path("rig-demo"),
 ) -> None:
     """Enroll objects on the simulated bench, then identify each of them, and two objects that are not enrolled.
@@ -82,6 +85,7 @@ def demo(
         strategy=strategy,
         change=Change.named(change or ()),
         faults=planned,
+        empty_table=not no_empty_table,
     )
     if settings.json:
         settings.print_json(result.as_dict())

@@ -139,12 +139,13 @@ def run_demo(
     strategy: str | None = None,
     change: Change | None = None,
     faults: Sequence[Fault] = (),
+    empty_table: bool = True,
 ) -> DemoResult:
     """Enroll a shelf, identify each object and two unknown ones, print the events, and write ``out/report.html``.
 
     Each object is enrolled with ``views`` views, by default ``enroll.views`` if the configuration has it, or `VIEWS`.
     The search uses ``strategy``, by default ``identify.strategy``. The bench is changed (``change``) after the
-    enrollments. The ``faults`` and those of the configuration are injected meanwhile.
+    enrollments. Without ``empty_table`` no empty-table image is taken. The ``faults`` and those of the configuration are injected meanwhile.
 
     Raises
     ------
@@ -176,13 +177,15 @@ def run_demo(
     ):
         # Enroll, then change the bench if asked for, then identify.
         each = views or (config.enroll.views if "views" in config.enroll.model_fields_set else VIEWS)
-        _photograph(bench, operator, each)
+        if empty_table:
+            _photograph(bench, operator, each)
         with Catalog.open(folder, clock=bench.clock) as catalog:
             enrollments = _enroll_all(bench, catalog, list(enrolled), each, say=not settings.json)
             model = load_model(catalog, descriptor=None if chosen is None else descriptor_for(chosen))
         if change is not None:
             operator.change_bench(change)
-            _photograph(bench, operator, each, marked=True)
+            if empty_table:
+                _photograph(bench, operator, each, marked=True)
             model = replace(model, camera=())  # a real bench rejects a search with other settings of the camera
         trials = [
             _identify(
