@@ -7,15 +7,23 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from hbr.segmentation import BoxMethod
 from rig.catalog import Catalog, derived
+from rig.catalog.exchange.bundle import read_bundle, write_bundle
+from rig.catalog.jobs import finished
+from rig.catalog.transfer import CatalogSource, transfer
 from rig.events.events import Accepted, Enrolled, Identified
 from rig.motion.turntable import Turntable
 from rig.plans.enroll import enroll
 from rig.plans.estimate import even_azimuths, table_angles
 from rig.plans.identify import identify
+from rig.plans.photograph_table import photograph_table
 from rig.search.model import load_model, model_of
+from rig.search.replay import check
+from rig.search.saved_run import RunWriter, load_run
 from rig.search.strategies import descriptor_for
 from rig.search.strategies import strategy as strategy_named
+from rig.views.empty_table import empty_table_status
 from sim.objects.solid import empty_platter
 
 AX = (
@@ -56,18 +64,63 @@ def test_azimuths_agree_whether_object_or_camera_rotates(
         assert min(unlike, key=lambda side: unlike[side]) == azimuth
 
 
+@pytest.mark.parametrize("photographs", [False, True])
 @pytest.mark.parametrize("strategy", ["ahbr", "dense"])
-def test_orbiting_camera_enrolls_and_identifies(simulated, tmp_path: Path, strategy: str) -> None:
-    """The background differs in each view; whole frames (AHBR) and the rig's own search find the object again."""
-    with Catalog.open(tmp_path, clock=simulated().bench.clock, create=True) as catalog:
+def test_orbiting_camera_enrolls_and_identifies(simulated, tmp_path: Path, strategy: str, photographs: bool) -> None:
+    """The background differs in each view; whole frames (AHBR) and the rig's own search find the object again.
+
+    With an empty-table image for each azimuth the rig's own search knows the background of every view.
+    """
+    s = simulated(*ARM)
+    with Catalog.open(tmp_path / "catalog", clock=s.bench.clock, create=True) as catalog:
+        if photographs:
+            list(photograph_table(s.bench, views=12))
         for name in ("teapot", "mug-dots"):
-            assert len(enrolled(simulated, catalog, name, *ARM, views=12)) == 12
-        s = simulated(*ARM)
+            views = [event for event in enroll(s.bench, catalog, name, views=12) if isinstance(event, Accepted)]
+            assert len(views) == 12
         s.operator.next_object, s.operator.yaw_deg = "teapot", 10.0
         model = load_model(catalog, descriptor=descriptor_for(strategy_named(strategy)))
-        *_, found = identify(s.bench, model, strategy=strategy)
-    assert isinstance(found, Identified)
-    assert found.name == "teapot"
+        with RunWriter(tmp_path / "run", s.bench, model) as writer:
+            for event in identify(s.bench, model, strategy=strategy):
+                writer.add(event)
+                views += [event] if isinstance(event, Accepted) else []
+        stored = catalog.object("mug-dots").complete
+        methods = {one["method"] for one in derived.described(catalog, stored, "mug-dots").segmentation}
+        # Every copy of the object has all images: here a bundle.
+        write_bundle(tmp_path / "a.zip", CatalogSource(catalog))
+    again = check(load_run(tmp_path / "run"))
+    assert again.is_complete
+    assert again.differences == []
+    assert isinstance(event, Identified)
+    assert event.name == "teapot"
+    used = {view.segmentation["method"] for view in views if view.segmentation is not None}
+    if not photographs:
+        assert BoxMethod.EMPTY_TABLE not in methods | used
+        return
+    assert methods == {BoxMethod.EMPTY_TABLE}
+    assert used == {BoxMethod.EMPTY_TABLE}
+    with (
+        read_bundle(tmp_path / "a.zip", s.bench.clock) as bundle,
+        Catalog.open(tmp_path / "copy", clock=s.bench.clock) as copy,
+    ):
+        finished(transfer(bundle, copy))
+        (session,) = copy.object("mug-dots").complete.sessions
+        assert np.array_equal(copy.read_image(session.empty_table), empty_table_status(s.bench).table.image_bgr)
+
+
+def test_search_by_an_orbiting_camera_goes_where_an_image_was_taken(simulated, tmp_path: Path) -> None:
+    """The search weighs rotations of 5 degrees; with an image each 30 degrees it takes no view between them."""
+    s = simulated(*ARM)
+    with Catalog.open(tmp_path, clock=s.bench.clock, create=True) as catalog:
+        list(photograph_table(s.bench, views=12))
+        for name in ("mug-star", "mug-dots"):
+            list(enroll(s.bench, catalog, name, views=12))
+        s.operator.next_object, s.operator.yaw_deg = "radio", 100.0  # unknown, so the search takes several views
+        views = [e for e in identify(s.bench, load_model(catalog)) if isinstance(e, Accepted)]
+    assert len(views) > 1
+    assert all(abs((view.azimuth_deg + 15) % 30 - 15) < 1 for view in views)
+    assert {view.segmentation["method"] for view in views} == {BoxMethod.EMPTY_TABLE}
+    assert all(view.same_bench for view in views)
 
 
 def test_ax12_enrolls_and_identifies_within_its_reach(simulated, tmp_path: Path) -> None:

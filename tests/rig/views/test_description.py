@@ -140,7 +140,7 @@ def test_enrolled_view_keeps_its_silhouette() -> None:
     enrolled = together.describe(1, frames[1])
     assert enrolled.segmentation is not None
     assert enrolled.segmentation["together"] == 3
-    cut = ViewDescriber(WHOLE).segment(frames[1], enrolled.segmentation)
+    cut = ViewDescriber(WHOLE).segment(frames[1], 0.0, enrolled.segmentation)
     levels = hbr.descriptor(BENCH_DESCRIPTOR).describe(cut)
     assert np.array_equal(levels, enrolled.levels[BENCH_DESCRIPTOR])
 

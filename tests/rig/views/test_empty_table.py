@@ -1,7 +1,7 @@
 """The empty-table image: taken, checked, stored, its problems, and its use by an enrollment."""
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from datetime import timedelta
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,15 +17,19 @@ from rig.catalog import Catalog, derived
 from rig.config import RigConfig, load_config
 from rig.core.errors import StateNotStored, TableNotEmpty, UsageError, ViewRejected
 from rig.core.next_steps import Do
-from rig.events.events import EmptyTableImage, NoteCode, Warned
+from rig.events.events import EmptyTableImage, Moved, NoteCode, Warned
 from rig.events.wording import note_steps, note_words
-from rig.plans.enroll import enroll
+from rig.motion.move import equivalent_within
+from rig.motion.turntable import Turntable
+from rig.plans.enroll import SAME_SIMILARITY, enroll
 from rig.plans.photograph_table import photograph_table
 from rig.safety.saved_state import FileStore, MemoryStore
+from rig.views.capture import image_similarity
 from rig.views.description import BENCH_DESCRIPTOR, SegmentationSummary
 from rig.views.empty_table import MAX_AGE_H, empty_table_status
 from rig.views.object_presence import TableWatcher
 from rig.views.table_problems import TableProblem, TableProblemCode
+from rig.views.table_sheet import table_image
 from sim import disk
 from sim.bench import ShelfOperator, open_sim_bench
 from sim.change import CHANGES
@@ -99,10 +103,48 @@ def test_dark_table_is_rejected_like_a_view(simulated: Open) -> None:
     assert empty_table_status(s.bench).table is None
 
 
-def test_bench_that_rotates_its_camera_has_no_empty_table_image(simulated: Open) -> None:
-    s = simulated('table.carries="camera"')
-    with pytest.raises(UsageError, match="moves around"):
-        photographed(s.bench)
+@pytest.mark.parametrize(("limits_deg", "reached"), [((-180, 180), range(12)), ((-100, 40), (0, 1, 9, 10, 11))])
+def test_orbiting_camera_takes_an_image_at_each_azimuth_that_it_reaches(
+    simulated: Open, limits_deg: tuple[int, int], reached: Sequence[int]
+) -> None:
+    s = simulated("table.carries=camera", f"table.limits_deg={list(limits_deg)}", "enroll.views=12")
+    s.operator.place("dice")
+    events = list(photograph_table(s.bench))
+    assert events[-1].images == 12
+    assert len([event for event in events if isinstance(event, Moved)]) == len(reached)
+    assert s.world.scene.object is None
+    kept = empty_table_status(s.bench)
+    assert kept.problems == ()
+    for number in range(12):
+        with Turntable(s.bench) as table:
+            if number not in reached:
+                assert table_image(kept.table.image_bgr, events[-1].image_bgr, 30.0 * number) is None
+                continue
+            table.goto(equivalent_within(30.0 * number, 0.0, limits_deg))
+        frame = s.bench.camera.capture(s.bench.clock.now_ns()).image_bgr
+        image = table_image(kept.table.image_bgr, frame, 30.0 * number)
+        assert image_similarity(image, frame, s.bench.config.view) > SAME_SIMILARITY
+    other = simulated(f"table.limits_deg={list(limits_deg)}")
+    other.bench.state = s.bench.state
+    assert empty_table_status(other.bench).problems == (TableProblem(TableProblemCode.OTHER_MOTION),)
+
+
+def test_surroundings_that_move_while_the_camera_goes_around_are_noticed(simulated: Open) -> None:
+    s = simulated("table.carries=camera", "enroll.views=4")
+    events = photograph_table(s.bench)
+    for _ in range(3):
+        next(events)
+    s.world.seed += 1  # another room
+    with pytest.raises(TableNotEmpty, match="surroundings"):
+        list(events)
+    assert empty_table_status(s.bench).table is None
+
+
+def test_images_that_are_too_large_together_are_refused_before_anything_moves(simulated: Open) -> None:
+    s = simulated("table.carries=camera")
+    with pytest.raises(UsageError, match="too large together") as caught:
+        next(photograph_table(s.bench, views=2000))
+    assert Do.SET_KEY(key="enroll.views", value="1000") in caught.value.steps
 
 
 def test_age_and_settings_are_problems_and_another_size_is_not_usable(simulated: Open) -> None:
