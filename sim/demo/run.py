@@ -145,8 +145,8 @@ def run_demo(
 
     Each object is enrolled with ``views`` views, by default ``enroll.views`` if the configuration has it, or `VIEWS`.
     The search uses ``strategy``, by default ``identify.strategy``. The bench is changed (``change``) after the
-    enrollments. Without ``empty_table`` no empty-table image is taken. The ``faults`` and those of the configuration are
-    injected meanwhile.
+    enrollments. Without ``empty_table`` no empty-table image is taken. The ``faults`` and those of the configuration
+    are injected meanwhile.
 
     Raises
     ------

@@ -64,7 +64,8 @@ def empty_table(
     """Take an image of the empty table. Do this once a day, and when the light has changed.
 
     Objects are found by comparing views with this image. First take everything off the table. The table rotates a
-    little to check that it is empty. If the check fails, the previous image stays in use.
+    little to check that it is empty. If the check fails, the previous image stays in use. A camera that moves around
+    the object takes an image at each azimuth of enroll.views; no check then finds a forgotten object.
 
     Example: rig empty-table --bench sim
 
