@@ -103,11 +103,15 @@ def test_dark_table_is_rejected_like_a_view(simulated: Open) -> None:
     assert empty_table_status(s.bench).table is None
 
 
-@pytest.mark.parametrize(("limits_deg", "reached"), [((-180, 180), range(12)), ((-100, 40), (0, 1, 9, 10, 11))])
+@pytest.mark.parametrize(
+    ("mode", "limits_deg", "reached"),
+    [("turntable", (-180, 180), range(12)), ("pan", (-100, 40), (0, 1, 9, 10, 11))],
+)
 def test_orbiting_camera_takes_an_image_at_each_azimuth_that_it_reaches(
-    simulated: Open, limits_deg: tuple[int, int], reached: Sequence[int]
+    simulated: Open, mode: str, limits_deg: tuple[int, int], reached: Sequence[int]
 ) -> None:
-    s = simulated("table.carries=camera", f"table.limits_deg={list(limits_deg)}", "enroll.views=12")
+    range_of = (f"table.mode={mode}", f"table.limits_deg={list(limits_deg)}")
+    s = simulated("table.carries=camera", *range_of, "enroll.views=12")
     s.operator.place("dice")
     events = list(photograph_table(s.bench))
     assert events[-1].images == 12
@@ -124,7 +128,7 @@ def test_orbiting_camera_takes_an_image_at_each_azimuth_that_it_reaches(
         frame = s.bench.camera.capture(s.bench.clock.now_ns()).image_bgr
         image = table_image(kept.table.image_bgr, frame, 30.0 * number)
         assert image_similarity(image, frame, s.bench.config.view) > SAME_SIMILARITY
-    other = simulated(f"table.limits_deg={list(limits_deg)}")
+    other = simulated(*range_of)
     other.bench.state = s.bench.state
     assert empty_table_status(other.bench).problems == (TableProblem(TableProblemCode.OTHER_MOTION),)
 
@@ -140,7 +144,7 @@ def test_surroundings_that_move_while_the_camera_goes_around_are_noticed(simulat
     assert empty_table_status(s.bench).table is None
 
 
-def test_images_that_are_too_large_together_are_refused_before_anything_moves(simulated: Open) -> None:
+def test_images_that_are_too_large_together_are_rejected_before_anything_moves(simulated: Open) -> None:
     s = simulated("table.carries=camera")
     with pytest.raises(UsageError, match="too large together") as caught:
         next(photograph_table(s.bench, views=2000))
