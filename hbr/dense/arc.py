@@ -103,6 +103,8 @@ class ArcSession(DenseSession):
         Number of decisions so far; the first view is the first one.
     """
 
+    _NEWEST = 4  # 60°: the frames of fewer steps are hardly enough evidence of a change
+
     def __init__(self, index: DenseIndex, rule: StoppingRule, min_confidence: float) -> None:
         super().__init__(index, rule, max_views=DECISIONS)
         self.decisions = 0
@@ -113,6 +115,10 @@ class ArcSession(DenseSession):
     def _replace(self, queries: Sequence[LevelArray]) -> None:
         super()._replace(queries)
         self._sides = None  # these belief and views were described differently
+
+    def _forget(self) -> None:
+        super()._forget()
+        self.decisions, self._covered_deg, self._sides = 0, 0.0, None
 
     def _begin_view(self, orientation_deg: float) -> None:
         if self._so_far is not self._index:

@@ -12,19 +12,23 @@ views (`NeedEnrolledViews`); its driver brings them. `DenseSession.end` is the d
 
 The comparisons themselves are in `hbr.dense.local_difference`.
 
+If the object was replaced or rotated by hand, the search begins again with the views since then (`hbr.dense.change`).
+
 Decisions: docs/decisions/0013, docs/decisions/0016, docs/decisions/0015, docs/decisions/0017.
 """
 
+from collections import deque
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
-from typing import Final, NamedTuple, TypeVar
+from typing import ClassVar, Final, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from hbr.core.angles import size_deg, wrap180, wrap360
 from hbr.core.arrays import FloatArray, IndexArray, LevelArray
+from hbr.dense.change import Change, changed
 from hbr.dense.filter import KEPT, Belief, completed, poses_of, update_belief
 from hbr.dense.index import DenseIndex
 from hbr.dense.local_difference import NEAREST, LocalDecision, LocalView, Pixels, chosen_views, compare_objects, fit
@@ -271,6 +275,8 @@ def _margin(scores: FloatArray, probability: FloatArray) -> float:
     return float(scores[best] - np.delete(scores, best).max(initial=0.0))
 
 
+#: Number of times that a search begins again because the object changed.
+MOST_CHANGES: Final = 3  # more: a hand that stays in the picture holds up the bench; fewer: it uses up all of them
 _WORTH_REDUCING: Final = 2  # of a smaller catalog, a reduced index saves less time than its making takes
 
 
@@ -284,12 +290,18 @@ class DenseSession:
     rule : StoppingRule
         Decides when the search ends.
     max_views : int
-        Views after which it ends in any case.
+        Views after which it ends in any case, counted from the last change of the object.
+    most_changes : int
+        Number of times that the search begins again because the object changed; 0: all views count for one object.
 
     Attributes
     ----------
     belief : Belief
         After at least one view.
+    left_out : int
+        Number of views, from the first one on, that the belief leaves out because the object changed after them.
+    change : Change, optional
+        The change that the last view showed.
     decision : StopDecision
         The rule's last decision: at rest, after the last view.
     present : StopDecision
@@ -308,14 +320,22 @@ class DenseSession:
     is_new_decision = True
     verification: Verification | None = None
     comparison: LeaderComparison | None = None
+    left_out = 0
+    change: Change | None = None
+    _NEWEST: ClassVar[int] = 2
+    """Number of decisions since which the object may have changed."""
 
-    def __init__(self, index: DenseIndex, rule: StoppingRule, *, max_views: int = 8) -> None:
+    def __init__(
+        self, index: DenseIndex, rule: StoppingRule, *, max_views: int = 8, most_changes: int = MOST_CHANGES
+    ) -> None:
         self.rule = rule
         self.max_views = max_views
+        self._changes_left = most_changes
         # If a search ends after one or two views, an index of a part of the views costs more time than it saves.
         self._kept = KEPT if len(index) > _WORTH_REDUCING * KEPT else len(index)
         self._index = index
         self._so_far: DenseIndex | Belief = index
+        self._before: deque[Belief] = deque(maxlen=self._NEWEST)
         self._reliable = True
         self._same_bench: bool | None = None
         self._like_enrollment: bool | None = None
@@ -339,7 +359,7 @@ class DenseSession:
         orientation_deg : float
             Orientation of the camera around the object, from any zero that all views share.
         earlier : sequence of uint8 arrays, optional
-            New descriptions of the earlier views, because they were segmented again, and better.
+            New descriptions of all earlier views, because they were segmented again, and better.
         reliable : bool
             Whether the views were segmented reliably (`hbr.ViewsTogether.reliable`). If not, the search does not end
             while it may take more views.
@@ -356,6 +376,7 @@ class DenseSession:
             self._replace(earlier)
         self._begin_view(orientation_deg)
         self._extend(levels, orientation_deg)
+        self.change = self._changed()
         self.present = self._decide()
         if self.is_new_decision:
             self.decision = self.present
@@ -364,11 +385,36 @@ class DenseSession:
             self.present = self.decision
         return self.decision
 
+    def _changed(self) -> Change | None:
+        """Begin again with the newest views if they show another object."""
+        if not (self._changes_left and self.is_new_decision):
+            return None
+        found = changed(self.belief, self._before, beta=self.rule.beta)
+        if found is None:
+            return None
+        self._changes_left -= 1
+        newest = self.belief.levels[found.first :], self.belief.orientation_deg[found.first :].tolist()
+        found = found._replace(first=self.left_out + found.first)
+        self.left_out = found.first
+        self._forget()
+        for levels, orientation_deg in zip(*newest, strict=True):
+            self._begin_view(orientation_deg)
+            self._extend(levels, orientation_deg)
+        self.is_new_decision = True
+        return found
+
+    def _forget(self) -> None:
+        """Forget all views."""
+        self._so_far = self._index
+        self._before.clear()
+
     def _begin_view(self, orientation_deg: float) -> None:
         """Set ``is_new_decision`` for the next view."""
 
     def _extend(self, levels: LevelArray, orientation_deg: float) -> None:
         """Add a view to the belief."""
+        if self.is_new_decision and isinstance(self._so_far, Belief):
+            self._before.append(self._so_far)
         self._so_far = self.belief = update_belief(
             levels, orientation_deg, self._so_far, kept=self._kept, weight=self._weight(orientation_deg)
         )
@@ -376,12 +422,14 @@ class DenseSession:
     def _replace(self, queries: Sequence[LevelArray]) -> None:
         """Compute the belief again from other descriptions of the same views."""
         before = self._so_far.levels if isinstance(self._so_far, Belief) else ()
-        if len(queries) != len(before):
-            raise ValueError(f"{len(queries)} earlier views; the search has {len(before)}")
+        if len(queries) != self.left_out + len(before):
+            raise ValueError(f"{len(queries)} earlier views; the search has {self.left_out + len(before)}")
+        queries = queries[self.left_out :]
         if all(np.array_equal(a, b) for a, b in zip(queries, before, strict=True)):
             return
         orientations_deg = self.belief.orientation_deg.tolist()
         self._so_far = self._index
+        self._before.clear()
         for query, orientation_deg in zip(queries, orientations_deg, strict=True):
             self._extend(query, orientation_deg)
 

@@ -165,7 +165,7 @@ class _Search:
     """A search that continues after its end, to record the leading object after each view."""
 
     def __init__(self, index: DenseIndex, rule: StoppingRule, enrolled: Callable[[str], EnrolledViews]) -> None:
-        self._session = DenseSession(index, rule, max_views=VIEWS)
+        self._session = DenseSession(index, rule, max_views=VIEWS, most_changes=0)
         self._names = index.views.object_names
         self._enrolled = enrolled
         self._leaders: list[str] = []

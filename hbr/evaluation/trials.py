@@ -316,7 +316,7 @@ class _Trials:
         if self._index is None or self._index.omega != method.omega:
             self._index = DenseIndex(self._views.select(self._enrolled), omega=method.omega)
         last = self._last(method)
-        session = DenseSession(self._index, self._rule, max_views=last)
+        session = DenseSession(self._index, self._rule, max_views=last, most_changes=0)
         ended = False
         for n, seen, keep, measured in self._queries_of(draws, last, runs, at):
             # Views near the newest query leave the model for the earlier queries, too.
@@ -324,7 +324,7 @@ class _Trials:
             measured_deg = measured.tolist()
             if len(gone):
                 fewer = self._index.without(np.cumsum(self._enrolled)[gone] - 1)
-                session = DenseSession(fewer, self._rule, max_views=last)
+                session = DenseSession(fewer, self._rule, max_views=last, most_changes=0)
                 for i, angle_deg in zip(seen[:-1], measured_deg, strict=False):
                     session.add(self._queries[i], angle_deg)
             start_ns = self._now_ns()
