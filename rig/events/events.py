@@ -273,6 +273,21 @@ class FrameUsed:
 
 
 @dataclass(frozen=True, slots=True)
+class ObjectChanged:
+    """The newest views show another object, or the object was rotated by hand: the dense search begins again."""
+
+    event: Literal["object_changed"] = field(default="object_changed", init=False)
+    index: int
+    """Index of the view that shows the change, from 0."""
+    first: int
+    """Index of the first view since the change. The views before do not count in the answer."""
+    evidence: float
+    """Natural logarithm of how much better two objects explain the views than one object."""
+    needed: float
+    """Evidence from which the search begins again; it is higher if the views before fit no enrolled object closely."""
+
+
+@dataclass(frozen=True, slots=True)
 class Weighed:
     """All rotations that the dense search weighed before it chose one."""
 
@@ -466,6 +481,22 @@ class Failed:
     """The same as data, in order: sentences, and actions (``action``, ``parameters``, ``command``)."""
 
 
+class LeftOutReason(StrEnum):
+    """Why a view does not count in an answer."""
+
+    OBJECT_CHANGED = "object-changed"
+
+
+@dataclass(frozen=True, slots=True)
+class LeftOut:
+    """A view that does not count in an answer."""
+
+    index: int
+    """Index of the view, from 0."""
+    reason: LeftOutReason
+    """Why it does not count: ``object-changed``, because it shows the object that was on the table before."""
+
+
 @dataclass(frozen=True, slots=True)
 class Identified:
     """The answer of an identification."""
@@ -522,6 +553,8 @@ class Identified:
     open_set_threshold: float | None = None
     """Dense search: open-set score below which an object is unknown. Null if no object is called unknown, and in the
     paper's search."""
+    left_out: tuple[LeftOut, ...] = ()
+    """Views that the answer does not use; ``views`` does not count them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -544,6 +577,7 @@ Event = (
     | Accepted
     | Ranked
     | FrameUsed
+    | ObjectChanged
     | Verified
     | Compared
     | Decided

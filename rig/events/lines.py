@@ -27,6 +27,7 @@ from rig.events.events import (
     Identified,
     Item,
     Moved,
+    ObjectChanged,
     Ranked,
     Recorded,
     Rejected,
@@ -40,6 +41,7 @@ from rig.events.events import (
 )
 from rig.events.wording import (
     answer_lines,
+    change_words,
     comparison_words,
     decision_words,
     move_words,
@@ -124,6 +126,8 @@ def page_line(event: Event) -> str:
             return f"  candidates: {leaders} (margin {signed(event.margin, 3)})"
         case FrameUsed():
             return f"  {_frame_words(event)}"
+        case ObjectChanged():
+            return f"  {change_words(event)}"
         case Decided():
             return f"  {decision_words(event)} The table rotates to {angle_words(event.target_deg)}."
         case Enrolled():

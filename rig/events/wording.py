@@ -26,6 +26,7 @@ from rig.events.events import (
     Moved,
     Note,
     NoteCode,
+    ObjectChanged,
     Ranked,
     RotationReason,
     ScanStarted,
@@ -133,6 +134,15 @@ def verification_words(verified: Verified) -> str:
     }
     shares = f"its enrolled views explain {own} of the contrast, those of other candidates {others}"
     return f"compared with {verified.name} pixel by pixel: {shares}, {results[verified.outcome]}"
+
+
+def change_words(change: ObjectChanged) -> str:
+    """Return that the object changed, as a sentence."""
+    since = f"view {change.first + 1}" if change.first == change.index else f"views from {change.first + 1} on"
+    return (
+        f"The object on the table was changed or rotated by hand. The search begins again with {since} "
+        f"(evidence {change.evidence:.1f}, needed {change.needed:.1f})."
+    )
 
 
 def comparison_words(compared: Compared) -> str:
@@ -268,6 +278,8 @@ def answer_lines(answer: Identified) -> list[str]:
     reason = sentence(reason_words(answer))
     if answer.outcome is Outcome.UNKNOWN and answer.candidates[0].probability is not None:
         reason += " Percentages of candidates are shares among the enrolled objects."
+    if answer.left_out:
+        reason += f" The object changed, so {counted(len(answer.left_out), 'earlier view')} did not count."
     return [result_words(answer), reason]
 
 

@@ -40,6 +40,7 @@ from rig.events.events import (
     Moved,
     Note,
     NoteCode,
+    ObjectChanged,
     Recorded,
     Rejected,
     Started,
@@ -139,6 +140,8 @@ class ViewsAtRest:
         yield from warn_of_table(self.bench, self.number, described)
         ranked, step = self.search.add(described, azimuth_deg, table_deg=self.table.rest_deg)
         self.ended_ns, self.is_over = self.bench.clock.now_ns(), isinstance(step, Finish)
+        if (changed := self.search.changed()) is not None:
+            yield changed
         if self.search.is_new_decision:
             yield ranked
 
@@ -244,6 +247,8 @@ class ViewsInMotion(ViewsAtRest):
         azimuth_deg = float(wrap360(self.sign * motion.angle_deg))
         self.unseen.append(accepted(self.number, azimuth_deg, attempt, described))
         ranked, step = self.search.add(described, azimuth_deg, table_deg=motion.angle_deg)
+        if (changed := self.search.changed()) is not None:
+            self.unseen.append(changed)
         used = self.search.frame_used(self.number, azimuth_deg, self.seconds, self.rejected)
         self.live(used)
         self.unseen.append(used)
@@ -444,7 +449,8 @@ def watch(
         yield Waiting(reason)
         reason = WaitReason.NEXT_OBJECT
         try:
-            views = (yield from identify_next()).views
+            answer = yield from identify_next()
+            views = answer.views + len(answer.left_out)
         except (NoObject, ViewRejected) as error:
             yield Failed(**error.as_dict())
             views = 0
@@ -456,6 +462,8 @@ def watch(
 @dataclass(eq=False)
 class ResultRecorder:
     """Records each answer of `identify` or `watch`, with the image of its first view.
+
+    If the object changed, the image is that of the view that shows it.
 
     An answer is never lost: show it before it is recorded. A catalog that cannot be written is a `Warned`.
 
@@ -488,6 +496,7 @@ class ResultRecorder:
     with_image: bool = True
     sample: str | None = field(default=None, init=False)
     _image: NDArray[np.uint8] | None = field(default=None, init=False)
+    _newest: NDArray[np.uint8] | None = field(default=None, init=False)
     _azimuths_deg: list[float] = field(default_factory=list, init=False)
 
     def add(self, event: Event) -> Recorded | Warned | None:
@@ -496,9 +505,12 @@ class ResultRecorder:
             case Started():
                 self._image, self._azimuths_deg = None, []
             case Accepted():
-                if self.with_image and self._image is None:
-                    self._image = event.image_bgr
+                self._newest = event.image_bgr if self.with_image else None
+                if self._image is None:
+                    self._image = self._newest
                 self._azimuths_deg.append(event.azimuth_deg)
+            case ObjectChanged():
+                self._image = self._newest
             case Identified():
                 recorded = self._record(event)
                 self.sample = None

@@ -15,6 +15,7 @@ from rig.events.events import (
     FrameUsed,
     Identified,
     Moved,
+    ObjectChanged,
     Ranked,
     event_dict,
 )
@@ -92,6 +93,8 @@ def check(run: SavedRun) -> ReplayCheck:
                 if event.segmentation is not None:
                     saved, again = event.segmentation, plain(view.segmentation)
                     found.differences += _compare(found.views, "segmentation", saved, again)
+            case ObjectChanged():
+                computed = search.changed() or {}
             case Ranked():
                 # The number of candidates is a setting of the run.
                 computed = replace(search.ranked, candidates=search.ranked.candidates[: len(event.candidates)])

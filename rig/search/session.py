@@ -28,7 +28,17 @@ from hbr.model.symmetry import symmetry
 from hbr.paper.hmm import CONFIDENT, PoseBelief, PoseModel, update_poses
 from rig.config import RigConfig
 from rig.events.compared import Compared, ComparedView, Verified
-from rig.events.events import Candidate, Decided, FrameUsed, Identified, Ranked, RotationReason
+from rig.events.events import (
+    Candidate,
+    Decided,
+    FrameUsed,
+    Identified,
+    LeftOut,
+    LeftOutReason,
+    ObjectChanged,
+    Ranked,
+    RotationReason,
+)
 from rig.search.strategies import (
     DenseSearchState,
     Finish,
@@ -48,10 +58,14 @@ EnrolledViews = Callable[[str, Sequence[float]], Sequence[LocalView]]
 """Returns the enrolled views of an object near some azimuths."""
 
 
-def compared_event(index: int, comparison: LeaderComparison, names: tuple[str, ...]) -> Compared:
-    """Return the event of a comparison after the last view; ``names`` are those of the enrolled objects."""
+def compared_event(index: int, comparison: LeaderComparison, names: tuple[str, ...], left_out: int = 0) -> Compared:
+    """Return the event of a comparison after the last view; ``names`` are those of the enrolled objects.
+
+    ``left_out`` is the number of views that the comparison does not know, because the object changed after them.
+    """
     found = comparison.found
     first, second = comparison.leaders
+    views = [(left_out + comparison.compared[one.view], one) for one in found.views]
     return Compared(
         index=index,
         names=(names[first], names[second]),
@@ -63,7 +77,7 @@ def compared_event(index: int, comparison: LeaderComparison, names: tuple[str, .
         unexplained=found.unexplained,
         misfit=found.misfit,
         apart=found.apart,
-        views=tuple(ComparedView(comparison.compared[one.view], one.score, one.weight) for one in found.views),
+        views=tuple(ComparedView(number, one.score, one.weight) for number, one in views),
         azimuths_deg=(_azimuths(comparison.views[0]), _azimuths(comparison.views[1])),
         picture_bgr=_picture(found.views),
         leaders=(_pixels(comparison.views[0]), _pixels(comparison.views[1])),
@@ -196,6 +210,10 @@ class Search(ABC):
     def frame_used(self, number: int, azimuth_deg: float, seconds: float, rejected: int) -> FrameUsed:
         """Return the event of the last frame of a search in motion; ``number`` counts the views from 0."""
         raise NotImplementedError
+
+    def changed(self) -> ObjectChanged | None:
+        """Return the event if the last view shows that the object changed; the search has then begun again."""
+        return None
 
     def last_steps(self, hypotheses: Hypotheses) -> tuple[Asking[Verified | None], Asking[Compared | None]]:
         """Return the steps before the answer: a doubtful leader is verified, then the two leaders are compared."""
@@ -422,13 +440,17 @@ class DenseSearch(Search):
             for i in order[: self._top].tolist()
         )
         others = float(scores[order[1:]].max()) if len(order) > 1 else 0.0
-        return Ranked(belief.queries - 1, candidates, candidates[0].score - others, decision)
+        return Ranked(len(self._orientations) - 1, candidates, candidates[0].score - others, decision)
 
     def _ordered(self) -> tuple[NDArray[np.float64], NDArray[np.float64], IndexArray]:
         """Return probability and score of each object considered, and their order, the likeliest first."""
         belief = self._session.belief
         probability, scores = belief.probability(self._session.rule.beta), belief.scores()
         return probability, scores, np.lexsort((-scores, -probability))
+
+    def changed(self) -> ObjectChanged | None:
+        change = self._session.change
+        return None if change is None else ObjectChanged(len(self._orientations) - 1, *change)
 
     def frame_used(self, number: int, azimuth_deg: float, seconds: float, rejected: int) -> FrameUsed:
         present = self._session.present
@@ -469,10 +491,13 @@ class DenseSearch(Search):
 
     def compare(self, hypotheses: Hypotheses) -> Asking[Compared | None]:
         found = yield from self._session.compare(self._queries(hypotheses))
-        return None if found is None else compared_event(len(self._orientations) - 1, found, self.names)
+        if found is None:
+            return None
+        return compared_event(len(self._orientations) - 1, found, self.names, self._session.left_out)
 
     def _queries(self, hypotheses: Hypotheses) -> Queries:
-        return lambda n: [LocalView(one.crop, one.mask, self._orientations[n]) for one in hypotheses[n]]
+        own, orientations_deg = hypotheses[self._session.left_out :], self._orientations[self._session.left_out :]
+        return lambda n: [LocalView(one.crop, one.mask, orientations_deg[n]) for one in own[n]]
 
     def answer(self, *, travelled_deg: float = 0.0, seconds: float = 0.0) -> Identified:
         answer = super().answer(travelled_deg=travelled_deg, seconds=seconds)
@@ -485,6 +510,8 @@ class DenseSearch(Search):
         return replace(
             answer,
             name=None if outcome is hbr.Outcome.UNKNOWN else possible[0] if compared else answer.name,
+            views=self._session.belief.queries,
+            left_out=tuple(LeftOut(n, LeftOutReason.OBJECT_CHANGED) for n in range(self._session.left_out)),
             outcome=outcome,
             reason=decision.reason if compared or self._session.verification else answer.reason,
             possible=possible,
