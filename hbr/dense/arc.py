@@ -26,7 +26,7 @@ from hbr.dense.fitting import fit_min_confidence
 from hbr.dense.index import DenseIndex
 from hbr.dense.leave_one_out import LeaveOneOut, leave_one_out, searched_objects
 from hbr.dense.next_view import SHARPNESS, NextBestView, log_confusion, pairs_after
-from hbr.dense.session import DenseSession
+from hbr.dense.session import MOST_CHANGES, DenseSession
 from hbr.dense.stopping import Outcome, StopDecision, StoppingRule, StopReason, by_confidence
 
 STEP_DEG: Final = 15.0
@@ -92,7 +92,7 @@ class ArcSession(DenseSession):
 
     Parameters
     ----------
-    index, rule
+    index, rule, most_changes
         As for a search at rest.
     min_confidence : float
         Confidence that ends the search after the first view, from `fit_arc_confidence`.
@@ -105,8 +105,10 @@ class ArcSession(DenseSession):
 
     _NEWEST = 4  # 60°: the frames of fewer steps are hardly enough evidence of a change
 
-    def __init__(self, index: DenseIndex, rule: StoppingRule, min_confidence: float) -> None:
-        super().__init__(index, rule, max_views=DECISIONS)
+    def __init__(
+        self, index: DenseIndex, rule: StoppingRule, min_confidence: float, *, most_changes: int = MOST_CHANGES
+    ) -> None:
+        super().__init__(index, rule, max_views=DECISIONS, most_changes=most_changes)
         self.decisions = 0
         self._min_confidence = min_confidence
         self._covered_deg = 0.0

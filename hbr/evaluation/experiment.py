@@ -9,7 +9,7 @@ from hbr.evaluation.condition import Condition
 from hbr.evaluation.photographs import Dataset
 from hbr.evaluation.protocol import Method, Protocol
 
-KindName = Literal["trials", "matrix", "unknown-objects", "bench-change"]
+KindName = Literal["trials", "matrix", "unknown-objects", "bench-change", "replaced"]
 Change = Literal["mild", "hard"]
 #: Increased if the same settings give other numbers.
 FORMAT: Final = 9
@@ -23,9 +23,10 @@ class Experiment:
     ----------
     name : str
         Name in files and reports.
-    kind : {"trials", "matrix", "unknown-objects", "bench-change"}
+    kind : {"trials", "matrix", "unknown-objects", "bench-change", "replaced"}
         ``trials`` compares methods; ``matrix`` measures one perturbation at a time; ``unknown-objects`` leaves objects
-        out, and searches for them, too; ``bench-change`` searches after a change of a whole drawn bench.
+        out, and searches for them, too; ``bench-change`` searches after a change of a whole drawn bench; ``replaced``
+        replaces the object during the search.
     condition : Condition
         How the images of queries differ from those of enrolled views.
     protocol : Protocol
@@ -64,7 +65,7 @@ class Experiment:
             raise ValueError(f"change {self.change!r} is unknown; use mild or hard")
         if self.every < 1:
             raise ValueError(f"every is {self.every}; at least 1 is needed")
-        if self.kind in ("matrix", "bench-change") and self.protocol.enrolled is None:
+        if self.kind in ("matrix", "bench-change", "replaced") and self.protocol.enrolled is None:
             raise ValueError(f"{self.kind} needs the number of enrolled views; give enrolled = 18")
 
     def settings(self, dataset: Dataset) -> dict[str, Any]:

@@ -14,6 +14,7 @@ from hbr.evaluation.changes import BENCH_CHANGE
 from hbr.evaluation.experiment import Experiment, Kind
 from hbr.evaluation.matrix import MATRIX
 from hbr.evaluation.photographs import Dataset
+from hbr.evaluation.replaced import REPLACED
 from hbr.evaluation.trials import TRIALS
 from hbr.evaluation.unknown_objects import UNKNOWN_OBJECTS
 from rig.charts.evaluation_figures import figures
@@ -31,6 +32,7 @@ _KINDS: Final[Mapping[str, Kind]] = {
     "matrix": MATRIX,
     "unknown-objects": UNKNOWN_OBJECTS,
     "bench-change": BENCH_CHANGE,
+    "replaced": REPLACED,
 }
 _MAX_NAME: Final = 60  # the end of a name distinguishes runs, and file systems end names at 255 bytes
 _T = TypeVar("_T")

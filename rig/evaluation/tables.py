@@ -50,6 +50,8 @@ def tables(results: Mapping[str, Any]) -> list[Rows]:
             return [_matrix(rows)]
         case "unknown-objects":
             return [_unknown_objects(rows)]
+        case "replaced":
+            return [_replaced(rows)]
         case _:
             return [_changes(rows)]
 
@@ -134,6 +136,25 @@ def _unknown_objects(rows: Sequence[Row]) -> Rows:
         lambda row: f"nominal {100 * row['nominal']:g}{', fitted' if row['fitted'] else ''}",
         "views",
         cell,
+    )
+
+
+def _replaced(rows: Sequence[Row]) -> Rows:
+    """Return the shares of searches in percent; enrolled objects are marked +, others -."""
+    shares = ("noticed_1", "noticed_2", "noticed_3", "noticed_running", "wrong", "wrong_running")
+    heads = (
+        "%|searches|noticed, 1/3|2/3|3/3|running: noticed|began again wrongly|running: wrongly|right|without the test"
+    )
+    return Rows(
+        heads.split("|"),
+        [
+            [
+                f"{row['way']}: {row['case']} {'-+'[row['before_enrolled']]}{'-+'[row['after_enrolled']]}",
+                f"{row['searches']}",
+                *(_percent(row[share]) for share in (*shares, "right", "right_without")),
+            ]
+            for row in rows
+        ],
     )
 
 
