@@ -17,7 +17,7 @@ object begin again. Rates: docs/results.md.
 Source: R. P. Adams and D. J. C. MacKay, "Bayesian online changepoint detection", 2007, arXiv:0710.3742.
 """
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from math import log
 from typing import Final, NamedTuple
 
@@ -31,6 +31,10 @@ from hbr.dense.index import BINS, Floats
 KNOWN_FROM: Final = 0.75
 CHANGED_FROM_KNOWN: Final = 3.0
 CHANGED_FROM: Final = 6.0
+#: So much less evidence is needed if the table moved without a command before the view.
+DISTURBED: Final = (
+    3.0  # more: further changes are noticed at once; searches begin again without one if the table is hit
+)
 #: The mean is over at least this number of objects.
 _LEAST_OBJECTS: Final = 100
 
@@ -47,7 +51,7 @@ class Change(NamedTuple):
     needed: float
 
 
-def changed(belief: Belief, before: Iterable[Belief], *, beta: float) -> Change | None:
+def changed(belief: Belief, before: Iterable[Belief], *, beta: float, disturbed: Collection[int] = ()) -> Change | None:
     """Return the likeliest change, or None if the views show one object.
 
     Parameters
@@ -58,6 +62,8 @@ def changed(belief: Belief, before: Iterable[Belief], *, beta: float) -> Change 
         Earlier beliefs of the same search, after each of which the object may have changed.
     beta : float
         As for `Belief.posterior`.
+    disturbed : collection of int
+        The views, from 0, before which the table moved without a command.
     """
     found: list[Change] = []
     objects = max(len(belief.index.views.object_names), _LEAST_OBJECTS)
@@ -67,7 +73,7 @@ def changed(belief: Belief, before: Iterable[Belief], *, beta: float) -> Change 
             continue
         apart = _log_sum(one.support, beta) + _log_sum(belief.support - one.support, beta)
         known = float(one.support.max()) / one.amount >= KNOWN_FROM
-        needed = CHANGED_FROM_KNOWN if known else CHANGED_FROM
+        needed = (CHANGED_FROM_KNOWN if known else CHANGED_FROM) - DISTURBED * (one.queries in disturbed)
         evidence = apart - of_all - log(objects * BINS)
         if evidence >= needed:
             found.append(Change(one.queries, evidence, needed))

@@ -336,6 +336,7 @@ class DenseSession:
         self._index = index
         self._so_far: DenseIndex | Belief = index
         self._before: deque[Belief] = deque(maxlen=self._NEWEST)
+        self._disturbed: set[int] = set()
         self._reliable = True
         self._same_bench: bool | None = None
         self._like_enrollment: bool | None = None
@@ -349,6 +350,7 @@ class DenseSession:
         reliable: bool = True,
         same_bench: bool | None = None,
         segmented_by: str | None = None,
+        disturbed: bool = False,
     ) -> StopDecision:
         """Add the next view, as for `update_belief`, and return the rule's last decision.
 
@@ -368,6 +370,8 @@ class DenseSession:
         segmented_by : str, optional
             The `hbr.segmentation.Method` of the view. The rule considers the bench only with a method that segments
             like the enrollment (`hbr.descriptors.together.like_enrollment`).
+        disturbed : bool
+            Whether the table moved without a command since the view before, as if by hand.
         """
         self._reliable, self._same_bench = reliable, same_bench
         self._like_enrollment = same_bench if segmented_by is None else like_enrollment(segmented_by, same_bench)
@@ -376,6 +380,8 @@ class DenseSession:
             self._replace(earlier)
         self._begin_view(orientation_deg)
         self._extend(levels, orientation_deg)
+        if disturbed:
+            self._disturbed.add(self.belief.queries - 1)
         self.change = self._changed()
         self.present = self._decide()
         if self.is_new_decision:
@@ -389,7 +395,7 @@ class DenseSession:
         """Begin again with the newest views if they show another object."""
         if not (self._changes_left and self.is_new_decision):
             return None
-        found = changed(self.belief, self._before, beta=self.rule.beta)
+        found = changed(self.belief, self._before, beta=self.rule.beta, disturbed=self._disturbed)
         if found is None:
             return None
         self._changes_left -= 1
@@ -407,6 +413,7 @@ class DenseSession:
         """Forget all views."""
         self._so_far = self._index
         self._before.clear()
+        self._disturbed.clear()
 
     def _begin_view(self, orientation_deg: float) -> None:
         """Set ``is_new_decision`` for the next view."""

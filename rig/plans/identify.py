@@ -363,9 +363,9 @@ def identify(
         with views.table as table:
             yield from views.begin()
             while not views.is_over:
-                yield from views.view()
+                yield from _noticed(search, views.view())
                 if isinstance(search.step, Rotate):
-                    yield from views.rotate(search.step)
+                    yield from _noticed(search, views.rotate(search.step))
             seconds = views.seconds
             failed = yield from _unwound(views.number, table)
     except MotionStopped:
@@ -380,6 +380,13 @@ def identify(
     if failed:  # the answer is reported first
         raise failed
     return answer
+
+
+def _noticed(search: Search, events: Generator[Event, None, None]) -> Generator[Event, None, None]:
+    """Yield events that the search notices, as a replay of them does."""
+    for event in events:
+        search.notice(event)
+        yield event
 
 
 def _flies(config: RigConfig, model: Model) -> bool:

@@ -80,6 +80,7 @@ def check(run: SavedRun) -> ReplayCheck:
     table_deg = 0.0
     for event in run.events():
         computed: Event | dict[str, Any] | None = None
+        search.notice(event)
         match event:
             case Moved():
                 table_deg = event.encoder_deg

@@ -31,12 +31,15 @@ from rig.events.compared import Compared, ComparedView, Verified
 from rig.events.events import (
     Candidate,
     Decided,
+    Event,
     FrameUsed,
     Identified,
     LeftOut,
     LeftOutReason,
+    Moved,
     ObjectChanged,
     Ranked,
+    Rejected,
     RotationReason,
 )
 from rig.search.strategies import (
@@ -49,6 +52,7 @@ from rig.search.strategies import (
     reachable_arcs,
     reachable_rotations,
 )
+from rig.views.capture import RejectReason
 from rig.views.description import DescribedView
 
 SHOWN_VIEWS: Final = 3  # the most telling ones; more make the page of a report longer
@@ -170,6 +174,17 @@ class Search(ABC):
         self._top = top
         self._rng = np.random.default_rng(seed)
         self._orientations: list[float] = []
+        self._disturbed = False
+
+    def notice(self, event: Event) -> None:
+        """Take an event that precedes the next view: the table may have moved without a command, as if by hand."""
+        match event:
+            case Moved(agrees=False):
+                self._disturbed = True
+            case Rejected(reasons=reasons) if RejectReason.TABLE_MOVED in reasons:
+                self._disturbed = True
+            case _:
+                pass
 
     def add(self, view: DescribedView, azimuth_deg: float, *, table_deg: float) -> tuple[Ranked, Rotate | Finish]:
         """Add the next view, described by the search's descriptor; return the candidates and the strategy's decision.
@@ -179,6 +194,7 @@ class Search(ABC):
         """
         self._orientations.append(azimuth_deg)
         self.ranked = self._rank(view)
+        self._disturbed = False
         if self.is_new_decision:
             self.step = self.strategy.next(self._state(table_deg))
         assert self.step is not None
@@ -428,6 +444,7 @@ class DenseSearch(Search):
             reliable=view.reliable,
             same_bench=view.same_bench,
             segmented_by=None if view.segmentation is None else view.segmentation.get("method", ""),
+            disturbed=self._disturbed,
         )
         self.is_new_decision = self._session.is_new_decision
         belief = self._session.belief

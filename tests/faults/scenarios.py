@@ -244,6 +244,17 @@ SCENARIOS: dict[str, Scenario] = {
             shown=False,
             late=True,
         ),
+        stopped(
+            "object_moved@move3",
+            601,
+            "a last view at home differs from the first view; a search compares each new view with the views before",
+            "put the object back",
+            after=After.REPLACE,
+            identify="object_moved:other=0@move1",
+            answer=FOUND,
+            shown=False,
+            late=True,
+        ),
         stopped("disk_full@move3", 700, "a write fails", "free some disk space", answer=FOUND),
         survived("clock_jump@view3", "not detected: durations use the monotonic clock", identify="clock_jump@view0"),
     )
