@@ -470,7 +470,7 @@ def watch(
 class ResultRecorder:
     """Records each answer of `identify` or `watch`, with the image of its first view.
 
-    If the object changed, the image is that of the view that shows it.
+    If the object changed, the image is that of the view that showed it, and the views before the change do not count.
 
     An answer is never lost: show it before it is recorded. A catalog that cannot be written is a `Warned`.
 
@@ -518,6 +518,7 @@ class ResultRecorder:
                 self._azimuths_deg.append(event.azimuth_deg)
             case ObjectChanged():
                 self._image = self._newest
+                del self._azimuths_deg[: event.first - event.index - 1]
             case Identified():
                 recorded = self._record(event)
                 self.sample = None
