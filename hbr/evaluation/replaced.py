@@ -12,11 +12,12 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from hbr.core.angles import wrap180
-from hbr.core.arrays import LevelArray
-from hbr.dense.arc import ArcSession
+from hbr.core.angles import size_deg, wrap180
+from hbr.core.arrays import FloatArray, LevelArray
+from hbr.dense.arc import ArcSession, frame_weight
+from hbr.dense.filter import Belief, update_belief
 from hbr.dense.index import DenseIndex
-from hbr.dense.session import MOST_CHANGES, DenseSession
+from hbr.dense.session import DenseSession
 from hbr.dense.stopping import Outcome, StoppingRule
 from hbr.evaluation.condition import enrolled_levels, query_levels
 from hbr.evaluation.experiment import Experiment, Kind
@@ -24,7 +25,6 @@ from hbr.evaluation.photographs import Dataset
 from hbr.evaluation.protocol import generator, views_of_trial
 from hbr.evaluation.statistics import wilson
 from hbr.evaluation.trials import all_views, rule_of_trial
-from hbr.model.views import Views
 
 
 class _Way(NamedTuple):
@@ -40,6 +40,7 @@ class _Way(NamedTuple):
 #: At rest, as many views as a search on the bench takes at most; in motion, the longest arc, and a quarter revolution.
 _WAYS: Final = (_Way("at rest", 1, 3, 3, 8), _Way("in motion", 3, 21, 18, 42))
 _FRAME_DEG: Final = 5.0  # the photographs of COIL-100
+_MOTION_EVERY: Final = 5  # a trial in motion takes as long as several at rest
 #: What happens to the object, and whether the objects before and after it are enrolled.
 _CASES: Final = (
     ("stays", True, True),
@@ -88,11 +89,17 @@ class _Described(NamedTuple):
     queries: LevelArray
 
 
+class _Queries(NamedTuple):
+    """The views of an object that are not enrolled."""
+
+    levels: LevelArray
+    azimuth_deg: FloatArray
+
+
 class _Model(NamedTuple):
-    views: Views
     enrolled: DenseIndex
     rule: StoppingRule
-    queries: tuple[LevelArray, ...]
+    queries: tuple["_Queries", ...]
 
 
 def _enroll(experiment: Experiment, dataset: Dataset, j: int) -> _Described:
@@ -102,8 +109,13 @@ def _enroll(experiment: Experiment, dataset: Dataset, j: int) -> _Described:
 
 def _model(experiment: Experiment, dataset: Dataset, described: list[_Described]) -> _Model:
     views = all_views(experiment, dataset, [one.enrolled for one in described])
-    index = DenseIndex(views.select(views_of_trial(views, experiment.protocol)))
-    return _Model(views, index, rule_of_trial(views, experiment.protocol), tuple(one.queries for one in described))
+    is_enrolled = views_of_trial(views, experiment.protocol)
+    queries = []
+    for j, one in enumerate(described):
+        free = ~is_enrolled[rows := views.of(j)]
+        queries.append(_Queries(one.queries[free], views.azimuth_deg[rows][free]))
+    rule = rule_of_trial(views, experiment.protocol)
+    return _Model(DenseIndex(views.select(is_enrolled)), rule, tuple(queries))
 
 
 def _search(
@@ -112,7 +124,7 @@ def _search(
     others = [k for k in range(len(dataset.objects)) if k != j]
     results = []
     for trial in range(experiment.protocol.trials):
-        for way in _WAYS:
+        for way in _WAYS[: 1 if trial % _MOTION_EVERY else 2]:
             for number, (case, before, after) in enumerate(_CASES):
                 rng = generator(
                     experiment.protocol.seed, dataset.objects[j].name, "trial", trial * len(_CASES) + number
@@ -136,9 +148,8 @@ def _searched(
 ) -> tuple[bool, int | None, bool, bool, bool, bool]:
     """Search once, and return the last fields of `ReplacedSearch`; ``pair`` has the objects before and after."""
     is_moving = way.name == "in motion"
-    session, without = (_session(index, model.rule, is_moving, most) for most in (MOST_CHANGES, 0))
-    free = [np.flatnonzero(~views_of_trial(model.views, experiment.protocol)[model.views.of(k)]) for k in pair]
-    own_deg = [model.views.azimuth_deg[model.views.of(k)[some]] for k, some in zip(pair, free, strict=True)]
+    session = ArcSession(index, model.rule, model.rule.min_confidence) if is_moving else DenseSession(index, model.rule)
+    without: DenseIndex | Belief = index
     starts_deg = rng.uniform(0, 360, 2)
     if case == "rotated":
         starts_deg[1] = starts_deg[0] + rng.uniform(_LEAST_ROTATION_DEG, 360 - _LEAST_ROTATION_DEG)
@@ -146,15 +157,15 @@ def _searched(
     running, noticed, wrong, wrong_running, camera_deg = True, None, False, False, 0.0
     for n in range(before if case == "stays" else before + way.since):
         after = int(n >= before)
-        away_deg = wrap180(own_deg[after] - starts_deg[after] - camera_deg)
+        queries = model.queries[pair[after]]
+        away_deg = wrap180(queries.azimuth_deg - starts_deg[after] - camera_deg)
         place = int(np.abs(away_deg).argmin())
         measured_deg = camera_deg + float(away_deg[place]) + rng.normal(0, experiment.protocol.sigma_deg)
-        for one in (session, without):
-            one.add(
-                model.queries[pair[after]][free[after][place]],
-                measured_deg,
-                same_bench=experiment.condition.same_bench,
-            )
+        weight = None
+        if is_moving and isinstance(without, Belief):
+            weight = frame_weight(float(size_deg(without.orientation_deg - measured_deg).min()))
+        without = update_belief(queries.levels[place], measured_deg, without, weight=weight)
+        session.add(queries.levels[place], measured_deg, same_bench=experiment.condition.same_bench)
         if session.change is not None and after:
             noticed = noticed or n - before + 1
         elif session.change is not None:
@@ -162,14 +173,9 @@ def _searched(
         if not after:
             running = running and session.decision.outcome is Outcome.CONTINUE
         camera_deg += _FRAME_DEG if is_moving else session.next_best_view().rotation_deg
-    right = [one.decision.object_index == pair[1] for one in (session, without)]
-    return running, noticed, wrong, wrong_running, right[0], right[1]
-
-
-def _session(index: DenseIndex, rule: StoppingRule, is_moving: bool, most_changes: int) -> DenseSession:
-    if is_moving:
-        return ArcSession(index, rule, rule.min_confidence, most_changes=most_changes)
-    return DenseSession(index, rule, most_changes=most_changes)
+    assert isinstance(without, Belief)
+    leads = [int(one.index.object_index[one.likeliest(model.rule.beta)[0]]) for one in (session.belief, without)]
+    return running, noticed, wrong, wrong_running, leads[0] == pair[1], leads[1] == pair[1]
 
 
 def _results(
