@@ -7,7 +7,7 @@ import pytest
 
 from hbr import DenseIndex, DenseSession, Outcome, Views
 from hbr.dense.arc import STEP_DEG, ArcSession
-from hbr.dense.change import CHANGED_FROM, CHANGED_FROM_KNOWN, DISTURBED, changed
+from hbr.dense.change import CHANGED_FROM, CHANGED_FROM_KNOWN, DISTURBED, MORE_PER_VIEW, changed
 from hbr.dense.fitting import fit_stopping_rule
 from hbr.dense.stopping import StoppingRule
 from tests.hbr.dense.searches import belief_after
@@ -94,9 +94,9 @@ def test_change_that_one_view_leaves_open_is_found_by_the_next(index: DenseIndex
 
 
 def test_less_evidence_is_needed_of_a_known_object_and_after_a_disturbance(index: DenseIndex) -> None:
-    def needed(levels: np.ndarray, **options: set[int]) -> float:
-        before = belief_after([levels], [0.0], index)
-        after = belief_after([levels, view(index.views, 8, 140.0)], [0.0, 100.0], index)
+    def needed(levels: np.ndarray, views: int = 1, **options: set[int]) -> float:
+        before = belief_after([levels] * views, [0.0] * views, index)
+        after = belief_after([*before.levels, view(index.views, 8, 140.0)], [0.0] * views + [100.0], index)
         found = changed(after, [before], beta=300.0, **options)  # far more evidence than is needed
         assert found is not None
         assert found.evidence > found.needed
@@ -105,6 +105,7 @@ def test_less_evidence_is_needed_of_a_known_object_and_after_a_disturbance(index
     known = view(index.views, 3, 0.0)
     unknown = known * (np.arange(144) % 4 > 0).astype(np.uint8)  # resembles the object, but not closely
     assert needed(known) == CHANGED_FROM_KNOWN
+    assert needed(known, views=3) == CHANGED_FROM_KNOWN + 2 * MORE_PER_VIEW
     assert needed(unknown) == CHANGED_FROM
     assert needed(unknown, disturbed={1}) == CHANGED_FROM - DISTURBED
     assert needed(unknown, disturbed={0}) == CHANGED_FROM  # before the first view
