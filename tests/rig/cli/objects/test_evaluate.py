@@ -230,6 +230,23 @@ def test_left_out_objects_are_searched_for(photographs: Path, tmp_path: Path) ->
     assert all(row["false_rejects"] == 0 and row["false_accepts"] == 30 for row in by_trials)
 
 
+def test_objects_are_replaced_during_a_search(photographs: Path, tmp_path: Path) -> None:
+    done = run(photographs, 'base = "replaced"\nobjects = "1-4"\nenrolled = 6\ntrials = 3', "--out", tmp_path)
+    assert done.exit_code == 0, done.output
+    assert "at rest: replaced ++" in done.output
+    rows = results(tmp_path)["rows"]
+    assert [(row["way"], row["searches"]) for row in rows] == [("at rest", 12)] * 7 + [("in motion", 4)] * 7
+    for row in rows:
+        assert row["noticed_1"] <= row["noticed_2"] <= row["noticed_3"]
+        if row["case"] == "stays":
+            assert row["noticed_3"] == row["wrong"] == 0
+        if row["case"] == "replaced" and row["before_enrolled"] and row["after_enrolled"]:
+            assert row["noticed_3"] > 0.5
+            assert row["right"] >= row["right_without"]
+        if not row["after_enrolled"]:
+            assert row["right"] == row["right_without"] == 0
+
+
 @pytest.mark.nightly
 def test_bench_change_searches_for_each_object_also_as_if_it_were_not_enrolled(
     photographs: Path, tmp_path: Path
