@@ -140,11 +140,13 @@ def _unknown_objects(rows: Sequence[Row]) -> Rows:
 
 
 def _replaced(rows: Sequence[Row]) -> Rows:
-    """Return the shares of searches in percent; enrolled objects are marked +, others -."""
+    """Return the shares of searches in percent; enrolled objects are marked +, others -.
+
+    They noticed a change within one to three thirds of the views since; after "running", only searches count that their
+    stopping rule would not have ended.
+    """
     shares = ("noticed_1", "noticed_2", "noticed_3", "noticed_running", "wrong", "wrong_running")
-    heads = (
-        "%|searches|noticed, 1/3|2/3|3/3|running: noticed|began again wrongly|running: wrongly|right|without the test"
-    )
+    heads = "%|n|seen ⅓|⅔|all|running|wrong|running|right|no test"
     return Rows(
         heads.split("|"),
         [
