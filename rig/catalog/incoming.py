@@ -160,6 +160,8 @@ def _read(reading: Reading, task: describing.Task) -> ReadImages:
             break
         except _Rejected:
             read_others()
+            if not found.rejected.keys().isdisjoint(task.empty_tables):
+                break
         except CatalogError as error:
             if not isinstance(error.__cause__, UsageError | ValueError):
                 raise  # of the store

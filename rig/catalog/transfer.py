@@ -232,7 +232,8 @@ def transfer(
         found = yield from read_images(reading, tasks, strict=strict and not dry_run, jobs=jobs)
     rejected = (*source.rejected, *found.rejected_files)
     plan = replace(plan, wanted=_kept(plan.wanted, found, are_photographs=catalog is None))
-    if (strict and rejected) or (found.rejected and not plan.wanted):
+    tables = {image for task in tasks for image in task.empty_tables}
+    if (strict and rejected) or (found.rejected and not plan.wanted) or not tables.isdisjoint(found.rejected):
         raise _rejection(source, rejected)
 
     # Store the images of a strict transfer, now that all of them are right. Then add all rows.
@@ -299,11 +300,16 @@ def _new(name: str, old: Enrollment, found: ReadImages, *, is_photographed: bool
     plan, key = old.planned_azimuth_deg, old.key
     if is_photographed:
         plan = tuple(old.planned_azimuth_deg[view.index] for view in good)
-        key = sha256_of((name, *((view.azimuth_deg, found.images[view.image], view.region) for view in good)))
+        tables = [found.images.get(session.empty_table or "") for session in old.sessions]
+        shown = [(view.azimuth_deg, found.images[view.image], view.region) for view in good]
+        key = sha256_of((name, *shown, *([tables] if any(tables) else [])))
         found.contents[key] = found.contents.pop(old.key, {})
     new = Enrollment(key=key, object_id=0, started_utc=old.started_utc, planned_azimuth_deg=plan)
     for session in old.sessions:
-        new.sessions.append(Session(**{name: getattr(session, name) for name in _OF_SESSION}))
+        part = Session(**{name: getattr(session, name) for name in _OF_SESSION})
+        if part.empty_table in found.images:
+            part.empty_table, part.empty_table_bytes = found.images[part.empty_table]
+        new.sessions.append(part)
     for place, view in enumerate(good):
         copy = View(**{name: getattr(view, name) for name in _OF_VIEW})
         copy.session = view.session

@@ -91,15 +91,13 @@ def decode(content: bytes, *, max_pixels: int = MAX_PIXELS) -> NDArray[np.uint8]
     """
     if len(content) > MAX_FILE_BYTES:
         raise BadImage(f"{len(content)} bytes, more than {MAX_FILE_BYTES}")
-    if content.startswith(_PNG):
-        size, end = _png_size(content), b"IEND\xaeB`\x82"
-    elif content.startswith(_JPEG):
-        size, end = _jpeg_size(content), b"\xff\xd9"
-    else:
+    if not content.startswith((_PNG, _JPEG)):
         raise BadImage("neither a PNG nor a JPEG file")
-    if size is None or end not in content[-4096:]:  # padding after the end is legal
+    found = header(content)
+    end = b"IEND\xaeB`\x82" if content.startswith(_PNG) else b"\xff\xd9"
+    if found is None or end not in content[-4096:]:  # padding after the end is legal
         raise BadImage("truncated or damaged")
-    width, height = size
+    width, height, _ = found
     if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE and width * height <= max_pixels):
         raise BadImage(f"{width} x {height} pixels; at most {max_pixels} pixels and sides of {MAX_SIDE} are possible")
     try:
@@ -118,10 +116,22 @@ def suffix(content: bytes) -> str:
     return ".png" if content.startswith(_PNG) else ".jpg"
 
 
-def _png_size(content: bytes) -> tuple[int, int] | None:
-    if content[12:16] != b"IHDR" or len(content) < 24:
+class Header(NamedTuple):
+    """Width and height in pixels, and whether the pixels have colours; a grey image has one channel."""
+
+    width: int
+    height: int
+    is_coloured: bool
+
+
+def header(content: bytes) -> Header | None:
+    """Return what the header of a PNG or JPEG file tells; None if it has none."""
+    if not content.startswith(_PNG):
+        return _jpeg_header(content) if content.startswith(_JPEG) else None
+    if content[12:16] != b"IHDR" or len(content) < 26:
         return None
-    return int.from_bytes(content[16:20], "big"), int.from_bytes(content[20:24], "big")
+    is_coloured = bool(content[25] & 2)  # the colour type of ISO/IEC 15948, 11.2.1
+    return Header(int.from_bytes(content[16:20], "big"), int.from_bytes(content[20:24], "big"), is_coloured)
 
 
 class _Segment(NamedTuple):
@@ -131,11 +141,12 @@ class _Segment(NamedTuple):
     data: bytes
 
 
-def _jpeg_size(content: bytes) -> tuple[int, int] | None:
-    """Return width and height from the frame header (B.2.2); None if there is none."""
+def _jpeg_header(content: bytes) -> Header | None:
+    """Return what the frame header (B.2.2) tells; None if there is none."""
     for segment in _segments(content):
-        if 0xC0 <= segment.marker <= 0xCF and segment.marker not in _NO_FRAME and len(segment.data) >= 5:
-            return int.from_bytes(segment.data[3:5], "big"), int.from_bytes(segment.data[1:3], "big")
+        if 0xC0 <= segment.marker <= 0xCF and segment.marker not in _NO_FRAME and len(segment.data) >= 6:
+            height, width = (int.from_bytes(segment.data[at : at + 2], "big") for at in (1, 3))
+            return Header(width, height, is_coloured=segment.data[5] > 1)
     return None
 
 

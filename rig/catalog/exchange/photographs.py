@@ -6,11 +6,13 @@ In a folder the names of the files tell object and angle, such as ``obj12__355.p
 import csv
 import re
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from operator import itemgetter
 from pathlib import Path
 from typing import Any, Final
+from unicodedata import normalize
 
 from hbr.core.angles import wrap360
 from rig.catalog.exchange.tables import ANGLES, parse_region
@@ -21,7 +23,8 @@ from rig.catalog.state import EnrollmentState
 from rig.catalog.transfer import TransferItem
 from rig.core.errors import ImportRejected, UsageError
 from rig.core.next_steps import Do, NextStep
-from rig.views.image_files import read_file
+from rig.core.phrases import counted
+from rig.views.image_files import BadImage, Header, decode, header, read_file
 
 DEFAULT_PATTERN: Final = "{object}__{angle}"
 
@@ -56,6 +59,7 @@ class Photographs:
     now: datetime
     rejected: list[RejectedFile] = field(default_factory=list)
     _found: dict[str, dict[float, tuple[View, _Row]]] = field(default_factory=dict)
+    _empty_tables: dict[tuple[str, float], str] = field(default_factory=dict)
 
     def add(self, row: _Row, view: View) -> None:
         """Add a view of the object of a row, if its name and texts can be stored, and no view has its azimuth."""
@@ -85,6 +89,78 @@ class Photographs:
         shown = [f"{file.path} {file.reason}" for file in self.rejected[:5]]
         return ImportRejected(what, next_step=fix, evidence={"rejected": shown})
 
+    @property
+    def are_whole(self) -> bool:
+        """Whether a whole photograph is described, and not only its region in a table."""
+        return any(view.region is None for _, _, view in self._views())
+
+    def use_empty_tables(self, path: Path, *, table_angles: bool = False) -> None:
+        """Import the photographs with an image of the empty table, or with the images in a folder.
+
+        In a folder the name of an image tells which photographs it is for: the name of an object, or an angle in
+        degrees. The angles are those of `read_folder`.
+
+        Raises `ImportRejected`: a photograph has no such image, or the image cannot be used with it.
+        """
+        if path.is_dir():
+            named = [one for one in sorted(path.iterdir()) if one.suffix.lower() in _SUFFIXES]
+            by_stem = {normalize("NFC", one.stem): str(one) for one in named}
+            by_azimuth = {
+                wrap360(-float(stem) if table_angles else float(stem)): image
+                for stem, image in by_stem.items()
+                if re.fullmatch(_PARTS["{angle}"], stem)
+            }
+            for name, azimuth_deg, _ in self._views():
+                if image := by_stem.get(name) or by_azimuth.get(azimuth_deg):
+                    self._empty_tables[name, azimuth_deg] = image
+        else:
+            self._empty_tables = {(name, azimuth_deg): str(path) for name, azimuth_deg, _ in self._views()}
+        if missing := [view.image for *place, view in self._views() if tuple(place) not in self._empty_tables]:
+            raise ImportRejected(
+                f"{path} has no empty-table image for {counted(len(missing), 'photograph')}; nothing was imported.",
+                next_step="Name each image by its object (mug.png) or by its angle (90.png), or give one image for all "
+                "photographs.",
+                evidence={"photographs": missing[:5]},
+            )
+        self._check_empty_tables()
+
+    def _check_empty_tables(self) -> None:
+        tables = {image: self._table_header(image) for image in dict.fromkeys(self._empty_tables.values())}
+        for name, azimuth_deg, view in self._views():
+            image = self._empty_tables[name, azimuth_deg]
+            with suppress(OSError):  # it is rejected later, like one that is damaged
+                shown, table = header(self.content(view.image)), tables[image]
+                if shown is not None and shown[:2] != table[:2]:
+                    raise ImportRejected(
+                        f"The empty-table image {image} has {table.width} x {table.height} pixels, but {view.image} "
+                        f"has {shown.width} x {shown.height}; nothing was imported.",
+                        next_step="Take it with the same camera and settings as the photographs, and do not crop it.",
+                    )
+                if shown is not None and shown.is_coloured and not table.is_coloured:
+                    raise ImportRejected(
+                        f"The empty-table image {image} is grey, but {view.image} has colours; nothing was imported.",
+                        next_step="Take it in colour, with the same camera and settings as the photographs.",
+                    )
+
+    @staticmethod
+    def _table_header(image: str) -> Header:
+        try:
+            content = read_file(Path(image))
+            decode(content)
+        except (OSError, BadImage) as error:
+            raise ImportRejected(
+                f"The empty-table image {image} cannot be used: {error}; nothing was imported.",
+                next_step="Check the path. Save the image as PNG or JPEG.",
+            ) from error
+        found = header(content)
+        assert found is not None  # it was decoded
+        return found
+
+    def _views(self) -> Iterator[tuple[str, float, View]]:
+        for name, found in self._found.items():
+            for azimuth_deg, (view, _) in found.items():
+                yield name, azimuth_deg, view
+
     @staticmethod
     def content(image: str) -> bytes:
         """Return the bytes of an image file; an `OSError` if it cannot be read."""
@@ -97,13 +173,16 @@ class Photographs:
             enrollment = Enrollment(  # the transfer replaces the key by a digest of the images
                 key=name, object_id=0, started_utc=self.now, planned_azimuth_deg=tuple(sorted(found))
             )
-            sessions: dict[tuple[str, str], Session] = {}
+            sessions: dict[tuple[str, str, str | None], Session] = {}
             texts = {"label": "", "note": ""}
-            for index, (_, (view, row)) in enumerate(sorted(found.items(), key=itemgetter(0))):
-                by = (row.get("bench", ""), row.get("software") or software)
+            for index, (azimuth_deg, (view, row)) in enumerate(sorted(found.items(), key=itemgetter(0))):
+                table = self._empty_tables.get((name, azimuth_deg))
+                by = (row.get("bench", ""), row.get("software") or software, table)
                 if by not in sessions:
                     provenance = Provenance(by[0], {}, {"imported_from": self.origin}, by[1])
-                    sessions[by] = Session(number=len(sessions), started_utc=self.now, provenance=provenance)
+                    sessions[by] = Session(
+                        number=len(sessions), started_utc=self.now, provenance=provenance, empty_table=table
+                    )
                 view.index, view.session = index, sessions[by].number
                 enrollment.views.append(view)
                 texts = {key: text or row.get(key, "") for key, text in texts.items()}

@@ -58,6 +58,14 @@ def import_(
             "--table-angles", help="The angles in the names are table angles. Azimuths run in the opposite direction."
         ),
     ] = False,
+    empty_table: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="PATH",
+            help="For photographs: image of the empty table, or a folder of them, named by object (mug.png) or by "
+            "angle (90.png).",
+        ),
+    ] = None,
     label: Annotated[str | None, typer.Option(help="Label for objects without a label.")] = None,
     on_conflict: Annotated[
         Literal["reject", "skip", "replace"], typer.Option(help="What to do with objects that are enrolled already.")
@@ -70,15 +78,18 @@ def import_(
 
     Example: rig import coil-100 --label coil --bench sim
 
+    Example: rig import photographs --empty-table empty.png --bench sim
+
     Example: rig import /media/stick/catalog --on-conflict skip --bench sim
     """
+    from rig.catalog.exchange.photographs import Photographs
     from rig.catalog.transfer import Conflict, transfer
     from rig.core.json_form import plain
     from rig.views.description import DESCRIPTORS
 
     clock = SystemClock()
     begin_ns = clock.now_ns()
-    with _source(source, pattern, table_angles) as objects, _target(settings, dry_run) as catalog:
+    with _source(source, pattern, table_angles, empty_table) as objects, _target(settings, dry_run) as catalog:
         job = transfer(
             *(objects, catalog),
             conflict=Conflict(on_conflict),
@@ -94,6 +105,8 @@ def import_(
         f"{'Would import' if dry_run else 'Imported'} {counted(done.objects, 'object')} with "
         f"{counted(done.views, 'view')}, {size_words(done.bytes)}, in {seconds:.1f} s."
     ]
+    if isinstance(objects, Photographs) and objects.are_whole:
+        lines.append("Whole photographs are described: view.roi is only for the frames of the bench.")
     for title, names in (("Enrolled again", done.replaced), ("Skipped, already in the catalog", done.skipped)):
         lines += [f"{title}: {', '.join(names[:SHOWN])}"] if names else []
     values = {**plain(replace(done, rejected=())), "rejected": [file.as_json() for file in done.rejected]}
@@ -119,7 +132,9 @@ def _target(settings: Settings, dry_run: bool) -> "Iterator[Catalog]":
 
 
 @contextmanager
-def _source(source: Path, pattern: str | None, table_angles: bool) -> "Iterator[TransferSource]":
+def _source(
+    source: Path, pattern: str | None, table_angles: bool, empty_table: Path | None
+) -> "Iterator[TransferSource]":
     """Yield what is imported: a bundle, a catalog such as a training set, or photographs."""
     from rig.catalog import Catalog
     from rig.catalog.exchange.bundle import read_bundle
@@ -138,8 +153,20 @@ def _source(source: Path, pattern: str | None, table_angles: bool) -> "Iterator[
             f"{source} is not a folder of photographs.",
             next_step="Use --pattern and --table-angles only with a folder of photographs.",
         )
-    if is_folder:
-        yield read_folder(source, pattern=pattern or DEFAULT_PATTERN, table_angles=table_angles, now=clock.utc())
+    if is_folder or (source.suffix.lower() == ".csv" and source.is_file()):
+        photographs = (
+            read_folder(source, pattern=pattern or DEFAULT_PATTERN, table_angles=table_angles, now=clock.utc())
+            if is_folder
+            else read_table(source, now=clock.utc())
+        )
+        if empty_table is not None:
+            photographs.use_empty_tables(empty_table, table_angles=table_angles)
+        yield photographs
+    elif empty_table is not None and source.exists():
+        raise UsageError(
+            f"{source} contains no photographs, but objects with their own empty-table images.",
+            next_step="Use --empty-table only with photographs: a folder, or a table (.csv).",
+        )
     elif source.is_dir():
         with Catalog.open(source, clock=clock, create=False, read_only=True) as catalog:
             yield CatalogSource(catalog, own=False)
@@ -148,8 +175,6 @@ def _source(source: Path, pattern: str | None, table_angles: bool) -> "Iterator[
     elif source.suffix.lower() == ".zip":
         with read_bundle(source, clock) as bundle:
             yield bundle
-    elif source.suffix.lower() == ".csv":
-        yield read_table(source, now=clock.utc())
     else:
         raise ImportRejected(
             f"{source} is not a folder, a .zip file or a .csv file.", next_step="Give one of these: rig import --help"
