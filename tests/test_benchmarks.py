@@ -46,7 +46,7 @@ def test_views_of_figure_7_have_irregular_angles_that_the_gyro_measured(tmp_path
             assert view.imu_deg is not None
             assert view.azimuth_deg == wrap360(-view.imu_deg)
         assert {view.imu_deg == view.encoder_deg for view in catalog.object("teapot").views[1:]} == {False}
-        dataset = load_catalog(catalog, (80, 0, 480, 480))
+        dataset = load_catalog(catalog)
         write_folder(tmp_path / "folder", CatalogSource(catalog))
         exported = load_coil(tmp_path / "folder")
         for own, copied in zip(dataset.objects, exported.objects, strict=True):

@@ -31,10 +31,11 @@ class DatasetError(ValueError):
 
 @dataclass(frozen=True)
 class Photograph:
-    """A file, and the azimuth of the camera."""
+    """A file, the azimuth of the camera, and the part that is described: x, y, width, height in pixels; None: all."""
 
     path: Path
     azimuth_deg: float
+    region: tuple[int, int, int, int] | None = None
 
 
 @dataclass(frozen=True)
@@ -61,14 +62,11 @@ class Dataset:
         At least two objects with different names.
     ignored : int
         Number of image files in the folder whose names are not those of views.
-    region : (int, int, int, int) or None
-        The part of every image that is described: x, y, width, height in pixels; None: the whole image.
     """
 
     name: str
     objects: tuple[PhotographedObject, ...]
     ignored: int = 0
-    region: tuple[int, int, int, int] | None = None
 
     def __post_init__(self) -> None:
         if len(self.objects) < 2:
@@ -117,9 +115,10 @@ class Dataset:
         DatasetError
             The photograph cannot be used, or has another size than the first one.
         """
-        image = read_photograph(self.objects[j].photographs[i].path, self.size)
-        if self.region is not None:
-            x, y, width, height = self.region
+        photograph = self.objects[j].photographs[i]
+        image = read_photograph(photograph.path, self.size)
+        if photograph.region is not None:
+            x, y, width, height = photograph.region
             image = image[y : y + height, x : x + width]
         return image
 

@@ -3,6 +3,7 @@
 import tomllib
 from dataclasses import fields
 from importlib.resources import files
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, Final
 
@@ -16,6 +17,7 @@ from hbr.evaluation.perturb import Perturbations
 from hbr.evaluation.photographs import Dataset, Photograph, PhotographedObject
 from hbr.evaluation.protocol import Protocol, choose_methods
 from rig.catalog import Catalog
+from rig.catalog.derived import regions_of
 from rig.core import files as own_files
 
 DEFAULT: Final = "paper"
@@ -124,8 +126,8 @@ def _range(text: str) -> tuple[int, int]:
     return int(first), int(last)
 
 
-def load_catalog(catalog: Catalog, region: tuple[int, int, int, int] | None) -> Dataset:
-    """Return the stored images of a catalog as a data set; ``region`` is the part of an image that is described.
+def load_catalog(catalog: Catalog) -> Dataset:
+    """Return the stored images of a catalog as a data set, each with the part that searches use.
 
     Raises
     ------
@@ -134,8 +136,12 @@ def load_catalog(catalog: Catalog, region: tuple[int, int, int, int] | None) -> 
     """
     objects = []
     for summary in catalog.objects():
-        views = sorted(catalog.object(summary.name).views, key=lambda view: view.azimuth_deg)
-        photographs = tuple(Photograph(catalog.image_path(view.image), view.azimuth_deg) for view in views)
-        if photographs:
-            objects.append(PhotographedObject(summary.name, photographs))
-    return Dataset(str(catalog.place), tuple(objects), region=region)
+        enrollment = catalog.object(summary.name).complete
+        if enrollment is not None and enrollment.views:
+            photographs = [
+                Photograph(catalog.image_path(view.image), view.azimuth_deg, region)
+                for view, region in zip(enrollment.views, regions_of(catalog, enrollment), strict=True)
+            ]
+            ordered = tuple(sorted(photographs, key=attrgetter("azimuth_deg")))
+            objects.append(PhotographedObject(summary.name, ordered))
+    return Dataset(str(catalog.place), tuple(objects))

@@ -123,7 +123,7 @@ def _dataset(settings: Settings, folder: Path | None, experiment: "Experiment") 
 
     if folder is None:
         with settings.open_catalog(read_only=True) as catalog:
-            dataset = load_catalog(catalog, settings.load().view.roi)
+            dataset = load_catalog(catalog)
     else:
         dataset = load_coil(folder)
     if experiment.objects is not None:
