@@ -12,7 +12,8 @@ from rig.catalog.derived import views
 from rig.catalog.exchange.photographs import Photographs, read_folder
 from rig.catalog.transfer import CatalogSource, Conflict, transfer
 from rig.catalog.verify import verify
-from rig.core.errors import CatalogDamaged, CatalogError, ObjectExists
+from rig.core.errors import CatalogDamaged, CatalogError, ImportRejected, ObjectExists
+from rig.views.description import DESCRIPTORS
 from sim.clock import VirtualClock
 from tests.programs import server
 from tests.rig.catalog.catalog_samples import NOW, PROVENANCE, OpenCatalog, fill, finished, image, record
@@ -206,3 +207,16 @@ class TestOnlyOnce:
         with pytest.raises(CatalogDamaged, match="are missing or are not those"):
             run_import(catalog, CatalogSource(full))
         assert untouched(catalog, images=True)
+
+    def test_damaged_empty_table_image_of_a_catalog_is_not_transferred(
+        self, full: Catalog, open_catalog: OpenCatalog
+    ) -> None:
+        enrollment = full.object("tin").enrollments[0].enrollment
+        table = enrollment.sessions[0].empty_table
+        assert table is not None
+        full.image_path(table).write_bytes(b"x")
+        catalog = open_catalog("catalog")
+        with pytest.raises(ImportRejected) as error:
+            run_import(catalog, CatalogSource(full, own=False), descriptors=DESCRIPTORS)
+        assert error.value.evidence["rejected"] == [f"{table}: is not the stored image"]
+        assert untouched(catalog)

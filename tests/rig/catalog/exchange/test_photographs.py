@@ -1,16 +1,26 @@
 """Folders and tables of photographs are imported; unusable ones are rejected with their reasons."""
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
+from rig.catalog import Catalog
 from rig.catalog.derived import views
 from rig.catalog.exchange.photographs import read_folder, read_table
 from rig.catalog.incoming import ImportProblem
+from rig.catalog.jobs import JobProgress
+from rig.catalog.sessions import empty_tables
+from rig.catalog.transfer import Conflict
 from rig.catalog.verify import verify
 from rig.core.errors import ImportRejected, UsageError
 from rig.core.next_steps import Do
+from rig.evaluation.experiments import load_catalog
+from rig.search.model import load_model
+from rig.views.description import DESCRIPTORS
 from tests.rig.catalog.catalog_samples import NOW, OpenCatalog, finished
 from tests.rig.catalog.exchange.exchange_samples import photograph, run_import, untouched
 
@@ -189,3 +199,133 @@ class TestTables:
         (tmp_path / "a.csv").write_bytes(content)
         with pytest.raises(ImportRejected, match=words):
             read_table(tmp_path / "a.csv", now=NOW)
+
+
+class TestEmptyTables:
+    @pytest.fixture
+    def folder(self, tmp_path: Path) -> Path:
+        for seed, name in enumerate(["mug__0", "mug__90", "tin__0", "tin__90"]):
+            photograph(tmp_path / "in" / f"{name}.png", seed, (32, 32))
+        return tmp_path / "in"
+
+    def test_photographs_are_enrolled_with_one_image(
+        self, tmp_path: Path, folder: Path, open_catalog: OpenCatalog
+    ) -> None:
+        photograph(tmp_path / "empty.png", 9, (32, 32))
+        batch = read_folder(folder, now=NOW)
+        batch.use_empty_tables(tmp_path / "empty.png")
+        catalog = open_catalog("catalog")
+        done = run_import(catalog, batch, descriptors=DESCRIPTORS)
+        assert empty_tables(catalog).with_image == ("mug", "tin")
+        stored = self.stored(catalog, "mug")
+        assert stored == {0.0: (tmp_path / "empty.png").read_bytes(), 90.0: (tmp_path / "empty.png").read_bytes()}
+        files = [*folder.iterdir(), tmp_path / "empty.png"]
+        assert done.bytes == sum(path.stat().st_size for path in files)
+        assert finished(verify(catalog)).findings == ()
+
+    @pytest.mark.parametrize("names", [("mug", "tin"), ("0", "90.0"), ("mug", "0", "90")])
+    def test_images_of_a_folder_are_named_by_object_or_by_angle(
+        self, tmp_path: Path, folder: Path, open_catalog: OpenCatalog, names: tuple[str, ...]
+    ) -> None:
+        for seed, name in enumerate(names, 10):
+            photograph(tmp_path / "tables" / f"{name}.png", seed, (32, 32))
+        content = {name: (tmp_path / "tables" / f"{name}.png").read_bytes() for name in names}
+        batch = read_folder(folder, now=NOW)
+        batch.use_empty_tables(tmp_path / "tables")
+        catalog = open_catalog("catalog")
+        run_import(catalog, batch)
+        for name in ("mug", "tin"):
+            at_90 = content.get("90", content.get("90.0", b""))
+            expected = {0.0: content.get(name, content.get("0", b"")), 90.0: content.get(name, at_90)}
+            assert self.stored(catalog, name) == expected
+
+    def test_angles_in_the_names_are_table_angles_as_those_of_the_photographs(
+        self, tmp_path: Path, folder: Path, open_catalog: OpenCatalog
+    ) -> None:
+        for seed, name in enumerate(("0", "90"), 10):
+            photograph(tmp_path / "tables" / f"{name}.png", seed, (32, 32))
+        batch = read_folder(folder, table_angles=True, now=NOW)
+        batch.use_empty_tables(tmp_path / "tables", table_angles=True)
+        catalog = open_catalog("catalog")
+        run_import(catalog, batch)
+        assert self.stored(catalog, "mug")[270.0] == (tmp_path / "tables" / "90.png").read_bytes()
+
+    def test_image_makes_the_same_photographs_another_enrollment(
+        self, tmp_path: Path, folder: Path, open_catalog: OpenCatalog
+    ) -> None:
+        catalog = open_catalog("catalog")
+        run_import(catalog, read_folder(folder, now=NOW))
+        photograph(tmp_path / "empty.png", 9, (32, 32))
+        batch = read_folder(folder, now=NOW)
+        batch.use_empty_tables(tmp_path / "empty.png")
+        assert run_import(catalog, batch, Conflict.REPLACE).replaced == ("mug", "tin")
+        assert empty_tables(catalog).without_image == ()
+        assert run_import(catalog, batch, Conflict.REPLACE).replaced == ()
+
+    @pytest.mark.parametrize(
+        ("make", "words"),
+        [
+            (lambda path: photograph(path, 9, (32, 30)), "has 30 x 32 pixels, but .*mug__0.png has 32 x 32"),
+            (
+                lambda path: cv2.imwrite(str(path), np.zeros((32, 32), np.uint8)),
+                "is grey, but .*mug__0.png has colours",
+            ),
+            (lambda path: path.write_text("no image"), "cannot be used: neither a PNG nor a JPEG file"),
+            (lambda _: None, "cannot be used: .*No such file"),
+            (os.mkfifo, "cannot be used: .*not a regular file"),
+            (Path.mkdir, "no empty-table image for 4 photographs"),
+        ],
+    )
+    def test_unusable_image_is_rejected_before_anything_is_stored(
+        self, tmp_path: Path, folder: Path, make: Callable[[Path], object], words: str
+    ) -> None:
+        make(tmp_path / "empty.png")
+        with pytest.raises(ImportRejected, match=words) as error:
+            read_folder(folder, now=NOW).use_empty_tables(tmp_path / "empty.png")
+        assert "nothing was imported" in error.value.what
+        assert error.value.steps
+
+    @pytest.mark.parametrize("suffix", [".png", ".jpg"])
+    def test_grey_image_is_used_with_grey_photographs(self, tmp_path: Path, suffix: str) -> None:
+        for name in ("mug__0", "empty"):
+            cv2.imwrite(str(tmp_path / f"{name}{suffix}"), np.zeros((32, 32), np.uint8))
+        batch = read_folder(tmp_path, now=NOW)
+        batch.use_empty_tables(tmp_path / f"empty{suffix}")
+        assert {session.empty_table for session in next(batch.items()).enrollments[0].enrollment.sessions} == {
+            str(tmp_path / f"empty{suffix}")
+        }
+
+    def test_image_that_disappears_after_its_check_ends_the_import(
+        self, tmp_path: Path, folder: Path, open_catalog: OpenCatalog
+    ) -> None:
+        photograph(tmp_path / "empty.png", 9, (32, 32))
+        batch = read_folder(folder, now=NOW)
+        batch.use_empty_tables(tmp_path / "empty.png")
+        (tmp_path / "empty.png").unlink()
+        catalog = open_catalog("catalog")
+        with pytest.raises(ImportRejected):
+            run_import(catalog, batch, descriptors=DESCRIPTORS)
+        assert untouched(catalog, images=True)
+
+    def test_small_photographs_are_described_as_a_whole_and_at_once(
+        self, folder: Path, open_catalog: OpenCatalog
+    ) -> None:
+        batch = read_folder(folder, now=NOW)
+        assert batch.are_whole
+        catalog = open_catalog("catalog")
+        run_import(catalog, batch, descriptors=DESCRIPTORS)
+        described_now: list[JobProgress] = []
+        for name in DESCRIPTORS:
+            assert len(load_model(catalog, descriptor=name, progress=described_now.append).views) == 4
+        assert described_now == []
+        (mug, _) = load_catalog(catalog).objects
+        assert [one.region for one in mug.photographs] == [None, None]
+        assert load_catalog(catalog).image(0, 0).shape == (32, 32, 3)
+
+    @staticmethod
+    def stored(catalog: Catalog, name: str) -> dict[float, bytes]:
+        """The empty-table image of each view by its azimuth."""
+        enrollment = catalog.object(name).complete
+        assert enrollment is not None
+        tables = [session.empty_table or "" for session in enrollment.sessions]
+        return {view.azimuth_deg: catalog.image_path(tables[view.session]).read_bytes() for view in enrollment.views}

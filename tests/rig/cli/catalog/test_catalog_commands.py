@@ -215,6 +215,32 @@ def test_import_rejects_bad_source(rig: Rig) -> None:
     assert rig("import", "empty", "--on-conflict", "merge").exit_code == 2
 
 
+def test_photographs_are_imported_with_empty_table_images(rig: Rig, tmp_path: Path) -> None:
+    photographs(tmp_path / "in", "mug", "tin")
+    photographs(tmp_path / "tables", "table", step_deg=360)
+    done = rig("import", "in", "--empty-table", "tables/table__0.png", "--dry-run")
+    assert done.exit_code == 0, done.output
+    assert "Whole photographs are described" in done.stdout
+    assert result(rig("import", "in", "--empty-table", "tables/table__0.png", "--json"))["views"] == 8
+    shown = result(rig("catalog", "show", "tin", "--json"))
+    (session,) = shown["enrollments"][0]["sessions"]
+    stored = Path("catalog", "images", session["empty_table"][:2], session["empty_table"])
+    assert stored.read_bytes() == Path("tables/table__0.png").read_bytes()
+
+
+def test_empty_table_images_that_do_not_fit_the_source_are_rejected(two: Rig, tmp_path: Path) -> None:
+    photographs(tmp_path / "in", "jar")
+    photographs(tmp_path / "tables", "table", step_deg=360, side=20)
+    rejected = two("import", "in", "--empty-table", "tables/table__0.png")
+    assert rejected.exit_code == 7
+    assert "20 x 20 pixels" in rejected.stderr
+    assert two("import", "in", "--empty-table", "tables").exit_code == 7
+    assert names(two) == ["mug", "tin"]
+    of_catalog = two("import", "catalog", "--empty-table", "tables/table__0.png")
+    assert of_catalog.exit_code == 2
+    assert "only with photographs" in of_catalog.stderr
+
+
 def test_busy_catalog_is_reported_after_the_timeout(two: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(Catalog.open.__func__.__kwdefaults__, "busy_timeout_s", 0.05)
     with closing(sqlite3.connect("catalog/catalog.sqlite", isolation_level=None)) as other:
