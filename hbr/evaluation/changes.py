@@ -146,12 +146,12 @@ def search_changed(
         views, empty = ViewsTogether(kind), Background(visit.empty()) if picture else None
         search = _Search(index, rule, enrolled)
         without = None if left_out is None else _Search(left_out, rule, enrolled)
-        same_bench: bool | None = None
+        same_bench, first = None, True
         for place in nearest_photographs(item, first_deg + _STEP_DEG * np.arange(VIEWS, dtype=np.float64)):
             azimuth_deg = item.photographs[place].azimuth_deg
             frame = visit.photograph(*cut_out(item, place), azimuth_deg).image
-            if same_bench is None:
-                same_bench = before.shows_same_bench(frame)
+            if first:
+                same_bench, first = before.shows_same_bench(frame), False
             views.add(frame, empty)
             search.add(views, azimuth_deg, same_bench)
             if without is not None:
@@ -171,7 +171,7 @@ class _Search:
         self._leaders: list[str] = []
         self._result: SearchResult | None = None
 
-    def add(self, views: ViewsTogether, azimuth_deg: float, same_bench: bool) -> None:
+    def add(self, views: ViewsTogether, azimuth_deg: float, same_bench: bool | None) -> None:
         *earlier, levels = views.levels
         decision = self._session.add(
             levels,
