@@ -28,10 +28,14 @@ from hbr.segmentation.cut_out import Box, Found, Segmentation
 from hbr.segmentation.silhouette import guess_object, shares, silhouette
 
 #: Probabilities above which a pixel belongs to the object: of the first segmentation, and of further ones.
-_LEVELS: Final = (0.5, 0.2, 0.8)
-#: The same of an enrolled view with a learned background: where an object looks the same from all sides, it is part of
-#: that background, and less probable.
-_ENROLLED_LEVEL: Final = 0.25
+_LEVELS: Final = (0.3, 0.1, 0.6)
+#: A silhouette that another method found counts before the network's if the expected overlap is at least this share of
+#: that of the network's: it is sharper, but it contains the platter if that differs from the backdrop.
+_CONFIRMED: Final = 0.8
+#: Smallest expected overlap of the network's silhouette that counts before a guess.
+_BETTER_THAN_GUESS: Final = 0.8
+#: A smaller expected overlap is reported.
+_DOUBTFUL: Final = 0.7
 #: Smallest overlap of two boxes that count as one.
 _SAME_BOX: Final = 0.85
 # more: the right box is missed less often; each is described and compared with all enrolled views
@@ -91,7 +95,10 @@ def compared(
     return background, frame.difference(background)
 
 
-def _found(frame: SegmentedFrame, background: Background | None, difference: Difference | None) -> Found:
+def _found(
+    frame: SegmentedFrame, background: Background | None, difference: Difference | None, *, guess: bool = True
+) -> Found:
+    """Return the object by the empty-table image, before a plain background, or guessed if that is asked for."""
     issues: list[Issue] = []
     correction: Illumination | None = None
     found: Mask | None = None
@@ -110,6 +117,8 @@ def _found(frame: SegmentedFrame, background: Background | None, difference: Dif
             found = silhouette(frame.differs, framed=False)
             if found is None:
                 issues.append(Issue(IssueCode.NO_DIFFERENCE))
+        elif not guess:
+            issues.append(Issue(IssueCode.BACKGROUND_NOT_PLAIN))
         else:
             method = BoxMethod.GUESS
             issues.append(Issue(IssueCode.BACKGROUND_NOT_PLAIN))
@@ -134,7 +143,8 @@ def hypotheses(
     """Return several segmentations of a frame, the likeliest first, whose boxes differ.
 
     A search compares the enrolled views with all of them, and the most similar one counts
-    (`hbr.DenseSession.add` takes the levels of several segmentations as rows). Before a plain background there is one.
+    (`hbr.DenseSession.add` takes the levels of several segmentations as rows). The network sees the frame with all that
+    is known about its background. What does not rotate is not the object, also before a plain background.
 
     Parameters
     ----------
@@ -142,10 +152,10 @@ def hypotheses(
         As for `segment`; or a `hbr.segmentation.background.SegmentedFrame`, if the frame is segmented more than once.
     learned : Background, optional
         The background that the other views of the search show (`hbr.descriptors.together.LearnedBackground.of`). The
-        object is not guessed then. It is not used if the frame's border differs from it.
+        object is not guessed then, if the frame's border agrees with it.
     alone : callable, optional
         Returns what `without_background` returns for this frame: segmentations that count besides those with the
-        learned background. No other view changes them. By default the network's alone counts.
+        learned background. No other view changes them.
     most : int
         Largest number of segmentations.
 
@@ -157,38 +167,43 @@ def hypotheses(
     frame = SegmentedFrame.of(image_bgr)
     background, difference = compared(frame, empty_table)
     by_picture = difference is not None and difference.reliable
-    rotated = None if learned is None or by_picture or frame.differs is not None else learned.difference(frame.small)
-    found: list[Segmentation | Found]
-    # A camera that moves around the object shows other surroundings in each view: then nothing is learned from them.
-    if rotated is None or not rotated.reliable:
-        like = _found(frame, background, difference)
-        if like.method is BoxMethod.PLAIN_BACKGROUND or (most == 1 and not by_picture):
-            return (like.cut_out(),)
-        share = shares(frame.small, difference if by_picture else None).object
-        if by_picture:
-            found = [like, *_by_network(share, BoxMethod.EMPTY_TABLE, like)]
-            if most == 1 and not _same(like, found[-1]):  # an enrollment: the network's box is right more often
-                found.reverse()
-        else:
-            found = [like, *_by_network(share, BoxMethod.NETWORK, like)]
-    else:
-        issues = [Issue(IssueCode.BACKGROUND_NOT_PLAIN)]
-        if difference is not None:
-            issues.insert(0, Issue(IssueCode.TABLE_DIFFERS, {"agreement": round(difference.agreement, 3)}))
-        agreement = None if difference is None else difference.agreement
-        like = Found(frame, None, None, agreement, BoxMethod.NONE, tuple(issues))
-        share = shares(frame.small, rotated, learned=True).object
-        levels = _LEVELS if most > 1 else (_ENROLLED_LEVEL,)
-        found = [*_by_network(share, BoxMethod.ROTATION, like, levels=levels)]
-        if most > 1:
-            by_itself = None if alone is None else alone()
-            found += by_itself or _by_network(shares(frame.small).object, BoxMethod.NETWORK, like)
-        found = found or [replace(like, issues=(*issues, Issue(IssueCode.NO_OBJECT)))]
+    rotated = None if learned is None or by_picture else learned.difference(frame.small)
+    still = rotated is not None and rotated.reliable
+    like = _found(frame, background, difference, guess=not still)
+    method = BoxMethod.EMPTY_TABLE if by_picture else BoxMethod.ROTATION if still else BoxMethod.NETWORK
+    share = shares(frame.small, difference if by_picture else rotated).object
+    found: list[Segmentation | Found] = [*_by_network(share, method, like)]
+    # A camera that moves around the object shows other surroundings in each view: then less is learned from them.
+    if rotated is not None and not still:
+        by_itself = shares(frame.small).object
+        alternative = _by_network(by_itself, method, like)
+        if alternative and (not found or _expected(alternative[0], by_itself) > _expected(found[0], share)):
+            found, share = [*alternative], by_itself
+    sure = _expected(found[0], share) if found else 0.0
+    known = like.method is not BoxMethod.GUESS
+    if like.box is not None:
+        before = _expected(like, share) >= _CONFIRMED * sure if known else sure < _BETTER_THAN_GUESS
+        found.insert(0 if before else 1, like)
+    if most > 1 and still and alone is not None:
+        found += alone()
+    found = found or [replace(like, method=BoxMethod.NONE, issues=(*like.issues, Issue(IssueCode.NO_OBJECT)))]
+    overlap = _expected(found[0], share)
+    if 0 < overlap < _DOUBTFUL:
+        issue = Issue(IssueCode.DOUBTFUL_OUTLINE, {"overlap": round(overlap, 2)})
+        found[0] = replace(found[0], issues=(*found[0].issues, issue))
     several: list[Segmentation | Found] = []
     for one in found:
-        if not any(_same(known, one) for known in several):
+        if not any(_same(known_one, one) for known_one in several):
             several.append(one)
     return tuple(map(_cut_out, several[:most]))
+
+
+def _expected(found: Segmentation | Found, share: NDArray[np.float32]) -> float:
+    """Return the expected overlap of a silhouette with the object, by the probability of each pixel; 0 without one."""
+    if found.silhouette is None:
+        return 0.0
+    both, area = float(share[found.silhouette].sum()), np.count_nonzero(found.silhouette)
+    return both / (area + float(share.sum()) - both)
 
 
 def _cut_out(found: Segmentation | Found) -> Segmentation:
@@ -204,17 +219,10 @@ def without_background(frame: SegmentedFrame) -> tuple[Found, ...]:
     )
 
 
-def _by_network(
-    share: NDArray[np.float32], method: BoxMethod, like: Found, levels: tuple[float, ...] = _LEVELS[:1]
-) -> list[Found]:
-    """Return the silhouettes at these probabilities, with the illumination and the evidence of another one."""
-    masks = [mask for level in levels if (mask := _object_in(share, level)) is not None]
-    return [replace(like, silhouette=mask, method=method) for mask in masks]
-
-
-def _object_in(share: NDArray[np.float32], level: float) -> Mask | None:
-    """Return the object's silhouette where its probability is above a level."""
-    return silhouette(share > level, framed=False)
+def _by_network(share: NDArray[np.float32], method: BoxMethod, like: Found) -> list[Found]:
+    """Return the silhouettes at several probabilities, with the illumination and the evidence of another one."""
+    masks = [silhouette(share > level, framed=False) for level in _LEVELS]
+    return [replace(like, silhouette=mask, method=method) for mask in masks if mask is not None]
 
 
 def _same(a: Segmentation | Found, b: Segmentation | Found) -> bool:
