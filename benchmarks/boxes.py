@@ -4,8 +4,8 @@
 
 Photographed objects stand on drawn benches, whose silhouettes are known: a plain backdrop, or clutter; a plain platter,
 or one with marks. With ``--masks`` the photographs themselves are segmented; the folder has a mask of the same name for
-each of them. Each row is one way: *enrolled*, all views together; *search*, the last of 1, 2 or 4 views, by the likeliest
-segmentation and by the best of all.
+each of them. *enrolled*: all views together; *search*: the last of 1, 2 or 4 views, by the likeliest segmentation and by
+the best of all.
 """
 
 import argparse
@@ -116,7 +116,10 @@ def main() -> None:
     things = dataset.objects[:: max(1, len(dataset.objects) // given.objects)][: given.objects]
     print(f"{'':56s} {'box':>5s} {'<0.8':>6s} {'mask':>5s} {'<0.8':>6s}")
     if given.masks:
-        report("photographs", [(list(real(item, given.masks, 2)), list(real(item, given.masks, 4)), None) for item in things])
+        report(
+            "photographs",
+            [(list(real(item, given.masks, 2)), list(real(item, given.masks, 4)), None) for item in things],
+        )
         return
     for backdrop in ("plain", "clutter"):
         for platter in ("plain", "marks"):
@@ -129,7 +132,11 @@ def main() -> None:
                     empty = visit.empty()
                     first_deg = rng.uniform(0, 360)
                     scenes.append(
-                        (list(drawn(item, visit, first_deg, given.views)), list(drawn(item, visit, first_deg, 4)), empty)
+                        (
+                            list(drawn(item, visit, first_deg, given.views)),
+                            list(drawn(item, visit, first_deg, 4)),
+                            empty,
+                        )
                     )
                 name = f"{backdrop} backdrop, {platter} platter, {words}"
                 report(f"{name}, no image", [(a, b, None) for a, b, _ in scenes])

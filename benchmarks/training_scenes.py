@@ -80,7 +80,9 @@ class _Solid:
         lids, lid_angle = np.sqrt(self.rng.uniform(0, 1, n // 3)), self.rng.uniform(0, 2 * np.pi, n // 3)
         top = self.rng.random(n // 3) < 0.7
         lid_radius = lids * np.where(top, radii[-1], radii[0])
-        lid = np.stack([lid_radius * np.cos(lid_angle), np.where(top, height, 0), lid_radius * np.sin(lid_angle)], axis=1)
+        lid = np.stack(
+            [lid_radius * np.cos(lid_angle), np.where(top, height, 0), lid_radius * np.sin(lid_angle)], axis=1
+        )
         lid_normal = np.stack([0 * lids, np.where(top, 1.0, -1.0), 0 * lids], axis=1)
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
         self._add(np.concatenate([body, lid]), np.concatenate([normal, lid_normal]), at, turn)
@@ -138,14 +140,16 @@ def solid(rng: np.random.Generator) -> list[CutOut]:
         neck = np.array([long * rng.uniform(0.9, 1.3), high + thick * rng.uniform(0.4, 2), 0])
         made.ellipsoid(neck, np.array([rng.uniform(0.2, 0.4), rng.uniform(0.15, 0.28), rng.uniform(0.12, 0.22)]))
         made.ellipsoid(
-            (neck + [0.7 * long, high + 0.7 * thick, 0]) / 2, np.array([0.25, 0.35, 0.18]), _turn(rng, 0.2)
+            (neck + np.array([0.7 * long, high + 0.7 * thick, 0])) / 2, np.array([0.25, 0.35, 0.18]), _turn(rng, 0.2)
         )
         if rng.random() < 0.6:  # ears or horns
             for z in (-0.12, 0.12):
-                made.ellipsoid(neck + [0, 0.25, z], np.array([0.05, rng.uniform(0.08, 0.22), 0.04]))
+                made.ellipsoid(neck + np.array([0, 0.25, z]), np.array([0.05, rng.uniform(0.08, 0.22), 0.04]))
         if rng.random() < 0.8:
             drop = rng.uniform(0.2, 0.7)
-            made.ellipsoid(np.array([-long - 0.05, high + thick - drop / 2, 0]), np.array([0.04, drop, 0.04]), _turn(rng, 0.15))
+            made.ellipsoid(
+                np.array([-long - 0.05, high + thick - drop / 2, 0]), np.array([0.04, drop, 0.04]), _turn(rng, 0.15)
+            )
     elif kind < 0.76:  # cars
         half = np.array([1.0, rng.uniform(0.12, 0.25), rng.uniform(0.35, 0.5)])
         wheel = rng.uniform(0.12, 0.22)
@@ -176,9 +180,7 @@ def _colours(made: _Solid, rng: np.random.Generator) -> Floats:
         return rng.uniform(10, 245, 3) if vivid else rng.uniform(12, 243) + rng.normal(0, 12, 3)
 
     palette = [colour() for _ in range(int(rng.integers(1, 5)))]
-    found = []
-    for points in made.points:
-        found.append(np.tile(palette[int(rng.integers(len(palette)))], (len(points), 1)))
+    found = [np.tile(palette[int(rng.integers(len(palette)))], (len(points), 1)) for points in made.points]
     colours, points = np.concatenate(found), np.concatenate(made.points)
     size = float(np.ptp(points, axis=0).max())
     for _ in range(int(rng.integers(0, 5))):
@@ -205,6 +207,8 @@ def _drawn(points: Floats, normals: Floats, colours: Floats, rng: np.random.Gene
     scale = _LONGEST_PX / (1.1 * reach)
     lamp = np.array([rng.normal(0, 0.6), 1.0, rng.uniform(0.3, 1.2)])
     lamp /= np.linalg.norm(lamp)
+    half = lamp + np.array([0, 0, 1])
+    half /= np.linalg.norm(half)
     ambient, gloss = rng.uniform(0.35, 0.8), rng.choice([0, rng.uniform(20, 160)])
     found = []
     for n in range(SIDES):
@@ -212,7 +216,7 @@ def _drawn(points: Floats, normals: Floats, colours: Floats, rng: np.random.Gene
         rotation = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
         seen, normal = points @ rotation.T, normals @ rotation.T
         light = ambient + (1 - ambient) * np.clip(normal @ lamp, 0, 1)
-        shine = gloss * np.clip(normal @ (lamp + [0, 0, 1]) / np.linalg.norm(lamp + [0, 0, 1]), 0, 1) ** 20
+        shine = gloss * np.clip(normal @ half, 0, 1) ** 20
         depth = seen[:, 2] * np.cos(tilt) + seen[:, 1] * np.sin(tilt)
         across = seen[:, 0] * scale
         down = (seen[:, 2] * np.sin(tilt) - seen[:, 1] * np.cos(tilt)) * scale
@@ -229,8 +233,8 @@ def _drawn(points: Floats, normals: Floats, colours: Floats, rng: np.random.Gene
         image = np.where((share > 0)[:, :, None], image, blurred)
         image = cv2.GaussianBlur(image, (0, 0), 0.6)
         soft = cv2.GaussianBlur(closed.astype(np.float32), (0, 0), 0.6)
-        image = np.where((soft > 0.05)[:, :, None], image / np.maximum(cv2.GaussianBlur(
-            ((share > 0) | (blurred.max(axis=2) > 0)).astype(np.float32), (0, 0), 0.6), 0.05)[:, :, None], blurred)  # fmt: skip
+        weight = cv2.GaussianBlur(((share > 0) | (blurred.max(axis=2) > 0)).astype(np.float32), (0, 0), 0.6)
+        image = np.where((soft > 0.05)[:, :, None], image / np.maximum(weight, 0.05)[:, :, None], blurred)
         found.append(CutOut(np.clip(image, 0, 255).astype(np.float32), soft, float(-left)))
     return found
 
@@ -242,7 +246,11 @@ def _ground(rng: np.random.Generator, strength: float) -> Floats:
     picture = np.full((HEIGHT, WIDTH, 3), colour, np.float32)
     if rng.random() < 0.5:  # folds of a cloth, and uneven light
         cells = int(rng.integers(2, 7))
-        folds = cv2.resize(rng.normal(0, rng.uniform(0.02, 0.2), (cells, cells)).astype(np.float32), (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC)
+        folds = cv2.resize(
+            rng.normal(0, rng.uniform(0.02, 0.2), (cells, cells)).astype(np.float32),
+            (WIDTH, HEIGHT),
+            interpolation=cv2.INTER_CUBIC,
+        )
         picture *= np.exp(folds)[:, :, None]
     for cells in (2, 4, 8, 16, 32, 64):
         if strength and rng.random() < 0.75:
@@ -269,7 +277,7 @@ def _ground(rng: np.random.Generator, strength: float) -> Floats:
 
 
 def scene(rng: np.random.Generator, sides: list[CutOut], clutter: list[CutOut], views: int) -> Scene:
-    """Draw an object near the middle from one side and ``views`` others; ``clutter`` is beside and behind the platter."""
+    """Draw an object near the middle from one side and ``views`` others; ``clutter`` is around the platter."""
     strength = float(rng.choice([0.0, 0.3, 1.0, 1.6], p=[0.2, 0.2, 0.35, 0.25]))
     picture = _ground(rng, strength)
     if rng.random() < 0.75:

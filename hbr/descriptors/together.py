@@ -6,7 +6,6 @@ object, too; the network was trained with such medians and combines them with th
 improves the segmentation of the first one. Further views hardly improve those that were segmented by rotation.
 """
 
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Final

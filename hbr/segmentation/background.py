@@ -369,7 +369,8 @@ def from_border(small: ImageArray) -> Floats:
     squares *= -2
     squares += np.einsum("nc,nc->n", near, near)[:, None]
     nearest = squares.min(axis=0) + np.einsum("nc,nc->n", colours, colours)
-    return np.sqrt(np.maximum(nearest, 0)).reshape(height, width)
+    distances: Floats = np.sqrt(np.maximum(nearest, 0)).reshape(height, width)
+    return distances
 
 
 def _opponents(image: ImageArray) -> Floats:

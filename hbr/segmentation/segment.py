@@ -180,9 +180,13 @@ def hypotheses(
         if alternative and (not found or _expected(alternative[0], by_itself) > _expected(found[0], share)):
             found, share = [*alternative], by_itself
     sure = _expected(found[0], share) if found else 0.0
-    known = like.method is not BoxMethod.GUESS
+    if like.method is BoxMethod.GUESS:
+        before = sure < _BETTER_THAN_GUESS
+    elif like.method is BoxMethod.EMPTY_TABLE:  # marks of the platter differ from the image, too
+        before = not found or _same(like, found[0])
+    else:
+        before = _expected(like, share) >= _CONFIRMED * sure
     if like.box is not None:
-        before = _expected(like, share) >= _CONFIRMED * sure if known else sure < _BETTER_THAN_GUESS
         found.insert(0 if before else 1, like)
     if most > 1 and still and alone is not None:
         found += alone()
