@@ -4,8 +4,8 @@
 
 Photographed objects stand on drawn benches, whose silhouettes are known: a plain backdrop, or clutter; a plain platter,
 or one with marks. With ``--masks`` the photographs themselves are segmented; the folder has a mask of the same name for
-each of them. *enrolled*: all views together; *search*: the last of 1, 2 or 4 views, by the likeliest segmentation and by
-the best of all.
+each of them. *enrolled*: all views together; *search*: the last of 1, 2 or 4 views, by the likeliest segmentation and
+by the best of all.
 """
 
 import argparse

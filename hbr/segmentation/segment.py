@@ -28,10 +28,10 @@ from hbr.segmentation.cut_out import Box, Found, Segmentation
 from hbr.segmentation.silhouette import guess_object, shares, silhouette
 
 #: Probabilities above which a pixel belongs to the object: of the first segmentation, and of further ones.
-_LEVELS: Final = (0.3, 0.1, 0.6)
+_LEVELS: Final = (0.2, 0.5, 0.1)
 #: A silhouette that another method found counts before the network's if the expected overlap is at least this share of
 #: that of the network's: it is sharper, but it contains the platter if that differs from the backdrop.
-_CONFIRMED: Final = 0.8
+_CONFIRMED: Final = 0.7
 #: Smallest expected overlap of the network's silhouette that counts before a guess.
 _BETTER_THAN_GUESS: Final = 0.8
 #: A smaller expected overlap is reported.
