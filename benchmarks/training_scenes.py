@@ -45,20 +45,22 @@ class _Solid:
         self.points: list[Floats] = []
         self.normals: list[Floats] = []
 
-    def _add(self, points: Floats, normals: Floats, at: NDArray[np.float64], turn: NDArray[np.float64] | None) -> None:
-        if turn is not None:
-            points, normals = points @ turn.T, normals @ turn.T
+    def _add(
+        self, points: Floats, normals: Floats, at: NDArray[np.float64], rotation: NDArray[np.float64] | None
+    ) -> None:
+        if rotation is not None:
+            points, normals = points @ rotation.T, normals @ rotation.T
         self.points.append((points + at).astype(np.float32))
         self.normals.append(normals.astype(np.float32))
 
-    def ellipsoid(self, at: NDArray[np.float64], axes: NDArray[np.float64], turn=None) -> None:  # type: ignore[no-untyped-def]
+    def ellipsoid(self, at: NDArray[np.float64], axes: NDArray[np.float64], rotation=None) -> None:  # type: ignore[no-untyped-def]
         n = 6000
         way = self.rng.normal(size=(n, 3))
         way /= np.linalg.norm(way, axis=1, keepdims=True)
         normal = way / axes
-        self._add(way * axes, normal / np.linalg.norm(normal, axis=1, keepdims=True), at, turn)
+        self._add(way * axes, normal / np.linalg.norm(normal, axis=1, keepdims=True), at, rotation)
 
-    def box(self, at: NDArray[np.float64], half: NDArray[np.float64], turn=None) -> None:  # type: ignore[no-untyped-def]
+    def box(self, at: NDArray[np.float64], half: NDArray[np.float64], rotation=None) -> None:  # type: ignore[no-untyped-def]
         n = 6000
         points = self.rng.uniform(-1, 1, (n, 3))
         areas = np.array([half[1] * half[2], half[0] * half[2], half[0] * half[1]])
@@ -67,9 +69,9 @@ class _Solid:
         points[np.arange(n), face] = sign
         normals = np.zeros((n, 3))
         normals[np.arange(n), face] = sign
-        self._add(points * half, normals, at, turn)
+        self._add(points * half, normals, at, rotation)
 
-    def lathe(self, radii: NDArray[np.float64], height: float, at: NDArray[np.float64], turn=None) -> None:  # type: ignore[no-untyped-def]
+    def lathe(self, radii: NDArray[np.float64], height: float, at: NDArray[np.float64], rotation=None) -> None:  # type: ignore[no-untyped-def]
         n = 9000
         y = self.rng.uniform(0, 1, n)
         angle = self.rng.uniform(0, 2 * np.pi, n)
@@ -85,7 +87,7 @@ class _Solid:
         )
         lid_normal = np.stack([0 * lids, np.where(top, 1.0, -1.0), 0 * lids], axis=1)
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-        self._add(np.concatenate([body, lid]), np.concatenate([normal, lid_normal]), at, turn)
+        self._add(np.concatenate([body, lid]), np.concatenate([normal, lid_normal]), at, rotation)
 
     def ring(self, at: NDArray[np.float64], radius: float, thick: float, tall: float) -> None:
         n = 5000
@@ -95,7 +97,7 @@ class _Solid:
         self._add(middle + thick * way, way, at, None)
 
 
-def _turn(rng: np.random.Generator, strength: float = 1.0) -> NDArray[np.float64]:
+def _any_way(rng: np.random.Generator, strength: float = 1.0) -> NDArray[np.float64]:
     q, _ = np.linalg.qr(np.eye(3) + strength * rng.normal(size=(3, 3)))
     return q
 
@@ -140,7 +142,7 @@ def solid(rng: np.random.Generator) -> list[CutOut]:
         neck = np.array([long * rng.uniform(0.9, 1.3), high + thick * rng.uniform(0.4, 2), 0])
         made.ellipsoid(neck, np.array([rng.uniform(0.2, 0.4), rng.uniform(0.15, 0.28), rng.uniform(0.12, 0.22)]))
         made.ellipsoid(
-            (neck + np.array([0.7 * long, high + 0.7 * thick, 0])) / 2, np.array([0.25, 0.35, 0.18]), _turn(rng, 0.2)
+            (neck + np.array([0.7 * long, high + 0.7 * thick, 0])) / 2, np.array([0.25, 0.35, 0.18]), _any_way(rng, 0.2)
         )
         if rng.random() < 0.6:  # ears or horns
             for z in (-0.12, 0.12):
@@ -148,7 +150,7 @@ def solid(rng: np.random.Generator) -> list[CutOut]:
         if rng.random() < 0.8:
             drop = rng.uniform(0.2, 0.7)
             made.ellipsoid(
-                np.array([-long - 0.05, high + thick - drop / 2, 0]), np.array([0.04, drop, 0.04]), _turn(rng, 0.15)
+                np.array([-long - 0.05, high + thick - drop / 2, 0]), np.array([0.04, drop, 0.04]), _any_way(rng, 0.15)
             )
     elif kind < 0.76:  # cars
         half = np.array([1.0, rng.uniform(0.12, 0.25), rng.uniform(0.35, 0.5)])
@@ -164,7 +166,7 @@ def solid(rng: np.random.Generator) -> list[CutOut]:
         for _ in range(int(rng.integers(1, 7))):
             at = np.array([rng.normal(0, 0.35), rng.uniform(0.2, 1.6), rng.normal(0, 0.35)])
             axes = rng.uniform(0.06, 0.7, 3)
-            (made.ellipsoid if rng.random() < 0.6 else made.box)(at, axes, _turn(rng))
+            (made.ellipsoid if rng.random() < 0.6 else made.box)(at, axes, _any_way(rng))
         made.lathe(np.linspace(rng.uniform(0.2, 0.7), rng.uniform(0.1, 0.5), 4), rng.uniform(0.2, 1), zero)
     colours = _colours(made, rng)
     points, normals = np.concatenate(made.points), np.concatenate(made.normals)
