@@ -48,8 +48,6 @@ class _Solid:
     def _add(
         self, points: Floats, normals: Floats, at: NDArray[np.float64], rotation: NDArray[np.float64] | None
     ) -> None:
-        self, points: Floats, normals: Floats, at: NDArray[np.float64], rotation: NDArray[np.float64] | None
-    ) -> None:
         if rotation is not None:
             points, normals = points @ rotation.T, normals @ rotation.T
         self.points.append((points + at).astype(np.float32))

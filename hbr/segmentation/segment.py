@@ -225,7 +225,8 @@ def without_background(frame: SegmentedFrame) -> tuple[Found, ...]:
 
 def _by_network(share: NDArray[np.float32], method: BoxMethod, like: Found) -> list[Found]:
     """Return the silhouettes at several probabilities, with the illumination and the evidence of another one."""
-    masks = [silhouette(share > level, framed=False) for level in _LEVELS]
+    levels = _LEVELS if method is BoxMethod.ROTATION else _LEVELS[:1]
+    masks = [silhouette(share > level, framed=False) for level in levels]
     return [replace(like, silhouette=mask, method=method) for mask in masks if mask is not None]
 
 
