@@ -112,8 +112,9 @@ class Repeatability(Procedure):
                         move = table.goto(step * 360.0 / AZIMUTHS)
                         yield moved(index, move)
                         captured = yield from capture(index, viewer, table, move.settled_ns)
-                        yield Accepted(index, (-move.encoder_deg) % 360.0, captured.evidence, captured.image_bgr)
-                        views.append(describe(captured.image_bgr).levels[PAPER_DESCRIPTOR])
+                        azimuth_deg = (-move.encoder_deg) % 360.0
+                        yield Accepted(index, azimuth_deg, captured.evidence, captured.image_bgr)
+                        views.append(describe(captured.image_bgr, azimuth_deg).levels[PAPER_DESCRIPTOR])
                         index += 1
                     rounds.append(views)
                 table.goto(0.0)

@@ -335,7 +335,10 @@ def missing_enrollments(transaction: Transaction, object_id: int | None = None) 
     if object_id is not None:
         lines = lines.where(Entry.object_id == object_id)
     names = {number: name for number, name in transaction.execute(lines) if number is not None}
-    present = set(transaction.scalars(select(Enrollment.id)))
+    ids = select(Enrollment.id)
+    present = set(transaction.scalars(ids if object_id is None else ids.where(Enrollment.object_id == object_id)))
+    if names.keys() <= present:
+        return {}
     removals = select(Entry).where(Entry.action.in_((Action.ENROLLMENT_DISCARDED, Action.GARBAGE_COLLECTED)))
     for line in transaction.scalars(removals):
         collected = (line.record or {}).get(COLLECTED)
