@@ -22,7 +22,9 @@ class ViewConfig(Section):
     """Quality that a view needs."""
 
     roi: tuple[int, int, int, int] | None = Field(
-        (80, 0, 480, 480), description="x, y, width and height of the image region that is described"
+        (80, 0, 480, 480),
+        description="x, y, width and height of the image region that is described; none: the whole frame; if it is not "
+        "set: the largest square in the middle of the frame, here of 640x480 pixels",
     )
     min_sharpness: float = Field(
         3.0, ge=0, le=1e6, description="smallest variance of the Laplacian of the region in grey"
@@ -174,6 +176,11 @@ class RigConfig(Section):
     @classmethod
     def _region_within_frame(cls, view: ViewConfig, others: ValidationInfo) -> ViewConfig:
         camera = others.data.get("camera")
+        if camera is not None and "roi" not in view.model_fields_set:
+            side = min(camera.width, camera.height)
+            square = (camera.width - side) // 2, (camera.height - side) // 2, side, side
+            # It stays unset, so that a calibration can set it.
+            return ViewConfig.model_construct(view.model_fields_set, **{**dict(view), "roi": square})
         if camera is not None and view.roi is not None:
             x, y, width, height = view.roi
             if min(x, y) < 0 or min(width, height) < 1 or x + width > camera.width or y + height > camera.height:

@@ -300,16 +300,14 @@ def ribbon_camera(name: str, number: int) -> Finding:
 def camera_settings(found: FoundCamera) -> dict[Key, Any]:
     """Return the settings of this camera, by key; its number may change after a restart.
 
-    The mode is the offered one that is nearest to the default. The region of another size is the square in its middle.
+    The mode is the offered one that is nearest to the default.
     """
     number = Path(found.node.path).name.removeprefix("video")
     keys: dict[Key, Any] = {("camera", "source"): found.node.stable or _number_or(found.node.path, number)}
     usual = CameraConfig()
     mode = choose_mode(found.modes, usual.width, usual.height, usual.fps)
     if mode is not None and (mode.width, mode.height) != (usual.width, usual.height):
-        side = min(mode.width, mode.height)
         keys |= {("camera", "width"): mode.width, ("camera", "height"): mode.height}
-        keys[("view", "roi")] = [(mode.width - side) // 2, (mode.height - side) // 2, side, side]
     if mode is not None and 0 < mode.fps < 0.9 * usual.fps:
         keys[("camera", "fps")] = round(mode.fps, 3)
     return keys

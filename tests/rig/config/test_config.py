@@ -22,7 +22,8 @@ def test_all_mistakes_are_reported_with_range_and_suggestion(tmp_path):
     file = tmp_path / "rig.toml"
     file.write_text(
         '[servo]\nbaud = 3\nprot = "/dev/ttyUSB1"\n[table]\nlimits_deg = [0, 90]\nvelocity_dps = -1\n'
-        "[identify]\nmax_view = 3\nmax_views = 1\n[camera]\nwidth = 320\n",
+        "[identify]\nmax_view = 3\nmax_views = 1\n[camera]\nwidth = 320\n"
+        "[view]\nroi = [80, 0, 480, 480]\n",
         encoding="utf-8",
     )
     with pytest.raises(ConfigError) as caught:
@@ -54,6 +55,25 @@ def test_region_outside_the_frame_is_rejected(roi):
     with pytest.raises(ConfigError, match="1 mistake"):
         load_config(None, [f"view.roi={roi}"])
     assert load_config(None, ["view.roi=[0, 0, 640, 480]"]).view.roi == (0, 0, 640, 480)
+
+
+@pytest.mark.parametrize(
+    ("size", "square"),
+    [
+        ((640, 480), (80, 0, 480, 480)),
+        ((256, 480), (0, 112, 256, 256)),
+        ((1280, 720), (280, 0, 720, 720)),
+        ((257, 256), (0, 0, 256, 256)),
+    ],
+)
+def test_region_is_the_largest_square_in_the_middle_of_the_frame_if_it_is_not_set(size, square):
+    config = load_config(None, [f"camera.width={size[0]}", f"camera.height={size[1]}", "view.min_sharpness=2"])
+    assert config.view.roi == square
+    assert config.view.min_sharpness == 2
+    # Another frame, such as after a calibration was applied, has another region.
+    again = RigConfig.model_validate(config.model_dump(exclude_unset=True) | {"camera": {"width": 100, "height": 80}})
+    assert again.view.roi == (10, 0, 80, 80)
+    assert load_config(None, [f"camera.width={size[0]}", "view.roi=none"]).view.roi is None
 
 
 def test_overrides_replace_values_of_the_file(tmp_path):

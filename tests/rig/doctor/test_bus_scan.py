@@ -269,7 +269,6 @@ def test_mode_of_a_camera_is_chosen_from_what_it_offers():
         ("camera", "width"): 1280,
         ("camera", "height"): 720,
         ("camera", "fps"): 20.0,
-        ("view", "roi"): [280, 0, 720, 720],
     }
     usual = VideoMode("YUYV", 640, 480, 30.0)
     assert camera_settings(FoundCamera(**at, modes=(*hd, usual))) == {("camera", "source"): 2}
@@ -277,7 +276,7 @@ def test_mode_of_a_camera_is_chosen_from_what_it_offers():
 
 
 def test_doctor_names_the_nearest_mode():
-    with unopened("camera.width=1280", "camera.height=720", "view.roi=none") as bench:
+    with unopened("camera.width=1280", "camera.height=720") as bench:
         problems = bench.problems("camera")
         assert problems[FindingCode.MODE_NOT_OFFERED] == (Do.SETUP(),)
 
