@@ -111,6 +111,7 @@ def configuration_page() -> str:
     """Return a page with every key of `rig.toml`."""
     from rig.config import RigConfig
     from sim.bench import SimOptions
+    from sim.photographs import PhotographOptions
 
     lines = [
         f"# Configuration keys\n\n{NOTE}`rig.toml` holds these keys. `rig config show` prints the values in use and "
@@ -123,7 +124,10 @@ def configuration_page() -> str:
     for name, field in RigConfig.model_fields.items():
         if section := _section(field):
             lines += [f"\n## [{name}]\n", _unwrapped(section.__doc__ or ""), "", *_key_table(section.model_fields)]
-    lines += ["\n## [bench.sim]\n", "The simulated bench.\n", *_key_table(SimOptions.model_fields), ""]
+    lines += ["\n## [bench.sim]\n", "The simulated bench.\n", *_key_table(SimOptions.model_fields)]
+    own = {key: field for key, field in PhotographOptions.model_fields.items() if key not in SimOptions.model_fields}
+    lines += ["\n## [bench.photographs]\n", "The bench of photographs. It has the keys of [bench.sim], too.\n"]
+    lines += [*_key_table(own), ""]
     return "\n".join(lines)
 
 

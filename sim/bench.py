@@ -5,8 +5,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, fields
 from functools import partial
-from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from pydantic import BaseModel, Field, field_validator
 
@@ -28,7 +27,7 @@ from sim.faults import Fault, Faults
 from sim.faults.injector import Occurrence
 from sim.faults.schedule import read_faults
 from sim.noise import NoiseModel
-from sim.objects.photographs import PhotographsOnTable, photographs
+from sim.objects.projection import Image
 from sim.objects.shelf import shelf
 from sim.optics import Optics
 from sim.world import SimObject, World
@@ -37,7 +36,6 @@ from sim.world import SimObject, World
 class SimOptions(Section):
     """The section ``[bench.sim]``."""
 
-    objects: Path | None = Field(None, description="folder of photographs obj{N}__{A}.png; default: built-in objects")
     object: str | list[str] | None = Field(
         None, description="object on the table to identify, or a list that is repeated; default: random, from the seed"
     )
@@ -85,7 +83,13 @@ class ShelfOperator:
         Store for the state of the table on the benches of this world.
     optics
         The camera's optics for the boards, drawn from the world's seed.
+    targets
+        Calibration boards and a grey card, by name.
+    backdrop
+        See `sim.camera.SimCapture`.
     """
+
+    backdrop: Image | None = None
 
     def __init__(
         self,
@@ -105,6 +109,7 @@ class ShelfOperator:
         self.faults: Faults | None = None
         self.state: StateStore = MemoryStore()
         self.optics = Optics.of(world)
+        self.targets: Mapping[str, SimObject] = calibration_targets(self.optics)
         self._rng = world.rng("operator")
         self._days = world.rng("days")
 
@@ -115,29 +120,37 @@ class ShelfOperator:
         """
         dx_mm, dy_mm = self._rng.normal(0.0, self.world.noise.placement_mm, 2).tolist()
         yaw_deg = 0.0
-        if name is None:
+        if to_identify := name is None:
             drawn, drawn_deg = str(self._rng.choice(sorted(self.objects))), float(self._rng.uniform(0.0, 360.0))
             if self.queue:
                 self.next_object = self.queue[0]
                 self.queue.rotate(-1)
             name = self.next_object or drawn
             yaw_deg = drawn_deg if self.yaw_deg is None else self.yaw_deg
-        if name in (at_hand := calibration_targets(self.optics)):
-            self.world.put(at_hand[name])
+        if name in self.targets:
+            self.world.put(self.targets[name])
             return
-        if name not in self.objects:
-            raise ObjectNotFound(
-                f"The simulated bench has no object {name!r}.",
-                next_step="Choose a listed object, or set bench.sim.objects to a folder of photographs.",
-                evidence={"objects": list(self.objects)},
-            )
+        placed = self.thing(name, to_identify=to_identify)
         if self.change is not None:
             assert self.devices is not None
             self.change.visit(self.devices, self._days)
             self.world.change(light=self.change.light(self._days))
             further_mm = self.change.offset_mm(self._days)
             dx_mm, dy_mm = dx_mm + further_mm[0], dy_mm + further_mm[1]
-        self.world.put(self.objects[name], yaw_deg, (dx_mm, dy_mm))
+        self.world.put(placed, yaw_deg, (dx_mm, dy_mm))
+
+    def thing(self, name: str, *, to_identify: bool) -> SimObject:  # noqa: ARG002
+        """Return the object called ``name``, to enroll or to identify it.
+
+        Raises `ObjectNotFound` if no object has that name.
+        """
+        if name not in self.objects:
+            raise ObjectNotFound(
+                f"The simulated bench has no object {name!r}.",
+                next_step="Choose a listed object.",
+                evidence={"objects": list(self.objects)},
+            )
+        return self.objects[name]
 
     def change_bench(self, change: Change) -> None:
         """Change the bench from now on; it must be open."""
@@ -148,9 +161,7 @@ class ShelfOperator:
         change.visit(self.devices, self._days)
 
     def clear(self) -> bool:
-        """Clear the table and return whether that is possible: a photograph always shows its own table."""
-        if any(isinstance(thing, PhotographsOnTable) for thing in self.objects.values()):
-            return False
+        """Clear the table and return whether that is possible."""
         self.world.put(None)
         return True
 
@@ -163,6 +174,7 @@ def open_sim_bench(
     on_fault: Callable[[Occurrence], None] | None = None,
     devices: SimDevices | None = None,
     open_now: Collection[str] = DEVICES,
+    name: str = "sim",
 ) -> Bench:
     """Open a bench whose real drivers are connected to simulated devices, by the code that opens a real bench.
 
@@ -180,6 +192,8 @@ def open_sim_bench(
         Devices of an earlier bench in this world; the caller closes them.
     open_now
         Devices to open now, see `rig.bench.open_bench`.
+    name
+        Name of the bench.
 
     Raises
     ------
@@ -193,7 +207,9 @@ def open_sim_bench(
     with ExitStack() as wires:
         owned = devices is None
         if devices is None:
-            devices = wires.enter_context(SimDevices.connected(config, world))
+            devices = wires.enter_context(SimDevices.connected(config, world, operator.backdrop))
+        if operator.backdrop is not None:  # objects of another size do not fit into the frame
+            devices.objects = operator.objects
         capture = partial(getattr, devices, "camera")
         operator.devices, operator.faults = devices, Faults(devices)
         if on_fault:
@@ -204,7 +220,7 @@ def open_sim_bench(
         operator.faults.schedule(*faults)
         # Assemble the bench, with a cable that is not wound up in a new world.
         bench = assemble(
-            "sim",
+            name,
             config,
             world.clock,
             connection=devices.adapter,
@@ -233,22 +249,48 @@ def open_sim_bench(
     return bench
 
 
+class Stage(NamedTuple):
+    """A simulated bench before it is opened.
+
+    Attributes
+    ----------
+    config
+        Its configuration.
+    operator
+        Returns the operator in a world.
+    findings
+        Notes for the operator.
+    """
+
+    config: RigConfig
+    operator: Callable[[World], ShelfOperator]
+    findings: tuple[str, ...] = ()
+
+
 class SimBenchKind:
     """The kind of bench ``sim``: a simulated bench in a new world whose clock starts at the computer's time."""
 
+    name = "sim"
     options: type[BaseModel] = SimOptions
+
+    def prepare(self, config: RigConfig, options: SimOptions) -> Stage:  # noqa: ARG002
+        """Return what is on the bench."""
+        return Stage(config, partial(ShelfOperator, objects=shelf()))
 
     def open(self, config: RigConfig, options: Any, seed: int | None) -> Bench:
         assert isinstance(options, SimOptions)
-        objects = photographs(options.objects) if options.objects else shelf()
+        stage = self.prepare(config, options)
         with ExitStack() as held:
-            state = _state(config, held)
-            world = new_world(options, seed, rest_angle_deg(config, state))
-            single = options.object if isinstance(options.object, str) else None
-            operator = ShelfOperator(world, objects, next_object=single, yaw_deg=options.yaw_deg)
+            state = _state(self.name, config, held)
+            operator = stage.operator(new_world(options, seed, rest_angle_deg(config, state)))
+            operator.next_object = options.object if isinstance(options.object, str) else None
+            operator.yaw_deg = options.yaw_deg
             operator.queue.extend(options.object if isinstance(options.object, list) else ())
             operator.state = state
-            bench = open_sim_bench(config, operator, faults=read_faults(options.faults), open_now=())
+            bench = open_sim_bench(
+                stage.config, operator, faults=read_faults(options.faults), open_now=(), name=self.name
+            )
+            bench.findings += stage.findings
             bench.connections.enter_context(held.pop_all())
         return bench
 
@@ -256,9 +298,11 @@ class SimBenchKind:
     def computer(self, config: RigConfig, options: Any, seed: int | None) -> Iterator[Computer]:
         """Yield the simulated computer with the faults that need no motion."""
         assert isinstance(options, SimOptions)
+        stage = self.prepare(config, options)
+        world = new_world(options, seed)
         with (
-            SimDevices.connected(config, new_world(options, seed)) as devices,
-            simulated_computer(config, devices) as computer,
+            SimDevices.connected(stage.config, world, stage.operator(world).backdrop) as devices,
+            simulated_computer(stage.config, devices) as computer,
         ):
             faults = Faults(devices)
             faults.schedule(*read_faults(options.faults))
@@ -275,11 +319,11 @@ def new_world(options: SimOptions, seed: int | None, start_deg: float = 0.0) -> 
     return World(noise=NoiseModel(**options.noise), seed=seed or 0, clock=clock, start_deg=start_deg)
 
 
-def _state(config: RigConfig, held: ExitStack) -> StateStore:
+def _state(name: str, config: RigConfig, held: ExitStack) -> StateStore:
     """Return the store of the bench's state: in memory, unless the configuration names a folder."""
     if config.state_dir is None:
         return MemoryStore()
-    path = config.state_path("sim")
+    path = config.state_path(name)
     held.callback(BenchLock(path, SystemClock()).close)
     return FileStore(path)
 

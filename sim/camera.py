@@ -36,10 +36,7 @@ READOUT_NS = 15_000_000  # time from the end of the exposure until the computer 
 SELECT_S = 10.0  # how long OpenCV's V4L2 backend waits for a frame (OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT)
 
 _FOCUS_STEP = 15  # distance by which the autofocus moves the lens between two measurements
-MODES = tuple(
-    v4l2.VideoMode(fourcc, WIDTH // n, HEIGHT // n, float(FPS)) for fourcc in ("MJPG", "YUYV") for n in (1, 2)
-)
-"""The modes that it offers; MJPG has no errors of compression."""
+_FOURCCS = ("MJPG", "YUYV")  # MJPG has no errors of compression
 _NO_CONTROLS = (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT, cv2.CAP_PROP_FPS, cv2.CAP_PROP_POS_MSEC)
 """Properties that OpenCV answers without asking the camera."""
 _REMEMBERED = (
@@ -63,9 +60,10 @@ class SimCapture:
     shutter). The frame arrives `READOUT_NS` and a delay of the USB after an exposure from its stamp. As in V4L2, up to
     four frames wait in buffers; while the buffers are full, new frames are lost. A frame is drawn when it is retrieved,
     from the world's state at its exposure, so dropped frames take no time and change nothing. The width selects one of
-    two modes, 640x480 and 320x240. Properties have the units of OpenCV's V4L2 backend; for an unknown property `set`
-    returns False and `get` -1. As on V4L2, `isOpened` stays True after an unplug, while `grab` fails. The camera begins
-    with the focus that an earlier program left; plugged in again, it wakes out of focus with its autofocus on.
+    two modes: the size of the backdrop (640x480), and half of it. Properties have the units of OpenCV's V4L2 backend;
+    for an unknown property `set` returns False and `get` -1. As on V4L2, `isOpened` stays True after an unplug, while
+    `grab` fails. The camera begins with the focus that an earlier program left; plugged in again, it wakes out of focus
+    with its autofocus on.
 
     Attributes
     ----------
@@ -95,14 +93,15 @@ class SimCapture:
         Frequency in Hz and depth of the light's flicker, which leaves bands because rows are read out one after the
         other; None for a steady light.
     backdrop
-        Wall, table and platter without an object, uint8 (480, 640, 3).
+        What is behind the objects: wall, table and platter, uint8 (480, 640, 3), or another ground of any size for
+        objects that fill the frame. Such frames do not depend on the camera's mounting and on its orbit.
     visit
         A hard change of the bench, through which everything is seen (`sim.change`).
     filters
         Called in order with each fetched frame and its number; each returns a frame.
     """
 
-    def __init__(self, world: World) -> None:
+    def __init__(self, world: World, backdrop: Image | None = None) -> None:
         self.remembers = True
         self._remembered: dict[int, float] = {}
         self.every = 1
@@ -118,13 +117,15 @@ class SimCapture:
         self._world = world
         self._clock = world.clock
         self._binning = 1
-        self._fourcc = MODES[0].fourcc
+        self._fourcc = _FOURCCS[0]
         self._noise = world.noise
         self.times = FrameTimes(world)
         self.stamp_shift_ns = 0
-        self.backdrop = empty_platter()
+        self._draws_bench = backdrop is None
+        self.backdrop = empty_platter() if backdrop is None else backdrop
+        self._height, self._width = self.backdrop.shape[:2]
         # A well-mounted camera sees the objects as they are drawn; calibration boards are drawn through its lens.
-        self._moved = Optics.of(world).from_drawn() if world.noise.camera_mount else None
+        self._moved = Optics.of(world).from_drawn() if world.noise.camera_mount and self._draws_bench else None
         self._open = self._plugged = True
         self._lost = False
         self._plugs = 1
@@ -178,7 +179,8 @@ class SimCapture:
 
     def modes(self) -> tuple[v4l2.VideoMode, ...]:
         """Return the modes that the camera offers."""
-        return MODES
+        sizes = [(self._width // n, self._height // n) for n in (1, 2)]
+        return tuple(v4l2.VideoMode(fourcc, *size, float(FPS)) for fourcc in _FOURCCS for size in sizes)
 
     def isOpened(self) -> bool:  # noqa: N802
         return self._open
@@ -222,7 +224,7 @@ class SimCapture:
         return not self.wait_ns()
 
     def retrieve(self) -> tuple[bool, Image | None]:
-        """Return the frame that was grabbed last, uint8 (480, 640, 3)."""
+        """Return the frame that was grabbed last, uint8 (height, width, 3)."""
         if self._grabbed is None or not self._delivers:
             return False, None
         self._world.notify(Activity.FRAME_FETCHED)
@@ -243,8 +245,8 @@ class SimCapture:
         self._meter()
         now = self._controls[-1][1]
         values: dict[int, float] = {
-            cv2.CAP_PROP_FRAME_WIDTH: WIDTH // self._binning,
-            cv2.CAP_PROP_FRAME_HEIGHT: HEIGHT // self._binning,
+            cv2.CAP_PROP_FRAME_WIDTH: self._width // self._binning,
+            cv2.CAP_PROP_FRAME_HEIGHT: self._height // self._binning,
             cv2.CAP_PROP_FPS: FPS,
             cv2.CAP_PROP_FOURCC: v4l2.fourcc_number(self._fourcc),
             cv2.CAP_PROP_POS_MSEC: 0.0 if self._grabbed is None else self._stamp_ns(self._grabbed) * 1e-6,
@@ -260,10 +262,10 @@ class SimCapture:
         self._meter()
         now = self._controls[-1][1]
         match prop:
-            case cv2.CAP_PROP_FOURCC if value in {v4l2.fourcc_number(mode.fourcc) for mode in MODES}:
+            case cv2.CAP_PROP_FOURCC if value in {v4l2.fourcc_number(fourcc) for fourcc in _FOURCCS}:
                 self._fourcc = int(value).to_bytes(4, "little").decode("ascii")
-            case cv2.CAP_PROP_FRAME_WIDTH if value in (WIDTH, WIDTH // 2):
-                self._binning = round(WIDTH / value)
+            case cv2.CAP_PROP_FRAME_WIDTH if value in (self._width, self._width // 2):
+                self._binning = 1 if value == self._width else 2
             case cv2.CAP_PROP_FRAME_WIDTH | cv2.CAP_PROP_FRAME_HEIGHT | cv2.CAP_PROP_FPS:
                 return value == self.get(prop)
             case cv2.CAP_PROP_BUFFERSIZE if BUFFERS_RANGE[0] <= value <= BUFFERS_RANGE[1]:
@@ -332,10 +334,11 @@ class SimCapture:
             seen = np.asarray(cv2.GaussianBlur(seen, (0, 0), blur), dtype=np.float32)
         if self.lamp is not None:
             seen = np.asarray(
-                seen * bands(*self.lamp, start, controls.exposure_ns, self.times.readout_ns), dtype=np.float32
+                seen * bands(*self.lamp, start, controls.exposure_ns, self.times.readout_ns, self._height),
+                dtype=np.float32,
             )
         rng = np.random.default_rng([self._world.seed, crc32(b"camera frame"), frame])
-        image = _sensor(self._noise, self._world.seed, self._binning, get_ident()).expose(
+        image = _sensor(self._noise, self._world.seed, self._binning, (self._width, self._height), get_ident()).expose(
             seen,
             light=scene.light,
             exposure=controls.exposure / NOMINAL_EXPOSURE,
@@ -355,8 +358,8 @@ class SimCapture:
         if path_px < _STILL_PX:
             return self._picture(scene, float(angles[0]))
         n = min(1 + max(ceil(path_px / self._binning), 1), _MAX_SUBFRAMES * (1 + readout // max(exposure, 1)))
-        steps, weights = row_weights(exposure, readout, n)
-        seen = np.zeros((HEIGHT, WIDTH, 3), dtype=np.float32)
+        steps, weights = row_weights(exposure, readout, n, self._height)
+        seen = np.zeros((self._height, self._width, 3), dtype=np.float32)
         for angle, weight in zip(self._world.table_angles(start + steps.astype(np.int64)), weights, strict=True):
             exposed = np.flatnonzero(weight)
             if len(exposed):
@@ -368,7 +371,8 @@ class SimCapture:
     def _picture(self, scene: Scene, table_deg: float, rows: tuple[int, int] = (0, HEIGHT)) -> Image:
         """Return the image of a scene under nominal light; only the ``rows`` need to be right."""
         table_deg = -table_deg if self.orbits else table_deg
-        empty = room(self._world.seed, table_deg) if self.orbits else self.backdrop
+        in_room = self.orbits and self._draws_bench
+        empty = room(self._world.seed, table_deg) if in_room else self.backdrop
         image = empty.copy()
         if scene.object is None:
             return self._as_mounted(image if self.visit is None else seen_on_visit(self.visit, None, table_deg))
@@ -384,7 +388,7 @@ class SimCapture:
             scene.object.draw(image, table_deg + scene.yaw_deg, offset_mm, rows)
             return image
         scene.object.draw(image, table_deg + scene.yaw_deg, offset_mm)
-        if self.orbits:
+        if in_room:
             relight(image, empty, table_deg)
         return self._as_mounted(image)
 
@@ -426,6 +430,6 @@ class SimCapture:
 
 
 @lru_cache(maxsize=4)
-def _sensor(noise: NoiseModel, seed: int, binning: int, _thread: int) -> Sensor:
+def _sensor(noise: NoiseModel, seed: int, binning: int, size: tuple[int, int], _thread: int) -> Sensor:
     """Return the sensor of a world, built for the first frame and shared by all benches of that world in a thread."""
-    return Sensor(noise, np.random.default_rng([seed, crc32(b"camera")]), binning)
+    return Sensor(noise, np.random.default_rng([seed, crc32(b"camera")]), binning, size)

@@ -1,7 +1,8 @@
 """The simulated devices of a bench, to which its drivers are connected."""
 
+from collections.abc import Mapping
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pkgutil import resolve_name
 from typing import Self
 
@@ -16,16 +17,19 @@ from sim.head.board import PinChange, SimHead
 from sim.head.serial_port import HeadSerial
 from sim.i2c import SimI2cBus
 from sim.imu.inertial import SimulatedImu
+from sim.objects.projection import Image
+from sim.objects.shelf import shelf
 from sim.servo import ServoBus, SimSerial
 from sim.servo.configured import SimulatedServo, simulated_servo
-from sim.world import World
+from sim.world import SimObject, World
 
 
 @dataclass
 class SimDevices(AbstractContextManager["SimDevices"]):
     """The devices in one world and the connections to them, which the end of a ``with`` block closes.
 
-    They outlive a bench: a second bench on the same devices finds them in the state after the first one.
+    They outlive a bench: a second bench on the same devices finds them in the state after the first one. ``objects``
+    are those that a fault can put on the table.
     """
 
     world: World
@@ -36,13 +40,14 @@ class SimDevices(AbstractContextManager["SimDevices"]):
     imu: SimulatedImu
     camera: SimCapture
     head: SimHead | None = None
+    objects: Mapping[str, SimObject] = field(default_factory=shelf, repr=False)
 
     def __exit__(self, *_: object) -> None:
         self.i2c.close()
 
     @classmethod
-    def connected(cls, config: RigConfig, world: World) -> Self:
-        """Return the devices that ``config`` describes, with factory settings.
+    def connected(cls, config: RigConfig, world: World, backdrop: Image | None = None) -> Self:
+        """Return the devices that ``config`` describes, with factory settings; ``backdrop`` as in `SimCapture`.
 
         Raises `ConfigError` if the simulator has no servo or IMU of that model, or the servo does not support the baud
         rate.
@@ -56,7 +61,7 @@ class SimDevices(AbstractContextManager["SimDevices"]):
         i2c = head or SimI2cBus(world.clock)
         i2c.attach(config.imu.address, imu)
         adapter = SimSerial(servo_bus, config.servo.baud, READ_SLICE_S)
-        camera = SimCapture(world)
+        camera = SimCapture(world, backdrop)
         camera.orbits = config.table.carries == "camera"
         return cls(world, servo_bus, servo, adapter, i2c, imu, camera, head)
 

@@ -36,10 +36,14 @@ class Sensor:
         Generator of the noise tile; each frame uses a part of it.
     binning
         Number of pixels along each side that are combined into one.
+    size
+        Width and height of the scene in pixels.
     """
 
-    def __init__(self, noise: NoiseModel, rng: np.random.Generator, binning: int = 1) -> None:
-        self._size = width, height = WIDTH // binning, HEIGHT // binning
+    def __init__(
+        self, noise: NoiseModel, rng: np.random.Generator, binning: int = 1, size: tuple[int, int] = (WIDTH, HEIGHT)
+    ) -> None:
+        self._size = width, height = size[0] // binning, size[1] // binning
         self._noise = noise
         levels_per_e = 255 / (noise.full_well_e or NoiseModel().full_well_e)
         self._shot = levels_per_e if noise.full_well_e else 0.0
@@ -62,12 +66,12 @@ class Sensor:
         gains: Gains,
         rng: np.random.Generator,
     ) -> Image:
-        """Return one frame, uint8 (480, 640, 3), or smaller by the binning.
+        """Return one frame, uint8, of the size of the scene, or smaller by the binning.
 
         Parameters
         ----------
         scene
-            The scene under nominal light, 0..255, (480, 640, 3).
+            The scene under nominal light, 0..255, (height, width, 3).
         light
             The light relative to the nominal one.
         exposure

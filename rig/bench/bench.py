@@ -202,6 +202,14 @@ class ServoAlone(Protocol):
     def open_servo(self, config: RigConfig, options: Any, seed: int | None) -> AbstractContextManager[Servo]: ...
 
 
+@runtime_checkable
+class FitsConfig(Protocol):
+    """A kind of bench on which other settings follow from its options, such as the size of the camera's frames."""
+
+    def fitted(self, config: RigConfig, options: Any) -> RigConfig:
+        """Return the configuration with these settings."""
+
+
 def bench_names() -> list[str]:
     """Return the names of the installed kinds of benches."""
     return sorted(_plugins())

@@ -23,8 +23,8 @@ class ViewConfig(Section):
 
     roi: tuple[int, int, int, int] | None = Field(
         (80, 0, 480, 480),
-        description="x, y, width and height of the image region that is described; none: the whole frame; if it is not "
-        "set: the largest square in the middle of the frame, here of 640x480 pixels",
+        description="x, y, width and height of the image region that is described; none: the whole frame; the default "
+        "follows the frame: the largest square in its middle",
     )
     min_sharpness: float = Field(
         3.0, ge=0, le=1e6, description="smallest variance of the Laplacian of the region in grey"

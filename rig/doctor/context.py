@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from rig.bench import bench_kind
+from rig.bench import FitsConfig, bench_kind
 from rig.bench.computer import Computer, ComputerProvider
 from rig.config import RigConfig
 from rig.config.values import validate
@@ -73,6 +73,8 @@ def open_context(
     """
     kind = bench_kind(bench)
     chosen = validate(kind.options, config.bench.get(bench, {}), where="the configuration", prefix=f"bench.{bench}")
+    if isinstance(kind, FitsConfig):
+        config = kind.fitted(config, chosen)
     try:
         who = None if is_held else holder(config.state_path(bench))
     except OSError:  # the folder is not readable: the check of the bench's state reports it

@@ -78,7 +78,11 @@ def photograph_table(
     """
     if bench.placer is not None and not bench.placer.clear():
         raise UsageError(
-            "The object on this bench cannot be taken away.", next_step="Continue without an empty-table image."
+            "The object on this bench cannot be taken away.",
+            next_step=(
+                "Continue without an empty-table image. If the bench shows photographs, name one:",
+                Do.SET_KEY(key="bench.photographs.empty_table", value="FILE"),
+            ),
         )
     started_ns = bench.clock.now_ns()
     if bench.config.table.carries == "camera":

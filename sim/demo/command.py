@@ -16,7 +16,7 @@ def demo(
     settings: Settings,
     objects: Annotated[
         Path | None,
-        typer.Option(metavar="FOLDER", help="Use photographs obj{N}__{A}.png instead of the built-in objects."),
+        typer.Option(metavar="FOLDER", help="Use photographs, as on the bench photographs, not the built-in objects."),
     ] = None,
     count: Annotated[
         int | None,

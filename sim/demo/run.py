@@ -9,6 +9,7 @@ import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -48,9 +49,10 @@ from sim.demo.moves import MoveLines
 from sim.faults.injector import Occurrence
 from sim.faults.schedule import Fault, read_faults
 from sim.noise import NoiseModel
-from sim.objects.photographs import PhotographsOnTable, photographs
+from sim.objects.photographs import PhotographsOnTable
 from sim.objects.shelf import shelf
 from sim.objects.solid import Solid
+from sim.photographs import NAME, PhotographedObjects, PhotographOperator, PhotographOptions
 from sim.world import World
 
 ENROLLED = (
@@ -144,16 +146,16 @@ def run_demo(
     """Enroll a shelf, identify each object and two unknown ones, print the events, and write ``out/report.html``.
 
     Each object is enrolled with ``views`` views, by default ``enroll.views`` if the configuration has it, or `VIEWS`.
-    The search uses ``strategy``, by default ``identify.strategy``. The bench is changed (``change``) after the
-    enrollments. Without ``empty_table`` no empty-table image is taken. The ``faults`` and those of the configuration
-    are injected meanwhile.
+    The search uses ``strategy``, by default ``identify.strategy``. With ``objects`` these are photographs. The bench is
+    changed (``change``) after the enrollments. Without ``empty_table`` no empty-table image is taken. The ``faults``
+    and those of the configuration are injected meanwhile.
 
     Raises
     ------
     UsageError
-        There are fewer objects than ``count``, or ``out`` is not writable.
+        There are fewer objects than ``count``, ``out`` is not writable, or photographs cannot show the ``change``.
     ConfigError
-        The options of the simulated bench have mistakes.
+        The options of the simulated bench have mistakes, or there are no photographs.
     """
     if settings.bench not in (None, "sim"):
         raise UsageError(
@@ -166,18 +168,33 @@ def run_demo(
     config = settings.load()
     asked = strategy or config.identify.strategy
     chosen = None if asked is None else strategy_named(asked)
+    views_are_set = "views" in config.enroll.model_fields_set
     options = validate(SimOptions, config.bench.get("sim", {}), where="the configuration", prefix="bench.sim")
-    enrolled, unknown = _choose(objects or options.objects, count)
     seed = settings.seed or 0
     world = World(noise=NoiseModel(**options.noise), seed=seed)
-    operator = ShelfOperator(world, {**enrolled, **unknown})
+    if objects is None:
+        enrolled, unknown = _choose(count)
+        operator = ShelfOperator(world, {**enrolled, **unknown})
+    else:
+        if change is not None and (change.hard or change.background or change.placement_mm):
+            raise UsageError(
+                "Photographs show their own bench, and their objects cannot be moved on it.",
+                next_step="Use --change only with light, gn, gn-sd or mb.",
+            )
+        section = config.bench.get(NAME, {}) | {"source": objects}
+        photographed = PhotographedObjects.read(
+            validate(PhotographOptions, section, where="the configuration", prefix=f"bench.{NAME}")
+        )
+        config = photographed.fitted(config)
+        enrolled, unknown = _choose_photographed(photographed.identified, count)
+        operator = PhotographOperator(world, photographed)
     heard = None if settings.json else _say_fault
     with (
         _folder_within(out) as folder,
         open_sim_bench(config, operator, faults=[*read_faults(options.faults), *faults], on_fault=heard) as bench,
     ):
         # Enroll, then change the bench if asked for, then identify.
-        each = views or (config.enroll.views if "views" in config.enroll.model_fields_set else VIEWS)
+        each = views or (config.enroll.views if views_are_set else min(VIEWS, config.enroll.views))
         if empty_table:
             _photograph(bench, operator, each)
         with Catalog.open(folder, clock=bench.clock) as catalog:
@@ -227,22 +244,29 @@ def _say_fault(occurrence: Occurrence) -> None:
     print(f"{occurrence.time_ns * 1e-9:8.2f} s  fault {begins}: {occurrence.fault.kind.name}", file=sys.stderr)
 
 
-def _choose(folder: Path | None, count: int | None) -> tuple[Mapping[str, SimObject], Mapping[str, SimObject]]:
-    """Return the objects to enroll and the unknown ones; if a whole folder is enrolled, those come from the shelf."""
-    built_in: dict[str, SimObject] = dict(shelf())
-    known = dict(photographs(folder)) if folder else {k: v for k, v in built_in.items() if k not in UNKNOWN_OBJECTS}
-    names = list(known) if folder else list(dict.fromkeys([*ENROLLED, *known]))
-    wanted = count or min(COUNT_OF_FOLDER if folder else len(ENROLLED), len(names))
-    if wanted > len(names):
+_Objects = Mapping[str, SimObject]
+
+
+def _choose(count: int | None) -> tuple[_Objects, _Objects]:
+    """Return the built-in objects to enroll and the unknown ones."""
+    known: dict[str, SimObject] = {name: thing for name, thing in shelf().items() if name not in UNKNOWN_OBJECTS}
+    enrolled = _first({name: known[name] for name in dict.fromkeys([*ENROLLED, *known])}, count or len(ENROLLED))
+    return enrolled, {name: shelf()[name] for name in UNKNOWN_OBJECTS}
+
+
+def _choose_photographed(known: _Objects, count: int | None) -> tuple[_Objects, _Objects]:
+    """Return the objects to enroll, and as unknown ones those that follow them, if there are any."""
+    enrolled = _first(known, count or min(COUNT_OF_FOLDER, len(known)))
+    left = list(known)[len(enrolled) :][: len(UNKNOWN_OBJECTS)]
+    return enrolled, {name: known[name] for name in left}
+
+
+def _first(known: _Objects, count: int) -> _Objects:
+    if count > len(known):
         raise UsageError(
-            f"There are {len(names)} objects to enroll, not {wanted}.", next_step=f"Use --count {len(names)} or less."
+            f"There are {len(known)} objects to enroll, not {count}.", next_step=f"Use --count {len(known)} or less."
         )
-    left = names[wanted : wanted + len(UNKNOWN_OBJECTS)]
-    unknown = {name: known[name] for name in left} if folder and len(left) == len(UNKNOWN_OBJECTS) else None
-    return (
-        {name: known[name] for name in names[:wanted]},
-        unknown or {name: built_in[name] for name in UNKNOWN_OBJECTS},
-    )
+    return dict(islice(known.items(), count))
 
 
 def _folder_within(out: Path) -> "tempfile.TemporaryDirectory[str]":

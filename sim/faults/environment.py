@@ -7,7 +7,6 @@ import numpy as np
 from sim import disk
 from sim.devices import SimDevices
 from sim.faults.kind import End, Parameter, simulated_fault
-from sim.objects.shelf import shelf
 
 Values = Mapping[str, float]
 
@@ -22,13 +21,15 @@ def _object_falls(devices: SimDevices, _values: Values, _rng: np.random.Generato
 @simulated_fault(
     "object_moved",
     "Someone replaces the object on the platter by another one, or rotates it by hand.",
-    other=Parameter(1.0, "place of the other object in the list of built-in ones, from 1; 0: the same one", 0, 99),
+    other=Parameter(
+        1.0, "place of the other object in the list of the bench's objects, from 1; 0: the same one", 0, 99
+    ),
     angle=Parameter(120.0, "rotation on the platter, °", -360, 360),
 )
 def _object_moved(devices: SimDevices, values: Values, rng: np.random.Generator) -> End:
     world, before = devices.world, devices.world.scene
-    names, place = sorted(shelf()), int(values["other"])
-    put = shelf()[names[(place - 1) % len(names)]] if place else before.object
+    names, place = sorted(devices.objects), int(values["other"])
+    put = devices.objects[names[(place - 1) % len(names)]] if place else before.object
     dx_mm, dy_mm = rng.normal(0.0, world.noise.placement_mm, 2).tolist()
     world.put(put, before.yaw_deg + values["angle"], (dx_mm, dy_mm))
     return lambda: world.put(before.object, before.yaw_deg, before.offset_mm)

@@ -1,35 +1,28 @@
-"""A folder of photographs in COIL layout, ``obj{N}__{A}.png`` or ``.jpg``, as objects on the platter.
+"""Photographs of real objects, which fill the frame of the simulated camera; it sees the one nearest to its azimuth."""
 
-N is the number of the object, A the table's angle in degrees, with optional decimals. The camera sees the photograph
-nearest to the table's angle.
-"""
-
-import re
-from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from types import MappingProxyType
+from typing import Self
 
-import cv2
 import numpy as np
 
 from rig.core.errors import UsageError
-from sim.objects.projection import HEIGHT, WIDTH, Floats, Image
+from rig.views.image_files import BadImage, decode, read_file
+from sim.objects.projection import Floats, Image
 
-_LAYOUT = re.compile(r"obj(\d+)__(\d+(?:\.\d+)?)\.(?:png|jpe?g)", re.IGNORECASE)
-_KEPT = 96  # decoded photographs, 0.9 MB each
+_KEPT = 16  # decoded photographs: a move goes from one to the next, and large ones take 30 MB each
 
 
 @dataclass(frozen=True)
 class PhotographsOnTable:
-    """One object of a folder.
+    """An object.
 
     Attributes
     ----------
     azimuth_deg : float64 (n,)
-        Angles of its photographs, ascending, in [0, 360).
+        Azimuths of the camera in its photographs, ascending, in [0, 360).
     files
         The photographs, in that order.
     """
@@ -39,64 +32,36 @@ class PhotographsOnTable:
     files: tuple[Path, ...] = field(repr=False)
     symmetry_deg: float = 360.0
 
+    @classmethod
+    def of(cls, name: str, views: Sequence[tuple[float, Path]]) -> Self:
+        """Return the object with these photographs: azimuth and file, by ascending azimuth."""
+        return cls(name, np.array([azimuth_deg for azimuth_deg, _ in views]), tuple(path for _, path in views))
+
     def draw(self, image: Image, azimuth_deg: float, offset_mm: tuple[float, float]) -> None:
-        """Fill ``image`` with the photograph nearest to ``azimuth_deg``; ``offset_mm`` cannot move a photograph."""
+        """Fill ``image`` with the nearest photograph; ``offset_mm`` cannot move an object in a photograph.
+
+        The object's counter-clockwise rotation ``azimuth_deg`` moves the camera clockwise around it.
+        """
         del offset_mm
-        image[:] = _framed(self.files[self.nearest(azimuth_deg)])
+        image[:] = photograph(self.files[self.nearest(-azimuth_deg)])
 
     def nearest(self, azimuth_deg: float) -> int:
-        """Return the index of the photograph nearest to an angle around the circle; of two, the first."""
+        """Return the index of the photograph nearest to an azimuth around the circle; of two, the first."""
         apart = np.abs((self.azimuth_deg - azimuth_deg + 180) % 360 - 180)
         return int(apart.argmin())
 
 
-def photographs(folder: str | Path) -> Mapping[str, PhotographsOnTable]:
-    """Return the objects of a folder by name, ``obj2`` before ``obj10``; photographs are read when they are drawn.
-
-    Raises `UsageError` if the folder does not exist, contains no photograph in this layout, or contains two photographs
-    of an object at one angle.
-    """
-    folder = Path(folder)
-    if not folder.is_dir():
-        raise UsageError(
-            f"The folder {folder} does not exist.",
-            next_step="Give a folder with photographs named obj1__0.png, obj1__5.png, ...",
-        )
-    views: dict[int, dict[float, Path]] = defaultdict(dict)
-    for path in sorted(folder.iterdir()):
-        if match := _LAYOUT.fullmatch(path.name):
-            number, azimuth = int(match[1]), float(match[2]) % 360
-            if azimuth in views[number]:
-                raise UsageError(
-                    f"{views[number][azimuth]} and {path.name} show the same angle.", next_step="Remove one of them."
-                )
-            views[number][azimuth] = path
-    if not views:
-        raise UsageError(
-            f"No photograph in {folder} is named like obj1__0.png.",
-            next_step="Name them by object number and angle in degrees.",
-        )
-    return MappingProxyType({f"obj{number}": _object(f"obj{number}", views[number]) for number in sorted(views)})
-
-
-def _object(name: str, views: Mapping[float, Path]) -> PhotographsOnTable:
-    azimuths = sorted(views)
-    return PhotographsOnTable(name, np.array(azimuths), tuple(views[a] for a in azimuths))
-
-
 @lru_cache(maxsize=_KEPT)
-def _framed(path: Path) -> Image:
-    """Return a photograph scaled to the frame's height, centred on the colour of its border."""
-    photo = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    if photo is None:
-        raise UsageError(f"{path} cannot be read as an image.", next_step="Replace or remove the file.")
-    border = np.concatenate([photo[0], photo[-1], photo[:, 0], photo[:, -1]])
-    frame = np.empty((HEIGHT, WIDTH, 3), dtype=np.uint8)
-    frame[:] = np.median(border, axis=0).round()
-    scale = min(HEIGHT / photo.shape[0], WIDTH / photo.shape[1])
-    size = (round(photo.shape[1] * scale), round(photo.shape[0] * scale))
-    photo = cv2.resize(photo, size, interpolation=cv2.INTER_CUBIC if scale > 1 else cv2.INTER_AREA)
-    x, y = (WIDTH - size[0]) // 2, (HEIGHT - size[1]) // 2
-    frame[y : y + size[1], x : x + size[0]] = photo
-    frame.flags.writeable = False
-    return frame
+def photograph(path: Path) -> Image:
+    """Return a photograph, uint8 (height, width, 3), BGR.
+
+    Raises `UsageError`: the file cannot be read, or is no image.
+    """
+    try:
+        image = decode(read_file(path))
+    except (OSError, BadImage) as error:
+        raise UsageError(
+            f"The photograph {path} cannot be used: {error}.", next_step="Replace or remove the file."
+        ) from error
+    image.flags.writeable = False
+    return image

@@ -73,13 +73,10 @@ def configure(folder: Path, settings: Settings) -> tuple[RigConfig, SimOptions]:
     """
     path = folder / CONFIG
     source = settings.config or (path if path.exists() else default_path())
-    options = read_values(source, settings.overrides).values.get("bench", {}).get("sim", {})
     changes: dict[Key, Any] = {}
     for override in settings.overrides:
         key, _, value = override.partition("=")
         changes[tuple(key.strip().split("."))] = parsed(value)
-    if isinstance(options, dict) and isinstance(objects := options.get("objects"), str):
-        changes["bench", "sim", "objects"] = str(Path(objects).absolute())
     changes |= {
         ("default_bench",): "sim-bench",
         ("state_dir",): str(folder / STATE),

@@ -19,7 +19,6 @@ from sim.faults import Faults
 from sim.faults.injector import Occurrence
 from sim.faults.schedule import read_faults
 from sim.motion import to_velocity
-from sim.objects.photographs import photographs
 from sim.objects.shelf import shelf
 from sim.realtime import folder as folders
 from sim.realtime.bench import RunningSimBench
@@ -62,7 +61,7 @@ def run_bench(settings: Settings, folder: Path | None, seconds: float | None) ->
         if devices.head is not None:
             ports.append(_port(devices.head_port, folder / HEAD, ends))
         time = RealTime(world.clock, ports)
-        operator = ShelfOperator(world, photographs(options.objects) if options.objects else shelf())
+        operator = ShelfOperator(world, shelf())
         commands = Commands(operator, devices, faults, quit=lambda: setattr(time, "over", True))
         server = ends.enter_context(BenchServer(folder, devices, time, commands))
         inputs: dict[int, Callable[[], bool]] = {server.fileno(): server.accept}

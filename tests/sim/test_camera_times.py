@@ -151,7 +151,7 @@ def test_views_at_rest_do_not_depend_on_the_errors_of_camera_time() -> None:
 
 def test_mean_time_of_each_row_is_the_middle_of_its_exposure() -> None:
     for steps in (2, 3, 8):
-        times, weights = row_weights(10_000_000, 18_000_000, steps)
+        times, weights = row_weights(10_000_000, 18_000_000, steps, 480)
         middles = (np.arange(480) + 0.5) / 480 * 18e6 + 5e6
         assert weights.min() >= 0
         assert np.abs(times @ weights - middles).max() < 100

@@ -1,105 +1,294 @@
-"""Photographs of real objects on the simulated platter."""
+"""The bench of photographs, through the commands of its users."""
 
-import os
+import json
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from click.testing import Result
 from hypothesis import given
 from hypothesis import strategies as st
+from typer.testing import CliRunner
 
-from rig.core.errors import UsageError
-from sim.objects.photographs import PhotographsOnTable, photographs
-from sim.objects.projection import Image, Visible
+from rig.bench import open_bench
+from rig.catalog import Catalog
+from rig.cli.main import app
+from rig.config import load_config
+from rig.core.clock import SystemClock
+from sim.objects.photographs import PhotographsOnTable
+from sim.objects.projection import Image
+
+SIZE = 100
+GROUND = (120, 70, 30)
+COLOURS = {"obj1": (40, 40, 230), "obj2": (60, 220, 240), "obj10": (230, 230, 230)}
+QUIET = ("read_noise_e", "full_well_e", "vignetting", "light_flicker", "lost_frames", "encoder_noise_deg")
+
+Rig = Callable[..., Result]
 
 
-def save(path: Path, level: int, *, border: int = 0, size: tuple[int, int] = (60, 60)) -> None:
-    image = np.full((*size, 3), border, np.uint8)
-    image[size[0] // 4 : -size[0] // 4, size[1] // 4 : -size[1] // 4] = level
-    assert cv2.imwrite(str(path), image)
-
-
-def shown(solid: Visible, azimuth_deg: float) -> Image:
-    image = np.full((480, 640, 3), 99, np.uint8)
-    solid.draw(image, azimuth_deg, (0.0, 0.0))
+def drawn(name: str, angle: float) -> Image:
+    """A block with a spot; the place and the colour of the spot tell the angle."""
+    image = np.full((SIZE, SIZE, 3), GROUND, np.uint8)
+    half = round(16 + 12 * abs(np.cos(np.radians(angle))))
+    cv2.rectangle(image, (50 - half, 25), (50 + half, 80), COLOURS[name], -1)
+    spot = (20, 160, 20) if np.cos(np.radians(angle)) > -1e-9 else (160, 20, 120)
+    cv2.circle(image, (round(50 + half * 0.6 * np.sin(np.radians(angle))), 40), 6, spot, -1)
     return image
 
 
-def test_objects_come_in_the_order_of_their_numbers(tmp_path: Path) -> None:
-    for name in ("obj10__0.png", "obj2__5.png", "obj2__0.JPG", "obj1__355.jpeg", "obj1__2.5.png", "obj3_0.png"):
-        save(tmp_path / name, 200)
-    (tmp_path / "notes.txt").write_text("obj")
-    objects = photographs(tmp_path)
-    assert list(objects) == ["obj1", "obj2", "obj10"]
-    assert objects["obj1"].azimuth_deg.tolist() == [2.5, 355]
-    assert all(isinstance(solid, Visible) for solid in objects.values())
+def save(folder: Path, *names: str, step_deg: float = 45.0, suffix: str = "png") -> Path:
+    folder.mkdir(exist_ok=True)
+    for name in names or COLOURS:
+        for angle in np.arange(0, 360, step_deg):
+            assert cv2.imwrite(str(folder / f"{name}__{angle:g}.{suffix}"), drawn(name, angle))
+    return folder
 
 
-def test_nearest_photograph_is_shown_around_the_circle(tmp_path: Path) -> None:
-    for angle, level in ((0, 50), (90, 100), (182.5, 150), (270, 200)):
-        save(tmp_path / f"obj1__{angle:g}.png", level)
-    solid = photographs(tmp_path)["obj1"]
-    for azimuth, level in (
-        *((0, 50), (359, 50), (314, 200), (-50, 200)),
-        *((136, 100), (137, 150), (720 + 44, 50), (-270, 100)),
-    ):
-        image = shown(solid, azimuth)
-        assert image[240, 320].tolist() == [level] * 3
-        image[:] = 0  # the next drawing must not see this
+@pytest.fixture
+def rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Rig:
+    """Return a function that runs `rig ...` on the bench of the photographs in the folder ``photographs``."""
+    monkeypatch.chdir(tmp_path)
+    Path("rig.toml").write_text(
+        'default_bench = "photographs"\nstate_dir = "state"\ncalibration_dir = "calibrations"\n'
+        '[catalog]\npath = "catalog"\n[bench.photographs]\nsource = "photographs"\n'
+    )
+    return lambda *words, **options: CliRunner().invoke(app, [str(word) for word in words], **options)
+
+
+def put(**options: object) -> list[str]:
+    """Return the words that set these options of the bench."""
+    return [word for key, value in options.items() for word in ("--set", f"bench.photographs.{key}={value}")]
+
+
+WITHOUT_NOISE = put(**{f"noise.{name}": 0 for name in QUIET})
+
+
+def stored_views(name: str) -> list[tuple[float, Image]]:
+    with Catalog.open("catalog", clock=SystemClock(), read_only=True) as catalog:
+        views = catalog.object(name).complete.views
+        return [(view.azimuth_deg, catalog.read_image(view.image)) for view in views]
+
+
+def nearest_angle(name: str, image: Image, step_deg: float) -> float:
+    """Return the angle of the photograph that an image shows."""
+    angles = np.arange(0, 360, step_deg)
+    return float(angles[np.argmin([np.abs(image.astype(float) - drawn(name, angle)).mean() for angle in angles])])
+
+
+def apart(first_deg: float, second_deg: float) -> float:
+    return abs((first_deg - second_deg + 180) % 360 - 180)
+
+
+def test_enrollment_takes_each_photograph_with_its_own_angle(rig: Rig) -> None:
+    save(Path("photographs"))
+    done = rig("enroll", "obj1", "--yes", *WITHOUT_NOISE)
+    assert done.exit_code == 0, done.output
+    views = stored_views("obj1")
+    assert len(views) == 8  # as many as there are photographs
+    for azimuth_deg, image in views:
+        assert image.shape == (SIZE, SIZE, 3)
+        assert apart(azimuth_deg, nearest_angle("obj1", image, 45)) < 1
+        np.testing.assert_allclose(image, drawn("obj1", round(azimuth_deg / 45) * 45 % 360), atol=1)
+    assert rig("enroll", "obj2", "--views", "4", "--yes").exit_code == 0
+    assert len(stored_views("obj2")) == 4
+
+
+def test_table_angles_in_the_names_run_the_other_way(rig: Rig) -> None:
+    save(Path("photographs"))
+    assert rig("enroll", "obj1", "--yes", *put(table_angles="true")).exit_code == 0
+    assert all(apart(azimuth_deg, -nearest_angle("obj1", image, 45)) < 1 for azimuth_deg, image in stored_views("obj1"))
+
+
+def test_objects_are_found_by_the_photographs_that_were_not_enrolled(rig: Rig) -> None:
+    save(Path("photographs"), step_deg=22.5)
+    Path("tray.csv").write_text("name\nobj1\nobj2\nobj10\n")
+    assert rig("enroll", "--list", "tray.csv", "--yes", *put(every=2)).exit_code == 0
+    for name in COLOURS:
+        for azimuth_deg, image in stored_views(name):
+            shown_deg = nearest_angle(name, image, 22.5)
+            assert shown_deg % 45 == 0
+            assert apart(azimuth_deg, shown_deg) < 1
+    chosen = put(every=2, object=json.dumps("obj10"), yaw_deg=67.5)
+    done = rig("identify", "--json", "--save-run", "run", *chosen)
+    answer = next(event for event in map(json.loads, done.stdout.splitlines()) if event.get("event") == "identified")
+    assert answer["name"] == "obj10"
+    assert apart(answer["yaw_deg"], 67.5) < 45 / 2 + 1  # between two enrolled photographs
+    images = [cv2.imread(str(path)) for path in sorted(Path("run").glob("**/*.png"))]
+    frames = [image for image in images if image.shape[:2] == (SIZE, SIZE)]
+    assert frames
+    assert all(nearest_angle("obj10", frame, 22.5) % 45 == 22.5 for frame in frames)
+
+
+def test_watch_shows_one_object_after_the_other(rig: Rig) -> None:
+    save(Path("photographs"))
+    for name in COLOURS:
+        assert rig("enroll", name, "--yes").exit_code == 0
+
+    done = rig("identify", "--watch", "--json", *put(object='["obj2","obj1","nothing"]'))
+    events = [json.loads(line) for line in done.stdout.splitlines()]
+    assert [event["name"] for event in events if event.get("event") == "identified"] == ["obj2", "obj1"]
+    assert "has no object 'nothing'" in done.stderr
+
+
+def test_noise_of_the_simulated_camera_is_in_the_photographs(rig: Rig) -> None:
+    save(Path("photographs"))
+    noise = [*WITHOUT_NOISE, *put(**{"noise.gaussian_variance": 0.012})]
+    assert rig("enroll", "obj10", "--yes", *noise, "--set", "view.max_noise=1").exit_code == 0
+    ground = np.concatenate([image[:10].reshape(-1, 3) for _, image in stored_views("obj10")])
+    assert ground.std(axis=0)[0] == pytest.approx(255 * 0.012**0.5, rel=0.05)  # of the channel that is not clipped
+
+
+def test_empty_table_is_shown_from_its_image(rig: Rig) -> None:
+    save(Path("photographs"))
+    missing = rig("empty-table")
+    assert missing.exit_code == 2
+    assert "cannot be taken away" in missing.stderr
+    assert "bench.photographs.empty_table" in missing.stderr
+    image = np.full((SIZE, SIZE, 3), GROUND, np.uint8)
+    cv2.imwrite("empty.png", image)
+    given = put(empty_table="empty.png")
+    assert rig("empty-table", *given).exit_code == 0
+    assert rig("snapshot", "seen.png", *given, *WITHOUT_NOISE).exit_code == 0
+    np.testing.assert_allclose(cv2.imread("seen.png"), image, atol=1)
+    done = rig("enroll", "obj1", *given)
+    assert done.exit_code == 0
+    with Catalog.open("catalog", clock=SystemClock(), read_only=True) as catalog:
+        assert catalog.object("obj1").complete.sessions[0].empty_table is not None
+
+
+def test_empty_table_has_an_image_for_each_angle(rig: Rig) -> None:
+    save(Path("photographs"), step_deg=90)
+    Path("tables").mkdir()
+    for angle in range(0, 360, 90):
+        cv2.imwrite(f"tables/{angle}.png", np.full((SIZE, SIZE, 3), 40 + angle // 3, np.uint8))
+    given = [*put(empty_table="tables"), *WITHOUT_NOISE]
+    assert rig("goto", "90", *given).exit_code == 0
+    with open_bench("photographs", load_config(Path("rig.toml"), given[1::2])) as bench:
+        seen = bench.camera.capture(bench.clock.now_ns()).image_bgr
+    assert seen.mean() == pytest.approx(40 + 270 // 3, abs=1)  # the camera is at the azimuth 270°
+    for name in COLOURS:
+        cv2.imwrite(f"tables/{name}.png", np.full((SIZE, SIZE, 3), len(name), np.uint8))
+    done = rig("snapshot", "seen.png", *given)
+    assert done.exit_code == 3
+    assert "for each object" in done.stderr
+
+
+def test_table_gives_objects_angles_and_the_region(rig: Rig) -> None:
+    save(Path("photographs"))
+    rows = [f"cup,{angle},photographs/obj1__{angle}.png,10 5 80 90" for angle in range(0, 360, 90)]
+    Path("views.csv").write_text("\n".join(["object,azimuth_deg,image,region", *rows]))
+    done = rig("enroll", "cup", "--yes", *put(source="views.csv"))
+    assert done.exit_code == 0, done.output
+    with Catalog.open("catalog", clock=SystemClock(), read_only=True) as catalog:
+        assert [view.region for view in catalog.object("cup").complete.views] == [(10, 5, 80, 90)] * 4
+
+
+def test_doctor_finds_no_problem_with_the_camera(rig: Rig) -> None:
+    save(Path("photographs"))
+    done = rig("doctor", "--json", "--only", "camera")
+    found = [json.loads(line) for line in done.stdout.splitlines()]
+    assert not [one for one in found if one.get("level") == "bad"], done.stdout
+
+
+def _no_folder(_: Path) -> None:
+    pass
+
+
+def _empty_folder(folder: Path) -> None:
+    folder.mkdir()
+
+
+def _one_angle(folder: Path) -> None:
+    save(folder, step_deg=360)
+
+
+def _two_sizes(folder: Path) -> None:
+    save(folder)
+    cv2.imwrite(str(folder / "obj1__90.png"), np.zeros((90, SIZE, 3), np.uint8))
+
+
+def _grey(folder: Path) -> None:
+    save(folder)
+    cv2.imwrite(str(folder / "obj1__90.png"), np.zeros((SIZE, SIZE), np.uint8))
+
+
+def _small(folder: Path) -> None:
+    folder.mkdir()
+    cv2.imwrite(str(folder / "obj1__0.png"), np.zeros((60, 60, 3), np.uint8))
+
+
+def _damaged(folder: Path) -> None:
+    save(folder)
+    whole = (folder / "obj1__90.png").read_bytes()
+    (folder / "obj1__90.png").write_bytes(whole[: len(whole) // 2])
+
+
+@pytest.mark.parametrize(
+    ("prepare", "words"),
+    [
+        (_no_folder, ("There is no folder photographs", "bench.photographs.source")),
+        (_empty_folder, ("No photograph in photographs", "bench.photographs.pattern")),
+        (_one_angle, ("There is 1 photograph to enroll obj1", "Add photographs")),
+        (_two_sizes, ("obj1__90.png has 100 x 90 pixels", "one size")),
+        (_grey, ("obj1__90.png is grey", "in colour")),
+        (_small, ("60 x 60 pixels", "Scale the photographs")),
+        (_damaged, ("obj1__90.png cannot be used: truncated", "Replace or remove")),
+    ],
+)
+def test_unusable_photographs_are_errors_with_a_next_step(
+    rig: Rig, prepare: Callable[[Path], None], words: tuple[str, str]
+) -> None:
+    prepare(Path("photographs"))
+    done = rig("enroll", "obj1", "--yes")
+    assert done.exit_code in (2, 3)
+    said = " ".join(done.stderr.split())
+    assert words[0] in said
+    assert words[1] in said.split("Next step:")[1]
+
+
+def test_bench_without_a_source_names_the_key(rig: Rig) -> None:
+    Path("rig.toml").write_text('default_bench = "photographs"\n')
+    done = rig("status")
+    assert done.exit_code == 3
+    assert "rig config set bench.photographs.source FOLDER" in done.stderr
+    assert rig("config", "check").exit_code == 0
+
+
+def test_every_leaves_photographs_for_both(rig: Rig) -> None:
+    save(Path("photographs"))
+    done = rig("enroll", "obj1", "--yes", *put(every=8))
+    assert "1 photograph to enroll obj1" in done.stderr
+    assert "bench.photographs.every" in done.stderr
+
+
+def test_grey_photographs_and_unused_files_do_not_disturb(rig: Rig) -> None:
+    folder = save(Path("photographs"))
+    for path in folder.iterdir():
+        cv2.imwrite(str(path), cv2.imread(str(path), cv2.IMREAD_GRAYSCALE))
+    cv2.imwrite(str(folder / "cover.png"), np.zeros((9, 9), np.uint8))
+    (folder / "notes.txt").write_text("obj")
+    assert rig("enroll", "obj1", "--yes").exit_code == 0
+    assert "1 file of photographs not used: cover.png" in " ".join(rig("status").output.split())
+
+
+def test_region_that_is_set_must_lie_within_the_photographs(rig: Rig) -> None:
+    save(Path("photographs"))
+    assert rig("enroll", "obj1", "--yes", "--set", "view.roi=[10, 10, 80, 80]").exit_code == 0
+    done = rig("enroll", "obj2", "--yes", "--set", "view.roi=[10, 10, 100, 80]")
+    assert done.exit_code == 3
+    assert "not within the camera's frame of 100x100" in done.stderr
+
+
+def test_calibration_boards_are_not_on_this_bench(rig: Rig) -> None:
+    save(Path("photographs"))
+    done = rig("calibrate", "camera")
+    assert "has no object" in done.stderr
 
 
 @given(st.lists(st.floats(0, 359.9), min_size=1, max_size=20, unique=True), st.floats(-1000, 1000))
 def test_no_photograph_is_nearer_than_the_one_shown(angles: list[float], azimuth: float) -> None:
-    solid = PhotographsOnTable("obj1", np.array(sorted(angles)), tuple(Path(str(a)) for a in sorted(angles)))
-    apart = [abs(np.angle(np.exp(1j * np.radians(a - azimuth)), deg=True)) for a in sorted(angles)]
-    assert apart[solid.nearest(azimuth)] == pytest.approx(min(apart), abs=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("size", "filled"), [((128, 128), (480, 480)), ((100, 200), (320, 640)), ((960, 640), (480, 320))]
-)
-def test_photograph_is_centred_on_the_colour_of_its_border(
-    tmp_path: Path, size: tuple[int, int], filled: tuple[int, int]
-) -> None:
-    save(tmp_path / "obj1__0.png", 220, border=33, size=size)
-    image = shown(photographs(tmp_path)["obj1"], 0)
-    assert image.shape == (480, 640, 3)
-    assert (image[[0, -1]] == 33).all()
-    assert (image[:, [0, -1]] == 33).all()
-    rows, columns = np.nonzero(image[..., 0] > 120)
-    assert (rows.min() + rows.max(), columns.min() + columns.max()) == pytest.approx((479, 639), abs=2)
-    assert (np.ptp(rows), np.ptp(columns)) == pytest.approx((filled[0] / 2, filled[1] / 2), abs=4)
-
-
-def test_invalid_folder_is_rejected_with_a_message(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="does not exist"):
-        photographs(tmp_path / "nowhere")
-    with pytest.raises(UsageError, match="named like"):
-        photographs(tmp_path)
-    save(tmp_path / "obj1__0.png", 200)
-    save(tmp_path / "obj1__360.jpg", 200)
-    with pytest.raises(UsageError, match=r"obj1__0\.png and obj1__360\.jpg"):
-        photographs(tmp_path)
-
-
-def test_damaged_photograph_is_reported_with_its_path(tmp_path: Path) -> None:
-    save(tmp_path / "obj1__0.png", 200)
-    (tmp_path / "obj1__90.png").write_bytes(b"not an image")
-    solid = photographs(tmp_path)["obj1"]
-    shown(solid, 10)
-    with pytest.raises(UsageError, match=r"obj1__90\.png"):
-        shown(solid, 80)
-
-
-def test_photographs_of_coil_100_are_found() -> None:
-    folder = Path(os.environ.get("RIG_TEST_DATA", "../shared/data")) / "coil-100"
-    if not folder.is_dir():
-        pytest.skip(f"no photographs in {folder}")
-    objects = photographs(folder)
-    assert list(objects) == [f"obj{k}" for k in range(1, 101)]
-    assert sum(len(solid.files) for solid in objects.values()) == 7178
-    image = shown(objects["obj1"], 43.0)
-    photo = cv2.imread(str(folder / "obj1__45.png"))
-    assert photo is not None
-    assert image[:, 80:560].mean() == pytest.approx(photo.mean(), abs=1)
+    thing = PhotographsOnTable.of("obj1", [(angle, Path(str(angle))) for angle in sorted(angles)])
+    away = [abs(np.angle(np.exp(1j * np.radians(a - azimuth)), deg=True)) for a in sorted(angles)]
+    assert away[thing.nearest(azimuth)] == pytest.approx(min(away), abs=1e-6)

@@ -15,7 +15,7 @@ from typing import Any, Final
 from unicodedata import normalize
 
 from hbr.core.angles import wrap360
-from rig.catalog.exchange.tables import ANGLES, parse_region
+from rig.catalog.exchange.tables import ANGLES, TABLE, parse_region
 from rig.catalog.facts import Enrollment, Session, View
 from rig.catalog.incoming import ImportProblem, Reason, RejectedFile
 from rig.catalog.records import EnrollmentStatus, Provenance, check_text, clean_name, this_software
@@ -92,7 +92,7 @@ class Photographs:
     @property
     def are_whole(self) -> bool:
         """Whether a whole photograph is described, and not only its region in a table."""
-        return any(view.region is None for _, _, view in self._views())
+        return any(view.region is None for _, _, view in self.views())
 
     def use_empty_tables(self, path: Path, *, table_angles: bool = False) -> None:
         """Import the photographs with an image of the empty table, or with the images in a folder.
@@ -110,12 +110,12 @@ class Photographs:
                 for stem, image in by_stem.items()
                 if re.fullmatch(_PARTS["{angle}"], stem)
             }
-            for name, azimuth_deg, _ in self._views():
+            for name, azimuth_deg, _ in self.views():
                 if image := by_stem.get(name) or by_azimuth.get(azimuth_deg):
                     self._empty_tables[name, azimuth_deg] = image
         else:
-            self._empty_tables = {(name, azimuth_deg): str(path) for name, azimuth_deg, _ in self._views()}
-        if missing := [view.image for *place, view in self._views() if tuple(place) not in self._empty_tables]:
+            self._empty_tables = {(name, azimuth_deg): str(path) for name, azimuth_deg, _ in self.views()}
+        if missing := [view.image for *place, view in self.views() if tuple(place) not in self._empty_tables]:
             raise ImportRejected(
                 f"{path} has no empty-table image for {counted(len(missing), 'photograph')}; nothing was imported.",
                 next_step="Name each image by its object (mug.png) or by its angle (90.png), or give one image for all "
@@ -126,7 +126,7 @@ class Photographs:
 
     def _check_empty_tables(self) -> None:
         tables = {image: self._table_header(image) for image in dict.fromkeys(self._empty_tables.values())}
-        for name, azimuth_deg, view in self._views():
+        for name, azimuth_deg, view in self.views():
             image = self._empty_tables[name, azimuth_deg]
             with suppress(OSError):  # it is rejected later, like one that is damaged
                 shown, table = header(self.content(view.image)), tables[image]
@@ -156,10 +156,15 @@ class Photographs:
         assert found is not None  # it was decoded
         return found
 
-    def _views(self) -> Iterator[tuple[str, float, View]]:
+    def views(self) -> Iterator[tuple[str, float, View]]:
+        """Yield the name of the object, the azimuth and the view of each photograph, object by object."""
         for name, found in self._found.items():
             for azimuth_deg, (view, _) in found.items():
                 yield name, azimuth_deg, view
+
+    def empty_table(self, name: str, azimuth_deg: float) -> str | None:
+        """Return the path of the empty-table image for a photograph, if there is one."""
+        return self._empty_tables.get((name, azimuth_deg))
 
     @staticmethod
     def content(image: str) -> bytes:
@@ -176,7 +181,7 @@ class Photographs:
             sessions: dict[tuple[str, str, str | None], Session] = {}
             texts = {"label": "", "note": ""}
             for index, (azimuth_deg, (view, row)) in enumerate(sorted(found.items(), key=itemgetter(0))):
-                table = self._empty_tables.get((name, azimuth_deg))
+                table = self.empty_table(name, azimuth_deg)
                 by = (row.get("bench", ""), row.get("software") or software, table)
                 if by not in sessions:
                     provenance = Provenance(by[0], {}, {"imported_from": self.origin}, by[1])
@@ -189,6 +194,20 @@ class Photographs:
             enrollment.sessions.extend(sessions.values())
             state = EnrollmentState(enrollment, EnrollmentStatus.COMPLETE, self.now, None)
             yield TransferItem(name=name, **texts, created_utc=self.now, enrollments=(state,))
+
+
+def read_photographs(
+    source: Path, *, pattern: str | None = None, table_angles: bool = False, now: datetime
+) -> Photographs:
+    """Find the photographs of a table (.csv), of the folder of an export with its table, or of another folder.
+
+    Raises `UsageError`, `ImportRejected` as `read_folder`, whose parameters these are, and `read_table`.
+    """
+    if pattern is None and not table_angles and (source / TABLE).is_file():
+        source = source / TABLE
+    if source.suffix.lower() == ".csv" and not source.is_dir():
+        return read_table(source, now=now)
+    return read_folder(source, pattern=pattern or DEFAULT_PATTERN, table_angles=table_angles, now=now)
 
 
 def read_folder(

@@ -100,8 +100,9 @@ def serve(
         keyfile=keyfile,
         needs_login=needs_login,
     )
-    if settings.bench_name == "sim" and "speed" not in settings.load().bench.get("sim", {}):
-        settings = settings.merged(overrides=["bench.sim.speed=1"])  # people watch it
+    name = settings.bench_name
+    if name in ("sim", "photographs") and "speed" not in settings.load().bench.get(name, {}):
+        settings = settings.merged(overrides=[f"bench.{name}.speed=1"])  # people watch it
     # The web process runs with the same settings.
     arguments = tuple(settings.arguments())
     settings.opened.append(settings.bench_name)

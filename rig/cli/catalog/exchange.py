@@ -138,15 +138,12 @@ def _source(
     """Yield what is imported: a bundle, a catalog such as a training set, or photographs."""
     from rig.catalog import Catalog
     from rig.catalog.exchange.bundle import read_bundle
-    from rig.catalog.exchange.photographs import DEFAULT_PATTERN, read_folder, read_table
-    from rig.catalog.exchange.tables import TABLE
+    from rig.catalog.exchange.photographs import read_photographs
     from rig.catalog.transfer import CatalogSource
     from rig.config.catalog_place import DATABASE_NAME
 
     clock = SystemClock()
     is_named = pattern is not None or table_angles
-    if not is_named and (source / TABLE).is_file():  # the folder of an export
-        source = source / TABLE
     is_folder = source.is_dir() and not (source / DATABASE_NAME).exists()
     if is_named and not is_folder:
         raise UsageError(
@@ -154,11 +151,7 @@ def _source(
             next_step="Use --pattern and --table-angles only with a folder of photographs.",
         )
     if is_folder or (source.suffix.lower() == ".csv" and source.is_file()):
-        photographs = (
-            read_folder(source, pattern=pattern or DEFAULT_PATTERN, table_angles=table_angles, now=clock.utc())
-            if is_folder
-            else read_table(source, now=clock.utc())
-        )
+        photographs = read_photographs(source, pattern=pattern, table_angles=table_angles, now=clock.utc())
         if empty_table is not None:
             photographs.use_empty_tables(empty_table, table_angles=table_angles)
         yield photographs
