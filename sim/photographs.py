@@ -186,8 +186,8 @@ class PhotographOperator(ShelfOperator):
         thing = (photographed.identified if to_identify else photographed.enrolled)[name]
         if len(thing.files) < 2:
             raise UsageError(
-                f"There is {counted(len(thing.files), 'photograph')} to {'identify' if to_identify else 'enroll'} "
-                f"{name}; two are needed at least.",
+                f"{name} has {counted(len(thing.files), 'photograph')} to {'identify' if to_identify else 'enroll'} "
+                "it with; two are needed at least.",
                 next_step=f"Add photographs from other angles, or reduce {_SECTION}.every.",
             )
         first = photographed.header

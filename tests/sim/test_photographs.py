@@ -230,7 +230,7 @@ def _damaged(folder: Path) -> None:
     [
         (_no_folder, ("There is no folder photographs", "bench.photographs.source")),
         (_empty_folder, ("No photograph in photographs", "bench.photographs.pattern")),
-        (_one_angle, ("There is 1 photograph to enroll obj1", "Add photographs")),
+        (_one_angle, ("obj1 has 1 photograph to enroll it with", "Add photographs")),
         (_two_sizes, ("obj1__90.png has 100 x 90 pixels", "one size")),
         (_grey, ("obj1__90.png is grey", "in colour")),
         (_small, ("60 x 60 pixels", "Scale the photographs")),
@@ -259,7 +259,7 @@ def test_bench_without_a_source_names_the_key(rig: Rig) -> None:
 def test_every_leaves_photographs_for_both(rig: Rig) -> None:
     save(Path("photographs"))
     done = rig("enroll", "obj1", "--yes", *put(every=8))
-    assert "1 photograph to enroll obj1" in done.stderr
+    assert "obj1 has 1 photograph to enroll it with" in done.stderr
     assert "bench.photographs.every" in done.stderr
 
 
