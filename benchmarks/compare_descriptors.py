@@ -28,7 +28,7 @@ def main() -> None:
         dataset = (photographs if asked.objects is None else photographs.subset(*asked.objects)).every(asked.every)
         objects = range(len(dataset.objects))
         model = TRIALS.model(asked, dataset, [TRIALS.enroll(asked, dataset, j) for j in objects])
-        found = [TRIALS.search(asked, dataset, model, lambda: 0, j) for j in objects]
+        found = [TRIALS.search(asked, dataset, model, lambda: 0, j).runs for j in objects]
         hits = np.concatenate([runs.rank for runs in found], axis=1) == 1
         first = hits if first is None else first
         for m, method in enumerate(asked.methods):

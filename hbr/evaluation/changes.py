@@ -1,13 +1,14 @@
 """Searches by image after a change of the bench: rates of right decisions and of accepted unknown objects.
 
 Objects are enrolled on one drawn bench. Each search is a visit to the same bench (mild change), or to one of twelve
-other benches (hard change), with four views, 90° apart. Every ninth object is never enrolled.
+other benches (hard change), with four views, 90° apart. Every ninth object is never enrolled. Without a change, the
+photographs are used as they are, all objects are enrolled, and the views of searches are those that are not enrolled.
 """
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cache, lru_cache, partial
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,9 +22,11 @@ from hbr.dense.session import DenseSession, answered, near
 from hbr.dense.stopping import Outcome, StoppingRule
 from hbr.descriptors.together import ViewsTogether
 from hbr.drawing.bench import ENROLLMENT, HARD, MILD, DrawnBench, Visit
+from hbr.evaluation.condition import Condition
 from hbr.evaluation.experiment import Experiment, Kind
 from hbr.evaluation.photographs import Dataset, PhotographedObject, object_mask, read_photograph, without_specks
-from hbr.evaluation.protocol import generator
+from hbr.evaluation.protocol import generator, views_enrolled
+from hbr.evaluation.statistics import bootstrap_mean
 from hbr.model.views import Views
 from hbr.segmentation import Background
 
@@ -34,6 +37,11 @@ _BENCHES: Final = 12  # more: the result depends less on one drawing; each proce
 _NEVER_ENROLLED: Final = 9  # every ninth object, so that rates of unknown objects have a number of cases, too
 #: Objects whose enrolled views each process remembers for the last steps of searches, 4 MB each with 36 views.
 _REMEMBERED: Final = 128
+#: Shares of `summary` with an interval.
+INTERVALS: Final = (
+    *("hit_rate_1", "hit_rate_2", "hit_rate_4", "decided_right", "ambiguous", "called_unknown", "decided_wrong"),
+    "left_out_accepted",
+)
 
 
 @dataclass(frozen=True)
@@ -94,14 +102,12 @@ def enroll_changed(item: PhotographedObject, experiment: Experiment) -> Enrolled
     DatasetError
         A photograph cannot be used.
     """
-    visit = _enrollment_visit()
-    count = experiment.protocol.enrolled or 0
-    places = nearest_photographs(item, np.arange(count) * 360 / count)
+    scene = _enrollment_scene(experiment)
+    places = _enrolled_places(item, experiment)
     kind, picture = experiment.condition.descriptor, _has_picture(experiment)
-    views, empty = ViewsTogether(kind, several=False), Background(visit.empty()) if picture else None
+    views, empty = ViewsTogether(kind, several=False), Background(scene.empty()) if picture else None
     for place in places:
-        azimuth_deg = item.photographs[place].azimuth_deg
-        views.learn(visit.photograph(*cut_out(item, place), azimuth_deg).image, empty)
+        views.learn(scene.frame(item, place), empty)
     views.revise()
     azimuths_deg = item.azimuth_deg[places]
     cuts = zip(views.segmentations, azimuths_deg.tolist(), strict=True)
@@ -134,22 +140,21 @@ def search_changed(
     """
     results = []
     picture, protocol = _has_picture(experiment), experiment.protocol
-    before = _bench_image(None if picture else example)
+    before = _bench_image(experiment, None if picture else example)
     left_out = _without(index, item.name)
     for trial in range(protocol.trials):
         rng = generator(protocol.seed, item.name, "trial", trial)
-        hard = experiment.change == "hard"
-        bench = _benches()[int(rng.integers(_BENCHES))] if hard else _enrollment_bench()
-        visit = Visit(bench, HARD if hard else MILD, rng)
+        scene = _search_scene(experiment, rng)
         first_deg = rng.uniform(0, 360)
         kind = experiment.condition.descriptor
-        views, empty = ViewsTogether(kind), Background(visit.empty()) if picture else None
+        views, empty = ViewsTogether(kind), Background(scene.empty()) if picture else None
         search = _Search(index, rule, enrolled)
         without = None if left_out is None else _Search(left_out, rule, enrolled)
         same_bench: bool | None = None
-        for place in nearest_photographs(item, first_deg + _STEP_DEG * np.arange(VIEWS, dtype=np.float64)):
+        wanted_deg = first_deg + _STEP_DEG * np.arange(VIEWS, dtype=np.float64)
+        for place in _query_places(item, experiment, wanted_deg):
             azimuth_deg = item.photographs[place].azimuth_deg
-            frame = visit.photograph(*cut_out(item, place), azimuth_deg).image
+            frame = scene.frame(item, place)
             if same_bench is None:
                 same_bench = before.shows_same_bench(frame)
             views.add(frame, empty)
@@ -251,9 +256,89 @@ def summary(known: dict[str, list[SearchResult]], unknown: dict[str, list[Search
     }
 
 
-def is_enrolled(place: int) -> bool:
+def intervals(known: dict[str, list[SearchResult]], rng: np.random.Generator) -> dict[str, float]:
+    """Return the 95 % interval of each of `INTERVALS` for enrolled objects, by resampling them."""
+    by_object = [summary({name: results}, {}) for name, results in known.items()]
+    found: dict[str, float] = {}
+    for share in INTERVALS:
+        low, high = bootstrap_mean(np.array([one[share] for one in by_object]), rng)
+        found |= {f"{share}_low": low, f"{share}_high": high}
+    return found
+
+
+def is_enrolled(place: int, experiment: Experiment) -> bool:
     """Return whether the object at this place of the data set is enrolled."""
-    return (place + 1) % _NEVER_ENROLLED != 0
+    return experiment.change == "none" or (place + 1) % _NEVER_ENROLLED != 0
+
+
+class _Scene(Protocol):
+    """What the camera sees during an enrollment or a search: frames and the empty table, uint8 (H, W, 3)."""
+
+    def empty(self) -> ImageArray: ...
+
+    def frame(self, item: PhotographedObject, place: int) -> ImageArray: ...
+
+
+@dataclass(frozen=True)
+class _DrawnScene:
+    """An object that is cut out of its photographs, on a drawn bench."""
+
+    visit: Visit
+
+    def empty(self) -> ImageArray:
+        return self.visit.empty()
+
+    def frame(self, item: PhotographedObject, place: int) -> ImageArray:
+        return self.visit.photograph(*cut_out(item, place), item.photographs[place].azimuth_deg).image
+
+
+@dataclass(frozen=True)
+class _OwnScene:
+    """The photographs as they are; ``seed`` draws the noise of queries, None: they are enrolled."""
+
+    condition: Condition
+    seed: int | None = None
+
+    def empty(self) -> ImageArray:
+        raise NotImplementedError  # `Experiment` rejects that
+
+    def frame(self, item: PhotographedObject, place: int) -> ImageArray:
+        image = item.photographs[place].read()
+        if self.seed is None:
+            return self.condition.enrolled(image, generator(0, item.name, "enrolled", place)).image
+        return self.condition.query(image, generator(self.seed, item.name, "photograph", place)).image
+
+
+def _enrollment_scene(experiment: Experiment) -> _Scene:
+    if experiment.change == "none":
+        return _OwnScene(experiment.condition)
+    return _DrawnScene(Visit(_enrollment_bench(), ENROLLMENT, np.random.default_rng(1)))
+
+
+def _search_scene(experiment: Experiment, rng: np.random.Generator) -> _Scene:
+    if experiment.change == "none":
+        return _OwnScene(experiment.condition, experiment.protocol.seed)
+    hard = experiment.change == "hard"
+    bench = _benches()[int(rng.integers(_BENCHES))] if hard else _enrollment_bench()
+    return _DrawnScene(Visit(bench, HARD if hard else MILD, rng))
+
+
+def _enrolled_places(item: PhotographedObject, experiment: Experiment) -> list[int]:
+    count = experiment.protocol.enrolled or 0
+    return nearest_photographs(item, np.arange(count) * 360 / count)
+
+
+def _query_places(item: PhotographedObject, experiment: Experiment, azimuth_deg: NDArray[np.float64]) -> list[int]:
+    """Return the photographs nearest to the azimuths; without a change, of those that are not enrolled."""
+    if experiment.change != "none":
+        return nearest_photographs(item, azimuth_deg)
+    others = np.flatnonzero(~views_enrolled(item.azimuth_deg, experiment.protocol.enrolled or 0))
+    if len(others) < VIEWS:
+        raise ValueError(
+            f"{item.name} has {len(others)} photographs that are not enrolled; a search needs {VIEWS}: enroll fewer"
+        )
+    left = replace(item, photographs=tuple(item.photographs[place] for place in others))
+    return [int(others[place]) for place in nearest_photographs(left, azimuth_deg)]
 
 
 def _has_picture(experiment: Experiment) -> bool:
@@ -270,16 +355,10 @@ def nearest_photographs(item: PhotographedObject, azimuth_deg: NDArray[np.float6
     return [int(np.abs(wrap180(item.azimuth_deg - one)).argmin()) for one in azimuth_deg.tolist()]
 
 
-def _bench_image(example: PhotographedObject | None) -> Background:
+def _bench_image(experiment: Experiment, example: PhotographedObject | None) -> Background:
     """Return the image that a catalog has of the enrollment's bench: the empty-table image, or a view of an object."""
-    visit = _enrollment_visit()
-    if example is None:
-        return Background(visit.empty())
-    return Background(visit.photograph(*cut_out(example, 0), example.photographs[0].azimuth_deg).image)
-
-
-def _enrollment_visit() -> Visit:
-    return Visit(_enrollment_bench(), ENROLLMENT, np.random.default_rng(1))
+    scene = _enrollment_scene(experiment)
+    return Background(scene.empty() if example is None else scene.frame(example, 0))
 
 
 @cache
@@ -293,7 +372,7 @@ def _benches() -> tuple[DrawnBench, ...]:
 
 
 def _enroll(experiment: Experiment, dataset: Dataset, j: int) -> tuple[LevelArray, NDArray[np.float64]] | None:
-    if not is_enrolled(j):
+    if not is_enrolled(j, experiment):
         return None
     found = _enrolled(experiment, dataset, dataset.objects[j].name)
     return found.levels, found.azimuth_deg
@@ -338,7 +417,8 @@ def _results(
         some = {name: results for name, results in searched.items() if name in of}
         known = {name: results for name, results in some.items() if name in views.object_names}
         others = {name: results for name, results in some.items() if name not in known}
-        return {"change": words, "objects": objects, **summary(known, others)}
+        rng = generator(experiment.protocol.seed, dataset.name, "bootstrap", 0)
+        return {"change": words, "objects": objects, **summary(known, others), **intervals(known, rng)}
 
     rows = [row("all", searched)]
     if experiment.report is not None:

@@ -10,7 +10,7 @@ from hbr.evaluation.photographs import Dataset
 from hbr.evaluation.protocol import Method, Protocol
 
 KindName = Literal["trials", "matrix", "unknown-objects", "bench-change", "replaced"]
-Change = Literal["mild", "hard"]
+Change = Literal["none", "mild", "hard"]
 #: Increased if the same settings give other numbers.
 FORMAT: Final = 9
 
@@ -25,8 +25,8 @@ class Experiment:
         Name in files and reports.
     kind : {"trials", "matrix", "unknown-objects", "bench-change", "replaced"}
         ``trials`` compares methods; ``matrix`` measures one perturbation at a time; ``unknown-objects`` leaves objects
-        out, and searches for them, too; ``bench-change`` searches after a change of a whole drawn bench; ``replaced``
-        replaces the object during the search.
+        out, and searches for them, too; ``bench-change`` searches after a change of a whole drawn bench, or in the
+        photographs as they are; ``replaced`` replaces the object during the search.
     condition : Condition
         How the images of queries differ from those of enrolled views.
     protocol : Protocol
@@ -39,8 +39,9 @@ class Experiment:
         Step between the photographs of an object that are used: with 2, every second one.
     left_out : int
         Objects that ``unknown-objects`` leaves out, five times.
-    change : {"mild", "hard"}
-        The change of ``bench-change``.
+    change : {"none", "mild", "hard"}
+        The change of ``bench-change``; none: the photographs as they are, with the noise of the condition, and queries
+        that are not enrolled.
     margin, min_views
         Lead per view, and number of views, that end a search of the paper.
     """
@@ -62,7 +63,9 @@ class Experiment:
         if self.kind not in get_args(KindName):
             raise ValueError(f"kind {self.kind!r} is unknown; use one of {', '.join(get_args(KindName))}")
         if self.change not in get_args(Change):
-            raise ValueError(f"change {self.change!r} is unknown; use mild or hard")
+            raise ValueError(f"change {self.change!r} is unknown; use none, mild or hard")
+        if self.kind == "bench-change" and self.change == "none" and self.condition.reference != "none":
+            raise ValueError("photographs as they are have no empty-table image; give reference = none")
         if self.every < 1:
             raise ValueError(f"every is {self.every}; at least 1 is needed")
         if self.kind in ("matrix", "bench-change", "replaced") and self.protocol.enrolled is None:

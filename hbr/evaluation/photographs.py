@@ -37,6 +37,14 @@ class Photograph:
     azimuth_deg: float
     region: tuple[int, int, int, int] | None = None
 
+    def read(self, size: tuple[int, int] | None = None) -> ImageArray:
+        """Return the described part; parameter and errors as for `read_photograph`."""
+        image = read_photograph(self.path, size)
+        if self.region is None:
+            return image
+        x, y, width, height = self.region
+        return image[y : y + height, x : x + width]
+
 
 @dataclass(frozen=True)
 class PhotographedObject:
@@ -115,12 +123,7 @@ class Dataset:
         DatasetError
             The photograph cannot be used, or has another size than the first one.
         """
-        photograph = self.objects[j].photographs[i]
-        image = read_photograph(photograph.path, self.size)
-        if photograph.region is not None:
-            x, y, width, height = photograph.region
-            image = image[y : y + height, x : x + width]
-        return image
+        return self.objects[j].photographs[i].read(self.size)
 
     def every(self, step: int) -> "Dataset":
         """Return the data set with every ``step``-th photograph of each object."""

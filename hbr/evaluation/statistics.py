@@ -77,7 +77,11 @@ def bootstrap_difference(first: Hits, second: Hits, rng: np.random.Generator) ->
     """
     if first.shape != second.shape or first.ndim != 2 or not first.size:
         raise ValueError(f"hits of shapes {first.shape} and {second.shape}; one (objects, trials) for both is needed")
-    by_object: FloatArray = first.mean(axis=1) - second.mean(axis=1)
+    return bootstrap_mean(first.mean(axis=1) - second.mean(axis=1), rng)
+
+
+def bootstrap_mean(by_object: FloatArray, rng: np.random.Generator) -> tuple[float, float]:
+    """Return the 95 % percentile interval of the mean of values of objects, (n,), by resampling them with ``rng``."""
     drawn = by_object[rng.integers(len(by_object), size=(_RESAMPLES, len(by_object)))].mean(axis=1)
     low, high = np.quantile(drawn, [(1 - _CONFIDENCE) / 2, (1 + _CONFIDENCE) / 2])
     return float(low), float(high)

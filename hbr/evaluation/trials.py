@@ -61,6 +61,13 @@ class _Model(NamedTuple):
         return place
 
 
+class Searched(NamedTuple):
+    """The runs of an object, and the mean time to read, segment and describe one of its photographs."""
+
+    runs: Runs
+    describe_ns: float
+
+
 class LocalPhotographs:
     """The photographs of a data set, cut out when a comparison of two leaders asks for them (`hbr.dense.session`).
 
@@ -528,11 +535,13 @@ def _search(
     model: tuple[Views, StoppingRule | None],
     now_ns: Callable[[], int],
     j: int,
-) -> Runs:
+) -> Searched:
     condition, protocol, (views, rule) = experiment.condition, experiment.protocol, model
+    began_ns = now_ns()
     queries = query_levels(dataset, j, condition, protocol.seed)
+    describe_ns = (now_ns() - began_ns) / len(queries.levels)
     photographs = LocalPhotographs(dataset, condition, protocol.seed)
-    return run_object(
+    runs = run_object(
         j,
         queries.levels,
         views,
@@ -544,18 +553,21 @@ def _search(
         segmented_by=queries.methods,
         now_ns=now_ns,
     )
+    return Searched(runs, describe_ns)
 
 
-def _results(experiment: Experiment, dataset: Dataset, _model: object, found: list[Runs]) -> dict[str, Any]:
-    runs, report = Runs.concatenate(found), experiment.report
+def _results(experiment: Experiment, dataset: Dataset, _model: object, found: list[Searched]) -> dict[str, Any]:
+    runs, report = Runs.concatenate([one.runs for one in found]), experiment.report
     if report is not None:
         runs = runs.of(slice(report[0] - 1, report[1]))
     rng = generator(experiment.protocol.seed, dataset.name, "bootstrap", 0)
+    results = results_of(runs, experiment.methods, experiment.margin, experiment.min_views, rng)
+    results["wall_clock"]["describe_median_ms"] = float(np.median([one.describe_ns for one in found])) * 1e-6
     return {
         "settings": experiment.settings(dataset),
         "reported": None if report is None else list(report),
         "bytes_per_view": descriptor(experiment.condition.descriptor).size_bytes,
-        **results_of(runs, experiment.methods, experiment.margin, experiment.min_views, rng),
+        **results,
     }
 
 

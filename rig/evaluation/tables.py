@@ -53,7 +53,7 @@ def tables(results: Mapping[str, Any]) -> list[Rows]:
         case "replaced":
             return [_replaced(rows)]
         case _:
-            return [_changes(rows)]
+            return [_changes(rows), _intervals(rows)]
 
 
 def _pivot(
@@ -181,6 +181,35 @@ def _changes(rows: Sequence[Row]) -> Rows:
             for row in rows
         ],
     )
+
+
+def _intervals(rows: Sequence[Row]) -> Rows:
+    """Return the shares of enrolled objects in percent, with their intervals."""
+    names = {
+        **{f"hit_rate_{n}": f"ranked first, N = {n}" for n in (1, 2, 4)},
+        "decided_right": "decided right",
+        "ambiguous": "ambiguous",
+        "called_unknown": "unknown, though enrolled",
+        "decided_wrong": "wrong name",
+        "left_out_accepted": "left out in turn: accepted",
+    }
+
+    def cell(row: Row, share: str) -> str:
+        low, high = (_percent(row[f"{share}_{end}"]) for end in ("low", "high"))
+        return f"{_percent(row[share])} [{low}, {high}]"
+
+    return Rows(
+        ["% [95 % interval by objects]", *(f"{row['change']}: {row['objects']}" for row in rows)],
+        [[name, *(cell(row, share) for row in rows)] for share, name in names.items()],
+    )
+
+
+def cost_sentence(results: Mapping[str, Any]) -> str | None:
+    """Return what a view costs, in words; None if the experiment did not measure it."""
+    if "bytes_per_view" not in results:
+        return None
+    took_ms = results["wall_clock"]["describe_median_ms"]
+    return f"A view has {results['bytes_per_view']} bytes; to describe one takes {took_ms:.1f} ms."
 
 
 def contest_sentences(results: Mapping[str, Any]) -> list[str]:

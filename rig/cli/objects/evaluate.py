@@ -68,7 +68,7 @@ def evaluate(
     from rig.cli.ui.present import ProgressBar, console
     from rig.evaluation.experiments import DEFAULT, load_experiment
     from rig.evaluation.run import own_folder, run_experiment, write_results
-    from rig.evaluation.tables import contest_sentences, tables
+    from rig.evaluation.tables import contest_sentences, cost_sentence, tables
 
     if data is None and Path(experiment).is_dir():
         experiment, data = DEFAULT, Path(experiment)
@@ -112,7 +112,7 @@ def evaluate(
     for table in tables(results):
         screen.print(table.terminal())
         screen.print()
-    for sentence in contest_sentences(results):
+    for sentence in filter(None, (cost_sentence(results), *contest_sentences(results))):
         screen.print(sentence, markup=False, highlight=False, soft_wrap=not screen.is_terminal)
     print(f"Written: {folder}/results.json, results.csv, and the figures if there are any.", file=sys.stderr)
 

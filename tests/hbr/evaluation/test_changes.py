@@ -1,7 +1,12 @@
 """The shares of searches after a change of the bench."""
 
+from dataclasses import replace
+
+import numpy as np
+
 import hbr
-from hbr.evaluation.changes import SearchResult, is_enrolled, summary
+from hbr.evaluation.changes import SearchResult, intervals, is_enrolled, summary
+from hbr.evaluation.experiment import Experiment
 
 
 def result(leader: str, outcome: hbr.Outcome, views: int = 1, left_out: hbr.Outcome | None = None) -> SearchResult:
@@ -43,4 +48,13 @@ def test_answers_of_the_comparison_count_as_decided() -> None:
 
 
 def test_every_ninth_object_is_never_enrolled() -> None:
-    assert [place for place in range(20) if not is_enrolled(place)] == [8, 17]
+    changed = Experiment("changed", change="mild")
+    assert [place for place in range(20) if not is_enrolled(place, changed)] == [8, 17]
+    assert all(is_enrolled(place, replace(changed, change="none")) for place in range(20))
+
+
+def test_intervals_resample_objects_and_not_searches() -> None:
+    known = {"a": [result("a", hbr.Outcome.FOUND)] * 50, "b": [result("a", hbr.Outcome.FOUND)] * 50}
+    found = intervals(known, np.random.default_rng(0))
+    assert (found["decided_right_low"], found["decided_right_high"]) == (0, 1)  # both objects drawn, or only one
+    assert (found["called_unknown_low"], found["called_unknown_high"]) == (0, 0)

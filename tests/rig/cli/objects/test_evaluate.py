@@ -211,6 +211,7 @@ def test_other_descriptors_are_evaluated_with_the_dense_filter(photographs: Path
     assert done.exit_code == 0, done.output
     found = results(tmp_path)
     assert found["bytes_per_view"] == 160
+    assert "A view has 160 bytes; to describe one takes" in done.output
     assert found["settings"]["condition"]["perturbations"] == "shift:1+gain:1"
     assert (found["settings"]["protocol"]["enrolled"], found["settings"]["protocol"]["removal"]) == (6, "queries")
     assert [method["name"] for method in found["methods"]] == ["dense", "dense-90"]
@@ -263,6 +264,40 @@ def test_bench_change_searches_for_each_object_also_as_if_it_were_not_enrolled(
         assert {len(one["leaders"]) for one in searches} == {4}, name
 
 
+def test_photographs_are_searched_for_in_those_that_are_not_enrolled(photographs: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "photographs"
+    shutil.copytree(photographs, folder)
+    keys = 'base = "photographs-8"\nenrolled = 4\ntrials = 2'
+    done = run(folder, keys, "--out", tmp_path / "clean")
+    assert done.exit_code == 0, done.output
+    clean = results(tmp_path / "clean")
+    (row,) = clean["rows"]
+    assert (row["searches"], row["unknown_searches"], row["left_out_searches"]) == (8, 0, 8)
+    assert row["hit_rate_4_low"] <= row["hit_rate_4"] <= row["hit_rate_4_high"]
+    assert "95 % interval by objects" in done.output
+    # What is not enrolled, is searched for: other queries change the searches, and not the rule of the enrolled views.
+    for angle in (30, 60, 120, 150, 210, 240, 300, 330):
+        shutil.copy(photographs / f"obj2__{angle}.png", folder / f"obj1__{angle}.png")
+    assert run(folder, keys, "--out", tmp_path / "swapped").exit_code == 0
+    swapped = results(tmp_path / "swapped")
+    assert swapped["fitted"] == clean["fitted"]
+    assert {leader for one in clean["searches"]["obj1"] for leader in one["leaders"]} == {"obj1"}
+    assert {leader for one in swapped["searches"]["obj1"] for leader in one["leaders"]} == {"obj2"}
+    assert swapped["searches"]["obj3"] == clean["searches"]["obj3"]
+    assert run(folder, keys, "--noise", "gn", "--out", tmp_path / "noisy").exit_code == 0
+    assert results(tmp_path / "noisy")["searches"] != swapped["searches"]
+
+
+@pytest.mark.parametrize(
+    ("keys", "words"),
+    [("enrolled = 9", "3 photographs that are not enrolled"), ('reference = "own"', "no empty-table image")],
+)
+def test_photographs_that_cannot_be_searched_for_are_rejected(photographs: Path, keys: str, words: str) -> None:
+    done = run(photographs, f'base = "photographs-8"\ntrials = 1\n{keys}')
+    assert done.exit_code == 2
+    assert words in " ".join(done.stderr.split())
+
+
 def test_other_settings_have_other_folders(photographs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     for noise in ("mb:5", "gn:0.01", "mb:5"):  # the last one has the results of the first one
@@ -308,7 +343,7 @@ def test_experiments_of_the_results_are_shipped(tmp_path: Path) -> None:
     for words in commands:
         name, *options = words.split()
         pairs = dict(zip(options[::2], options[1::2], strict=True))
-        assert pairs.pop("--data", "coil-100") == "coil-100"
+        assert pairs.pop("--data", "coil-100") in ("coil-100", "eth-80")
         assert set(pairs) <= {"--noise", "--methods", "--descriptor", "--set"}, words
         pairs.pop("--set", None)
         experiments.append(load_experiment(name, **{key[2:]: value for key, value in pairs.items()}))
