@@ -101,6 +101,30 @@ def test_table_angles_in_the_names_run_the_other_way(rig: Rig) -> None:
     assert all(apart(azimuth_deg, -nearest_angle("obj1", image, 45)) < 1 for azimuth_deg, image in stored_views("obj1"))
 
 
+def test_camera_that_moves_around_the_object_shows_the_same_photographs(rig: Rig) -> None:
+    save(Path("photographs"))
+    assert rig("enroll", "obj1", "--yes", "--set", "table.carries=camera").exit_code == 0
+    assert all(apart(azimuth_deg, nearest_angle("obj1", image, 45)) < 1 for azimuth_deg, image in stored_views("obj1"))
+
+
+def test_fault_replaces_the_object_by_another_one_of_the_photographs(rig: Rig) -> None:
+    save(Path("photographs"))
+    rig("enroll", "obj1", "--yes", *WITHOUT_NOISE, *put(faults='["object_moved:other=3:angle=0@move3"]'))
+    colours = [tuple(image[70, 50].tolist()) for _, image in stored_views("obj1")]
+    assert set(colours[:2]) == {COLOURS["obj1"]}
+    assert set(colours[4:]) == {COLOURS["obj2"]}  # the third one of the sorted names
+
+
+def test_demo_enrolls_photographs_and_searches_in_the_others(rig: Rig) -> None:
+    save(Path("photographs"), step_deg=22.5)
+    done = rig("demo", "--objects", "photographs", "--count", "2", "--json", *put(every=2))
+    totals = json.loads(done.stdout.splitlines()[-1])
+    assert (totals["enrolled"], totals["views_enrolled"], totals["of_unknown"]) == (2, 16, 1)
+    moved = rig("demo", "--objects", "photographs", "--change", "placement")
+    assert moved.exit_code == 2
+    assert "cannot be moved" in moved.stderr
+
+
 def test_objects_are_found_by_the_photographs_that_were_not_enrolled(rig: Rig) -> None:
     save(Path("photographs"), step_deg=22.5)
     Path("tray.csv").write_text("name\nobj1\nobj2\nobj10\n")
