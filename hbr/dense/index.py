@@ -193,7 +193,7 @@ class DenseIndex:
     def _set_segments(self, order: IndexArray, begin: IndexArray, count: IndexArray) -> None:
         """Set the views of each object: ``count`` of the rows ``order`` from ``begin`` on, by rising azimuth."""
         self._segments = calls.Segments(order, begin, count, bool((np.diff(order, prepend=-1) == 1).all()))
-        for name in ("rows", "left_out", "azimuth_deg", "spacing_deg", "_ring"):
+        for name in ("rows", "left_out", "azimuth_deg", "_ring"):
             self.__dict__.pop(name, None)  # cached values of the index that this one was copied from
 
     @cached_property
@@ -216,16 +216,6 @@ class DenseIndex:
         """Azimuths of `rows`."""
         return self.views.azimuth_deg[self.rows]
 
-    @cached_property
-    def spacing_deg(self) -> FloatArray:
-        """The usual step between neighbouring views of each object; 360 of a single one."""
-        spacing_deg = np.empty(len(self))
-        for count in np.unique(self._segments.lengths).tolist():  # objects with the same number of views together
-            ring_deg = self.azimuth_deg[self._segments.lengths == count, :count]
-            steps_deg = np.diff(ring_deg, axis=1, append=ring_deg[:, :1] + 360)
-            spacing_deg[self._segments.lengths == count] = np.median(steps_deg, axis=1)
-        return spacing_deg
-
     def similarity(self, query: LevelArray) -> FloatArray:
         """Return the similarity of every view to a query, (n,): of several segmentations, (h, length), the largest."""
         similar = self.compared.similarity(np.atleast_2d(query))
@@ -245,7 +235,7 @@ class DenseIndex:
             most = np.max([compared.bounds(row, self._segments) for row in np.atleast_2d(query)], axis=0)
         else:
             most = self.best(query)
-        return _raised(most).astype(np.float64)
+        return raised(most).astype(np.float64)
 
     def nearest(self, query: LevelArray, kept: int) -> IndexArray:
         """Return the objects with the most similar views, ascending places (kept,); of equal ones, the first."""
@@ -333,7 +323,7 @@ class DenseIndex:
             For azimuths 0, 5, 10, ... at the first query.
         """
         whole, part_deg = divmod(rotated_deg % 360.0, BIN_DEG)
-        levels = _raised(similar)
+        levels = raised(similar)
         slope = self.omega / 360
         azimuth_deg = self.views.azimuth_deg
         compiled = calls.support(self._segments, azimuth_deg, levels, slope, part_deg, int(whole))
@@ -359,7 +349,7 @@ class DenseIndex:
         return np.roll(best, -int(whole), axis=1)
 
 
-def _raised(similar: FloatArray) -> Floats:
+def raised(similar: FloatArray) -> Floats:
     """Return the similarities to the power p = 4, by products, which are the same on every computer."""
     raised = np.square(np.maximum(similar, 0))
     return np.square(raised, out=raised).astype(np.float32)

@@ -29,10 +29,11 @@ from numpy.typing import ArrayLike
 from hbr.core.angles import size_deg, wrap180, wrap360
 from hbr.core.arrays import FloatArray, IndexArray, LevelArray
 from hbr.dense.change import Change, changed
-from hbr.dense.filter import KEPT, Belief, completed, poses_of, update_belief
+from hbr.dense.filter import KEPT, Belief, completed, update_belief
 from hbr.dense.index import DenseIndex
 from hbr.dense.local_difference import NEAREST, LocalDecision, LocalView, Pixels, chosen_views, compare_objects, fit
 from hbr.dense.next_view import NextBestView, next_best_view
+from hbr.dense.pose import poses_of
 from hbr.dense.stopping import Outcome, StopDecision, StoppingRule, StopReason, fitted_before
 from hbr.descriptors import descriptor
 from hbr.descriptors.together import like_enrollment
@@ -152,15 +153,14 @@ def verify(belief: Belief, leader: int, queries: Queries) -> Asking[Verification
 
     The leader is an index of the views' names, and the queries are in the order of the belief's levels.
     """
-    index, ranking = belief.index, belief.ranking()
-    last_deg = float(belief.orientation_deg[-1])
-    pose_deg = dict(zip(ranking.object_index.tolist(), ranking.pose_deg.tolist(), strict=True))
-    candidates = [leader, *[one for one in ranking.object_index.tolist() if one != leader][:_OTHERS]]
+    index, last_deg = belief.index, float(belief.orientation_deg[-1])
+    candidates = [leader, *[one for one in belief.ranking().object_index.tolist() if one != leader][:_OTHERS]]
     seen: list[list[Pixels]] = []
     similarity = descriptor(index.views.descriptor).similarity
     means = []
     for candidate in candidates:
-        azimuths_deg = [wrap360(pose_deg[candidate] + o - last_deg) for o in belief.orientation_deg.tolist()]
+        pose_deg, *_ = poses_of(belief, candidate)
+        azimuths_deg = [wrap360(pose_deg + o - last_deg) for o in belief.orientation_deg.tolist()]
         views = yield NeedEnrolledViews(candidate, tuple(azimuths_deg))
         if views is None:
             return None

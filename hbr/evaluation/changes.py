@@ -6,7 +6,7 @@ photographs are used as they are, all objects are enrolled, and the views of sea
 """
 
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cache, lru_cache, partial
 from typing import Any, Final, Protocol
 
@@ -18,6 +18,7 @@ from hbr.core.arrays import ImageArray, LevelArray
 from hbr.dense.fitting import fit_stopping_rule
 from hbr.dense.index import DenseIndex
 from hbr.dense.local_difference import LocalView
+from hbr.dense.pose import pose
 from hbr.dense.session import DenseSession, answered, near
 from hbr.dense.stopping import Outcome, StoppingRule
 from hbr.descriptors.together import ViewsTogether
@@ -25,6 +26,7 @@ from hbr.drawing.bench import ENROLLMENT, HARD, MILD, DrawnBench, Visit
 from hbr.evaluation.condition import Condition
 from hbr.evaluation.experiment import Experiment, Kind
 from hbr.evaluation.photographs import Dataset, PhotographedObject, object_mask, read_photograph, without_specks
+from hbr.evaluation.poses import StatedPose, pose_rates, stated_pose
 from hbr.evaluation.protocol import generator, views_enrolled
 from hbr.evaluation.statistics import bootstrap_mean
 from hbr.model.views import Views
@@ -64,6 +66,8 @@ class SearchResult:
         Whether that comparison changed the outcome.
     verified : bool
         Whether the leader was doubtful, and compared with the views pixel by pixel (`hbr.dense.session`).
+    pose : StatedPose
+        Of the leading object at the end.
     left_out : Outcome, optional
         Outcome of the same search if the object is not enrolled; None if it never was.
     """
@@ -72,6 +76,7 @@ class SearchResult:
     outcome: Outcome
     decided: str
     views: int
+    pose: StatedPose = field(default=StatedPose(0))
     compared: bool = False
     by_comparison: bool = False
     verified: bool = False
@@ -207,10 +212,17 @@ class _Search:
             end.outcome,
             self._names[end.object_index],
             len(self._leaders),
+            self._stated(end.object_index),
             comparison is not None,
             end.outcome is not before.outcome,
             verification is not None,
         )
+
+    def _stated(self, leader: int) -> StatedPose:
+        belief = self._session.belief
+        views = belief.index.views
+        enrolled_deg = views.azimuth_deg[views.of(leader)]
+        return stated_pose(pose(belief, leader), float(belief.orientation_deg[-1]), enrolled_deg)
 
     def _near(self, leader: int, azimuths_deg: Sequence[float]) -> list[LocalView]:
         enrolled = self._enrolled(self._names[leader])
@@ -229,7 +241,9 @@ def _without(index: DenseIndex, name: str) -> DenseIndex | None:
     return DenseIndex(index.views.select(index.views.object_index != index.views.object_names.index(name)))
 
 
-def summary(known: dict[str, list[SearchResult]], unknown: dict[str, list[SearchResult]]) -> dict[str, float | int]:
+def summary(
+    known: dict[str, list[SearchResult]], unknown: dict[str, list[SearchResult]]
+) -> dict[str, float | int | None]:
     """Return the rates of each outcome, for enrolled objects and for others, by names with units."""
     searches = [(name, one) for name, results in known.items() for one in results]
     others = [one for results in unknown.values() for one in results]
@@ -248,6 +262,7 @@ def summary(known: dict[str, list[SearchResult]], unknown: dict[str, list[Search
         "right_by_comparison": sum(one.by_comparison and one.decided == name for name, one in found) / count,
         "wrong_by_comparison": sum(one.by_comparison and one.decided != name for name, one in found) / count,
         "mean_views": sum(one.views for _, one in found) / max(1, len(found)),
+        **pose_rates(np.array([one.pose for name, one in found if one.decided == name], np.float64).reshape(-1, 4)),
         "unknown_searches": len(others),
         "unknown_accepted": sum(one.outcome is Outcome.FOUND for one in others) / unknown_count,
         "unknown_called_unknown": sum(one.outcome is Outcome.UNKNOWN for one in others) / unknown_count,

@@ -12,7 +12,7 @@ from hbr.evaluation.protocol import Method, Protocol
 KindName = Literal["trials", "matrix", "unknown-objects", "bench-change", "replaced"]
 Change = Literal["none", "mild", "hard"]
 #: Increased if the same settings give other numbers.
-FORMAT: Final = 9
+FORMAT: Final = 10
 
 
 @dataclass(frozen=True)

@@ -235,6 +235,8 @@ class Runs:
     period_deg : float64
         Symmetry of the true object, from all its views (`hbr.model.symmetry.symmetry`): 360 if it is not symmetric;
         nan if it has too few views.
+    stated : float64 (methods, objects, trials, views, 4)
+        `hbr.evaluation.poses.StatedPose` for the true object, where a search of the dense filter ends; else nan.
     margin : float64
         `hbr.score_margin` of the leading object per view; with the dense filter, its score minus the second score.
     best : int32
@@ -257,6 +259,7 @@ class Runs:
     pose_error_deg: FloatArray
     alike_error_deg: FloatArray
     period_deg: FloatArray
+    stated: FloatArray
     margin: FloatArray
     best: NDArray[np.int32]
     score: FloatArray
@@ -276,7 +279,9 @@ class Runs:
             "step_ns": (0, np.int64),
         }
         shape = (methods, objects, trials, views)
-        return cls(*(np.full(shape, *filled.get(item.name, (np.nan, np.float64))) for item in fields(cls)))
+        shapes = {"stated": (*shape, 4)}
+        numbers = ((item.name, filled.get(item.name, (np.nan, np.float64))) for item in fields(cls))
+        return cls(*(np.full(shapes.get(name, shape), *values) for name, values in numbers))
 
     def of(self, objects: slice) -> "Runs":
         """Return the runs of some objects."""

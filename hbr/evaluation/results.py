@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from hbr.core.arrays import FloatArray
 from hbr.dense.stopping import Outcome
+from hbr.evaluation.poses import pose_rates
 from hbr.evaluation.protocol import COMPARED, OUTCOMES, Method, Runs
 from hbr.evaluation.statistics import bootstrap_difference, mcnemar_exact, wilson
 
@@ -49,7 +50,8 @@ class Stopping:
     was fitted to the enrolled views. A hit is a search that found the right object. ``unknown_rate``,
     ``ambiguous_rate`` and ``wrong_rate`` are the shares of searches with these outcomes. ``compared_rate`` is the share
     whose two leaders were compared pixel by pixel, ``compared_right_rate`` the share in which the comparison named the
-    right object, and ``ended_early`` the share that ended before the last view.
+    right object, and ``ended_early`` the share that ended before the last view. ``pose`` has the rates of
+    `hbr.evaluation.poses.pose_rates` for the hits of the dense filter.
     """
 
     margin: float
@@ -65,6 +67,7 @@ class Stopping:
     compared_right_rate: float
     travelled_mean_deg: float
     ended_early: float
+    pose: dict[str, float | None]
 
 
 @dataclass(frozen=True)
@@ -242,6 +245,7 @@ def _stopping(runs: Runs, method: int, least_margin: float, min_views: int) -> S
     named = ~unknown & ~ambiguous
     right = np.where(changed, is_right, rank[trial, end] == 1) & named
     hits = int(right.sum())
+    stated = runs.stated[method][..., seen, :].reshape(-1, len(seen), 4)[trial, end][right]
     return Stopping(
         least_margin,
         float(end.mean()) + 1,
@@ -255,6 +259,7 @@ def _stopping(runs: Runs, method: int, least_margin: float, min_views: int) -> S
         float(is_right.mean()),
         float(travelled_deg[trial, end].mean()),
         float(ends[:, :-1].any(axis=1).mean()),
+        pose_rates(stated[~np.isnan(stated[:, 0])]),
     )
 
 

@@ -18,12 +18,14 @@ from hbr.dense.fitting import fit_stopping_rule
 from hbr.dense.index import POWER, DenseIndex
 from hbr.dense.local_difference import LocalView
 from hbr.dense.next_view import ALL_ROTATIONS_DEG, expected_views, strongest
+from hbr.dense.pose import pose, poses_of
 from hbr.dense.session import DenseSession, answered, near
 from hbr.dense.stopping import Outcome, StoppingRule
 from hbr.descriptors import descriptor
 from hbr.evaluation.condition import Condition, EvaluationImage, enrolled_levels, query_levels
 from hbr.evaluation.experiment import Experiment, Kind
 from hbr.evaluation.photographs import Dataset
+from hbr.evaluation.poses import stated_pose
 from hbr.evaluation.protocol import COMPARED, OUTCOMES, Method, Protocol, Runs, generator, views_of_trial
 from hbr.evaluation.results import results_of
 from hbr.model.symmetry import symmetry
@@ -345,7 +347,9 @@ class _Trials:
             following = self._next_dense(method, draws, seen, session) if n + 1 < last else seen[-1]
             runs.step_ns[*at, n] = self._now_ns() - start_ns
             ranking = session.belief.ranking()
-            self._record(ranking.object_index, ranking.pose_deg, seen, runs, (*at, n))
+            objects = ranking.object_index.tolist()
+            pose_deg = [poses_of(session.belief, j)[0] if j == self._object else np.nan for j in objects]
+            self._record(ranking.object_index, np.array(pose_deg), seen, runs, (*at, n))
             # The numbers after this view; at the first end, also the last steps.
             runs.score[*at, n] = ranking.scores[0]
             runs.margin[*at, n] = ranking.scores[0] - (ranking.scores[1] if len(ranking.scores) > 1 else 0.0)
@@ -354,6 +358,10 @@ class _Trials:
                 ended = True
                 end, runs.compared[*at, n] = self._end(session, seen, measured_deg)
                 runs.outcome[*at, n] = OUTCOMES.index(end)
+                if self._object in objects:
+                    stated = pose(session.belief, self._object)
+                    enrolled_deg = self._azimuth_deg[keep]
+                    runs.stated[*at, n] = stated_pose(stated, float(self._azimuth_deg[newest]), enrolled_deg)
             seen.append(following)
 
     def _end(self, session: DenseSession, seen: list[int], measured_deg: list[float]) -> tuple[Outcome, int]:

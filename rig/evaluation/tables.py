@@ -45,7 +45,8 @@ def tables(results: Mapping[str, Any]) -> list[Rows]:
     rows = rows_of(results)
     match results["settings"]["kind"]:
         case "trials":
-            return [_curves(results, rows), _decisions(results), _poses(results)]
+            stated = {method["label"]: method["stopping"]["pose"] for method in results["methods"]}
+            return [_curves(results, rows), _decisions(results), _stated(stated), _poses(results)]
         case "matrix":
             return [_matrix(rows)]
         case "unknown-objects":
@@ -53,7 +54,8 @@ def tables(results: Mapping[str, Any]) -> list[Rows]:
         case "replaced":
             return [_replaced(rows)]
         case _:
-            return [_changes(rows), _intervals(rows)]
+            stated = _stated({f"{row['change']}, {row['objects']}": row for row in rows})
+            return [_changes(rows), _intervals(rows), stated]
 
 
 def _pivot(
@@ -108,6 +110,19 @@ def _poses(results: Mapping[str, Any]) -> Rows:
         rows.append([method["label"], str(len(found)), *cells])
     heads = "RMSE of the pose by object, °|objects|least|25 %|median|75 %|largest"
     return Rows(heads.split("|"), rows)
+
+
+def _stated(rates: Mapping[str, Mapping[str, Any]]) -> Rows:
+    """Return what right answers state about the pose, by the name of the row (`hbr.evaluation.poses.pose_rates`)."""
+    heads = "pose of right answers|one, %|several, %|error°|towards a view°|within σ, %|within 2 σ, %|one, 30° off, %"
+    shown = {"one": 100, "several": 100, "error_median_deg": 1, "toward_view_median_deg": 1}
+    shown |= {"within_1_sigma": 100, "within_2_sigma": 100, "far": 100}
+
+    def cells(own: Mapping[str, Any]) -> list[str]:
+        values = [(own[f"pose_{key}"], scale) for key, scale in shown.items()]
+        return ["–" if value is None else f"{scale * value:.1f}" for value, scale in values]
+
+    return Rows(heads.split("|"), [[name, *cells(own)] for name, own in rates.items()])
 
 
 def _matrix(rows: Sequence[Row]) -> Rows:

@@ -21,8 +21,8 @@ import hbr
 from hbr.core.angles import wrap360
 from hbr.core.arrays import IndexArray
 from hbr.dense.arc import ArcSession
-from hbr.dense.filter import pose
 from hbr.dense.local_difference import LocalView, ViewDifference
+from hbr.dense.pose import pose, poses_of
 from hbr.dense.session import UNKNOWN_BELOW, Asking, LeaderComparison, Queries, Verification
 from hbr.model.symmetry import symmetry
 from hbr.paper.hmm import CONFIDENT, PoseBelief, PoseModel, update_poses
@@ -449,11 +449,9 @@ class DenseSearch(Search):
         self.is_new_decision = self._session.is_new_decision
         belief = self._session.belief
         probability, scores, order = self._ordered()
-        ranking = belief.ranking()
-        pose_deg = dict(zip(ranking.object_index.tolist(), ranking.pose_deg.tolist(), strict=True))
         objects = belief.index.object_index.tolist()
         candidates = tuple(
-            Candidate(self.names[objects[i]], float(scores[i]), pose_deg[objects[i]], float(probability[i]))
+            Candidate(self.names[objects[i]], float(scores[i]), poses_of(belief, objects[i])[0], float(probability[i]))
             for i in order[: self._top].tolist()
         )
         others = float(scores[order[1:]].max()) if len(order) > 1 else 0.0

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 import hbr
-from hbr.dense.filter import poses_of
 from hbr.dense.local_difference import (
     MOST_VIEWS,
     LocalView,
@@ -15,6 +14,7 @@ from hbr.dense.local_difference import (
     compare_objects,
     pixel_difference,
 )
+from hbr.dense.pose import poses_of
 
 STEP_DEG = 10.0
 
