@@ -54,8 +54,8 @@ def tables(results: Mapping[str, Any]) -> list[Rows]:
         case "replaced":
             return [_replaced(rows)]
         case _:
-            stated = _stated({f"{row['change']}, {row['objects']}": row for row in rows})
-            return [_changes(rows), _intervals(rows), stated]
+            by_change = {f"{row['change']}, {row['objects']}": row for row in rows}
+            return [_changes(rows), _intervals(rows), _stated(by_change)]
 
 
 def _pivot(
