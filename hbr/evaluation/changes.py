@@ -155,13 +155,13 @@ def search_changed(
         views, empty = ViewsTogether(kind), Background(scene.empty()) if picture else None
         search = _Search(index, rule, enrolled)
         without = None if left_out is None else _Search(left_out, rule, enrolled)
-        same_bench: bool | None = None
+        same_bench, first = None, True
         wanted_deg = first_deg + _STEP_DEG * np.arange(VIEWS, dtype=np.float64)
         for place in _query_places(item, experiment, wanted_deg):
             azimuth_deg = item.photographs[place].azimuth_deg
             frame = scene.frame(item, place)
-            if same_bench is None:
-                same_bench = before.shows_same_bench(frame)
+            if first:
+                same_bench, first = before.shows_same_bench(frame), False
             views.add(frame, empty)
             search.add(views, azimuth_deg, same_bench)
             if without is not None:
@@ -181,7 +181,7 @@ class _Search:
         self._leaders: list[str] = []
         self._result: SearchResult | None = None
 
-    def add(self, views: ViewsTogether, azimuth_deg: float, same_bench: bool) -> None:
+    def add(self, views: ViewsTogether, azimuth_deg: float, same_bench: bool | None) -> None:
         *earlier, levels = views.levels
         decision = self._session.add(
             levels,

@@ -44,6 +44,11 @@ _CELL_SHARE: Final = 0.6
 #: The empty-table image is used if at least this share of the border cells agree.
 # the right image agrees with 83 % or more of the border, one of another bench with 42 % or less (decision 0012)
 MIN_AGREEMENT: Final = 0.65
+#: More than this share of the border's cells must show the same texture to prove that two images show one bench.
+_PROOF: Final = 0.5  # a horizon and the platter's rim, which many benches have in the same places, reach half of them
+#: Smallest contrast of a texture, as a standard deviation of logarithms, and smallest correlation of equal textures.
+_CONTRAST: Final = 0.02  # twice the noise
+_CORRELATION: Final = 0.6
 #: Largest difference between the border cells of a plain backdrop, and its largest distance from grey, in logarithms.
 _PLAIN: Final = 0.12  # larger: a coloured wall counts as plain, and its colour is corrected away
 _NEAR_GREY: Final = 0.35  # a factor of 1.4 between two channels: with more, the backdrop itself is coloured
@@ -254,12 +259,19 @@ class Background:
             _largest([np.abs(part) for part in residual]) < _AGREES,
         )
 
-    def shows_same_bench(self, image_bgr: ImageArray) -> bool:
-        """Return whether another image of this size, uint8 (H, W, 3), shows the same bench in any light.
+    def shows_same_bench(self, image_bgr: ImageArray) -> bool | None:
+        """Return whether another image, uint8 (H, W, 3), shows the same bench in any light; None: not known.
 
-        Only the border counts: an object may stand on the table in both images.
+        Only the border counts: an object may stand on the table in both images. If the two agree, but have too little
+        texture in common, they may show two plain benches.
         """
-        return image_bgr.shape[:2] == self.shape and self.difference(shrunk(image_bgr)).reliable
+        if image_bgr.shape[:2] != self.shape:
+            return None
+        small = shrunk(image_bgr)
+        if not self.difference(small).reliable:
+            return False
+        pairs = zip(*(border_cells(_texture(one)) for one in (self._log, _logarithm(small))), strict=True)
+        return True if sum(_same_texture(*pair) for pair in pairs) > _PROOF * len(_BORDER) else None
 
     def whole_correction(self, difference: Difference) -> Illumination:
         """Return the correction of a frame to the light of this image, and to a plain grey backdrop if it shows one."""
@@ -305,10 +317,21 @@ def shrunk(image_bgr: ImageArray) -> ImageArray:
     return cv2.GaussianBlur(image_bgr, (5, 5), 0.8).astype(np.uint8, copy=False)
 
 
-def border_cells(image: NDArray[np.generic]) -> list[NDArray[np.generic]]:
+def border_cells(image: NDArray[Any]) -> list[NDArray[Any]]:
     """Return the 12 cells of a 4 x 4 grid that lie at the border."""
     rows, columns = map(_quarters, image.shape[:2])
     return [image[rows[y] : rows[y + 1], columns[x] : columns[x + 1]] for y, x in _BORDER]
+
+
+def _texture(logarithms: Floats) -> Floats:
+    """Return the differences of brightness within a few pixels, (h, w)."""
+    grey = cv2.transform(logarithms, np.full((1, 3), 1 / 3, np.float32))
+    return np.asarray(grey - cv2.GaussianBlur(grey, (0, 0), 4), np.float32)
+
+
+def _same_texture(a: NDArray[Any], b: NDArray[Any]) -> bool:
+    correlation = np.vdot(a, b) / max(1e-9, float(np.linalg.norm(a) * np.linalg.norm(b)))
+    return bool(a.std() > _CONTRAST and correlation > _CORRELATION)
 
 
 @lru_cache

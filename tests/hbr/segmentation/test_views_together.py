@@ -10,7 +10,7 @@ from hbr.dense.index import Whitening
 from hbr.dense.leave_one_out import can_shift
 from hbr.descriptors.base import Shift
 from hbr.descriptors.together import like_enrollment
-from hbr.drawing.bench import HARD, DrawnBench, Visit
+from hbr.drawing.bench import ENROLLMENT, HARD, MILD, DrawnBench, Visit
 from hbr.segmentation import BoxMethod
 from sim.objects.shelf import shelf
 from sim.room import room
@@ -184,3 +184,16 @@ def test_a_segmentation_by_rotation_is_not_like_the_enrollment(
     method: BoxMethod, same_bench: bool | None, expected: bool | None
 ) -> None:
     assert like_enrollment(method, same_bench) is expected
+
+
+def test_two_plain_benches_are_not_known_to_be_one() -> None:
+    """A border without texture proves nothing, a border with texture proves both."""
+    answers = {}
+    for textured in (0.0, 1.0):
+        bench, *others = (DrawnBench.drawn(np.random.default_rng(n), textured=textured) for n in range(12))
+        enrolled = hbr.Background(Visit(bench, ENROLLMENT, np.random.default_rng(0)).empty())
+        later = Visit(bench, MILD, np.random.default_rng(1)).empty()
+        foreign = [Visit(one, HARD, np.random.default_rng(n)).empty() for n, one in enumerate(others)]
+        answers[textured] = enrolled.shows_same_bench(later), {enrolled.shows_same_bench(one) for one in foreign}
+    assert answers == {0.0: (None, {None, False}), 1.0: (True, {False})}
+    assert enrolled.shows_same_bench(later[:200]) is None  # another camera
