@@ -47,8 +47,8 @@ _WEIGHTS: Final = (0.714, 9.438, 4.995)
 _OFFSET: Final = -5.416
 #: Log-odds from which an object is found, and below which it is unknown: that of 1 in 100 enrolled objects.
 FOUND_FROM: Final = 0.0
-#: Log-odds from which an object is found on the bench of the enrollment, where an enrolled object fits much better. In
-#: searches for objects 1–50 after a mild change, enrolled objects reach 5.6 or more, left-out objects 1.1 or less.
+#: Log-odds from which an object is found where the bench may be that of the enrollment: there an enrolled object fits much
+#: better. In searches for objects 1–50 after a mild change, enrolled objects reach 5.6 or more, left-out ones 1.1 or less.
 FOUND_FROM_SAME_BENCH: Final = 3.0
 UNKNOWN_BELOW: Final = -1.3
 #: With a smaller open-set score, an object is unknown at any fit.
@@ -460,7 +460,7 @@ class DenseSession:
     @property
     def found_from(self) -> float:
         """Log-odds from which a verified leader is found."""
-        return FOUND_FROM_SAME_BENCH if self._same_bench else FOUND_FROM
+        return FOUND_FROM if self._same_bench is False else FOUND_FROM_SAME_BENCH
 
     @property
     def is_doubtful(self) -> bool:

@@ -108,13 +108,20 @@ class DrawnBench:
     top: Picture
 
     @classmethod
-    def drawn(cls, rng: np.random.Generator, *, textured: float = 1.0, clutter: int = 6) -> "DrawnBench":
-        """Draw a bench; ``textured`` is the contrast of its patterns, ``clutter`` the largest number of objects."""
+    def drawn(
+        cls, rng: np.random.Generator, *, textured: float = 1.0, clutter: int = 6, plain: bool = False
+    ) -> "DrawnBench":
+        """Draw a bench; ``textured`` is the contrast of its patterns, ``clutter`` the largest number of objects.
+
+        With ``plain`` wall and table are one plain backdrop, before which the platter is visible.
+        """
         horizon = int(rng.integers(110, 175))
+        textured = 0.0 if plain else textured
         still = _surface(rng, textured)
-        still[horizon:] = _surface(rng, textured)[horizon:]
-        if rng.random() < 0.5:  # a low camera sees the table's pattern compressed
-            still[horizon:] = cv2.resize(_surface(rng, textured), (WIDTH, 2 * (HEIGHT - horizon)))[::2]
+        if not plain:
+            still[horizon:] = _surface(rng, textured)[horizon:]
+            if rng.random() < 0.5:  # a low camera sees the table's pattern compressed
+                still[horizon:] = cv2.resize(_surface(rng, textured), (WIDTH, 2 * (HEIGHT - horizon)))[::2]
         still = np.asarray(cv2.GaussianBlur(still, (0, 0), rng.uniform(0.5, 1.0)), np.float32)
         if textured:
             for _ in range(int(rng.integers(clutter // 2, clutter + 1))):

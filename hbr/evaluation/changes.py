@@ -3,6 +3,7 @@
 Objects are enrolled on one drawn bench. Each search is a visit to the same bench (mild change), or to one of twelve
 other benches (hard change), with four views, 90° apart. Every ninth object is never enrolled. Without a change, the
 photographs are used as they are, all objects are enrolled, and the views of searches are those that are not enrolled.
+The drawn benches have texture and clutter, or all of them have one plain backdrop with a visible platter.
 """
 
 from collections.abc import Callable, Collection, Sequence
@@ -327,14 +328,14 @@ class _OwnScene:
 def _enrollment_scene(experiment: Experiment) -> _Scene:
     if experiment.change == "none":
         return _OwnScene(experiment.condition)
-    return _DrawnScene(Visit(_enrollment_bench(), ENROLLMENT, np.random.default_rng(1)))
+    return _DrawnScene(Visit(_enrollment_bench(experiment.plain), ENROLLMENT, np.random.default_rng(1)))
 
 
 def _search_scene(experiment: Experiment, rng: np.random.Generator) -> _Scene:
     if experiment.change == "none":
         return _OwnScene(experiment.condition, experiment.protocol.seed)
     hard = experiment.change == "hard"
-    bench = _benches()[int(rng.integers(_BENCHES))] if hard else _enrollment_bench()
+    bench = _benches(experiment.plain)[int(rng.integers(_BENCHES))] if hard else _enrollment_bench(experiment.plain)
     return _DrawnScene(Visit(bench, HARD if hard else MILD, rng))
 
 
@@ -377,13 +378,13 @@ def _bench_image(experiment: Experiment, example: PhotographedObject | None) -> 
 
 
 @cache
-def _enrollment_bench() -> DrawnBench:
-    return DrawnBench.drawn(np.random.default_rng(7), textured=0.35, clutter=3)
+def _enrollment_bench(plain: bool) -> DrawnBench:
+    return DrawnBench.drawn(np.random.default_rng(7), textured=0.35, clutter=3, plain=plain)
 
 
 @cache
-def _benches() -> tuple[DrawnBench, ...]:
-    return tuple(DrawnBench.drawn(np.random.default_rng(1000 + k)) for k in range(_BENCHES))
+def _benches(plain: bool) -> tuple[DrawnBench, ...]:
+    return tuple(DrawnBench.drawn(np.random.default_rng(1000 + k), plain=plain) for k in range(_BENCHES))
 
 
 def _enroll(experiment: Experiment, dataset: Dataset, j: int) -> tuple[LevelArray, NDArray[np.float64]] | None:
@@ -426,7 +427,7 @@ def _results(
 ) -> dict[str, Any]:
     views, rule = model
     searched = {item.name: results for item, results in zip(dataset.objects, found, strict=True)}
-    words = f"{experiment.change}, {'picture' if _has_picture(experiment) else 'no picture'}"
+    words = f"{experiment.change}{', plain' * experiment.plain}, {'' if _has_picture(experiment) else 'no '}picture"
 
     def row(objects: str, of: Collection[str]) -> dict[str, Any]:
         some = {name: results for name, results in searched.items() if name in of}

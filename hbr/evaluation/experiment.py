@@ -42,6 +42,8 @@ class Experiment:
     change : {"none", "mild", "hard"}
         The change of ``bench-change``; none: the photographs as they are, with the noise of the condition, and queries
         that are not enrolled.
+    plain : bool
+        Whether all benches of ``bench-change`` have a plain backdrop and a visible platter.
     margin, min_views
         Lead per view, and number of views, that end a search of the paper.
     """
@@ -56,6 +58,7 @@ class Experiment:
     every: int = 1
     left_out: int = 20
     change: Change = "hard"
+    plain: bool = False
     margin: float = 0.02
     min_views: int = 2
 
@@ -95,6 +98,7 @@ class Experiment:
             "methods": [asdict(method) for method in self.methods],
             "every": self.every,
             "change": self.change if self.kind == "bench-change" else None,
+            "plain": self.plain if self.kind == "bench-change" else None,
             "left_out": self.left_out if self.kind == "unknown-objects" else None,
         }
 
