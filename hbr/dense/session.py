@@ -47,8 +47,8 @@ _WEIGHTS: Final = (0.714, 9.438, 4.995)
 _OFFSET: Final = -5.416
 #: Log-odds from which an object is found, and below which it is unknown: that of 1 in 100 enrolled objects.
 FOUND_FROM: Final = 0.0
-#: Log-odds from which an object is found where the bench may be that of the enrollment: there an enrolled object fits much
-#: better. In searches for objects 1–50 after a mild change, enrolled objects reach 5.6 or more, left-out ones 1.1 or less.
+#: Log-odds from which an object is found where the bench may be that of the enrollment: there an enrolled object fits
+#: much better. In searches for objects 1–50 after a mild change, enrolled ones reach 5.6 or more, others 1.1 or less.
 FOUND_FROM_SAME_BENCH: Final = 3.0
 UNKNOWN_BELOW: Final = -1.3
 #: With a smaller open-set score, an object is unknown at any fit.

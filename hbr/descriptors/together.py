@@ -6,7 +6,6 @@ object, too; the network was trained with such medians and combines them with th
 improves the segmentation of the first one. Further views hardly improve those that were segmented by rotation.
 """
 
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Final
@@ -56,25 +55,7 @@ class LearnedBackground:
             return None
         if len(others) > _MOST:  # evenly spread over all views
             others = [others[n * len(others) // _MOST] for n in range(_MOST)]
-        return Background.learned(median([self._small[n] for n in others]), self._shape)
-
-
-def median(images: Sequence[ImageArray]) -> ImageArray:
-    """Return the median of each value of at most a few images of one shape, uint8, rounded down.
-
-    The images are sorted up to their middle by pairwise minima and maxima, which is ten times faster than a partition
-    of each pixel.
-    """
-    ranked = [image.copy() for image in images]
-    middle = len(ranked) // 2
-    for rank in range(middle + 1):
-        for n in range(len(ranked) - 1, rank, -1):
-            lower = np.minimum(ranked[n - 1], ranked[n])
-            np.maximum(ranked[n - 1], ranked[n], out=ranked[n])
-            ranked[n - 1] = lower
-    if len(ranked) % 2:
-        return ranked[middle]
-    return ((ranked[middle - 1].astype(np.uint16) + ranked[middle]) // 2).astype(np.uint8)
+        return Background.learned([self._small[n] for n in others], self._shape)
 
 
 #: Methods whose segmentations are as good as those of enrolled views.
@@ -196,4 +177,4 @@ class ViewsTogether:
     def _without_background(self, view: int, frame: SegmentedFrame) -> tuple[Segmentation | Found, ...]:
         """Return the segmentations of a view that no other view changes."""
         known = self.segmentations[view]
-        return known if known and known[0].method is BoxMethod.GUESS else without_background(frame)
+        return known if known and known[0].method in (BoxMethod.GUESS, BoxMethod.NETWORK) else without_background(frame)

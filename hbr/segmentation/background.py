@@ -37,6 +37,8 @@ _NOISE: Final = (0.35 * 8.0 / (np.arange(256) + _FLOOR)).astype(np.float32)
 _RIDGE: Final = 1e-9 * np.eye(3)
 #: Largest residual of a pixel that agrees, in logarithms: about 15 % more or less light.
 _AGREES: Final = 0.15  # larger: another bench passes as this one; smaller: a lamp that moved makes the image useless
+#: Half of the mean of three channels, and the difference of each from it.
+_OPPONENTS: Final = np.vstack([np.full((1, 3), 1 / 6), np.eye(3) - 1 / 3]).astype(np.float32)
 #: Cells of a 4 x 4 grid at the frame's border; the object is in the middle.
 _BORDER: Final = tuple((y, x) for y in range(4) for x in range(4) if y in (0, 3) or x in (0, 3))
 #: A cell agrees if this share of its pixels agree.
@@ -44,6 +46,11 @@ _CELL_SHARE: Final = 0.6
 #: The empty-table image is used if at least this share of the border cells agree.
 # the right image agrees with 83 % or more of the border, one of another bench with 42 % or less (decision 0012)
 MIN_AGREEMENT: Final = 0.65
+#: A learned background is used if at least this share of the frame's edge, of this width, agrees.
+# not of the border's cells, which an object that fills the frame covers: photographs of such objects agree with 58 %
+# of the edge or more, views of a camera that moves around the object with 55 % or less
+_STILL: Final = 0.57
+_EDGE_PX: Final = 4
 #: More than this share of the border's cells must show the same texture to prove that two images show one bench.
 _PROOF: Final = 0.5  # a horizon and the platter's rim, which many benches have in the same places, reach half of them
 #: Smallest contrast of a texture, as a standard deviation of logarithms, and smallest correlation of equal textures.
@@ -93,6 +100,8 @@ class IssueCode(StrEnum):
     """The backdrop is too dark or too bright to correct the exposure with it."""
     BACKGROUND_NOT_PLAIN = "background-not-plain"
     """The background is not plain: the object can only be guessed from its colours, or found by rotation."""
+    DOUBTFUL_OUTLINE = "doubtful-outline"
+    """Parts of the platter or of the backdrop may be inside the box: ``overlap``, expected with the object, 0..1."""
     NO_OBJECT = "no-object"
     """The network found no object."""
     NO_GUESS = "no-guess"
@@ -160,6 +169,10 @@ class Difference:
         Mean over the channels of what remains of the difference, in logarithms.
     coloured : float32 array (h, w)
         Largest distance of a channel from that mean.
+    spread : float32 array (h, w)
+        How much the background itself changes from view to view, in logarithms; 0 for an empty-table image.
+    trust : float
+        1 for an empty-table image; less for a background that was learned from views, 0.1 for each of them.
     """
 
     agreement: float
@@ -168,6 +181,9 @@ class Difference:
     correction: Illumination
     evenly: Floats
     coloured: Floats
+    spread: Floats
+    trust: float
+    still: bool
 
     @property
     def reliable(self) -> bool:
@@ -195,22 +211,30 @@ class Background:
         self._set(shrunk(empty_table_bgr))
 
     @classmethod
-    def learned(cls, small: ImageArray, shape: tuple[int, int]) -> "Background":
-        """Return a background that was learned from frames of this height and width.
+    def learned(cls, smalls: Sequence[ImageArray], shape: tuple[int, int]) -> "Background":
+        """Return the background that frames of this height and width show while the table rotates: their median.
 
         Parameters
         ----------
-        small : uint8 array (h, w, 3)
-            The background, of the size that `shrunk` returns for a frame.
+        smalls : sequence of uint8 array (h, w, 3)
+            One to nine frames as `shrunk` returns them.
         shape : (int, int)
             Height and width of the frames.
         """
         background = cls.__new__(cls)
         background.shape = shape
-        background._set(small)
+        background._set(median(smalls))
+        background._trust = 0.1 * len(smalls)
+        # every second pixel is enough, and takes a quarter of the time
+        apart = [_logarithm(small[::2, ::2]) - background._log[::2, ::2] for small in smalls]
+        apart = [np.abs(one - np.median(one[::3, ::3], axis=(0, 1))) for one in apart]  # without the camera's exposure
+        spread = _largest(cv2.split(np.mean(apart, axis=0, dtype=np.float32)))
+        height, width = background._log.shape[:2]
+        background._spread = np.asarray(cv2.resize(spread, (width, height)), np.float32)
         return background
 
     def _set(self, small: ImageArray) -> None:
+        self._trust, self._spread = 1.0, np.zeros(small.shape[:2], np.float32)
         self._grey_levels = small
         self._log = _logarithm(small)
         self._useful = _useful(small)
@@ -234,6 +258,8 @@ class Background:
         certain |= possible & (cv2.blur(grain, (5, 5)) > 0.15)
         shares = [int(np.count_nonzero(cell)) / cell.size for cell in border_cells(agrees)]
         agreement = sum(share > _CELL_SHARE for share in shares) / len(shares)
+        inner = agrees[_EDGE_PX:-_EDGE_PX, _EDGE_PX:-_EDGE_PX]
+        edge = np.count_nonzero(agrees) - np.count_nonzero(inner)
         return Difference(
             agreement,
             certain,
@@ -241,6 +267,9 @@ class Background:
             Illumination(-slopes),
             evenly,
             coloured,
+            self._spread,
+            self._trust,
+            bool(edge >= _STILL * (agrees.size - inner.size)),
         )
 
     def _planes(self, small: ImageArray, illumination: Illumination) -> tuple[Floats, Floats, Mask, Mask, Mask]:
@@ -315,6 +344,47 @@ def shrunk(image_bgr: ImageArray) -> ImageArray:
             by_kernel = cv2.resize(image_bgr, size, interpolation=cv2.INTER_AREA).astype(np.uint8, copy=False)
         image_bgr = by_kernel
     return cv2.GaussianBlur(image_bgr, (5, 5), 0.8).astype(np.uint8, copy=False)
+
+
+def median(images: Sequence[ImageArray]) -> ImageArray:
+    """Return the median of each value of at most a few images of one shape, uint8, rounded down.
+
+    The images are sorted up to their middle by pairwise minima and maxima, which is ten times faster than a partition
+    of each pixel.
+    """
+    ranked = [image.copy() for image in images]
+    middle = len(ranked) // 2
+    for rank in range(middle + 1):
+        for n in range(len(ranked) - 1, rank, -1):
+            lower = np.minimum(ranked[n - 1], ranked[n])
+            np.maximum(ranked[n - 1], ranked[n], out=ranked[n])
+            ranked[n - 1] = lower
+    if len(ranked) % 2:
+        return ranked[middle]
+    return ((ranked[middle - 1].astype(np.uint16) + ranked[middle]) // 2).astype(np.uint8)
+
+
+def from_border(small: ImageArray) -> Floats:
+    """Return the distance of each pixel's colour from the nearest colour at the frame's border, in logarithms, (h, w).
+
+    Brightness counts half, because shadows and folds of a cloth change it more than the colour.
+    """
+    height, width = small.shape[:2]
+    coarse = cv2.resize(small, (16, 12), interpolation=cv2.INTER_AREA)
+    border = np.concatenate([coarse[0], coarse[-1], coarse[1:-1, 0], coarse[1:-1, -1]])[None]
+    colours = _opponents(small.reshape(1, -1, 3))
+    near = _opponents(np.ascontiguousarray(border, np.uint8))
+    squares = near @ colours.T
+    squares *= -2
+    squares += np.einsum("nc,nc->n", near, near)[:, None]
+    nearest = squares.min(axis=0) + np.einsum("nc,nc->n", colours, colours)
+    distances: Floats = np.sqrt(np.maximum(nearest, 0)).reshape(height, width)
+    return distances
+
+
+def _opponents(image: ImageArray) -> Floats:
+    """Return half the mean of the logarithms of each pixel's channels, and their differences from it, (n, 4)."""
+    return cv2.transform(_logarithm(image), _OPPONENTS).reshape(-1, 4).astype(np.float32, copy=False)
 
 
 def border_cells(image: NDArray[Any]) -> list[NDArray[Any]]:

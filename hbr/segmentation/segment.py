@@ -28,10 +28,10 @@ from hbr.segmentation.cut_out import Box, Found, Segmentation
 from hbr.segmentation.silhouette import guess_object, shares, silhouette
 
 #: Probabilities above which a pixel belongs to the object: of the first segmentation, and of further ones.
-_LEVELS: Final = (0.5, 0.2, 0.8)
-#: The same of an enrolled view with a learned background: where an object looks the same from all sides, it is part of
-#: that background, and less probable.
-_ENROLLED_LEVEL: Final = 0.25
+# the first is low: where an object looks the same from all sides, it is part of a learned background, and less probable
+_LEVELS: Final = (0.25, 0.5, 0.8)
+#: A smaller expected overlap is reported.
+_DOUBTFUL: Final = 0.7
 #: Smallest overlap of two boxes that count as one.
 _SAME_BOX: Final = 0.85
 # more: the right box is missed less often; each is described and compared with all enrolled views
@@ -91,7 +91,10 @@ def compared(
     return background, frame.difference(background)
 
 
-def _found(frame: SegmentedFrame, background: Background | None, difference: Difference | None) -> Found:
+def _found(
+    frame: SegmentedFrame, background: Background | None, difference: Difference | None, *, guess: bool = True
+) -> Found:
+    """Return the object by the empty-table image, before a plain background, or guessed if that is asked for."""
     issues: list[Issue] = []
     correction: Illumination | None = None
     found: Mask | None = None
@@ -113,9 +116,9 @@ def _found(frame: SegmentedFrame, background: Background | None, difference: Dif
         else:
             method = BoxMethod.GUESS
             issues.append(Issue(IssueCode.BACKGROUND_NOT_PLAIN))
-            cut = guess_object(frame.small)
+            cut = guess_object(frame.small) if guess else None
             found = None if cut is None else silhouette(cut, framed=False)
-            if found is None:
+            if found is None and guess:
                 issues.append(Issue(IssueCode.NO_GUESS))
     if found is None:
         method = BoxMethod.NONE
@@ -134,7 +137,9 @@ def hypotheses(
     """Return several segmentations of a frame, the likeliest first, whose boxes differ.
 
     A search compares the enrolled views with all of them, and the most similar one counts
-    (`hbr.DenseSession.add` takes the levels of several segmentations as rows). Before a plain background there is one.
+    (`hbr.DenseSession.add` takes the levels of several segmentations as rows). The network sees the frame with all that
+    is known about its background. What does not rotate is not the object, also before a plain background: there the
+    difference from the border contains a visible platter. It counts first only if the network confirms it.
 
     Parameters
     ----------
@@ -142,7 +147,7 @@ def hypotheses(
         As for `segment`; or a `hbr.segmentation.background.SegmentedFrame`, if the frame is segmented more than once.
     learned : Background, optional
         The background that the other views of the search show (`hbr.descriptors.together.LearnedBackground.of`). The
-        object is not guessed then. It is not used if the frame's border differs from it.
+        object is not guessed then. It is not used if the frame's edge differs from it.
     alone : callable, optional
         Returns what `without_background` returns for this frame: segmentations that count besides those with the
         learned background. No other view changes them. By default the network's alone counts.
@@ -156,39 +161,42 @@ def hypotheses(
     """
     frame = SegmentedFrame.of(image_bgr)
     background, difference = compared(frame, empty_table)
-    by_picture = difference is not None and difference.reliable
-    rotated = None if learned is None or by_picture or frame.differs is not None else learned.difference(frame.small)
-    found: list[Segmentation | Found]
-    # A camera that moves around the object shows other surroundings in each view: then nothing is learned from them.
-    if rotated is None or not rotated.reliable:
-        like = _found(frame, background, difference)
-        if like.method is BoxMethod.PLAIN_BACKGROUND or (most == 1 and not by_picture):
-            return (like.cut_out(),)
-        share = shares(frame.small, difference if by_picture else None).object
-        if by_picture:
-            found = [like, *_by_network(share, BoxMethod.EMPTY_TABLE, like)]
-            if most == 1 and not _same(like, found[-1]):  # an enrollment: the network's box is right more often
-                found.reverse()
-        else:
-            found = [like, *_by_network(share, BoxMethod.NETWORK, like)]
-    else:
-        issues = [Issue(IssueCode.BACKGROUND_NOT_PLAIN)]
-        if difference is not None:
-            issues.insert(0, Issue(IssueCode.TABLE_DIFFERS, {"agreement": round(difference.agreement, 3)}))
-        agreement = None if difference is None else difference.agreement
-        like = Found(frame, None, None, agreement, BoxMethod.NONE, tuple(issues))
-        share = shares(frame.small, rotated, learned=True).object
-        levels = _LEVELS if most > 1 else (_ENROLLED_LEVEL,)
-        found = [*_by_network(share, BoxMethod.ROTATION, like, levels=levels)]
-        if most > 1:
-            by_itself = None if alone is None else alone()
-            found += by_itself or _by_network(shares(frame.small).object, BoxMethod.NETWORK, like)
-        found = found or [replace(like, issues=(*issues, Issue(IssueCode.NO_OBJECT)))]
+    method, seen = BoxMethod.EMPTY_TABLE, difference
+    if seen is None or not seen.reliable:
+        method, seen = BoxMethod.ROTATION, None if learned is None else learned.difference(frame.small)
+        # a camera that moves around the object shows other surroundings in each view: nothing is learned from them
+        if seen is None or not seen.still:
+            method, seen = BoxMethod.NETWORK, None
+    rotated = method is BoxMethod.ROTATION
+    share = shares(frame.small, seen).object
+    like = _found(frame, background, difference, guess=not rotated)
+    found: list[Segmentation | Found] = [*_by_network(share, method, like, _LEVELS[: most if rotated else 1])]
+    if like.box is not None:
+        confirmed = not found or (not rotated and (like.method is BoxMethod.GUESS or _same(like, found[0])))
+        found.insert(0 if confirmed else len(found), like)
+    if rotated and most > 1:
+        by_itself = None if alone is None else alone()
+        found += by_itself or _by_network(shares(frame.small).object, BoxMethod.NETWORK, like)
+    if not found:
+        nothing = (Issue(IssueCode.NO_OBJECT),) if rotated else ()
+        found = [replace(like, method=BoxMethod.NONE, issues=(*like.issues, *nothing))]
+    overlap = _expected(found[0].silhouette, share)
+    if found[0].method is not BoxMethod.GUESS and 0 < overlap < _DOUBTFUL:
+        issue = Issue(IssueCode.DOUBTFUL_OUTLINE, {"overlap": round(overlap, 2)})
+        found[0] = replace(found[0], issues=(*found[0].issues, issue))
     several: list[Segmentation | Found] = []
     for one in found:
-        if not any(_same(known, one) for known in several):
+        if not any(_same(other, one) for other in several):
             several.append(one)
     return tuple(map(_cut_out, several[:most]))
+
+
+def _expected(found: Mask | None, share: NDArray[np.float32]) -> float:
+    """Return the expected overlap of a silhouette with the object, by the probability of each pixel; 0 without one."""
+    if found is None:
+        return 0.0
+    both = float(share[found].sum())
+    return both / (int(np.count_nonzero(found)) + float(share.sum()) - both)
 
 
 def _cut_out(found: Segmentation | Found) -> Segmentation:
@@ -212,7 +220,7 @@ def _by_network(
     return [replace(like, silhouette=mask, method=method) for mask in masks]
 
 
-def _object_in(share: NDArray[np.float32], level: float) -> Mask | None:
+def _object_in(share: NDArray[np.float32], level: float = _LEVELS[0]) -> Mask | None:
     """Return the object's silhouette where its probability is above a level."""
     return silhouette(share > level, framed=False)
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from hbr.core.arrays import ImageArray
 from hbr.core.nets import Floats, SharedNet
-from hbr.segmentation.background import Difference, Mask
+from hbr.segmentation.background import Difference, Mask, from_border
 
 Binary = NDArray[np.uint8]
 
@@ -208,11 +208,11 @@ def _prior(height: int, width: int) -> NDArray[np.float32]:
 WIDTH: Final = 128
 HEIGHT: Final = 96  # a change of the size needs another training of the network
 WEIGHTS: Final = "network.onnx"
-#: Scales of the difference, in logarithms: brightness, and colour.
-EVENLY: Final = 1.0
-COLOURED: Final = 0.7  # smaller than `EVENLY`, because shadows change the brightness more than the colour
-#: Trust in a background that was learned from other views; 1 for an empty-table image.
-LEARNED: Final = 0.5  # less than an image that was taken for this purpose, more than none
+#: Scales of the input's planes, in logarithms: brightness, colour, spread, and distance from the border's colours.
+_EVENLY: Final = 1.0
+_COLOURED: Final = 0.7  # smaller than `_EVENLY`, because shadows change the brightness more than the colour
+_SPREAD_SCALE: Final = 0.5
+_FROM_BORDER: Final = 1.0
 
 
 class Shares(NamedTuple):
@@ -222,33 +222,32 @@ class Shares(NamedTuple):
     platter: Floats
 
 
-def shares(small: ImageArray, difference: Difference | None = None, *, learned: bool = False) -> Shares:
-    """Return where a small frame shows the object and the platter.
+def shares(small: ImageArray, difference: Difference | None = None) -> Shares:
+    """Return where a small frame, as `hbr.segmentation.background.shrunk` returns it, shows the object and the platter.
 
-    Parameters
-    ----------
-    small : uint8 array (h, w, 3)
-        As `hbr.segmentation.background.shrunk` returns it.
-    difference : Difference, optional
-        Of the frame from its background.
-    learned : bool
-        Whether the background was learned from other views, which may show the object, too.
+    ``difference`` is the frame's from its background, if that is known.
     """
     height, width = small.shape[:2]
-    planes = np.zeros((1, 8, HEIGHT, WIDTH), np.float32)
-    planes[0, :3] = _sized(small).transpose(2, 0, 1)
-    planes[0, :3] *= np.float32(1 / 255)
-    planes[0, :3] -= np.float32(0.5)
-    planes[0, 3:5] = _places()
-    if difference is not None:
-        planes[0, 5] = np.clip(_sized(difference.evenly) * np.float32(1 / EVENLY), -1, 1)
-        planes[0, 6] = np.clip(_sized(difference.coloured) * np.float32(1 / COLOURED), 0, 1)
-        planes[0, 7] = LEARNED if learned else 1.0
-    logits = _NET(planes)[0]
-    found = [1 / (1 + cv2.exp(-plane)) for plane in logits]
+    found = [1 / (1 + cv2.exp(-plane)) for plane in _NET(planes(small, difference)[None])[0]]
     if (height, width) != (HEIGHT, WIDTH):
         found = [cv2.resize(share, (width, height), interpolation=cv2.INTER_LINEAR) for share in found]
     return Shares(*(np.asarray(share, np.float32) for share in found))
+
+
+def planes(small: ImageArray, difference: Difference | None) -> Floats:
+    """Return the network's input for a small frame, float32 (10, HEIGHT, WIDTH)."""
+    found = np.zeros((10, HEIGHT, WIDTH), np.float32)
+    found[:3] = _sized(small).transpose(2, 0, 1)
+    found[:3] *= np.float32(1 / 255)
+    found[:3] -= np.float32(0.5)
+    found[3:5] = _places()
+    found[5] = np.minimum(_sized(from_border(small)) * np.float32(1 / _FROM_BORDER), 1)
+    if difference is not None:
+        found[6] = np.clip(_sized(difference.evenly) * np.float32(1 / _EVENLY), -1, 1)
+        found[7] = np.minimum(_sized(difference.coloured) * np.float32(1 / _COLOURED), 1)
+        found[8] = np.minimum(_sized(difference.spread) * np.float32(1 / _SPREAD_SCALE), 1)
+        found[9] = difference.trust
+    return found
 
 
 def _sized(plane: NDArray[Any]) -> NDArray[Any]:

@@ -34,7 +34,7 @@ from rig.views.description import DESCRIPTORS, EnrollmentDescriber, check_eviden
 
 SEGMENTATION: Final = "segmentation"
 """The kind of the stored silhouettes: a list of the evidence of each view (`hbr.segmentation.segment`)."""
-SEGMENTATION_VERSION: Final = 1
+SEGMENTATION_VERSION: Final = 2
 """Increases when the same images give other silhouettes."""
 FEWEST_VIEWS: Final = 4
 """A session with fewer views, after an interruption, learns its background from all views of the enrollment."""

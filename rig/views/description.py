@@ -39,6 +39,7 @@ _TEXT: Final = {
     IssueCode.BACKDROP_COLOURFUL: "the backdrop is not grey",
     IssueCode.BACKDROP_LEVEL: "the backdrop is too dark or too bright to correct the exposure",
     IssueCode.BACKGROUND_NOT_PLAIN: "the background is not plain",
+    IssueCode.DOUBTFUL_OUTLINE: "the platter or the backdrop may be inside the box",
     IssueCode.NO_GUESS: "no part of the frame stands out",
     IssueCode.NO_OBJECT: "no object was found while the table rotated",
     IssueCode.NO_DIFFERENCE: "nothing differs from the background",

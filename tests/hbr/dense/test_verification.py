@@ -101,7 +101,9 @@ def test_outcome_follows_from_fit_and_open_set_score(fitted: float, confidence: 
 
 
 @pytest.mark.parametrize("fitted", [0.5, 0.8])
-def test_object_on_a_bench_that_may_be_unchanged_needs_a_better_fit(index: DenseIndex, rule: StoppingRule, fitted: float) -> None:
+def test_object_on_a_bench_that_may_be_unchanged_needs_a_better_fit(
+    index: DenseIndex, rule: StoppingRule, fitted: float
+) -> None:
     for same_bench, least in ((True, FOUND_FROM_SAME_BENCH), (None, FOUND_FROM_SAME_BENCH), (False, FOUND_FROM)):
         session = DenseSession(index, rule)
         session.add(index.views.descriptors[0], 0.0, same_bench=same_bench)

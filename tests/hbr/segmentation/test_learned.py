@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 
-from hbr.descriptors.together import median
+from hbr.segmentation.background import median
 
 
 @given(st.data(), st.integers(1, 10), array_shapes(min_dims=2, max_dims=3, max_side=4))

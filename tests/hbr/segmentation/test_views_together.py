@@ -1,7 +1,9 @@
 """Segmentation of the views of one search together, and the open-set score under changes of the bench."""
 
 from dataclasses import replace
+from importlib import import_module
 
+import cv2
 import numpy as np
 import pytest
 
@@ -10,8 +12,10 @@ from hbr.dense.index import Whitening
 from hbr.dense.leave_one_out import can_shift
 from hbr.descriptors.base import Shift
 from hbr.descriptors.together import like_enrollment
-from hbr.drawing.bench import ENROLLMENT, HARD, MILD, DrawnBench, Visit
-from hbr.segmentation import BoxMethod
+from hbr.drawing.bench import ENROLLMENT, HARD, MILD, DrawnBench, DrawnFrame, Visit
+from hbr.segmentation import BoxMethod, Issue, IssueCode
+from hbr.segmentation.background import shrunk
+from hbr.segmentation.silhouette import Shares
 from sim.objects.shelf import shelf
 from sim.room import room
 
@@ -184,6 +188,63 @@ def test_a_segmentation_by_rotation_is_not_like_the_enrollment(
     method: BoxMethod, same_bench: bool | None, expected: bool | None
 ) -> None:
     assert like_enrollment(method, same_bench) is expected
+
+
+def on_a_visible_platter(count: int) -> list[DrawnFrame]:
+    """Return frames of a printed box on a dark platter before a bright plain backdrop."""
+    bench = DrawnBench(np.full((240, 320, 3), 170, np.float32), np.full((192, 192, 3), 70, np.float32))
+    visit = Visit(bench, ENROLLMENT, np.random.default_rng(0))
+    photograph = np.zeros((128, 128, 3), np.uint8)
+    photograph[30:120, 34:94] = (40, 60, 210)
+    photograph[50:70, 40:80] = (230, 220, 60)
+    return [visit.photograph(photograph, photograph.any(axis=2), 360.0 * n / count) for n in range(count)]
+
+
+@pytest.mark.parametrize("count", [1, 4])
+@pytest.mark.parametrize("several", [False, True])
+def test_a_platter_before_a_plain_backdrop_is_not_part_of_the_object(count: int, several: bool) -> None:
+    drawn = on_a_visible_platter(count)
+    views = hbr.ViewsTogether("edges+colours", several=several)
+    for frame in drawn:
+        views.learn(frame.image)
+    views.revise()
+    by_border = hbr.segment(drawn[0].image)
+    box = cv2.boundingRect(drawn[0].mask.astype(np.uint8))
+    assert by_border.method is BoxMethod.PLAIN_BACKGROUND
+    assert overlap(by_border.box, box) < 0.6
+    assert overlap(views.segmentations[0][0].box, box) > 0.85
+    assert views.reliable is (count > 1)  # one view does not show what rotates
+
+
+def test_a_plain_background_that_the_network_confirms_is_a_known_one() -> None:
+    image = np.full((240, 320, 3), 170, np.uint8)
+    image[80:200, 120:200] = (40, 60, 210)
+    views = hbr.ViewsTogether("edges+colours")
+    assert views.add(image)[0].method is BoxMethod.PLAIN_BACKGROUND
+    assert views.reliable
+
+
+@pytest.mark.parametrize(("platter", "overlaps"), [(0.4, [0.68]), (0.0, [])])
+def test_a_box_that_may_contain_the_platter_is_reported(
+    monkeypatch: pytest.MonkeyPatch, platter: float, overlaps: list[float]
+) -> None:
+    drawn = [frame.image for frame in on_a_visible_platter(2)]
+    share = np.zeros((96, 128), np.float32)
+    share[70:86, 30:98], share[40:80, 50:78] = platter, 0.9
+    monkeypatch.setattr(import_module("hbr.segmentation.segment"), "shares", lambda *_: Shares(share, share))
+    learned = hbr.Background.learned([shrunk(drawn[1])], drawn[1].shape[:2])
+    issues = tuple(Issue(IssueCode.DOUBTFUL_OUTLINE, {"overlap": one}) for one in overlaps)
+    assert hbr.hypotheses(drawn[0], learned=learned, most=1)[0].issues == issues
+
+
+def test_an_object_that_fills_the_frame_does_not_hide_that_the_background_stands_still() -> None:
+    rng = np.random.default_rng(0)
+    first, second = rng.integers(0, 255, (2, 96, 128, 3), np.uint8)
+    for image in (first, second):
+        image[:6], image[:, :6], image[:, -6:] = 150, 150, 150
+    found = hbr.Background.learned([shrunk(second)], (96, 128)).difference(shrunk(first))
+    assert not found.reliable
+    assert found.still
 
 
 def test_two_plain_benches_are_not_known_to_be_one() -> None:
