@@ -48,7 +48,7 @@ def benches(backdrop: str, platter: str) -> list[DrawnBench]:
     """Return benches with a plain or cluttered backdrop, and a plain or marked platter."""
     made: list[DrawnBench] = []
     for number in range(BENCHES):
-        bench = DrawnBench.drawn(np.random.default_rng(number), textured=0.0 if backdrop == "plain" else 1.0)
+        bench = DrawnBench.drawn(np.random.default_rng(number), plain=backdrop == "plain")
         top = np.full_like(bench.top, np.median(bench.top, axis=(0, 1)))
         if platter == "marks":
             rng = np.random.default_rng(100 + number)

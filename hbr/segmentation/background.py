@@ -46,6 +46,12 @@ _CELL_SHARE: Final = 0.6
 #: The empty-table image is used if at least this share of the border cells agree.
 # the right image agrees with 83 % or more of the border, one of another bench with 42 % or less (decision 0012)
 MIN_AGREEMENT: Final = 0.65
+#: Pixels that are compared with the border's colours at once: they fit into the processor's cache.
+_BLOCK: Final = 1024  # with more, BLAS starts threads, which take longer than the comparison
+#: Grey levels by which most pixels of a texture differ from the mean of their neighbours, and how far these are.
+# half of the pixels of plain backdrops and of cloth differ by 0.7 or less, those of drawn textures by 1.1 or more
+_ROUGH: Final = 1.0
+_WITHIN_PX: Final = 4
 #: A learned background is used if at least this share of the frame's edge, of this width, agrees.
 # not of the border's cells, which an object that fills the frame covers: photographs of such objects agree with 58 %
 # of the edge or more, views of a camera that moves around the object with 55 % or less
@@ -181,8 +187,7 @@ class Difference:
     correction: Illumination
     evenly: Floats
     coloured: Floats
-    spread: Floats
-    trust: float
+    background: "Background"
     still: bool
 
     @property
@@ -224,20 +229,31 @@ class Background:
         background = cls.__new__(cls)
         background.shape = shape
         background._set(median(smalls))
-        background._trust = 0.1 * len(smalls)
-        # every second pixel is enough, and takes a quarter of the time
-        apart = [_logarithm(small[::2, ::2]) - background._log[::2, ::2] for small in smalls]
-        apart = [np.abs(one - np.median(one[::3, ::3], axis=(0, 1))) for one in apart]  # without the camera's exposure
-        spread = _largest(cv2.split(np.mean(apart, axis=0, dtype=np.float32)))
-        height, width = background._log.shape[:2]
-        background._spread = np.asarray(cv2.resize(spread, (width, height)), np.float32)
+        background._views = smalls
         return background
 
     def _set(self, small: ImageArray) -> None:
-        self._trust, self._spread = 1.0, np.zeros(small.shape[:2], np.float32)
+        self._views: Sequence[ImageArray] = ()
         self._grey_levels = small
         self._log = _logarithm(small)
         self._useful = _useful(small)
+
+    @property
+    def views(self) -> int:
+        """Number of views that the background was learned from; 0 for an empty-table image."""
+        return len(self._views)
+
+    @cached_property
+    def spread(self) -> Floats:
+        """How much the background changes from view to view, in logarithms, (h, w); 0 for an empty-table image."""
+        height, width = self._log.shape[:2]
+        if not self._views:
+            return np.zeros((height, width), np.float32)
+        # every second pixel is enough, and takes a quarter of the time
+        apart = [_logarithm(small[::2, ::2]) - self._log[::2, ::2] for small in self._views]
+        apart = [np.abs(one - np.median(one[::3, ::3], axis=(0, 1))) for one in apart]  # without the camera's exposure
+        spread = _largest(cv2.split(np.mean(apart, axis=0, dtype=np.float32)))
+        return np.asarray(cv2.resize(spread, (width, height)), np.float32)
 
     @property
     def correction(self) -> Illumination | None:
@@ -267,8 +283,7 @@ class Background:
             Illumination(-slopes),
             evenly,
             coloured,
-            self._spread,
-            self._trust,
+            self,
             bool(edge >= _STILL * (agrees.size - inner.size)),
         )
 
@@ -369,16 +384,15 @@ def from_border(small: ImageArray) -> Floats:
 
     Brightness counts half, because shadows and folds of a cloth change it more than the colour.
     """
-    height, width = small.shape[:2]
     coarse = cv2.resize(small, (16, 12), interpolation=cv2.INTER_AREA)
     border = np.concatenate([coarse[0], coarse[-1], coarse[1:-1, 0], coarse[1:-1, -1]])[None]
-    colours = _opponents(small.reshape(1, -1, 3))
-    near = _opponents(np.ascontiguousarray(border, np.uint8))
-    squares = near @ colours.T
-    squares *= -2
-    squares += np.einsum("nc,nc->n", near, near)[:, None]
-    nearest = squares.min(axis=0) + np.einsum("nc,nc->n", colours, colours)
-    distances: Floats = np.sqrt(np.maximum(nearest, 0)).reshape(height, width)
+    colours, near = _opponents(small), _opponents(np.ascontiguousarray(border, np.uint8))
+    own = np.einsum("nc,nc->n", near, near)[:, None]
+    squares = np.einsum("nc,nc->n", colours, colours)
+    for start in range(0, len(colours), _BLOCK):
+        block = np.s_[start : start + _BLOCK]
+        squares[block] += (own - 2 * (near @ colours[block].T)).min(axis=0)
+    distances: Floats = np.sqrt(np.maximum(squares, 0)).reshape(small.shape[:2])
     return distances
 
 
@@ -396,7 +410,7 @@ def border_cells(image: NDArray[Any]) -> list[NDArray[Any]]:
 def _texture(logarithms: Floats) -> Floats:
     """Return the differences of brightness within a few pixels, (h, w)."""
     grey = cv2.transform(logarithms, np.full((1, 3), 1 / 3, np.float32))
-    return np.asarray(grey - cv2.GaussianBlur(grey, (0, 0), 4), np.float32)
+    return np.asarray(grey - cv2.GaussianBlur(grey, (0, 0), _WITHIN_PX), np.float32)
 
 
 def _same_texture(a: NDArray[Any], b: NDArray[Any]) -> bool:
@@ -566,6 +580,13 @@ class SegmentedFrame:
         if self._compared is None or self._compared[0] is not background:
             self._compared = background, background.difference(self.small)
         return self._compared[1]
+
+    @cached_property
+    def textured(self) -> bool:
+        """Whether the background has texture: at most one cell of the border has none."""
+        grey = cv2.cvtColor(self.small, cv2.COLOR_BGR2GRAY).astype(np.float32)
+        rough = cv2.absdiff(grey, cv2.GaussianBlur(grey, (0, 0), _WITHIN_PX)) > _ROUGH
+        return sorted(int(np.count_nonzero(cell)) / cell.size for cell in border_cells(rough))[1] >= 0.5
 
     @cached_property
     def differs(self) -> Mask | None:

@@ -11,13 +11,13 @@ from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hbr.core.arrays import ImageArray
 from hbr.segmentation.background import (
     Background,
     BoxMethod,
     Difference,
+    Floats,
     Illumination,
     Issue,
     IssueCode,
@@ -27,9 +27,13 @@ from hbr.segmentation.background import (
 from hbr.segmentation.cut_out import Box, Found, Segmentation
 from hbr.segmentation.silhouette import guess_object, shares, silhouette
 
-#: Probabilities above which a pixel belongs to the object: of the first segmentation, and of further ones.
-# the first is low: where an object looks the same from all sides, it is part of a learned background, and less probable
-_LEVELS: Final = (0.25, 0.5, 0.8)
+#: Probabilities above which a pixel belongs to the object, of the first segmentation and of further ones: before a
+#: texture, and before a plain background.
+_BEFORE_TEXTURE: Final = (0.5, 0.2, 0.8)
+_BEFORE_PLAIN: Final = (0.25, 0.5, 0.8)
+#: The same of an enrolled view with a learned background: where an object looks the same from all sides, it is part of
+#: that background, and less probable.
+_ENROLLED: Final = (0.25,)
 #: A smaller expected overlap is reported.
 _DOUBTFUL: Final = 0.7
 #: Smallest overlap of two boxes that count as one.
@@ -168,15 +172,17 @@ def hypotheses(
         if seen is None or not seen.still:
             method, seen = BoxMethod.NETWORK, None
     rotated = method is BoxMethod.ROTATION
-    share = shares(frame.small, seen).object
+    share = shares(frame.small, seen, textured=frame.textured).object
     like = _found(frame, background, difference, guess=not rotated)
-    found: list[Segmentation | Found] = [*_by_network(share, method, like, _LEVELS[: most if rotated else 1])]
+    levels = (_levels(frame) if most > 1 else _ENROLLED) if rotated else _levels(frame)[:1]
+    found: list[Segmentation | Found] = [*_by_network(share, method, like, levels)]
     if like.box is not None:
-        confirmed = not found or (not rotated and (like.method is BoxMethod.GUESS or _same(like, found[0])))
-        found.insert(0 if confirmed else len(found), like)
+        sure = like.method is BoxMethod.GUESS or (like.method is BoxMethod.EMPTY_TABLE and most > 1)
+        first = not found or (not rotated and (sure or _same(like, found[0])))
+        found.insert(0 if first else len(found), like)
     if rotated and most > 1:
         by_itself = None if alone is None else alone()
-        found += by_itself or _by_network(shares(frame.small).object, BoxMethod.NETWORK, like)
+        found += by_itself or _alone(frame, like)
     if not found:
         nothing = (Issue(IssueCode.NO_OBJECT),) if rotated else ()
         found = [replace(like, method=BoxMethod.NONE, issues=(*like.issues, *nothing))]
@@ -191,7 +197,7 @@ def hypotheses(
     return tuple(map(_cut_out, several[:most]))
 
 
-def _expected(found: Mask | None, share: NDArray[np.float32]) -> float:
+def _expected(found: Mask | None, share: Floats) -> float:
     """Return the expected overlap of a silhouette with the object, by the probability of each pixel; 0 without one."""
     if found is None:
         return 0.0
@@ -206,23 +212,23 @@ def _cut_out(found: Segmentation | Found) -> Segmentation:
 def without_background(frame: SegmentedFrame) -> tuple[Found, ...]:
     """Return the guess and the network's silhouette of a frame, if they found an object."""
     guess = _found(frame, None, None)
-    return (
-        *([] if guess.box is None else [guess]),
-        *_by_network(shares(frame.small).object, BoxMethod.NETWORK, guess),
-    )
+    return (*([] if guess.box is None else [guess]), *_alone(frame, guess))
 
 
-def _by_network(
-    share: NDArray[np.float32], method: BoxMethod, like: Found, levels: tuple[float, ...] = _LEVELS[:1]
-) -> list[Found]:
+def _alone(frame: SegmentedFrame, like: Found) -> list[Found]:
+    """Return the network's silhouette of a frame whose background is not known."""
+    share = shares(frame.small, textured=frame.textured).object
+    return _by_network(share, BoxMethod.NETWORK, like, _levels(frame)[:1])
+
+
+def _levels(frame: SegmentedFrame) -> tuple[float, ...]:
+    return _BEFORE_TEXTURE if frame.textured else _BEFORE_PLAIN
+
+
+def _by_network(share: Floats, method: BoxMethod, like: Found, levels: tuple[float, ...]) -> list[Found]:
     """Return the silhouettes at these probabilities, with the illumination and the evidence of another one."""
-    masks = [mask for level in levels if (mask := _object_in(share, level)) is not None]
+    masks = [mask for level in levels if (mask := silhouette(share > level, framed=False)) is not None]
     return [replace(like, silhouette=mask, method=method) for mask in masks]
-
-
-def _object_in(share: NDArray[np.float32], level: float = _LEVELS[0]) -> Mask | None:
-    """Return the object's silhouette where its probability is above a level."""
-    return silhouette(share > level, framed=False)
 
 
 def _same(a: Segmentation | Found, b: Segmentation | Found) -> bool:

@@ -1,14 +1,15 @@
 """The object's silhouette: from the pixels that differ from the background, by its colours, or by a neural network.
 
-The small network labels the object, the platter, and everything else. It sees a small frame and, where the background
+A small network labels the object, the platter, and everything else. It sees a small frame and, where the background
 is known, the frame's difference from it. The background is known from the empty-table image, or was learned while the
-table rotated. The weights are in the wheel. The model card says how they were made:
+table rotated. Before a plain background another network finds more: it also sees how much the background changes from
+view to view, and the colours of the border. The weights are in the wheel. The model card says how they were made:
 docs/explanation/segmentation-network.md.
 
 Decision: docs/decisions/0013.
 """
 
-from functools import cache, lru_cache
+from functools import cache, lru_cache, partial
 from importlib.resources import files
 from typing import Any, Final, NamedTuple
 
@@ -207,12 +208,14 @@ def _prior(height: int, width: int) -> NDArray[np.float32]:
 #: Size of the network's input.
 WIDTH: Final = 128
 HEIGHT: Final = 96  # a change of the size needs another training of the network
-WEIGHTS: Final = "network.onnx"
 #: Scales of the input's planes, in logarithms: brightness, colour, spread, and distance from the border's colours.
 _EVENLY: Final = 1.0
 _COLOURED: Final = 0.7  # smaller than `_EVENLY`, because shadows change the brightness more than the colour
 _SPREAD_SCALE: Final = 0.5
 _FROM_BORDER: Final = 1.0
+#: Trust in a background that was learned from other views, of each network; 1 for an empty-table image.
+_LEARNED: Final = 0.5  # less than an image that was taken for this purpose, more than none
+_OF_A_VIEW: Final = 0.1  # for each of the views
 
 
 class Shares(NamedTuple):
@@ -222,32 +225,44 @@ class Shares(NamedTuple):
     platter: Floats
 
 
-def shares(small: ImageArray, difference: Difference | None = None) -> Shares:
+def shares(small: ImageArray, difference: Difference | None = None, *, textured: bool) -> Shares:
     """Return where a small frame, as `hbr.segmentation.background.shrunk` returns it, shows the object and the platter.
 
-    ``difference`` is the frame's from its background, if that is known.
+    ``difference`` is the frame's from its background, if that is known; ``textured`` says whether that has texture.
     """
     height, width = small.shape[:2]
-    found = [1 / (1 + cv2.exp(-plane)) for plane in _NET(planes(small, difference)[None])[0]]
+    shown = _shown(small, difference)
+    logits = _BEFORE_TEXTURE(shown) if textured else _BEFORE_PLAIN(_with_context(shown, small, difference))
+    found = [1 / (1 + cv2.exp(-plane)) for plane in logits[0]]
     if (height, width) != (HEIGHT, WIDTH):
         found = [cv2.resize(share, (width, height), interpolation=cv2.INTER_LINEAR) for share in found]
     return Shares(*(np.asarray(share, np.float32) for share in found))
 
 
-def planes(small: ImageArray, difference: Difference | None) -> Floats:
-    """Return the network's input for a small frame, float32 (10, HEIGHT, WIDTH)."""
-    found = np.zeros((10, HEIGHT, WIDTH), np.float32)
-    found[:3] = _sized(small).transpose(2, 0, 1)
-    found[:3] *= np.float32(1 / 255)
-    found[:3] -= np.float32(0.5)
-    found[3:5] = _places()
-    found[5] = np.minimum(_sized(from_border(small)) * np.float32(1 / _FROM_BORDER), 1)
+def _shown(small: ImageArray, difference: Difference | None) -> Floats:
+    """Return the input of the network for textures, float32 (1, 8, HEIGHT, WIDTH)."""
+    planes = np.zeros((1, 8, HEIGHT, WIDTH), np.float32)
+    planes[0, :3] = _sized(small).transpose(2, 0, 1)
+    planes[0, :3] *= np.float32(1 / 255)
+    planes[0, :3] -= np.float32(0.5)
+    planes[0, 3:5] = _places()
     if difference is not None:
-        found[6] = np.clip(_sized(difference.evenly) * np.float32(1 / _EVENLY), -1, 1)
-        found[7] = np.minimum(_sized(difference.coloured) * np.float32(1 / _COLOURED), 1)
-        found[8] = np.minimum(_sized(difference.spread) * np.float32(1 / _SPREAD_SCALE), 1)
-        found[9] = difference.trust
-    return found
+        planes[0, 5] = np.clip(_sized(difference.evenly) * np.float32(1 / _EVENLY), -1, 1)
+        planes[0, 6] = np.minimum(_sized(difference.coloured) * np.float32(1 / _COLOURED), 1)
+        planes[0, 7] = _LEARNED if difference.background.views else 1.0
+    return planes
+
+
+def _with_context(shown: Floats, small: ImageArray, difference: Difference | None) -> Floats:
+    """Return the input of the network for plain backgrounds, float32 (1, 10, HEIGHT, WIDTH)."""
+    planes = np.zeros((1, 10, HEIGHT, WIDTH), np.float32)
+    planes[0, :5], planes[0, 6:8] = shown[0, :5], shown[0, 5:7]
+    planes[0, 5] = np.minimum(_sized(from_border(small)) * np.float32(1 / _FROM_BORDER), 1)
+    if difference is not None:
+        background = difference.background
+        planes[0, 8] = np.minimum(_sized(background.spread) * np.float32(1 / _SPREAD_SCALE), 1)
+        planes[0, 9] = _OF_A_VIEW * background.views or 1.0
+    return planes
 
 
 def _sized(plane: NDArray[Any]) -> NDArray[Any]:
@@ -263,9 +278,9 @@ def _places() -> Floats:
     return np.stack([x, y]).astype(np.float32)
 
 
-@cache
-def _weights() -> bytes:
-    return files("hbr.segmentation").joinpath(WEIGHTS).read_bytes()
+def _weights(name: str) -> bytes:
+    return files("hbr.segmentation").joinpath(name).read_bytes()
 
 
-_NET: Final = SharedNet(_weights)
+_BEFORE_TEXTURE: Final = SharedNet(partial(_weights, "network.onnx"))
+_BEFORE_PLAIN: Final = SharedNet(partial(_weights, "network-plain.onnx"))

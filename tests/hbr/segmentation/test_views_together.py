@@ -231,7 +231,7 @@ def test_a_box_that_may_contain_the_platter_is_reported(
     drawn = [frame.image for frame in on_a_visible_platter(2)]
     share = np.zeros((96, 128), np.float32)
     share[70:86, 30:98], share[40:80, 50:78] = platter, 0.9
-    monkeypatch.setattr(import_module("hbr.segmentation.segment"), "shares", lambda *_: Shares(share, share))
+    monkeypatch.setattr(import_module("hbr.segmentation.segment"), "shares", lambda *_, **__: Shares(share, share))
     learned = hbr.Background.learned([shrunk(drawn[1])], drawn[1].shape[:2])
     issues = tuple(Issue(IssueCode.DOUBTFUL_OUTLINE, {"overlap": one}) for one in overlaps)
     assert hbr.hypotheses(drawn[0], learned=learned, most=1)[0].issues == issues
