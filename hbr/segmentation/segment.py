@@ -187,7 +187,7 @@ def hypotheses(
         nothing = (Issue(IssueCode.NO_OBJECT),) if rotated else ()
         found = [replace(like, method=BoxMethod.NONE, issues=(*like.issues, *nothing))]
     overlap = _expected(found[0].silhouette, share)
-    if found[0].method is not BoxMethod.GUESS and 0 < overlap < _DOUBTFUL:
+    if found[0].method not in (BoxMethod.EMPTY_TABLE, BoxMethod.GUESS) and 0 < overlap < _DOUBTFUL:
         issue = Issue(IssueCode.DOUBTFUL_OUTLINE, {"overlap": round(overlap, 2)})
         found[0] = replace(found[0], issues=(*found[0].issues, issue))
     several: list[Segmentation | Found] = []
