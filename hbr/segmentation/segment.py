@@ -178,7 +178,7 @@ def hypotheses(
     found: list[Segmentation | Found] = [*_by_network(share, method, like, levels)]
     if like.box is not None:
         sure = like.method is BoxMethod.GUESS or (like.method is BoxMethod.EMPTY_TABLE and most > 1)
-        first = not found or (not rotated and (sure or _same(like, found[0])))
+        first = not found or (not rotated and sure) or _same(like, found[0])
         found.insert(0 if first else len(found), like)
     if rotated and most > 1:
         by_itself = None if alone is None else alone()
