@@ -26,6 +26,8 @@ Floats = NDArray[np.float32]
 
 #: Longer side of the images that are compared.
 SIDE_PX: Final = 128  # larger: thinner objects are seen, and the time of each frame grows with the square
+#: Smallest share of the frame that an object takes.
+LEAST: Final = 0.004
 #: Step between the pixels that a plane is fitted to.
 _EVERY: Final = 5  # a plane has three parameters: a pixel in 25 is enough, and 25 times as fast
 #: Number that is added to grey levels before the logarithm, because noise dominates below it.
@@ -57,11 +59,10 @@ _WITHIN_PX: Final = 4
 # of the edge or more, views of a camera that moves around the object with 55 % or less
 _STILL: Final = 0.57
 _EDGE_PX: Final = 4
-#: More than this share of the border's cells must show the same texture to prove that two images show one bench.
-_PROOF: Final = 0.5  # a horizon and the platter's rim, which many benches have in the same places, reach half of them
-#: Smallest contrast of a texture, as a standard deviation of logarithms, and smallest correlation of equal textures.
+#: At least this share of the border's cells needs texture to prove that two images show different benches.
+_PROOF: Final = 0.5  # a horizon and the platter's rim reach half of them
+#: Smallest contrast of a texture, as a standard deviation of logarithms.
 _CONTRAST: Final = 0.02  # twice the noise
-_CORRELATION: Final = 0.6
 #: Largest difference between the border cells of a plain backdrop, and its largest distance from grey, in logarithms.
 _PLAIN: Final = 0.12  # larger: a coloured wall counts as plain, and its colour is corrected away
 _NEAR_GREY: Final = 0.35  # a factor of 1.4 between two channels: with more, the backdrop itself is coloured
@@ -113,7 +114,7 @@ class IssueCode(StrEnum):
     NO_GUESS = "no-guess"
     """No part of the frame stands out by its colours."""
     NO_DIFFERENCE = "no-difference"
-    """Nothing differs from the plain background."""
+    """Nothing differs from the background: the empty-table image, or a plain one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -195,6 +196,11 @@ class Difference:
         """Whether the frame's border looks like the empty-table image."""
         return self.agreement >= MIN_AGREEMENT
 
+    @property
+    def is_enough(self) -> bool:
+        """Whether as many pixels differ as an object has."""
+        return int(np.count_nonzero(self.certain | self.possible)) >= LEAST * self.certain.size
+
 
 class Background:
     """An empty-table image, prepared for comparison with many frames.
@@ -255,6 +261,11 @@ class Background:
         spread = _largest(cv2.split(np.mean(apart, axis=0, dtype=np.float32)))
         return np.asarray(cv2.resize(spread, (width, height)), np.float32)
 
+    @cached_property
+    def differs(self) -> Mask | None:
+        """Where the small image differs from a plain background, (h, w); None if it is not plain."""
+        return plain_difference(self._grey_levels)
+
     @property
     def correction(self) -> Illumination | None:
         """The correction that makes a plain backdrop grey; None if its colour is too far from grey."""
@@ -303,19 +314,17 @@ class Background:
             _largest([np.abs(part) for part in residual]) < _AGREES,
         )
 
-    def shows_same_bench(self, image_bgr: ImageArray) -> bool | None:
-        """Return whether another image, uint8 (H, W, 3), shows the same bench in any light; None: not known.
+    def shows_another_bench(self, empty_bgr: ImageArray) -> bool:
+        """Return whether another empty-table image, uint8 (H, W, 3), certainly shows another bench, in any light.
 
-        Only the border counts: an object may stand on the table in both images. If the two agree, but have too little
-        texture in common, they may show two plain benches.
+        Only the border counts. A border without texture proves nothing: the same backdrop may have another shade, or
+        another part of it may be in the picture.
         """
-        if image_bgr.shape[:2] != self.shape:
-            return None
-        small = shrunk(image_bgr)
-        if not self.difference(small).reliable:
+        if empty_bgr.shape[:2] != self.shape:
             return False
-        pairs = zip(*(border_cells(_texture(one)) for one in (self._log, _logarithm(small))), strict=True)
-        return True if sum(_same_texture(*pair) for pair in pairs) > _PROOF * len(_BORDER) else None
+        small = shrunk(empty_bgr)
+        textured = min(_textured_cells(self._log), _textured_cells(_logarithm(small)))
+        return textured >= _PROOF * len(_BORDER) and not self.difference(small).reliable
 
     def whole_correction(self, difference: Difference) -> Illumination:
         """Return the correction of a frame to the light of this image, and to a plain grey backdrop if it shows one."""
@@ -407,15 +416,11 @@ def border_cells(image: NDArray[Any]) -> list[NDArray[Any]]:
     return [image[rows[y] : rows[y + 1], columns[x] : columns[x + 1]] for y, x in _BORDER]
 
 
-def _texture(logarithms: Floats) -> Floats:
-    """Return the differences of brightness within a few pixels, (h, w)."""
+def _textured_cells(logarithms: Floats) -> int:
+    """Return the number of border cells with differences of brightness within a few pixels."""
     grey = cv2.transform(logarithms, np.full((1, 3), 1 / 3, np.float32))
-    return np.asarray(grey - cv2.GaussianBlur(grey, (0, 0), _WITHIN_PX), np.float32)
-
-
-def _same_texture(a: NDArray[Any], b: NDArray[Any]) -> bool:
-    correlation = np.vdot(a, b) / max(1e-9, float(np.linalg.norm(a) * np.linalg.norm(b)))
-    return bool(a.std() > _CONTRAST and correlation > _CORRELATION)
+    within = np.asarray(grey - cv2.GaussianBlur(grey, (0, 0), _WITHIN_PX), np.float32)
+    return sum(float(cell.std()) > _CONTRAST for cell in border_cells(within))
 
 
 @lru_cache

@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Final
 
+import cv2
 import numpy as np
 
 from hbr.core.arrays import ImageArray
@@ -34,6 +35,19 @@ _BEFORE_PLAIN: Final = (0.25, 0.5, 0.8)
 #: The same of an enrolled view with a learned background: where an object looks the same from all sides, it is part of
 #: that background, and less probable.
 _ENROLLED: Final = (0.25,)
+#: Of a silhouette that the network finds, at least this share differs from the background,
+# 8 % or more of drawn objects whose sides look alike; 1 % or less where the drawn plain table is empty
+_SUPPORT: Final = 0.05
+#: or the network is so sure of so much of the frame: a ball does not change while it rotates.
+# 4 % or more of frames with drawn objects, 1.2 % or less of those of the empty plain table
+_SURE: Final = 0.85
+_SURE_OF: Final = 0.02
+#: Still parts count if the mean probability of the object is this, without the rotation.
+_STILL_FROM: Final = 0.25
+#: Still parts count if they make a silhouette this much larger.
+_MORE: Final = 1.2
+#: A part is the platter, or the object of other views, if the mean of its pixels is more than this.
+_MOST: Final = 0.5
 #: A smaller expected overlap is reported.
 _DOUBTFUL: Final = 0.7
 #: Smallest overlap of two boxes that count as one.
@@ -103,15 +117,19 @@ def _found(
     correction: Illumination | None = None
     found: Mask | None = None
     method = BoxMethod.EMPTY_TABLE
+    empty = False
     if background is not None and difference is not None:
         if difference.reliable:
             found = silhouette(difference.certain, difference.possible, framed=True)
+            empty = found is None and not difference.is_enough
             correction = background.whole_correction(difference)
             if background.issue is not None:
                 issues.append(Issue(background.issue))
         else:
             issues.append(Issue(IssueCode.TABLE_DIFFERS, {"agreement": round(difference.agreement, 3)}))
-    if found is None:
+    if empty:
+        issues.append(Issue(IssueCode.NO_DIFFERENCE))
+    elif found is None:
         if frame.differs is not None:
             method = BoxMethod.PLAIN_BACKGROUND
             found = silhouette(frame.differs, framed=False)
@@ -172,15 +190,21 @@ def hypotheses(
         if seen is None or not seen.still:
             method, seen = BoxMethod.NETWORK, None
     rotated = method is BoxMethod.ROTATION
-    share = shares(frame.small, seen, textured=frame.textured).object
+    share, platter = shares(frame.small, seen, textured=frame.textured)
     like = _found(frame, background, difference, guess=not rotated)
     levels = (_levels(frame) if most > 1 else _ENROLLED) if rotated else _levels(frame)[:1]
-    found: list[Segmentation | Found] = [*_by_network(share, method, like, levels)]
-    if like.box is not None:
+    found: list[Segmentation | Found] = []
+    if by_network := _by_network(share, method, like, levels):
+        found += by_network if _is_there(frame, share > min(levels), share, seen) else []
+    if rotated and found and (whole := _with_still_parts(by_network[0], like, platter)) is not None:
+        found.insert(0, whole)
+    only_platter = rotated and not found and like.silhouette is not None and _mean(platter, like.silhouette) > _MOST
+    if like.box is not None and not only_platter:
         sure = like.method is BoxMethod.GUESS or (like.method is BoxMethod.EMPTY_TABLE and most > 1)
-        first = not found or (not rotated and sure) or _same(like, found[0])
+        first = not found or (not rotated and sure) or _same(like, found[0]) or _is_whole(like, found[0], platter)
         found.insert(0 if first else len(found), like)
-    if rotated and most > 1:
+    # before a plain background, what the rotation does not show is not there
+    if rotated and most > 1 and (found or frame.differs is None):
         by_itself = None if alone is None else alone()
         found += by_itself or _alone(frame, like)
     if not found:
@@ -195,6 +219,59 @@ def hypotheses(
         if not any(_same(other, one) for other in several):
             several.append(one)
     return tuple(map(_cut_out, several[:most]))
+
+
+def _is_there(frame: SegmentedFrame, mask: Mask, share: Floats, seen: Difference | None) -> bool:
+    """Return whether more than the network shows that there is something where it finds an object."""
+    if seen is None:
+        return frame.differs is None or _mean(frame.differs, mask) >= _SUPPORT
+    rotated = seen.background.views > 0
+    if _mean(seen.certain | seen.possible, mask) < _SUPPORT:
+        return rotated and int(np.count_nonzero(share > _SURE)) >= _SURE_OF * share.size
+    if not rotated or frame.differs is None or _mean(frame.differs, mask) > _MOST:
+        return True
+    # the other views show an object there, this one its background
+    others = seen.background.differs
+    return others is None or _mean(others & ~frame.differs, mask) <= _MOST
+
+
+def _is_whole(like: Found, found: Segmentation | Found, platter: Floats) -> bool:
+    """Return whether all that differs from a plain background is the object, of which the network finds a part.
+
+    The rest is then not the platter, and nothing reaches into the frame: a shadow or clutter at one of its sides.
+    """
+    if like.method is not BoxMethod.PLAIN_BACKGROUND or like.silhouette is None or found.silhouette is None:
+        return False
+    whole = like.silhouette
+    left, right, top, bottom = whole[:, 0].any(), whole[:, -1].any(), whole[0].any(), whole[-1].any()
+    fills = (left and right) or (top and bottom)
+    rest = whole & ~found.silhouette
+    return bool(fills or not (left or right or top or bottom)) and not (rest.any() and _mean(platter, rest) > _MOST)
+
+
+def _with_still_parts(found: Found, like: Found, platter: Floats) -> Found | None:
+    """Return a silhouette with all that differs from a plain border around it, if that is more; without the platter.
+
+    An even surface of revolution, such as the glass of a bottle, looks still while it rotates. So the network, which
+    then sees this frame alone, must take it for the object.
+    """
+    if like.method is not BoxMethod.PLAIN_BACKGROUND or like.silhouette is None or found.silhouette is None:
+        return None
+    rest = like.silhouette & (platter < _MOST)
+    _, labels = cv2.connectedComponents(rest.astype(np.uint8))
+    own = np.unique(labels[found.silhouette & rest])
+    whole = np.isin(labels, own[own > 0]) | found.silhouette
+    added = whole & ~found.silhouette
+    if np.count_nonzero(added) < (_MORE - 1) * np.count_nonzero(found.silhouette):
+        return None
+    frame = found.frame
+    if _mean(shares(frame.small, textured=frame.textured).object, added) < _STILL_FROM:
+        return None
+    return replace(found, silhouette=silhouette(whole, framed=False))
+
+
+def _mean(values: Floats | Mask, mask: Mask) -> float:
+    return float(values[mask].mean())
 
 
 def _expected(found: Mask | None, share: Floats) -> float:

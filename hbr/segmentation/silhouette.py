@@ -19,12 +19,10 @@ from numpy.typing import NDArray
 
 from hbr.core.arrays import ImageArray
 from hbr.core.nets import Floats, SharedNet
-from hbr.segmentation.background import Difference, Mask, from_border
+from hbr.segmentation.background import LEAST, Difference, Mask, from_border
 
 Binary = NDArray[np.uint8]
 
-#: Smallest share of the frame that an object takes.
-_LEAST: Final = 0.004
 #: Another part belongs to the object if it has this share of the largest part's area.
 _PART: Final = 0.08
 #: and, if something may reach into the frame, is so near.
@@ -84,21 +82,26 @@ def _opened(mask: Binary, radius: int) -> Binary:
 
 def _main_parts(mask: Binary, *, framed: bool) -> Binary | None:
     """Return the largest part and those close to it; None if a part that touches the border is much larger."""
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask)
-    if count < 2:
+    left, top, across, down = cv2.boundingRect(mask)
+    if not across:
         return None
+    within = np.s_[top : top + down, left : left + across]
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(mask[within])
+    stats[:, :2] += left, top
     height, width = mask.shape
     x, y, w, h, area = stats[1:].T
     outside = framed & ((x == 0) | (y == 0) | (x + w == width) | (y + h == height))
     inner, outer = np.where(outside, 0, area), np.where(outside, area, 0)
     largest = int(inner.argmax())
-    if inner[largest] < max(_LEAST * mask.size, _OF_BORDER * outer.max()):
+    if inner[largest] < max(LEAST * mask.size, _OF_BORDER * outer.max()):
         return None
     keep = inner > _PART * inner[largest]
     if framed:
         keep &= _near(stats[1:], largest, _NEAR_PX)
     chosen = 1 + np.flatnonzero(keep)
-    return (labels == chosen[0] if len(chosen) == 1 else np.isin(labels, chosen)).view(np.uint8)
+    parts = np.zeros_like(mask)
+    parts[within] = labels == chosen[0] if len(chosen) == 1 else np.isin(labels, chosen)
+    return parts
 
 
 def _near(stats: cv2.typing.MatLike, main: int, px: int) -> Mask:
@@ -112,11 +115,14 @@ def _near(stats: cv2.typing.MatLike, main: int, px: int) -> Mask:
 def _filled(mask: Binary) -> Mask:
     margin = 12  # so that closing does not see the frame's border as background
     height, width = mask.shape
-    wide = cv2.copyMakeBorder(mask, margin, margin, margin, margin, cv2.BORDER_CONSTANT)
-    closed = cv2.morphologyEx(wide, cv2.MORPH_CLOSE, _disc(8)).astype(np.uint8, copy=False)
+    left, top, across, down = cv2.boundingRect(mask)
+    part = mask[top : top + down, left : left + across]  # closing adds nothing outside the box
+    closed = cv2.copyMakeBorder(part, margin, margin, margin, margin, cv2.BORDER_CONSTANT)
+    closed = cv2.morphologyEx(closed, cv2.MORPH_CLOSE, _disc(8)).astype(np.uint8, copy=False)
     contours, _ = cv2.findContours(closed, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     cv2.drawContours(closed, contours, -1, (1,), -1)
-    filled: Mask = closed[margin : margin + height, margin : margin + width] > 0
+    filled = np.zeros((height, width), np.bool_)
+    filled[top : top + down, left : left + across] = closed[margin:-margin, margin:-margin]
     return filled
 
 
@@ -232,11 +238,23 @@ def shares(small: ImageArray, difference: Difference | None = None, *, textured:
     """
     height, width = small.shape[:2]
     shown = _shown(small, difference)
-    logits = _BEFORE_TEXTURE(shown) if textured else _BEFORE_PLAIN(_with_context(shown, small, difference))
+    logits = (
+        _interleaved(_BEFORE_TEXTURE(shown)) if textured else _BEFORE_PLAIN(_with_context(shown, small, difference))
+    )
     found = [1 / (1 + cv2.exp(-plane)) for plane in logits[0]]
     if (height, width) != (HEIGHT, WIDTH):
         found = [cv2.resize(share, (width, height), interpolation=cv2.INTER_LINEAR) for share in found]
     return Shares(*(np.asarray(share, np.float32) for share in found))
+
+
+def _interleaved(fourfold: Floats) -> Floats:
+    """Return the planes (1, n, 2 h, 2 w), of whose pixels the network computes each fourth one: (1, 4 n, h, w).
+
+    The last layer is a convolution: OpenCV takes three times as long for the transposed one that was trained.
+    """
+    _, planes, height, width = fourfold.shape
+    apart = fourfold.reshape(planes // 4, 2, 2, height, width)
+    return apart.transpose(0, 3, 1, 4, 2).reshape(1, planes // 4, 2 * height, 2 * width)
 
 
 def _shown(small: ImageArray, difference: Difference | None) -> Floats:

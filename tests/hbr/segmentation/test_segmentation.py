@@ -153,8 +153,8 @@ def test_frames_of_noise_and_of_flat_colours_are_described() -> None:
         blots = cv2.resize(noise[:4, :5], size[::-1], interpolation=cv2.INTER_NEAREST)
         for image in (noise, blots):
             for table_image in (None, noise, np.zeros_like(noise), np.full_like(noise, 255)):
-                levels = hbr.describe(image, descriptor="edges+colours", empty_table=table_image)
-                assert hbr.descriptor("edges+colours").similarity(levels[None], levels[None]) == pytest.approx(1)
+                levels = hbr.describe(image, descriptor="edges+colours+cedd", empty_table=table_image)
+                assert hbr.descriptor("edges+colours+cedd").similarity(levels[None], levels[None]) == pytest.approx(1)
 
 
 def test_objects_are_scaled_to_the_same_size() -> None:
@@ -198,21 +198,21 @@ def test_uniform_frames_of_any_size_are_described(size: tuple[int, int], value: 
     for table_image in (None, image):
         seen = segment(image, empty_table=table_image)
         assert seen.crop.shape == (CROP_PX, CROP_PX, 3)
-        for name in ("edges+colours", "cedd+colours"):
+        for name in ("edges+colours+cedd", "cedd+colours"):
             assert hbr.descriptor(name).describe(seen).shape == (hbr.descriptor(name).length,)
 
 
 def test_describe_segments_for_descriptors_of_the_object() -> None:
     empty = table(3, patterned=True)
     image = with_object(empty)
-    levels = hbr.describe(image, descriptor="edges+colours", empty_table=empty)
-    again = hbr.descriptor("edges+colours").describe(segment(image, empty_table=Background(empty)))
+    levels = hbr.describe(image, descriptor="edges+colours+cedd", empty_table=empty)
+    again = hbr.descriptor("edges+colours+cedd").describe(segment(image, empty_table=Background(empty)))
     np.testing.assert_array_equal(levels, again)
     np.testing.assert_array_equal(hbr.describe(image), hbr.descriptor("cedd").describe(image))
 
 
-def test_bench_descriptor_is_robust_to_illumination_and_background() -> None:
-    own = hbr.descriptor("edges+colours")
+def test_edges_and_colours_are_robust_to_illumination_and_background() -> None:
+    own = hbr.descriptor("edges=0.5,colours=0.5")
     empty, other = table(3), table(6, patterned=True)
     first = hbr.describe(with_object(empty), descriptor=own, empty_table=empty)
     moved = with_object(other, (150, 90, 54, 99))
@@ -231,8 +231,8 @@ def test_code_of_the_descriptors_page_runs(monkeypatch: pytest.MonkeyPatch) -> N
     parts = []
     for j in range(3):
         shown = [with_object(empty, (100 + 4 * j + i, 60, 60 + 10 * j, 110)) for i in range(6)]
-        levels = [hbr.describe(image, descriptor="edges+colours", empty_table=empty) for image in shown]
-        parts.append(hbr.Views.of_object(f"object {j}", np.stack(levels), np.arange(6) * 60.0, "edges+colours"))
+        levels = [hbr.describe(image, descriptor="edges+colours+cedd", empty_table=empty) for image in shown]
+        parts.append(hbr.Views.of_object(f"object {j}", np.stack(levels), np.arange(6) * 60.0, "edges+colours+cedd"))
     known: dict[str, Any] = {
         "frame": with_object(empty),
         "views": hbr.Views.concatenate(parts),

@@ -1,6 +1,5 @@
-"""Segmentation of the views of one search together, and the open-set score under changes of the bench."""
+"""Segmentation of the views of one search together."""
 
-from dataclasses import replace
 from importlib import import_module
 
 import cv2
@@ -8,18 +7,13 @@ import numpy as np
 import pytest
 
 import hbr
-from hbr.dense.index import Whitening
-from hbr.dense.leave_one_out import can_shift
-from hbr.descriptors.base import Shift
-from hbr.descriptors.together import like_enrollment
-from hbr.drawing.bench import ENROLLMENT, HARD, MILD, DrawnBench, DrawnFrame, Visit
+from hbr.drawing.bench import ENROLLMENT, HARD, DrawnBench, DrawnFrame, Visit
 from hbr.segmentation import BoxMethod, Issue, IssueCode
 from hbr.segmentation.background import shrunk
 from hbr.segmentation.silhouette import Shares
 from sim.objects.shelf import shelf
 from sim.room import room
-
-NAMES = tuple("abcdefghij")
+from tests.hbr.dense.searches import LIGHT, catalog
 
 
 def frames(count: int) -> tuple[list[np.ndarray], np.ndarray, list[tuple[int, int, int, int]]]:
@@ -47,7 +41,7 @@ def overlap(a: tuple[int, ...], b: tuple[int, ...]) -> float:
 
 def test_further_views_revise_the_segmentation_of_earlier_ones() -> None:
     images, _, boxes = frames(3)
-    views = hbr.ViewsTogether("edges+colours")
+    views = hbr.ViewsTogether("edges+colours+cedd")
     views.add(images[0])
     assert views.segmentations[0][0].method is BoxMethod.GUESS
     for image in images[1:]:
@@ -59,7 +53,7 @@ def test_further_views_revise_the_segmentation_of_earlier_ones() -> None:
 
 def test_surroundings_that_change_with_the_view_are_not_learned() -> None:
     """A camera that orbits the object sees other surroundings in each view: each view is segmented alone."""
-    views, again = hbr.ViewsTogether("edges+colours"), hbr.ViewsTogether("edges+colours", several=False)
+    views, again = hbr.ViewsTogether("edges+colours+cedd"), hbr.ViewsTogether("edges+colours+cedd", several=False)
     for azimuth_deg in (0.0, 60.0, 120.0, 180.0):
         image = room(0, -azimuth_deg).copy()
         shelf()["teapot"].draw(image, -azimuth_deg, (0.0, 0.0))
@@ -73,7 +67,7 @@ def test_surroundings_that_change_with_the_view_are_not_learned() -> None:
 
 def test_the_guess_counts_beside_the_segmentations_with_a_learned_background() -> None:
     images, _, _ = frames(3)
-    views, again = hbr.ViewsTogether("edges+colours"), hbr.ViewsTogether("edges+colours", several=False)
+    views, again = hbr.ViewsTogether("edges+colours+cedd"), hbr.ViewsTogether("edges+colours+cedd", several=False)
     for image in images:
         views.add(image)
         again.learn(image)
@@ -82,7 +76,7 @@ def test_the_guess_counts_beside_the_segmentations_with_a_learned_background() -
         guess = hbr.segment(image).box
         assert max(overlap(one.box, guess) for one in found) >= 0.85
         for one, row in zip(found, levels, strict=True):  # also of those that were described after an earlier view
-            np.testing.assert_array_equal(hbr.descriptor("edges+colours").describe(one), row)
+            np.testing.assert_array_equal(hbr.descriptor("edges+colours+cedd").describe(one), row)
     assert [len(found) for found in again.segmentations] == [1] * 3  # an enrollment has one
 
 
@@ -97,7 +91,7 @@ def test_the_network_uses_the_empty_table_image() -> None:
 
 def test_views_of_another_size_are_rejected() -> None:
     images, _, _ = frames(1)
-    views = hbr.ViewsTogether("edges+colours")
+    views = hbr.ViewsTogether("edges+colours+cedd")
     views.add(images[0])
     with pytest.raises(ValueError, match="one size"):
         views.add(images[0][:200])
@@ -105,89 +99,35 @@ def test_views_of_another_size_are_rejected() -> None:
 
 def test_the_most_similar_segmentation_counts() -> None:
     rng = np.random.default_rng(0)
-    levels = rng.integers(0, 4, (6, 512), dtype=np.uint8)
+    levels = rng.integers(0, 2, (6, 512), dtype=np.uint8)
     index = hbr.DenseIndex(hbr.Views(levels, np.arange(6) * 120.0 % 360, np.repeat([0, 1], 3), ("a", "b"), "edges"))
-    other = rng.integers(0, 4, 512, dtype=np.uint8)
+    other = rng.integers(0, 2, 512, dtype=np.uint8)
     several = hbr.update_belief(np.stack([other, levels[4]]), 0.0, index)
     alone = hbr.update_belief(levels[4], 0.0, index)
     assert several.ranking().object_index[0] == 1
     assert several.scores()[1] == alone.scores()[1]
 
 
-def test_a_shift_of_strength_0_changes_nothing_and_a_hard_one_does() -> None:
-    images, empty, _ = frames(1)
-    kind = hbr.descriptor("edges+colours")
-    levels = kind.describe(hbr.segment(images[0], empty_table=empty))
-    rng = np.random.default_rng(0)
-    same = kind.shifted(levels, Shift.drawn(rng, 0.0))
-    assert kind.similarity(same[None], levels[None])[0, 0] > 0.995
-    hard = [kind.shifted(levels, Shift.drawn(rng, 1.0)) for _ in range(20)]
-    similar = kind.similarity(np.stack(hard), levels[None])[:, 0]
-    assert 0.7 < np.median(similar) < 0.97
-
-
-def test_a_descriptor_without_shifts_keeps_the_earlier_score() -> None:
-    rng = np.random.default_rng(0)
-    views = hbr.Views(
-        rng.integers(0, 8, (8, 144), dtype=np.uint8), np.arange(8) * 90.0 % 360, np.repeat([0, 1], 4), ("a", "b")
-    )
-    assert not can_shift(hbr.DenseIndex(views))
-
-
 def test_no_answer_on_a_guessed_view_while_another_one_is_possible() -> None:
     images, empty, _ = frames(2)
-    alone = hbr.ViewsTogether("edges+colours")
+    alone = hbr.ViewsTogether("edges+colours+cedd")
     alone.add(images[0], empty)
     assert alone.reliable  # by the empty-table image
-    views = hbr.ViewsTogether("edges+colours")
+    views = hbr.ViewsTogether("edges+colours+cedd")
     views.add(images[0])
-    index = hbr.DenseIndex(hbr.Views(views.levels[0][:1], np.zeros(1), np.zeros(1, np.intp), ("a",), "edges+colours"))
-    rule = hbr.fit_stopping_rule(index).rule
-    session = hbr.DenseSession(index, rule)
+    enrolled = hbr.Views.of_object("box", views.levels[0][:1], np.zeros(1), LIGHT)
+    index = hbr.DenseIndex(hbr.Views.concatenate([enrolled, catalog()]))
+    session = hbr.DenseSession(index)
     decision = session.add(views.levels[0], 0.0, reliable=views.reliable)
     assert (decision.outcome, decision.reason) == (hbr.Outcome.CONTINUE, hbr.StopReason.BADLY_SEGMENTED)
     assert session.end().outcome is hbr.Outcome.FOUND  # the table cannot rotate: no further view
-    other = np.full_like(views.levels[0], 3)
-    unknown = hbr.DenseSession(index, replace(rule, open_set_thresholds=(2.0,)))
-    assert unknown.add(other, 0.0, reliable=False).outcome is hbr.Outcome.CONTINUE
-    assert hbr.DenseSession(index, unknown.rule, max_views=1).add(other, 0.0, reliable=False).outcome is (
-        hbr.Outcome.UNKNOWN
-    )
+    for max_views, outcome in ((8, hbr.Outcome.CONTINUE), (1, hbr.Outcome.UNKNOWN)):
+        unknown = hbr.DenseSession(index, max_views=max_views)
+        assert unknown.add(np.zeros_like(views.levels[0]), 0.0, reliable=False).outcome is outcome
     views.add(images[1])
     *earlier, levels = views.levels
     assert views.reliable
     assert session.add(levels, 90.0, earlier=earlier, reliable=True).reason is not hbr.StopReason.BADLY_SEGMENTED
-
-
-def test_whitening_without_an_object_is_that_of_the_other_views() -> None:
-    rng = np.random.default_rng(1)
-    levels = rng.integers(0, 4, (60, 512), dtype=np.uint8)
-    index = hbr.DenseIndex(hbr.Views(levels, np.arange(60) * 60.0 % 360, np.repeat(np.arange(10), 6), NAMES, "edges"))
-    left_out = index.whitening.without(np.arange(6))
-    found = left_out(index.whitening.white(levels[6:]))
-    expected = Whitening(index.views.select(np.arange(6, 60))).unit(levels[6:])
-    np.testing.assert_allclose(found @ found.T, expected @ expected.T, atol=0.03)
-    with_it = index.whitening.unit(levels[:6])
-    own = left_out(index.whitening.white(levels[:6]))
-    gain = own @ found.T - with_it @ index.whitening.unit(levels[6:]).T
-    assert np.abs(gain).max() > 0.003  # an unknown object is compared differently
-
-
-@pytest.mark.parametrize(
-    ("method", "same_bench", "expected"),
-    [
-        (BoxMethod.EMPTY_TABLE, True, True),
-        (BoxMethod.PLAIN_BACKGROUND, True, True),
-        (BoxMethod.ROTATION, True, None),
-        (BoxMethod.GUESS, True, None),
-        (BoxMethod.ROTATION, False, False),
-        (BoxMethod.EMPTY_TABLE, None, None),
-    ],
-)
-def test_a_segmentation_by_rotation_is_not_like_the_enrollment(
-    method: BoxMethod, same_bench: bool | None, expected: bool | None
-) -> None:
-    assert like_enrollment(method, same_bench) is expected
 
 
 def on_a_visible_platter(count: int) -> list[DrawnFrame]:
@@ -204,7 +144,7 @@ def on_a_visible_platter(count: int) -> list[DrawnFrame]:
 @pytest.mark.parametrize("several", [False, True])
 def test_a_platter_before_a_plain_backdrop_is_not_part_of_the_object(count: int, several: bool) -> None:
     drawn = on_a_visible_platter(count)
-    views = hbr.ViewsTogether("edges+colours", several=several)
+    views = hbr.ViewsTogether("edges+colours+cedd", several=several)
     for frame in drawn:
         views.learn(frame.image)
     views.revise()
@@ -219,7 +159,7 @@ def test_a_platter_before_a_plain_backdrop_is_not_part_of_the_object(count: int,
 def test_a_plain_background_that_the_network_confirms_is_a_known_one() -> None:
     image = np.full((240, 320, 3), 170, np.uint8)
     image[80:200, 120:200] = (40, 60, 210)
-    views = hbr.ViewsTogether("edges+colours")
+    views = hbr.ViewsTogether("edges+colours+cedd")
     assert views.add(image)[0].method is BoxMethod.PLAIN_BACKGROUND
     assert views.reliable
 
@@ -231,10 +171,54 @@ def test_a_box_that_may_contain_the_platter_is_reported(
     drawn = [frame.image for frame in on_a_visible_platter(2)]
     share = np.zeros((96, 128), np.float32)
     share[70:86, 30:98], share[40:80, 50:78] = platter, 0.9
-    monkeypatch.setattr(import_module("hbr.segmentation.segment"), "shares", lambda *_, **__: Shares(share, share))
+    monkeypatch.setattr(import_module("hbr.segmentation.segment"), "shares", lambda *_, **__: Shares(share, 1 - share))
     learned = hbr.Background.learned([shrunk(drawn[1])], drawn[1].shape[:2])
     issues = tuple(Issue(IssueCode.DOUBTFUL_OUTLINE, {"overlap": one}) for one in overlaps)
     assert hbr.hypotheses(drawn[0], learned=learned, most=1)[0].issues == issues
+
+
+@pytest.mark.parametrize("count", [1, 4])
+@pytest.mark.parametrize("plain", [True, False])
+def test_nothing_is_found_on_an_empty_table(count: int, plain: bool) -> None:
+    """By the empty-table image, or because a plain table does not change while it rotates."""
+    visit = Visit(DrawnBench.drawn(np.random.default_rng(3), plain=plain), ENROLLMENT, np.random.default_rng(0))
+    views = hbr.ViewsTogether("edges+colours+cedd")
+    for n in range(count):
+        views.learn(visit.empty(90.0 * n), visit.empty() if count == 1 or not plain else None)
+    views.revise()
+    for found in views.segmentations:
+        assert [one.method for one in found] == [BoxMethod.NONE]
+
+
+@pytest.mark.parametrize("missing", [0, 2])
+def test_what_only_the_other_views_show_is_not_found(missing: int) -> None:
+    """Before a plain backdrop: there the object would stand out."""
+    frames = [np.full((240, 320, 3), 170, np.uint8) for _ in range(4)]
+    for n, frame in enumerate(frames):
+        if n != missing:
+            frame[80:200, 120 - 10 * n : 200 + 10 * n] = 40, 60, 210
+    views = hbr.ViewsTogether("edges+colours+cedd", several=False)
+    for frame in frames:
+        views.learn(frame)
+    views.revise()
+    assert [(found[0].box is None) for found in views.segmentations] == [n == missing for n in range(4)]
+
+
+def test_an_object_that_fills_the_frame_before_a_plain_background_is_whole() -> None:
+    """A disc does not change while it rotates, and only the spot on it would be found."""
+    frames = []
+    for n in range(4):
+        frame = np.zeros((120, 160, 3), np.uint8)
+        cv2.circle(frame, (80, 60), 62, (70, 160, 230), -1)
+        spot = round(80 + 30 * np.cos(np.pi / 2 * n)), round(60 + 30 * np.sin(np.pi / 2 * n))
+        cv2.circle(frame, spot, 16, (210, 50, 30), -1)
+        frames.append(frame)
+    views = hbr.ViewsTogether("edges+colours+cedd")
+    for frame in frames:
+        views.learn(frame)
+    views.revise()
+    for found in views.segmentations:
+        assert overlap(found[0].box, (18, 0, 125, 120)) > 0.9
 
 
 def test_an_object_that_fills_the_frame_does_not_hide_that_the_background_stands_still() -> None:
@@ -245,16 +229,3 @@ def test_an_object_that_fills_the_frame_does_not_hide_that_the_background_stands
     found = hbr.Background.learned([shrunk(second)], (96, 128)).difference(shrunk(first))
     assert not found.reliable
     assert found.still
-
-
-def test_two_plain_benches_are_not_known_to_be_one() -> None:
-    """A border without texture proves nothing, a border with texture proves both."""
-    answers = {}
-    for textured in (0.0, 1.0):
-        bench, *others = (DrawnBench.drawn(np.random.default_rng(n), textured=textured) for n in range(12))
-        enrolled = hbr.Background(Visit(bench, ENROLLMENT, np.random.default_rng(0)).empty())
-        later = Visit(bench, MILD, np.random.default_rng(1)).empty()
-        foreign = [Visit(one, HARD, np.random.default_rng(n)).empty() for n, one in enumerate(others)]
-        answers[textured] = enrolled.shows_same_bench(later), {enrolled.shows_same_bench(one) for one in foreign}
-    assert answers == {0.0: (None, {None, False}), 1.0: (True, {False})}
-    assert enrolled.shows_same_bench(later[:200]) is None  # another camera
